@@ -79,7 +79,7 @@ def test_latches_and_robots_are_built_as_specified():
     late = meaning(mechanism, 1.0, 1.0, 1.0, 1.0, 1.0).delay
     np.testing.assert_allclose(late, max(delay, 0.004 + lag[1] + 0.008))
     held = meaning(mechanism, 1.0, 1.0, np.nan, 1.0, np.nan)
-    assert "; in space a latch holds, peak force 1 N; the rig" in held.line("claw")
+    assert "; ideal contact: held by a latch, peak force 1 N; rig: delay" in held.line("claw")
 
 
 def central(name):
@@ -133,9 +133,9 @@ def test_starts_that_cannot_be_run_are_refused():
     for name, changes, reason in (
         ("hydraulic-hexapod", {**above, "rig.simulator.stroke": [1.6, 1.9]},
          "rig.simulator.stroke: found legs from "),
-        ("hydraulic-hexapod", above | legs, "rig.simulator.base: found legs that hardly hold the platform"),
+        ("hydraulic-hexapod", above | legs, "rig.simulator.base: found legs that are nearly singular"),
         ("ring-capture", {**APART, "contact": {}, "start.chaser.position": [0.04, 0.06, 2.19]},
-         "latch.hooks.depth: found 0.0002 m, deep enough at the start already"),
+         "latch.hooks.depth: found 0.0002 m, with which the latch catches"),
         ("ring-capture", {"approach.angular_velocity": [0, 60, 0]},
          "approach.angular_velocity: found a rotation by 1.22 rad at the start, expected at most 1 rad"),
     ):  # fmt: skip
@@ -143,10 +143,10 @@ def test_starts_that_cannot_be_run_are_refused():
             simulate_six_axes(load_any(name, changes).mechanism)
         assert str(caught.value).startswith(f"{name}: {reason}")
     for changes, reason in (
-        ({"approach.offset": [9.0, 0.0]}, "approach.offset: found nothing to touch"),
+        ({"approach.offset": [9.0, 0.0]}, "approach.offset: found a chaser that passes the target"),
         (
             {"approach.velocity": [0, 0, -5.0]},
-            "approach.velocity: found shapes of contact.tip that pass at 5 m/s, expected at most 1.25 m/s",
+            "approach.velocity: found a speed of 5 m/s between the shapes of contact.tip, expected at most",
         ),
         (
             {"rig.simulator.natural_frequency": {"translation": 14.0, "rotation": 2e4}},
@@ -276,7 +276,7 @@ def test_friction_that_is_too_stiff_is_named():
 def test_shapes_that_pass_through_each_other_are_reported():
     soft = {"contact.tip.stiffness": 3e4, "approach.velocity": [0, 0, -0.5], "uncertainty": {}}
     run = package.simulate(package.load("probe-drogue", soft))
-    assert run.episodes[0].penetration > 0.9 and "of the size of its shapes" in run.meaning.warnings[-1]
+    assert run.episodes[0].penetration > 0.9 and "times the size of the shapes" in run.meaning.warnings[-1]
     gentle = package.simulate(package.load("probe-drogue"))
     assert gentle.episodes[0].penetration < 0.1 and not gentle.meaning.warnings
 

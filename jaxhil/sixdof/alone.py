@@ -1,4 +1,4 @@
-"""Ideal contact of two free bodies without a rig: their first episode and their final motion."""
+"""Simulation of a six-axis mechanism's ideal contact: two free bodies without a rig."""
 
 from collections.abc import Callable
 from functools import cache
@@ -22,31 +22,49 @@ from jaxhil.sixdof.watch import quiet_time
 
 
 class EpisodeInSpace(NamedTuple):
-    """First episode of the ideal contact, as in a run; NaN for values that it does not have."""
+    """Metrics of the first episode of the ideal contact; NaN for a metric that is not defined.
 
-    reference_restitution: float  # e*; NaN unless there is a single touch [1]
-    effective_mass: float  # m_n at the first touch [kg]
-    approach_velocity: float  # along the normal of the first touch [m/s]
-    point: tuple[float, ...]  # point of the first touch, in T axes [m]
-    normal: tuple[float, ...]  # normal there, outward from the target
-    reference_peak_force: float  # [N]
-    reference_peak_moment: float  # about T's origin [N m]
-    reference_duration: float  # time in touch [s]
-    reference_touches: int  # number of onsets of touch, over all candidates
+    Attributes:
+        reference_restitution: Restitution e* [1]; NaN unless there is a single touch.
+        effective_mass: Effective mass m_n at the first touch [kg].
+        approach_velocity: Approach velocity along the normal of the first touch [m/s].
+        point: Point of the first touch, in T axes [m].
+        normal: Normal of the target's surface at this point, outward.
+        reference_peak_force: Peak force [N].
+        reference_peak_moment: Peak moment about T's origin [N m].
+        reference_duration: Time during which shapes touch [s].
+        reference_touches: Number of touches, summed over the candidates.
+    """
+
+    reference_restitution: float
+    effective_mass: float
+    approach_velocity: float
+    point: tuple[float, ...]
+    normal: tuple[float, ...]
+    reference_peak_force: float
+    reference_peak_moment: float
+    reference_duration: float
+    reference_touches: int
 
 
 class SpaceRun(NamedTuple):
-    """Ideal contact of a mechanism's two bodies."""
+    """Result of a simulation of the ideal contact.
+
+    Attributes:
+        episode: Metrics of the first episode.
+        status: "rebounded", "captured" (a latch holds the chaser), or "miss".
+        final: Motion of the bodies at the end of the duration that the mechanism file specifies.
+    """
 
     episode: EpisodeInSpace
-    status: str  # "rebounded", "captured" (held by a latch), or "miss"
-    final: Final  # motion at the end of the file's duration
+    status: str
+    final: Final
 
 
 def simulate_in_space(mechanism: SixAxisMechanism) -> SpaceRun:
-    """Simulate the ideal contact of a six-axis mechanism, from its start to the end of its duration.
+    """Simulate the ideal contact of a six-axis mechanism over the whole duration of its nominal run.
 
-    Raise `InputError` if the start is invalid or a contact is too stiff to be integrated.
+    Raise `InputError` if the start is invalid, or if a contact is too stiff to be integrated.
     """
     with jax_context():
         scenario = build_scenarios(mechanism)
@@ -68,7 +86,7 @@ def simulate_in_space(mechanism: SixAxisMechanism) -> SpaceRun:
 
 
 def _ideal_metrics(scenario: Scenario) -> Metrics:
-    """Return the metrics of the ideal contact; those of a rig's episode in them are meaningless."""
+    """Return metrics whose fields of the ideal contact are valid; the fields of the rig are meaningless."""
     period = scenario.control_period
     space = Space(scenario.bodies, scenario.groups, scenario.latches)
     until = jnp.round(scenario.duration / period) * period
@@ -95,5 +113,5 @@ def _ideal_metrics(scenario: Scenario) -> Metrics:
 
 @cache
 def _compiled() -> Callable[[Scenario], Metrics]:
-    """Return the compiled function for the metrics."""
+    """Return the compiled version of `_ideal_metrics`."""
     return jax.jit(_ideal_metrics, compiler_options=supported_options(SINGLE_RUN_OPTIONS))

@@ -1,4 +1,4 @@
-"""Start of a run: free flight towards the first touch."""
+"""States of the bodies at the start of a run, in free flight towards the first touch."""
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +10,9 @@ from jaxhil.sixdof.relative import Pair, Pose, States, Twist
 from jaxhil.sixdof.rotations import Quaternion, compose, identity, reverse, rotate, rotate_back
 from jaxhil.sixdof.vectors import Vector, cross
 
-FAR = 10.0  # m; height from which the chaser is lowered on the target
-STEPS, POLISHES = 400, 3  # steps and final Newton steps of the search for the first touch
-FLIGHTS = 8  # steps of the backward flight
+FAR = 10.0  # m; height above the target at which the search for the first touch begins
+STEPS, POLISHES = 400, 3  # numbers of search steps and of Newton steps; enough for rounding accuracy
+FLIGHTS = 8  # number of integration steps of the free flight before the first touch
 
 
 def touching_height(
@@ -21,16 +21,16 @@ def touching_height(
     offset_y: Float[Array, "*batch"],
     attitude: Quaternion,
 ) -> Float[Array, "*batch"]:
-    """Return z [m] of C, in T axes, at which the chaser, lowered along z, first touches; NaN if never.
+    """Return the height z [m] of C at which the chaser first touches the target, lowered along z of T.
 
-    Steps are as long as the gap, so that they cannot pass a surface. Newton's method then gives the last
-    digits.
+    The result is NaN if the chaser passes without a touch. Each search step is as long as the gap between
+    the shapes, so that no step can pass a surface. Newton's method then refines the height to rounding.
     """
 
     def depth(height: Array) -> Array:
         return deepest(groups, Pose(Vector(offset_x, offset_y, height), attitude))
 
-    def polished(_, height: Array) -> Array:
+    def newton(_, height: Array) -> Array:
         guess = jax.lax.stop_gradient(height)
         value, slope = jax.jvp(depth, (guess,), (jnp.ones_like(guess),))
         return guess - value / jnp.where(slope < 0, slope, -1)
@@ -38,14 +38,14 @@ def touching_height(
     start = jnp.full_like(offset_x, FAR)
     height = jax.lax.fori_loop(0, STEPS, lambda _, z: z + jax.lax.stop_gradient(depth(z)), start)
     touches = (jnp.abs(depth(height)) < 1e-6) & (height > -FAR)
-    polish = jax.lax.fori_loop(0, POLISHES, polished, height)
-    return jnp.where(touches, polish, jnp.nan)
+    refined = jax.lax.fori_loop(0, POLISHES, newton, height)
+    return jnp.where(touches, refined, jnp.nan)
 
 
 def begin(bodies: Pair, pose: Pose, twist: Twist, before: Float[Array, "*batch"]) -> States:
-    """Return the states `before` [s] bodies in free flight have a pose and a twist.
+    """Return the states from which free flight for a time `before` [s] leads to a pose and a twist.
 
-    The target is at rest, its centre of mass is at the origin, and its body axes are the world axes.
+    The target is at rest with its centre of mass at the world's origin. Its body axes equal the world axes.
     """
     zero = jnp.zeros_like(before)
     still = Vector(zero, zero, zero)

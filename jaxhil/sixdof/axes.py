@@ -1,9 +1,10 @@
-"""Drives of the motion simulator: axes that each have a model and a delay.
+"""Axes of the motion simulator, each with its own transfer function and delay.
 
-An axis is a coordinate, a robot's coordinate or a leg; axes are the leading dimension, (axes, *batch). Each
-follows its command like the single axis of `jaxhil.simulation.motion_simulator`, discretised exactly. The
-hardware's pose at an instant needs the positions of all axes at this instant. As delays differ, each axis is
-sampled at its own fraction of a sampling interval, and looked up as many intervals back as its delay is long.
+An axis is a coordinate of the pose, a coordinate of one of two robots, or a leg of a hexapod. Arrays have the
+shape (axes, *batch). Each axis follows its command like the single axis of
+`jaxhil.simulation.motion_simulator`, with an exact discretisation. A sensor needs the positions of all axes
+at one instant, but the delays of the axes differ. Therefore each axis is sampled at its own fraction of a
+sampling interval, and a delay line stores the samples for the whole intervals of the delay.
 """
 
 from typing import Any, NamedTuple
@@ -29,36 +30,36 @@ from jaxhil.simulation.scenario import MotionSimulatorBatch
 
 
 class Axes(NamedTuple):
-    """Discretised axes of a motion simulator, with the sensors' sampling instants."""
+    """Discretised axes of a motion simulator, with the delays of the two sensors."""
 
-    propagation: Propagation  # each axis's motion simulator, (..., axes, *batch)
-    # row at the force sensor's sampling instant [1/s^2]; None unless a tool is weighed
+    propagation: Propagation  # matrices and output rows of the discretised axes, (..., axes, *batch)
+    # output row of the acceleration at the force sensor's sampling instant [1/s^2]; None if not needed
     acceleration: Float[Array, "columns axes *batch"] | None
-    force: SplitDelay  # delay of each axis plus the force sensor, (axes, *batch)
-    position: SplitDelay  # delay of each axis plus the position sensor, (axes, *batch)
+    force: SplitDelay  # sum of the delays of each axis and of the force sensor, (axes, *batch)
+    position: SplitDelay  # sum of the delays of each axis and of the position sensor, (axes, *batch)
 
 
 class Motion(NamedTuple):
-    """Positions of the axes, in their units, and rates per second."""
+    """Positions, rates and accelerations of the axes or of the coordinates, (axes, *batch)."""
 
-    position: Float[Array, "..."]  # (axes, *batch)
-    rate: Float[Array, "..."]  # (axes, *batch)
-    acceleration: Float[Array, "..."] | None  # (axes, *batch); None if unused
+    position: Float[Array, "..."]  # [m or rad]
+    rate: Float[Array, "..."]  # [m/s or rad/s]
+    acceleration: Float[Array, "..."] | None  # [m/s^2 or rad/s^2]; None if not needed
 
 
 class Samples(NamedTuple):
     """Motion of the axes at the sensors' sampling instants."""
 
-    motion: Motion  # at the force sensor's sampling instant
-    measured: Float[Array, "..."] | None  # positions at the position sensor's; None if unused
+    motion: Motion  # motion at the force sensor's sampling instant
+    measured: Float[Array, "..."] | None  # positions at the position sensor's instant; None if not needed
 
 
 class Hardware(NamedTuple):
-    """State of the axes and their delay line."""
+    """State of the axes, with their latest commands and their delay line."""
 
-    commands: tuple[Array, ...]  # c(n), c(n-1), ... as sent to the drives, (axes, *batch) each
-    state: tuple[Array, ...]  # state of the axes
-    ring: Float[Array, "rows *batch"]  # delay line; rows are (intervals, sampled quantities, axes), flattened
+    commands: tuple[Array, ...]  # commands c(n), c(n-1), ... to the drives, (axes, *batch) each
+    state: tuple[Array, ...]  # states of the axes' transfer functions
+    ring: Float[Array, "rows *batch"]  # ring buffer of the samples, (intervals x quantities x axes, *batch)
 
 
 def build_axes(
@@ -70,10 +71,10 @@ def build_axes(
     weighed: bool = False,
     measured: bool = False,
 ) -> Axes:
-    """Return axes without limits, leaves (..., axes, *batch), sampled by sensors with delays [s].
+    """Discretise the axes of a motion simulator without limits, for sensors with the given delays [s].
 
-    `weighed` adds accelerations, for the weight of a tool, and `measured` the positions that the position
-    sensor reads.
+    `weighed` adds the accelerations, from which the inertia force of a tool follows. `measured` adds the
+    positions at the position sensor's sampling instant.
     """
     period = jnp.broadcast_to(control_period[None], simulator.delay.shape)
     force, position = (
@@ -86,7 +87,7 @@ def build_axes(
 
 
 def lags(simulator: MotionSimulatorBatch) -> np.ndarray:
-    """Return the lag -G'(0) [s] of each axis, (axes, *batch), without its transport delay."""
+    """Return the low-frequency lag -G'(0) [s] of each axis, (axes, *batch), without the transport delay."""
     numerator, denominator = (np.asarray(part) for part in (simulator.numerator, simulator.denominator))
     if len(denominator) == 1:
         return np.zeros(simulator.delay.shape)
@@ -97,9 +98,16 @@ def lags(simulator: MotionSimulatorBatch) -> np.ndarray:
 def enter(
     axes: Axes, at: Array, stride: Array, period: Array, hold: str, latency: int, ring: int
 ) -> Hardware:
-    """Return the hardware in uniform motion, at positions `at` that grow by `stride` in a control period [s].
+    """Return the hardware state in steady uniform motion.
 
-    Both are (axes, *batch). `ring` is the length of the delay line: a power of two, longer than any delay.
+    Args:
+        axes: Discretised axes.
+        at: Latest position command, (axes, *batch).
+        stride: Change of the command in a control period, (axes, *batch).
+        period: Control period [s].
+        hold: Hold of the command, "linear" or "zoh".
+        latency: Latency of the command [control periods].
+        ring: Length of the delay line [control periods]: a power of two, longer than any delay.
     """
     commands = tuple(at - back * stride for back in range(latency + 1))
     drive = commands[-1] if hold == "linear" else commands[-1] + stride
@@ -113,7 +121,7 @@ def enter(
     )
     newest = _samples(axes, position, stride / period[None], 0 * stride, measured)
     growth = _samples(axes, stride, 0 * stride, 0 * stride, stride)
-    # The delay line contains the uniform motion of the past intervals.
+    # The delay line starts with the samples of the past uniform motion.
     back = jnp.arange(1 - ring, 1, dtype=jnp.int32).astype(stride.dtype).reshape(-1, 1, *[1] * stride.ndim)
     newest, growth = (jnp.stack(jax.tree.leaves(samples))[None] for samples in (newest, growth))
     return Hardware(
@@ -122,7 +130,7 @@ def enter(
 
 
 def sampled(axes: Axes, hardware: Hardware, tick: Int[Array, ""]) -> Samples:
-    """Return the samples that the sensors read at `tick`, counted from the start of the run."""
+    """Return the samples that the sensors read at a tick; ticks are counted from the start of the run."""
     force = axes.force.intervals
     delays, structure = jax.tree.flatten(_samples(axes, force, force, force, axes.position.intervals))
     size = force.size
@@ -131,7 +139,7 @@ def sampled(axes: Axes, hardware: Hardware, tick: Int[Array, ""]) -> Samples:
     lane = jnp.arange(size, dtype=force.dtype).reshape(force.shape)
     samples = []
     for kind, delay in enumerate(delays):
-        # The delay line is read up to its length back: an index below 0 wraps.
+        # The bit mask wraps the index around the ring buffer.
         index = ((tick - 1 - delay) & last) * (len(delays) * size) + (kind * size + lane)
         samples.append(ring.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False))
     return structure.unflatten(samples)
@@ -140,7 +148,7 @@ def sampled(axes: Axes, hardware: Hardware, tick: Int[Array, ""]) -> Samples:
 def actuate(
     axes: Axes, hardware: Hardware, tick: Int[Array, ""], command: Array, hold: str, latency: int
 ) -> Hardware:
-    """Return the hardware after the control period of `tick`, at whose end `command` is sent."""
+    """Advance the hardware by one control period; `command` is the command for the end of the period."""
     commands = (command, *hardware.commands)
     end = commands[latency]
     start = commands[latency + 1] if hold == "linear" else end
@@ -155,7 +163,7 @@ def actuate(
 
 
 def _samples(axes: Axes, position: Any, rate: Any, acceleration: Any, measured: Any) -> Samples:
-    """Return the samples that are used."""
+    """Return samples without the quantities that the loop does not need."""
     return Samples(
         Motion(position, rate, acceleration if axes.acceleration is not None else None),
         measured if axes.propagation.measured_position is not None else None,

@@ -1,6 +1,6 @@
-"""Construction of scenarios and loops from a six-axis mechanism, nominal or drawn.
+"""Construction of scenarios and loops from a six-axis mechanism, with nominal or drawn values.
 
-Arrays are NumPy's until a run is compiled, except draws given as JAX arrays. The batch is the trailing axis.
+Values are computed in NumPy, or in JAX if the draws are JAX arrays. The last axis of all arrays is the batch.
 """
 
 from collections.abc import Mapping
@@ -27,18 +27,21 @@ from jaxhil.sixdof.stewart import Stewart
 from jaxhil.sixdof.values import Values
 from jaxhil.sixdof.vectors import Vector, vector
 
-APPROACH = 0.02  # s; free flight before the first touch, in addition to the phase
-LONGEST = 10.0  # s; duration of a run whose start does not specify one
+APPROACH = 0.02  # s; duration of the free flight before the first touch, without the phase
+LONGEST = 10.0  # s; duration of a run if [start] does not specify a duration
 
 
 def build_scenarios(
     mechanism: SixAxisMechanism, draws: Mapping[str, Any] | None = None, seed: int = 0, first: int = 0
 ) -> Scenario:
-    """Return a batch of scenarios of a mechanism.
+    """Build a batch of scenarios of a mechanism.
 
-    `draws` maps dotted paths to values, (number,), or (number, *entries) for lists; other numbers are
-    nominal. Without draws the batch is the nominal run alone. Noise keys depend only on `seed` and `first` +
-    lane.
+    Args:
+        mechanism: Mechanism with the nominal values.
+        draws: Drawn values by dotted path, (scenarios,), or (scenarios, *entries) for lists. All other values
+            are nominal. None builds the nominal scenario alone.
+        seed: Seed of the sensors' noise.
+        first: Index of the first scenario. The noise of a scenario depends on `seed` and its index alone.
     """
     numbers = Values(mechanism, dict(draws or {}))
     bodies = Pair(*(_body(numbers, name) for name in ("target", "chaser")))
@@ -69,7 +72,7 @@ def build_scenarios(
 
 
 def loop_of(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -> Loop:
-    """Return the static loop of a mechanism's scenarios."""
+    """Return the structure of the loop that runs a mechanism's scenarios with a compensator."""
     rig, sensor = mechanism.rig, scenario.sensor
     return build_loop(
         scenario,
@@ -89,7 +92,7 @@ def loop_of(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -
 
 
 def _body(numbers: Values, name: str) -> Body:
-    """Return a body by its name."""
+    """Build the body `name`, "target" or "chaser"."""
     turned = f"{name}.interface_rotation"
     return build_body(
         jnp.asarray(numbers(f"{name}.mass")),
@@ -100,14 +103,15 @@ def _body(numbers: Values, name: str) -> Body:
 
 
 def _specified(numbers: Values, bodies: Pair) -> States:
-    """Return the states of [start]."""
+    """Return the states of the bodies that the table [start] specifies."""
 
     def state(name: str, body: Body):
         parts = numbers(f"start.{name}.attitude")
         norm = numbers.np.sqrt((parts**2).sum(axis=0))
         attitude = Quaternion(jnp.asarray(parts[0] / norm), numbers.vector(parts[1:] / norm))
-        motion = (numbers.vector(numbers(f"start.{name}.{key}")) for key in ("position", "velocity"))
-        position, velocity = motion
+        position, velocity = (
+            numbers.vector(numbers(f"start.{name}.{key}")) for key in ("position", "velocity")
+        )
         return build_state(
             body, position, velocity, attitude, numbers.vector(numbers(f"start.{name}.angular_velocity"))
         )
@@ -116,14 +120,14 @@ def _specified(numbers: Values, bodies: Pair) -> States:
 
 
 def _before_touch(numbers: Values, bodies: Pair, groups: tuple[ContactGroup, ...], before: Any) -> States:
-    """Return the states before the first touch of [approach]."""
+    """Return the states a time `before` [s] earlier than the first touch that [approach] specifies."""
     keys = ("offset", "attitude", "velocity", "angular_velocity")
     return _lowered(bodies, groups, *(numbers(f"approach.{key}") for key in keys), before)
 
 
 @jax.jit
 def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, before) -> States:
-    """Return the states `before` [s] the chaser, with an offset and attitude, touches the target."""
+    """Return the states a time `before` [s] earlier than a first touch with the given motion of C."""
     turned = exponential(vector(attitude))
     height = touching_height(groups, offset[0], offset[1], turned)
     pose = Pose(Vector(offset[0], offset[1], height), turned)
@@ -131,7 +135,7 @@ def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, befor
 
 
 def _kinematics(mechanism: SixAxisMechanism, numbers: Values) -> Kinematics:
-    """Return the relation of axes and coordinates."""
+    """Build the kinematics of the motion simulator."""
     path, simulator = "rig.simulator.", mechanism.rig.simulator
     if simulator.space == "task":
         return TaskSpace()
@@ -145,13 +149,13 @@ def _kinematics(mechanism: SixAxisMechanism, numbers: Values) -> Kinematics:
 
 
 def _simulator(mechanism: SixAxisMechanism, numbers: Values) -> MotionSimulatorBatch:
-    """Return every axis's motion simulator as a transfer function; `ideal` has order 0."""
+    """Return the transfer function, delay and limits of every axis; the model "ideal" has order 0."""
     path, model = "rig.simulator.", mechanism.rig.simulator.model
 
     def of(key: str) -> Any:
-        """Return a key's values for all axes.
+        """Return the values of a key for all axes; with two robots, first those of the chaser's robot.
 
-        With two robots, the target's axes follow the chaser's, and have the same values unless specified.
+        If the file has no value for the target's robot, both robots have the same value.
         """
         chaser = numbers(path + key)
         if mechanism.rig.simulator.target_robot is None:
@@ -187,7 +191,7 @@ def _simulator(mechanism: SixAxisMechanism, numbers: Values) -> MotionSimulatorB
 
 
 def _sensor(mechanism: SixAxisMechanism, numbers: Values) -> sensor.Sensor:
-    """Return the force sensor and the controller's assumptions about it."""
+    """Build the force sensor and the controller's assumptions about the sensor."""
     path = "rig.force_sensor."
     nothing: Any = np.zeros((6, numbers.number))
     tool = _tool(mechanism, numbers)
@@ -214,7 +218,10 @@ def _sensor(mechanism: SixAxisMechanism, numbers: Values) -> sensor.Sensor:
 
 
 def _tool(mechanism: SixAxisMechanism, numbers: Values, assumed: str = "") -> sensor.Tool:
-    """Return the tool or, with a suffix, the controller's assumed tool, by default the nominal one."""
+    """Build the real tool or, with the suffix "_assumed", the tool that the controller assumes.
+
+    Without assumed values in the file, the controller assumes the nominal tool.
+    """
     tool = mechanism.rig.force_sensor.tool or Tool(mass=0.0, com=[0.0, 0.0, 0.0])
     path = "rig.force_sensor.tool."
     return sensor.Tool(

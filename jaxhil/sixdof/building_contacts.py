@@ -1,7 +1,7 @@
 """Construction of contact groups and latches from a six-axis mechanism file.
 
-Each copy of a pattern is a candidate. Candidates with equal kinds of shapes and laws form a group, whatever
-their tables.
+Each copy of a pattern is a contact candidate. Candidates whose shapes and laws are of the same kinds form a
+group, also if they come from different tables of the file.
 """
 
 from typing import Any, NamedTuple
@@ -25,9 +25,9 @@ from jaxhil.sixdof.vectors import Vector
 
 
 class Candidate(NamedTuple):
-    """Pair of shapes with its laws; leaves (number,)."""
+    """Pair of shapes that may touch, with its contact law and friction law; arrays (lanes,)."""
 
-    name: str  # name of its table, with the index of the copy in a pattern
+    name: str  # name of the file's table, with the index of the copy if the table has a pattern
     pair: Candidates
     law: ContactLaw
     parameters: ContactParameters
@@ -35,7 +35,7 @@ class Candidate(NamedTuple):
 
 
 def candidates(mechanism: SixAxisMechanism, numbers: Values) -> list[list[Candidate]]:
-    """Return all candidates, grouped by kind."""
+    """Return all contact candidates of a mechanism, grouped by the kinds of their shapes and laws."""
     groups: dict[Any, list[Candidate]] = {}
     for name, contact in mechanism.contact.items():
         count = contact.pattern.count if contact.pattern else 1
@@ -47,16 +47,16 @@ def candidates(mechanism: SixAxisMechanism, numbers: Values) -> list[list[Candid
 
 
 def candidate_names(mechanism: SixAxisMechanism) -> tuple[str, ...]:
-    """Return the candidates' names, in the order of `build_groups`."""
+    """Return the names of all contact candidates, in the order of the groups of `build_groups`."""
     groups = candidates(mechanism, Values(mechanism, {}))
     return tuple(candidate.name for group in groups for candidate in group)
 
 
 def build_groups(mechanism: SixAxisMechanism, numbers: Values) -> tuple[ContactGroup, ...]:
-    """Return all candidates in groups, leaves (candidates, number)."""
+    """Build the groups of contact candidates, with arrays (..., candidates, lanes)."""
 
     def stacked(*leaves: Any) -> Any:
-        # The axis of segments of slopes and depths precedes that of the candidates.
+        # Slopes and depths have a leading axis for their segments, before the axis of the candidates.
         return numbers.np.stack(leaves, axis=max(leaves[0].ndim - 1, 0))
 
     return tuple(
@@ -71,12 +71,12 @@ def build_groups(mechanism: SixAxisMechanism, numbers: Values) -> tuple[ContactG
 
 
 def build_latches(mechanism: SixAxisMechanism, numbers: Values) -> tuple[Latch, ...]:
-    """Return the latches of every table, leaves (..., latches, number)."""
+    """Build the latches of each [latch] table, with arrays (..., latches, lanes)."""
     return tuple(_latch(latch, numbers, f"latch.{name}") for name, latch in mechanism.latch.items())
 
 
 def _latch(latch: six_axes.Latch, numbers: Values, path: str) -> Latch:
-    """Return the latches of one table, one for each copy of its pattern."""
+    """Build the latches of one table, one latch for each copy of the table's pattern."""
     count = latch.pattern.count if latch.pattern else 1
 
     def repeated(value: Any) -> Any:
@@ -105,7 +105,7 @@ def _latch(latch: six_axes.Latch, numbers: Values, path: str) -> Latch:
 
 
 def _candidate(contact: six_axes.Contact, numbers: Values, name: str, copy: int, count: int) -> Candidate:
-    """Return one copy of a table's contact."""
+    """Build the candidate for copy number `copy` of the `count` copies of a [contact] table."""
     path = f"contact.{name}"
     turn = numbers(f"{path}.pattern.phase", 0.0) + 2 * np.pi * copy / count
     turns = {"chaser": turn, "target": turn + numbers(f"{path}.target_pattern.phase", 0.0)}
@@ -122,7 +122,6 @@ def _candidate(contact: six_axes.Contact, numbers: Values, name: str, copy: int,
 
 
 def _pair(chaser: Shape, target: Shape) -> Candidates:
-    """Return the pair of shapes."""
     if isinstance(chaser, Ball):
         return ChaserSpheres(chaser.centre, chaser.radius, target)
     if isinstance(target, Ball):
@@ -132,7 +131,7 @@ def _pair(chaser: Shape, target: Shape) -> Candidates:
 
 
 def _shape(shape: six_axes.Shape, numbers: Values, path: str, turn: Any) -> Shape:
-    """Return a shape, rotated about z by `turn` [rad]."""
+    """Build a shape and rotate it about z by `turn` [rad]."""
 
     def of(key: str) -> Any:
         return jnp.asarray(numbers(f"{path}.{key}"))
@@ -156,12 +155,12 @@ def _shape(shape: six_axes.Shape, numbers: Values, path: str, turn: Any) -> Shap
 
 
 def _law(contact: six_axes.Contact, numbers: Values, path: str) -> ContactLaw:
-    """Return the contact law, specialised for the file's values."""
+    """Return the contact law, specialised for the values in the file."""
     return find_contact_law(contact.law).specialised(contact, lambda key: numbers.drawn(f"{path}.{key}"))
 
 
 def _parameters(contact: six_axes.Contact, numbers: Values, path: str) -> ContactParameters:
-    """Return the parameters of one candidate, (number,) each; slopes and depths (segments, number)."""
+    """Return a candidate's parameters of the contact law, (lanes,); slopes and depths (segments, lanes)."""
 
     def of_law(key: ContactKey) -> Any:
         if isinstance(key.default, bool):
@@ -176,7 +175,6 @@ def _parameters(contact: six_axes.Contact, numbers: Values, path: str) -> Contac
 
 
 def _friction(friction: six_axes.Friction | None, numbers: Values, path: str) -> Friction:
-    """Return the friction law."""
     if friction is None:
         return Frictionless()
     keys = ("slip",) if friction.law == "regularised" else ("stiffness", "damping")

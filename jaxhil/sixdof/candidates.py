@@ -1,8 +1,7 @@
-"""Contact candidates: pairs of shapes that may touch, and their penetration.
+"""Contact candidates: pairs of shapes that may touch, with their penetration.
 
-The pairs are known at compile time: the program does not search, count or sort. All candidates of one kind
-are along one leading array axis, (candidates, *batch), so that the compile time does not grow with their
-number.
+The pairs are known at compile time, so that no collision search is necessary. Arrays have a leading axis for
+all candidates of one kind, (candidates, *batch), so that the compile time does not grow with their number.
 """
 
 import abc
@@ -17,38 +16,39 @@ from jaxhil.sixdof.rotations import rotate, rotate_back
 from jaxhil.sixdof.shapes import Capsule, Shape
 from jaxhil.sixdof.vectors import Vector, cross, direction, dot, norm
 
-# Relative to a segment's squared length; regularisation that draws the nearest points of parallel segments to
-# their middles.
+# Regularisation for parallel segments, whose nearest points are not unique, relative to the squared length of
+# a segment [1]. It selects points near the middles of both segments.
 PARALLEL = 1e-9
 
 
 class Touch(NamedTuple):
-    """Two shapes at a pose; all values are in T axes."""
+    """Geometry of contact candidates at a pose, in T axes."""
 
-    depth: Float[Array, "candidates *batch"]  # d [m], negative apart
-    normal: Vector  # n, outward from the target's surface
-    point: Vector  # P, where the force acts: on the sphere's counterpart, or on the target's capsule [m]
+    depth: Float[Array, "candidates *batch"]  # penetration d [m]; minus the distance if the shapes are apart
+    normal: Vector  # normal n of the target's surface, outward
+    # point P where the force acts [m]: on the shape that the sphere touches, or on the target's capsule
+    point: Vector
 
 
 class Candidates(eqx.Module):
-    """Interface of all kinds of pairs."""
+    """Interface of all kinds of contact candidates."""
 
     @abc.abstractmethod
     def touch(self, pose: Pose) -> Touch:
-        """Return the contacts at a pose, whose leaves have a leading axis of length 1."""
+        """Return penetration, normal and point at a pose, whose arrays have a leading axis of length 1."""
 
     @property
     @abc.abstractmethod
     def size(self) -> Float[Array, "candidates *batch"]:
-        """Penetration [m] at which a shape has passed through the other; infinite if it cannot."""
+        """Penetration [m] at which one shape has passed through the other; infinite if this is impossible."""
 
 
 class ChaserSpheres(Candidates):
-    """Spheres of the chaser against one kind of the target's shapes; a sphere of radius 0 is a point."""
+    """Pairs of a sphere of the chaser and a shape of the target; a sphere of radius 0 is a point."""
 
-    centre: Vector  # in C axes [m]
-    radius: Float[Array, "candidates *batch"]  # [m]
-    shape: Shape  # in T axes
+    centre: Vector  # centre of the sphere, in C axes [m]
+    radius: Float[Array, "candidates *batch"]  # radius of the sphere [m]
+    shape: Shape  # shape of the target, in T axes
 
     @property
     def size(self):
@@ -61,11 +61,11 @@ class ChaserSpheres(Candidates):
 
 
 class TargetSpheres(Candidates):
-    """Spheres of the target against one kind of the chaser's shapes; a sphere of radius 0 is a point."""
+    """Pairs of a sphere of the target and a shape of the chaser; a sphere of radius 0 is a point."""
 
-    centre: Vector  # in T axes [m]
-    radius: Float[Array, "candidates *batch"]  # [m]
-    shape: Shape  # in C axes
+    centre: Vector  # centre of the sphere, in T axes [m]
+    radius: Float[Array, "candidates *batch"]  # radius of the sphere [m]
+    shape: Shape  # shape of the chaser, in C axes
 
     @property
     def size(self):
@@ -79,10 +79,10 @@ class TargetSpheres(Candidates):
 
 
 class Capsules(Candidates):
-    """Capsules of the chaser, in C axes, against capsules of the target, in T axes."""
+    """Pairs of a capsule of the chaser and a capsule of the target."""
 
-    chaser: Capsule
-    target: Capsule
+    chaser: Capsule  # in C axes
+    target: Capsule  # in T axes
 
     @property
     def size(self):
@@ -102,20 +102,17 @@ class Capsules(Candidates):
 
 
 def motion_at(touch: Touch, pose: Pose, twist: Twist) -> tuple[Float[Array, "candidates *batch"], Vector]:
-    """Return the penetration rate d' [m/s] and the slip [m/s].
-
-    The slip is the chaser's velocity along the target's surface.
-    """
+    """Return the penetration rate d' [m/s], and the chaser's velocity along the target's surface [m/s]."""
     velocity = twist.linear + cross(twist.angular, touch.point - pose.position)
     rate = -dot(touch.normal, velocity)
     return rate, velocity + rate * touch.normal
 
 
 def _nearest(first: Capsule, second: Capsule) -> tuple[Array, Array]:
-    """Return the fractions of two segments at which they are nearest; near their middles if not unique.
+    """Return the nearest points of two capsules' segments, as fractions of the segments' lengths.
 
-    Both are first found together with a slight regularisation, then each is the nearest to the other, within
-    its segment.
+    If the nearest points are not unique, the result is near the middles. Both fractions are first solved for
+    together, with a slight regularisation. Then each point is projected on the other segment.
     """
     u, v, apart = first.end - first.start, second.end - second.start, first.start - second.start
     uu, vv, uv = dot(u, u) * (1 + PARALLEL), dot(v, v) * (1 + PARALLEL), dot(u, v)

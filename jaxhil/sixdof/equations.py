@@ -1,6 +1,6 @@
-"""Linear equations and square roots of small matrices, for all lanes at once.
+"""Linear equations and square roots of small matrices (rows, columns, *batch), for all lanes at once.
 
-Matrices are (rows, columns, *batch). A library would be called separately for each lane.
+The algorithms consist of array operations, because JAX would call a linear-algebra library once per lane.
 """
 
 import jax
@@ -8,14 +8,16 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-ROOT_STEPS = 32  # rounding accuracy for eigenvalues down to 1e-9 of their sum; small ones grow by 9/4 a step
+# Number of Newton-Schulz steps: accurate to rounding for eigenvalues down to 1e-9 of their sum, because a
+# small eigenvalue grows by 9/4 in each step.
+ROOT_STEPS = 32
 
 
 @jax.custom_jvp
 def solve(
     matrix: Float[Array, "size size *batch"], right: Float[Array, "size columns *batch"]
 ) -> Float[Array, "size columns *batch"]:
-    """Return matrix^-1 right, by the modified Gram-Schmidt process on the columns of both."""
+    """Solve matrix @ solution = right by modified Gram-Schmidt orthogonalisation."""
     size = len(matrix)
 
     def project(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -41,10 +43,9 @@ def solve(
 
 @solve.defjvp
 def _solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return the solution and its derivative."""
-    (matrix, right), (slope, right_slope) = primals, tangents
+    (matrix, right), (matrix_tangent, right_tangent) = primals, tangents
     solution = solve(matrix, right)
-    return solution, solve(matrix, right_slope - product(slope, solution))
+    return solution, solve(matrix, right_tangent - product(matrix_tangent, solution))
 
 
 def product(left: Float[Array, "rows inner *batch"], right: Float[Array, "inner columns *batch"]) -> Array:
@@ -56,17 +57,14 @@ def product(left: Float[Array, "rows inner *batch"], right: Float[Array, "inner 
 
 
 def square_root(matrix: Float[Array, "size size *batch"]) -> Float[Array, "size size *batch"]:
-    """Return the symmetric square root of symmetric positive definite matrices.
-
-    The Newton-Schulz iteration consists of matrix products only.
-    """
+    """Return the symmetric square root of positive definite matrices by the Newton-Schulz iteration."""
     unit = jnp.eye(len(matrix), dtype=matrix.dtype).reshape(*matrix.shape[:2], *[1] * (matrix.ndim - 2))
-    size = jnp.sum(unit * matrix, axis=(0, 1), keepdims=True)
+    trace = jnp.sum(unit * matrix, axis=(0, 1), keepdims=True)
 
     def step(_, pair: tuple[Array, Array]) -> tuple[Array, Array]:
         root, inverse = pair
-        share = (3 * unit - product(inverse, root)) / 2
-        return product(root, share), product(share, inverse)
+        factor = (3 * unit - product(inverse, root)) / 2
+        return product(root, factor), product(factor, inverse)
 
-    start = matrix / size, jnp.broadcast_to(unit, matrix.shape)
-    return lax.fori_loop(0, ROOT_STEPS, step, start)[0] * jnp.sqrt(size)
+    start = matrix / trace, jnp.broadcast_to(unit, matrix.shape)
+    return lax.fori_loop(0, ROOT_STEPS, step, start)[0] * jnp.sqrt(trace)

@@ -1,4 +1,4 @@
-"""First touch of an ideal contact: point, normal, effective mass, and the bodies' states."""
+"""First touch of the ideal contact: point, normal, effective mass, and the bodies' states."""
 
 from typing import NamedTuple
 
@@ -18,20 +18,20 @@ TOUCH_STEPS = 4  # steps of Newton's method for the time of the first touch
 
 
 class Meeting(NamedTuple):
-    """First touch of an episode, in T axes."""
+    """Bodies and contact geometry at the first touch of an episode."""
 
     states: States  # states of the bodies
-    point: Vector  # point of the touch [m]
-    normal: Vector  # normal of the target's surface
+    point: Vector  # point of the touch, in T axes [m]
+    normal: Vector  # normal of the target's surface, in T axes
 
 
 def meet(space: Space, before: States, depths: tuple[Float[Array, "candidates *batch"], ...]) -> Meeting:
-    """Return the first touch, found on the free flight before it.
+    """Find the first touch by Newton's method, on the free flight that leads to it.
 
     Args:
-        space: constants of the contact.
-        before: last states without a touch, at most one step before it.
-        depths: penetrations at the end of this step [m]; 0 if nothing touches.
+        space: Constants of the ideal contact.
+        before: States at the start of the integration step in which the first touch begins.
+        depths: Penetration of each candidate at the end of this step [m]; 0 if nothing ever touches.
     """
     zero = jnp.zeros_like(before.target.position.x)
     if not space.groups:
@@ -40,16 +40,13 @@ def meet(space: Space, before: States, depths: tuple[Float[Array, "candidates *b
         return Meeting(before, nowhere, nowhere)
 
     def touch_of(states: States) -> tuple[Touch, Array]:
-        """Return a candidate's touch and the rate of its penetration.
-
-        The candidate is the one with the largest penetration at the end of the step.
-        """
+        """Return geometry and penetration rate of the candidate that is deepest at the end of the step."""
         pose, twist = jax.tree.map(lambda leaf: leaf[None], relative(space.bodies, states))
         touches = [group.candidates.touch(pose) for group in space.groups]
         rates = [motion_at(touch, pose, twist)[0] for touch in touches]
         return _deepest(list(zip(touches, rates, strict=True)), depths)
 
-    # The loop is not unrolled: the compiler would fuse and repeat the computations.
+    # A Python loop would be unrolled, and the compiler would fuse and repeat its computations.
     def newton(_, carry: tuple[Array, States, Meeting]) -> tuple[Array, States, Meeting]:
         time, states, _ = carry
         touch, rate = touch_of(states)
@@ -64,12 +61,12 @@ def meet(space: Space, before: States, depths: tuple[Float[Array, "candidates *b
 
 
 def meeting_mass(bodies: Pair, meeting: Meeting) -> Float[Array, "*batch"]:
-    """Return the effective mass [kg] of the first touch along its normal."""
+    """Return the effective mass [kg] of the bodies at the first touch, along the normal of the touch."""
     return effective_mass(bodies, meeting.states, meeting.point, meeting.normal)
 
 
 def glide(bodies: Pair, states: States, time: Float[Array, "*batch"]) -> States:
-    """Return the states after a short free flight [s], in one step."""
+    """Return the states after a free flight that lasts `time` [s], integrated in a single step."""
     zero = jnp.zeros_like(time)
     nothing = Vector(zero, zero, zero)
     return States(*(
@@ -79,7 +76,7 @@ def glide(bodies: Pair, states: States, time: Float[Array, "*batch"]) -> States:
 
 
 def _deepest(candidates: list[tuple[Touch, Array]], depths: tuple[Array, ...]) -> tuple[Touch, Array]:
-    """Return the candidate with the largest of the penetrations `depths`."""
+    """Return geometry and penetration rate of the candidate with the largest penetration in `depths` [m]."""
     best: tuple[tuple[Touch, Array], Array] | None = None
     for candidate, depth in zip(candidates, depths, strict=True):
         index = jnp.argmax(depth, axis=0)[None]

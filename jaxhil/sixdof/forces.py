@@ -1,8 +1,7 @@
-"""Contact at several points: normal forces, friction forces, and their resultant wrench.
+"""Contact at several points: normal forces, friction forces, and the resulting wrench.
 
-A contact law of `jaxhil.contact` gives each candidate's normal force from its penetration and rate, a
-friction law the tangential force from its slip. Neither tests for contact: without penetration the force is
-0.
+A contact law of `jaxhil.contact` computes the normal force of each candidate from penetration and penetration
+rate. A friction law computes the tangential force from the slip. Both forces are 0 without penetration.
 """
 
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ from jaxhil.sixdof.vectors import Vector, cross
 
 
 class ContactGroup(eqx.Module):
-    """Candidates of one kind with their laws."""
+    """Contact candidates with the same kinds of shapes, contact law and friction law."""
 
     candidates: Candidates  # pairs of shapes
     law: ContactLaw = eqx.field(static=True)  # contact law of the normal force
@@ -28,36 +27,39 @@ class ContactGroup(eqx.Module):
     friction: Friction  # friction law of the tangential force
 
     def init(self) -> "Memory":
-        """Return the laws' state before the first touch."""
+        """Return the states of contact law and friction law before the first touch."""
         like = jnp.zeros_like(self.parameters.damping)
         return Memory(self.law.init(like), self.friction.init(like))
 
 
 class Memory(NamedTuple):
-    """State of a contact's laws."""
+    """States of a group's contact law and friction law."""
 
     law: tuple[Array, ...]
     friction: tuple[Vector, ...]
 
 
 class Forces(NamedTuple):
-    """Forces of each candidate on the chaser, in T axes."""
+    """Contact forces on the chaser, for each candidate, in T axes."""
 
     touch: Touch  # penetration, normal and point
-    normal: Float[Array, "candidates *batch"]  # F [N]
-    tangential: Vector  # f_t [N]
-    slip: Vector  # [m/s]
+    normal: Float[Array, "candidates *batch"]  # normal force F [N]
+    tangential: Vector  # friction force f_t [N]
+    slip: Vector  # chaser's velocity along the target's surface [m/s]
 
 
 def contact_forces(
     group: ContactGroup, memory: Memory, pose: Pose, twist: Twist, duration: Float[Array, "*batch"]
 ) -> tuple[Forces, Memory]:
-    """Return the forces at a pose and twist, `duration` [s] after the laws' last evaluation."""
+    """Compute the forces of a group's candidates at a pose and twist, and the laws' next states.
+
+    `duration` is the time since the last evaluation of the laws [s].
+    """
     pose, twist, duration = jax.tree.map(lambda leaf: leaf[None], (pose, twist, duration))
     touch = group.candidates.touch(pose)
     rate, slip = motion_at(touch, pose, twist)
     normal, law = group.law.step(group.parameters, memory.law, touch.depth, rate)
-    # A pulling contact has no friction.
+    # A contact law with tension may pull; a pulling contact has no friction.
     pressed = jnp.where(normal > 0, normal, 0)
     tangential, friction = group.friction.step(
         Touching(pressed, touch.normal, slip, duration), memory.friction
@@ -66,7 +68,7 @@ def contact_forces(
 
 
 def total_wrench(forces: Forces) -> Wrench:
-    """Return the wrench of all candidates on the chaser, with its moment about T's origin."""
+    """Sum the forces of all candidates to a wrench on the chaser, with the moment about T's origin."""
     force = forces.normal * forces.touch.normal + forces.tangential
     moment = cross(forces.touch.point, force)
     return Wrench(*(jax.tree.map(lambda part: part.sum(axis=0), part) for part in (force, moment)))
@@ -79,9 +81,9 @@ def contact_wrench(
     twist: Twist,
     duration: Float[Array, "*batch"],
 ) -> tuple[Wrench, tuple[Forces, ...], tuple[Memory, ...]]:
-    """Return the wrench [N, N m] of contacts of several kinds, their forces, and the laws' next states.
+    """Compute the wrench [N, N m] of all groups on the chaser, the candidates' forces, and the next states.
 
-    The laws were evaluated last `duration` [s] before.
+    `duration` is the time since the last evaluation of the contact and friction laws [s].
     """
     results = [
         contact_forces(group, memory, pose, twist, duration)
@@ -95,7 +97,7 @@ def contact_wrench(
 
 
 def deepest(groups: tuple[ContactGroup, ...], pose: Pose) -> Float[Array, "*batch"]:
-    """Return the penetration [m] of the deepest candidate at a pose; minus infinity without candidates."""
+    """Return the largest penetration [m] of all candidates at a pose; minus infinity without candidates."""
     lifted = jax.tree.map(lambda leaf: leaf[None], pose)
     depth = jnp.full_like(pose.position.x, -jnp.inf)
     for group in groups:

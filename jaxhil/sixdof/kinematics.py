@@ -1,6 +1,6 @@
-"""Kinematics of motion simulators: from coordinates to axes, and from axes to the pose.
+"""Kinematics of motion simulators: conversion of coordinates to axis positions, and back to the pose.
 
-Coordinates are (p, theta), six numbers along a leading axis, (6, *batch).
+The coordinates of a pose are its position p and its rotation vector theta, in arrays (6, *batch).
 """
 
 import abc
@@ -17,39 +17,39 @@ from jaxhil.sixdof.vectors import vector
 
 
 class Moving(NamedTuple):
-    """Motion of C relative to T on the hardware."""
+    """Motion of the hardware's frame C relative to T."""
 
     pose: Pose
     twist: Twist
-    acceleration: Twist | None  # time derivative of the twist; None if unused
+    acceleration: Twist | None  # time derivative of the twist; None if not needed
 
 
 class Kinematics(eqx.Module):
-    """Interface of all motion simulators."""
+    """Interface of the kinematics of all motion simulators."""
 
     @property
     def is_linear(self) -> bool:
-        """Return whether the axes are linear functions of the coordinates."""
+        """Return whether the axis positions are linear functions of the coordinates."""
         return True
 
     def reaches(self, axes: Float[Array, "axes *batch"]) -> Bool[Array, "*batch"]:
-        """Return whether the axes' positions are within their workspace."""
+        """Return whether all axis positions are within the workspace."""
         return jnp.ones(axes.shape[1:], bool)
 
     @abc.abstractmethod
     def command(self, coordinates: Float[Array, "6 *batch"]) -> Float[Array, "axes *batch"]:
-        """Return the positions of the axes for the pose with these coordinates."""
+        """Return the axis positions for the pose with these coordinates."""
 
     @abc.abstractmethod
     def coordinates(self, motion: Motion, near: Float[Array, "6 *batch"]) -> Motion:
-        """Return the coordinates of the axes' pose, with rates and accelerations.
+        """Convert the motion of the axes to the motion of the coordinates.
 
-        `near` are coordinates close to the result.
+        `near` are coordinates near the result, where an iteration can start.
         """
 
 
 class TaskSpace(Kinematics):
-    """Motion simulator with one axis per coordinate."""
+    """Motion simulator with one axis for each coordinate."""
 
     def command(self, coordinates):
         return coordinates
@@ -59,13 +59,13 @@ class TaskSpace(Kinematics):
 
 
 class TwoRobots(Kinematics):
-    """Motion simulator with a robot for the chaser's mechanism and another for the target's.
+    """Motion simulator with one robot for the chaser's mechanism and one robot for the target's mechanism.
 
-    There are twelve axes, the chaser's first. The pose is the difference of both robots' coordinates, of
-    which the target's robot moves a share.
+    Each robot has six axes; the six axes of the chaser's robot are the first. The relative pose is the
+    difference between the coordinates of the two robots.
     """
 
-    share: Float[Array, "6 *batch"]  # share of each coordinate that the target's robot moves [1]
+    share: Float[Array, "6 *batch"]  # fraction of each coordinate that the target's robot moves [1]
 
     def command(self, coordinates):
         return jnp.concatenate([(1 - self.share) * coordinates, -self.share * coordinates])
@@ -76,7 +76,7 @@ class TwoRobots(Kinematics):
 
 
 def moving(motion: Motion) -> Moving:
-    """Return pose, twist and acceleration from coordinates, their rates and accelerations."""
+    """Convert the motion of the coordinates to pose, twist and acceleration."""
 
     def pose_and_twist(at, rates):
         return motion_of(*(Coordinates(vector(part[:3]), vector(part[3:])) for part in (at, rates)))

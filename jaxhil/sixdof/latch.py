@@ -1,7 +1,7 @@
-"""Latches: points of the chaser that are caught when they are deep, aligned and slow enough.
+"""Latches, each of which catches a point of the chaser that is deep, aligned and slow enough.
 
-From then on a spring and a damper in six axes hold the point, about the pose at which it was caught; the
-spring force begins at 0. A latch belongs to the hardware and does not release during a run.
+A latch that has caught holds the point by a six-axis spring and damper, about the pose at which the point was
+caught, so that the spring force begins at 0. A latch belongs to the hardware and does not release in a run.
 """
 
 from typing import NamedTuple
@@ -24,35 +24,36 @@ from jaxhil.sixdof.vectors import Vector, cross, vector
 
 
 class Latch(NamedTuple):
-    """Latches of one kind along a leading axis, (latches, *batch)."""
+    """Parameters of the latches of one table."""
 
-    point: Vector  # in C axes [m]
-    depth: Float[Array, "latches *batch"]  # least depth below T's plane z = 0 for catching [m]
-    angle: Float[Array, "latches *batch"]  # greatest angle of C against T for catching [rad]
-    speed: Float[Array, "latches *batch"]  # greatest receding speed for catching [m/s]; infinite for no limit
-    # (force, moment about the point) per (displacement, rotation) of the point, in T axes [N/m, N, N m]
-    stiffness: Float[Array, "6 6 latches *batch"]
-    damping: Float[Array, "6 6 latches *batch"]  # likewise per twist of the point [N s/m, N s, N m s]
-    from_start: Bool[Array, "latches *batch"]  # whether it holds from the start, about the start's pose
+    point: Vector  # point of the chaser that the latch catches, in C axes [m]
+    depth: Float[Array, "latches *batch"]  # minimum depth of the point below T's plane z = 0 [m]
+    angle: Float[Array, "latches *batch"]  # maximum angle between C and T [rad]
+    speed: Float[Array, "latches *batch"]  # maximum speed at which the point recedes [m/s]; may be infinite
+    # stiffness matrix in T axes: from displacement and rotation to force and moment about the point
+    stiffness: Float[Array, "6 6 latches *batch"]  # [N/m, N, N m]
+    # damping matrix in T axes: from velocity and angular velocity to force and moment about the point
+    damping: Float[Array, "6 6 latches *batch"]  # [N s/m, N s, N m s]
+    from_start: Bool[Array, "latches *batch"]  # whether the latch holds the chaser at the start of the run
 
 
 class Held(NamedTuple):
-    """State of latches."""
+    """State of the latches: whether they have caught, and the pose at which they caught."""
 
     caught: Bool[Array, "latches *batch"]
-    point: Vector  # position of the point when caught, in T axes [m]
-    attitude: Quaternion  # attitude of C then, from C axes to T axes
+    point: Vector  # position of the caught point when the latch caught, in T axes [m]
+    attitude: Quaternion  # rotation from C axes to T axes when the latch caught
 
 
 def init_latch(latch: Latch, pose: Pose) -> Held:
-    """Return the state at the start of a run, at a pose."""
+    """Return the latches' state at the start of a run, when the chaser has the given pose."""
     zero = jnp.zeros_like(latch.depth)
     attitude: Quaternion = jax.tree.map(lambda part: part[None] + zero, pose.attitude)
     return Held(latch.from_start, latch_points(latch, pose), attitude)
 
 
 def latch_wrench(latch: Latch, memory: Held, pose: Pose, twist: Twist) -> tuple[Wrench, Held]:
-    """Return the latches' wrench [N, N m] on the chaser, about T's origin, and their next state."""
+    """Return the latches' wrench [N, N m] on the chaser, about T's origin, and the latches' next state."""
     point = latch_points(latch, pose)
     (position, attitude), (linear, angular) = jax.tree.map(lambda part: part[None], (pose, twist))
     velocity = linear + cross(angular, point - position)
@@ -70,27 +71,27 @@ def latch_wrench(latch: Latch, memory: Held, pose: Pose, twist: Twist) -> tuple[
     damped = _product(latch.damping, velocity, angular)
     pull = memory.caught.astype(point.x.dtype)
     force = (-pull) * (moved[0] + damped[0])
-    # The spring's moment is the energy's gradient with respect to the rotation, not to the rotation vector.
+    # The spring's moment is the gradient of its energy with respect to the rotation, hence the Jacobian.
     moment = (-pull) * (inverse_left_jacobian(-turned, moved[1]) + damped[1]) + cross(point, force)
     total = jax.tree.map(lambda part: part.sum(axis=0), Wrench(force, moment))
     return total, memory
 
 
 def latch_points(latch: Latch, pose: Pose) -> Vector:
-    """Return the latches' points in T axes."""
+    """Return the positions of the latches' points at a pose, in T axes [m]."""
     position, attitude = jax.tree.map(lambda part: part[None], (pose.position, pose.attitude))
     return position + rotate(attitude, latch.point)
 
 
 def _sine(attitude: Quaternion) -> Array:
-    """Return the sine of half the angle of a rotation, without derivative."""
+    """Return the sine of half a rotation's angle, as a constant for differentiation."""
     v = attitude.v
     return jax.lax.stop_gradient(jnp.sqrt(v.x**2 + v.y**2 + v.z**2))
 
 
 def _product(matrix: Array, linear: Vector, angular: Vector) -> tuple[Vector, Vector]:
-    """Return matrix times (linear, angular), for all latches."""
-    # All latches have the same angular velocity, whose leading axis has length 1.
+    """Multiply each latch's 6 x 6 matrix by a linear and an angular vector."""
+    # The angular velocity is the same for all latches: its leading axis has length 1.
     parts = jnp.stack(jnp.broadcast_arrays(*jax.tree.leaves((linear, angular))))
     result = jnp.sum(matrix * parts[None], axis=1)
     return vector(result[:3]), vector(result[3:])

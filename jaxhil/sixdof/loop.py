@@ -1,9 +1,9 @@
-"""Loop of the rig in six degrees of freedom, tick by tick.
+"""Loop of the six-axis rig, tick by tick.
 
-A tick reads the delayed wrench of the real contact and the pose of the hardware, compensates the wrench,
-moves the two bodies of the numerical model by it, and sends their relative pose to the motion simulator,
-which carries the contact. The wrench is computed at the hardware's pose, in T axes about T's origin, and acts
-at the model's T.
+A tick has four steps. It reads the delayed wrench of the real contact and the pose of the hardware. The
+compensator computes the wrench command. The numerical model integrates the motion of both bodies under this
+wrench. The motion simulator receives the relative pose of the bodies as its command.
+The contact wrench is computed at the hardware's pose, in T axes about T's origin, and acts at the model's T.
 """
 
 from typing import Any, NamedTuple
@@ -53,33 +53,36 @@ from jaxhil.sixdof.sensor import (
 from jaxhil.sixdof.vectors import assembled, vector
 
 SIDES = ("fixed", "moving")  # sides of the rig on which the force sensor may be
-HISTORY = 256  # ticks simulated before a run if the axes are not linear in the coordinates
+# Number of ticks that are simulated before a run if the axis positions are not linear in the coordinates, so
+# that the hardware has settled.
+HISTORY = 256
 
 
 class Loop(eqx.Module):
-    """Structure of the loop, which determines the compiled program; every field is static."""
+    """Structure of the loop, which determines the compiled program; all fields are static."""
 
     integrator: str = eqx.field(static=True)  # integrator of the numerical model, a name of `SHARES`
     hold: str = eqx.field(static=True)  # hold of the command within a period, "linear" or "zoh"
-    latency: int = eqx.field(static=True)  # latency of the command, 0 or 1 periods
-    ring: int = eqx.field(static=True)  # length of the delay line, a power of two above the longest delay
+    latency: int = eqx.field(static=True)  # latency of the command [control periods], 0 or 1
+    # length of the delay line [control periods], a power of two above the longest delay
+    ring: int = eqx.field(static=True)
     side: str = eqx.field(static=True, default="fixed")  # side of the force sensor, one of `SIDES`
     has_noise: bool = eqx.field(static=True, default=False)  # whether the force sensor has noise
     has_lag: bool = eqx.field(static=True, default=True)  # whether the force sensor has a lag
-    has_sample_effects: bool = eqx.field(static=True, default=True)  # quantum, dead zone or range
-    has_pose_errors: bool = eqx.field(static=True, default=False)  # noise or quantum of the measured pose
-    controller_ring: int = eqx.field(
-        static=True, default=1
-    )  # length of a compensator's delay line, as `ring`
-    compensator: str = eqx.field(
-        static=True, default="none"
-    )  # name of the compensator, one of `SIX_AXIS_COMPENSATORS`
+    # whether the force sensor has a quantum, a dead zone or a range
+    has_sample_effects: bool = eqx.field(static=True, default=True)
+    has_pose_errors: bool = eqx.field(static=True, default=False)  # whether the pose has noise or a quantum
+    # length of the compensator's own delay line [control periods], a power of two
+    controller_ring: int = eqx.field(static=True, default=1)
+    # name of the compensator, one of `SIX_AXIS_COMPENSATORS`
+    compensator: str = eqx.field(static=True, default="none")
     episodes: int = eqx.field(static=True, default=1)  # number of evaluated episodes
-    whole: bool = eqx.field(static=True, default=False)  # whether a run lasts its whole duration
+    # whether a run continues after its last evaluated episode until the end of its duration
+    whole: bool = eqx.field(static=True, default=False)
 
 
 class Rig(NamedTuple):
-    """Constants of a run."""
+    """Constants of a batch of runs: bodies, hardware, sensors and compensator."""
 
     bodies: Pair  # bodies of the numerical model
     axes: Axes  # axes of the motion simulator, with the sensors' delays
@@ -87,54 +90,54 @@ class Rig(NamedTuple):
     groups: tuple[ContactGroup, ...]  # candidates of the real contact
     latches: tuple[Latch, ...]
     sensor: Sensor
-    period: Float[Array, "*batch"]  # T [s]
+    period: Float[Array, "*batch"]  # control period T [s]
     key: UInt32[Array, "2 *batch"]  # key of the sensors' noise
     gains: Gains  # gains of the compensator, (*batch)
-    constants: SixAxisConstants  # what the compensator knows
-    prepared: Any  # result of the compensator's `prepare`
+    constants: SixAxisConstants  # constants of the rig that the compensator knows
+    prepared: Any  # constants that the compensator's `prepare` computes
 
 
 class NumericalController(NamedTuple):
-    """State of the force sensor's lag and of the compensator."""
+    """States of the force sensor's lag and of the compensator."""
 
-    # last reading before the lag and behind it; None without a lag
+    # last input and last output of the lag; None without a lag
     lag: tuple[Wrench, Wrench] | None
     law: Any  # state of the compensator
 
 
 class RunState(NamedTuple):
-    """State from tick to tick."""
+    """State of a batch of runs between two ticks."""
 
-    states: States  # bodies of the numerical model
-    near: Float[Array, "6 *batch"]  # coordinates of C against T in these states
-    twist: Float[Array, "6 *batch"]  # twist of C against T in these states
+    states: States  # states of the numerical model's bodies
+    near: Float[Array, "6 *batch"]  # coordinates of C relative to T in the numerical model
+    twist: Float[Array, "6 *batch"]  # twist of C relative to T in the numerical model
     hardware: Hardware
-    memories: tuple[Memory, ...]  # states of the contact's laws
+    memories: tuple[Memory, ...]  # states of the contact and friction laws
     held: tuple[Held, ...]  # states of the latches
     controller: NumericalController
-    tick: Int[Array, ""]
+    tick: Int[Array, ""]  # index of the next tick
 
 
 class Tick(NamedTuple):
-    """Record of a tick."""
+    """Record of one tick: numerical model, hardware, and wrenches."""
 
-    states: States  # bodies of the numerical model, at the tick
+    states: States  # states of the numerical model's bodies at the tick
     pose: Pose  # pose of the hardware at the force sensor's sampling instant
-    twist: Twist  # twist likewise
-    contact: Wrench  # wrench of the real contact then, latches included
-    forces: tuple[Forces, ...]  # forces of the candidates
+    twist: Twist  # twist of the hardware at this instant
+    contact: Wrench  # wrench of the real contact at this instant, including the latches
+    forces: tuple[Forces, ...]  # forces of each group of candidates at this instant
     held: tuple[Held, ...]  # states of the latches
-    command: Wrench  # wrench on the numerical model
+    command: Wrench  # wrench command, which acts on the numerical model
 
 
 def build_loop(scenario: Scenario, **static: Any) -> Loop:
-    """Return the loop of a batch of scenarios; `static` are the fields that these do not determine."""
+    """Build the loop for a batch of scenarios; `static` contains the fields that the scenarios leave open."""
     sensor, period = scenario.sensor, np.asarray(scenario.control_period)
     errors = sensor.errors
     slowest = np.maximum(sensor.delay, sensor.position_delay)[None] + np.asarray(scenario.simulator.delay)
     intervals = int(np.max(slowest / period[None])) + 2
     law = SIX_AXIS_COMPENSATORS[static.get("compensator", "none")]
-    # A compensator may estimate the delay of the whole loop, with an error of its own size.
+    # A compensator may estimate the delay of the whole loop, with an error of up to 100 %.
     whole = int(np.max((slowest + lags(scenario.simulator)) / period[None]))
     loop = Loop(
         ring=1 << intervals.bit_length(),
@@ -151,7 +154,7 @@ def build_loop(scenario: Scenario, **static: Any) -> Loop:
 
 
 def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
-    """Discretise the axes and prepare the compensator; `gains` are scalars or of the batch shape."""
+    """Discretise the axes and prepare the compensator; each gain is a scalar or has the batch shape."""
     sensor, period, law = scenario.sensor, scenario.control_period, SIX_AXIS_COMPENSATORS[loop.compensator]
     weighed = loop.side == "moving"
     axes = build_axes(
@@ -181,9 +184,9 @@ def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
 
 
 def begin(loop: Loop, rig: Rig, states: States) -> RunState:
-    """Return the state before tick 0.
+    """Return the state of the loop before tick 0, when the bodies have the given states.
 
-    Before it the command was in uniform motion, at the states' relative pose and rates.
+    Before tick 0, the pose command moves uniformly with the relative rates of these states.
     """
     law = SIX_AXIS_COMPENSATORS[loop.compensator]
     at, rates, twist = model_motion(rig.bodies, states)
@@ -224,14 +227,14 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
 
 
 def run(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[RunState, Tick]:
-    """Return the state after `ticks` ticks, and every tick, (ticks, ...)."""
+    """Run a batch of scenarios for `ticks` ticks; return the final state and the records, (ticks, ...)."""
     rig = build_rig(loop, gains, scenario)
     state = begin(loop, rig, scenario.start)
     return lax.scan(lambda state, _: tick(loop, rig, state), state, None, length=ticks)
 
 
 def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
-    """Run one control period; return the next state and the tick's record."""
+    """Simulate one control period; return the next state and the record of the tick."""
     samples = sampled(rig.axes, state.hardware, state.tick)
     motion = moving(rig.kinematics.coordinates(samples.motion, state.near))
     pose, twist, _ = motion
@@ -264,14 +267,20 @@ def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
 
 
 def model_motion(bodies: Pair, states: States) -> tuple[Array, Array, Array]:
-    """Return coordinates, their rates, and twist of C against T in the numerical model, (6, *batch)."""
+    """Return coordinates, coordinate rates and twist of C relative to T, (6, *batch) each.
+
+    `states` are those of the numerical model's bodies.
+    """
     pose, twist = relative(bodies, states)
     at, rates = coordinates(pose, twist)
     return assembled(at), assembled(rates), assembled(twist)
 
 
 def controller_constants(scenario: Scenario, weighed: bool) -> SixAxisConstants:
-    """Return what the compensator knows of the rig; `weighed`: the force sensor carries a tool."""
+    """Return the constants of the rig that the compensator knows.
+
+    `weighed` states whether the force sensor carries a tool.
+    """
     bodies, period = scenario.bodies, scenario.control_period
     zero = jnp.zeros_like(period)
     still = vector(jnp.zeros((3, *period.shape), period.dtype))
@@ -286,7 +295,7 @@ def controller_constants(scenario: Scenario, weighed: bool) -> SixAxisConstants:
 
 
 def _measured_pose(loop: Loop, rig: Rig, state: RunState, measured: Array) -> Array:
-    """Return the coordinates (6, *batch) that the position sensor reads, from those of the axes."""
+    """Convert the measured axis positions to the measured coordinates, with noise and quantum."""
     still = Motion(measured, jnp.zeros_like(measured), None)
     at = rig.kinematics.coordinates(still, state.near).position
     if not loop.has_pose_errors:
@@ -298,7 +307,7 @@ def _measured_pose(loop: Loop, rig: Rig, state: RunState, measured: Array) -> Ar
 def _control(
     loop: Loop, rig: Rig, state: RunState, contact: Wrench, motion: Moving, measured: Array | None
 ) -> tuple[Wrench, NumericalController]:
-    """Return the wrench on the numerical model, from sensor and compensator, and their next state."""
+    """Simulate force sensor and compensator; return the wrench command and the next states of both."""
     sensor, last = rig.sensor, state.controller
     if motion.acceleration is None:
         raw = read_fixed(contact, sensor.mounting)
@@ -332,7 +341,7 @@ def _control(
 
 
 def _behind_lag(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:
-    """Return the reading behind the sensor's lag; the input is a straight line between two ticks."""
+    """Return the output of the force sensor's lag; its input is interpolated linearly between ticks."""
     first, zero = now == (0 if rig.kinematics.is_linear else HISTORY), jnp.zeros_like(rig.period)
 
     def late(now: Array, before: Array, lagged: Array) -> Array:
@@ -345,12 +354,12 @@ def _behind_lag(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench)
 
 
 def _wrench(channels: Array) -> Wrench:
-    """Return six channels, (6, *batch), as a wrench."""
+    """Convert six channels (6, *batch) to a wrench."""
     return Wrench(vector(channels[:3]), vector(channels[3:]))
 
 
 def _noise(rig: Rig, now: Array, sensor: int) -> Array:
-    """Return standard normal noise of six channels at a tick; `sensor` is 0 for force and 1 for pose."""
+    """Return standard normal noise for the six channels of a sensor: 0 for the force, 1 for the pose."""
     channel = jnp.arange(6, dtype=jnp.int32).reshape(6, *[1] * rig.period.ndim)
     count = jnp.broadcast_to(6 * now + channel, (6, *rig.period.shape))
     stream = jnp.full(rig.period.shape, sensor, jnp.int32)

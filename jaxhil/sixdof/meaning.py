@@ -1,4 +1,4 @@
-"""Summary of a six-axis mechanism file: its first ideal contact compared with the abilities of the rig."""
+"""Summary of a six-axis mechanism: first ideal contact, delay of the rig, and implausible values."""
 
 import math
 from typing import NamedTuple
@@ -7,30 +7,41 @@ from jaxhil.laws.shared.nominal_values import axis_lags
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.sixdof.units import unit_warnings
 
-FASTEST = 0.1  # greatest plausible contact frequency, over the control rate
+FASTEST = 0.1  # highest plausible contact frequency, divided by the control rate [1]
 
 
 class Meaning(NamedTuple):
-    """Summary of a nominal mechanism's first touch; NaN if nothing touches."""
+    """Summary of a nominal six-axis mechanism; metrics of the contact are NaN if nothing touches.
 
-    effective_mass: float  # m_n [kg]
-    frequency: float  # of the ideal contact, 1/(2 duration) [Hz]; NaN if a latch holds at its end
-    peak_force: float  # of the ideal contact [N]
-    restitution: float  # e* of the ideal contact; NaN unless there is a single touch
-    delay: float  # delay of the loop: slowest axis with its lag, and force sensor [s]
-    slip_limit: float  # least stable slip of regularised friction on the rig [m/s]; NaN without friction
-    warnings: tuple[str, ...]  # implausible numbers: key, found value, expected value
+    Attributes:
+        effective_mass: Effective mass m_n at the first touch [kg].
+        frequency: Frequency of the ideal contact, 1/(2 duration) [Hz]; NaN if a latch holds at its end.
+        peak_force: Peak force of the ideal contact [N].
+        restitution: Restitution e* of the ideal contact [1]; NaN unless there is a single touch.
+        delay: Delay of the loop [s]: delay and lag of the slowest axis and of the force sensor.
+        slip_limit: Slip v_s of regularised friction below which the rig is unstable [m/s]; NaN without
+            regularised friction.
+        warnings: Implausible values of the file, each with key, found value and expected value.
+    """
+
+    effective_mass: float
+    frequency: float
+    peak_force: float
+    restitution: float
+    delay: float
+    slip_limit: float
+    warnings: tuple[str, ...]
 
     def line(self, name: str) -> str:
-        """Return the summary in one line, without the warnings."""
+        """Return the summary without the warnings as one line of text, which begins with `name`."""
         if math.isnan(self.effective_mass):
-            return f"{name}: nothing touches; the rig is {1e3 * self.delay:.3g} ms late"
+            return f"{name}: nothing touches; rig: delay {1e3 * self.delay:.3g} ms"
         rebound = "" if math.isnan(self.restitution) else f", e* {self.restitution:.3g}"
-        kind = "a latch holds" if math.isnan(self.frequency) else f"a contact of {self.frequency:.3g} Hz"
-        text = f"{name}: effective mass {self.effective_mass:.4g} kg at the first touch; in space {kind}, "
-        text += f"peak force {self.peak_force:.3g} N{rebound}; the rig is {1e3 * self.delay:.3g} ms late"
+        kind = "held by a latch" if math.isnan(self.frequency) else f"{self.frequency:.3g} Hz"
+        text = f"{name}: effective mass {self.effective_mass:.4g} kg at the first touch; "
+        text += f"ideal contact: {kind}, peak force {self.peak_force:.3g} N{rebound}; rig: delay {1e3 * self.delay:.3g} ms"
         if not math.isnan(self.slip_limit):
-            text += f", friction steady there from a slip of {self.slip_limit:.2g} m/s on"
+            text += f", friction stable if its slip parameter is above {self.slip_limit:.2g} m/s"
         return text
 
 
@@ -42,7 +53,10 @@ def meaning(
     peak_force: float,
     restitution: float,
 ) -> Meaning:
-    """Return the summary of a mechanism whose first ideal contact has these metrics, in SI units."""
+    """Summarise a mechanism whose first ideal contact has the given metrics, in SI units.
+
+    `tangential_mass` is the effective mass along the surface, `duration` the duration of the contact.
+    """
     rig = mechanism.rig
     delay = rig.force_sensor.delay + rig.force_sensor.time_constant + max(axis_lags(mechanism))
     frequency = 1 / (2 * duration) if duration > 0 else math.nan
@@ -58,7 +72,7 @@ def meaning(
         friction = contact.friction
         if friction is None or friction.slip is None or not peak_force > 0:
             continue
-        # A delayed damper on a mass is stable if damping times delay over mass is below pi/2.
+        # A delayed damper on a mass is stable if (damping times delay) / mass is below pi/2.
         slip = 2 / math.pi * friction.coefficient * peak_force * delay / tangential_mass
         limit = slip if math.isnan(limit) else max(limit, slip)
         if friction.slip < slip:

@@ -1,4 +1,4 @@
-"""Peak value of a sampled signal, including peaks between samples."""
+"""Peak value of a sampled signal, with interpolation between the samples."""
 
 from typing import NamedTuple
 
@@ -7,23 +7,23 @@ from jaxtyping import Array, Bool, Float
 
 
 class Peak(NamedTuple):
-    """Largest value so far, of samples and of parabolas through three samples that have a peak."""
+    """Largest value of a signal so far, and the last two samples."""
 
-    largest: Float[Array, "*batch"]
-    before: tuple[Array, Array]  # the last two samples
-    step: Float[Array, "*batch"]  # time between them [s]
+    largest: Float[Array, "*batch"]  # largest sample or vertex of a parabola through three samples
+    before: tuple[Array, Array]  # last two samples
+    step: Float[Array, "*batch"]  # time between the last two samples [s]
 
 
 def no_peak(zero: Float[Array, "*batch"]) -> Peak:
-    """Return the state before the first sample."""
+    """Return the peak before the first sample, 0 in every lane."""
     return Peak(zero, (zero, zero), zero)
 
 
 def higher(peak: Peak, now: Array, step: Array, anew: Bool[Array, "*batch"] | bool = False) -> Peak:
-    """Update the peak with the sample `now`, a `step` [s] after the last one.
+    """Update the peak with the sample `now`, which follows a time `step` [s] after the last sample.
 
-    `anew` means that the sample does not continue a smooth curve. A peak between samples requires that none
-    of the three samples is 0.
+    A peak between samples is the vertex of a parabola through three samples, all greater than 0. `anew`
+    marks a sample at a jump or kink of the signal, where no parabola is fitted.
     """
     first, middle = peak.before
     smooth = (first > 0) & (now > 0) & (middle >= first) & (middle >= now) & (step > 0) & ~jnp.asarray(anew)

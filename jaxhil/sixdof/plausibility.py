@@ -1,4 +1,4 @@
-"""Checks that the nominal run of a six-axis mechanism starts apart, within reach, and is not too long."""
+"""Checks of a nominal six-axis run: no contact at the start, poses within reach, and a limited duration."""
 
 from collections.abc import Callable
 from functools import cache
@@ -25,29 +25,31 @@ from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.stewart import Stewart, condition
 from jaxhil.sixdof.vectors import dot
 
-MOST_TICKS = 1e7  # limit on the ticks of a run
-LARGEST_ATTITUDE = 1.0  # rad, of C against T at the start
-LARGEST_CONDITION = 100.0  # condition number of a hexapod's Jacobian, lengths in m
-BLIND = STRETCH  # control periods between checks, in which shapes must not pass through each other
+MOST_TICKS = 1e7  # maximum number of ticks of a run
+LARGEST_ATTITUDE = 1.0  # rad; maximum angle between C and T at the start
+LARGEST_CONDITION = 100.0  # maximum condition number of a hexapod's Jacobian, with lengths in m
+# Number of control periods between two checks of a run; shapes must not pass through each other in this time.
+BLIND = STRETCH
 
 
 class Beginning(NamedTuple):
-    """Start of a run, and a hexapod's legs there and at the pose with C at T."""
+    """Values at the start of a run that the checks need."""
 
-    coordinates: Float[Array, "6 *batch"]
+    coordinates: Float[Array, "6 *batch"]  # coordinates of C relative to T
     depth: Float[Array, "*batch"]  # largest penetration [m]
-    # relative speed of each candidate's shapes [m/s], and their size [m]
+    # for each group: relative speed of the shapes [m/s], and penetration at which they pass through [m]
     passing: tuple[tuple[Float[Array, "candidates *batch"], Float[Array, "candidates *batch"]], ...]
     caught: tuple[Bool[Array, "latches *batch"], ...]  # whether latches catch at the start
-    legs: tuple[Float[Array, "6 *batch"], ...]  # lengths [m]
-    conditions: tuple[Float[Array, "*batch"], ...]  # condition numbers of their Jacobian
+    # lengths of a hexapod's legs [m], and condition number of their Jacobian: at the start, and with C at T
+    legs: tuple[Float[Array, "6 *batch"], ...]
+    conditions: tuple[Float[Array, "*batch"], ...]
 
 
 def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
-    """Raise `InputError` unless the nominal run can start.
+    """Raise `InputError` unless the nominal run of a mechanism can start.
 
-    It must start apart, at a pose within the range of the six coordinates and the reach of the rig, and take
-    at most 1e7 ticks.
+    The bodies must start without contact, at a pose that the six coordinates and the rig can represent. The
+    run must have at most 1e7 ticks.
     """
     ticks = float(scenario.duration[0] / scenario.control_period[0])
     where = "start" if mechanism.start is not None else "approach"
@@ -59,27 +61,27 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
     begins: Beginning = jax.tree.map(np.asarray, _compiled()(scenario))
     at = begins.coordinates[:, 0]
     if not np.all(np.isfinite(at)):
-        found = f"nothing to touch below {FAR:g} m: it goes past the target"
+        found = f"a chaser that passes the target without a touch (searched below {FAR:g} m)"
         raise InputError(
-            f"{mechanism.name}: approach.offset: found {found}, expected an approach that touches, in m"
+            f"{mechanism.name}: approach.offset: found {found}, expected an offset in m that leads to a touch"
         )
     angle = float(np.linalg.norm(at[3:]))
     if angle > LARGEST_ATTITUDE:
-        allowed = f"at most {LARGEST_ATTITUDE:g} rad between C and T (interface_rotation counts)"
+        allowed = f"at most {LARGEST_ATTITUDE:g} rad between C and T, including interface_rotation"
         key = "start.chaser.attitude" if mechanism.start else "approach.angular_velocity"
         found = f"{key}: found a rotation by {angle:.3g} rad at the start"
         raise InputError(f"{mechanism.name}: {found}, expected {allowed}")
     depth = float(begins.depth[0])
     if depth > 0:
         key = "start.chaser.position" if mechanism.start else "approach.angular_velocity"
-        change = "move the chaser along z of T" if mechanism.start else "turn or move sideways less"
-        found = f"{key}: found a start that is in touch already, {depth:.3g} m deep"
-        raise InputError(f"{mechanism.name}: {found}, expected one apart: {change}")
+        change = "move the chaser along z of T" if mechanism.start else "reduce angular or sideways velocity"
+        found = f"{key}: found a contact at the start, {depth:.3g} m deep"
+        raise InputError(f"{mechanism.name}: {found}, expected a start without contact: {change}")
     _check_speed(mechanism, begins, float(scenario.control_period[0]))
     for (name, latch), caught in zip(mechanism.latch.items(), begins.caught, strict=True):
         if caught.any() and not latch.latched:
-            found = f"latch.{name}.depth: found {latch.depth:g} m, deep enough at the start already"
-            allowed = "a depth or an angle that is not yet met there, or latched = true"
+            found = f"latch.{name}.depth: found {latch.depth:g} m, with which the latch catches at the start"
+            allowed = "a depth or an angle with which the latch catches later, or latched = true"
             raise InputError(f"{mechanism.name}: {found}, expected {allowed}")
     _check_legs(mechanism, begins)
 
@@ -91,38 +93,38 @@ def _check_speed(mechanism: SixAxisMechanism, begins: Beginning, period: float) 
         most = size / (BLIND * period)
         if speed > most:
             key = "start.chaser.velocity" if mechanism.start else "approach.velocity"
-            found = f"{key}: found shapes of contact.{name} that pass at {speed:.3g} m/s"
-            allowed = f"at most {most:.3g} m/s: their size of {size:.3g} m in {BLIND} control periods"
+            found = f"{key}: found a speed of {speed:.3g} m/s between the shapes of contact.{name}"
+            allowed = f"at most {most:.3g} m/s (their size {size:.3g} m divided by {BLIND} control periods)"
             raise InputError(f"{mechanism.name}: {found}, expected {allowed}")
 
 
 def _check_legs(mechanism: SixAxisMechanism, begins: Beginning) -> None:
-    """Raise `InputError` if a hexapod cannot reach two poses or is nearly singular there.
+    """Raise `InputError` if a hexapod cannot reach the start or the docked pose, or is nearly singular there.
 
-    The poses are the start and the one with C at T.
+    In the docked pose, C equals T.
     """
     stroke = mechanism.rig.simulator.stroke
-    poses = zip(("the start", "C at T"), begins.legs, begins.conditions, strict=False)
+    poses = zip(("the start", "the docked pose"), begins.legs, begins.conditions, strict=False)
     for pose, legs, conditions in poses:
         lengths, number = legs[:, 0], float(conditions[0])
         if not number <= LARGEST_CONDITION:
-            found = f"rig.simulator.base: found legs that hardly hold the platform with {pose}"
+            found = f"rig.simulator.base: found legs that are nearly singular at {pose}"
             allowed = f"joints whose Jacobian has a condition number of at most {LARGEST_CONDITION:g}"
             raise InputError(f"{mechanism.name}: {found} (condition number {number:.3g}), expected {allowed}")
         if stroke is not None and not (stroke[0] <= lengths.min() and lengths.max() <= stroke[1]):
             found = f"rig.simulator.stroke: found legs from {lengths.min():.4g} to {lengths.max():.4g} m"
             allowed = f"{stroke[0]:g} to {stroke[1]:g} m: change stroke or height"
-            raise InputError(f"{mechanism.name}: {found} with {pose}, expected {allowed}")
+            raise InputError(f"{mechanism.name}: {found} at {pose}, expected {allowed}")
 
 
 @cache
 def _compiled() -> Callable[[Scenario], Beginning]:
-    """Return the compiled function for the start."""
+    """Return the compiled version of `_beginning`."""
     return jax.jit(_beginning, compiler_options=supported_options(SINGLE_RUN_OPTIONS))
 
 
 def _beginning(scenario: Scenario) -> Beginning:
-    """Return the start of the runs."""
+    """Compute the values at the start of the runs that the checks need."""
     pose, twist = relative(scenario.bodies, scenario.start)
     at, *_ = model_motion(scenario.bodies, scenario.start)
     caught = tuple(

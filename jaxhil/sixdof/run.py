@@ -145,8 +145,8 @@ def _result(
     )  # fmt: skip
     deep = max(episode.penetration for episode in episodes)
     if deep > DEEP:
-        expected = f"at most {DEEP:g}: shapes that are too soft, or meet too fast, go through each other"
-        warning = f"contact: found a depth of {deep:.2g} of the size of its shapes, expected {expected}"
+        expected = f"at most {DEEP:g}: shapes that are too soft or too fast pass through each other"
+        warning = f"contact: found a depth of {deep:.2g} times the size of the shapes, expected {expected}"
         summary = summary._replace(warnings=(*summary.warnings, warning))
     status = [*bad, episodes[-1].status][0]
     return SixAxisRun(
@@ -185,7 +185,7 @@ def _stiffest(mechanism: SixAxisMechanism) -> str:
     else:
         name = next(iter(mechanism.contact))
         found, allowed = f"contact.{name}: found forces", "a softer contact"
-    return f"{found} that take too many steps to follow in space, expected {allowed}"
+    return f"{found} for which the integration of the ideal contact takes too many steps, expected {allowed}"
 
 
 def _episode(metrics: Metrics, slot: int) -> Episode:
