@@ -38,8 +38,8 @@ class Meaning(NamedTuple):
             return f"{name}: nothing touches; rig: delay {1e3 * self.delay:.3g} ms"
         rebound = "" if math.isnan(self.restitution) else f", e* {self.restitution:.3g}"
         kind = "held by a latch" if math.isnan(self.frequency) else f"{self.frequency:.3g} Hz"
-        text = f"{name}: effective mass {self.effective_mass:.4g} kg at the first touch; "
-        text += f"ideal contact: {kind}, peak force {self.peak_force:.3g} N{rebound}; rig: delay {1e3 * self.delay:.3g} ms"
+        text = f"{name}: effective mass {self.effective_mass:.4g} kg at the first touch; ideal contact: "
+        text += f"{kind}, peak force {self.peak_force:.3g} N{rebound}; rig: delay {1e3 * self.delay:.3g} ms"
         if not math.isnan(self.slip_limit):
             text += f", friction stable if its slip parameter is above {self.slip_limit:.2g} m/s"
         return text

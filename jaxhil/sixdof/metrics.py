@@ -1,7 +1,7 @@
-"""Metrics of episodes: the rig's contact compared with the ideal contact with the same initial states.
+"""Metrics of episodes: comparison of the rig's contact with the ideal contact from the same initial states.
 
-Both are compared at the end of the rig's episode, when both are free. The relative mass matrix M relates
-metres and radians: twists are compared in its norm.
+The comparison takes place at the end of the rig's episode, when the bodies are free in both contacts. Twists
+V are compared in the norm sqrt(V^T M V) of the relative mass matrix M, which relates metres and radians.
 """
 
 from typing import NamedTuple
@@ -24,63 +24,75 @@ from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.space import Space, fly, scale, start_flight
 from jaxhil.sixdof.vectors import components, cross, dot
 
-LEAST_SHARE = 0.05  # least energy of a first touch to which errors are related, over that of the approach
+# Lower limit of the energy of the first touch by which errors are divided, relative to the energy of the
+# approach [1]: a first touch that only grazes the surface must not enlarge all errors.
+LEAST_SHARE = 0.05
 
 
 class Metrics(NamedTuple):
-    """Metrics of episodes, (episodes, *batch); NaN for values that they do not have."""
+    """Metrics of episodes, (episodes, *batch); NaN for a metric that is not defined.
 
-    energy_error: Float[Array, "..."]  # error of the change of kinetic energy, over that of the approach [1]
-    twist_error: Float[Array, "..."]  # |V - V*| over |V* - V_0|, in the norm of M [1]
+    V is the twist after the contact, V_0 the twist before the contact. A star marks the ideal contact.
+    """
+
+    energy_error: Float[Array, "..."]  # (dE - dE*) divided by the energy of the approach [1]
+    twist_error: Float[Array, "..."]  # |V - V*| divided by |V* - V_0|, in the norm of M [1]
     normal_part: Float[Array, "..."]  # part of the twist error along the ideal impulse [1]
-    lateral_part: Float[Array, "..."]  # translational part of the rest [1]
-    rotational_part: Float[Array, "..."]  # rotational part of the rest [1]
-    restitution: Float[Array, "..."]  # e at the first touch's point and normal, of a single touch [1]
-    reference_restitution: Float[Array, "..."]  # e* of the ideal contact, of a single touch [1]
-    effective_mass: Float[Array, "..."]  # m_n at the first touch [kg]
-    approach_velocity: Float[Array, "..."]  # v_n there [m/s]
+    lateral_part: Float[Array, "..."]  # translational part of the remaining twist error [1]
+    rotational_part: Float[Array, "..."]  # rotational part of the remaining twist error [1]
+    # restitution at the point and along the normal of the first touch; only for a single touch [1]
+    restitution: Float[Array, "..."]
+    reference_restitution: Float[
+        Array, "..."
+    ]  # restitution of the ideal contact; only for a single touch [1]
+    effective_mass: Float[Array, "..."]  # effective mass m_n at the first touch [kg]
+    approach_velocity: Float[Array, "..."]  # approach velocity v_n along the normal of the first touch [m/s]
     point: Float[Array, "..."]  # point of the first touch, in T axes, (3, episodes, *batch) [m]
-    normal: Float[Array, "..."]  # normal there, likewise
-    energy_change: Float[Array, "..."]  # change of the kinetic energy [J]
-    reference_energy_change: Float[Array, "..."]  # likewise in the ideal contact [J]
-    peak_force: Float[Array, "..."]  # of the real contact [N]
-    reference_peak_force: Float[Array, "..."]  # of the ideal contact [N]
-    peak_moment: Float[Array, "..."]  # of the real contact, about T's origin [N m]
-    reference_peak_moment: Float[Array, "..."]  # of the ideal contact [N m]
-    duration: Float[Array, "..."]  # time in touch [s]
-    reference_duration: Float[Array, "..."]  # of the ideal contact; NaN if not integrated to its end [s]
-    touches: Int[Array, "..."]  # number of onsets of touch, over all candidates
-    reference_touches: Int[Array, "..."]  # likewise in the ideal contact
-    penetration: Float[Array, "..."]  # largest penetration on the rig, over the size of its shapes [1]
-    captured: Bool[Array, "..."]  # whether a latch holds
-    reference_captured: Bool[Array, "..."]  # likewise in the ideal contact
+    normal: Float[Array, "..."]  # normal of the target's surface at this point, (3, episodes, *batch)
+    energy_change: Float[Array, "..."]  # change dE of the bodies' kinetic energy [J]
+    reference_energy_change: Float[Array, "..."]  # change of the kinetic energy in the ideal contact [J]
+    peak_force: Float[Array, "..."]  # peak force of the real contact [N]
+    reference_peak_force: Float[Array, "..."]  # peak force of the ideal contact [N]
+    peak_moment: Float[Array, "..."]  # peak moment of the real contact, about T's origin [N m]
+    reference_peak_moment: Float[Array, "..."]  # peak moment of the ideal contact, about T's origin [N m]
+    duration: Float[Array, "..."]  # time during which the hardware touches [s]
+    # time during which the ideal contact touches; NaN if it was too stiff to be integrated [s]
+    reference_duration: Float[Array, "..."]
+    touches: Int[Array, "..."]  # number of touches of the hardware, summed over the candidates
+    reference_touches: Int[Array, "..."]  # number of touches of the ideal contact
+    penetration: Float[Array, "..."]  # largest penetration of the hardware, divided by the shapes' size [1]
+    captured: Bool[Array, "..."]  # whether a latch of the hardware holds at the end
+    reference_captured: Bool[Array, "..."]  # whether a latch holds at the end of the ideal contact
     status: Int[Array, "..."]  # index of `rollout.STATUS_NAMES`
 
 
 class Moment(NamedTuple):
-    """Two bodies at an instant."""
+    """Twist, energy and mass matrix of the two bodies at an instant."""
 
-    twist: Twist  # twist of C against T
-    energy: Float[Array, "..."]  # kinetic energy of both [J]
+    twist: Twist  # twist of C relative to T
+    energy: Float[Array, "..."]  # kinetic energy of both bodies [J]
     mass: Float[Array, "..."]  # relative mass matrix, (6, 6, episodes, *batch)
 
 
 class Result(NamedTuple):
-    """Runs on the rig and their metrics."""
+    """Metrics and final states of a batch of runs on the rig."""
 
     metrics: Metrics
-    final: States  # numerical model at the end of the run
-    final_time: Float[Array, "*batch"]  # [s]
+    final: States  # states of the numerical model at the end of each run
+    final_time: Float[Array, "*batch"]  # duration of each run [s]
 
 
 def evaluate(loop: Loop, gains: Gains, scenario: Scenario) -> Result:
-    """Run and evaluate a batch of scenarios; `gains` are those of `jaxhil.sixdof.loop.build_rig`."""
+    """Simulate a batch of scenarios on the rig, and compare their episodes with the ideal contacts.
+
+    Each of the compensator's `gains` is a scalar or has the batch shape.
+    """
     outcome = rollout(loop, gains, scenario)
     return Result(judge(scenario.bodies, outcome.episodes), outcome.final, outcome.final_time)
 
 
 def reference_final(scenario: Scenario, time: Float[Array, "*batch"]) -> States:
-    """Return the bodies' states in the ideal contact, at a time [s] after the scenario's start."""
+    """Return the bodies' states in the ideal contact at a `time` [s] after the start of the scenario."""
     space = Space(scenario.bodies, scenario.groups, scenario.latches)
     longest = LONGEST * scenario.control_period
     flight = start_flight(space, scenario.start, jnp.minimum(longest, time))
@@ -88,7 +100,7 @@ def reference_final(scenario: Scenario, time: Float[Array, "*batch"]) -> States:
 
 
 def judge(bodies: Pair, episodes: Episode) -> Metrics:
-    """Return the metrics of episodes, (episodes, *batch), of bodies (*batch)."""
+    """Compute the metrics of episodes (episodes, *batch); the bodies have the shape (*batch)."""
     bodies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, episodes.status.shape), bodies)
     past, meeting = episodes.past, episodes.meeting
     expected_states = states_at(bodies, past, episodes.lasted)
@@ -134,7 +146,7 @@ def judge(bodies: Pair, episodes: Episode) -> Metrics:
 
 
 def _closing(pose: Pose, meeting: Meeting, twist: Twist) -> Array:
-    """Return the approach speed [m/s] of the first touch's point at a `pose`, for a `twist`."""
+    """Return the approach speed [m/s] at the first touch's point, along its normal, for a pose and twist."""
     velocity = twist.linear + cross(twist.angular, meeting.point - pose.position)
     return -dot(meeting.normal, velocity)
 
@@ -142,7 +154,7 @@ def _closing(pose: Pose, meeting: Meeting, twist: Twist) -> Array:
 def _moments(bodies: Pair, states: list[States]) -> list[Moment]:
     """Return twist, energy and mass matrix for each of the states."""
 
-    # The loop is not unrolled: the compiler would fuse and repeat the computations.
+    # A Python loop would be unrolled, and the compiler would fuse and repeat its computations.
     def moment(_, states: States) -> tuple[None, Moment]:
         _, twist = relative(bodies, states)
         energies = [kinetic_energy(*item) for item in zip(bodies, states, strict=True)]
@@ -153,7 +165,10 @@ def _moments(bodies: Pair, states: list[States]) -> list[Moment]:
 
 
 def _twist_parts(matrix: Array, after: Twist, expected: Twist, before: Twist) -> tuple[Array, ...]:
-    """Return the error of a twist in the norm of M, and its normal, lateral and rotational parts."""
+    """Return the twist error in the norm of M, and its normal, lateral and rotational parts [1].
+
+    All are divided by the norm of the expected change of the twist.
+    """
     error, impulse = (_stacked(a) - _stacked(b) for a, b in ((after, expected), (expected, before)))
     size = safe_sqrt(_square(matrix, impulse))
     scale_ = 1 / jnp.where(size > 0, size, jnp.nan)
@@ -167,10 +182,10 @@ def _twist_parts(matrix: Array, after: Twist, expected: Twist, before: Twist) ->
 
 
 def _stacked(twist: Twist) -> Float[Array, "6 *batch"]:
-    """Return the components of a twist along a leading axis."""
+    """Stack the components of a twist along a leading axis."""
     return jnp.stack(jax.tree.leaves(twist))
 
 
 def _square(matrix: Float[Array, "6 6 *batch"], vector: Float[Array, "6 *batch"]) -> Float[Array, "*batch"]:
-    """Return vector . matrix vector."""
+    """Return the quadratic form vector^T matrix vector."""
     return jnp.sum(vector[:, None] * matrix * vector[None], axis=(0, 1))

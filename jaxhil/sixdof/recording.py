@@ -1,4 +1,4 @@
-"""Record of a six-axis run, tick by tick, as NumPy arrays of one lane, beside the ideal contact."""
+"""Recording of all ticks of a six-axis run and of the ideal contact, as NumPy arrays."""
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial
@@ -21,41 +21,63 @@ from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.space import Space, follow
 from jaxhil.sixdof.vectors import Vector
 
-LEAST_TICKS = 256  # least length of a program; lengths are powers of two, so that most runs share one
+# Minimum number of ticks of a compiled program. The numbers are powers of two, so that runs share programs.
+LEAST_TICKS = 256
 
 
 class Recorded(NamedTuple):
-    """Record of every tick, in SI units.
+    """Signals of the rig and of the ideal contact at all ticks of a run, in SI units.
 
-    Coordinates (p, theta), twists (v, w) and wrenches (force, moment about T's origin) are in T axes.
+    Coordinates are (p, theta), twists (v, w), and wrenches (force, moment about T's origin), all in T axes.
+    Signals of the hardware are those at the force sensor's sampling instant. The motion of a body consists of
+    position, attitude (w, x, y, z), velocity and angular velocity, in the axes of the file's table [start].
+
+    Attributes:
+        time: Time since the start of the run [s], (ticks,).
+        desired: Coordinates of the numerical model, (ticks, 6).
+        actual: Coordinates of the hardware, (ticks, 6).
+        in_space: Coordinates in the ideal contact, (ticks, 6).
+        twist_desired: Twist of the numerical model, (ticks, 6).
+        twist_actual: Twist of the hardware, (ticks, 6).
+        twist_in_space: Twist in the ideal contact, (ticks, 6).
+        wrench: Wrench of the real contact, (ticks, 6).
+        command: Wrench command, which acts on the numerical model, (ticks, 6).
+        wrench_in_space: Wrench of the ideal contact, (ticks, 6).
+        target: Motion of the numerical model's target, (ticks, 13).
+        chaser: Motion of the numerical model's chaser, (ticks, 13).
+        names: Names of the contact candidates.
+        force: Normal force of each candidate [N], (ticks, candidates).
+        depth: Penetration of each candidate [m], negative if the shapes are apart, (ticks, candidates).
+        point: Point where each candidate's force acts, in T axes [m], (ticks, candidates, 3).
+        push: Force of each candidate on the chaser, with friction, in T axes [N], (ticks, candidates, 3).
+        groups: Groups of contact candidates.
     """
 
-    time: np.ndarray  # (ticks,) [s]
-    desired: np.ndarray  # (ticks, 6), coordinates of the numerical model
-    actual: np.ndarray  # (ticks, 6), coordinates of the hardware at the force sensor's sampling instant
-    in_space: np.ndarray  # (ticks, 6), coordinates in the ideal contact
-    twist_desired: np.ndarray  # (ticks, 6), twist of the numerical model
-    twist_actual: np.ndarray  # (ticks, 6), twist of the hardware at the force sensor's sampling instant
-    twist_in_space: np.ndarray  # (ticks, 6), twist in the ideal contact
-    wrench: np.ndarray  # (ticks, 6), wrench of the real contact at the sampling instant
-    command: np.ndarray  # (ticks, 6), wrench on the numerical model
-    wrench_in_space: np.ndarray  # (ticks, 6), wrench of the ideal contact
-    # (ticks, 13), numerical model as in [start.target]: position, attitude, velocity, angular velocity
+    time: np.ndarray
+    desired: np.ndarray
+    actual: np.ndarray
+    in_space: np.ndarray
+    twist_desired: np.ndarray
+    twist_actual: np.ndarray
+    twist_in_space: np.ndarray
+    wrench: np.ndarray
+    command: np.ndarray
+    wrench_in_space: np.ndarray
     target: np.ndarray
-    chaser: np.ndarray  # (ticks, 13), likewise as in [start.chaser]
-    names: tuple[str, ...]  # names of the candidates
-    force: np.ndarray  # (ticks, candidates), normal force [N]
-    depth: np.ndarray  # (ticks, candidates), penetration [m], negative apart
-    point: np.ndarray  # (ticks, candidates, 3), point of the force, in T axes [m]
-    push: np.ndarray  # (ticks, candidates, 3), force on the chaser, friction included [N]
-    groups: tuple[ContactGroup, ...]  # candidates
+    chaser: np.ndarray
+    names: tuple[str, ...]
+    force: np.ndarray
+    depth: np.ndarray
+    point: np.ndarray
+    push: np.ndarray
+    groups: tuple[ContactGroup, ...]
 
 
 COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
 WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 MOTION = ("x", "y", "z", "qw", "qx", "qy", "qz", *TWIST)
-# Suffixes of the table's columns for each array.
+# For each field of `Recorded`, the suffixes of its columns in the CSV file.
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("desired", "actual", "in_space"), COORDINATES),
     **dict.fromkeys(("twist_desired", "twist_actual", "twist_in_space"), TWIST),
@@ -65,7 +87,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 
 
 def table(recorded: Recorded) -> dict[str, np.ndarray]:
-    """Return all ticks as columns (ticks,) by name, such as `desired_x`, `wrench_fz` and `depth_tip`."""
+    """Split the record into columns (ticks,) by name, such as `desired_x`, `wrench_fz` and `depth_tip`."""
     columns = {"time": recorded.time}
     for name, suffixes in COLUMNS.items():
         columns |= {f"{name}_{suffix}": getattr(recorded, name)[:, i] for i, suffix in enumerate(suffixes)}
@@ -77,7 +99,7 @@ def table(recorded: Recorded) -> dict[str, np.ndarray]:
 def record(
     mechanism: SixAxisMechanism, compensator: str, gains: dict[str, Any], seed: int, duration: float
 ) -> Recorded:
-    """Return the nominal run of a mechanism for a `duration` [s]."""
+    """Simulate the nominal run of a mechanism for a `duration` [s], and record all ticks."""
     scenario = build_scenarios(mechanism, seed=seed)
     return _recorded(mechanism, loop_of(mechanism, compensator, scenario), gains, scenario, duration)
 
@@ -85,7 +107,7 @@ def record(
 def record_scenario(
     mechanism: SixAxisMechanism, loop: Loop, gains: dict[str, Any], scenario: Scenario
 ) -> Recorded:
-    """Return the whole run of a scenario of a mechanism, a batch of one lane."""
+    """Simulate the whole run of one scenario (a batch with one lane) of a mechanism; record all ticks."""
     (duration,) = np.asarray(_duration()(loop, gains, scenario))
     return _recorded(mechanism, loop, gains, scenario, float(duration))
 
@@ -93,7 +115,7 @@ def record_scenario(
 def _recorded(
     mechanism: SixAxisMechanism, loop: Loop, gains: dict[str, Any], scenario: Scenario, duration: float
 ) -> Recorded:
-    """Return the run of one lane for a `duration` [s]."""
+    """Simulate a scenario with one lane for a `duration` [s], and record all ticks."""
     period = float(scenario.control_period[0])
     ticks = max(round(duration / period), 2)
     length = max(LEAST_TICKS, 1 << (ticks - 1).bit_length())
@@ -108,7 +130,7 @@ def _recorded(
 
 @cache
 def _duration() -> Callable[..., Any]:
-    """Return the compiled function for the duration of runs [s], (lanes,)."""
+    """Return a compiled function that computes the duration of runs [s], (lanes,)."""
 
     def time(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> Any:
         return rollout(loop, gains, scenario).final_time
@@ -117,7 +139,10 @@ def _duration() -> Callable[..., Any]:
 
 
 def motion(bodies: Pair, states: States) -> tuple[Any, ...]:
-    """Return coordinates, twist, and the motion of target and chaser as in [start], (..., lanes)."""
+    """Return coordinates, twist, motion of the target, and motion of the chaser, (components, lanes) each.
+
+    The motion of a body has the components of the file's table [start].
+    """
     pose, twist = relative(bodies, states)
     motions = (
         (state.position, state.attitude, state.velocity, angular_velocity(body, state))
@@ -128,7 +153,7 @@ def motion(bodies: Pair, states: States) -> tuple[Any, ...]:
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _run(loop: Loop, ticks: int, gains: dict[str, Any], scenario: Scenario) -> dict[str, Any]:
-    """Return the recorded arrays, (ticks, ..., lanes), of a run and of the ideal contact."""
+    """Simulate a run and the ideal contact; return the arrays of `Recorded`, (ticks, ..., lanes)."""
     _, seen = run(loop, gains, scenario, ticks)
     space, period = Space(scenario.bodies, scenario.groups, scenario.latches), scenario.control_period
     _, free = follow(space, scenario.start, period, ticks, period)
@@ -155,7 +180,7 @@ _OF_CANDIDATES = {"force": (), "depth": (), "point": (3,), "push": (3,)}
 
 
 def _of_candidates(forces: Forces) -> dict[str, Any]:
-    """Return the arrays of a group's candidates, (ticks, candidates, ..., lanes)."""
+    """Return force, depth, point and push of a group's candidates, (ticks, candidates, ..., lanes)."""
     touch = forces.touch
     push = forces.normal * touch.normal + forces.tangential
     return {
@@ -167,10 +192,9 @@ def _of_candidates(forces: Forces) -> dict[str, Any]:
 
 
 def _components(points: Vector) -> Any:
-    """Return the components of vectors, (ticks, candidates, 3, lanes)."""
+    """Stack the components of vectors, (ticks, candidates, 3, lanes)."""
     return jnp.stack([points.x, points.y, points.z], axis=2)
 
 
 def _stacked(parts: Any, axis: int) -> Any:
-    """Return all components along an axis."""
     return jnp.stack(jax.tree.leaves(parts), axis)

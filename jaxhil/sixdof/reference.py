@@ -1,8 +1,8 @@
-"""Ideal contact as reference of a run: two bodies that touch without a rig.
+"""Ideal contact as the reference of a run on the rig.
 
-It is integrated once, over the whole duration of the run. An episode of the rig ends where both the rig and
-the ideal contact are free: therefore the times in which nothing touches are recorded, with the motion at the
-start of each.
+The ideal contact is integrated once, over the whole duration of the run. An episode of the rig ends when both
+the rig and the ideal contact are free. Therefore this module records the gaps between touches of the ideal
+contact (periods in which nothing touches), with the motion of the bodies at the start of each gap.
 """
 
 from typing import Any, NamedTuple
@@ -27,76 +27,79 @@ from jaxhil.sixdof.space import (
 )
 from jaxhil.sixdof.vectors import norm
 
-FIRST = 1e-4  # s; first step
-LONGEST = 2.0  # control periods; longest step of the integration near a touch
-GAPS = 4  # number of recorded gaps between touches
-LEAST_CHANGE = 0.05  # least change of the twist by a contact that may end an episode, over the twist before
+FIRST = 1e-4  # s; length of the first integration step
+LONGEST = 2.0  # control periods; maximum length of an integration step near a touch
+GAPS = 4  # maximum number of recorded gaps between touches
+# Minimum change of the twist by a contact after which an episode may end, relative to the twist before [1].
+LEAST_CHANGE = 0.05
 
 
 class Past(NamedTuple):
-    """Ideal contact up to a time."""
+    """States and metrics of the ideal contact from its start up to a time."""
 
-    time: Float[Array, "*batch"]  # time since its start [s]
-    states: States  # states of the bodies
-    touches: Int[Array, "*batch"]  # number of onsets of touch, over all candidates
-    touched: Float[Array, "*batch"]  # time in touch [s]
-    peak_force: Float[Array, "*batch"]  # [N]
-    peak_moment: Float[Array, "*batch"]  # about T's origin [N m]
+    time: Float[Array, "*batch"]  # time since the start [s]
+    states: States  # states of the bodies at this time
+    touches: Int[Array, "*batch"]  # number of touches, summed over the candidates
+    touched: Float[Array, "*batch"]  # time during which shapes touched [s]
+    peak_force: Float[Array, "*batch"]  # peak force [N]
+    peak_moment: Float[Array, "*batch"]  # peak moment about T's origin [N m]
     captured: Bool[Array, "*batch"]  # whether a latch holds
 
 
 class Gaps(NamedTuple):
-    """Times without a touch, after a contact that changed the twist noticeably, (GAPS, *batch).
+    """Gaps of the ideal contact: periods without a touch, after a noticeable change of the twist.
 
-    The last one replaces those for which there is no room. An unused one begins at infinity.
+    Arrays are (GAPS, *batch). If there are more gaps, the latest gap overwrites the last entry. An unused
+    entry begins at infinity.
     """
 
-    begin: Past  # ideal contact up to the begin of the gap
-    end: Float[Array, "gaps *batch"]  # time of the next touch [s]; infinite if there is none
+    begin: Past  # ideal contact up to the start of the gap
+    end: Float[Array, "gaps *batch"]  # time of the next touch [s]; infinite if nothing touches again
 
 
 class Reference(NamedTuple):
-    """Ideal contact over the whole duration of a run."""
+    """Ideal contact over the whole duration of a run: first touch, gaps, and final values."""
 
-    meeting: Meeting
+    meeting: Meeting  # first touch
     gaps: Gaps
-    last: Past  # at the end of the run; its time is infinite if the contact was too stiff to be integrated
+    # ideal contact up to the end of the run; the time is infinite if it was too stiff to be integrated
+    last: Past
 
 
 class Passage(NamedTuple):
-    """State of the integration."""
+    """State of the integration of an ideal contact, with the metrics so far."""
 
-    flight: Flight
-    touching: tuple[Bool[Array, "candidates *batch"], ...]
-    touches: Int[Array, "*batch"]  # number of onsets of touch, over all candidates
-    touched: Float[Array, "*batch"]  # time in touch [s]
-    before: States  # last states before the first touch
-    depths: tuple[Float[Array, "candidates *batch"], ...]  # penetrations at the first step in touch [m]
+    flight: Flight  # motion of the bodies, with the state of the integrator
+    touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each group's candidates touch
+    touches: Int[Array, "*batch"]  # number of touches, summed over the candidates
+    touched: Float[Array, "*batch"]  # time during which shapes touched [s]
+    before: States  # states at the start of the step in which the first touch begins
+    depths: tuple[Float[Array, "candidates *batch"], ...]  # penetrations at the end of this step [m]
     force: Peak  # peak force [N]
     moment: Peak  # peak moment about T's origin [N m]
     gaps: Gaps
     slot: Int[Array, "*batch"]  # index of the current or next gap
-    active: Bool[Array, "*batch"]
+    active: Bool[Array, "*batch"]  # whether the integration of each lane continues
 
 
 class Approach(NamedTuple):
-    """Relative motion at the start, to which changes are related."""
+    """Relative motion at the start of the ideal contact, and the minimum duration of a recorded gap."""
 
-    twist: Twist
+    twist: Twist  # twist of C relative to T
     mass: Float[Array, "6 6 *batch"]  # relative mass matrix
-    speed: Float[Array, "*batch"]  # of the bodies, as in `space.scale` [m/s]
-    quiet: Float[Array, "*batch"]  # least duration of a gap [s]
+    speed: Float[Array, "*batch"]  # speed that scales the integration error, see `space.scale` [m/s]
+    quiet: Float[Array, "*batch"]  # minimum duration of a recorded gap [s]
 
 
 def follow_contact(space: Space, states: States, quiet: Array, until: Array, period: Array) -> Reference:
-    """Return the ideal contact of free bodies over a time.
+    """Integrate the ideal contact of two bodies that start apart.
 
     Args:
-        space: constants of the contact.
-        states: states of the free bodies at the start.
-        quiet: least duration of a gap between touches that is recorded [s].
-        until: duration [s].
-        period: control period [s]; steps near a touch are limited to two periods.
+        space: Constants of the ideal contact.
+        states: States of the bodies at the start, without contact.
+        quiet: Minimum duration of a recorded gap between touches [s].
+        until: Duration of the integration [s].
+        period: Control period [s]; integration steps near a touch last at most two control periods.
     """
     _, twist = relative(space.bodies, states)
     approach = Approach(twist, mass_matrix(space.bodies, states), scale(space, states), quiet)
@@ -117,13 +120,16 @@ def follow_contact(space: Space, states: States, quiet: Array, until: Array, per
 
 
 def is_quiet(reference: Reference, time: Array, quiet: Array) -> Bool[Array, "*batch"]:
-    """Return whether the ideal contact has touched nothing for `quiet` [s] at a time [s]."""
+    """Return whether the ideal contact, at a `time` [s], has had no touch for at least `quiet` [s]."""
     begin, end = reference.gaps.begin.time, reference.gaps.end
     return jnp.any((begin + quiet[None] <= time[None]) & (time[None] < end), axis=0)
 
 
 def past_at(reference: Reference, time: Array, common: Bool[Array, "*batch"]) -> Past:
-    """Return the ideal contact up to the gap in which a time [s] lies; if not `common`, up to its end."""
+    """Return the ideal contact up to the start of the gap that contains a `time` [s].
+
+    In lanes where `common` is false, return the ideal contact up to the end of the run.
+    """
     past = reference.last
     for slot in range(GAPS):
         begin = jax.tree.map(lambda leaf, slot=slot: leaf[slot], reference.gaps.begin)
@@ -132,7 +138,7 @@ def past_at(reference: Reference, time: Array, common: Bool[Array, "*batch"]) ->
 
 
 def states_at(bodies: Pair, past: Past, time: Float[Array, "*batch"]) -> States:
-    """Return the states after the free flight that follows, at a time [s]."""
+    """Extend the ideal contact by free flight, and return the bodies' states at a `time` [s]."""
     free = Space(bodies, (), ())
     left = jnp.where(time > past.time, time - past.time, 0)
     flight = start_flight(free, past.states, left)
@@ -140,7 +146,7 @@ def states_at(bodies: Pair, past: Past, time: Float[Array, "*batch"]) -> States:
 
 
 def _start(space: Space, states: States, first: Float[Array, "*batch"]) -> Passage:
-    """Return the state before the first step, which has a length `first` [s]."""
+    """Return the state of the integration before the first step, which has the length `first` [s]."""
     zero, none = jnp.zeros_like(first), jnp.zeros(first.shape, jnp.int32)
     depths = tuple(jnp.zeros_like(group.parameters.damping) for group in space.groups)
     touching = tuple(depth > 0 for depth in depths)
@@ -163,7 +169,7 @@ def _start(space: Space, states: States, first: Float[Array, "*batch"]) -> Passa
 
 
 def _past(passage: Passage) -> Past:
-    """Return the contact so far."""
+    """Return the metrics of the ideal contact so far."""
     captured = passage.touches < 0
     for latch in passage.flight.memories.held:
         captured = captured | jnp.any(latch.caught, axis=0)
@@ -179,7 +185,7 @@ def _past(passage: Passage) -> Past:
 
 
 def _recorded(passage: Passage, approach: Approach, ahead: Passage, now: Instant) -> Passage:
-    """Return the passage `ahead` with the gap that begins or ends in the step from `passage`."""
+    """Return `ahead` with the gap recorded that begins or ends in the step from `passage` to `ahead`."""
     was, touches = _touches(passage), _touches(ahead)
     slot = jnp.arange(GAPS, dtype=jnp.int32).reshape(-1, *[1] * was.ndim) == passage.slot[None]
     change = jnp.stack(jax.tree.leaves(jax.tree.map(jnp.subtract, now.twist, approach.twist)))
@@ -199,12 +205,12 @@ def _recorded(passage: Passage, approach: Approach, ahead: Passage, now: Instant
 
 
 def _square(matrix: Array, vector: Array) -> Array:
-    """Return vector . matrix vector."""
+    """Return the quadratic form vector^T matrix vector."""
     return jnp.sum(vector[:, None] * matrix * vector[None], axis=(0, 1))
 
 
 def _updated(passage: Passage, approach: Approach, after: Flight, now: Instant) -> Passage:
-    """Return the episode after a step that ends `now`."""
+    """Update the metrics of the ideal contact with a step that ends with the motion `after`."""
     depths = tuple(forces.touch.depth for forces in now.forces)
     touching = tuple(depth > 0 for depth in depths)
     touches = passage.touches
@@ -213,7 +219,7 @@ def _updated(passage: Passage, approach: Approach, after: Flight, now: Instant) 
     ahead = passage._replace(flight=after, touching=touching, touches=touches)
     first = (passage.touches == 0) & (touches > 0)
     step = after.time - passage.flight.time
-    # At the begin or end of a touch the force jumps or has a corner.
+    # The force has a jump or a kink where a touch begins or ends.
     bends = jnp.zeros(step.shape, bool)
     for now_touching, before in zip(touching, passage.touching, strict=True):
         bends = bends | jnp.any(now_touching != before, axis=0)
@@ -229,7 +235,7 @@ def _updated(passage: Passage, approach: Approach, after: Flight, now: Instant) 
 
 
 def _touches(passage: Passage) -> Array:
-    """Return whether something touches or a latch holds."""
+    """Return whether any candidate touches or any latch holds."""
     result = jnp.zeros(passage.touched.shape, bool)
     for flags in (*passage.touching, *(latch.caught for latch in passage.flight.memories.held)):
         result = result | jnp.any(flags, axis=0)

@@ -1,7 +1,7 @@
-"""Relative pose and twist of chaser and target, wrenches, and the relative mass.
+"""Relative pose and twist of chaser and target, wrenches, and the relative mass matrix.
 
-The interface frames are T on the target and C on the chaser. z of T is the docking axis and points from the
-target to the chaser. All relative quantities are in T axes (notebooks/guide/six_axes.md, section 1).
+The interface frames are T on the target and C on the chaser. The z axis of T is the docking axis and points
+from the target to the chaser. Relative quantities are in T axes (notebooks/guide/six_axes.md, section 1).
 """
 
 from typing import NamedTuple
@@ -27,51 +27,51 @@ from jaxhil.sixdof.vectors import Vector, cross, dot, vector
 
 
 class Frame(NamedTuple):
-    """Interface frame in the world."""
+    """Position, attitude and velocity of an interface frame in the world."""
 
-    position: Vector  # of its origin, in world axes [m]
-    attitude: Quaternion  # from its axes to world axes
-    velocity: Vector  # of its origin, in world axes [m/s]
-    angular_velocity: Vector  # in world axes [rad/s]
+    position: Vector  # position of the frame's origin, in world axes [m]
+    attitude: Quaternion  # rotation from the frame's axes to world axes
+    velocity: Vector  # velocity of the frame's origin, in world axes [m/s]
+    angular_velocity: Vector  # angular velocity of the frame, in world axes [rad/s]
 
 
 class Pose(NamedTuple):
     """Pose of C relative to T."""
 
-    position: Vector  # p, of C's origin, in T axes [m]
-    attitude: Quaternion  # from C axes to T axes
+    position: Vector  # position p of C's origin, in T axes [m]
+    attitude: Quaternion  # rotation from C axes to T axes
 
 
 class Twist(NamedTuple):
-    """Velocity of C relative to T, as seen from T."""
+    """Linear and angular velocity of C relative to T, observed from T."""
 
-    linear: Vector  # v, of C's origin, in T axes [m/s]
-    angular: Vector  # w, in T axes [rad/s]
+    linear: Vector  # velocity v of C's origin, in T axes [m/s]
+    angular: Vector  # angular velocity w, in T axes [rad/s]
 
 
 class Coordinates(NamedTuple):
-    """Six coordinates of a pose, or their rates."""
+    """Six coordinates of a pose, or the rates of these coordinates."""
 
-    position: Vector  # p [m], or its rate [m/s]
-    rotation: Vector  # rotation vector theta from T axes [rad], or its rate [rad/s]
+    position: Vector  # position p [m], or its rate [m/s]
+    rotation: Vector  # rotation vector theta of C relative to T [rad], or its rate [rad/s]
 
 
 class Wrench(NamedTuple):
     """Force and moment of the target on the chaser, in T axes."""
 
-    force: Vector  # f [N]
-    moment: Vector  # m, about T's origin unless said otherwise [N m]
+    force: Vector  # force f [N]
+    moment: Vector  # moment m about T's origin, if not stated otherwise [N m]
 
 
 class Pair(NamedTuple):
-    """Target and chaser."""
+    """Parameters of the two bodies."""
 
     target: Body
     chaser: Body
 
 
 class States(NamedTuple):
-    """Motion of the two bodies."""
+    """States of the two bodies."""
 
     target: State
     chaser: State
@@ -79,7 +79,7 @@ class States(NamedTuple):
 
 @jax.jit
 def interface_frame(body: Body, state: State) -> Frame:
-    """Return a body's interface frame."""
+    """Return the motion of a body's interface frame in the world."""
     angular = rotate(state.attitude, angular_velocity(body, state))
     offset = rotate(state.attitude, body.interface)
     turned = body.interface_attitude
@@ -92,7 +92,7 @@ def interface_frame(body: Body, state: State) -> Frame:
 
 
 def relative_motion(target: Frame, chaser: Frame) -> tuple[Pose, Twist]:
-    """Return pose and twist of the frame C relative to the frame T."""
+    """Return pose and twist of frame C (`chaser`) relative to frame T (`target`)."""
     apart = chaser.position - target.position
     velocity = chaser.velocity - target.velocity - cross(target.angular_velocity, apart)
     pose = Pose(rotate_back(target.attitude, apart), compose(reverse(target.attitude), chaser.attitude))
@@ -102,13 +102,13 @@ def relative_motion(target: Frame, chaser: Frame) -> tuple[Pose, Twist]:
 
 @jax.jit
 def relative(bodies: Pair, states: States) -> tuple[Pose, Twist]:
-    """Return pose and twist of C relative to T."""
+    """Return pose and twist of C relative to T for the states of the two bodies."""
     target, chaser = (interface_frame(*item) for item in zip(bodies, states, strict=True))
     return relative_motion(target, chaser)
 
 
 def coordinates(pose: Pose, twist: Twist) -> tuple[Coordinates, Coordinates]:
-    """Return coordinates (p, theta) of a pose, with |theta| < pi, and their rates."""
+    """Convert pose and twist to the coordinates (p, theta), with |theta| <= pi, and their rates."""
     theta = logarithm(pose.attitude)
     return (
         Coordinates(pose.position, theta),
@@ -117,7 +117,7 @@ def coordinates(pose: Pose, twist: Twist) -> tuple[Coordinates, Coordinates]:
 
 
 def motion_of(at: Coordinates, rates: Coordinates) -> tuple[Pose, Twist]:
-    """Return pose and twist for coordinates and their rates."""
+    """Convert coordinates and their rates to pose and twist."""
     return (
         Pose(at.position, exponential(at.rotation)),
         Twist(rates.position, left_jacobian(at.rotation, rates.rotation)),
@@ -125,17 +125,20 @@ def motion_of(at: Coordinates, rates: Coordinates) -> tuple[Pose, Twist]:
 
 
 def wrench_at_chaser(wrench: Wrench, pose: Pose) -> Wrench:
-    """Return the wrench about C's origin; its product with the relative twist is the power."""
+    """Move the moment of a wrench from T's origin to C's origin.
+
+    The product of the result with the relative twist is the power of the wrench.
+    """
     return Wrench(wrench.force, wrench.moment - cross(pose.position, wrench.force))
 
 
 def power(wrench_at_chaser: Wrench, twist: Twist) -> Float[Array, "..."]:
-    """Return the power [W] of a wrench about C's origin on the relative motion."""
+    """Return the power [W] that a wrench about C's origin transfers to the relative motion."""
     return dot(wrench_at_chaser.force, twist.linear) + dot(wrench_at_chaser.moment, twist.angular)
 
 
 def loads(wrench: Wrench, target: Frame, states: States) -> tuple[Load, Load]:
-    """Return the loads of a wrench on target and chaser: equal and opposite, at one point."""
+    """Return the loads on target and chaser that a wrench exerts: equal and opposite, at T's origin."""
     force, moment = (rotate(target.attitude, part) for part in wrench)
 
     def about(state: State) -> Vector:
@@ -147,10 +150,10 @@ def loads(wrench: Wrench, target: Frame, states: States) -> tuple[Load, Load]:
 def advance(
     bodies: Pair, states: States, wrench: Wrench, period: Float[Array, "..."], share: Array | float
 ) -> States:
-    """Return the bodies of the numerical model after a control `period` [s] under a wrench.
+    """Integrate the motion of both bodies over a control `period` [s] under a constant wrench.
 
-    Linear momentum is conserved for any wrench, angular momentum if `share` is 1. Otherwise the latter
-    changes by (1 - share) T^2 (v_chaser - v_target) x f per period.
+    `share` selects the integrator (see `bodies.SHARES`). Linear momentum is conserved exactly. Angular
+    momentum changes by (1 - share) T^2 (v_chaser - v_target) x f per period.
     """
     target, chaser = loads(wrench, interface_frame(bodies.target, states.target), states)
     return States(
@@ -160,9 +163,9 @@ def advance(
 
 
 def acceleration(bodies: Pair, states: States, wrench_at_chaser: Wrench) -> Twist:
-    """Return M^-1 W_C: the rate of the relative twist of bodies at rest under a wrench about C's origin.
+    """Return the relative acceleration M^-1 W_C of bodies at rest under a wrench W_C about C's origin.
 
-    M is the relative mass matrix; M^-1 is the sum of the bodies' contributions.
+    M is the relative mass matrix. M^-1 is the sum of the contributions of the two bodies.
     """
     target = interface_frame(bodies.target, states.target)
     chaser = interface_frame(bodies.chaser, states.chaser)
@@ -177,14 +180,14 @@ def acceleration(bodies: Pair, states: States, wrench_at_chaser: Wrench) -> Twis
 
 
 def mass_matrix(bodies: Pair, states: States) -> Float[Array, "6 6 *batch"]:
-    """Return the relative mass matrix M at the pose, in kg, kg m and kg m^2.
+    """Return the relative mass matrix M [kg, kg m, kg m^2].
 
-    It satisfies M V' = W_C for bodies at rest.
+    M relates the relative twist V and the wrench W_C about C's origin: M V' = W_C for bodies at rest.
     """
     like = states.target.position.x
     unit = jnp.eye(6, dtype=like.dtype).reshape(6, 6, *[1] * like.ndim)
     unit = jnp.broadcast_to(unit, (6, 6, *like.shape))
-    # All six unit wrenches are computed at once, along an axis before the batch.
+    # The accelerations for all six unit wrenches are computed at once, along an axis before the batch.
     bodies, states = jax.tree.map(lambda leaf: leaf[None], (bodies, states))
     twist = acceleration(bodies, states, Wrench(vector(unit[:3]), vector(unit[3:])))
     inverse = jnp.stack(jax.tree.leaves(twist))
@@ -192,10 +195,10 @@ def mass_matrix(bodies: Pair, states: States) -> Float[Array, "6 6 *batch"]:
 
 
 def effective_mass(bodies: Pair, states: States, point: Vector, normal: Vector) -> Float[Array, "..."]:
-    """Return the mass [kg] that is effective in a frictionless contact.
+    """Return the effective mass m_n [kg] of the two bodies in a frictionless contact.
 
-    It is 1/m_n = sum 1/m_i + (a_i . J_i^-1 a_i), a_i = (point - r_i) x normal, with `point` [m] and the unit
-    `normal` in T axes.
+    1/m_n is the sum of 1/m_i + a_i . J_i^-1 a_i over the bodies, where a_i = (point - r_i) x normal. The
+    contact's `point` [m] and unit `normal` are in T axes.
     """
     target = interface_frame(bodies.target, states.target)
     total = jnp.zeros_like(normal.x)
@@ -207,6 +210,6 @@ def effective_mass(bodies: Pair, states: States, point: Vector, normal: Vector) 
 
 
 def _turning(body: Body, state: State, target: Frame, torque: Vector) -> Vector:
-    """Return J^-1 torque; both vectors are in T axes."""
+    """Return the angular acceleration J^-1 torque of a body; both vectors are in T axes."""
     in_body = rotate_back(state.attitude, rotate(target.attitude, torque))
     return rotate_back(target.attitude, rotate(state.attitude, body.inverse_inertia @ in_body))

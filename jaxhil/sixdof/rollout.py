@@ -1,8 +1,8 @@
-"""Rollout of a batch of runs on the rig, from the approach until the evaluated episodes are over.
+"""Rollout of a batch of six-axis runs on the rig, until all evaluated episodes are over.
 
-An episode is a contact with all its touches (`jaxhil.sixdof.watch`). The ideal contact from the same start is
-integrated before it. Ticks run in short segments ("stretches"), between which the runs are checked. The
-program ends with its slowest lane.
+An episode is a contact with all its touches (`jaxhil.sixdof.watch`). Before each episode, the ideal contact
+from the same states is integrated. The ticks run in segments (constant `STRETCH`); the end of the runs is
+checked after each segment. The program ends when the longest run of the batch ends.
 """
 
 from typing import Any, NamedTuple
@@ -32,53 +32,54 @@ from jaxhil.sixdof.watch import (
     watch_tick,
 )
 
-STRETCH = 16  # ticks between checks of a run
-SLOW = 1e-3  # m/s; least approach speed to which the growth of the speed is related
+STRETCH = 16  # number of ticks in a segment, after which the end of the runs is checked
+SLOW = 1e-3  # m/s; a slower approach counts as this speed in the test for divergence
 MISS, REBOUNDED, CAPTURED, JAMMED, TIMEOUT, DIVERGED, NON_FINITE, REACH = range(8)
 STATUS_NAMES = ("miss", "rebounded", "captured", "jammed", "timeout", "diverged", "non-finite", "reach")
 
 
 class Episode(NamedTuple):
-    """Results of episodes, (episodes, *batch)."""
+    """Results of episodes on the rig, with their ideal contacts, (episodes, *batch)."""
 
-    start: States  # numerical model at its start
-    end: States  # numerical model at its end
+    start: States  # states of the numerical model at the start of the episode
+    end: States  # states of the numerical model at the end of the episode
     lasted: Float[Array, "episodes *batch"]  # time from start to end [s]
     meeting: Meeting  # first touch of the ideal contact from the same start
-    past: Past  # ideal contact at the begin of its gap in which the end lies; else at the end of the run
-    touches: Int[Array, "episodes *batch"]  # number of onsets of touch, over all candidates
-    duration: Float[Array, "episodes *batch"]  # time in touch [s]
-    peak_force: Float[Array, "episodes *batch"]  # [N]
-    peak_moment: Float[Array, "episodes *batch"]  # about T's origin [N m]
-    penetration: Float[Array, "episodes *batch"]  # largest penetration, over the size of its shapes [1]
+    # ideal contact up to the gap in which the episode ends; without a common gap, up to the end of the run
+    past: Past
+    touches: Int[Array, "episodes *batch"]  # number of touches of the hardware, summed over the candidates
+    duration: Float[Array, "episodes *batch"]  # time during which the hardware touches [s]
+    peak_force: Float[Array, "episodes *batch"]  # peak force of the real contact [N]
+    peak_moment: Float[Array, "episodes *batch"]  # peak moment of the real contact, about T's origin [N m]
+    penetration: Float[Array, "episodes *batch"]  # largest penetration, divided by the shapes' size [1]
     status: Int[Array, "episodes *batch"]  # index of `STATUS_NAMES`
 
 
 class EpisodeProgress(NamedTuple):
-    """State of a batch of runs."""
+    """State of a rollout: loop, current episode, and finished episodes."""
 
     run: RunState
     beginning: Beginning  # start of the current episode
-    watch: Watch
-    episodes: Episode
+    watch: Watch  # record of the current episode
+    episodes: Episode  # results of the finished episodes
     index: Int[Array, "*batch"]  # index of the current or next episode
-    active: Bool[Array, "*batch"]
+    active: Bool[Array, "*batch"]  # whether each run continues
     lasted: Int[Array, "*batch"]  # number of ticks of each run so far
 
 
 class Outcome(NamedTuple):
-    """Results of runs."""
+    """Results of a rollout: episodes, and final states of the numerical model."""
 
     episodes: Episode
-    final: States  # numerical model at the end of the run
-    final_time: Float[Array, "*batch"]  # [s]
+    final: States  # states of the numerical model at the end of each run
+    final_time: Float[Array, "*batch"]  # duration of each run [s]
 
 
 def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
-    """Return the episodes of every lane; `gains` are those of `jaxhil.sixdof.loop.build_rig`."""
+    """Simulate a batch of scenarios on the rig; each of the `gains` is a scalar or has the batch shape."""
     rig = build_rig(loop, gains, scenario)
     last = jnp.round(scenario.duration / rig.period).astype(jnp.int32)
-    # Each further episode has a start of its own, which must not be lost between two checks.
+    # With several episodes, the next episode must begin at the tick after the end of the last episode.
     stretch = STRETCH if loop.episodes == 1 else 1
 
     def one_tick(progress: EpisodeProgress, _) -> tuple[EpisodeProgress, None]:
@@ -95,14 +96,14 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
 
 
 def ideal_contact(rig: Rig, states: States, ticks: Int[Array, "*batch"]) -> Reference:
-    """Return the ideal contact of free bodies for so many ticks."""
+    """Integrate the ideal contact from the given states over a number of control periods (`ticks`)."""
     space = Space(rig.bodies, rig.groups, rig.latches)
     until = ticks.astype(rig.period.dtype) * rig.period
     return follow_contact(space, states, quiet_time(rig.sensor, rig.period), until, rig.period)
 
 
 def _start(loop: Loop, rig: Rig, states: States, last: Array) -> EpisodeProgress:
-    """Return the state at the start of the runs."""
+    """Return the state of the rollout at the start of the runs."""
     none = jnp.zeros(rig.period.shape, jnp.int32)
     beginning = Beginning(states, none, relative_energy(rig, states), ideal_contact(rig, states, last))
     watch = fresh_watch(rig, states, none)
@@ -123,7 +124,7 @@ def _start(loop: Loop, rig: Rig, states: States, last: Array) -> EpisodeProgress
 
 
 def _tick(loop: Loop, rig: Rig, last: Array, progress: EpisodeProgress) -> EpisodeProgress:
-    """Run one tick. In lanes whose run is over the bodies stand still."""
+    """Simulate one tick. In lanes whose run is over, the states of the bodies do not change."""
     run, watch = progress.run, progress.watch
     after, seen = tick(loop, rig, run)
     runs = progress.active & (progress.lasted < last) & ~watch.beyond
@@ -141,7 +142,10 @@ def _tick(loop: Loop, rig: Rig, last: Array, progress: EpisodeProgress) -> Episo
 def _episode(
     rig: Rig, beginning: Beginning, watch: Watch, over: Array, ticks: Array, states: States
 ) -> Episode:
-    """Return the current episode; where it is not `over`, it ends now, after so many ticks of the run."""
+    """Return the results of the current episode.
+
+    In lanes where the episode is not `over`, it ends now, with the given `states` after `ticks` ticks.
+    """
     period = rig.period
     lasted = (jnp.where(over, watch.end_tick, ticks) - beginning.tick).astype(period.dtype) * period
     return Episode(
@@ -160,7 +164,7 @@ def _episode(
 
 
 def _turn_over(loop: Loop, rig: Rig, last: Array, progress: EpisodeProgress) -> EpisodeProgress:
-    """Write finished episodes, and begin the next ones."""
+    """Store the results of finished episodes, and begin the next episodes."""
     watch, run, beginning, age = progress.watch, progress.run, progress.beginning, progress.lasted
     over = watch.over & progress.active
     status = _failure(rig, beginning, watch, run.states)
@@ -181,7 +185,7 @@ def _turn_over(loop: Loop, rig: Rig, last: Array, progress: EpisodeProgress) -> 
 
 
 def _begin_next(rig: Rig, last: Array, progress: EpisodeProgress, begins: Array) -> EpisodeProgress:
-    """Begin another episode on the lanes where one is over."""
+    """Begin the next episode in the lanes where `begins` is true."""
     states, age, watch = progress.run.states, progress.lasted, progress.watch
 
     def follow(beginning: Beginning) -> Beginning:
@@ -195,7 +199,10 @@ def _begin_next(rig: Rig, last: Array, progress: EpisodeProgress, begins: Array)
 
 
 def _failure(rig: Rig, beginning: Beginning, watch: Watch, states: States) -> Array:
-    """Return DIVERGED, NON_FINITE, REACH for an axis commanded beyond its workspace, or else MISS."""
+    """Return the status of runs that must end: DIVERGED, NON_FINITE or REACH; MISS for the other runs.
+
+    REACH means that an axis was commanded beyond its workspace.
+    """
     energy = relative_energy(rig, states)
     least = jnp.maximum(beginning.energy, SLOW**2 / mass_share(rig))
     status = jnp.where(energy > DIVERGENCE_SPEED_RATIO**2 * least, DIVERGED, MISS)
