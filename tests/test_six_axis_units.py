@@ -24,7 +24,10 @@ def test_six_axis_builtins_are_plausible(name):
             {"chaser.inertia": [1.5e-5, 1.8e-5, 1.1e-5]},
             "chaser.interface: found 1 m for a radius",
         ),
-        ({"chaser.mass": 0.42}, "of 20.7 m, expected the size of the body: mass in kg, inertia in kg m^2"),
+        (
+            {"chaser.mass": 0.42},
+            "of 20.7 m, expected about the size of the body: mass in kg, inertia in",
+        ),
         ({"approach.attitude": [0.5, 0.4, 0.2]}, "approach.attitude: found 0.671 rad, expected at most 0.3"),
         (
             {"approach.velocity": [0.1, 0.2, -2.5]},

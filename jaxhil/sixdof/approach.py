@@ -21,7 +21,7 @@ def touching_height(
     offset_y: Float[Array, "*batch"],
     attitude: Quaternion,
 ) -> Float[Array, "*batch"]:
-    """Return the height z [m] of C at which the chaser first touches the target, lowered along z of T.
+    """Return the height z [m] of the frame C at the first touch, if the chaser moves down along z of T.
 
     The result is NaN if the chaser passes without a touch. Each search step is as long as the gap between
     the shapes, so that no step can pass a surface. Newton's method then refines the height to rounding.
@@ -43,7 +43,7 @@ def touching_height(
 
 
 def begin(bodies: Pair, pose: Pose, twist: Twist, before: Float[Array, "*batch"]) -> States:
-    """Return the states from which free flight for a time `before` [s] leads to a pose and a twist.
+    """Return the states a time `before` [s] earlier than a relative pose and twist, in free flight.
 
     The target is at rest with its centre of mass at the world's origin. Its body axes equal the world axes.
     """

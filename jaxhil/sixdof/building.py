@@ -127,7 +127,7 @@ def _before_touch(numbers: Values, bodies: Pair, groups: tuple[ContactGroup, ...
 
 @jax.jit
 def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, before) -> States:
-    """Return the states a time `before` [s] earlier than a first touch with the given motion of C."""
+    """Return the states a time `before` [s] earlier than a first touch with this offset and velocity."""
     turned = exponential(vector(attitude))
     height = touching_height(groups, offset[0], offset[1], turned)
     pose = Pose(Vector(offset[0], offset[1], height), turned)

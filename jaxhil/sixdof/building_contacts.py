@@ -160,7 +160,7 @@ def _law(contact: six_axes.Contact, numbers: Values, path: str) -> ContactLaw:
 
 
 def _parameters(contact: six_axes.Contact, numbers: Values, path: str) -> ContactParameters:
-    """Return a candidate's parameters of the contact law, (lanes,); slopes and depths (segments, lanes)."""
+    """Return a candidate's contact-law parameters, (lanes,); slopes and depths are (segments, lanes)."""
 
     def of_law(key: ContactKey) -> Any:
         if isinstance(key.default, bool):

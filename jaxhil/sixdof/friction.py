@@ -27,7 +27,7 @@ class Friction(eqx.Module):
     """Interface of all friction laws."""
 
     def init(self, like: Float[Array, "candidates *batch"]) -> tuple[Vector, ...]:
-        """Return the law's state before the first touch, for candidates shaped like `like`."""
+        """Return the law's state before the first touch, in arrays with the shape of `like`."""
         return ()
 
     @abc.abstractmethod

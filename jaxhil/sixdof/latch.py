@@ -90,7 +90,7 @@ def _sine(attitude: Quaternion) -> Array:
 
 
 def _product(matrix: Array, linear: Vector, angular: Vector) -> tuple[Vector, Vector]:
-    """Multiply each latch's 6 x 6 matrix by a linear and an angular vector."""
+    """Multiply each latch's 6 x 6 matrix by a 6-vector; return the linear and the angular part."""
     # The angular velocity is the same for all latches: its leading axis has length 1.
     parts = jnp.stack(jnp.broadcast_arrays(*jax.tree.leaves((linear, angular))))
     result = jnp.sum(matrix * parts[None], axis=1)

@@ -1,8 +1,9 @@
 """Loop of the six-axis rig, tick by tick.
 
-A tick has four steps. It reads the delayed wrench of the real contact and the pose of the hardware. The
-compensator computes the wrench command. The numerical model integrates the motion of both bodies under this
-wrench. The motion simulator receives the relative pose of the bodies as its command.
+A tick has four steps. The sensors read the delayed wrench of the real contact and the pose of the hardware.
+The compensator computes the wrench command. The numerical model integrates the motion of both bodies under
+this wrench. The motion simulator receives the relative pose of the bodies as its command.
+
 The contact wrench is computed at the hardware's pose, in T axes about T's origin, and acts at the model's T.
 """
 

@@ -42,9 +42,7 @@ class Metrics(NamedTuple):
     rotational_part: Float[Array, "..."]  # rotational part of the remaining twist error [1]
     # restitution at the point and along the normal of the first touch; only for a single touch [1]
     restitution: Float[Array, "..."]
-    reference_restitution: Float[
-        Array, "..."
-    ]  # restitution of the ideal contact; only for a single touch [1]
+    reference_restitution: Float[Array, "..."]  # restitution of the ideal contact; only for one touch [1]
     effective_mass: Float[Array, "..."]  # effective mass m_n at the first touch [kg]
     approach_velocity: Float[Array, "..."]  # approach velocity v_n along the normal of the first touch [m/s]
     point: Float[Array, "..."]  # point of the first touch, in T axes, (3, episodes, *batch) [m]

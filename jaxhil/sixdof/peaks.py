@@ -15,7 +15,7 @@ class Peak(NamedTuple):
 
 
 def no_peak(zero: Float[Array, "*batch"]) -> Peak:
-    """Return the peak before the first sample, 0 in every lane."""
+    """Return the initial `Peak`, whose value and samples are 0 in every lane."""
     return Peak(zero, (zero, zero), zero)
 
 

@@ -32,7 +32,7 @@ LARGEST_CONDITION = 100.0  # maximum condition number of a hexapod's Jacobian, w
 BLIND = STRETCH
 
 
-class Beginning(NamedTuple):
+class StartValues(NamedTuple):
     """Values at the start of a run that the checks need."""
 
     coordinates: Float[Array, "6 *batch"]  # coordinates of C relative to T
@@ -58,8 +58,8 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
         raise InputError(f"{mechanism.name}: {found}, expected at most {MOST_TICKS:.0e}")
     denominator = np.asarray(scenario.simulator.denominator)[..., 0]
     check_poles(mechanism.name, denominator, np.full(denominator.shape[1], scenario.control_period[0]))
-    begins: Beginning = jax.tree.map(np.asarray, _compiled()(scenario))
-    at = begins.coordinates[:, 0]
+    start: StartValues = jax.tree.map(np.asarray, _compiled()(scenario))
+    at = start.coordinates[:, 0]
     if not np.all(np.isfinite(at)):
         found = f"a chaser that passes the target without a touch (searched below {FAR:g} m)"
         raise InputError(
@@ -71,24 +71,24 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
         key = "start.chaser.attitude" if mechanism.start else "approach.angular_velocity"
         found = f"{key}: found a rotation by {angle:.3g} rad at the start"
         raise InputError(f"{mechanism.name}: {found}, expected {allowed}")
-    depth = float(begins.depth[0])
+    depth = float(start.depth[0])
     if depth > 0:
         key = "start.chaser.position" if mechanism.start else "approach.angular_velocity"
         change = "move the chaser along z of T" if mechanism.start else "reduce angular or sideways velocity"
         found = f"{key}: found a contact at the start, {depth:.3g} m deep"
         raise InputError(f"{mechanism.name}: {found}, expected a start without contact: {change}")
-    _check_speed(mechanism, begins, float(scenario.control_period[0]))
-    for (name, latch), caught in zip(mechanism.latch.items(), begins.caught, strict=True):
+    _check_speed(mechanism, start, float(scenario.control_period[0]))
+    for (name, latch), caught in zip(mechanism.latch.items(), start.caught, strict=True):
         if caught.any() and not latch.latched:
             found = f"latch.{name}.depth: found {latch.depth:g} m, with which the latch catches at the start"
             allowed = "a depth or an angle with which the latch catches later, or latched = true"
             raise InputError(f"{mechanism.name}: {found}, expected {allowed}")
-    _check_legs(mechanism, begins)
+    _check_legs(mechanism, start)
 
 
-def _check_speed(mechanism: SixAxisMechanism, begins: Beginning, period: float) -> None:
+def _check_speed(mechanism: SixAxisMechanism, start: StartValues, period: float) -> None:
     """Raise `InputError` if shapes are so fast that they could pass through each other undetected."""
-    speeds, sizes = (np.concatenate([pair[i][:, 0] for pair in begins.passing] or [[]]) for i in (0, 1))
+    speeds, sizes = (np.concatenate([pair[i][:, 0] for pair in start.passing] or [[]]) for i in (0, 1))
     for name, speed, size in zip(candidate_names(mechanism), speeds, sizes, strict=True):
         most = size / (BLIND * period)
         if speed > most:
@@ -98,13 +98,13 @@ def _check_speed(mechanism: SixAxisMechanism, begins: Beginning, period: float) 
             raise InputError(f"{mechanism.name}: {found}, expected {allowed}")
 
 
-def _check_legs(mechanism: SixAxisMechanism, begins: Beginning) -> None:
+def _check_legs(mechanism: SixAxisMechanism, start: StartValues) -> None:
     """Raise `InputError` if a hexapod cannot reach the start or the docked pose, or is nearly singular there.
 
     In the docked pose, C equals T.
     """
     stroke = mechanism.rig.simulator.stroke
-    poses = zip(("the start", "the docked pose"), begins.legs, begins.conditions, strict=False)
+    poses = zip(("the start", "the docked pose"), start.legs, start.conditions, strict=False)
     for pose, legs, conditions in poses:
         lengths, number = legs[:, 0], float(conditions[0])
         if not number <= LARGEST_CONDITION:
@@ -118,12 +118,12 @@ def _check_legs(mechanism: SixAxisMechanism, begins: Beginning) -> None:
 
 
 @cache
-def _compiled() -> Callable[[Scenario], Beginning]:
-    """Return the compiled version of `_beginning`."""
-    return jax.jit(_beginning, compiler_options=supported_options(SINGLE_RUN_OPTIONS))
+def _compiled() -> Callable[[Scenario], StartValues]:
+    """Return the compiled version of `_start_values`."""
+    return jax.jit(_start_values, compiler_options=supported_options(SINGLE_RUN_OPTIONS))
 
 
-def _beginning(scenario: Scenario) -> Beginning:
+def _start_values(scenario: Scenario) -> StartValues:
     """Compute the values at the start of the runs that the checks need."""
     pose, twist = relative(scenario.bodies, scenario.start)
     at, *_ = model_motion(scenario.bodies, scenario.start)
@@ -145,4 +145,4 @@ def _beginning(scenario: Scenario) -> Beginning:
         passing.append(
             (jnp.sqrt(rate**2 + dot(slip, slip)), jnp.broadcast_to(group.candidates.size, rate.shape))
         )
-    return Beginning(at, deepest(scenario.groups, pose), tuple(passing), caught, legs, conditions)
+    return StartValues(at, deepest(scenario.groups, pose), tuple(passing), caught, legs, conditions)

@@ -185,7 +185,7 @@ def _past(passage: Passage) -> Past:
 
 
 def _recorded(passage: Passage, approach: Approach, ahead: Passage, now: Instant) -> Passage:
-    """Return `ahead` with the gap recorded that begins or ends in the step from `passage` to `ahead`."""
+    """Record in `ahead` the gap, if any, that begins or ends in the step from `passage` to `ahead`."""
     was, touches = _touches(passage), _touches(ahead)
     slot = jnp.arange(GAPS, dtype=jnp.int32).reshape(-1, *[1] * was.ndim) == passage.slot[None]
     change = jnp.stack(jax.tree.leaves(jax.tree.map(jnp.subtract, now.twist, approach.twist)))

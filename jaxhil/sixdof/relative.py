@@ -36,14 +36,14 @@ class Frame(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """Pose of C relative to T."""
+    """Pose of the chaser's frame C relative to the target's frame T."""
 
     position: Vector  # position p of C's origin, in T axes [m]
     attitude: Quaternion  # rotation from C axes to T axes
 
 
 class Twist(NamedTuple):
-    """Linear and angular velocity of C relative to T, observed from T."""
+    """Velocity of the chaser's frame C relative to the target's frame T, observed from T."""
 
     linear: Vector  # velocity v of C's origin, in T axes [m/s]
     angular: Vector  # angular velocity w, in T axes [rad/s]
@@ -102,7 +102,7 @@ def relative_motion(target: Frame, chaser: Frame) -> tuple[Pose, Twist]:
 
 @jax.jit
 def relative(bodies: Pair, states: States) -> tuple[Pose, Twist]:
-    """Return pose and twist of C relative to T for the states of the two bodies."""
+    """Return pose and twist of the chaser's frame C relative to the target's frame T."""
     target, chaser = (interface_frame(*item) for item in zip(bodies, states, strict=True))
     return relative_motion(target, chaser)
 

@@ -1,8 +1,8 @@
 """Rollout of a batch of six-axis runs on the rig, until all evaluated episodes are over.
 
 An episode is a contact with all its touches (`jaxhil.sixdof.watch`). Before each episode, the ideal contact
-from the same states is integrated. The ticks run in segments (constant `STRETCH`); the end of the runs is
-checked after each segment. The program ends when the longest run of the batch ends.
+from the same states is integrated. The ticks run in segments of `STRETCH` ticks. After each segment, the
+program checks which runs have ended. The program ends when the longest run of the batch ends.
 """
 
 from typing import Any, NamedTuple

@@ -1,8 +1,8 @@
-"""Rotations as unit quaternions, and rotation vectors: exponential, logarithm and left Jacobian.
+"""Rotations as unit quaternions and rotation vectors: exponential, logarithm and left Jacobian.
 
-Quaternions q = (w, v) are Hamilton's; q and -q are the same rotation. A rotation vector theta is the axis
-times the angle t = |theta| [rad]. Functions of t are power series in t^2, which are summed near t = 0: thus
-values and derivatives of any order are accurate there.
+Quaternions q = (w, v) follow Hamilton's convention; q and -q are the same rotation. A rotation vector theta
+is the axis times the angle t = |theta| [rad]. Near t = 0, functions of t are computed as power series in t^2,
+so that values and derivatives of any order are accurate there.
 """
 
 from math import factorial
@@ -15,26 +15,29 @@ from jaxtyping import Array, Float
 
 from jaxhil.sixdof.vectors import Vector, cross, dot
 
-PI = 3.141592653589793, 1.2246467991473532e-16  # their sum has twice the digits
-NEAR = (PI[0] / 2) ** 2  # limit of t^2 for summing series; eleven terms give rounding accuracy
+PI = 3.141592653589793, 1.2246467991473532e-16  # pi as a sum of two floats, which has twice the digits
+NEAR = (PI[0] / 2) ** 2  # maximum t^2 for the power series, whose eleven terms are accurate to rounding
 
 
 class Quaternion(NamedTuple):
-    """Rotation w + v of norm 1; from axes A to axes B it maps components in A to components in B."""
+    """Rotation as a unit quaternion (w, v).
+
+    A rotation from axes A to axes B maps a vector's components in A to its components in B.
+    """
 
     w: Float[Array, "..."]  # cos(t/2)
     v: Vector  # sin(t/2) times the axis
 
 
 def identity(like: Float[Array, "*batch"]) -> Quaternion:
-    """Return the identity rotation, for a batch shaped like `like`."""
+    """Return the identity rotation, for a batch with the shape of `like`."""
     zero = jnp.zeros_like(like)
     return Quaternion(zero + 1, Vector(zero, zero, zero))
 
 
 @jax.jit
 def compose(second: Quaternion, first: Quaternion) -> Quaternion:
-    """Return the rotation `first` followed by the rotation `second`: their product."""
+    """Return the product of two rotations: `first`, followed by `second`."""
     (a, u), (b, v) = second, first
     return Quaternion(a * b - dot(u, v), a * v + b * u + cross(u, v))
 
@@ -46,47 +49,50 @@ def reverse(rotation: Quaternion) -> Quaternion:
 
 @jax.jit
 def rotate(rotation: Quaternion, vector: Vector) -> Vector:
-    """Return R vector."""
+    """Return R vector, where R is the matrix of the rotation."""
     along = 2 * cross(rotation.v, vector)
     return vector + rotation.w * along + cross(rotation.v, along)
 
 
 def rotate_back(rotation: Quaternion, vector: Vector) -> Vector:
-    """Return R^T vector."""
+    """Return R^T vector, where R is the matrix of the rotation."""
     return rotate(reverse(rotation), vector)
 
 
 @jax.jit
 def normalise(rotation: Quaternion) -> Quaternion:
-    """Return the same rotation with norm 1 to rounding."""
-    share = 1 / jnp.sqrt(rotation.w**2 + dot(rotation.v, rotation.v))
-    return Quaternion(share * rotation.w, share * rotation.v)
+    """Scale a quaternion to norm 1, to correct rounding errors."""
+    scale = 1 / jnp.sqrt(rotation.w**2 + dot(rotation.v, rotation.v))
+    return Quaternion(scale * rotation.w, scale * rotation.v)
 
 
 @jax.jit
 def exponential(theta: Vector) -> Quaternion:
-    """Return the rotation with the rotation vector theta [rad]."""
+    """Convert a rotation vector [rad] to a quaternion."""
     square = dot(theta, theta) / 4
     return Quaternion(_cosine(square), (_sine(square) / 2) * theta)
 
 
 @jax.jit
 def logarithm(rotation: Quaternion) -> Vector:
-    """Return the rotation vector [rad], with norm at most pi; for a half turn, either of the two."""
+    """Convert a rotation to its rotation vector [rad], with a norm of at most pi.
+
+    For a rotation by pi, the result is one of the two possible vectors.
+    """
     sign = jnp.where(rotation.w < 0, -1, 1).astype(rotation.w.dtype)
     w, v = sign * rotation.w, sign * rotation.v
     # tan(a/2) = tan(a)/(1 + sqrt(1 + tan(a)^2)) reduces tan(t/2) to tan(t/8), which is less than 1/2.
     square = dot(v, v)
-    share = 1 / (w + jnp.sqrt(w**2 + square))
-    share = share / (1 + jnp.sqrt(1 + share**2 * square))
-    return (8 * share * _sum(_ARCTANGENT, share**2 * square)) * v
+    scale = 1 / (w + jnp.sqrt(w**2 + square))
+    scale = scale / (1 + jnp.sqrt(1 + scale**2 * square))
+    return (8 * scale * _sum(_ARCTANGENT, scale**2 * square)) * v
 
 
 @jax.jit
 def left_jacobian(theta: Vector, rate: Vector) -> Vector:
-    """Return Jl(theta) rate: the angular velocity [rad/s] of a rotation vector with a `rate` [rad/s].
+    """Return the angular velocity Jl(theta) rate [rad/s] for a rotation vector theta and its rate [rad/s].
 
-    The angular velocity is in the axes to which exp(theta) maps.
+    Jl is the left Jacobian. The angular velocity is in the axes to which the rotation maps.
     """
     square = dot(theta, theta)
     once = cross(theta, rate)
@@ -95,16 +101,16 @@ def left_jacobian(theta: Vector, rate: Vector) -> Vector:
 
 @jax.jit
 def inverse_left_jacobian(theta: Vector, angular_velocity: Vector) -> Vector:
-    """Return Jl(theta)^-1 w: the rate [rad/s] of the rotation vector at the angular velocity w [rad/s].
+    """Return the rate Jl(theta)^-1 w [rad/s] of a rotation vector theta for an angular velocity w [rad/s].
 
-    |theta| must be less than 2 pi.
+    Jl is the left Jacobian. The norm of theta must be less than 2 pi.
     """
     once = cross(theta, angular_velocity)
     return angular_velocity - 0.5 * once + _cotangent(dot(theta, theta)) * cross(theta, once)
 
 
 def _sum(coefficients, x):
-    """Return the power series of x."""
+    """Evaluate a power series in x with these coefficients, lowest order first."""
     total = jnp.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         total = coefficient + x * total
@@ -112,7 +118,7 @@ def _sum(coefficients, x):
 
 
 def _alternating(first: int) -> tuple[float, ...]:
-    """Return the coefficients (-1)^k / (2k + first)!."""
+    """Return the eleven coefficients (-1)^k / (2k + first)! for k = 0 to 10."""
     return tuple((-1) ** k / factorial(2 * k + first) for k in range(11))
 
 
@@ -129,9 +135,9 @@ def _sine(square: Array) -> Array:
 
 
 def _reduced(square: Array) -> tuple[Array, Array, Array]:
-    """Return r/t, r^2 and (-1)^k for t = r + k pi with |r| <= pi/2.
+    """Reduce the angle t = sqrt(square) to t = r + k pi with |r| <= pi/2; return r/t, r^2 and (-1)^k.
 
-    The library's sine and cosine would be called separately for each number.
+    The power series for sine and cosine are faster than JAX's functions, which call a library per number.
     """
     near = square <= NEAR
     safe = jnp.where(near, 1, square)
@@ -147,23 +153,23 @@ def _reduced(square: Array) -> tuple[Array, Array, Array]:
 
 
 def _versine(square: Array) -> Array:
-    """Return (1 - cos t)/t^2."""
+    """Return (1 - cos t)/t^2 as a function of t^2."""
     return _sine(square / 4) ** 2 / 2
 
 
 def _cubic(square: Array) -> Array:
-    """Return (t - sin t)/t^3."""
+    """Return (t - sin t)/t^3 as a function of t^2."""
     sine = _sine(square / 4) * _cosine(square / 4)
     return _near(_CUBIC, NEAR, square, 1 - sine)
 
 
 def _cotangent(square: Array) -> Array:
-    """Return (1 - t/2 cot(t/2))/t^2."""
+    """Return (1 - t/2 cot(t/2))/t^2 as a function of t^2."""
     return _near(_BERNOULLI, 0.25, square, 1 - _cosine(square / 4) / _sine(square / 4))
 
 
 def _near(series: tuple[float, ...], limit: float, square: Array, beyond: Array) -> Array:
-    """Return the series of t^2 up to a limit, and `beyond`/t^2 above it."""
+    """Return the power series in t^2 where t^2 is at most `limit`, and `beyond`/t^2 elsewhere."""
     near = square <= limit
     return jnp.where(near, _sum(series, jnp.where(near, square, 0)), beyond / jnp.where(near, 1, square))
 

@@ -1,4 +1,4 @@
-"""Run of a six-axis mechanism: results of each episode, and all ticks."""
+"""Simulation of a six-axis mechanism on the rig: results of each episode, and all ticks."""
 
 import math
 import os
@@ -29,76 +29,133 @@ from jaxhil.sixdof.rollout import STATUS_NAMES
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.vectors import Vector, cross, direction, vector
 
-GOOD = ("rebounded", "captured")  # statuses of good episodes
-DEEP = 0.5  # penetration over shapes' size above which there is a warning
+GOOD = ("rebounded", "captured")  # statuses of episodes that ended as they should
+DEEP = 0.5  # penetration, divided by the shapes' size, above which the summary contains a warning [1]
 
 
 class Episode(NamedTuple):
-    """Results of a contact with all its touches; NaN for values that it does not have."""
+    """Results of one episode (a contact with all its touches); NaN for a result that is not defined.
 
-    energy_error: float  # kinetic energy minus that of the ideal contact, over that of the approach [1]
-    twist_error: float  # deviation of the twist from that of the ideal contact, over the latter's change [1]
-    normal_part: float  # part of the twist error along the ideal impulse [1]
-    lateral_part: float  # translational part of the rest [1]
-    rotational_part: float  # rotational part of the rest [1]
-    restitution: float  # e; NaN unless there is a single touch [1]
-    reference_restitution: float  # e* of the ideal contact [1]
-    effective_mass: float  # m_n at the first touch [kg]
-    approach_velocity: float  # along the normal of the first touch [m/s]
-    point: tuple[float, ...]  # point of the first touch, in T axes [m]
-    normal: tuple[float, ...]  # normal there, outward from the target
-    peak_force: float  # of the real contact [N]
-    reference_peak_force: float  # of the ideal contact [N]
-    peak_moment: float  # of the real contact, about T's origin [N m]
-    reference_peak_moment: float  # of the ideal contact [N m]
-    duration: float  # time in touch [s]
-    reference_duration: float  # time in touch of the ideal contact [s]
-    touches: int  # number of onsets of touch, over all candidates
-    reference_touches: int  # likewise in the ideal contact
-    penetration: float  # largest penetration of the real contact, over the size of its shapes [1]
-    status: str  # one of `rollout.STATUS_NAMES`
+    The ideal contact is the contact without a rig from the same initial states.
+
+    Attributes:
+        energy_error: Change of kinetic energy minus that of the ideal contact, divided by the energy of the
+            approach [1].
+        twist_error: Norm of the difference between the twist and the ideal contact's twist, divided by the
+            norm of the ideal contact's change of twist [1].
+        normal_part: Part of the twist error along the ideal contact's impulse [1].
+        lateral_part: Translational part of the remaining twist error [1].
+        rotational_part: Rotational part of the remaining twist error [1].
+        restitution: Restitution e [1]; NaN unless there is a single touch.
+        reference_restitution: Restitution e* of the ideal contact [1]; NaN unless there is a single touch.
+        effective_mass: Effective mass m_n at the first touch [kg].
+        approach_velocity: Approach velocity along the normal of the first touch [m/s].
+        point: Point of the first touch, in T axes [m].
+        normal: Normal of the target's surface at this point, outward.
+        peak_force: Peak force of the real contact [N].
+        reference_peak_force: Peak force of the ideal contact [N].
+        peak_moment: Peak moment of the real contact, about T's origin [N m].
+        reference_peak_moment: Peak moment of the ideal contact, about T's origin [N m].
+        duration: Time during which the hardware touches [s].
+        reference_duration: Time during which the ideal contact touches [s].
+        touches: Number of touches of the hardware, summed over the candidates.
+        reference_touches: Number of touches of the ideal contact, summed over the candidates.
+        penetration: Largest penetration of the hardware, divided by the size of the shapes [1].
+        status: How the episode ended, one of `rollout.STATUS_NAMES`.
+    """
+
+    energy_error: float
+    twist_error: float
+    normal_part: float
+    lateral_part: float
+    rotational_part: float
+    restitution: float
+    reference_restitution: float
+    effective_mass: float
+    approach_velocity: float
+    point: tuple[float, ...]
+    normal: tuple[float, ...]
+    peak_force: float
+    reference_peak_force: float
+    peak_moment: float
+    reference_peak_moment: float
+    duration: float
+    reference_duration: float
+    touches: int
+    reference_touches: int
+    penetration: float
+    status: str
 
 
 class Final(NamedTuple):
-    """Motion at the end of a run."""
+    """Motion of the bodies at the end of a run.
 
-    time: float  # [s]
-    pose: tuple[float, ...]  # position and rotation vector of C against T, in T axes [m, rad]
-    twist: tuple[float, ...]  # velocity and angular velocity, likewise [m/s, rad/s]
-    v1: tuple[float, ...]  # velocity of the target's centre of mass, in world axes [m/s]
-    w1: tuple[float, ...]  # angular velocity of the target, in body axes [rad/s]
-    v2: tuple[float, ...]  # velocity of the chaser's centre of mass, in world axes [m/s]
-    w2: tuple[float, ...]  # angular velocity of the chaser, in body axes [rad/s]
+    Attributes:
+        time: Time since the start of the run [s].
+        pose: Position and rotation vector of the chaser's frame C relative to the target's frame T, in T axes
+            [m, rad].
+        twist: Velocity and angular velocity of C relative to T, in T axes [m/s, rad/s].
+        v1: Velocity of the target's centre of mass, in world axes [m/s].
+        w1: Angular velocity of the target, in body axes [rad/s].
+        v2: Velocity of the chaser's centre of mass, in world axes [m/s].
+        w2: Angular velocity of the chaser, in body axes [rad/s].
+    """
+
+    time: float
+    pose: tuple[float, ...]
+    twist: tuple[float, ...]
+    v1: tuple[float, ...]
+    w1: tuple[float, ...]
+    v2: tuple[float, ...]
+    w2: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class SixAxisRun:
-    """One run of a six-axis mechanism's episodes under a compensator."""
+    """Simulated run of a six-axis mechanism with a compensator.
+
+    Attributes:
+        mechanism: Mechanism.
+        compensator: Name of the compensator.
+        gains: Gains of the compensator by name [SI units].
+        seed: Seed of the sensors' noise.
+        episodes: Results of every episode.
+        status: Status of the first episode that ended neither "rebounded" nor "captured"; if there is no such
+            episode, status of the last episode.
+        final: Motion of the numerical model at the end of the run.
+        meaning: Summary of the mechanism.
+    """
 
     mechanism: SixAxisMechanism = field(repr=False)
-    compensator: str  # name of the compensator
-    gains: dict[str, float]  # gains by name, in SI units
-    seed: int  # seed of the sensor's noise
+    compensator: str
+    gains: dict[str, float]
+    seed: int
     episodes: tuple[Episode, ...]
-    status: str  # status of the first episode not in `GOOD`, else of the last episode
-    final: Final  # final motion of the numerical model
-    meaning: Meaning  # summary of the mechanism
+    status: str
+    final: Final
+    meaning: Meaning
 
     @cached_property
     def reference_final(self) -> Final:
-        """Motion in the ideal contact with the same start, at the time of `final`."""
+        """Motion of the bodies in the ideal contact from the same start, at the time of `final`."""
         return final_in_space(self.mechanism, self.final.time)
 
     @cached_property
     def ticks(self) -> Recorded:
-        """All ticks of the run."""
+        """Signals at all ticks of the run, computed when this attribute is first used."""
         with jax_context():
             return record(self.mechanism, self.compensator, self.gains, self.seed, self.final.time)
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:
-        """Write the ticks as CSV, one line each after a line of names, in SI units with all digits.
+        """Write the signals at all ticks as a CSV file, in SI units with full precision.
 
-        Raise `InputError` if the file cannot be written.
+        The file has a header line, then one line for each tick.
+
+        Args:
+            path: Path of the file.
+
+        Raises:
+            InputError: The file cannot be written.
         """
         write_csv(path, {name: column.tolist() for name, column in table(self.ticks).items()})
 
@@ -106,9 +163,9 @@ class SixAxisRun:
 def simulate_six_axes(
     mechanism: SixAxisMechanism, compensator: str = "none", gains: Any = None, *, seed: int = 0
 ) -> SixAxisRun:
-    """Run a nominal six-axis mechanism once; the arguments are those of `jaxhil.simulate`.
+    """Simulate the episodes of a nominal six-axis mechanism once.
 
-    `compensator` is one of `SIX_AXIS_COMPENSATORS`; it acts on each channel of the wrench separately. Raise
+    The arguments are those of `jaxhil.simulate`; `compensator` is one of `SIX_AXIS_COMPENSATORS`. Raise
     `InputError` if an argument is invalid.
     """
     if compensator not in SIX_AXIS_COMPENSATORS:
@@ -128,7 +185,7 @@ def simulate_six_axes(
 def _result(
     mechanism: SixAxisMechanism, compensator: str, gains: dict[str, float], seed: int, outcome: Any
 ) -> SixAxisRun:
-    """Return the run from the metrics, final time, final motion and tangential mass."""
+    """Build the `SixAxisRun` from the arrays that the compiled simulation returns (`outcome`)."""
     metrics, time, final, tangential = outcome
     check_followed(mechanism, metrics)
     episodes = tuple(
@@ -162,20 +219,20 @@ def _result(
 
 
 def final_in_space(mechanism: SixAxisMechanism, time: float) -> Final:
-    """Return the motion in the ideal contact at a time [s] after a mechanism's start."""
+    """Return the motion of the bodies in the ideal contact, at a `time` [s] after the start."""
     with jax_context():
         scenario = build_scenarios(mechanism)
         return _final(time, jax.device_get(_ideal_motion(scenario, np.array([time]))))
 
 
 def check_followed(mechanism: SixAxisMechanism, metrics: Metrics) -> None:
-    """Raise `InputError` if the ideal contact was not integrated to its end."""
+    """Raise `InputError`, with advice, if the ideal contact could not be integrated to its end."""
     if not np.all(np.isfinite(metrics.reference_duration)):
         raise InputError(f"{mechanism.name}: {_stiffest(mechanism)}")
 
 
 def _stiffest(mechanism: SixAxisMechanism) -> str:
-    """Return advice for an ideal contact that takes too many steps."""
+    """Return key, found value and expected value for an ideal contact that takes too many steps."""
     frictions = {name: contact.friction for name, contact in mechanism.contact.items() if contact.friction}
     slips = {name: law.slip / max(law.coefficient, 1e-9) for name, law in frictions.items() if law.slip}
     if slips:
@@ -189,7 +246,7 @@ def _stiffest(mechanism: SixAxisMechanism) -> str:
 
 
 def _episode(metrics: Metrics, slot: int) -> Episode:
-    """Return the results of one episode."""
+    """Convert the metrics of episode number `slot` to an `Episode`."""
 
     def value(name: str) -> Any:
         entry = np.asarray(getattr(metrics, name))[..., slot, 0]
@@ -201,19 +258,19 @@ def _episode(metrics: Metrics, slot: int) -> Episode:
 
 
 def _final(time: float, motion: Any) -> Final:
-    """Return the motion at the end of a run."""
+    """Convert the arrays that `_motion` returns to a `Final`."""
     pose, twist, *velocities = (tuple(np.asarray(part, float)[:, 0].tolist()) for part in motion)
     return Final(time, pose, twist, *velocities)
 
 
 @cache
 def _compiled() -> Callable[..., Any]:
-    """Return the compiled function for runs."""
+    """Return the compiled version of `_run`."""
     return jax.jit(_run, static_argnums=0, compiler_options=supported_options(SINGLE_RUN_OPTIONS))
 
 
 def _run(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Any, ...]:
-    """Return the metrics of the episodes, the final time, the final motion, and the tangential mass."""
+    """Simulate the runs; return metrics, duration [s], final motion, and tangential effective mass [kg]."""
     result = evaluate(loop, gains, scenario)
     final = _motion(scenario.bodies, result.final)
     return result.metrics, result.final_time, final, _tangential_mass(scenario, result.metrics)
@@ -221,12 +278,15 @@ def _run(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Any, ..
 
 @jax.jit
 def _ideal_motion(scenario: Scenario, time: Any) -> tuple[Any, ...]:
-    """Return the motion in the ideal contact at a time [s]."""
+    """Return the arrays of `_motion` for the ideal contact at a `time` [s]."""
     return _motion(scenario.bodies, reference_final(scenario, time))
 
 
 def _tangential_mass(scenario: Scenario, metrics: Metrics) -> Any:
-    """Return the effective mass [kg] of the first touch along the surface: the lesser of two directions."""
+    """Return the effective mass [kg] along the surface at the first touch.
+
+    The result is the smaller of the masses in two perpendicular directions.
+    """
     point, normal = (vector(part[:, 0]) for part in (metrics.point, metrics.normal))
     zero = jnp.zeros_like(normal.x)
     flat = jnp.abs(normal.x) < 0.9
@@ -236,6 +296,6 @@ def _tangential_mass(scenario: Scenario, metrics: Metrics) -> Any:
 
 
 def _motion(bodies: Pair, states: States) -> tuple[Any, ...]:
-    """Return the values of `Final` except the time, each along a leading axis."""
+    """Return the fields of `Final` without the time, as arrays (components, lanes)."""
     pose, twist, *motions = motion(bodies, states)
     return pose, twist, *(part for rows in motions for part in (rows[7:10], rows[10:]))

@@ -1,6 +1,6 @@
-"""Scenario in six degrees of freedom as arrays: every number of a run is a leaf.
+"""Scenarios of a six-axis mechanism as arrays that contain every number of a run.
 
-The batch is the trailing axis; candidates, latches and the axes of the motion simulator come before it.
+The last axis of all arrays is the batch. Candidates, latches and simulator axes have an axis before it.
 """
 
 from typing import NamedTuple
@@ -16,15 +16,15 @@ from jaxhil.sixdof.sensor import Sensor
 
 
 class Scenario(NamedTuple):
-    """Batch of scenarios, one run per lane."""
+    """Batch of scenarios; each lane is one run."""
 
     bodies: Pair
-    start: States  # numerical model at tick 0
-    groups: tuple[ContactGroup, ...]  # candidates of the contact
+    start: States  # states of the numerical model at tick 0
+    groups: tuple[ContactGroup, ...]  # groups of contact candidates
     latches: tuple[Latch, ...]
-    simulator: MotionSimulatorBatch  # model of each axis, (..., axes, *batch), without limits
-    kinematics: Kinematics  # relation of axes and coordinates
-    sensor: Sensor
-    control_period: Float[Array, "*batch"]  # T [s]
-    duration: Float[Array, "*batch"]  # longest duration of the run, rounded to ticks [s]
-    key: UInt32[Array, "2 *batch"]  # key of the sensor's noise
+    simulator: MotionSimulatorBatch  # transfer function of each axis, (..., axes, *batch), without limits
+    kinematics: Kinematics  # kinematics of the motion simulator
+    sensor: Sensor  # sensors of force and pose
+    control_period: Float[Array, "*batch"]  # control period T [s]
+    duration: Float[Array, "*batch"]  # maximum duration of the run [s], which is rounded to ticks
+    key: UInt32[Array, "2 *batch"]  # key of the sensors' noise

@@ -1,9 +1,9 @@
-"""Six-axis force sensor on the ground: its reading of a contact, and the controller's reconstruction.
+"""Six-axis force sensor of the rig, and the controller's reconstruction of the contact wrench.
 
-The sensor is on one of two sides. On the fixed side, under the target's mechanism, it reads the reaction; the
-weight on it is constant and tared. On the moving side, between the flange and the chaser's mechanism, it also
-carries this mechanism, the tool, whose weight and inertia add to the reading and change with the pose. The
-loop models delay and lag.
+A sensor on the fixed side, under the target's mechanism, reads the reaction; the constant weight on it is
+tared. A sensor on the moving side is between the robot's flange and the chaser's mechanism, which is called
+the tool. The sensor also reads the tool's weight and inertia, which change with the pose. Delay and lag of
+the sensor are part of `jaxhil.sixdof.loop`.
 """
 
 from typing import NamedTuple
@@ -19,48 +19,47 @@ from jaxhil.sixdof.vectors import Matrix, Vector, components, cross
 
 
 class Tool(NamedTuple):
-    """Mass between a sensor on the moving side and the contact."""
+    """Mass properties of the mechanism that a sensor on the moving side carries."""
 
-    mass: Float[Array, "..."]  # m_t [kg]
-    centre: Vector  # c, centre of mass from C's origin, in C axes [m]
-    inertia: Matrix  # J_t about the centre of mass, in C axes [kg m^2]
+    mass: Float[Array, "..."]  # mass m_t [kg]
+    centre: Vector  # vector c from C's origin to the centre of mass, in C axes [m]
+    inertia: Matrix  # inertia J_t about the centre of mass, in C axes [kg m^2]
 
 
 class SampleErrors(NamedTuple):
-    """Errors of a sample; per channel (fx, fy, fz, mx, my, mz), in N and N m."""
+    """Errors of the force sensor's samples, per channel (fx, fy, fz, mx, my, mz) [N, N m]."""
 
-    # sensitivity of each channel (row) to each component [1]; None for the identity
+    # sensitivity of each channel (row) to each component of the wrench (column); None for the identity
     crosstalk: Float[Array, "6 6 *batch"] | None
     bias: Float[Array, "6 *batch"]
-    quantum: Float[Array, "6 *batch"]  # 0 without quantisation
+    quantum: Float[Array, "6 *batch"]  # resolution; 0 without quantisation
     dead_zone: Float[Array, "6 *batch"]
     range: Float[Array, "6 *batch"]  # infinite if unlimited
 
 
 class Sensor(NamedTuple):
-    """Force sensor, and the controller's assumptions about it."""
+    """Sensors of force and pose, and the controller's assumptions about the force sensor."""
 
-    delay: Float[Array, "*batch"]  # [s]
-    time_constant: Float[Array, "*batch"]  # time constant of the lag of all channels [s]; 0 for none
+    delay: Float[Array, "*batch"]  # delay of the force sensor [s]
+    time_constant: Float[Array, "*batch"]  # time constant of the lag of all channels [s]; 0 without a lag
     errors: SampleErrors
-    noise_std: Float[Array, "6 *batch"]  # standard deviation of white noise [N, N m]
-    mounting: Pose | None  # pose of a sensor on the fixed side relative to T; None if it is T
+    noise_std: Float[Array, "6 *batch"]  # standard deviation of the white noise [N, N m]
+    mounting: Pose | None  # pose of a sensor on the fixed side relative to T; None if the sensor is at T
     tool: Tool  # tool of a sensor on the moving side
-    gravity: Vector  # in T axes [m/s^2]
-    assumed_tool: Tool  # tool as assumed by the controller
-    assumed_gravity: Vector  # likewise [m/s^2]
-    assumed_bias: Float[Array, "6 *batch"]  # likewise [N, N m]
-    position_delay: Float[Array, "*batch"]  # delay of the measured pose [s]
-    # standard deviation of white noise of the pose's coordinates, and step to which they are rounded [m, rad]
-    position_noise_std: Float[Array, "6 *batch"]
-    position_quantum: Float[Array, "6 *batch"]
+    gravity: Vector  # gravity in T axes [m/s^2]
+    assumed_tool: Tool  # tool that the controller assumes
+    assumed_gravity: Vector  # gravity that the controller assumes, in T axes [m/s^2]
+    assumed_bias: Float[Array, "6 *batch"]  # bias that the controller assumes [N, N m]
+    position_delay: Float[Array, "*batch"]  # delay of the pose sensor [s]
+    position_noise_std: Float[Array, "6 *batch"]  # standard deviation of the coordinates' noise [m, rad]
+    position_quantum: Float[Array, "6 *batch"]  # resolution of the coordinates [m, rad]
 
 
 def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity: Vector) -> Wrench:
-    """Return weight and inertia of the tool [N, N m] on the flange, about C's origin, in T axes.
+    """Return the wrench of the tool's weight and inertia [N, N m], about C's origin, in T axes.
 
-    `acceleration` contains the accelerations of C's origin and of the rotation, on the ground, where T is at
-    rest.
+    T is at rest on the ground. `acceleration` contains the acceleration of C's origin and the angular
+    acceleration of the tool.
     """
     centre = rotate(pose.attitude, tool.centre)
     angular, alpha = twist.angular, acceleration.angular
@@ -71,13 +70,13 @@ def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity
 
 
 def weight(tool: Tool, attitude: Quaternion, gravity: Vector) -> Wrench:
-    """Return the weight of the tool alone, as `tool_load` does."""
+    """Return the wrench of the tool's weight [N, N m], about C's origin, in T axes."""
     force = tool.mass * gravity
     return Wrench(force, cross(rotate(attitude, tool.centre), force))
 
 
 def tool_mass(tool: Tool) -> Float[Array, "6 6 *batch"]:
-    """Return the tool's mass matrix about C's origin, for C aligned with T."""
+    """Return the tool's mass matrix about C's origin [kg, kg m, kg m^2], if C and T have equal axes."""
     mass, centre = tool.mass, components(tool.centre)
     unit = jnp.eye(3, dtype=mass.dtype).reshape(3, 3, *[1] * mass.ndim)
     zero = jnp.zeros_like(mass)
@@ -93,16 +92,16 @@ def tool_mass(tool: Tool) -> Float[Array, "6 6 *batch"]:
 def read_moving(wrench: Wrench, load: Wrench, pose: Pose) -> Wrench:
     """Return the reading of a sensor on the moving side, about C's origin, in C axes.
 
-    It is the sum of contact and tool on the flange.
+    The reading is the sum of the contact's `wrench` and the tool's `load`.
     """
     moment = wrench.moment - cross(pose.position, wrench.force) + load.moment
     return Wrench(*(rotate_back(pose.attitude, part) for part in (wrench.force + load.force, moment)))
 
 
 def undo_moving(reading: Wrench, load: Wrench, pose: Pose) -> Wrench:
-    """Return the contact's wrench from a reading on the moving side.
+    """Reconstruct the contact's wrench from the reading of a sensor on the moving side.
 
-    `load` is the tool's weight as assumed by the controller, `pose` the measured pose.
+    `load` is the tool's weight that the controller assumes, `pose` the measured pose.
     """
     force, moment = (rotate(pose.attitude, part) for part in reading)
     force = force - load.force
@@ -110,9 +109,9 @@ def undo_moving(reading: Wrench, load: Wrench, pose: Pose) -> Wrench:
 
 
 def read_fixed(wrench: Wrench, mounting: Pose | None) -> Wrench:
-    """Return the reading of a sensor on the fixed side, about its own origin, in its own axes: the reaction.
+    """Return the reading (the reaction) of a sensor on the fixed side, in the sensor's frame.
 
-    `mounting` is the pose of its frame relative to T, None if it is T.
+    `mounting` is the pose of this frame relative to T; None if the frame equals T.
     """
     if mounting is None:
         return Wrench(-wrench.force, -wrench.moment)
@@ -122,7 +121,7 @@ def read_fixed(wrench: Wrench, mounting: Pose | None) -> Wrench:
 
 
 def undo_fixed(reading: Wrench, mounting: Pose | None) -> Wrench:
-    """Return the contact's wrench from a reading on the fixed side."""
+    """Reconstruct the contact's wrench from the reading of a sensor on the fixed side."""
     if mounting is None:
         return Wrench(-reading.force, -reading.moment)
     position, attitude = mounting
@@ -133,11 +132,11 @@ def undo_fixed(reading: Wrench, mounting: Pose | None) -> Wrench:
 def sample(
     reading: Wrench, errors: SampleErrors, noise: Float[Array, "6 *batch"] | None, has_effects: bool = True
 ) -> Wrench:
-    """Return a sample of a reading: with cross-talk, bias and noise [N, N m].
+    """Add cross-talk, bias and `noise` [N, N m] to a reading.
 
-    `has_effects` adds quantum, dead zone and range.
+    With `has_effects`, apply quantum, dead zone and range too.
     """
-    # Components are separate: the compiler would compute slices of stacked arrays repeatedly.
+    # Each component is a separate array, because the compiler would compute slices of a stack repeatedly.
     components, structure = jax.tree.flatten(reading)
 
     def channel(row: int) -> Array:
@@ -155,5 +154,5 @@ def sample(
 
 
 def _inertia(tool: Tool, pose: Pose, angular: Vector) -> Vector:
-    """Return R J_t R^T angular."""
+    """Return R J_t R^T angular, where R is the matrix of the attitude and J_t the tool's inertia."""
     return rotate(pose.attitude, tool.inertia @ rotate_back(pose.attitude, angular))

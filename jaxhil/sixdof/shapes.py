@@ -1,7 +1,7 @@
-"""Shapes of contact candidates: signed distance of a point from a surface, and the outward normal there.
+"""Shapes of contact candidates, with the signed distance from a point to the surface and the outward normal.
 
-Numbers of a shape are arrays (candidates, *batch), in the axes of the frame in which the shape is fixed [m].
-Distances are positive outside. Formulas: Quilez, "3D signed distance functions".
+The parameters of a shape are arrays (candidates, *batch), in the axes of the body's interface frame [m].
+Distances are positive outside. The formulas follow Quilez, "3D signed distance functions".
 """
 
 import abc
@@ -15,14 +15,14 @@ from jaxhil.lanes import safe_sqrt
 from jaxhil.sixdof.rotations import Quaternion, rotate, rotate_back
 from jaxhil.sixdof.vectors import Vector, direction, dot, norm
 
-NEAR_AXIS = 1e-12  # m; distance from the axis below which the radial direction vanishes smoothly
+NEAR_AXIS = 1e-12  # m; nearer to the axis, the radial direction decreases smoothly to 0
 
 
 class Surface(NamedTuple):
-    """Surface as seen from a point."""
+    """Distance and direction of a shape's surface from a point."""
 
-    distance: Float[Array, "..."]  # signed distance [m]
-    normal: Vector  # unit vector, outward
+    distance: Float[Array, "..."]  # signed distance [m], positive if the point is outside the shape
+    normal: Vector  # outward normal at the nearest point of the surface, unit vector
 
 
 class Shape(eqx.Module):
@@ -30,26 +30,26 @@ class Shape(eqx.Module):
 
     @abc.abstractmethod
     def surface(self, point: Vector) -> Surface:
-        """Return the distance of `point` [m] from the surface, and the normal."""
+        """Return the signed distance from a point [m] to the surface, and the outward normal."""
 
     @property
     def thickness(self) -> Float[Array, "..."] | float:
-        """Depth behind the surface [m] at which a point has passed through the shape."""
+        """Depth below the surface [m] at which a point has passed through the shape."""
         return jnp.inf
 
 
 class Plane(Shape):
-    """Half-space behind a point, with a normal."""
+    """Half-space that is bounded by a plane."""
 
     point: Vector  # point on the plane [m]
-    normal: Vector  # unit vector
+    normal: Vector  # outward normal, unit vector
 
     def surface(self, point):
         return Surface(dot(self.normal, point - self.point), self.normal)
 
 
 class Ball(Shape):
-    """Sphere that is touched from outside; at its centre the normal is 0."""
+    """Sphere that is touched from outside. At the centre, the normal is 0."""
 
     centre: Vector  # [m]
     radius: Float[Array, "..."]  # [m]
@@ -64,7 +64,7 @@ class Ball(Shape):
 
 
 class Cavity(Shape):
-    """Sphere that is touched from inside; with the end of a slack tether as point, the tether's limit."""
+    """Sphere that is touched from inside, such as the surface that the end of a tether cannot leave."""
 
     centre: Vector  # [m]
     radius: Float[Array, "..."]  # [m]
@@ -75,14 +75,15 @@ class Cavity(Shape):
 
 
 class Drogue(Shape):
-    """Cone about z that opens along +z, touched from inside, with a tangent sphere as bottom.
+    """Cone about the z axis that opens along +z and is touched from inside; a tangent sphere is the bottom.
 
-    A sphere in it must be smaller than its bottom sphere, since it cannot touch the wall from the axis.
+    A sphere that touches the drogue must be smaller than the bottom sphere: a larger sphere could touch the
+    wall while its centre is on the axis, where the wall's normal is not defined.
     """
 
     half_angle: Float[Array, "..."]  # half angle of the cone [rad]
     bottom_radius: Float[Array, "..."]  # radius of the bottom sphere [m]
-    bottom: Float[Array, "..."]  # z of the bottom sphere's centre [m]
+    bottom: Float[Array, "..."]  # z coordinate of the bottom sphere's centre [m]
 
     def surface(self, point):
         radius, outward = _radial(point)
@@ -98,12 +99,12 @@ class Drogue(Shape):
 
 
 class Shell(Drogue):
-    """Drogue that ends at its mouth: a thin shell, which is touched from both sides.
+    """Drogue with a mouth: a thin shell, which is touched from both sides.
 
-    A sphere that touches it must have a radius greater than 0.
+    A sphere that touches the shell must have a radius greater than 0.
     """
 
-    mouth_radius: Float[Array, "..."]  # radius of the wall's edge [m]
+    mouth_radius: Float[Array, "..."]  # radius of the wall's edge at the mouth [m]
 
     def surface(self, point):
         signed, inward = super().surface(point)
@@ -112,7 +113,7 @@ class Shell(Drogue):
         height = self.bottom + (self.mouth_radius * cosine - self.bottom_radius) / sine
         edge = Rim(self.mouth_radius, height, jnp.zeros_like(height)).surface(point)
         radius, _ = _radial(point)
-        # If the nearest point of the extended wall is beyond the mouth, the edge is nearest.
+        # If the nearest point of an endless wall lies beyond the mouth, the edge is the nearest part.
         on_wall = radius * sine + (point.z - self.bottom) * cosine > 0
         beyond = on_wall & (radius + signed * cosine > self.mouth_radius)
         distance = jnp.where(beyond, edge.distance, side * signed)
@@ -124,19 +125,19 @@ class Shell(Drogue):
 
 
 class Rim(Shape):
-    """Ring about z with a round section: the rim of a drogue's mouth."""
+    """Torus about the z axis, such as the rim of a drogue's mouth."""
 
-    ring_radius: Float[Array, "..."]  # radius of the circle of section centres [m]
-    height: Float[Array, "..."]  # z of this circle [m]
-    radius: Float[Array, "..."]  # radius of the section [m]
+    ring_radius: Float[Array, "..."]  # major radius: radius of the centre circle [m]
+    height: Float[Array, "..."]  # z coordinate of the centre circle [m]
+    radius: Float[Array, "..."]  # minor radius: radius of the cross-section [m]
 
     def surface(self, point):
         radius, outward = _radial(point)
         across, along = radius - self.ring_radius, point.z - self.height
         apart = safe_sqrt(across**2 + along**2)
-        share = 1 / jnp.where(apart > 0, apart, 1)
+        scale = 1 / jnp.where(apart > 0, apart, 1)
         zero = jnp.zeros_like(along)
-        normal = (share * across) * outward + Vector(zero, zero, share * along)
+        normal = (scale * across) * outward + Vector(zero, zero, scale * along)
         return Surface(apart - self.radius, normal)
 
     @property
@@ -145,7 +146,7 @@ class Rim(Shape):
 
 
 class Capsule(Shape):
-    """Set of points nearer to a segment than a radius."""
+    """Capsule: all points whose distance from a line segment is less than a radius."""
 
     start: Vector  # start of the segment [m]
     end: Vector  # end of the segment [m]
@@ -156,11 +157,11 @@ class Capsule(Shape):
         return Surface(norm(apart) - self.radius, direction(apart))
 
     def at(self, s: Float[Array, "..."]) -> Vector:
-        """Return the point at the fraction s of the segment."""
+        """Return the point of the segment at a fraction `s` of its length."""
         return self.start + s * (self.end - self.start)
 
     def nearest(self, point: Vector) -> Float[Array, "..."]:
-        """Return the fraction of the segment that is nearest to a point."""
+        """Return the segment's nearest point to `point` [m], as a fraction of the segment's length."""
         along = self.end - self.start
         square = dot(along, along)
         return jnp.clip(dot(along, point - self.start) / jnp.where(square > 0, square, 1), 0, 1)
@@ -171,11 +172,11 @@ class Capsule(Shape):
 
 
 class Box(Shape):
-    """Box with rounded edges; a thin box is a face with a border."""
+    """Box with rounded edges."""
 
     centre: Vector  # [m]
-    attitude: Quaternion  # from the box's axes to the frame's axes
-    half_lengths: Vector  # half lengths of its edges, rounding included [m]
+    attitude: Quaternion  # rotation from the box's axes to the frame's axes
+    half_lengths: Vector  # half lengths of the edges, including the rounding [m]
     rounding: Float[Array, "..."]  # radius of the edges [m], positive
 
     def surface(self, point):
@@ -185,7 +186,7 @@ class Box(Shape):
         beyond = [s * part - half for s, part, half in zip(_parts(sign), _parts(in_box), core, strict=True)]
         outside = Vector(*(jnp.where(part > 0, part, 0) for part in beyond))
         apart = norm(outside)
-        # Inside the core box, the nearest face determines distance and normal.
+        # Inside the core (the box without its rounding), the nearest face determines distance and normal.
         x, y, z = beyond
         first, second = (x >= y) & (x >= z), y >= z
         faces = first, ~first & second, ~first & ~second
@@ -202,16 +203,15 @@ class Box(Shape):
 
 
 def _parts(vector: Vector) -> tuple[Array, Array, Array]:
-    """Return the components of a vector."""
     return vector.x, vector.y, vector.z
 
 
 def _either(condition: Array, a: Vector, b: Vector) -> Vector:
-    """Return the first of two vectors where the condition holds, else the second."""
+    """Select the vector `a` where the condition holds, else the vector `b`."""
     return Vector(*(jnp.where(condition, u, v) for u, v in zip(_parts(a), _parts(b), strict=True)))
 
 
 def _radial(point: Vector) -> tuple[Array, Vector]:
-    """Return the distance from the z axis [m] and the radial direction, which is 0 on the axis and smooth."""
+    """Return the distance from the z axis [m], and the radial direction (smooth, and 0 on the axis)."""
     radius = jnp.sqrt(point.x**2 + point.y**2 + NEAR_AXIS**2)
     return radius, Vector(point.x / radius, point.y / radius, jnp.zeros_like(radius))

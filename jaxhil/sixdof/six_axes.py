@@ -1,7 +1,7 @@
-"""Model of a rig that moves in six axes.
+"""Rig model for six axes, which `tune`, `sweep` and similar commands use.
 
-An episode has two errors, that of the energy and that of the twist: an outcome has the rows of the first,
-then those of the second.
+Each episode has two errors: energy error and twist error. The arrays of an outcome contain all episodes
+twice: first with the energy errors, then with the twist errors.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from jaxhil.sixdof.metrics import Metrics, evaluate
 from jaxhil.sixdof.rollout import CAPTURED, JAMMED, MISS, NON_FINITE, REBOUNDED, TIMEOUT
 from jaxhil.sixdof.scenario import Scenario
 
-# Corresponding statuses on one axis; other statuses become "diverged".
+# Statuses of six-axis episodes, with the corresponding one-axis statuses; other statuses become "diverged".
 STATUSES = {
     MISS: one_axis.NOT_REACHED,
     REBOUNDED: one_axis.OK,
@@ -38,7 +38,7 @@ STATUSES = {
 
 @dataclasses.dataclass(frozen=True)
 class SixAxes(RigModel):
-    """Model of a rig in six axes: its runs are episodes, with an error of the energy and one of the twist."""
+    """Rig model for six axes, whose runs are episodes with an energy error and a twist error."""
 
     axes: ClassVar[int] = 6
     run_name: ClassVar[str] = "episode"
@@ -52,32 +52,32 @@ class SixAxes(RigModel):
         seed: int = 0,
         first: int = 0,
     ) -> Scenario:
-        """Return scenarios; see `jaxhil.sixdof.building.build_scenarios`."""
+        """Build a batch of scenarios; see `jaxhil.sixdof.building.build_scenarios`."""
         return jax.tree.map(np.asarray, building.build_scenarios(mechanism, draws, seed, first))
 
     def loop(self, mechanism: SixAxisMechanism, compensator: str, scenarios: Scenario, **parts: bool) -> Loop:
-        """Return the loop that runs all the scenarios; the one-axis options `parts` are ignored."""
+        """Build the loop that runs all the scenarios; `parts`, the options of one-axis loops, are ignored."""
         return building.loop_of(mechanism, compensator, scenarios)
 
     def runs(self, mechanism: SixAxisMechanism) -> int:
-        """Return the number of episodes of a scenario."""
+        """Return the number of evaluated episodes in a scenario of the mechanism."""
         return mechanism.approach.episodes if mechanism.approach else 1
 
     def run(self, loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
-        """Run the episodes of a batch and compare them with the ideal contacts."""
+        """Simulate a batch of scenarios, and compare the episodes with the ideal contacts."""
         return outcome_of(evaluate(loop, gains, scenario).metrics, scenario)
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
-        """Return scenarios in which the `idle` lanes end at once."""
+        """Return the scenarios with a duration of 0 in the `idle` lanes."""
         duration: Any = np.where(idle, 0.0, scenarios.duration).astype(np.asarray(scenarios.duration).dtype)
         return scenarios._replace(duration=duration)
 
     def expected_duration(self, scenarios: Scenario) -> np.ndarray:
-        """Return zeros, since durations are unknown before a run."""
+        """Return zeros, because the duration of a run is not known beforehand."""
         return np.zeros(np.shape(scenarios.duration))
 
     def whole_delays(self, scenarios: Scenario) -> np.ndarray:
-        """Return zeros, since delay lines are read lane by lane."""
+        """Return zeros, because scenarios with different delays can share a batch in six axes."""
         return np.zeros(np.shape(scenarios.duration))
 
     def without_noise(self, scenarios: Scenario) -> Scenario:
@@ -99,9 +99,10 @@ SIX_AXES = SixAxes()
 
 
 def outcome_of(found: Metrics, scenario: Scenario) -> Outcome:
-    """Return the metrics of episodes as an outcome.
+    """Convert the metrics of episodes to an outcome, whose arrays contain the episodes twice.
 
-    Its peak command is the peak of the real force, and its chatter is 0.
+    The first half of the errors are energy errors, the second half twist errors. The peak command is the
+    peak force of the real contact, and the chatter is 0.
     """
     # A draw that misses the target has no contact to evaluate.
     begins = jnp.isfinite(scenario.start.chaser.position.z)

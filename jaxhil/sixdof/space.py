@@ -1,9 +1,10 @@
-"""Ideal contact without a rig: continuous and undelayed, the reference for the evaluation of a rig.
+"""Integration of the ideal contact: continuous motion of the two bodies, without a rig or delays.
 
-The two bodies are integrated with the Dormand-Prince pair of order 5(4) and error control. A step in which a
-touch begins or ends is repeated down to 1 us, so that derivatives through the time of this event are accurate
-too. Each lane has its own steps. Within a step each stage uses the laws' state at the step's start: laws with
-memory are therefore of first order and have shorter steps.
+The integrator is the Dormand-Prince pair of order 5(4) with error control and separate steps for each lane. A
+step in which a touch begins or ends is repeated with a shorter length, down to 1 us, so that derivatives with
+respect to the time of this event are accurate too. All stages of a step use the state that the contact and
+friction laws have at the start of the step. For laws with memory, the method is therefore of first order,
+and the steps are shorter.
 """
 
 from typing import Any, NamedTuple
@@ -31,63 +32,63 @@ from jaxhil.sixdof.relative import (
 from jaxhil.sixdof.rotations import Quaternion, compose, normalise, rotate
 from jaxhil.sixdof.vectors import norm
 
-TOLERANCE = 1e-10  # of a step's error, relative to the relative speed
-SHORTEST = 1e-9  # s; a step as short as this is accepted whatever its error
+TOLERANCE = 1e-10  # maximum error of a step, divided by the relative speed (function `scale`)
+SHORTEST = 1e-9  # s; steps up to this length are accepted with any error, so that the integration proceeds
 EVENT = 1e-6  # s; accuracy of the time at which a touch begins or ends, or a latch catches
-REMEMBERING = 1e-4  # s; longest step of laws with memory
-MOST_STEPS = 200_000  # limit on the steps of a motion, unless they are long
-SMALLEST, LARGEST = 0.1, 4.0  # limits of the change of the step length
-REACH = 1.0  # m; distance by which the nearest points of two shapes may move on them
+REMEMBERING = 1e-4  # s; maximum length of a step for laws with memory
+MOST_STEPS = 200_000  # number of steps after which the integration stops if the mean step is short
+SMALLEST, LARGEST = 0.1, 4.0  # limits of the ratio of two successive step lengths
+REACH = 1.0  # m; margin for the motion of the nearest points along two shapes
 TINY = 1e-30  # m/s; avoids a division by zero
 
 
 class Space(NamedTuple):
-    """Constants of an ideal contact."""
+    """Constants of an ideal contact: bodies, contact candidates and latches."""
 
     bodies: Pair
-    groups: tuple[ContactGroup, ...]  # candidates of the contact
+    groups: tuple[ContactGroup, ...]  # groups of contact candidates
     latches: tuple[Latch, ...]
 
 
 class Memories(NamedTuple):
-    """State of the contact's laws and latches."""
+    """States of the contact laws, friction laws and latches."""
 
-    laws: tuple[Memory, ...]
+    laws: tuple[Memory, ...]  # states of each group's contact law and friction law
     held: tuple[Held, ...]  # states of the latches
 
 
 class Instant(NamedTuple):
-    """Two bodies in contact at an instant."""
+    """Motion of the two bodies and contact forces at an instant."""
 
     states: States  # states of the bodies
     pose: Pose
     twist: Twist
-    wrench: Wrench  # on the chaser, about T's origin
-    forces: tuple[Forces, ...]  # forces of the candidates
+    wrench: Wrench  # wrench on the chaser, about T's origin
+    forces: tuple[Forces, ...]  # forces of each group of candidates
 
 
 class Flight(NamedTuple):
-    """State of a motion's integration."""
+    """State of the integration of an ideal contact."""
 
-    time: Float[Array, "*batch"]  # time since its start [s]
+    time: Float[Array, "*batch"]  # time since the start of the integration [s]
     length: Float[Array, "*batch"]  # length of the next step [s]
-    touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each group's candidates touch now
+    touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each group's candidates touch
     memories: Memories
     states: States  # states of the bodies
-    tries: Int[Array, "*batch"]  # number of tried steps so far
-    apart: Float[Array, "*batch"]  # time in which nothing can touch [s]; 0 in touch
+    tries: Int[Array, "*batch"]  # number of steps so far, including rejected steps
+    apart: Float[Array, "*batch"]  # time from now in which nothing can touch [s]; 0 if something touches
 
 
 class Step(NamedTuple):
-    """Tried step."""
+    """Result of an integration step, accepted or rejected."""
 
-    now: Instant  # bodies at its end
-    memories: Memories
-    accepted: Bool[Array, "*batch"]
+    now: Instant  # motion and forces at the end of the step
+    memories: Memories  # states of laws and latches at the end of the step
+    accepted: Bool[Array, "*batch"]  # whether the step was accepted
 
 
 def start_flight(space: Space, states: States, length: Float[Array, "*batch"]) -> Flight:
-    """Return a motion at its start; its first step has a `length` [s]."""
+    """Return the state of an integration that starts with `states` and a first step of `length` [s]."""
     memories = Memories(tuple(group.init() for group in space.groups), ())
     if space.latches:
         pose, _ = relative(space.bodies, states)
@@ -107,7 +108,10 @@ def start_flight(space: Space, states: States, length: Float[Array, "*batch"]) -
 def instant(
     space: Space, states: States, memories: Memories, duration: Float[Array, "*batch"]
 ) -> tuple[Instant, Memories]:
-    """Return the forces for the states, `duration` [s] after the laws' last evaluation."""
+    """Compute relative motion and contact forces for the bodies' states, and the next states of the laws.
+
+    `duration` is the time since the last evaluation of the laws [s].
+    """
     pose, twist = relative(space.bodies, states)
     wrench, forces, laws = contact_wrench(space.groups, memories.laws, pose, twist, duration)
     latched = []
@@ -125,16 +129,17 @@ def advance_flight(
     longest: Float[Array, "*batch"],
     speed: Float[Array, "*batch"],
 ) -> tuple[Flight, Step]:
-    """Try a step; return the motion at its end or, if rejected, at its start with a shorter next step.
+    """Integrate one step. Return the state of the integration after the step, and the step itself.
 
-    If a number is not finite or there are too many steps, the motion's time becomes infinite.
+    If the step is rejected, the state keeps its motion and has a shorter next step. If a number is not
+    finite, or if there are too many steps, the time of the state becomes infinite.
 
     Args:
-        space: constants of the motion.
-        flight: motion at the start of the step.
-        left: upper bound of the step [s].
-        longest: upper bound of the step where something touches or may touch soon [s].
-        speed: relative speed that scales the step's error [m/s].
+        space: Constants of the ideal contact.
+        flight: State of the integration before the step.
+        left: Maximum length of the step [s].
+        longest: Maximum length of a step while something touches or may touch soon [s].
+        speed: Relative speed by which the error of the step is divided [m/s].
     """
     if _remembers(space):
         longest = jnp.minimum(longest, REMEMBERING)
@@ -151,7 +156,7 @@ def advance_flight(
     safe = jnp.where(jnp.isfinite(error), jnp.maximum(error, 1e-12), 1e12)
     change = jnp.clip(0.9 * safe**-0.2, SMALLEST, jnp.where(accepted, LARGEST, 0.9))
     proposed = length * change
-    # A step shortened by its limit does not determine the next length.
+    # If `left` or `longest` limited an accepted step, the next step may have the length planned before.
     cut = accepted & (length < flight.length)
     proposed = jnp.where(cut, jnp.maximum(flight.length, proposed), proposed)
     ahead = lax.stop_gradient(jnp.where(late, length / 4, proposed))
@@ -160,7 +165,7 @@ def advance_flight(
     apart = lax.stop_gradient(_time_apart(space, now))
     moved = Flight(time, ahead, touching, memories, now.states, tries, apart)
     after: Flight = select_lanes(accepted, moved, flight._replace(length=ahead, tries=tries))
-    # The integration stops after many steps with a mean below a thousandth of the longest step.
+    # The integration stops after `MOST_STEPS` steps whose mean length is below a thousandth of `longest`.
     endless = (tries > MOST_STEPS) & (after.time < 1e-3 * tries.astype(length.dtype) * longest)
     time = jnp.where(endless, jnp.inf, after.time)
     return after._replace(time=time), Step(now, memories, accepted | endless)
@@ -169,7 +174,7 @@ def advance_flight(
 def _try(
     space: Space, flight: Flight, length: Float[Array, "*batch"], speed: Array
 ) -> tuple[Instant, Memories, Array]:
-    """Return the end of a step of `length` [s], and its error relative to the tolerance."""
+    """Compute a step of `length` [s]: motion and laws at its end, and its error divided by `TOLERANCE`."""
 
     def slope(offset, states):
         now, memories = instant(space, states, flight.memories, offset)
@@ -182,7 +187,7 @@ def _try(
 
 
 def slope_at(space: Space, now: Instant) -> States:
-    """Return the time derivatives of the states."""
+    """Return the time derivatives of the bodies' states under the contact wrench."""
     states = now.states
     target, chaser = loads(now.wrench, interface_frame(space.bodies.target, states.target), states)
     return States(
@@ -197,9 +202,17 @@ def follow(
     periods: int,
     longest: Float[Array, "*batch"],
 ) -> tuple[Flight, Instant]:
-    """Return the motion after so many periods [s], and each period's start, (periods, ...).
+    """Integrate the ideal contact over a number of periods, and record the start of each period.
 
-    Steps are no longer than `longest` [s].
+    Args:
+        space: Constants of the ideal contact.
+        states: States of the bodies at the start.
+        period: Length of a period [s].
+        periods: Number of periods.
+        longest: Maximum length of a step while something touches or may touch soon [s].
+
+    Returns:
+        State of the integration at the end, and motion and forces at the starts, (periods, ...).
     """
     speed = scale(space, states)
 
@@ -213,7 +226,10 @@ def follow(
 
 
 def fly(space: Space, flight: Flight, until: Array, longest: Array, speed: Array) -> Flight:
-    """Return the motion at the time `until` [s] since its start."""
+    """Continue an integration up to the time `until` [s] since its start.
+
+    `longest` and `speed` are those of `advance_flight`.
+    """
 
     def body(flight):
         left = until - flight.time
@@ -227,10 +243,10 @@ def fly(space: Space, flight: Flight, until: Array, longest: Array, speed: Array
 
 
 def scale(space: Space, states: States) -> Float[Array, "*batch"]:
-    """Return a speed [m/s] to which errors are related, which does not depend on the interface frames.
+    """Return the relative speed [m/s] by which integration errors are divided.
 
-    It is the relative speed of the centres of mass plus that of a point at a distance of 1 m due to the
-    relative rotation.
+    The speed is the sum of two speeds: the relative speed of the centres of mass, and the speed that the
+    relative rotation gives a point at a distance of 1 m. It does not depend on the interface frames.
     """
     target, chaser = (
         rotate(state.attitude, angular_velocity(body, state))
@@ -241,14 +257,14 @@ def scale(space: Space, states: States) -> Float[Array, "*batch"]:
 
 
 def _nothing(until: Array) -> Array:
-    """Return the rest of a time [s] that counts as rounding."""
+    """Return the remaining time [s] below which an integration up to `until` [s] has ended."""
     return 1e-14 + 1e-13 * until
 
 
 def _time_apart(space: Space, now: Instant) -> Float[Array, "*batch"]:
-    """Return half the time [s] that the nearest pair needs to touch at the largest possible speed.
+    """Return a step length [s] in which no shapes can touch and no latch can catch.
 
-    A latch counts as near if its point is, whatever its angle and speed.
+    It is half the minimum time until then. The conditions of a latch on angle and speed are not considered.
     """
     linear, angular = norm(now.twist.linear), norm(now.twist.angular)
     time = jnp.full_like(linear, jnp.inf)
@@ -264,15 +280,15 @@ def _time_apart(space: Space, now: Instant) -> Float[Array, "*batch"]:
 
 
 def _remembers(space: Space) -> bool:
-    """Return whether a law has memory."""
+    """Return whether any contact law or friction law has memory."""
     memories = jax.eval_shape(lambda: [group.init() for group in space.groups])
     return bool(jax.tree.leaves(memories))
 
 
 def _size(space: Space, error: States, speed: Array) -> Array:
-    """Return the relative size of an error.
+    """Return the size of a step's error relative to `speed` [1].
 
-    Velocities are related to the speed, positions to its distance in 0.1 s.
+    Errors of velocities are divided by `speed`, errors of positions by the distance `speed` times 0.1 s.
     """
     largest = jnp.zeros_like(speed)
     for body, state in zip(space.bodies, error, strict=True):
@@ -284,7 +300,7 @@ def _size(space: Space, error: States, speed: Array) -> Array:
 
 
 def _slope(body: Body, state: State, load: Load) -> State:
-    """Return the time derivative of a state."""
+    """Return the time derivative of a body's state under a load."""
     angular = angular_velocity(body, state)
     turning = compose(state.attitude, Quaternion(0 * state.attitude.w, 0.5 * angular))
     return State(state.velocity, (1 / body.mass) * load.force, turning, load.torque)

@@ -1,7 +1,7 @@
-"""Stewart-Gough hexapod: a platform on six legs, each of them an axis.
+"""Kinematics of a Stewart-Gough hexapod: a platform on six legs, which are the axes.
 
-A leg's length is the distance from its joint on the base to its joint on the platform. Newton's method finds
-the pose for given lengths from a pose nearby.
+The length of a leg is the distance from its joint on the base to its joint on the platform. Newton's method,
+started at a pose nearby, finds the pose for given lengths.
 """
 
 import jax
@@ -15,16 +15,16 @@ from jaxhil.sixdof.kinematics import Kinematics
 from jaxhil.sixdof.rotations import exponential, left_jacobian, rotate
 from jaxhil.sixdof.vectors import Vector, cross, direction, norm, vector
 
-NEWTON_STEPS = 3  # quadratic convergence from an error of 1e-3 to rounding
+NEWTON_STEPS = 3  # number of Newton steps, enough to reduce an error of 1e-3 to rounding
 
 
 class Stewart(Kinematics):
-    """Platform that carries C, on a base that carries T."""
+    """Kinematics of a hexapod whose platform carries C and whose base carries T."""
 
-    base: Vector  # joints on the base, components (6, *batch), in T axes [m]
-    platform: Vector  # joints on the platform, components (6, *batch), in C axes [m]
-    height: Vector  # position of the platform's origin relative to the base's if C is at T [m]
-    stroke: Float[Array, "2 *batch"] | None = None  # shortest and longest leg [m]; None for no limit
+    base: Vector  # joints on the base, from the base's origin, components (6, *batch), in T axes [m]
+    platform: Vector  # joints on the platform, from its origin, components (6, *batch), in C axes [m]
+    height: Vector  # vector from the base's origin to the platform's origin in the docked pose (C at T) [m]
+    stroke: Float[Array, "2 *batch"] | None = None  # minimum and maximum leg length [m]; None without limits
 
     @property
     def is_linear(self):
@@ -46,7 +46,7 @@ class Stewart(Kinematics):
 
         lengths, near = lax.stop_gradient((motion.position, near))
         at = lax.fori_loop(0, NEWTON_STEPS - 1, lambda _, at: newton(at, lengths), near)
-        # Only the last step is differentiated, which gives the derivatives of the pose.
+        # The derivatives of the last Newton step alone are those of the pose.
         at = newton(at, motion.position)
         slopes = jacobian(self, at)
         rate = solve(slopes, motion.rate[:, None])[:, 0]
@@ -61,10 +61,10 @@ class Stewart(Kinematics):
 
 
 def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 6 *batch"]:
-    """Return the derivative of each leg (row) with respect to each coordinate [m, rad].
+    """Return the derivatives of the leg lengths (rows) with respect to the coordinates (columns) [m, rad].
 
-    It is u for p, where u is the leg's direction, and Jl(theta)^T (R b x u) for theta, where b is the joint
-    on the platform.
+    A row consists of u and Jl(theta)^T (R b x u), where u is the direction of the leg, b its joint on the
+    platform, R the rotation and Jl the left Jacobian.
     """
     leg, arm, theta = _legs(hexapod, at)
     along = direction(leg)
@@ -73,14 +73,14 @@ def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 
 
 
 def condition(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "*batch"]:
-    """Return the condition number of the legs' Jacobian, lengths in m: large near singular poses."""
+    """Return the condition number of the Jacobian, with lengths in m; it is large near singular poses."""
     return jnp.linalg.cond(jnp.moveaxis(jacobian(hexapod, at), (0, 1), (-2, -1)))
 
 
 def _legs(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> tuple[Vector, Vector, Vector]:
-    """Return the legs, the joints from the platform's origin, and theta [rad].
+    """Return the legs as vectors, the joints on the platform, and the rotation vector theta [rad].
 
-    Legs and joints are vectors of components (6, *batch), in T axes [m].
+    Legs and joints have components (6, *batch), in T axes [m]. Joints are relative to the platform's origin.
     """
     position, theta = (vector(part[:, None]) for part in (at[:3], at[3:]))
     height = jax.tree.map(lambda part: part[None], hexapod.height)

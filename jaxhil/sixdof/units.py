@@ -1,4 +1,4 @@
-"""Warnings about implausible numbers of a six-axis mechanism file, most of which have a wrong unit."""
+"""Warnings about implausible values in a six-axis mechanism file, which often have a wrong unit."""
 
 from collections.abc import Iterator
 
@@ -7,31 +7,31 @@ import numpy as np
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.six_axes_rules import inertia_matrix
 
-LARGEST_VELOCITY = 1.0  # m/s; greatest approach velocity
-LARGEST_ANGLE = 0.3  # rad; greatest angle of C against T at the first touch
-LARGEST_RATE = 0.1  # rad/s; greatest angular velocity of the chaser against the target
-GRAVITY = 10.0  # m/s^2; greatest gravity on the ground
-LONGEST_TOOL = 2.0  # m; greatest distance from C to the tool's centre of mass
-FAR = 20.0  # greatest distance of the interface from the centre of mass, over the radius of gyration
-WIDE = 10.0  # greatest radius of gyration, over the interface's distance or 1 m
+# Largest plausible values.
+LARGEST_VELOCITY = 1.0  # m/s; approach velocity
+LARGEST_ANGLE = 0.3  # rad; angle between C and T at the first touch
+LARGEST_RATE = 0.1  # rad/s; angular velocity of the chaser relative to the target
+GRAVITY = 10.0  # m/s^2; gravity on the ground
+LONGEST_TOOL = 2.0  # m; distance from C's origin to the tool's centre of mass
+FAR = 20.0  # distance from the centre of mass to the interface, divided by the radius of gyration [1]
+WIDE = 10.0  # radius of gyration, divided by the larger of this distance and 1 m [1]
 
 
 def unit_warnings(mechanism: SixAxisMechanism) -> tuple[str, ...]:
-    """Return warnings about implausible numbers: key, found value, expected value, with the unit."""
+    """Return a warning for each implausible value, with key, found value, expected value and unit."""
     return tuple(_warnings(mechanism))
 
 
 def _warnings(mechanism: SixAxisMechanism) -> Iterator[str]:
-    """Yield the warnings."""
     for name, body in (("target", mechanism.target), ("chaser", mechanism.chaser)):
         moment = float(np.linalg.eigvalsh(inertia_matrix(body.inertia))[-1])
         radius, distance = (moment / body.mass) ** 0.5, float(np.linalg.norm(body.interface))
         if distance > FAR * radius:
             found = f"{name}.interface: found {distance:.3g} m for a radius of gyration of {radius:.3g} m"
-            yield f"{found}, expected at most {FAR:g} times that: lengths in m, inertia in kg m^2"
+            yield f"{found}, expected at most {FAR:g} times this radius: lengths in m, inertia in kg m^2"
         if radius > WIDE * max(distance, 1.0):
             found = f"{name}.inertia: found a radius of gyration of {radius:.3g} m"
-            yield f"{found}, expected the size of the body: mass in kg, inertia in kg m^2"
+            yield f"{found}, expected about the size of the body: mass in kg, inertia in kg m^2"
     approach = mechanism.approach
     if approach is not None:
         for key, most, unit in (
@@ -49,7 +49,7 @@ def _warnings(mechanism: SixAxisMechanism) -> Iterator[str]:
     if sensor.tool is not None:
         most = min(mechanism.target.mass, mechanism.chaser.mass)
         if sensor.tool.mass > most:
-            expected = f"expected at most {most:.4g} kg, the lighter body's"
+            expected = f"expected at most {most:.4g} kg, the mass of the lighter body"
             yield f"{path}.tool.mass: found {sensor.tool.mass:.4g} kg, {expected}"
         length = float(np.linalg.norm(sensor.tool.com))
         if length > LONGEST_TOOL:

@@ -1,7 +1,7 @@
-"""Numbers of a six-axis mechanism by dotted path, drawn or nominal, one per lane.
+"""Drawn or nominal values of a six-axis mechanism by dotted path, as arrays with one entry per lane.
 
-Computed numbers are NumPy arrays unless draws are JAX arrays; vectors, matrices and rotations consist of JAX
-arrays.
+The arrays are JAX arrays if the draws are JAX arrays, else NumPy arrays. Vectors, matrices and rotations
+always consist of JAX arrays.
 """
 
 from collections.abc import Mapping
@@ -18,16 +18,16 @@ from jaxhil.sixdof.vectors import Matrix, Vector
 
 
 class Values:
-    """Arrays of shape (*entries, number): of NumPy, or of JAX if draws are."""
+    """Drawn or nominal values of a mechanism, as arrays (*entries, lanes) of NumPy or JAX."""
 
     def __init__(self, mechanism: SixAxisMechanism, draws: Mapping[str, Any]) -> None:
-        # Namespace of the arrays: JAX or NumPy.
+        # Array library: `jax.numpy` or `numpy`.
         self.np: Any = jnp if any(isinstance(drawn, jax.Array) for drawn in draws.values()) else np
         self.number = len(next(iter(draws.values()))) if draws else 1
         self._mechanism, self._draws = mechanism, draws
 
     def __call__(self, path: str, default: Any = None) -> Any:
-        """Return the drawn value, else the nominal one or, without one in the file, the `default`."""
+        """Return the drawn value, else the nominal value, else (if the file has no value) the `default`."""
         value = self._draws.get(path)
         if value is None:
             nominal = value_at(self._mechanism, path)
@@ -36,47 +36,47 @@ class Values:
         return self.np.moveaxis(self.np.asarray(value, float), 0, -1)
 
     def has(self, path: str) -> bool:
-        """Return whether the file has a value."""
+        """Return whether the file has a value for this path."""
         return value_at(self._mechanism, path) is not None
 
     def drawn(self, path: str) -> bool:
-        """Return whether the value is drawn."""
+        """Return whether the value for this path is drawn."""
         return path in self._draws
 
     def nothing(self, path: str) -> bool:
-        """Return whether the value is 0 in every lane."""
+        """Return whether the value is not drawn, and 0 in the file."""
         return not self.drawn(path) and not np.any(np.asarray(value_at(self._mechanism, path), float))
 
     def constant(self, value: float) -> Any:
-        """Return the same number in every lane."""
+        """Return an array (lanes,) with the same number in every lane."""
         return np.full(self.number, value)
 
     def inertia(self, path: str, default: Any = None) -> Any:
-        """Return three moments, or three rows, as (3, 3, number)."""
+        """Return an inertia, given by three moments or three rows, as matrices (3, 3, lanes)."""
         value = self(path, default)
         return value if value.ndim == 3 else np.eye(3)[:, :, None] * value[None]
 
     def rotation(self, theta: Any) -> Quaternion:
-        """Return the rotation for rotation vectors (3, number)."""
+        """Convert rotation vectors (3, lanes) [rad] to rotations."""
         if self.np is jnp:
             return exponential(self.vector(theta))
         half = np.sqrt((theta**2).sum(axis=0)) / 2
         return Quaternion(jnp.asarray(np.cos(half)), self.vector(np.sinc(half / np.pi) / 2 * theta))
 
     def vector(self, values: Any) -> Vector:
-        """Return a vector of components (3, number)."""
+        """Convert components (3, lanes) to a `Vector`."""
         return Vector(*(jnp.asarray(part) for part in values))
 
     def matrix(self, values: Any) -> Matrix:
-        """Return a matrix of rows (3, 3, number)."""
+        """Convert rows (3, 3, lanes) to a `Matrix`."""
         return Matrix(*(self.vector(row) for row in values))
 
     def turned(self, angle: Any, axis: Any) -> Any:
-        """Return points (3, number), rotated about z by an angle [rad]."""
+        """Rotate points or axes (3, lanes) about z by an angle [rad]."""
         cosine, sine = self.np.cos(angle), self.np.sin(angle)
         x, y, z = axis
         return self.np.stack([cosine * x - sine * y, sine * x + cosine * y, z])
 
     def direction(self, values: Any) -> Vector:
-        """Return the unit vector along (3, number)."""
+        """Convert components (3, lanes) to a `Vector` of length 1."""
         return self.vector(values / self.np.sqrt((values**2).sum(axis=0)))

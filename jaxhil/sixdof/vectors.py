@@ -1,6 +1,6 @@
-"""Vectors and matrices in three dimensions, component by component.
+"""Vectors and matrices in three dimensions, with a separate array for each component.
 
-Each component is an array of the batch shape; an axis for the components would have to be split and joined at
+Each component has the batch shape. An array axis for the components would have to be split and joined at
 every tick.
 """
 
@@ -16,59 +16,54 @@ from jaxhil.lanes import safe_sqrt
 
 
 class Vector(eqx.Module):
-    """Three components, with sums, differences and `number * vector`."""
+    """Vector with three components, which supports `+`, `-` and `number * vector`."""
 
     x: Float[Array, "..."]
     y: Float[Array, "..."]
     z: Float[Array, "..."]
 
-    # This lets NumPy's numbers use `__rmul__` of this class for `number * vector`.
+    # With this, NumPy numbers call `__rmul__` of this class for `number * vector`.
     __array_ufunc__ = None
 
     def __add__(self, other: "Vector") -> "Vector":
-        """Return the sum."""
         return Vector(self.x + other.x, self.y + other.y, self.z + other.z)
 
     def __sub__(self, other: "Vector") -> "Vector":
-        """Return the difference."""
         return Vector(self.x - other.x, self.y - other.y, self.z - other.z)
 
     def __neg__(self) -> "Vector":
-        """Return the negative vector."""
         return Vector(-self.x, -self.y, -self.z)
 
     def __rmul__(self, number: Array | float | int) -> "Vector":
-        """Return the product with a number."""
         return Vector(number * self.x, number * self.y, number * self.z)
 
 
 class Matrix(eqx.Module):
-    """Three rows, with `matrix @ vector`."""
+    """Matrix with three rows, which supports `matrix @ vector`."""
 
     x: Vector
     y: Vector
     z: Vector
 
     def __matmul__(self, vector: Vector) -> Vector:
-        """Return the product with a vector."""
         return Vector(dot(self.x, vector), dot(self.y, vector), dot(self.z, vector))
 
 
 def vector(components: Float[Array, "3 *batch"]) -> Vector:
-    """Return the components along the leading axis as a vector."""
+    """Convert an array with the components along the leading axis to a `Vector`."""
     return Vector(components[0], components[1], components[2])
 
 
 def components(vector: Vector) -> Float[Array, "3 *batch"]:
-    """Return the components of a vector along a leading axis."""
+    """Stack the components of a vector along a leading axis."""
     return jnp.stack([vector.x, vector.y, vector.z])
 
 
 def assembled(parts: Any) -> Float[Array, "components *batch"]:
-    """Return the leaves of `parts` along a leading axis.
+    """Stack the leaves of `parts` along a leading axis.
 
-    They are written one after the other, since the compiler would compute a stack number by number, together
-    with its inputs.
+    The leaves are written one after the other, because the compiler would fuse `jnp.stack` with the
+    computation of its inputs.
     """
     leaves = jax.tree.leaves(parts)
     whole = jnp.zeros((len(leaves), *leaves[0].shape), leaves[0].dtype)
@@ -78,7 +73,7 @@ def assembled(parts: Any) -> Float[Array, "components *batch"]:
 
 
 def matrix(entries: Float[Array, "3 3 *batch"]) -> Matrix:
-    """Return the entries along the two leading axes, rows first, as a matrix."""
+    """Convert an array (rows, columns, *batch) to a `Matrix`."""
     return Matrix(vector(entries[0]), vector(entries[1]), vector(entries[2]))
 
 
@@ -93,20 +88,20 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 def norm(a: Vector) -> Float[Array, "..."]:
-    """Return the length; its derivative at 0 is 0."""
+    """Return the length of a vector. At the zero vector, the derivative is 0."""
     return safe_sqrt(dot(a, a))
 
 
 def direction(a: Vector) -> Vector:
-    """Return the unit vector along a; 0 if a is 0."""
+    """Return the unit vector along `a`, or the zero vector if `a` is 0."""
     length = norm(a)
     return (1 / jnp.where(length > 0, length, 1)) * a
 
 
 @jax.jit
 def inverse(a: Matrix) -> Matrix:
-    """Return the inverse of a regular matrix, by its cofactors."""
+    """Return the inverse of a regular matrix, computed from the cofactors."""
     columns = cross(a.y, a.z), cross(a.z, a.x), cross(a.x, a.y)
-    share = 1 / dot(a.x, columns[0])
-    i, j, k = (share * column for column in columns)
+    factor = 1 / dot(a.x, columns[0])
+    i, j, k = (factor * column for column in columns)
     return Matrix(Vector(i.x, j.x, k.x), Vector(i.y, j.y, k.y), Vector(i.z, j.z, k.z))

@@ -1,8 +1,8 @@
-"""Record of the current episode of a rig in six axes, tick by tick, and the condition for its end.
+"""Record of the current episode of a six-axis rig, tick by tick, and the condition for the episode's end.
 
-An episode is over at the first tick at which neither the rig nor the ideal contact has touched anything for
-`QUIET`, the numerical model is free, and its wrench has decayed. The wait for the wrench is at most
-`MAX_DECAY_WAIT`: with noise it never decays completely.
+An episode ends at the first tick at which three conditions hold: the hardware and the ideal contact have both
+paused (no touch for `quiet_time`), the numerical model is free, and the wrench command has decayed. The wait
+for this decay lasts at most `MAX_DECAY_WAIT`, because a noisy command never decays completely.
 """
 
 from typing import NamedTuple
@@ -21,40 +21,40 @@ from jaxhil.sixdof.relative import States, relative
 from jaxhil.sixdof.sensor import Sensor
 from jaxhil.sixdof.vectors import dot, norm
 
-QUIET = 0.06  # s; time without a touch, of rig and ideal contact, after which an episode is over
+QUIET = 0.06  # s; minimum pause, without a touch of rig and ideal contact, after which an episode may end
 
 
 class Beginning(NamedTuple):
-    """Start of an episode: that of the run, or the end of the last episode."""
+    """Start of an episode, which is the start of the run or the end of the last episode."""
 
-    states: States  # numerical model
-    tick: Int[Array, "*batch"]
-    energy: Float[Array, "*batch"]  # energy of the relative motion [J]
-    reference: Reference  # ideal contact from these states on
+    states: States  # states of the numerical model at the start
+    tick: Int[Array, "*batch"]  # index of the tick at the start
+    energy: Float[Array, "*batch"]  # energy of the relative motion at the start, see `relative_energy`
+    reference: Reference  # ideal contact that starts from these states
 
 
 class Watch(NamedTuple):
-    """Record of the current episode."""
+    """Record of the current episode on the rig."""
 
-    begun: Bool[Array, "*batch"]  # whether anything has touched
-    touching: tuple[Bool[Array, "candidates *batch"], ...]
-    touches: Int[Array, "*batch"]  # number of onsets of touch, over all candidates
-    touched: Int[Array, "*batch"]  # ticks in touch
-    quiet: Int[Array, "*batch"]  # ticks since the last touch
+    begun: Bool[Array, "*batch"]  # whether the hardware has touched or a latch has caught
+    touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each group's candidates touch
+    touches: Int[Array, "*batch"]  # number of touches, summed over the candidates
+    touched: Int[Array, "*batch"]  # number of ticks with a touch
+    quiet: Int[Array, "*batch"]  # number of ticks since the last touch
     caught: Bool[Array, "*batch"]  # whether a latch holds
     force: Peak  # peak force of the real contact [N]
-    moment: Peak  # peak moment about T's origin [N m]
-    highest: tuple[Array, Array]  # largest force [N] and moment [N m] on the numerical model
-    faded: Int[Array, "*batch"]  # ticks since the wrench on the numerical model decayed
+    moment: Peak  # peak moment of the real contact, about T's origin [N m]
+    highest: tuple[Array, Array]  # largest force [N] and largest moment [N m] of the wrench command
+    faded: Int[Array, "*batch"]  # number of ticks since the wrench command decayed
     over: Bool[Array, "*batch"]  # whether the episode is over
-    end: States  # numerical model at its end
-    end_tick: Int[Array, "*batch"]
-    penetration: Float[Array, "*batch"]  # largest penetration, over the size of its shapes [1]
+    end: States  # states of the numerical model at the end of the episode
+    end_tick: Int[Array, "*batch"]  # number of ticks from the start of the run to the end of the episode
+    penetration: Float[Array, "*batch"]  # largest penetration, divided by the shapes' size [1]
     beyond: Bool[Array, "*batch"]  # whether an axis was commanded beyond its workspace
 
 
 def fresh_watch(rig: Rig, states: States, now: Array) -> Watch:
-    """Return the record at the start of an episode."""
+    """Return the record at the start of an episode, for the model's `states` after `now` ticks."""
     zero, none = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32)
     peak = no_peak(zero)
     return Watch(
@@ -79,15 +79,15 @@ def fresh_watch(rig: Rig, states: States, now: Array) -> Watch:
 def watch_tick(
     rig: Rig, beginning: Beginning, watch: Watch, seen: Tick, after: States, ticks: Array
 ) -> Watch:
-    """Update the record with a tick.
+    """Update the record of the episode with a tick, and end the episode if the conditions hold.
 
     Args:
-        rig: constants of the run.
-        beginning: start of the episode.
-        watch: record before the tick.
-        seen: record of the tick.
-        after: numerical model at the end of the tick.
-        ticks: number of ticks of the run until then.
+        rig: Constants of the run.
+        beginning: Start of the episode.
+        watch: Record of the episode before the tick.
+        seen: Record of the tick.
+        after: States of the numerical model after the tick.
+        ticks: Number of ticks from the start of the run, including this tick.
     """
     watch = _updated(rig, watch, seen)
     time = (ticks - beginning.tick).astype(rig.period.dtype) * rig.period
@@ -97,7 +97,7 @@ def watch_tick(
     def are_free() -> Array:
         return deepest(rig.groups, relative(rig.bodies, after)[0]) < 0
 
-    # Hardly any tick needs the depths of the numerical model.
+    # Computing the model's penetrations only when needed saves time, because few ticks need them.
     ends = pauses & lax.cond(jnp.any(pauses), are_free, lambda: jnp.ones_like(pauses))
     return watch._replace(
         over=watch.over | ends,
@@ -107,27 +107,28 @@ def watch_tick(
 
 
 def quiet_time(sensor: Sensor, period: Array) -> Array:
-    """Return the time [s] without a touch after which a contact is over.
+    """Return the pause [s] (time without a touch) after which an episode may end.
 
-    It is `QUIET`, or the time tau_f + 20 sensor time constants + 2 T of a reading if that is longer.
+    The pause is `QUIET` or, if longer, the time that the force sensor needs to settle: its delay, 20 of its
+    time constants, and two control periods.
     """
     return jnp.maximum(QUIET, sensor.delay + 20 * sensor.time_constant + 2 * period)
 
 
 def is_rig_quiet(rig: Rig, watch: Watch) -> Array:
-    """Return whether the hardware has touched nothing for the quiet time and the command has decayed."""
-    still = quiet_ticks(rig)
-    patience = still + jnp.ceil(MAX_DECAY_WAIT / rig.period).astype(jnp.int32)
-    return ((watch.quiet >= still) & (watch.faded > 0)) | (watch.quiet >= patience)
+    """Return whether the hardware has paused and the wrench command has decayed, or the wait is over."""
+    pause = quiet_ticks(rig)
+    max_wait = pause + jnp.ceil(MAX_DECAY_WAIT / rig.period).astype(jnp.int32)
+    return ((watch.quiet >= pause) & (watch.faded > 0)) | (watch.quiet >= max_wait)
 
 
 def quiet_ticks(rig: Rig) -> Array:
-    """Return the number of ticks without a touch after which a contact is over."""
+    """Return the pause of `quiet_time` as a number of ticks."""
     return jnp.floor(quiet_time(rig.sensor, rig.period) / rig.period + 1e-9).astype(jnp.int32) + 1
 
 
 def relative_energy(rig: Rig, states: States) -> Array:
-    """Return the energy of the relative motion [J], without the coupling of translation and rotation."""
+    """Return twice the relative motion's energy [J], without the coupling of translation and rotation."""
     _, (linear, angular) = relative(rig.bodies, states)
     return dot(linear, linear) / mass_share(rig) + dot(angular, rig.bodies.chaser.inertia @ angular)
 
@@ -138,7 +139,7 @@ def mass_share(rig: Rig) -> Array:
 
 
 def _updated(rig: Rig, watch: Watch, seen: Tick) -> Watch:
-    """Update touches, peaks and decay with a tick."""
+    """Update the record's touches, peaks and decay with a tick."""
     touching = tuple(forces.touch.depth > 0 for forces in seen.forces)
     caught = watch.caught
     for latch in seen.held:
@@ -153,7 +154,7 @@ def _updated(rig: Rig, watch: Watch, seen: Tick) -> Watch:
         penetration = jnp.maximum(penetration, share)
     command = norm(seen.command.force), norm(seen.command.moment)
     highest = tuple(jnp.maximum(a, b) for a, b in zip(watch.highest, command, strict=True))
-    # No threshold depends on the noise; `jaxhil.simulation.watch` gives the reason.
+    # The threshold does not depend on the noise; `jaxhil.simulation.watch` states the reason.
     faded = (command[0] <= COMMAND_DECAY_RATIO * highest[0]) & (
         command[1] <= COMMAND_DECAY_RATIO * highest[1]
     )
