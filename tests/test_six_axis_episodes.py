@@ -25,7 +25,7 @@ from jaxhil.sixdof.rollout import STATUS_NAMES
 from jaxhil.sixdof.rotations import identity
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.shapes import Plane
-from jaxhil.sixdof.space import EVENT, Space, follow
+from jaxhil.sixdof.space import EVENT_ACCURACY, Space, follow
 
 pytestmark = pytest.mark.slow
 CENTRAL, ASIDE, EARLIER, BIASED, AWAY, AGAIN, GRAZING = range(7)
@@ -116,7 +116,7 @@ def test_episode_does_not_depend_on_the_start_of_its_run(evaluated):
     for name, figure in evaluated.metrics._asdict().items():
         one, other = (figure[..., 0, lane] for lane in (ASIDE, EARLIER))
         # The ideal contact finds the begin and end of a touch to 1 us.
-        tolerance = EVENT if name == "reference_duration" else 1e-10
+        tolerance = EVENT_ACCURACY if name == "reference_duration" else 1e-10
         np.testing.assert_allclose(one, other, rtol=1e-7, atol=tolerance, err_msg=name)
 
 

@@ -10,9 +10,10 @@ from jaxhil.sixdof.relative import Pair, Pose, States, Twist
 from jaxhil.sixdof.rotations import Quaternion, compose, identity, reverse, rotate, rotate_back
 from jaxhil.sixdof.vectors import Vector, cross
 
-FAR = 10.0  # m; height above the target at which the search for the first touch begins
-STEPS, POLISHES = 400, 3  # numbers of search steps and of Newton steps; enough for rounding accuracy
-FLIGHTS = 8  # number of integration steps of the free flight before the first touch
+SEARCH_HEIGHT = 10.0  # m; height above the target at which the search for the first touch begins
+SEARCH_STEPS = 400  # number of search steps for the first touch
+NEWTON_STEPS = 3  # number of Newton steps after the search; enough for rounding accuracy
+FLIGHT_STEPS = 8  # number of integration steps of the free flight before the first touch
 
 
 def touching_height(
@@ -35,10 +36,10 @@ def touching_height(
         value, slope = jax.jvp(depth, (guess,), (jnp.ones_like(guess),))
         return guess - value / jnp.where(slope < 0, slope, -1)
 
-    start = jnp.full_like(offset_x, FAR)
-    height = jax.lax.fori_loop(0, STEPS, lambda _, z: z + jax.lax.stop_gradient(depth(z)), start)
-    touches = (jnp.abs(depth(height)) < 1e-6) & (height > -FAR)
-    refined = jax.lax.fori_loop(0, POLISHES, newton, height)
+    start = jnp.full_like(offset_x, SEARCH_HEIGHT)
+    height = jax.lax.fori_loop(0, SEARCH_STEPS, lambda _, z: z + jax.lax.stop_gradient(depth(z)), start)
+    touches = (jnp.abs(depth(height)) < 1e-6) & (height > -SEARCH_HEIGHT)
+    refined = jax.lax.fori_loop(0, NEWTON_STEPS, newton, height)
     return jnp.where(touches, refined, jnp.nan)
 
 
@@ -64,6 +65,6 @@ def begin(bodies: Pair, pose: Pose, twist: Twist, before: Float[Array, "*batch"]
     )
 
     def back(_, state: State) -> State:
-        return kick_drift(body, state, Load(still, still), -before / FLIGHTS, 1.0)
+        return kick_drift(body, state, Load(still, still), -before / FLIGHT_STEPS, 1.0)
 
-    return States(target, jax.lax.fori_loop(0, FLIGHTS, back, chaser))
+    return States(target, jax.lax.fori_loop(0, FLIGHT_STEPS, back, chaser))

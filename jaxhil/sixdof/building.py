@@ -27,8 +27,8 @@ from jaxhil.sixdof.stewart import Stewart
 from jaxhil.sixdof.values import Values
 from jaxhil.sixdof.vectors import Vector, vector
 
-APPROACH = 0.02  # s; duration of the free flight before the first touch, without the phase
-LONGEST = 10.0  # s; duration of a run if [start] does not specify a duration
+APPROACH_DURATION = 0.02  # s; duration of the free flight before the first touch, without the phase
+DEFAULT_DURATION = 10.0  # s; duration of a run if [start] does not specify a duration
 
 
 def build_scenarios(
@@ -51,9 +51,11 @@ def build_scenarios(
     period = numbers("rig.control_period")
     if mechanism.start is not None:
         start = _specified(numbers, bodies)
-        duration = numbers("start.duration") if mechanism.start.duration else numbers.constant(LONGEST)
+        duration = (
+            numbers("start.duration") if mechanism.start.duration else numbers.constant(DEFAULT_DURATION)
+        )
     else:
-        before = APPROACH + numbers("approach.phase") * period
+        before = APPROACH_DURATION + numbers("approach.phase") * period
         start = _before_touch(numbers, bodies, groups, before)
         duration = before + numbers("approach.duration")
     # Compiled functions accept only JAX arrays.
@@ -93,12 +95,12 @@ def loop_of(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -
 
 def _body(numbers: Values, name: str) -> Body:
     """Build the body `name`, "target" or "chaser"."""
-    turned = f"{name}.interface_rotation"
+    rotation_path = f"{name}.interface_rotation"
     return build_body(
         jnp.asarray(numbers(f"{name}.mass")),
         numbers.matrix(numbers.inertia(f"{name}.inertia")),
         numbers.vector(numbers(f"{name}.interface")),
-        None if numbers.nothing(turned) else numbers.rotation(numbers(turned)),
+        None if numbers.is_zero(rotation_path) else numbers.rotation(numbers(rotation_path)),
     )
 
 
@@ -128,9 +130,9 @@ def _before_touch(numbers: Values, bodies: Pair, groups: tuple[ContactGroup, ...
 @jax.jit
 def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, before) -> States:
     """Return the states a time `before` [s] earlier than a first touch with this offset and velocity."""
-    turned = exponential(vector(attitude))
-    height = touching_height(groups, offset[0], offset[1], turned)
-    pose = Pose(Vector(offset[0], offset[1], height), turned)
+    rotation = exponential(vector(attitude))
+    height = touching_height(groups, offset[0], offset[1], rotation)
+    pose = Pose(Vector(offset[0], offset[1], height), rotation)
     return begin(bodies, pose, Twist(vector(velocity), vector(angular_velocity)), before)
 
 
@@ -161,7 +163,7 @@ def _simulator(mechanism: SixAxisMechanism, numbers: Values) -> MotionSimulatorB
         if mechanism.rig.simulator.target_robot is None:
             return chaser
         target = path + "target_robot." + key
-        return numbers.np.concatenate([chaser, numbers(target) if numbers.has(target) else chaser])
+        return numbers.np.concatenate([chaser, numbers(target) if numbers.has_value(target) else chaser])
 
     delay = of("delay")
     ones, stack = 0 * delay + 1, numbers.np.stack
@@ -196,7 +198,7 @@ def _sensor(mechanism: SixAxisMechanism, numbers: Values) -> sensor.Sensor:
     nothing: Any = np.zeros((6, numbers.number))
     tool = _tool(mechanism, numbers)
     errors = sensor.SampleErrors(
-        None if numbers.nothing(path + "crosstalk") else np.eye(6)[:, :, None] + numbers(path + "crosstalk"),
+        None if numbers.is_zero(path + "crosstalk") else np.eye(6)[:, :, None] + numbers(path + "crosstalk"),
         *(numbers(path + key) for key in ("bias", "quantum", "dead_zone", "range")),
     )
     gravity = numbers.vector(numbers(path + "gravity"))

@@ -86,7 +86,7 @@ def _latch(latch: six_axes.Latch, numbers: Values, path: str) -> Latch:
         return np.eye(6)[:, :, None] * value[None]
 
     first, point = numbers(f"{path}.pattern.phase", 0.0), numbers(f"{path}.chaser")
-    points = [numbers.turned(first + 2 * np.pi * copy / count, point) for copy in range(count)]
+    points = [numbers.rotated_about_z(first + 2 * np.pi * copy / count, point) for copy in range(count)]
     spring = (
         numbers(f"{path}.stiffness_matrix")
         if latch.stiffness is None
@@ -137,10 +137,12 @@ def _shape(shape: six_axes.Shape, numbers: Values, path: str, turn: Any) -> Shap
         return jnp.asarray(numbers(f"{path}.{key}"))
 
     def point(key: str) -> Vector:
-        return numbers.vector(numbers.turned(turn, numbers(f"{path}.{key}")))
+        return numbers.vector(numbers.rotated_about_z(turn, numbers(f"{path}.{key}")))
 
     if shape.shape == "plane":
-        return Plane(point("point"), numbers.direction(numbers.turned(turn, numbers(f"{path}.normal"))))
+        return Plane(
+            point("point"), numbers.direction(numbers.rotated_about_z(turn, numbers(f"{path}.normal")))
+        )
     if shape.shape == "capsule":
         return Capsule(point("from"), point("to"), of("radius"))
     if shape.shape == "drogue":
@@ -156,7 +158,7 @@ def _shape(shape: six_axes.Shape, numbers: Values, path: str, turn: Any) -> Shap
 
 def _law(contact: six_axes.Contact, numbers: Values, path: str) -> ContactLaw:
     """Return the contact law, specialised for the values in the file."""
-    return find_contact_law(contact.law).specialised(contact, lambda key: numbers.drawn(f"{path}.{key}"))
+    return find_contact_law(contact.law).specialised(contact, lambda key: numbers.is_drawn(f"{path}.{key}"))
 
 
 def _parameters(contact: six_axes.Contact, numbers: Values, path: str) -> ContactParameters:

@@ -18,7 +18,7 @@ from jaxhil.sixdof.vectors import Vector, cross, direction, dot, norm
 
 # Regularisation for parallel segments, whose nearest points are not unique, relative to the squared length of
 # a segment [1]. It selects points near the middles of both segments.
-PARALLEL = 1e-9
+PARALLEL_WEIGHT = 1e-9
 
 
 class Touch(NamedTuple):
@@ -115,8 +115,8 @@ def _nearest(first: Capsule, second: Capsule) -> tuple[Array, Array]:
     together, with a slight regularisation. Then each point is projected on the other segment.
     """
     u, v, apart = first.end - first.start, second.end - second.start, first.start - second.start
-    uu, vv, uv = dot(u, u) * (1 + PARALLEL), dot(v, v) * (1 + PARALLEL), dot(u, v)
-    shift_u, shift_v = (PARALLEL / 2 * dot(w, w) for w in (u, v))
+    uu, vv, uv = dot(u, u) * (1 + PARALLEL_WEIGHT), dot(v, v) * (1 + PARALLEL_WEIGHT), dot(u, v)
+    shift_u, shift_v = (PARALLEL_WEIGHT / 2 * dot(w, w) for w in (u, v))
     determinant = uu * vv - uv**2
     towards = vv * (shift_u - dot(u, apart)) + uv * (shift_v + dot(v, apart))
     s = towards / jnp.where(determinant > 0, determinant, 1)

@@ -66,13 +66,13 @@ def latch_wrench(latch: Latch, memory: Held, pose: Pose, twist: Twist) -> tuple[
     )
 
     displaced = point - memory.point
-    turned = logarithm(compose(attitude, reverse(memory.attitude)))
-    moved = _product(latch.stiffness, displaced, turned)
-    damped = _product(latch.damping, velocity, angular)
+    rotation = logarithm(compose(attitude, reverse(memory.attitude)))
+    spring = _product(latch.stiffness, displaced, rotation)
+    damper = _product(latch.damping, velocity, angular)
     pull = memory.caught.astype(point.x.dtype)
-    force = (-pull) * (moved[0] + damped[0])
+    force = (-pull) * (spring[0] + damper[0])
     # The spring's moment is the gradient of its energy with respect to the rotation, hence the Jacobian.
-    moment = (-pull) * (inverse_left_jacobian(-turned, moved[1]) + damped[1]) + cross(point, force)
+    moment = (-pull) * (inverse_left_jacobian(-rotation, spring[1]) + damper[1]) + cross(point, force)
     total = jax.tree.map(lambda part: part.sum(axis=0), Wrench(force, moment))
     return total, memory
 

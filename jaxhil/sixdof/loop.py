@@ -56,7 +56,7 @@ from jaxhil.sixdof.vectors import assembled, vector
 SIDES = ("fixed", "moving")  # sides of the rig on which the force sensor may be
 # Number of ticks that are simulated before a run if the axis positions are not linear in the coordinates, so
 # that the hardware has settled.
-HISTORY = 256
+SETTLING_TICKS = 256
 
 
 class Loop(eqx.Module):
@@ -190,31 +190,31 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
     Before tick 0, the pose command moves uniformly with the relative rates of these states.
     """
     law = SIX_AXIS_COMPENSATORS[loop.compensator]
-    at, rates, twist = model_motion(rig.bodies, states)
+    position, rates, twist = model_motion(rig.bodies, states)
     stride = rates * rig.period[None]
-    history = 0 if rig.kinematics.is_linear else HISTORY
-    first = law.pose_command(rig.gains, at, rates) - history * stride
+    history = 0 if rig.kinematics.is_linear else SETTLING_TICKS
+    first = law.pose_command(rig.gains, position, rates) - history * stride
     legs, leg_rates = jax.jvp(rig.kinematics.command, (first,), (stride,))
     hardware = enter(rig.axes, legs, leg_rates, rig.period, loop.hold, loop.latency, loop.ring)
 
     def before(hardware, tick):
-        command = rig.kinematics.command(first + (tick + 1).astype(at.dtype) * stride)
+        command = rig.kinematics.command(first + (tick + 1).astype(position.dtype) * stride)
         return actuate(rig.axes, hardware, tick, command, loop.hold, loop.latency), None
 
     hardware, _ = lax.scan(before, hardware, jnp.arange(history, dtype=jnp.int32))
-    zero = vector(jnp.zeros_like(at[:3]))
+    zero = vector(jnp.zeros_like(position[:3]))
     nothing = Wrench(zero, zero)
     pose, _ = relative(rig.bodies, states)
     start = SixAxisSignals(
         wrench=tuple(jax.tree.leaves(nothing)),
-        pose_desired=at,
+        pose_desired=position,
         twist_desired=twist,
         pose_measured=None,
         age=jnp.zeros(rig.period.shape, jnp.int32),
     )
     return RunState(
         states=states,
-        near=at,
+        near=position,
         twist=twist,
         hardware=hardware,
         memories=tuple(group.init() for group in rig.groups),
@@ -242,9 +242,9 @@ def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
     contact, forces, memories = contact_wrench(rig.groups, state.memories, pose, twist, rig.period)
     latched = []
     for latch, before in zip(rig.latches, state.held, strict=True):
-        caught, now = latch_wrench(latch, before, pose, twist)
-        contact = jax.tree.map(jnp.add, contact, caught)
-        latched.append(now)
+        latch_force, latch_state = latch_wrench(latch, before, pose, twist)
+        contact = jax.tree.map(jnp.add, contact, latch_force)
+        latched.append(latch_state)
     measured = None if samples.measured is None else _measured_pose(loop, rig, state, samples.measured)
     command, controller = _control(loop, rig, state, contact, motion, measured)
     states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
@@ -298,10 +298,10 @@ def controller_constants(scenario: Scenario, weighed: bool) -> SixAxisConstants:
 def _measured_pose(loop: Loop, rig: Rig, state: RunState, measured: Array) -> Array:
     """Convert the measured axis positions to the measured coordinates, with noise and quantum."""
     still = Motion(measured, jnp.zeros_like(measured), None)
-    at = rig.kinematics.coordinates(still, state.near).position
+    position = rig.kinematics.coordinates(still, state.near).position
     if not loop.has_pose_errors:
-        return at
-    noisy = at + rig.sensor.position_noise_std * _noise(rig, state.tick, 1)
+        return position
+    noisy = position + rig.sensor.position_noise_std * _noise(rig, state.tick, 1)
     return quantise(noisy, rig.sensor.position_quantum)
 
 
@@ -315,7 +315,7 @@ def _control(
     else:
         load = tool_load(sensor.tool, motion.pose, motion.twist, motion.acceleration, sensor.gravity)
         raw = read_moving(contact, load, motion.pose)
-    lagged = raw if last.lag is None else _behind_lag(rig, state.tick, raw, *last.lag)
+    lagged = raw if last.lag is None else _lagged_reading(rig, state.tick, raw, *last.lag)
     noise = sensor.noise_std * _noise(rig, state.tick, 0) if loop.has_noise else None
     reading = sample(lagged, sensor.errors, noise, loop.has_sample_effects)
     unbiased: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
@@ -328,7 +328,7 @@ def _control(
         contact = undo_moving(unbiased, load, pose)
     forces, structure = jax.tree.flatten(contact)
     law = SIX_AXIS_COMPENSATORS[loop.compensator]
-    first = 0 if rig.kinematics.is_linear else HISTORY
+    first = 0 if rig.kinematics.is_linear else SETTLING_TICKS
     signals = SixAxisSignals(
         wrench=tuple(forces),
         pose_desired=state.near,
@@ -341,16 +341,16 @@ def _control(
     return command, NumericalController(None if last.lag is None else (raw, lagged), law_state)
 
 
-def _behind_lag(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:
+def _lagged_reading(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:
     """Return the output of the force sensor's lag; its input is interpolated linearly between ticks."""
-    first, zero = now == (0 if rig.kinematics.is_linear else HISTORY), jnp.zeros_like(rig.period)
+    first, zero = now == (0 if rig.kinematics.is_linear else SETTLING_TICKS), jnp.zeros_like(rig.period)
 
-    def late(now: Array, before: Array, lagged: Array) -> Array:
+    def lagged_channel(now: Array, before: Array, lagged: Array) -> Array:
         before, lagged = jnp.where(first, now, before), jnp.where(first, now, lagged)
         middle = (before + now) / 2
         return apply_lag(lagged, zero, rig.period, zero, [before, middle, now], rig.sensor.time_constant)
 
-    reading: Wrench = jax.tree.map(late, raw, last, lagged)
+    reading: Wrench = jax.tree.map(lagged_channel, raw, last, lagged)
     return reading
 
 

@@ -7,7 +7,7 @@ from jaxhil.laws.shared.nominal_values import axis_lags
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.sixdof.units import unit_warnings
 
-FASTEST = 0.1  # highest plausible contact frequency, divided by the control rate [1]
+MAX_FREQUENCY_RATIO = 0.1  # highest plausible contact frequency, divided by the control rate [1]
 
 
 class Meaning(NamedTuple):
@@ -62,10 +62,10 @@ def meaning(
     frequency = 1 / (2 * duration) if duration > 0 else math.nan
     warnings = list(unit_warnings(mechanism))
     rate = 1 / rig.control_period
-    if frequency > FASTEST * rate:
+    if frequency > MAX_FREQUENCY_RATIO * rate:
         warnings.append(
-            f"contact: found a contact of {frequency:.3g} Hz, expected at most {FASTEST * rate:.4g} Hz, "
-            "1/10 of the control rate"
+            f"contact: found a contact of {frequency:.3g} Hz, expected at most "
+            f"{MAX_FREQUENCY_RATIO * rate:.4g} Hz, 1/10 of the control rate"
         )
     limit = math.nan
     for name, contact in mechanism.contact.items():

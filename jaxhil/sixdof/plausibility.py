@@ -13,7 +13,7 @@ from jaxhil.errors import InputError
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, supported_options
 from jaxhil.simulation.plausibility import check_poles
-from jaxhil.sixdof.approach import FAR
+from jaxhil.sixdof.approach import SEARCH_HEIGHT
 from jaxhil.sixdof.building_contacts import candidate_names
 from jaxhil.sixdof.candidates import motion_at
 from jaxhil.sixdof.forces import deepest
@@ -25,11 +25,11 @@ from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.stewart import Stewart, condition
 from jaxhil.sixdof.vectors import dot
 
-MOST_TICKS = 1e7  # maximum number of ticks of a run
-LARGEST_ATTITUDE = 1.0  # rad; maximum angle between C and T at the start
-LARGEST_CONDITION = 100.0  # maximum condition number of a hexapod's Jacobian, with lengths in m
+MAX_TICKS = 1e7  # maximum number of ticks of a run
+MAX_ATTITUDE = 1.0  # rad; maximum angle between C and T at the start
+MAX_CONDITION_NUMBER = 100.0  # maximum condition number of a hexapod's Jacobian, with lengths in m
 # Number of control periods between two checks of a run; shapes must not pass through each other in this time.
-BLIND = STRETCH
+CHECK_PERIODS = STRETCH
 
 
 class StartValues(NamedTuple):
@@ -53,21 +53,21 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
     """
     ticks = float(scenario.duration[0] / scenario.control_period[0])
     where = "start" if mechanism.start is not None else "approach"
-    if not ticks <= MOST_TICKS:
+    if not ticks <= MAX_TICKS:
         found = f"{where}.duration: found {scenario.duration[0]:g} s, {ticks:.2g} control periods"
-        raise InputError(f"{mechanism.name}: {found}, expected at most {MOST_TICKS:.0e}")
+        raise InputError(f"{mechanism.name}: {found}, expected at most {MAX_TICKS:.0e}")
     denominator = np.asarray(scenario.simulator.denominator)[..., 0]
     check_poles(mechanism.name, denominator, np.full(denominator.shape[1], scenario.control_period[0]))
     start: StartValues = jax.tree.map(np.asarray, _compiled()(scenario))
     at = start.coordinates[:, 0]
     if not np.all(np.isfinite(at)):
-        found = f"a chaser that passes the target without a touch (searched below {FAR:g} m)"
+        found = f"a chaser that passes the target without a touch (searched below {SEARCH_HEIGHT:g} m)"
         raise InputError(
             f"{mechanism.name}: approach.offset: found {found}, expected an offset in m that leads to a touch"
         )
     angle = float(np.linalg.norm(at[3:]))
-    if angle > LARGEST_ATTITUDE:
-        allowed = f"at most {LARGEST_ATTITUDE:g} rad between C and T, including interface_rotation"
+    if angle > MAX_ATTITUDE:
+        allowed = f"at most {MAX_ATTITUDE:g} rad between C and T, including interface_rotation"
         key = "start.chaser.attitude" if mechanism.start else "approach.angular_velocity"
         found = f"{key}: found a rotation by {angle:.3g} rad at the start"
         raise InputError(f"{mechanism.name}: {found}, expected {allowed}")
@@ -90,11 +90,12 @@ def _check_speed(mechanism: SixAxisMechanism, start: StartValues, period: float)
     """Raise `InputError` if shapes are so fast that they could pass through each other undetected."""
     speeds, sizes = (np.concatenate([pair[i][:, 0] for pair in start.passing] or [[]]) for i in (0, 1))
     for name, speed, size in zip(candidate_names(mechanism), speeds, sizes, strict=True):
-        most = size / (BLIND * period)
-        if speed > most:
+        max_speed = size / (CHECK_PERIODS * period)
+        if speed > max_speed:
             key = "start.chaser.velocity" if mechanism.start else "approach.velocity"
             found = f"{key}: found a speed of {speed:.3g} m/s between the shapes of contact.{name}"
-            allowed = f"at most {most:.3g} m/s (their size {size:.3g} m divided by {BLIND} control periods)"
+            ratio = f"their size {size:.3g} m divided by {CHECK_PERIODS} control periods"
+            allowed = f"at most {max_speed:.3g} m/s ({ratio})"
             raise InputError(f"{mechanism.name}: {found}, expected {allowed}")
 
 
@@ -107,9 +108,9 @@ def _check_legs(mechanism: SixAxisMechanism, start: StartValues) -> None:
     poses = zip(("the start", "the docked pose"), start.legs, start.conditions, strict=False)
     for pose, legs, conditions in poses:
         lengths, number = legs[:, 0], float(conditions[0])
-        if not number <= LARGEST_CONDITION:
+        if not number <= MAX_CONDITION_NUMBER:
             found = f"rig.simulator.base: found legs that are nearly singular at {pose}"
-            allowed = f"joints whose Jacobian has a condition number of at most {LARGEST_CONDITION:g}"
+            allowed = f"joints whose Jacobian has a condition number of at most {MAX_CONDITION_NUMBER:g}"
             raise InputError(f"{mechanism.name}: {found} (condition number {number:.3g}), expected {allowed}")
         if stroke is not None and not (stroke[0] <= lengths.min() and lengths.max() <= stroke[1]):
             found = f"rig.simulator.stroke: found legs from {lengths.min():.4g} to {lengths.max():.4g} m"

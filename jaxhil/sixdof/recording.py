@@ -22,7 +22,7 @@ from jaxhil.sixdof.space import Space, follow
 from jaxhil.sixdof.vectors import Vector
 
 # Minimum number of ticks of a compiled program. The numbers are powers of two, so that runs share programs.
-LEAST_TICKS = 256
+MIN_TICKS = 256
 
 
 class Recorded(NamedTuple):
@@ -118,7 +118,7 @@ def _recorded(
     """Simulate a scenario with one lane for a `duration` [s], and record all ticks."""
     period = float(scenario.control_period[0])
     ticks = max(round(duration / period), 2)
-    length = max(LEAST_TICKS, 1 << (ticks - 1).bit_length())
+    length = max(MIN_TICKS, 1 << (ticks - 1).bit_length())
     arrays = _run(loop, length, gains, scenario)
     return Recorded(
         time=np.arange(ticks) * period,

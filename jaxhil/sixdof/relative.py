@@ -82,10 +82,10 @@ def interface_frame(body: Body, state: State) -> Frame:
     """Return the motion of a body's interface frame in the world."""
     angular = rotate(state.attitude, angular_velocity(body, state))
     offset = rotate(state.attitude, body.interface)
-    turned = body.interface_attitude
+    rotation = body.interface_attitude
     return Frame(
         position=state.position + offset,
-        attitude=state.attitude if turned is None else compose(state.attitude, turned),
+        attitude=state.attitude if rotation is None else compose(state.attitude, rotation),
         velocity=state.velocity + cross(angular, offset),
         angular_velocity=angular,
     )

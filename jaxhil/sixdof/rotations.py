@@ -16,7 +16,8 @@ from jaxtyping import Array, Float
 from jaxhil.sixdof.vectors import Vector, cross, dot
 
 PI = 3.141592653589793, 1.2246467991473532e-16  # pi as a sum of two floats, which has twice the digits
-NEAR = (PI[0] / 2) ** 2  # maximum t^2 for the power series, whose eleven terms are accurate to rounding
+# Maximum t^2 for the power series, whose eleven terms are accurate to rounding.
+MAX_SERIES_SQUARE = (PI[0] / 2) ** 2
 
 
 class Quaternion(NamedTuple):
@@ -139,7 +140,7 @@ def _reduced(square: Array) -> tuple[Array, Array, Array]:
 
     The power series for sine and cosine are faster than JAX's functions, which call a library per number.
     """
-    near = square <= NEAR
+    near = square <= MAX_SERIES_SQUARE
     safe = jnp.where(near, 1, square)
     share = lax.rsqrt(safe)
     half_turns = lax.stop_gradient(jnp.round(safe * share / PI[0]))
@@ -160,7 +161,7 @@ def _versine(square: Array) -> Array:
 def _cubic(square: Array) -> Array:
     """Return (t - sin t)/t^3 as a function of t^2."""
     sine = _sine(square / 4) * _cosine(square / 4)
-    return _near(_CUBIC, NEAR, square, 1 - sine)
+    return _near(_CUBIC, MAX_SERIES_SQUARE, square, 1 - sine)
 
 
 def _cotangent(square: Array) -> Array:

@@ -29,8 +29,8 @@ from jaxhil.sixdof.rollout import STATUS_NAMES
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.vectors import Vector, cross, direction, vector
 
-GOOD = ("rebounded", "captured")  # statuses of episodes that ended as they should
-DEEP = 0.5  # penetration, divided by the shapes' size, above which the summary contains a warning [1]
+GOOD_STATUSES = ("rebounded", "captured")  # statuses of episodes that ended as they should
+MAX_PENETRATION_RATIO = 0.5  # penetration divided by the shapes' size, above which there is a warning [1]
 
 
 class Episode(NamedTuple):
@@ -193,7 +193,7 @@ def _result(
         for slot in range(metrics.status.shape[0])
         if slot == 0 or STATUS_NAMES[int(metrics.status[slot, 0])] != "miss"
     )
-    bad = [episode.status for episode in episodes if episode.status not in GOOD]
+    bad = [episode.status for episode in episodes if episode.status not in GOOD_STATUSES]
     first = episodes[0]
     duration = math.nan if metrics.reference_captured[0, 0] else first.reference_duration
     summary = meaning(
@@ -201,8 +201,8 @@ def _result(
         first.reference_peak_force, first.reference_restitution,
     )  # fmt: skip
     deep = max(episode.penetration for episode in episodes)
-    if deep > DEEP:
-        expected = f"at most {DEEP:g}: shapes that are too soft or too fast pass through each other"
+    if deep > MAX_PENETRATION_RATIO:
+        expected = f"at most {MAX_PENETRATION_RATIO:g}: too soft or too fast shapes pass through each other"
         warning = f"contact: found a depth of {deep:.2g} times the size of the shapes, expected {expected}"
         summary = summary._replace(warnings=(*summary.warnings, warning))
     status = [*bad, episodes[-1].status][0]

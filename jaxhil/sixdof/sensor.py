@@ -65,8 +65,8 @@ def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity
     angular, alpha = twist.angular, acceleration.angular
     centre_acceleration = acceleration.linear + cross(alpha, centre) + cross(angular, cross(angular, centre))
     force = tool.mass * (gravity - centre_acceleration)
-    turned = _inertia(tool, pose, alpha) + cross(angular, _inertia(tool, pose, angular))
-    return Wrench(force, cross(centre, force) - turned)
+    inertia_moment = _inertia(tool, pose, alpha) + cross(angular, _inertia(tool, pose, angular))
+    return Wrench(force, cross(centre, force) - inertia_moment)
 
 
 def weight(tool: Tool, attitude: Quaternion, gravity: Vector) -> Wrench:

@@ -98,7 +98,7 @@ class SixAxes(RigModel):
 SIX_AXES = SixAxes()
 
 
-def outcome_of(found: Metrics, scenario: Scenario) -> Outcome:
+def outcome_of(episodes: Metrics, scenario: Scenario) -> Outcome:
     """Convert the metrics of episodes to an outcome, whose arrays contain the episodes twice.
 
     The first half of the errors are energy errors, the second half twist errors. The peak command is the
@@ -106,22 +106,22 @@ def outcome_of(found: Metrics, scenario: Scenario) -> Outcome:
     """
     # A draw that misses the target has no contact to evaluate.
     begins = jnp.isfinite(scenario.start.chaser.position.z)
-    wanted = (found.status != MISS) & begins[None]
-    is_finite = jnp.isfinite(found.energy_error) & jnp.isfinite(found.twist_error)
-    status = jnp.full_like(found.status, one_axis.DIVERGED)
+    wanted = (episodes.status != MISS) & begins[None]
+    is_finite = jnp.isfinite(episodes.energy_error) & jnp.isfinite(episodes.twist_error)
+    status = jnp.full_like(episodes.status, one_axis.DIVERGED)
     for code, one_axis_code in STATUSES.items():
-        status = jnp.where(found.status == code, one_axis_code, status)
+        status = jnp.where(episodes.status == code, one_axis_code, status)
     status = jnp.where(wanted, jnp.where((status == one_axis.OK) & ~is_finite, one_axis.NON_FINITE, status),
                        one_axis.NOT_REACHED)  # fmt: skip
-    zero = jnp.zeros_like(found.energy_error)
+    zero = jnp.zeros_like(episodes.energy_error)
     metrics = one_axis.Metrics(
-        restitution=found.restitution,
-        approach_velocity=found.approach_velocity,
-        peak_force=found.peak_force,
-        peak_command=found.peak_force,
+        restitution=episodes.restitution,
+        approach_velocity=episodes.approach_velocity,
+        peak_force=episodes.peak_force,
+        peak_command=episodes.peak_force,
         excess_variation=zero,
         position_shortfall=zero,
-        duration=found.duration,
+        duration=episodes.duration,
         work_in=zero,
         work_out=zero,
         trajectory_error=zero,
@@ -129,25 +129,27 @@ def outcome_of(found: Metrics, scenario: Scenario) -> Outcome:
         status=status,
         ticks=0 * status,
     )
-    ratio = found.peak_force / jnp.where(found.reference_peak_force > 0, found.reference_peak_force, jnp.nan)
+    ratio = episodes.peak_force / jnp.where(
+        episodes.reference_peak_force > 0, episodes.reference_peak_force, jnp.nan
+    )
     both = Outcome(
         metrics=metrics,
-        reference_restitution=found.reference_restitution,
-        reference_peak_force=found.reference_peak_force,
-        reference_duration=found.reference_duration,
-        error=found.energy_error,
+        reference_restitution=episodes.reference_restitution,
+        reference_peak_force=episodes.reference_peak_force,
+        reference_duration=episodes.reference_duration,
+        error=episodes.energy_error,
         peak_ratio=ratio,
         chatter=zero,
         wanted=wanted,
         good=status == one_axis.OK,
         unlike=(status == one_axis.OK)
         & is_contact_out_of_bounds(
-            found.peak_force,
-            found.reference_peak_force,
-            found.duration,
-            found.reference_duration,
+            episodes.peak_force,
+            episodes.reference_peak_force,
+            episodes.duration,
+            episodes.reference_duration,
             scenario.control_period[None],
         ),
     )
     rows: Outcome = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), both)
-    return rows._replace(error=jnp.concatenate([found.energy_error, found.twist_error]))
+    return rows._replace(error=jnp.concatenate([episodes.energy_error, episodes.twist_error]))

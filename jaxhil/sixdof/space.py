@@ -33,13 +33,13 @@ from jaxhil.sixdof.rotations import Quaternion, compose, normalise, rotate
 from jaxhil.sixdof.vectors import norm
 
 TOLERANCE = 1e-10  # maximum error of a step, divided by the relative speed (function `scale`)
-SHORTEST = 1e-9  # s; steps up to this length are accepted with any error, so that the integration proceeds
-EVENT = 1e-6  # s; accuracy of the time at which a touch begins or ends, or a latch catches
-REMEMBERING = 1e-4  # s; maximum length of a step for laws with memory
-MOST_STEPS = 200_000  # number of steps after which the integration stops if the mean step is short
-SMALLEST, LARGEST = 0.1, 4.0  # limits of the ratio of two successive step lengths
-REACH = 1.0  # m; margin for the motion of the nearest points along two shapes
-TINY = 1e-30  # m/s; avoids a division by zero
+MIN_STEP = 1e-9  # s; steps up to this length are accepted with any error, so that the integration proceeds
+EVENT_ACCURACY = 1e-6  # s; accuracy of the time at which a touch begins or ends, or a latch catches
+MAX_STEP_WITH_MEMORY = 1e-4  # s; maximum length of a step for laws with memory
+MAX_STEPS = 200_000  # number of steps after which the integration stops if the mean step is short
+MIN_STEP_RATIO, MAX_STEP_RATIO = 0.1, 4.0  # limits of the ratio of two successive step lengths
+NEAREST_POINT_MARGIN = 1.0  # m; margin for the motion of the nearest points along two shapes
+MIN_SPEED = 1e-30  # m/s; avoids a division by zero
 
 
 class Space(NamedTuple):
@@ -142,7 +142,7 @@ def advance_flight(
         speed: Relative speed by which the error of the step is divided [m/s].
     """
     if _remembers(space):
-        longest = jnp.minimum(longest, REMEMBERING)
+        longest = jnp.minimum(longest, MAX_STEP_WITH_MEMORY)
     length = jnp.minimum(jnp.minimum(flight.length, left), jnp.maximum(longest, flight.apart))
     length = lax.stop_gradient(length)
     now, memories, error = _try(space, flight, length, speed)
@@ -151,22 +151,22 @@ def advance_flight(
     happens = jnp.zeros(length.shape, bool)
     for old, new in zip(before, (*touching, *(latch.caught for latch in memories.held)), strict=True):
         happens = happens | jnp.any(old != new, axis=0)
-    late = happens & (length > EVENT)
-    accepted = ((error <= 1) | (length <= SHORTEST)) & ~late
+    is_too_long = happens & (length > EVENT_ACCURACY)
+    accepted = ((error <= 1) | (length <= MIN_STEP)) & ~is_too_long
     safe = jnp.where(jnp.isfinite(error), jnp.maximum(error, 1e-12), 1e12)
-    change = jnp.clip(0.9 * safe**-0.2, SMALLEST, jnp.where(accepted, LARGEST, 0.9))
+    change = jnp.clip(0.9 * safe**-0.2, MIN_STEP_RATIO, jnp.where(accepted, MAX_STEP_RATIO, 0.9))
     proposed = length * change
     # If `left` or `longest` limited an accepted step, the next step may have the length planned before.
     cut = accepted & (length < flight.length)
     proposed = jnp.where(cut, jnp.maximum(flight.length, proposed), proposed)
-    ahead = lax.stop_gradient(jnp.where(late, length / 4, proposed))
+    ahead = lax.stop_gradient(jnp.where(is_too_long, length / 4, proposed))
     tries = flight.tries + 1
     time = jnp.where(jnp.isfinite(error), flight.time + length, jnp.inf)
     apart = lax.stop_gradient(_time_apart(space, now))
     moved = Flight(time, ahead, touching, memories, now.states, tries, apart)
     after: Flight = select_lanes(accepted, moved, flight._replace(length=ahead, tries=tries))
-    # The integration stops after `MOST_STEPS` steps whose mean length is below a thousandth of `longest`.
-    endless = (tries > MOST_STEPS) & (after.time < 1e-3 * tries.astype(length.dtype) * longest)
+    # The integration stops after `MAX_STEPS` steps whose mean length is below a thousandth of `longest`.
+    endless = (tries > MAX_STEPS) & (after.time < 1e-3 * tries.astype(length.dtype) * longest)
     time = jnp.where(endless, jnp.inf, after.time)
     return after._replace(time=time), Step(now, memories, accepted | endless)
 
@@ -182,8 +182,8 @@ def _try(
 
     step = take_looped_step(slope, flight.states, length)
     now, memories = step.extra
-    level: Any = States(*(body._replace(attitude=normalise(body.attitude)) for body in step.end))
-    return now._replace(states=level), memories, _size(space, step.error, speed) / TOLERANCE
+    normalised: Any = States(*(body._replace(attitude=normalise(body.attitude)) for body in step.end))
+    return now._replace(states=normalised), memories, _size(space, step.error, speed) / TOLERANCE
 
 
 def slope_at(space: Space, now: Instant) -> States:
@@ -270,12 +270,12 @@ def _time_apart(space: Space, now: Instant) -> Float[Array, "*batch"]:
     time = jnp.full_like(linear, jnp.inf)
     for forces in now.forces:
         arm = jax.tree.map(lambda point, origin: point - origin[None], forces.touch.point, now.pose.position)
-        closing = linear[None] + angular[None] * (REACH + norm(arm))
-        time = jnp.minimum(time, jnp.min(-forces.touch.depth / (2 * closing + TINY), axis=0))
+        closing = linear[None] + angular[None] * (NEAREST_POINT_MARGIN + norm(arm))
+        time = jnp.minimum(time, jnp.min(-forces.touch.depth / (2 * closing + MIN_SPEED), axis=0))
     for latch in space.latches:
         height = latch_points(latch, now.pose).z + latch.depth
-        closing = linear[None] + angular[None] * (REACH + norm(latch.point))
-        time = jnp.minimum(time, jnp.min(height / (2 * closing + TINY), axis=0))
+        closing = linear[None] + angular[None] * (NEAREST_POINT_MARGIN + norm(latch.point))
+        time = jnp.minimum(time, jnp.min(height / (2 * closing + MIN_SPEED), axis=0))
     return jnp.maximum(time, 0)
 
 

@@ -56,8 +56,8 @@ class Stewart(Kinematics):
         def leg_rates(at: Array) -> Array:
             return jax.jvp(self.command, (at,), (rate,))[1]
 
-        bent = jax.jvp(leg_rates, (at,), (rate,))[1]
-        return Motion(at, rate, solve(slopes, (motion.acceleration - bent)[:, None])[:, 0])
+        curvature = jax.jvp(leg_rates, (at,), (rate,))[1]
+        return Motion(at, rate, solve(slopes, (motion.acceleration - curvature)[:, None])[:, 0])
 
 
 def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 6 *batch"]:

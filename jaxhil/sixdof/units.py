@@ -8,13 +8,13 @@ from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.six_axes_rules import inertia_matrix
 
 # Largest plausible values.
-LARGEST_VELOCITY = 1.0  # m/s; approach velocity
-LARGEST_ANGLE = 0.3  # rad; angle between C and T at the first touch
-LARGEST_RATE = 0.1  # rad/s; angular velocity of the chaser relative to the target
-GRAVITY = 10.0  # m/s^2; gravity on the ground
-LONGEST_TOOL = 2.0  # m; distance from C's origin to the tool's centre of mass
-FAR = 20.0  # distance from the centre of mass to the interface, divided by the radius of gyration [1]
-WIDE = 10.0  # radius of gyration, divided by the larger of this distance and 1 m [1]
+MAX_VELOCITY = 1.0  # m/s; approach velocity
+MAX_ANGLE = 0.3  # rad; angle between C and T at the first touch
+MAX_RATE = 0.1  # rad/s; angular velocity of the chaser relative to the target
+MAX_GRAVITY = 10.0  # m/s^2; gravity on the ground
+MAX_TOOL_DISTANCE = 2.0  # m; distance from C's origin to the tool's centre of mass
+MAX_INTERFACE_RATIO = 20.0  # distance from centre of mass to interface, divided by radius of gyration [1]
+MAX_GYRATION_RATIO = 10.0  # radius of gyration, divided by the larger of this distance and 1 m [1]
 
 
 def unit_warnings(mechanism: SixAxisMechanism) -> tuple[str, ...]:
@@ -26,31 +26,32 @@ def _warnings(mechanism: SixAxisMechanism) -> Iterator[str]:
     for name, body in (("target", mechanism.target), ("chaser", mechanism.chaser)):
         moment = float(np.linalg.eigvalsh(inertia_matrix(body.inertia))[-1])
         radius, distance = (moment / body.mass) ** 0.5, float(np.linalg.norm(body.interface))
-        if distance > FAR * radius:
+        if distance > MAX_INTERFACE_RATIO * radius:
             found = f"{name}.interface: found {distance:.3g} m for a radius of gyration of {radius:.3g} m"
-            yield f"{found}, expected at most {FAR:g} times this radius: lengths in m, inertia in kg m^2"
-        if radius > WIDE * max(distance, 1.0):
+            expected = f"at most {MAX_INTERFACE_RATIO:g} times this radius"
+            yield f"{found}, expected {expected}: lengths in m, inertia in kg m^2"
+        if radius > MAX_GYRATION_RATIO * max(distance, 1.0):
             found = f"{name}.inertia: found a radius of gyration of {radius:.3g} m"
             yield f"{found}, expected about the size of the body: mass in kg, inertia in kg m^2"
     approach = mechanism.approach
     if approach is not None:
-        for key, most, unit in (
-            ("attitude", LARGEST_ANGLE, "rad"),
-            ("velocity", LARGEST_VELOCITY, "m/s"),
-            ("angular_velocity", LARGEST_RATE, "rad/s"),
+        for key, limit, unit in (
+            ("attitude", MAX_ANGLE, "rad"),
+            ("velocity", MAX_VELOCITY, "m/s"),
+            ("angular_velocity", MAX_RATE, "rad/s"),
         ):
             size = float(np.linalg.norm(getattr(approach, key)))
-            if size > most:
-                yield f"approach.{key}: found {size:.3g} {unit}, expected at most {most:g} {unit}"
+            if size > limit:
+                yield f"approach.{key}: found {size:.3g} {unit}, expected at most {limit:g} {unit}"
     sensor = mechanism.rig.force_sensor
     gravity, path = float(np.linalg.norm(sensor.gravity)), "rig.force_sensor"
-    if gravity > GRAVITY:
-        yield f"{path}.gravity: found {gravity:.4g} m/s^2, expected at most {GRAVITY:g} m/s^2"
+    if gravity > MAX_GRAVITY:
+        yield f"{path}.gravity: found {gravity:.4g} m/s^2, expected at most {MAX_GRAVITY:g} m/s^2"
     if sensor.tool is not None:
-        most = min(mechanism.target.mass, mechanism.chaser.mass)
-        if sensor.tool.mass > most:
-            expected = f"expected at most {most:.4g} kg, the mass of the lighter body"
+        limit = min(mechanism.target.mass, mechanism.chaser.mass)
+        if sensor.tool.mass > limit:
+            expected = f"expected at most {limit:.4g} kg, the mass of the lighter body"
             yield f"{path}.tool.mass: found {sensor.tool.mass:.4g} kg, {expected}"
         length = float(np.linalg.norm(sensor.tool.com))
-        if length > LONGEST_TOOL:
-            yield f"{path}.tool.com: found {length:.3g} m, expected at most {LONGEST_TOOL:g} m"
+        if length > MAX_TOOL_DISTANCE:
+            yield f"{path}.tool.com: found {length:.3g} m, expected at most {MAX_TOOL_DISTANCE:g} m"

@@ -35,17 +35,17 @@ class Values:
             value = np.broadcast_to(nominal, (self.number, *nominal.shape))
         return self.np.moveaxis(self.np.asarray(value, float), 0, -1)
 
-    def has(self, path: str) -> bool:
+    def has_value(self, path: str) -> bool:
         """Return whether the file has a value for this path."""
         return value_at(self._mechanism, path) is not None
 
-    def drawn(self, path: str) -> bool:
+    def is_drawn(self, path: str) -> bool:
         """Return whether the value for this path is drawn."""
         return path in self._draws
 
-    def nothing(self, path: str) -> bool:
+    def is_zero(self, path: str) -> bool:
         """Return whether the value is not drawn, and 0 in the file."""
-        return not self.drawn(path) and not np.any(np.asarray(value_at(self._mechanism, path), float))
+        return not self.is_drawn(path) and not np.any(np.asarray(value_at(self._mechanism, path), float))
 
     def constant(self, value: float) -> Any:
         """Return an array (lanes,) with the same number in every lane."""
@@ -71,7 +71,7 @@ class Values:
         """Convert rows (3, 3, lanes) to a `Matrix`."""
         return Matrix(*(self.vector(row) for row in values))
 
-    def turned(self, angle: Any, axis: Any) -> Any:
+    def rotated_about_z(self, angle: Any, axis: Any) -> Any:
         """Rotate points or axes (3, lanes) about z by an angle [rad]."""
         cosine, sine = self.np.cos(angle), self.np.sin(angle)
         x, y, z = axis

@@ -21,7 +21,7 @@ from jaxhil.sixdof.relative import States, relative
 from jaxhil.sixdof.sensor import Sensor
 from jaxhil.sixdof.vectors import dot, norm
 
-QUIET = 0.06  # s; minimum pause, without a touch of rig and ideal contact, after which an episode may end
+MIN_PAUSE = 0.06  # s; minimum pause, without a touch of rig and ideal contact, after which an episode may end
 
 
 class Beginning(NamedTuple):
@@ -109,10 +109,10 @@ def watch_tick(
 def quiet_time(sensor: Sensor, period: Array) -> Array:
     """Return the pause [s] (time without a touch) after which an episode may end.
 
-    The pause is `QUIET` or, if longer, the time that the force sensor needs to settle: its delay, 20 of its
-    time constants, and two control periods.
+    The pause is `MIN_PAUSE` or, if longer, the time that the force sensor needs to settle: its delay, 20 of
+    its time constants, and two control periods.
     """
-    return jnp.maximum(QUIET, sensor.delay + 20 * sensor.time_constant + 2 * period)
+    return jnp.maximum(MIN_PAUSE, sensor.delay + 20 * sensor.time_constant + 2 * period)
 
 
 def is_rig_quiet(rig: Rig, watch: Watch) -> Array:
