@@ -49,10 +49,10 @@ MACHINE_CODE_TAG = "exec"  # tag with which JAX marks machine code in its pickle
 # wrote the program.
 CACHEABLE_CALLS = re.compile(r"lapack_\w+|Sharding|SPMD\w+|xla\.sdy\.\w+")
 
-Options = Mapping[str, int | str]  # of the compiler, by name
+Options = Mapping[str, int | str]  # compiler options by name
 NO_OPTIONS: Options = MappingProxyType({})
 
-_programs: dict[Any, Any] = {}  # programs of this process
+_programs: dict[Any, Any] = {}  # compiled programs that this process has used
 
 
 def run_cached(

@@ -41,7 +41,7 @@ class CellCounts(NamedTuple):
 
     @property
     def part(self) -> int:
-        """Return the number of cells in either part of a sampling interval."""
+        """Return the number of cells in each of the two parts of a sampling interval."""
         return self.plain + self.window
 
 
@@ -94,7 +94,7 @@ def count_cells(fastest: float, lags: Any) -> CellCounts:
             window = max(_power_of_two(LAG_WINDOW), _power_of_two(fastest * longest))
     longest = fastest / (plain or window)
     return CellCounts(
-        plain, window, next(degree for most, degree in SERIES_DEGREES.items() if longest <= 1.001 * most)
+        plain, window, next(degree for limit, degree in SERIES_DEGREES.items() if longest <= 1.001 * limit)
     )
 
 
@@ -199,8 +199,8 @@ def power_series(cells: Cells, inputs: IntervalInputs) -> Float[Array, "powers c
 
 def bound_time_constant(time_constant: Array, control_period: Array) -> Array:
     """Return the time constant [s], raised to at least `MIN_LAG` control periods."""
-    least = MIN_LAG * control_period
-    return jnp.where(time_constant > least, time_constant, least)
+    shortest = MIN_LAG * control_period
+    return jnp.where(time_constant > shortest, time_constant, shortest)
 
 
 class _CellEdges(NamedTuple):
@@ -215,9 +215,9 @@ def _divide_part(counts, whole, lag):
     """Divide one part of a sampling interval, `whole` periods long, into cells; `lag` is in periods."""
     window = jnp.minimum(whole, LAG_WINDOW * lag) if counts.plain else whole
     window = window if counts.window else jnp.zeros_like(whole)
-    left = [(whole - window) * (i / counts.plain) for i in range(counts.plain, 0, -1)]
+    before_window = [(whole - window) * (i / counts.plain) for i in range(counts.plain, 0, -1)]
     inside = [window * (i / max(counts.window, 1)) for i in range(counts.window, -1, -1)]
-    before = jnp.stack([window + before_window for before_window in left] + inside)
+    before = jnp.stack([window + time for time in before_window] + inside)
     lengths = [(whole - window) / max(counts.plain, 1)] * counts.plain
     return _CellEdges(before, jnp.stack(lengths + [window / max(counts.window, 1)] * counts.window))
 

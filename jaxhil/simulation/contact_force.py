@@ -88,7 +88,7 @@ class Surfaces(NamedTuple):
         """Return a copy with the contact law's state after part of a smooth section of motion.
 
         Args:
-            start: Motion at the section's start, to which the state of `self` belongs.
+            start: Motion at the section's start, where the contact law has the state of `self`.
             end: Motion at the section's end.
             duration: Duration of the section [s].
             s: Fraction of the section, from 0 to 1, after which the state is returned.
@@ -250,8 +250,8 @@ def apply_sensor_lag(
 def interpolate_motion(start: MotionSample, end: MotionSample, duration: Array, s: Any) -> MotionSample:
     """Interpolate the motion at the fraction `s` of a section by a cubic Hermite polynomial."""
     v_0, v_1 = start.velocity * duration, end.velocity * duration
-    moved = end.position - start.position
-    bend, twist = 3 * moved - 2 * v_0 - v_1, v_0 + v_1 - 2 * moved
+    displacement = end.position - start.position
+    bend, twist = 3 * displacement - 2 * v_0 - v_1, v_0 + v_1 - 2 * displacement
     position = start.position + s * (v_0 + s * (bend + s * twist))
     velocity = v_0 + s * (2 * bend + s * 3 * twist)
     safe = jnp.where(duration > 0, duration, 1)
@@ -259,13 +259,13 @@ def interpolate_motion(start: MotionSample, end: MotionSample, duration: Array, 
 
 
 def _find_turning_point(start, end, duration, side):
-    """Return the fraction of a section at which motion into the surface reverses; 1 if it does not."""
+    """Return the fraction of a section at which the motion into the surface reverses; 1 without reversal."""
     first, last = side * start.velocity, side * end.velocity
     turns = (first > 0) & (last < 0)
     # The inward velocity, times the duration, is first + slope s + bend s^2 at the fraction s.
-    moved = side * (end.position - start.position)
+    displacement = side * (end.position - start.position)
     first, last = first * duration, last * duration
-    slope, bend = 6 * moved - 4 * first - 2 * last, 3 * (first + last - 2 * moved)
+    slope, bend = 6 * displacement - 4 * first - 2 * last, 3 * (first + last - 2 * displacement)
     square = jnp.where(turns, slope**2 - 4 * bend * first, 1)
     return jnp.where(turns, 2 * first / jnp.where(turns, jnp.sqrt(square) - slope, 1), 1)
 
@@ -289,10 +289,10 @@ class _SectionContact(NamedTuple):
 
 
 def _find_section_contact(surfaces, start, end, duration):
-    """Return begin and end of the contact in a section.
+    """Find begin and end of the contact in a section of motion.
 
-    The contact lasts while both the penetration and the contact law's `hold` are positive. The `hold` becomes
-    negative if the force vanishes before the penetration does.
+    The contact lasts while both the penetration and the contact law's function `hold` are positive. `hold`
+    becomes negative if the force vanishes while there is still a penetration.
     """
     side, surface = surfaces.side(start, end)
 

@@ -83,7 +83,7 @@ class RigModel(abc.ABC):
 
     @abc.abstractmethod
     def at_rest(self, scenarios: Any, idle: np.ndarray) -> Any:
-        """Return the scenarios without runs in the `idle` lanes, which only fill a tile."""
+        """Return a copy of the scenarios in which the `idle` lanes, which only fill a tile, have no runs."""
 
     @abc.abstractmethod
     def expected_duration(self, scenarios: Any) -> np.ndarray:
@@ -91,9 +91,9 @@ class RigModel(abc.ABC):
 
     @abc.abstractmethod
     def whole_delays(self, scenarios: Any) -> np.ndarray:
-        """Return a number per scenario by which lanes with equal delays are sorted together.
+        """Return a sorting key for each scenario, which places scenarios with similar delays together.
 
-        Two scenarios have different numbers if one of their delays differs in its whole control periods.
+        Two scenarios have equal keys if each delay contains the same number of whole control periods.
         """
 
     @abc.abstractmethod
@@ -109,11 +109,11 @@ class RigModel(abc.ABC):
         """Return the name of a loop's compensator."""
 
     def prepared(self, loop: Any, scenarios: Any) -> Any:
-        """Compute the part of a run that does not depend on the gains, as an argument of `outcome`."""
+        """Compute the part of a run that does not depend on the gains; the result is passed to `outcome`."""
         return scenarios
 
     def outcome(self, loop: Any, gains: Gains, rig: Any) -> Outcome:
-        """Run what `prepared` returned; the outcome is differentiable with respect to the gains."""
+        """Run the scenarios given to `prepared`; the outcome is differentiable with respect to the gains."""
         return self.run(loop, gains, rig)
 
     def noise_amplification(self, loop: Any, gains: Gains, rig: Any) -> Float[Array, "*batch"]:
@@ -156,7 +156,7 @@ class RigModel(abc.ABC):
         at_least: int = 1,
         wanted: Callable[[Outcome], Any] = lambda outcome: outcome,
     ) -> Callable[[], Any]:
-        """Start `evaluate` and return a function that waits for `wanted(outcome)` and returns it."""
+        """Start an evaluation; return a function that waits for the outcome and returns `wanted(outcome)`."""
         return self.begin_batch(loop, gains, self.place_batch(scenarios, at_least), wanted)
 
     def place_batch(self, scenarios: Any, at_least: int = 1) -> Batch:
@@ -263,7 +263,10 @@ def count_lanes(scenarios: Any) -> int:
 
 
 def run_tiles(static: tuple[RigModel, Any], common: Any, per_lane: Any, scenarios: Any) -> Outcome:
-    """Run the tiles of all devices, those of one device one after another; `static` is (model, loop)."""
+    """Run all tiles: on all devices in parallel, on each device one tile after another.
+
+    `static` is the pair (model, loop).
+    """
     model, loop = static
 
     def one_device(common, arguments):

@@ -46,9 +46,9 @@ def begin_approach(
     if not (skip_flight and loop.is_idle_in_flight):
         return entered, jnp.zeros(velocity.shape, jnp.int32)
     stride = rig.constants.control_period * velocity
-    left = nearer - _newest_sample(loop, rig, entered, stride)
+    distance = nearer - _newest_sample(loop, rig, entered, stride)
     moves = stride > 0
-    periods = jnp.floor(jnp.where(moves, left, 0) / jnp.where(moves, stride, 1)) - 2
+    periods = jnp.floor(jnp.where(moves, distance, 0) / jnp.where(moves, stride, 1)) - 2
     skipped = lax.stop_gradient(jnp.maximum(periods, 0))
     state = start_uniform_motion(loop, rig, gains, state, position + skipped * stride, velocity, tick)
     return state, skipped.astype(jnp.int32)
@@ -65,8 +65,8 @@ def advance_to_surface(
     scenario, period = rig.scenario, rig.constants.control_period
     velocity, position = state.velocity, state.position
     stride = period * velocity
-    left = jnp.where(velocity > 0, -position, position + scenario.clearance)
-    spare = left - APPROACH_TIME * jnp.abs(velocity) - jnp.abs(scenario.contact_plane)
+    distance = jnp.where(velocity > 0, -position, position + scenario.clearance)
+    spare = distance - APPROACH_TIME * jnp.abs(velocity) - jnp.abs(scenario.contact_plane)
     strides = spare / jnp.where(stride != 0, jnp.abs(stride), 1)
     periods = lax.stop_gradient(jnp.floor(jnp.where(stride != 0, strides, 0)))
     arrived = start_uniform_motion(loop, rig, gains, state, position + periods * stride, velocity, tick)

@@ -44,7 +44,7 @@ class LoadedGains(NamedTuple):
 
 
 def load_gain_file(path: str | os.PathLike[str], any_axes: bool = False) -> LoadedGains:
-    """Read and check the gain file at `path`; accept a file of six axes only with `any_axes`.
+    """Read and check the gain file at `path`. A file for six axes is accepted only with `any_axes`.
 
     Raise `InputError` if the file cannot be read or is invalid.
     """
@@ -59,13 +59,13 @@ def load_gain_file(path: str | os.PathLike[str], any_axes: bool = False) -> Load
 def check_document(
     document: dict[str, Any], source: str = "gain document", any_axes: bool = False
 ) -> LoadedGains:
-    """Check the content of a gain file; accept six axes only with `any_axes`.
+    """Check the content of a gain file. A file for six axes is accepted only with `any_axes`.
 
     Raise `InputError` if the content is invalid; `source` names the file in the message.
     """
     axes = 6 if isinstance(document, dict) and document.get("axes") == 6 else 1
     try:
-        on_the_rig = check_gain_document(
+        checked = check_gain_document(
             document, source, _gains_without_runtime(axes), (1, 6) if any_axes else (1,)
         )
     except GainFileError as error:
@@ -77,15 +77,15 @@ def check_document(
             raise _make_error(source, key, format_value(document[key]), allowed)
     read = any_from_plain_data if axes == 6 else from_plain_data
     mechanism = read(document["mechanism"], f"{source}: mechanism")
-    law = find_compensator(on_the_rig.compensator, source, axes).gains
-    check_gain_names(on_the_rig.gains, law, f"{source}: gains")
+    law = find_compensator(checked.compensator, source, axes).gains
+    check_gain_names(checked.gains, law, f"{source}: gains")
     for gain in law:
         _check_entry(gain, document["gains"][gain.name], mechanism, source)
-    return LoadedGains(document, on_the_rig.compensator, dict(on_the_rig.gains), mechanism)
+    return LoadedGains(document, checked.compensator, dict(checked.gains), mechanism)
 
 
 def find_compensator(compensator: object, source: str, axes: int = 1) -> Compensator | SixAxisCompensator:
-    """Return the compensator with that name for a number of axes.
+    """Return the compensator with the given name for rigs with `axes` axes.
 
     Raise `InputError` that begins with `source` if there is none.
     """
@@ -113,7 +113,7 @@ def resolve_gain_bounds(gain: Gain, mechanism: Any) -> tuple[float, float, float
 
 
 def _gains_without_runtime(axes: int) -> dict[str, dict[str, GainSpecification]]:
-    """Return the gains of compensators without a runtime class for so many axes, by compensator."""
+    """Return the gain specifications of all compensators with no class for the rig, by compensator."""
     return {
         name: {gain.name: GainSpecification(gain.unit) for gain in law.gains}
         for name, law in (SIX_AXIS_COMPENSATORS if axes == 6 else COMPENSATORS).items()

@@ -54,8 +54,8 @@ def split_at_reversals(path: CellMotion) -> MonotonePieces:
 
 def split_at(path: CellMotion, edges: Array) -> MonotonePieces:
     """Divide each cell at the relative times `edges`, (edges, cells, *batch), into monotone pieces."""
-    moved = position_at(path, edges[1:]) - position_at(path, edges[:-1])
-    return MonotonePieces(path, edges[:-1], edges[1:], jnp.where(moved < 0, -1, 1).astype(moved.dtype))
+    step = position_at(path, edges[1:]) - position_at(path, edges[:-1])
+    return MonotonePieces(path, edges[:-1], edges[1:], jnp.where(step < 0, -1, 1).astype(step.dtype))
 
 
 def position_at(path: CellMotion, s: Array) -> Array:

@@ -170,7 +170,7 @@ def matrix_exponential(
         return units[order] + units[order + 1] * ramp[None]
 
     def product(left, right, ramp):
-        """Return the first rows of the product of two matrices of this form; `ramp` is that of `right`."""
+        """Return the first rows of left @ right for matrices of this form; `ramp` is the r of `right`."""
         total = _matrix_product(left[:, :order], right)
         driven = left[:, order, None] * ramp_row(ramp)[None]
         return total + driven + left[:, order + 1, None] * units[None, order + 1]
@@ -215,7 +215,7 @@ def rate_row(
     denominator: Float[Array, "order_plus_1 *batch"],
     control_period: Float[Array, "*batch"],
 ) -> Float[Array, "columns *batch"]:
-    """Return the row that gives the time derivative [1/s] of what `row` gives in a sampling interval.
+    """Return the row that computes the time derivative [1/s] of the quantity that `row` computes.
 
     The derivation uses d/ds E(s) = E(s) G, where G is the generator in `discretise`.
     """

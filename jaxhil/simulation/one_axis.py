@@ -46,7 +46,7 @@ class OneAxis(RigModel):
         return compare_with_ideal(loop, scenario, rollout(loop, gains, scenario))
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
-        """Return the scenarios without contacts in the `idle` lanes, which only fill a tile."""
+        """Return the scenarios with no contacts in the `idle` lanes, which only fill a tile."""
         contacts: Any = np.where(idle, 0, scenarios.contacts).astype(np.int32)
         return scenarios._replace(contacts=contacts)
 
@@ -60,9 +60,9 @@ class OneAxis(RigModel):
         return np.sum(np.where(slots, periods, 0), axis=0)
 
     def whole_delays(self, scenarios: Scenario) -> np.ndarray:
-        """Return a number per scenario by which lanes with equal delays are sorted together.
+        """Return a sorting key for each scenario, which places scenarios with similar delays together.
 
-        Two scenarios have different numbers if one of their delays differs in its whole control periods.
+        Two scenarios have equal keys if each delay contains the same number of whole control periods.
         """
         simulator = np.asarray(scenarios.simulator.delay)
         period = np.asarray(scenarios.control_period)
@@ -89,11 +89,11 @@ class OneAxis(RigModel):
         return loop.compensator.name
 
     def prepared(self, loop: Loop, scenarios: Scenario) -> RigConstants:
-        """Compute the constants of a run, which do not depend on the gains, as an argument of `outcome`."""
+        """Compute the constants of the runs, which do not depend on the gains and are passed to `outcome`."""
         return build_rig_constants(loop, scenarios, measured=loop.compensator.reads_position)
 
     def outcome(self, loop: Loop, gains: Gains, rig: RigConstants) -> Outcome:
-        """Run what `prepared` returned; the outcome is differentiable with respect to the gains."""
+        """Run the scenarios given to `prepared`; the outcome is differentiable with respect to the gains."""
         if loop.compensator.is_large:
             rig = _separate_loops(rig)
         return compare_with_ideal(loop, rig.scenario, run_contacts(loop, gains, rig))
@@ -108,13 +108,13 @@ evaluate = ONE_AXIS.evaluate
 
 
 def _separate_loops(rig: RigConstants) -> RigConstants:
-    """Return constants with equal values for which XLA compiles the loop of the runs as a separate function.
+    """Return the same constants, in a form that makes XLA compile the loop of the runs as its own function.
 
     XLA compiles nested loops as one function, up to the outermost loop that contains no sort. The time that
     LLVM needs for a function grows with the square of its length. This function sorts two numbers, so that
     loops around the runs are compiled separately.
     """
     contacts = rig.scenario.contacts
-    most = jnp.max(contacts)
-    most = jnp.sort(jnp.stack([most, most + 1]))[1]
-    return rig._replace(scenario=rig.scenario._replace(contacts=jnp.minimum(contacts, most)))
+    bound = jnp.max(contacts)
+    bound = jnp.sort(jnp.stack([bound, bound + 1]))[1]
+    return rig._replace(scenario=rig.scenario._replace(contacts=jnp.minimum(contacts, bound)))

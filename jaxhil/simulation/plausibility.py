@@ -209,9 +209,10 @@ def _check_ticks(name: str, mechanism: Mechanism, scenarios: Scenario) -> None:
     found = f"rig.control_period: found {scenarios.control_period[lane]:g} s"
     if approach_time[slot, lane] > MAX_CONTACT_DURATION:
         found = f"contact.clearance: found {scenarios.clearance[lane]:g} m"
-    seconds, most = (approach_time + contact_time)[slot, lane], f"{MAX_CONTACT_TICKS:.0e} ticks a contact"
+    seconds = (approach_time + contact_time)[slot, lane]
     raise InputError(
-        f"{name}: {found}, expected at most {most} and {MAX_RUN_TICKS:.0e} a run: "
+        f"{name}: {found}, expected at most {MAX_CONTACT_TICKS:.0e} ticks a contact "
+        f"and {MAX_RUN_TICKS:.0e} a run: "
         f"contact {slot + 1} takes about {seconds:.3g} s, {ticks[slot, lane]:.2g} ticks"
     )
 
@@ -241,7 +242,7 @@ def _compute_reference(
 
 
 def _find_distinct_contacts(mechanism: Mechanism, reference: IdealContact) -> tuple[ContactSummary, ...]:
-    """Return the contacts of the first lane in the order of the schedule, those with equal metrics once."""
+    """Summarise the first lane's contacts in scheduled order; contacts with equal metrics appear once."""
     durations = np.nan_to_num(reference.duration[:, 0], nan=math.inf, posinf=math.inf)
     contacts: dict[tuple[float, ...], ContactSummary] = {}
     for slot, duration in enumerate(durations):
@@ -314,16 +315,16 @@ def _find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) -
     fastest = max(contacts, key=lambda item: item.frequency)
     slowest = min(contacts, key=lambda item: item.frequency)
     strongest = max(contacts, key=lambda item: item.peak_force)
-    least, most = PLAUSIBLE_FREQUENCIES
+    lowest, highest = PLAUSIBLE_FREQUENCIES
     limit = MAX_FREQUENCY_RATIO / rig.control_period
     if fastest.frequency > limit:
         warnings.append(
             f"{_format_frequency(fastest)}, expected at most {limit:.4g} Hz, 1/10 of the control rate"
         )
-    elif fastest.frequency > most:
-        warnings.append(f"{_format_frequency(fastest)}, expected at most {most:g} Hz")
-    if slowest.frequency < least:
-        warnings.append(f"{_format_frequency(slowest)}, expected at least {least:g} Hz")
+    elif fastest.frequency > highest:
+        warnings.append(f"{_format_frequency(fastest)}, expected at most {highest:g} Hz")
+    if slowest.frequency < lowest:
+        warnings.append(f"{_format_frequency(slowest)}, expected at least {lowest:g} Hz")
     if mechanism.approach.velocity > MAX_PLAUSIBLE_VELOCITY:
         velocity = f"{mechanism.approach.velocity:.4g} m/s"
         warnings.append(

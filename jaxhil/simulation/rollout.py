@@ -227,7 +227,7 @@ def _replace_changing_parts(run, parts):
 
 
 def _build_rings(loop, ring, measured, order):
-    """Return the initial delay lines, only for signals that the loop uses; `ring` is filled with 0."""
+    """Return the initial delay lines of the signals that the loop uses; `ring` is an array of zeros."""
     interval = None
     if loop.is_two_sided:
         motion = MotionSample(ring, ring)
@@ -245,15 +245,15 @@ def _build_rings(loop, ring, measured, order):
 
 
 def _finished_lanes(rig, run):
-    """Return whether the current contact of each lane has ended or failed."""
+    """Return whether the current contact of each lane has ended, normally or with an error status."""
     status = determine_status(rig.scenario, run.watch, run.tick - run.state.onset_tick)
     return (run.watch.over | (status != OK)) & run.active
 
 
 def _restart(loop, gains, state, entered, begins, fresh):
-    """Return the state in which a run starts (`entered`) in lanes where it `begins`, else the old state.
+    """In lanes where a run begins (`begins`), replace the state by `entered`, the state at a run's start.
 
-    Delay lines and parameters of the contact law do not change.
+    The delay lines and the parameters of the contact law do not change.
     """
     sensed_at_entry = state.sensed._replace(
         last=entered.sensed.last,

@@ -83,7 +83,7 @@ def build_end_conditions(scenario: Scenario) -> ContactEndConditions:
 
 
 def fresh_watch(loop: Loop, like: Array) -> Watch:
-    """Return the initial record, before a contact and long after any force."""
+    """Return the record before a contact, for a rig on which no force has acted for a long time."""
     zeros = jnp.zeros_like(like)
     return Watch(
         elapsed=zeros,

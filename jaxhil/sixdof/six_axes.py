@@ -77,7 +77,7 @@ class SixAxes(RigModel):
         return np.zeros(np.shape(scenarios.duration))
 
     def whole_delays(self, scenarios: Scenario) -> np.ndarray:
-        """Return zeros, because scenarios with different delays can share a batch in six axes."""
+        """Return equal sorting keys (zeros), because six-axis delay lines are read lane by lane."""
         return np.zeros(np.shape(scenarios.duration))
 
     def without_noise(self, scenarios: Scenario) -> Scenario:
