@@ -1,1 +1,1 @@
-"""Tuning of gains: objective, search and evaluation of the result."""
+"""Tuning of a compensator's gains: objective, search and evaluation of the tuned gains."""

@@ -1,8 +1,8 @@
-"""Common compiled program of mechanisms with different contact laws, segments and numbers of contacts.
+"""One compiled program for mechanisms that differ in contact law, number of segments or number of contacts.
 
-These properties become array values of each lane. An optional part of the loop that any of the mechanisms
-has is in the program; the values of the other mechanisms make it inert. Mechanisms with a second surface,
-which costs time in every lane, have a program of their own.
+In this program these properties are array values of each lane. The program contains every optional part of
+the loop that any of the mechanisms needs; neutral parameters disable the part for the other mechanisms.
+Mechanisms with two contact surfaces share another program, because the second surface slows every lane.
 """
 
 import dataclasses
@@ -42,24 +42,24 @@ class CommonProgram:
 
     laws: tuple[str, ...]  # names of the contact laws
     segments: int  # largest number of segments of a contact law
-    slots: int  # result slots
-    parts: tuple[str, ...]  # names of the optional parts of the loop that any of the mechanisms has
+    slots: int  # largest number of contacts in a run
+    parts: tuple[str, ...]  # names of the optional parts of the loop that at least one mechanism needs
     discontinuity_order: int  # order of the lowest derivative that is discontinuous at a tick
-    ring: int  # samples in the delay lines
-    cells: CellCounts  # numbers of cells of a sampling interval
-    beforehand: bool  # whether integrated ideal contacts are computed before the simulation
+    ring: int  # length of the delay lines [samples]
+    cells: CellCounts  # numbers of integration cells in a control period
+    beforehand: bool  # whether ideal contacts without a closed form are integrated before the simulation
 
     def law(self, beforehand: bool | None = None) -> LawMixture:
-        """Return the mixture of the laws, which integrates ideal contacts unless they come `beforehand`."""
+        """Return the mixture of all contact laws; it integrates ideal contacts if `beforehand` is false."""
         return LawMixture(self._kinds, self.beforehand if beforehand is None else beforehand)
 
     @property
     def _kinds(self) -> tuple[ContactLaw, ...]:
-        """Return the different simulated laws; two names may share one."""
+        """Return the simulated contact laws, each once even if two law names share it."""
         return tuple(dict.fromkeys(find_contact_law(name).simulated for name in self.laws))
 
     def loop(self, loop: Loop) -> Loop:
-        """Return the loop of one mechanism in the form that this program takes."""
+        """Adapt the loop of one mechanism to the static properties of this program."""
         parts = {name: name in self.parts for name in _OPTIONAL_FLAGS}
         return dataclasses.replace(
             loop,
@@ -71,7 +71,7 @@ class CommonProgram:
         )
 
     def scenarios(self, mechanism: Mechanism, batch: Scenario) -> Scenario:
-        """Return the scenarios of one mechanism in the form that this program takes."""
+        """Adapt the scenarios of one mechanism to the array shapes of this program."""
         slots, number = batch.phase.shape
         chosen = np.minimum(np.arange(self.slots), slots - 1)
 
@@ -83,7 +83,7 @@ class CommonProgram:
         if stiffness.ndim == 2:
             stiffness = stiffness[:, None]
         missing = self.segments - stiffness.shape[1]
-        # The added segments repeat the last slope, so that the contact model is unchanged.
+        # The added segments repeat the last stiffness, so that the contact model is unchanged.
         stiffness = np.concatenate([stiffness, np.repeat(stiffness[:, -1:], missing, axis=1)], axis=1)
         deepest = depths[:, -1:] if depths.shape[1] else np.full((self.slots, 1, number), UNREACHED_DEPTH)
         further = deepest * (1 + np.arange(1, self.segments))[None, :, None]
@@ -98,7 +98,7 @@ class CommonProgram:
         return batch._replace(contact=contact, phase=by_slot(batch.phase), reference=reference)
 
     def _first(self, law: ContactLaw, batch: Scenario) -> Any:
-        """Return the ideal first contact of every scenario, repeated in every slot."""
+        """Compute the ideal first contact of every scenario, and repeat it for every contact of the run."""
         contact: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[0], batch.contact)
         reference = jax.device_get(
             _compute_ideal_contact(law, contact, batch.equivalent_mass, batch.velocity)
@@ -106,7 +106,7 @@ class CommonProgram:
         return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (self.slots, *leaf.shape)), reference)
 
 
-UNREACHED_DEPTH = 1.0  # m; larger than the penetration of any mechanism
+UNREACHED_DEPTH = 1.0  # m; no mechanism penetrates so deeply
 
 
 @partial(jax.jit, static_argnums=0)
@@ -117,8 +117,8 @@ def _compute_ideal_contact(
 
 
 def group_by_common_program(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], CommonProgram]]:
-    """Return the indices of the mechanisms that share a program, and the program, in order of first index."""
-    # Scenarios with every uncertain number at either end show each part of the loop that a draw may need.
+    """Group mechanisms that can share a compiled program; return (indices, program) of each group."""
+    # The scenarios at both ends of every uncertain range need every part of the loop that a draw can need.
     batches = [build_scenarios(mechanism, draw_extremes(mechanism)) for mechanism in mechanisms]
     loops = [build_loop(m, "none", batch) for m, batch in zip(mechanisms, batches, strict=True)]
     groups: dict[Any, list[int]] = {}
@@ -136,7 +136,7 @@ def group_by_common_program(mechanisms: Sequence[Mechanism]) -> list[tuple[list[
 
 
 def _needs_simulated_speeds(mechanism: Mechanism) -> bool:
-    """Return whether ideal contacts must be integrated at speeds that only the simulation yields."""
+    """Return whether ideal contacts must be integrated from approach speeds that the simulation computes."""
     return mechanism.approach.contacts > 1 and not find_contact_law(mechanism.contact.law).closed_form
 
 
@@ -156,7 +156,7 @@ def _build_common_program(mechanisms, group, loops, batches) -> CommonProgram:
 
 
 def _join_cell_counts(mechanisms, loops, batches) -> CellCounts:
-    """Return cell counts that suffice for every mechanism, `NO_CELLS` if no loop has cells."""
+    """Return the largest numbers of integration cells of all mechanisms, or `NO_CELLS` if none uses cells."""
     if not any(loop.has_cells for loop in loops):
         return NO_CELLS
     exact = [build_loop(m, "none", batch, exact=True) for m, batch in zip(mechanisms, batches, strict=True)]

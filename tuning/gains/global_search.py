@@ -1,7 +1,7 @@
 """Comparison of tuned gains with the best gains of a global search on the same objective.
 
-The search covers the whole box, does not start from the tuned gains and takes `EVALUATION_FACTOR` times as
-many evaluations as tuning.
+The search covers the whole range of every gain and does not start from the tuned gains. It evaluates the
+objective `EVALUATION_FACTOR` times as often as tuning did.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import search_globally
 
 EVALUATION_FACTOR = 50
-MIN_LANES_PER_CALL = 8192  # least number of lanes per call; many lanes are faster than few
+MIN_LANES_PER_CALL = 8192  # lanes; large calls of the compiled program take less time per lane
 
 
 class GlobalComparison(NamedTuple):
@@ -22,9 +22,9 @@ class GlobalComparison(NamedTuple):
 
     tuned: float  # objective of the tuned gains [1]
     best: float  # objective of the best gains of the search [1]
-    above: float  # tuned / best - 1 [1]
-    spent: int  # evaluations of tuning, a Jacobian over P gains counted as 1 + P
-    evaluations: int  # evaluations of the search
+    above: float  # relative excess of the tuned objective, tuned / best - 1 [1]
+    spent: int  # evaluations by tuning; a Jacobian with respect to P gains counts as 1 + P
+    evaluations: int  # evaluations by the global search
     gains: dict[str, float]  # best gains of the search
 
 
@@ -35,7 +35,10 @@ def compare_with_global_search(
     settings: TuneSettings,
     factor: int = EVALUATION_FACTOR,
 ) -> GlobalComparison | None:
-    """Search the box of one task with `factor` times the evaluations of tuning; None if all starts failed."""
+    """Compare the tuned gains of one task with a global search of `factor` times as many evaluations.
+
+    Return None if tuning failed from every start.
+    """
     if found.best is None:
         return None
 

@@ -1,7 +1,7 @@
 """User-defined objective, a function of the metrics of all contacts in all scenarios.
 
-The function gets `ScenarioMetrics` and returns one number >= 0, which tuning minimises. It must be traceable
-by JAX: it is compiled, and the solver differentiates it together with the simulation.
+The function gets `ScenarioMetrics` and returns one number >= 0, which tuning minimises. JAX must be able to
+trace the function, because the solver compiles and differentiates it together with the simulation.
 """
 
 from collections.abc import Callable
@@ -19,33 +19,41 @@ FUNCTION_REQUIREMENT = "a function of metrics that returns a finite number >= 0"
 
 
 class ScenarioMetrics(NamedTuple):
-    """Argument of a user's function: JAX arrays with one row per contact and one column per scenario.
+    """Contact metrics that a user's objective function gets, as JAX arrays (contacts, scenarios).
 
-    A contact that does not end has an error of 3, the matching restitution and a peak command of four times
-    the ideal contact's peak force; its other metrics are those until the run stopped.
+    For a contact that does not end, `error` is 3, `restitution` is e* + 3 and `peak_command` is four times
+    the ideal contact's peak force. Its other metrics cover the time until the run stopped.
+
+    Attributes:
+        error: restitution error e - e* [1].
+        restitution: restitution e, the rebound speed divided by the approach speed [1].
+        reference_restitution: restitution e* of the ideal contact with the same approach speed [1].
+        peak_command: largest magnitude of the force command F_c [N].
+        peak_force: largest magnitude of the real contact force [N].
+        duration: time from the contact's onset to its end [s].
+        approach_velocity: speed at the contact's onset [m/s].
+        status: 0 if the contact ended; otherwise an index into `jaxhil.simulation.metrics.STATUS_NAMES`.
     """
 
-    error: Float[Array, "contacts scenarios"]  # restitution error e - e* [1]
-    restitution: Float[Array, "contacts scenarios"]  # rebound speed over approach speed, e [1]
-    # restitution e* of the ideal contact with the same approach speed [1]
+    error: Float[Array, "contacts scenarios"]
+    restitution: Float[Array, "contacts scenarios"]
     reference_restitution: Float[Array, "contacts scenarios"]
-    peak_command: Float[Array, "contacts scenarios"]  # largest magnitude of the commanded force F_c [N]
-    peak_force: Float[Array, "contacts scenarios"]  # largest magnitude of the real contact force [N]
-    duration: Float[Array, "contacts scenarios"]  # from a contact's beginning to its end [s]
-    approach_velocity: Float[Array, "contacts scenarios"]  # speed at the onset of the contact [m/s]
-    # 0 for a contact that ended, else the reason (index into `jaxhil.simulation.metrics.STATUS_NAMES`)
+    peak_command: Float[Array, "contacts scenarios"]
+    peak_force: Float[Array, "contacts scenarios"]
+    duration: Float[Array, "contacts scenarios"]
+    approach_velocity: Float[Array, "contacts scenarios"]
     status: Int[Array, "contacts scenarios"]
 
 
 class MetricsFunction:
-    """User's function as an objective; equal only to itself, so that no other function uses its program."""
+    """User's objective function, which equals no other object, so that it has its own compiled program."""
 
     def __init__(self, function: Callable[[ScenarioMetrics], Any]):
         self.function = function
         self._vectorised = jax.jit(jax.vmap(self._value))
 
     def check(self, contacts: int, scenarios: int) -> None:
-        """Raise `InputError` if the function does not return one number for (contacts, scenarios) metrics."""
+        """Raise `InputError` if the function does not reduce (contacts, scenarios) metrics to one number."""
         like: Any = jax.ShapeDtypeStruct((contacts, scenarios), jnp.result_type(float))
         count: Any = jax.ShapeDtypeStruct((contacts, scenarios), jnp.int32)
         metrics = ScenarioMetrics(*[like] * 7, status=count)
@@ -54,25 +62,26 @@ class MetricsFunction:
         except Exception as error:
             reason = to_one_line(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}", 160)
             raise InputError(
-                f"objective: found one that raises {reason}, expected {FUNCTION_REQUIREMENT}"
+                f"objective: found a function that raises {reason}, expected {FUNCTION_REQUIREMENT}"
             ) from None
         if not isinstance(result, jax.ShapeDtypeStruct) or not jnp.issubdtype(result.dtype, jnp.floating):
             name = getattr(result, "dtype", type(result).__name__)
             raise InputError(
-                f"objective: found one that returns {format_value(str(name))}, expected "
+                f"objective: found a function that returns {format_value(str(name))}, expected "
                 f"{FUNCTION_REQUIREMENT}"
             )
         if result.shape != ():
             raise InputError(
-                f"objective: found one that returns shape {result.shape}, expected {FUNCTION_REQUIREMENT}"
+                f"objective: found a function that returns shape {result.shape}, expected "
+                f"{FUNCTION_REQUIREMENT}"
             )
 
     def values(self, metrics: ScenarioMetrics) -> Float[Array, "several"]:
-        """Return the values of several sets of metrics, leaves (several, contacts, scenarios); traceable."""
+        """Apply the function to each of several sets of metrics, arrays (several, contacts, scenarios)."""
         return jax.vmap(self._value)(metrics)
 
     def numbers(self, metrics: ScenarioMetrics) -> Float[np.ndarray, "several"]:
-        """Return `values` in NumPy, NaN for non-finite ones; raise `InputError` if one is negative."""
+        """Return `values` as a NumPy array, with NaN for infinity; raise `InputError` for negative values."""
         values = np.asarray(self._vectorised(metrics), float)
         if np.any(values < 0):
             raise InputError(
@@ -85,7 +94,7 @@ class MetricsFunction:
 
 
 def build_scenario_metrics(outcome: Outcome, failed: float) -> ScenarioMetrics:
-    """Return the metrics of an outcome, leaves (contacts, *batch); failed contacts have error `failed`."""
+    """Select the metrics (contacts, *batch) from an outcome; a failed contact gets the error `failed`."""
     metrics = outcome.metrics
     # Without the inner `where`, non-finite numbers of failed contacts would make the derivative NaN.
     usable = outcome.good & jnp.isfinite(outcome.error) & jnp.isfinite(outcome.peak_ratio)

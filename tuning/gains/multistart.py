@@ -1,10 +1,10 @@
 """Multistart search for the best gains of many tasks.
 
-The first batch of starts holds the literature's gains and the best points of a scan; the solver descends
-from each by derivatives. If they do not end at the same value, further batches start at the best points of
-other scans, until several starts agree on the best value. The number of minima is unknown; repeated
-convergence to the best one indicates that few better ones are left. Since contacts begin and end at ticks,
-the objective has kinks at which a descent may stop; the best point is then improved without derivatives.
+A start is a set of gains from which the gradient-based solver descends. The first batch of starts holds the
+literature's gains and the best points of a scan. If the descents do not reach the same minimum, further
+batches start at the best points of other scans, until several descents reach the best value. This repetition
+indicates that few better minima remain. Contacts begin and end at ticks, so that the objective has kinks at
+which a descent may stop; a derivative-free search therefore improves the best point.
 
 Source: multistart until a minimum recurs, Boender and Rinnooy Kan, "Bayesian stopping rules for multistart
 global optimization methods" (1987).
@@ -43,36 +43,34 @@ from tuning.gains.tasks import TuneTask, list_tuned_gains
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import polish
 
-NONSMOOTH_POLISH_FACTOR = 3  # factor on the evaluations without derivatives for a user's function
+NONSMOOTH_POLISH_FACTOR = 3  # a user's function gets so many times the derivative-free evaluations
 MAX_START_BATCHES = 4  # largest number of batches of starts
-MIN_AGREEING_STARTS = 3  # starts that must agree; two may converge to the same poor minimum
-AGREEMENT_TOLERANCE = 0.005  # relative difference of values that count as the same minimum
-# The same with probes: another draw of the scenarios would change the value by more.
+MIN_AGREEING_STARTS = 3  # starts that must reach the best value; two can reach the same poor minimum
+AGREEMENT_TOLERANCE = 0.005  # largest relative difference between values of the same minimum
+# Tolerance for scenarios with probes, where another draw of the scenarios changes the value by more.
 PROBED_AGREEMENT_TOLERANCE = 0.02
-RESTART_GENERATIONS, RESTART_STD = 24, 0.2  # search from a stuck start: generations, first standard deviation
-POLISH_STD, CANDIDATES_PER_GENERATION = (
-    0.1,
-    16,
-)  # final search without derivatives: first standard deviation, points per generation
+# derivative-free search from a stuck start: generations, initial standard deviation in unit coordinates
+RESTART_GENERATIONS, RESTART_STD = 24, 0.2
+# final derivative-free search: initial standard deviation in unit coordinates, points per generation
+POLISH_STD, CANDIDATES_PER_GENERATION = 0.1, 16
 
-Objectives = Objective | Sequence[Objective]  # one of all tasks, or one per task
+Objectives = Objective | Sequence[Objective]  # one objective for all tasks, or one per task
 
 
 class MultistartResult(NamedTuple):
     """Result of the search for one task."""
 
-    best: StartResult | None  # best start, improved without derivatives; None if all failed
-    starts: list[StartResult]  # all starts, batch by batch
-    # Evaluations of the objective. A Jacobian over P gains counts as 1 + P, a point of a scan as the share of
-    # the scenarios on which it may be evaluated.
+    best: StartResult | None  # best start, improved by a derivative-free search; None if all starts failed
+    starts: list[StartResult]  # all starts, in the order of their batches
+    # Number of evaluations of the objective. A Jacobian with respect to P gains counts as 1 + P. A point of
+    # a scan counts as the share of the scenarios on which a scan evaluates.
     evaluations: int
-    # objective of the search for quieter gains, which is that of `best`; None without such a search
-    quiet: Objective | None = None
+    quiet: Objective | None = None  # objective of the search for quieter gains; None if there was no search
 
 
 @dataclass
 class _SearchState:
-    """Starts of one task so far, and their evaluations of the objective."""
+    """Starts of one task that have ended, and the number of objective evaluations they took."""
 
     starts: list[StartResult] = field(default_factory=list)
     evaluations: int = 0
@@ -84,11 +82,11 @@ def find_gains(
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
     meanwhile: Callable[[], object] = lambda: None,
 ) -> list[MultistartResult]:
-    """Search the best gains of every task of `validation`.
+    """Search for the best gains of every task of `validation`.
 
-    `first` holds, per task, gains that replace the last starts of its first batch, never the literature's. A
-    single start is the literature's, in the only batch. `meanwhile` is called while the solver's program
-    compiles.
+    `first` holds, for each task, known good gains that replace the last starts of the first batch, but never
+    the literature's gains. If `settings.starts` is 1, the only start is at the literature's gains.
+    `meanwhile` is called while the solver compiles.
     """
     tasks, quiet = validation.tasks, is_quiet_search_needed(validation.tasks[0], settings)
     objective = build_least_error_objective(settings.objective) if quiet else settings.objective
@@ -97,22 +95,22 @@ def find_gains(
     agreed = PROBED_AGREEMENT_TOLERANCE if probed else AGREEMENT_TOLERANCE
     searches = [_SearchState() for _ in tasks]
     _check_function(validation, objective)
-    going = _solve_batches(validation, settings, first, agreed, searches, meanwhile)
+    unfinished = _solve_batches(validation, settings, first, agreed, searches, meanwhile)
     if probed or objective.function is not None:
         for i, search in enumerate(searches):
             search.starts, more = _restart_stuck_starts(
                 validation, i, search.starts, agreed, settings.seed, objective
             )
             search.evaluations += more
-    # Where starts agree within PROBED_AGREED, the draw of the scenarios matters more than a further descent.
-    polishing = 0 if probed and not going else settings.polish * len(validation.names)
+    # If probed starts agree, another draw of the scenarios changes the value by more than polishing does.
+    polishing = 0 if probed and not unfinished else settings.polish * len(validation.names)
     if objective.function is not None:
-        # A user's function may have many kinks, as a maximum has.
+        # A user's function may have many kinks: the maximum of several metrics, for example.
         polishing *= NONSMOOTH_POLISH_FACTOR
     objectives, ends = list_objectives(objective, len(tasks)), [search.starts for search in searches]
     quieter = _search_quieter_gains(validation, settings, first, searches) if quiet else {}
-    for i, (search, found) in quieter.items():
-        objectives[i], ends[i] = search, found
+    for i, (quiet_objective, quiet_starts) in quieter.items():
+        objectives[i], ends[i] = quiet_objective, quiet_starts
     if polishing:
         runs = polishing * len(tasks) * tasks[0].lanes
         validation.work.begin("searching on without derivatives", runs)
@@ -134,10 +132,10 @@ def _search_quieter_gains(
     first: Sequence[Sequence[Mapping[str, float]]] | None,
     searches: list[_SearchState],
 ) -> dict[int, tuple[Objective, list[StartResult]]]:
-    """Search for quieter gains from those of least error; return objective and final starts by task index.
+    """Search for quieter gains, starting from the most accurate gains.
 
-    Only tasks whose error is within the limit take part. The number of starts is that of the first batch, so
-    that the same program is used.
+    Tasks whose error exceeds the limit are skipped. The number of starts equals that of the first batch, so
+    that the compiled program is reused. Return objective and final starts, by task index.
     """
     tasks, objective = validation.tasks, settings.objective
     best = [ranked[0] if (ranked := _rank_starts(search.starts)) else None for search in searches]
@@ -162,12 +160,12 @@ def _search_quieter_gains(
 
 
 def _count_batch_starts(settings: TuneSettings, first: Sequence[Sequence[Mapping[str, float]]] | None) -> int:
-    """Return the number of starts of a batch, at least one more than the largest number in `first`."""
+    """Return the number of starts in a batch: room for all gains in `first` and for the literature's."""
     return max(settings.starts, 1 + max(map(len, first))) if first else settings.starts
 
 
 def estimate_search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
-    """Return the simulated runs of a search of like tasks if starts agree and none ends early."""
+    """Return the number of simulated runs of a search that needs one batch and all steps of every start."""
     names, lanes = list_tuned_gains(tasks), tasks[0].lanes
     scanning = settings.scanned * min(SCAN_SCENARIOS, lanes) if settings.starts > 1 else 0
     solve = settings.starts * settings.steps * count_step_runs(tasks, names)
@@ -177,7 +175,10 @@ def estimate_search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
 def _solve_batches(
     validation, settings, first, agreed, searches: list[_SearchState], meanwhile: Callable[[], object]
 ) -> list[int]:
-    """Solve batches of starts; return the tasks whose starts still do not agree."""
+    """Solve up to `MAX_START_BATCHES` batches of starts.
+
+    Return the indices of the tasks whose starts still disagree about the best value.
+    """
     tasks, objective, work = validation.tasks, settings.objective, validation.work
     numbers = [len(gains) for gains in first] if first else [0 for _ in tasks]
     number = _count_batch_starts(settings, first)
@@ -188,27 +189,27 @@ def _solve_batches(
         lambda: choose_starts(validation, number, settings.seed, objective, first, settings.scanned),
         meanwhile,
     )
-    going = list(range(len(tasks)))
+    unfinished = list(range(len(tasks)))
     for batch in range(MAX_START_BATCHES if number > 1 else 1):
         if batch > 0:
-            text = f"batch {batch + 1} of starts, {len(going)} of {len(tasks)} mechanisms"
-            work.begin(text, estimate_search_runs([tasks[i] for i in going], settings))
+            text = f"batch {batch + 1} of starts, {len(unfinished)} of {len(tasks)} mechanisms"
+            work.begin(text, estimate_search_runs([tasks[i] for i in unfinished], settings))
             seed = settings.seed, batch
             chosen = [np.empty((0, len(validation.names)))] * len(tasks)
-            scans = scan_gain_ranges(validation, going, number, seed, objective, settings.scanned)
-            for i, points in zip(going, scans, strict=True):
+            scans = scan_gain_ranges(validation, unfinished, number, seed, objective, settings.scanned)
+            for i, points in zip(unfinished, scans, strict=True):
                 chosen[i] = points
         ended = solve_tasks(tasks, chosen, settings.steps, objective, work)
-        for i in going:
+        for i in unfinished:
             search = searches[i]
             search.starts += _recompute_exact_values(validation, i, ended[i], objective)
             search.evaluations += (1 + len(validation.names)) * sum(start.steps for start in ended[i])
             if batch > 0 or number > 1 + numbers[i]:
                 search.evaluations += count_scan_evaluations(validation, number, settings.scanned)
-        going = [i for i in going if not _is_minimum_repeated(searches[i].starts, agreed)]
-        if not going:
+        unfinished = [i for i in unfinished if not _is_minimum_repeated(searches[i].starts, agreed)]
+        if not unfinished:
             break
-    return going
+    return unfinished
 
 
 def choose_starts(
@@ -219,9 +220,9 @@ def choose_starts(
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
     scanned: int = TuneSettings.scanned,
 ) -> list[Float[np.ndarray, "starts gains"]]:
-    """Return the starts of every task: the literature's gains, then the best separated points of a scan.
+    """Choose the starts of every task: the literature's gains, then the best distinct points of a scan.
 
-    `first` holds, per task, gains that replace the last of these, but never the literature's.
+    `first` holds, for each task, gains that replace the last points of the scan.
     """
     tasks = range(len(validation.tasks))
     prior = [validation.coordinates(i, first[i] if first else ()) for i in tasks]
@@ -242,9 +243,9 @@ def polish_best_starts(
     seed: int,
     objective: Objectives = RMS_OBJECTIVE,
 ) -> list[StartResult | None]:
-    """Improve the best start of every task without derivatives by so many evaluations; None if all failed.
+    """Improve the best start of every task by a derivative-free search with `evaluations` evaluations.
 
-    The search is `tuning.optimisation.derivative_free.polish`.
+    The search is `tuning.optimisation.derivative_free.polish`. A task whose starts all failed yields None.
     """
     best = [ranked[0] if (ranked := _rank_starts(starts)) else None for starts in solved]
     indices = [i for i, top in enumerate(best) if top]
@@ -266,7 +267,7 @@ def polish_best_starts(
 
 
 def _check_function(validation: Validation, objective: Objective) -> None:
-    """Raise `InputError` if the user's function, if any, is not finite for the literature's gains."""
+    """Raise `InputError` if a user's objective function is not finite for the literature's gains."""
     if objective.function is None:
         return
     tasks = range(len(validation.tasks))
@@ -287,9 +288,10 @@ def _restart_stuck_starts(
     seed: int,
     objective: Objectives,
 ) -> tuple[list[StartResult], int]:
-    """Search on without derivatives from the starts that ended above the best; return starts and evaluations.
+    """Restart a derivative-free search from every start that ended above the best value.
 
-    The solver can get stuck at the kink of the objective where the correction's limit begins to bind.
+    The solver can get stuck at the kink of the objective where the compensator's correction reaches its
+    limit. Return all starts, and the number of evaluations of the search.
     """
     ranked = _rank_starts(starts)
     stuck = [i for i, start in enumerate(starts) if ranked and start.rms > (1 + agreed) * ranked[0].rms]
@@ -312,7 +314,7 @@ def _restart_stuck_starts(
 def _recompute_exact_values(
     validation: Validation, task: int, starts: list[StartResult], objective: Objective
 ) -> list[StartResult]:
-    """Replace the values of starts by the exact objective, for which the solver minimised a smooth norm."""
+    """Replace the smooth norm that the solver minimised by the exact objective in every start."""
     if objective.name == "rms" or not starts:
         return starts
     values = validation.losses(objective, [task], np.stack([start.coordinates for start in starts])[None])[0]
@@ -322,14 +324,14 @@ def _recompute_exact_values(
 def _run_while_compiling(
     validation: Validation, number: int, objective: Objective, work: Callable, more: Callable[[], object]
 ):
-    """Call `work` and `more` while the solver's program compiles in a thread; return the result of `work`.
+    """Call `work` and `more` while a second thread compiles the solver; return the result of `work`.
 
-    Only this thread runs programs, since concurrent programs on several devices could deadlock.
+    The second thread runs no program, because concurrent programs on several devices could deadlock.
     """
     if program_folder() is None:
         return work()
-    with ThreadPoolExecutor(1) as beside:
-        ready = beside.submit(_compile_in_thread, validation, number, objective)
+    with ThreadPoolExecutor(1) as compiler:
+        ready = compiler.submit(_compile_in_thread, validation, number, objective)
         result = work()
         more()
         ready.result()
@@ -337,7 +339,7 @@ def _run_while_compiling(
 
 
 def _compile_in_thread(validation: Validation, number: int, objective: Objectives) -> None:
-    # A new thread has the process's JAX settings, not those of the calling thread.
+    # A new thread starts with the process's JAX settings, without the float64 setting of the calling thread.
     with use_float64():
         compile_solver(validation.tasks, number, objective)
 
@@ -345,7 +347,7 @@ def _compile_in_thread(validation: Validation, number: int, objective: Objective
 def _move_start(
     validation: Validation, task: int, start: StartResult, point: np.ndarray, loss: float
 ) -> StartResult:
-    """Return the start moved to `point`; unchanged if the search did not move."""
+    """Return the start with the gains and loss of `point`; unchanged if `point` is where the start ended."""
     if (point == start.coordinates).all():
         return start
     history = [*start.history, float(loss)]

@@ -1,8 +1,8 @@
-"""Solution of many tasks from many starts, in rounds of solver steps.
+"""Gradient-based solution of many tuning tasks, each from several starts, in rounds of solver steps.
 
-A start of a task is a problem. One compiled program solves a fixed number of problems per call. Every round
-distributes the problems that have not converged to calls again, so that hard ones do not delay easy ones.
-After the first, short round only the most promising starts of a task continue.
+One start of one task is a problem. One call of the compiled program advances a fixed number of problems by a
+round of steps. Each round distributes the unconverged problems to calls again, so that slow problems do not
+delay fast ones. After the first, short round only the best starts of each task continue.
 """
 
 import dataclasses
@@ -32,33 +32,34 @@ from tuning.optimisation.solution import SOLVER_STATUSES, SolverResult
 from tuning.optimisation.unit_box import GainBounds
 from tuning.transparency.probes import LANES_PER_SCENARIO
 
-MIN_PROBLEMS_PER_CALL, MAX_PROBLEMS_PER_CALL = 4, 32  # problems in one call of the program
-LANES_PER_TILE = 64  # lanes computed together on a device; more exceed the processor's cache
-STEPS_BEFORE_SELECTION = 8  # steps of the first round
-MAX_CONTINUED_STARTS = 3  # starts of a task that continue after the first round
-MAX_STEPS_PER_CALL = 32  # largest number of steps of one call
-# relative improvement in a round below which a start with probes counts as converged
+MIN_PROBLEMS_PER_CALL, MAX_PROBLEMS_PER_CALL = 4, 32  # problems in one call of the compiled program
+LANES_PER_TILE = 64  # lanes that a device computes together; more lanes exceed the processor's cache
+STEPS_BEFORE_SELECTION = 8  # solver steps of the first round
+MAX_CONTINUED_STARTS = 3  # number of starts per task that continue after the first round
+MAX_STEPS_PER_CALL = 32  # largest number of solver steps in one call
+# With probes, a start counts as converged if a round improves the objective by a smaller fraction.
 MIN_RELATIVE_IMPROVEMENT = 0.005
 STEP_LIMIT = SOLVER_STATUSES.index("step limit")
 GIVEN_UP = "given up"
 
 
 class StartResult(NamedTuple):
-    """Result of one start of the solver."""
+    """Gains and objective that the solver reached from one start."""
 
-    status: str  # why the solver stopped
-    steps: int  # steps of the solver
-    rms: float  # final value of the objective (its norm, see `tuning.gains.objective`)
-    history: list[float]  # value of the objective after every step
+    status: str  # reason why the solver stopped
+    steps: int  # number of solver steps
+    rms: float  # final objective [1], the smooth norm of `tuning.gains.objective`
+    history: list[float]  # objective after every step [1]
     gains: dict[str, float]  # all gains of the compensator
-    coordinates: np.ndarray = np.empty(0)  # unit coordinates of the gains that are tuned for any of the tasks
-    curvature: np.ndarray = np.empty((0, 0))  # J^T J, J the Jacobian of the residuals by the coordinates
+    coordinates: np.ndarray = np.empty(0)  # unit coordinates of the gains that are tuned in at least one task
+    # J^T J, where J is the Jacobian of the residuals with respect to the unit coordinates
+    curvature: np.ndarray = np.empty((0, 0))
 
 
 class _SolverState(NamedTuple):
-    """State of a start after a round."""
+    """State of the solver after a round of steps from one start."""
 
-    coordinates: np.ndarray  # unit coordinates
+    coordinates: np.ndarray  # unit coordinates of the gains
     curvature: np.ndarray  # J^T J at the coordinates
     loss: float  # loss at the coordinates
     history: np.ndarray  # loss after every step
@@ -67,10 +68,10 @@ class _SolverState(NamedTuple):
 
 @dataclasses.dataclass
 class _StartState:
-    """State of one start during the solution."""
+    """Progress of the solver from one start, over all rounds."""
 
-    task: int  # index of its task
-    coordinates: np.ndarray  # current unit coordinates
+    task: int  # index of the task
+    coordinates: np.ndarray  # current unit coordinates of the gains
     curvature: np.ndarray  # J^T J at the coordinates
     status: int | str = STEP_LIMIT  # index into `SOLVER_STATUSES`, or `GIVEN_UP`
     history: list[float] = dataclasses.field(default_factory=list)  # loss after every step
@@ -87,11 +88,11 @@ def solve_tasks(
     objective: Objective | Sequence[Objective] = RMS_OBJECTIVE,
     work: SearchProgress | None = None,
 ) -> list[list[StartResult]]:
-    """Solve like tasks (`tuning.gains.tasks.alike`) from every start; return the results task by task.
+    """Run the solver from every start of tasks that share a program; return the results of each task.
 
-    `starts` holds, per task, unit coordinates of the gains that are tuned for any of the tasks. No start ends
-    worse than it began. `objective` is one of all tasks or one per task; these differ by their weights only.
-    Every round is a step of the `work`.
+    `starts` holds, for each task, unit coordinates of the gains that are tuned in at least one task. The
+    final objective of a start never exceeds its first one. `objective` is common to all tasks, or a list with
+    one per task; these may differ only in their weights. `work` saves a checkpoint after every round.
     """
     work = work or SearchProgress()
     names = list_tuned_gains(tasks)
@@ -103,9 +104,9 @@ def solve_tasks(
         for coordinates in points
     ]
     objectives = list_objectives(objective, len(tasks))
-    # The call's size is that of the first round, so that later rounds with fewer problems use its program.
+    # All rounds use the call size of the first round, so that they use one compiled program.
     advance = _build_stepper(tasks, names, bounds, objectives, len(tasks) * max(map(len, starts)), work)
-    # Sorted by expected duration, problems of one call take about equally long.
+    # After sorting by expected duration, the problems of one call take about equally long.
     order = np.argsort(
         [-float(np.max(task.model.expected_duration(task.scenarios))) for task in tasks], kind="stable"
     )
@@ -137,7 +138,10 @@ def solve_tasks(
 
 
 def _mark_converged(problems: list[_StartState], before: list[float]) -> None:
-    """Mark problems as converged whose value fell by less than `MIN_RELATIVE_IMPROVEMENT` in the round."""
+    """Mark problems as converged if the round reduced the objective by less than the minimum improvement.
+
+    `before` holds each problem's loss before the round.
+    """
     for problem, loss in zip(problems, before, strict=True):
         if problem.status == STEP_LIMIT and problem.loss > (1 - MIN_RELATIVE_IMPROVEMENT) ** 2 * loss:
             problem.status = SOLVER_STATUSES.index("converged")
@@ -157,12 +161,12 @@ def _stop_poor_starts(problems: list[_StartState]) -> None:
 def compute_inverse_hessian(
     curvature: Float[np.ndarray, "gains gains"], value: float
 ) -> Float[np.ndarray, "gains gains"]:
-    """Return the inverse Hessian of the relative objective, from J^T J of the loss.
+    """Return the inverse Hessian of the relative objective in unit coordinates.
 
-    It is the shape of the region in which the objective rises little, limited to a standard deviation of a
-    quarter of the box.
+    `curvature` is J^T J and `value` the objective. The inverse Hessian describes the region in which the
+    objective rises little. No eigenvalue exceeds (1/4)^2, a standard deviation of a quarter of the range.
     """
-    # Where derivatives overflow, the shape is unknown.
+    # If a derivative has overflowed, the curvature is unknown and replaced by 0.
     curvature = np.where(np.all(np.isfinite(curvature)), curvature, 0.0)
     loss = (value / RESIDUAL_SCALE) ** 2 / 2
     return np.linalg.inv(curvature / (2 * max(loss, 1e-12)) + 16 * np.eye(len(curvature)))
@@ -182,7 +186,7 @@ def _build_result(
 def compile_solver(
     tasks: list[TuneTask], starts: int, objective: Objective | Sequence[Objective] = RMS_OBJECTIVE
 ) -> None:
-    """Compile the program of `solve_tasks` into the compile cache."""
+    """Compile the program of `solve_tasks`, and store it in the cache of compiled programs."""
     names = list_tuned_gains(tasks)
     bounds = [build_gain_bounds(task, names) for task in tasks]
     nothing = np.zeros(len(names))
@@ -193,7 +197,7 @@ def compile_solver(
 
 
 def _build_stepper(tasks, names, bounds, objectives, number, work: SearchProgress):
-    """Return a function that advances problems by up to `limit` steps and returns their states."""
+    """Return a function that advances problems by up to `limit` solver steps and returns their new states."""
     static, call = _build_call(tasks, names, bounds, objectives, number)
     size, runs = _choose_call_size(number), count_step_runs(tasks, names)
 
@@ -214,26 +218,29 @@ def _build_stepper(tasks, names, bounds, objectives, number, work: SearchProgres
 
 
 def count_step_runs(tasks: list[TuneTask], names: tuple[str, ...]) -> int:
-    """Return the number of simulated runs of one step of one start."""
+    """Return the number of simulated runs in one solver step of one start."""
     return (1 + len(names)) * tasks[0].lanes
 
 
 def _choose_call_size(number: int) -> int:
-    """Return the number of problems in one call, for `number` problems in total."""
+    """Return the number of problems per call if there are `number` problems in total."""
     return MIN_PROBLEMS_PER_CALL if number <= MIN_PROBLEMS_PER_CALL else MAX_PROBLEMS_PER_CALL
 
 
 def assign_to_devices(size: int) -> np.ndarray:
-    """Return the index of the problem at each position of a call.
+    """Return which problem each position of a call holds, so that all devices take about equally long.
 
-    Problems, sorted by duration, are dealt to the devices in turn; positions of a device are adjacent.
+    Problems are sorted by duration and go to the devices in turn. Each device has adjacent positions.
     """
     devices = math.gcd(jax.device_count(), size)
     return np.arange(size).reshape(-1, devices).T.ravel()
 
 
 def _build_call(tasks, names, bounds, objectives, number):
-    """Return the program's static part, and a function of problems and steps that returns its arguments."""
+    """Return the static arguments of `_solve_call`, and a function that builds the other arguments.
+
+    The function takes the problems and the number of steps.
+    """
     loop = join_loops([task.loop for task in tasks])
     fixed = [{k: v for k, v in task.literature.items() if k not in names} for task in tasks]
     weights = [objective.weights for objective in objectives]
@@ -246,7 +253,7 @@ def _build_call(tasks, names, bounds, objectives, number):
 
     def call(members: list[_StartState], limit: int):
         order = assign_to_devices(size)
-        # Positions that only fill the call hold copies of the first problem, and simulate nothing.
+        # Unused positions of the call hold copies of the first problem, and simulate nothing.
         filled = [members[i] if i < len(members) else members[0] for i in order]
         idle = order[:, None] >= len(members)
         index = np.array([p.task for p in filled])
@@ -258,7 +265,7 @@ def _build_call(tasks, names, bounds, objectives, number):
 
 
 def _sort_by_duration(task: TuneTask) -> Any:
-    """Return the task's scenarios, sorted by duration if they have probes, which run in chunks."""
+    """Return the task's scenarios; those with probes run in tiles and are sorted by duration."""
     if not task.probed:
         return task.scenarios
     # The time limit is proportional to the duration of the contacts.
@@ -282,13 +289,13 @@ def _update_start(problem: _StartState, state: _SolverState) -> None:
     before = problem.history[-1] if problem.history else np.inf
     problem.history.extend(np.minimum.accumulate(np.append(before, state.history))[1:].tolist())
     problem.status = state.status
-    # Every round starts with cautious steps, none of which ends worse than it began.
+    # No step of the solver increases the loss.
     if np.isfinite(state.loss):
         problem.coordinates, problem.curvature = np.clip(state.coordinates, 0, 1), state.curvature
 
 
 def _solve_call(static: tuple[Any, int, int], arguments: Any) -> SolverResult:
-    # The import is slow, and a cached program does not need it.
+    # This slow import is needed only if the program is not in the cache.
     from tuning.optimisation.levenberg_marquardt import solve_least_squares
 
     problem, longest, tile = static

@@ -10,13 +10,13 @@ from jaxhil.laws.simulation_base import Compensator, KnownConstants
 
 
 def has_noise_trade_off(compensator: str) -> bool:
-    """Return whether a compensator's gains change how much sensor noise it passes on."""
+    """Return whether the gains of a compensator change its amplification of sensor noise."""
     law = COMPENSATORS.get(compensator)
     return law is not None and type(law).noise_amplification is not Compensator.noise_amplification
 
 
 def compute_noise_amplification(mechanism: Any, compensator: str, gains: Mapping[str, float]) -> float:
-    """Return A [1] for the nominal mechanism of one axis (`Compensator.noise_amplification`)."""
+    """Return a compensator's amplification of force sensor noise [1] for a one-axis mechanism."""
     period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
     constants = KnownConstants(jnp.asarray(period), jnp.asarray(clearance))
     values = {name: jnp.asarray(value) for name, value in gains.items()}

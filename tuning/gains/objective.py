@@ -1,23 +1,24 @@
 """Objective of tuning: a metric of the restitution errors of a batch of scenarios, plus penalties.
 
-With the error e - e* of every contact, weighted where positive (`Objective`), the metrics are
+The metrics of the restitution errors e - e* (positive errors have their own weight, see `Objective`) are
 
     rms     root of the mean square
     cvar    mean magnitude of the worst 5 % of the contacts (the conditional value at risk)
     worst   the largest magnitude
 
-The penalties are for a command that exceeds the ideal contact's peak force, for chatter, and for amplified
-noise of the force sensor. Each penalty is a dimensionless number; its weight is the error, in multiples of
-the limit, that a penalty of 1 equals. `evaluate_objective` computes them exactly.
+Penalties are added for a force command that exceeds the ideal contact's peak force, for chatter, and for
+amplified noise of the force sensor. Each penalty is a dimensionless number. Its weight is the error, in
+multiples of the limit, that counts as much as a penalty of 1. `evaluate_objective` computes the exact
+objective.
 
-Levenberg-Marquardt needs smooth sums of squares. That of `compute_residuals` is the square of the norm
+Levenberg-Marquardt needs a smooth sum of squares. The residuals of `compute_residuals` therefore replace the
+metric by the norm
 
     (sum of |E|^p / m)^(1/p)    rms: p = 2, m contacts;  cvar: p = 6, m the worst 5 %;  worst: p = 8, m = 1
 
-It equals the rms, and is an upper bound of the other two, since the mean of the worst is at most the p-th
-root of the mean of their p-th powers. The exact tail suits no linearising solver: contacts outside it have
-no weight, so that the solver does not foresee a step that makes one of them worse. With the norm the solver
-reaches a lower tail.
+The norm equals the rms and is an upper bound of `cvar` and `worst`, since a mean of magnitudes is at most the
+p-th root of the mean of their p-th powers. A solver that linearises the exact `cvar` would ignore contacts
+outside the worst 5 %, and take steps that move these contacts into the worst 5 %.
 """
 
 import dataclasses
@@ -38,61 +39,62 @@ from jaxhil.simulation.outcome import Outcome
 from tuning.gains.metrics_function import MetricsFunction, ScenarioMetrics, build_scenario_metrics
 from tuning.transparency.probes import mask_probes
 
-# error that makes a residual of 1; the solver's first damping is for residuals of order one
+# error [1] that gives a residual of 1; the solver's initial damping suits residuals of about 1
 RESIDUAL_SCALE = 0.01
-# error of a contact that does not end or is not reached, as of a strong divergence
+# error e - e* [1] of a contact that does not end or does not occur, the size of a strong divergence
 FAILED_CONTACT_ERROR = 3.0
-PROBED_LANES_PER_TILE = 32  # lanes with probes that are computed together
-CVAR_TAIL_DIVISOR = 20  # cvar: the worst 1/TAIL of the contacts, at least one
-NORM_POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # even exponents p of the norms in the residuals
+PROBED_LANES_PER_TILE = 32  # lanes per tile if the scenarios have transparency probes
+CVAR_TAIL_DIVISOR = 20  # cvar averages the worst 1/20 of the contacts, at least one contact
+NORM_POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # even exponents p of the norm in the residuals
 OBJECTIVE_NAMES = tuple(NORM_POWERS)
 WEIGHT_FIELDS = tuple(
     f"{name}_weight" for name in ("divergence", "command", "noise", "chatter", "transparency")
 )
-# weights in multiples of the limit
-LIMIT_SCALED_WEIGHTS = "command_weight", "noise_weight", "chatter_weight"
-# Factor on an error within the tolerance: of equally quiet gains the most accurate are wanted.
+LIMIT_SCALED_WEIGHTS = "command_weight", "noise_weight", "chatter_weight"  # in multiples of the limit
+# Factor on an error within the tolerance [1]; above 0, so that the search prefers the most accurate of
+# equally quiet gains.
 TOLERATED_ERROR_FACTOR = 0.02
 
 
 @dataclass(frozen=True)
 class Objective:
-    """Objective J of tuning.
+    """Objective J that tuning minimises.
 
         J^2 = metric(E)^2 + (transparency_weight rms(H))^2
           + limit^2 ((command_weight rms(C))^2 + (chatter_weight rms(S))^2 + (noise_weight N)^2)
 
-        E  per contact the restitution error e - e* [1], times sqrt(divergence_weight) where it is positive
-        H  per contact of the transparency probes the error e - e* [1] (`tuning.transparency.probes`)
-        C  per contact, probes included, max(0, peak |F_c| / peak force of the ideal contact - 1) [1]
-        S  per contact, probes included, the chatter [1]: variation of F_c beyond a single rise and fall
-           (`jaxhil.simulation.metrics`) over the ideal contact's peak force, with the sensors' noise
-        N  max(0, A - 1) [1], A the amplification of the force sensor's white noise, from the gains alone
-           (`Compensator.noise_amplification`)
+        E  restitution error e - e* of each contact [1]; positive errors times sqrt(divergence_weight)
+        H  restitution error e - e* of each contact of the transparency probes [1]
+           (`tuning.transparency.probes`)
+        C  excess of each contact's peak command, max(0, peak |F_c| / peak force of the ideal contact - 1) [1]
+        S  chatter of each contact [1]: variation of F_c beyond a single rise and fall, divided by the ideal
+           contact's peak force (`jaxhil.simulation.metrics`); it includes the effect of sensor noise
+        N  max(0, A - 1) [1], where A is the amplification of the force sensor's white noise, which depends
+           only on the gains (`Compensator.noise_amplification`)
 
-    Let w be the weight of X, one of C, S and N. Minimising J raises the metric to at most
-    sqrt(metric^2 + (w limit X)^2), both evaluated at the gains of the least metric. The cost of a weight is
-    thus known in multiples of the limit for every rig.
+    C and S include the contacts of the probes. At the gains with the least metric, let a penalty X (C, S or
+    N) have the value X and the weight w. Then the minimum of J has a metric of at most
+    sqrt(metric^2 + (w limit X)^2). A weight thus costs the same multiple of the limit on every rig.
 
     With a `tolerance`, max(metric - tolerance, `TOLERATED_ERROR_FACTOR` metric) replaces the metric, so that
     the penalties decide between gains whose error is within the tolerance.
 
-    Raise `InputError` for an unknown name or a weight that is negative, not finite, or 0 for divergence.
+    Raises:
+        InputError: the name is unknown, or a weight is negative, not finite, or 0 for divergence.
     """
 
     name: str = "rms"  # name of the metric, one of `OBJECTIVE_NAMES`
-    # weight of a squared divergence (e > e*) relative to a squared convergence [1]
+    # weight of a squared positive error (e > e*) divided by the weight of a squared negative error [1]
     divergence_weight: float = 1.0
-    command_weight: float = 0.0  # error, in limits, that C = 1 equals [1]
-    noise_weight: float = 0.0  # error, in limits, that N = 1 equals [1]
-    chatter_weight: float = 0.0  # error, in limits, that S = 1 equals [1]
+    command_weight: float = 0.0  # error, in multiples of the limit, that counts as much as C = 1
+    noise_weight: float = 0.0  # error, in multiples of the limit, that counts as much as N = 1
+    chatter_weight: float = 0.0  # error, in multiples of the limit, that counts as much as S = 1
     transparency_weight: float = 0.0  # weight of the probes' rms error relative to the metric [1]
-    # user's function of the metrics of all scenarios without probes, which replaces the metric;
-    # divergence_weight does not apply to it
+    # User's function, which replaces the metric. Its arguments are the metrics of all scenarios without their
+    # probes. divergence_weight has no effect on the function.
     function: MetricsFunction | None = None
     limit: float = 0.01  # limit of the error [1], the unit of the weights of command, noise and chatter
-    # metric that is good enough [1]; None: there is no tolerance, and the program is compiled without one
-    tolerance: float | None = None
+    tolerance: float | None = None  # metric below which only the penalties count [1]; None: no tolerance
 
     def __post_init__(self):
         if self.name not in OBJECTIVE_NAMES:
@@ -110,12 +112,12 @@ class Objective:
             )
 
     def unit(self, weight: str) -> float:
-        """Return the error [1] that a weight of 1 stands for; `weight` is a field's name."""
+        """Return the error [1] that corresponds to 1 in the field named `weight`."""
         return self.limit if weight in LIMIT_SCALED_WEIGHTS else 1.0
 
     @property
     def weights(self) -> "ObjectiveWeights":
-        """Return the weights as scalar arrays, those of penalties in the unit of an error."""
+        """Return all weights as scalar arrays, with the penalties' weights converted to errors [1]."""
         numbers = [float(getattr(self, name)) * self.unit(name) for name in WEIGHT_FIELDS]
         return ObjectiveWeights(
             *map(jnp.asarray, numbers), tolerance=jnp.asarray(float(self.tolerance or 0.0))
@@ -126,31 +128,34 @@ RMS_OBJECTIVE = Objective()
 
 
 class ObjectiveTerms(NamedTuple):
-    """Static properties of an objective, which determine the compiled program."""
+    """Static properties of an objective; each combination needs its own compiled program."""
 
-    name: str  # name of its metric
-    command: bool  # whether it has a term of the command's peak
-    noise: bool  # whether it has a term of the amplified noise
-    chatter: bool  # whether it has a term of the chatter
-    transparency: bool = False  # whether the scenarios include probes
-    function: MetricsFunction | None = None  # user's function that replaces the metric, if any
-    contacts: int = 0  # number of contacts that the user's function gets
-    tolerance: bool = False  # whether it has a tolerance, which may be 0
+    name: str  # name of the metric
+    command: bool  # whether excess peaks of the force command are penalised
+    noise: bool  # whether noise amplification is penalised
+    chatter: bool  # whether chatter is penalised
+    transparency: bool = False  # whether the scenarios include transparency probes
+    function: MetricsFunction | None = None  # user's function that replaces the metric, or None
+    contacts: int = 0  # number of contacts per scenario in the arguments of the user's function
+    tolerance: bool = False  # whether the metric has a tolerance, which may be 0
 
 
 class ObjectiveWeights(NamedTuple):
-    """Weights of an `Objective` per problem, which are arguments of the compiled program."""
+    """Weights of the objective of each problem, as arguments of the compiled program.
 
-    divergence: Float[Array, "*problems"]  # weight of a squared divergence over a squared convergence [1]
-    command: Float[Array, "*problems"]  # weight of the command's excess C [1]
-    noise: Float[Array, "*problems"]  # weight of the excess amplification N [1]
+    C, N, S and H are the terms of `Objective`.
+    """
+
+    divergence: Float[Array, "*problems"]  # weight of squared positive errors over that of negative ones [1]
+    command: Float[Array, "*problems"]  # weight of the excess peak command C [1]
+    noise: Float[Array, "*problems"]  # weight of the excess noise amplification N [1]
     chatter: Float[Array, "*problems"]  # weight of the chatter S [1]
     transparency: Float[Array, "*problems"]  # weight of the probes' errors H [1]
     tolerance: Float[Array, "*problems"]  # tolerance of the metric [1]
 
 
 class SolverProblem(NamedTuple):
-    """Inputs of the solver for one start; for several, every leaf has a leading axis of problems."""
+    """Solver inputs for one start; for several starts, every array has a leading axis of problems."""
 
     rig: Any  # batch of scenarios, as returned by `RigModel.prepared`
     fixed: dict[str, Array]  # gains that are not tuned
@@ -158,21 +163,22 @@ class SolverProblem(NamedTuple):
 
 
 def list_objectives(objective: Objective | Sequence[Objective], number: int) -> list[Objective]:
-    """Return a list with the objective of each of `number` tasks, from one of all or one per task."""
+    """Return one objective for each of `number` tasks; repeat `objective` if it is a single one."""
     return [objective] * number if isinstance(objective, Objective) else list(objective)
 
 
 def join_terms(objectives: Sequence[Objective], probed: bool = False, contacts: int = 0) -> ObjectiveTerms:
-    """Return the union of the terms of objectives that share name and function; missing terms get weight 0.
+    """Return the terms that at least one of several objectives has, so that all can share a program.
 
-    `probed` says that the scenarios include probes; with a function all scenarios have `contacts` contacts.
-    Raise ValueError if names or functions differ.
+    An objective without one of these terms gives the term a weight of 0. `probed` states whether the
+    scenarios include probes, `contacts` the number of contacts that a user's function gets. Raise ValueError
+    if the objectives differ in metric or function.
     """
     [(name, function)] = {(objective.name, objective.function) for objective in objectives}
     tolerance = any(objective.tolerance is not None for objective in objectives)
     return ObjectiveTerms(
         name=name,
-        # A tolerance serves the search for quieter commands, which weights command and noise.
+        # An objective with a tolerance shares the program of the search for quieter commands.
         command=tolerance or any(objective.command_weight > 0 for objective in objectives),
         noise=tolerance or any(objective.noise_weight > 0 for objective in objectives),
         chatter=any(objective.chatter_weight > 0 for objective in objectives),
@@ -188,14 +194,15 @@ def compute_residuals(
     gains: Float[Array, "problems gains"],
     problems: SolverProblem,
 ) -> Float[Array, "problems residuals"]:
-    """Return residuals of every problem; their sum of squares is (J / `RESIDUAL_SCALE`)^2, J of `Objective`.
+    """Compute the least-squares residuals of every problem.
 
-    There is one residual per contact slot of every scenario for the norm of the errors and, if among the
-    terms, as many for the probes, the command and the chatter, and one for the noise. A failed contact has
-    error, excess and chatter `FAILED_CONTACT_ERROR`.
+    Their sum of squares is (J / `RESIDUAL_SCALE`)^2, where J is the objective with the smooth norm as its
+    metric. Each contact of each scenario has one residual for its error, and one for each of probes, command
+    and chatter that the objective has; the noise has one residual. A failed contact has an error, an excess
+    and a chatter of `FAILED_CONTACT_ERROR`.
 
-    `static` are the rig model, the loop, the names of the tuned gains and the objective's terms. The
-    scenarios of all problems are the lanes of one batch.
+    `static` holds the rig model, the loop, the names of the tuned gains and the objective's terms. All
+    problems are simulated in one batch, whose lanes are their scenarios.
     """
     model, loop, names, terms = static
     if terms.chatter:
@@ -239,13 +246,14 @@ def weight_residuals(
     probes: Bool[Array, "problems contacts"] | None = None,
     metric: Float[Array, "problems"] | None = None,
 ) -> Float[Array, "problems residuals"]:
-    """Return the residuals from the terms of `compute_contact_terms` and the amplification of the noise.
+    """Compute the least-squares residuals from the terms of all contacts and the noise amplification.
 
-    `probes` masks the contacts of probes, if the terms have transparency. `metric` is the value of the user's
-    function, which replaces the residuals of the errors by one residual.
+    `error`, `excess` and `chatter` are the results of `compute_contact_terms`. `probes` is True for contacts
+    of transparency probes. `metric` is the value of the user's function, which replaces all residuals of the
+    errors by a single residual.
     """
 
-    # A problem that only fills up a call has no wanted contact; its errors of 0 are divided by 1.
+    # A problem that only fills a call has no wanted contact; a count of 1 avoids a division by 0.
     def counted(mask):
         return jnp.maximum(jnp.sum(mask, axis=1, dtype=jnp.int32), 1)[:, None]
 
@@ -279,7 +287,7 @@ def weight_residuals(
 def _compute_untolerated_share(
     terms: Float[Array, "problems terms"], tolerance: Float[Array, "problems 1"]
 ) -> Float[Array, "problems 1"]:
-    """Return the factor max(1 - tolerance / norm, `TOLERATED_ERROR_FACTOR`) for the norm of `terms`."""
+    """Return max(1 - tolerance / norm, `TOLERATED_ERROR_FACTOR`), where norm is the norm of `terms`."""
     square = jnp.sum(terms**2, axis=1, keepdims=True)
     norm = jnp.sqrt(jnp.where(square > 0, square, 1))
     return jnp.where(tolerance > 0, jnp.maximum(1 - tolerance / norm, TOLERATED_ERROR_FACTOR), 1)
@@ -288,10 +296,11 @@ def _compute_untolerated_share(
 def compute_contact_terms(
     outcome: Outcome,
 ) -> tuple[Float[Any, "slots *batch"], Float[Any, "slots *batch"], Float[Any, "slots *batch"]]:
-    """Return per contact the restitution error, the command's relative excess and the chatter, all [1].
+    """Return the restitution error, the excess of the peak command and the chatter of every contact, all [1].
 
-    The excess is that of the command's peak over the ideal contact's peak force. Failed contacts have
-    `FAILED_CONTACT_ERROR`, contacts that are not wanted 0. NumPy arrays give NumPy arrays.
+    The excess is max(0, peak command / peak force of the ideal contact - 1). All three are
+    `FAILED_CONTACT_ERROR` for failed contacts and 0 for contacts that are not wanted. The results are NumPy
+    arrays if the outcome holds NumPy arrays, otherwise JAX arrays.
     """
     xp = jnp if isinstance(outcome.error, jax.Array) else np
     # Without the inner `where`, non-finite numbers of failed contacts would make the derivative NaN.
@@ -306,9 +315,9 @@ def compute_contact_terms(
 
 
 def extract_scenario_metrics(outcome: Outcome, number: int, contacts: int, probed: bool) -> ScenarioMetrics:
-    """Return the arguments of a user's function, leaves (problems, contacts, scenarios), without probes.
+    """Return the metrics for a user's function, arrays (problems, contacts, scenarios) without probes.
 
-    `outcome` holds the scenarios of `number` problems side by side, with their probes if `probed`.
+    The last axis of `outcome` joins the scenarios of `number` problems, which include probes if `probed`.
     """
 
     def by_problem(leaf):
@@ -327,12 +336,12 @@ def evaluate_objective(
     probe_errors: Float[np.ndarray, "*points contacts"] | None = None,
     value: Float[np.ndarray, "*points"] | None = None,
 ) -> Float[np.ndarray, "*points"]:
-    """Return the exact J [1] of `Objective`.
+    """Compute the exact objective J [1] of each point.
 
-    `errors`, `excesses` and `chatter` are those of `compute_contact_terms` for the wanted contacts; a term
-    that is None counts as 0. `errors` are without those of the transparency probes, which are `probe_errors`.
-    Non-finite numbers count as `FAILED_CONTACT_ERROR`. `value`, that of the user's function, replaces the
-    metric.
+    `errors`, `excesses` and `chatter` are the terms of `compute_contact_terms` for the wanted contacts; None
+    counts as 0. `errors` exclude the contacts of transparency probes, which are in `probe_errors`. A
+    non-finite number counts as `FAILED_CONTACT_ERROR`. `value` is the value of the user's function, which
+    replaces the metric.
     """
     terms = errors, excesses, chatter, probe_errors
     error, excess, swings, transparency = (
@@ -355,7 +364,7 @@ def evaluate_objective(
 def _compute_metric(
     objective: Objective, error: Float[np.ndarray, "*points contacts"]
 ) -> Float[np.ndarray, "*points"]:
-    """Return the metric of the errors, without penalties."""
+    """Return the objective's metric of the restitution errors, without penalties [1]."""
     size = np.abs(np.where(error > 0, math.sqrt(objective.divergence_weight) * error, error))
     if objective.name == "rms":
         return _compute_rms(size)
@@ -377,7 +386,8 @@ def _compute_norm_residuals(
 ) -> Array:
     """Return residuals E (|E| / |E|_p)^(p/2 - 1) / m^(1/p), whose sum of squares is (sum of |E|^p / m)^(2/p).
 
-    They are homogeneous of degree one in the errors, so that Gauss-Newton steps have the right length.
+    E is `error`, m is `number` and p is `power`. The residuals are homogeneous of degree one in the errors,
+    so that Gauss-Newton steps have the right length.
     """
     size = jnp.abs(error)
     largest = lax.stop_gradient(jnp.max(size, axis=1, keepdims=True))
@@ -388,7 +398,7 @@ def _compute_norm_residuals(
 
 
 def _map_over_tiles(function: Callable[[Any], Outcome], arguments: Any) -> Outcome:
-    """Apply `function` to `PROBED_LANES_PER_TILE` lanes at a time; slow lanes delay only their tile."""
+    """Apply `function` to tiles of `PROBED_LANES_PER_TILE` lanes; a slow lane delays only its own tile."""
     lanes = jax.tree.leaves(arguments)[0].shape[-1]
     size = math.gcd(lanes, PROBED_LANES_PER_TILE)
     chunks = jax.tree.map(

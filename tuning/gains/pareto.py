@@ -1,9 +1,9 @@
-"""Pareto fronts of restitution error against a second criterion, from gains for a ladder of weights.
+"""Pareto fronts of restitution error against a second criterion.
 
-A compensator with phase lead amplifies the noise of the measured force. With a larger
-`Objective.noise_weight` its command is quieter and less accurate; each weight gives a point of the front.
-Other criteria are the peak of the command (`Objective.command_weight`) and transparency
-(`Objective.transparency_weight`).
+The second criterion is noise amplification, the peak of the force command or transparency. Each point of a
+front is a set of gains, tuned with another weight of the second criterion in the objective
+(`Objective.noise_weight`, `command_weight` or `transparency_weight`). For example, a larger noise weight
+gives a quieter, less accurate force command.
 """
 
 from __future__ import annotations
@@ -42,51 +42,52 @@ from tuning.statistics.bootstrap import ErrorIntervals, compute_error_intervals
 from tuning.statistics.intervals import IntervalEstimate
 from tuning.transparency.probes import compute_probe_metrics
 
-TABLE_DIGITS = 4  # significant digits in which points are compared
+TABLE_DIGITS = 4  # significant digits to which points are rounded before they are compared
 
 
 class ParetoPoint(NamedTuple):
-    """Gains of one weight of the trade-off, evaluated on fresh scenarios."""
+    """Point of a Pareto front: gains and their metrics on fresh scenarios."""
 
     gains: dict[str, float]  # all gains of the compensator
-    weight: float | None  # weight of the axis [1] in tuning; None for other gains
-    # value on the axis [1]: the amplification A of the force sensor's noise, the 99th percentile of the peak
-    # command over the ideal contact's, or the rms error of the transparency probes
+    weight: float | None  # weight of the second criterion [1] in tuning; None for gains tuned without one
+    # second criterion [1]: the amplification of the force sensor's noise, the 99th percentile of the peak
+    # command divided by the ideal contact's peak force, or the rms error of the transparency probes
     cost: float
-    error: float  # objective without the axis's term [1]
+    error: float  # objective without the second criterion's term [1]
     figures: ErrorMetrics  # metrics on the fresh scenarios
     nominal: ErrorMetrics  # metrics of the nominal run
-    intervals: ErrorIntervals  # 95 % intervals of `compute_error_metrics`
-    on_front: bool  # whether no other point dominates it (`find_dominated`)
-    transparency: dict[str, IntervalEstimate] | None = None  # transparency, slope and peak, if probed
+    intervals: ErrorIntervals  # 95 % confidence intervals of the metrics on the fresh scenarios
+    on_front: bool  # whether no other point dominates this point (`find_dominated`)
+    # transparency, slope and peak with confidence intervals; None for scenarios without probes
+    transparency: dict[str, IntervalEstimate] | None = None
 
     @property
     def place(self) -> tuple[float, float]:
-        """Return error and cost, rounded to the digits of a table."""
+        """Return error and cost [1], rounded to `TABLE_DIGITS` significant digits."""
         return float(f"{self.error:.{TABLE_DIGITS}g}"), float(f"{self.cost:.{TABLE_DIGITS}g}")
 
 
 class _FrontGroup(NamedTuple):
-    """Mechanisms whose fronts are computed together, in one program."""
+    """Mechanisms whose Pareto fronts one compiled program computes together."""
 
-    tasks: list[TuneTask]  # one per mechanism
-    tuned: list[TuneResult]  # tuning result of each mechanism
-    number: int  # number of points
-    axis: ParetoCriterion
+    tasks: list[TuneTask]  # one tuning task per mechanism
+    tuned: list[TuneResult]  # earlier tuning result of each mechanism
+    number: int  # number of points per front
+    axis: ParetoCriterion  # second criterion of the fronts
 
     @property
     def settings(self) -> TuneSettings:
-        """Return the settings with which all mechanisms were tuned."""
+        """Return the settings of the earlier tuning, which are the same for all mechanisms."""
         return self.tuned[0].settings
 
     @property
     def names(self) -> list[str]:
-        """Return the names of the pieces."""
+        """Return the name of each mechanism's checkpoint."""
         return [f"pareto {result.mechanism.name}" for result in self.tuned]
 
     @property
     def inputs(self) -> list[Any]:
-        """Return all inputs that determine the fronts."""
+        """Return all inputs that the fronts depend on, as a key of the cache."""
         return [
             *("pareto", self.number, self.axis, self.settings, self.tuned[0].compensator),
             [(to_plain_data(result.mechanism), result.gains, result.starts) for result in self.tuned],
@@ -94,22 +95,22 @@ class _FrontGroup(NamedTuple):
 
     @property
     def runs(self) -> int:
-        """Return the approximate number of simulated runs."""
+        """Return the approximate number of simulated runs that the fronts need."""
         searched = estimate_ladder_runs(self.tasks, self.number, self.settings)
         return searched + _count_evaluation_runs(self.tasks, self.settings, self.number)
 
 
 class ParetoFront(NamedTuple):
-    """Pareto front of error and the axis's cost for one mechanism."""
+    """Pareto front of one mechanism: restitution error against a second criterion."""
 
-    points: list[ParetoPoint]  # in the order of their weights, the first of which is 0
-    literature: ParetoPoint  # the literature's gains
-    tuned: ParetoPoint  # the gains of the earlier tuning
-    axis: ParetoCriterion = NOISE_CRITERION  # criterion traded against the error
+    points: list[ParetoPoint]  # points in ascending order of weight; the first weight is 0
+    literature: ParetoPoint  # point of the literature's gains
+    tuned: ParetoPoint  # point of the gains of the earlier tuning
+    axis: ParetoCriterion = NOISE_CRITERION  # second criterion
 
 
 def find_dominated(places: Sequence[tuple[float, float]]) -> list[bool]:
-    """Return for each (error, cost) whether another one is better in one and no worse in the other."""
+    """Return for each (error, cost) whether another pair has no larger number and at least one smaller."""
     return [
         any(e <= error and a <= noise and (e, a) != (error, noise) for e, a in places)
         for error, noise in places
@@ -124,29 +125,30 @@ def compute_fronts(
     pieces: Checkpoints = NO_CHECKPOINTS,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, ParetoFront]]:
-    """Yield (index, front of `number` points) of tuned mechanisms, in the order in which they finish.
+    """Compute the Pareto fronts of tuned mechanisms; yield (index, front) as soon as a front is complete.
 
-    All were tuned with one compensator and the same settings; transparency needs settings that evaluate it.
-    Each front is cached in `pieces`. With a `scheduler`, the workers of a cluster compute the fronts.
+    All `results` have the same compensator and settings. If the second criterion `axis` is transparency, the
+    settings must evaluate transparency. Each front has `number` points and is cached in `pieces`. If
+    `scheduler` is given, the workers of a cluster compute the fronts.
     """
     work = work or SearchProgress()
     tasks = _build_tasks(results)
-    groups = group_by_program([task.loop for task in tasks], [task.scenarios for task in tasks])
     members = [
-        group[begin : begin + MAX_GROUP_SIZE]
-        for group in groups
-        for begin in range(0, len(group), MAX_GROUP_SIZE)
+        indices[begin : begin + MAX_GROUP_SIZE]
+        for indices in group_by_program([task.loop for task in tasks], [task.scenarios for task in tasks])
+        for begin in range(0, len(indices), MAX_GROUP_SIZE)
     ]
-    blocks = [
-        _FrontGroup([tasks[i] for i in group], [results[i] for i in group], number, axis) for group in members
+    groups = [
+        _FrontGroup([tasks[i] for i in indices], [results[i] for i in indices], number, axis)
+        for indices in members
     ]
-    work.runs_after_group = sum(block.runs for block in blocks)
+    work.runs_after_group = sum(group.runs for group in groups)
     if scheduler is None:
-        computed = _compute_locally(blocks, work, pieces)
+        computed = _compute_locally(groups, work, pieces)
     else:
-        computed = _compute_on_cluster(scheduler, blocks, work, pieces)
-    for index, block_fronts in computed:
-        yield from zip(members[index], block_fronts, strict=True)
+        computed = _compute_on_cluster(scheduler, groups, work, pieces)
+    for index, group_fronts in computed:
+        yield from zip(members[index], group_fronts, strict=True)
 
 
 def _build_tasks(results: Sequence[TuneResult]) -> list[TuneTask]:
@@ -159,78 +161,78 @@ def _build_tasks(results: Sequence[TuneResult]) -> list[TuneTask]:
 
 
 def _compute_locally(
-    blocks: list[_FrontGroup], work: SearchProgress, pieces: Checkpoints
+    groups: list[_FrontGroup], work: SearchProgress, pieces: Checkpoints
 ) -> Iterator[tuple[int, list[ParetoFront]]]:
-    """Yield (index, fronts) of every block, in order."""
-    for index, block in enumerate(blocks):
-        work.runs_after_group -= block.runs
-        work.name = describe_group(block.tasks)
-        block_fronts = _read_fronts(block, pieces)
-        if block_fronts is not None:
-            work.keep("front as kept", block.runs)
+    """Compute the fronts group by group; yield (index of the group, fronts)."""
+    for index, group in enumerate(groups):
+        work.runs_after_group -= group.runs
+        work.name = describe_group(group.tasks)
+        group_fronts = _read_fronts(group, pieces)
+        if group_fronts is not None:
+            work.keep("front as kept", group.runs)
         else:
             if pieces.is_enabled:
-                work.journal = pieces.journal(block.names[0], block.inputs)
-            block_fronts = _compute_group_fronts(block, work)
-            _write_fronts(block, pieces, block_fronts)
+                work.journal = pieces.journal(group.names[0], group.inputs)
+            group_fronts = _compute_group_fronts(group, work)
+            _write_fronts(group, pieces, group_fronts)
             work.journal.finish()
-        yield index, block_fronts
+        yield index, group_fronts
 
 
 def _compute_on_cluster(
-    scheduler: str, blocks: list[_FrontGroup], work: SearchProgress, pieces: Checkpoints
+    scheduler: str, groups: list[_FrontGroup], work: SearchProgress, pieces: Checkpoints
 ) -> Iterator[tuple[int, list[ParetoFront]]]:
-    """Yield (index, fronts) of every block, in the order in which workers finish them."""
+    """Compute the fronts on a cluster; yield (index of the group, fronts) when a worker finishes a group."""
     missing = []
-    for index, block in enumerate(blocks):
-        block_fronts = _read_fronts(block, pieces)
-        if block_fronts is None:
-            # Outcomes and scenarios serve plots only, and are too large to send.
-            light = [replace(result, outcomes={}, scenarios=None) for result in block.tuned]
-            missing.append(WorkUnit(index, (light, block.number, block.axis)))
+    for index, group in enumerate(groups):
+        group_fronts = _read_fronts(group, pieces)
+        if group_fronts is None:
+            # Outcomes and scenarios are needed for plots only, and are too large to send to a worker.
+            light = [replace(result, outcomes={}, scenarios=None) for result in group.tuned]
+            missing.append(WorkUnit(index, (light, group.number, group.axis)))
             continue
-        work.runs_after_group -= block.runs
-        work.keep("front as kept", block.runs)
-        yield index, block_fronts
-    what = f"pareto-{compute_digest([block.inputs for block in blocks])[:16]}"
+        work.runs_after_group -= group.runs
+        work.keep("front as kept", group.runs)
+        yield index, group_fronts
+    what = f"pareto-{compute_digest([group.inputs for group in groups])[:16]}"
     work.begin("on the cluster", 0.0)
     for index, content in run_on_workers(
         scheduler, compute_and_encode_fronts, missing, get_process_setting(), what
     ):
-        block, block_fronts = blocks[index], decode_value(content, list[ParetoFront])
-        work.runs_after_group -= block.runs
-        work.name = describe_group(block.tasks)
-        work.begin("front from the cluster", block.runs)
-        work.report_runs(block.runs)
-        _write_fronts(block, pieces, block_fronts)
-        yield index, block_fronts
+        group, group_fronts = groups[index], decode_value(content, list[ParetoFront])
+        work.runs_after_group -= group.runs
+        work.name = describe_group(group.tasks)
+        work.begin("front from the cluster", group.runs)
+        work.report_runs(group.runs)
+        _write_fronts(group, pieces, group_fronts)
+        yield index, group_fronts
 
 
 def compute_and_encode_fronts(tuned: list[TuneResult], number: int, axis: ParetoCriterion) -> bytes:
-    """Return the encoded fronts of mechanisms of one program; called on a worker."""
+    """Compute the fronts of a group of mechanisms on a cluster worker; return the encoded fronts."""
     return encode_value(
         _compute_group_fronts(_FrontGroup(_build_tasks(tuned), tuned, number, axis), SearchProgress())
     )
 
 
-def _read_fronts(block: _FrontGroup, pieces: Checkpoints) -> list[ParetoFront] | None:
-    """Read a block's fronts from the cache; return None if one is missing."""
+def _read_fronts(group: _FrontGroup, pieces: Checkpoints) -> list[ParetoFront] | None:
+    """Read the fronts of a group from the cache; return None if one front is missing."""
     if not pieces.is_enabled:
         return None
-    block_fronts = [pieces.read(name, (block.inputs, i), ParetoFront) for i, name in enumerate(block.names)]
-    return block_fronts if all(block_fronts) else None
+    group_fronts = [pieces.read(name, (group.inputs, i), ParetoFront) for i, name in enumerate(group.names)]
+    return group_fronts if all(group_fronts) else None
 
 
-def _write_fronts(block: _FrontGroup, pieces: Checkpoints, block_fronts: list[ParetoFront]) -> None:
+def _write_fronts(group: _FrontGroup, pieces: Checkpoints, group_fronts: list[ParetoFront]) -> None:
     if pieces.is_enabled:
-        for i, (name, front) in enumerate(zip(block.names, block_fronts, strict=True)):
-            pieces.write(name, (block.inputs, i), front)
+        for i, (name, front) in enumerate(zip(group.names, group_fronts, strict=True)):
+            pieces.write(name, (group.inputs, i), front)
 
 
-def _compute_group_fronts(block: _FrontGroup, work: SearchProgress) -> list[ParetoFront]:
-    tasks, tuned, number, axis = block
-    settings = block.settings
-    work.begin(f"accuracy against {axis.name}, {number} points", block.runs)
+def _compute_group_fronts(group: _FrontGroup, work: SearchProgress) -> list[ParetoFront]:
+    tasks, tuned, number, axis = group
+    settings = group.settings
+    work.begin(f"accuracy against {axis.name}, {number} points", group.runs)
     validation = build_validation(tasks, settings.validation, settings.seed, work)
     points = solve_weight_ladders(validation, tuned, number, settings, axis)
     work.begin(f"judging {number} points", _count_evaluation_runs(tasks, settings, number))
@@ -238,7 +240,7 @@ def _compute_group_fronts(block: _FrontGroup, work: SearchProgress) -> list[Pare
 
 
 def _count_evaluation_runs(tasks: list[TuneTask], settings: TuneSettings, number: int) -> int:
-    """Return the runs to evaluate the points, the literature's gains and the earlier gains."""
+    """Return the number of runs that evaluate all points, the literature's gains and the earlier gains."""
     return (number + 2) * len(tasks) * count_evaluated_runs(settings.validation, tasks[0].probed)
 
 
@@ -249,12 +251,13 @@ def _evaluate_fronts(
     settings: TuneSettings,
     axis: ParetoCriterion,
 ) -> list[ParetoFront]:
-    """Evaluate the points, the literature's gains and the earlier gains of every task on fresh scenarios."""
+    """Evaluate all points, the literature's gains and the earlier gains of every task on fresh scenarios."""
     plans = [
         [*ladder, (None, task.literature), (None, result.gains)]
         for task, result, ladder in zip(validation.tasks, tuned, points, strict=True)
     ]
-    # One set of gains of every task at a time, as in the evaluation after tuning.
+    # Each call evaluates one set of gains of every task, like the evaluation after tuning, and so shares its
+    # compiled program.
     outcomes = [validation.judge([gains for _, gains in row]) for row in zip(*plans, strict=True)]
     fronts = []
     for index, (plan, pairs) in enumerate(zip(plans, zip(*outcomes, strict=True), strict=True)):

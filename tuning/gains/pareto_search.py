@@ -1,7 +1,8 @@
-"""Search of gains for a ladder of weights, used by `tuning.gains.pareto`.
+"""Search for the gains of Pareto fronts (`tuning.gains.pareto`), one set of gains per weight.
 
-All weights of all mechanisms are problems of one program, on the mechanisms' training scenarios. The gains
-found for one weight are starts of its neighbours on the ladder in the next pass, until no point improves.
+The weights of a front are in ascending order and are called a ladder. One compiled program solves all weights
+of all mechanisms on the training scenarios. In the next pass, the gains of each weight are also starts for
+the next smaller and the next larger weight. The search ends when no point improves.
 """
 
 import dataclasses
@@ -21,23 +22,23 @@ from tuning.gains.tasks import TuneTask, list_tuned_gains
 from tuning.gains.tune import TuneResult
 from tuning.gains.validation import Validation
 
-# Ends of the ladder: the weighted noise of accurate gains over their error. The first ladder reaches further,
-# since the solver does not find quiet, inaccurate starts otherwise.
+# Smallest and largest positive weight, as the weighted noise of accurate gains divided by their error [1].
+# The first ladder extends to a larger weight, since the solver otherwise finds no quiet, inaccurate gains.
 LADDER_ENDS, FIRST_LADDER_ENDS = (0.5, 10.0), (1.0, 100.0)
-MAX_ACCURATE_ERROR_RATIO = 1.05  # largest error of accurate gains over the least error found
-MIN_NOISE_EXCESS = 0.1  # least amplification beyond 1 for which a ladder is computed
-MAX_NEIGHBOUR_SEARCHES = 4  # largest number of passes in which points start at the gains of their neighbours
+MAX_ACCURATE_ERROR_RATIO = 1.05  # gains count as accurate up to this multiple of the least error
+MIN_NOISE_EXCESS = 0.1  # least noise amplification beyond 1 [1] that scales a ladder
+MAX_NEIGHBOUR_SEARCHES = 4  # largest number of passes that start from the gains of neighbouring weights
 MIN_IMPROVEMENT = 1e-3  # relative improvement of a point that causes another pass
 
 
 class ParetoCriterion(NamedTuple):
-    """Criterion that is traded against the error."""
+    """Second criterion of a Pareto front, beside the restitution error."""
 
-    name: str  # name in commands
-    weight: str  # field of `Objective` that is its weight
-    cost: str  # name in JSON
-    words: str  # name in a sentence
-    least: float  # least value of the criterion for which a ladder of weights is computed
+    name: str  # name on the command line
+    weight: str  # name of the field of `Objective` that weights the criterion
+    cost: str  # name in JSON files
+    words: str  # name in sentences
+    least: float  # least value of the criterion [1] that scales a ladder of weights
 
 
 NOISE_CRITERION = ParetoCriterion(
@@ -53,7 +54,7 @@ PARETO_CRITERIA = {axis.name: axis for axis in (NOISE_CRITERION, PEAK_CRITERION,
 
 
 def choose_default_criterion(compensator: str) -> ParetoCriterion | None:
-    """Return the default criterion that a compensator's error is traded against, None if there is none."""
+    """Return a compensator's default second criterion: noise, else the peak command, else None."""
     if has_noise_trade_off(compensator):
         return NOISE_CRITERION
     return PEAK_CRITERION if COMPENSATORS[compensator].anticipates else None
@@ -66,10 +67,11 @@ def build_weight_ladder(
     ends: tuple[float, float] = LADDER_ENDS,
     least: float = MIN_NOISE_EXCESS,
 ) -> np.ndarray:
-    """Return weights (number,) in the unit of an error [1]: 0, then evenly spaced logarithms.
+    """Return a ladder (number,) of weights [1]: 0, then logarithmically spaced positive weights.
 
-    `error` and `excess` are J and the weighted term (such as A - 1) of accurate gains. At the first and last
-    positive weight that term is `ends` times the error.
+    `error` is the objective J and `excess` the second criterion's term (for example A - 1) of accurate gains.
+    The smallest and largest positive weights times `excess` are `ends` times `error`. A smaller `excess` than
+    `least` counts as `least`.
     """
     light, heavy = ends
     weights = np.geomspace(heavy, light, number - 1)[::-1] * error / max(excess, least)
@@ -77,14 +79,16 @@ def build_weight_ladder(
 
 
 class _LadderCandidate(NamedTuple):
-    """Gains of a mechanism with their error and excess on its training scenarios."""
+    """Candidate gains for one mechanism, with both criteria on its training scenarios."""
 
     gains: dict[str, float]
-    error: float  # J without the axis's term [1]
-    excess: float  # axis's term at weight 1 [1]: max(0, A - 1), or the rms of peak excesses or probe errors
+    error: float  # objective J without the second criterion's term [1]
+    # term of the second criterion for a weight of 1 [1]: max(0, A - 1), or the rms of the excess peak
+    # commands or of the probes' errors
+    excess: float
 
     def value(self, weight: float) -> float:
-        """Return J for a weight."""
+        """Return the objective J [1] for a weight of the second criterion."""
         return math.hypot(self.error, weight * self.excess)
 
 
@@ -95,7 +99,7 @@ def solve_weight_ladders(
     settings: TuneSettings,
     axis: ParetoCriterion = NOISE_CRITERION,
 ) -> list[list[tuple[float, dict[str, float]]]]:
-    """Return (weight in the unit of `Objective`, gains) of every point of every task."""
+    """Search the gains of every point of every task; return (weight in the unit of `Objective`, gains)."""
     unit = settings.objective.unit(axis.weight)
     weight = unit * getattr(settings.objective, axis.weight)
     pools = [
@@ -104,7 +108,7 @@ def solve_weight_ladders(
     ]
     ladders = []
     for turn in range(1 + MAX_NEIGHBOUR_SEARCHES):
-        # Each pass improves the estimate of the least error and of its excess, which determine the ladder.
+        # Each pass improves the estimates of the least error and its excess, which determine the ladder.
         ends = LADDER_ENDS if turn > 0 else FIRST_LADDER_ENDS
         ladders = [_build_fitting_ladder(pool, number, ends, axis) for pool in pools]
         before = [_pick_candidates(pool, weights) for pool, weights in zip(pools, ladders, strict=True)]
@@ -131,7 +135,7 @@ def solve_weight_ladders(
 
 
 def estimate_ladder_runs(tasks: list[TuneTask], number: int, settings: TuneSettings) -> int:
-    """Return the approximate simulated runs of `solve_weight_ladders` if points improve in every pass."""
+    """Return the approximate number of runs of `solve_weight_ladders` if all passes are needed."""
     starts = max(settings.starts, 2) + MAX_NEIGHBOUR_SEARCHES * 2
     return len(tasks) * number * starts * settings.steps * count_step_runs(tasks, list_tuned_gains(tasks))
 
@@ -148,14 +152,14 @@ def _build_fitting_ladder(
 
 
 def replace_weight(objective: Objective, axis: ParetoCriterion, weight: float) -> Objective:
-    """Return the objective with another weight of the axis, in the unit of an error."""
+    """Return a copy of the objective with another weight of the second criterion, given as an error [1]."""
     return dataclasses.replace(objective, **{axis.weight: float(weight) / objective.unit(axis.weight)})
 
 
 def _choose_first_starts(
     validation: Validation, tuned: list[TuneResult], objectives: list[list[Objective]], settings: TuneSettings
 ) -> list[list[np.ndarray]]:
-    """Return the starts of every point of each task: the usual ones for its weight, and the tuned gains."""
+    """Return the starts of every point of each task: those of `choose_starts`, with the tuned gains last."""
     number, first = max(settings.starts, 2), [[result.gains] for result in tuned]
     by_point = [
         choose_starts(validation, number, settings.seed, of_point, first)
@@ -167,7 +171,7 @@ def _choose_first_starts(
 def _choose_neighbour_starts(
     validation: Validation, picked: list[list[_LadderCandidate]]
 ) -> list[list[np.ndarray]]:
-    """Return the starts of every point of each task: the gains of the point and of its neighbours."""
+    """Return the starts of every point of each task: gains of the point and of its neighbouring weights."""
     return [
         [validation.coordinates(task, gains) for gains in _collect_neighbour_gains(points)]
         for task, points in enumerate(picked)
@@ -177,7 +181,7 @@ def _choose_neighbour_starts(
 def _solve_points(
     validation: Validation, starts, objectives, settings, axis: ParetoCriterion
 ) -> list[list[_LadderCandidate]]:
-    """Solve from all starts of all points; return the candidates of each task."""
+    """Run the solver from all starts of all points; return the resulting candidates of each task."""
     number = len(objectives[0])
     tasks = [task for task in validation.tasks for _ in range(number)]
     flat = list(chain(*objectives))
@@ -204,7 +208,7 @@ def _collect_candidates(
     weight: float,
     starts: list[StartResult],
 ) -> list[_LadderCandidate]:
-    """Return the candidates that the starts of a task ended with under a weight."""
+    """Convert the results of a task's starts, which were solved with one weight, into candidates."""
     task = validation.tasks[index]
     if axis == NOISE_CRITERION:
         return _collect_noise_candidates(task, weight, starts)
@@ -225,7 +229,7 @@ def _collect_candidates(
 def _collect_noise_candidates(
     task: TuneTask, weight: float, starts: list[StartResult]
 ) -> list[_LadderCandidate]:
-    """Return the candidates of the noise axis, whose excess follows from the gains alone."""
+    """Convert starts into candidates for the noise criterion, which depends on the gains alone."""
     candidates = []
     for start in starts:
         excess = max(0.0, compute_noise_amplification(task.mechanism, task.compensator, start.gains) - 1)
@@ -241,7 +245,7 @@ def _pick_candidates(pool: list[_LadderCandidate], weights: np.ndarray) -> list[
 
 
 def _collect_neighbour_gains(picked: list[_LadderCandidate]) -> list[list[dict[str, float]]]:
-    """Return for each point its gains and the different ones of its neighbours on the ladder."""
+    """Return the distinct gains of each point and of the points with the next smaller and larger weight."""
     neighbourhoods = []
     for index, point in enumerate(picked):
         near = [point, *picked[max(index - 1, 0) : index], *picked[index + 1 : index + 2]]

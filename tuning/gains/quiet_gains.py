@@ -1,14 +1,15 @@
-"""Search of the quietest gains whose error is within a limit, for rigs with noisy sensors.
+"""Search for the quietest gains whose error is within a limit, for rigs with noisy sensors.
 
-The least error needs phase lead, which amplifies the force sensor's noise, and peaks of the force command.
-So the search continues from the gains of least error. Within a tolerance below the limit the error hardly
-counts (`Objective.tolerance`), and the search minimises the root of
+Gains are quiet if they amplify sensor noise little and cause small peaks of the force command. The most
+accurate gains need phase lead, which does the opposite. A second search therefore starts at the most accurate
+gains. It gives errors within a tolerance below the limit almost no weight (`Objective.tolerance`), and
+minimises the root of
 
     (N / max(N_0, 1))^2 + (rms(C) / max(rms(C_0), 0.5))^2
 
-with N and C of `Objective`: the excess of the noise's amplification over 1, and of the command's peaks over
-those of the ideal contact. N_0 and C_0 belong to the gains of least error; 1 and 0.5 are the bounds beyond
-which tune warns. Without C the search would reduce the amplification at the cost of higher peaks.
+N is the noise amplification minus 1, and C is the relative excess of the peak command over the ideal
+contact's peak force (`Objective`). N_0 and C_0 are those of the most accurate gains; 1 and 0.5 are the values
+above which tuning warns. Without C, the search would reduce the noise at the cost of higher peaks.
 """
 
 import math
@@ -28,25 +29,25 @@ from tuning.gains.tasks import TuneTask, has_sensor_noise
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import select_distant_points
 
-MAX_PEAK_RATIO = 1.5  # peak command over the ideal contact's peak force [1], beyond which tune warns
-MAX_NOISE_AMPLIFICATION = 2.0  # amplification of the force sensor's noise [1], beyond which tune warns
-# MARGIN / sqrt(number of scenarios) is the relative excess of the rms error expected on other scenarios: two
-# standard errors of the rms of numbers whose kurtosis is 10.
+MAX_PEAK_RATIO = 1.5  # peak command divided by the ideal contact's peak force [1], above which tune warns
+MAX_NOISE_AMPLIFICATION = 2.0  # amplification of the force sensor's noise [1], above which tune warns
+# On other scenarios, the rms error may be larger by this number / sqrt(number of scenarios) [1]: two standard
+# errors of the rms of numbers with a kurtosis of 10.
 GENERALISATION_MARGIN = 3.0
-# Penalty of the gains of least error, in limits of the error [1]: small, so that the error does not end
-# beyond the tolerance.
+# Penalty of the most accurate gains, in multiples of the error limit; small, so that the error stays within
+# the tolerance.
 QUIET_PENALTY_WEIGHT = 0.1
 
 
 class CommandExcess(NamedTuple):
-    """Excess noise and excess peaks of the command under some gains."""
+    """Excess noise and excess peaks of the force command with a set of gains."""
 
-    noise: float  # amplification of the force sensor's noise beyond 1 [1]
-    peaks: float  # rms excess of the peak command over the ideal contact's peak force, relative to it [1]
+    noise: float  # amplification of the force sensor's noise minus 1, at least 0 [1]
+    peaks: float  # rms of max(0, peak command / peak force of the ideal contact - 1) [1]
 
 
 def is_quiet_search_needed(task: TuneTask, settings: TuneSettings) -> bool:
-    """Return whether to search for the quietest gains: if requested, and if there is noise to amplify."""
+    """Return whether a search for the quietest gains is requested, and the compensator amplifies noise."""
     return (
         settings.quiet
         and isinstance(task.mechanism, Mechanism)
@@ -56,17 +57,17 @@ def is_quiet_search_needed(task: TuneTask, settings: TuneSettings) -> bool:
 
 
 def compute_training_tolerance(limit: float, scenarios: int) -> float:
-    """Return the rms error [1] on the training scenarios that keeps other scenarios within the limit."""
+    """Return the largest rms error [1] on training scenarios with which other scenarios meet the limit."""
     return limit / (1 + GENERALISATION_MARGIN / math.sqrt(scenarios))
 
 
 def build_least_error_objective(objective: Objective) -> Objective:
-    """Return the objective of the first search, whose program also serves the second."""
+    """Return the objective of the search for accurate gains, in a form whose program both searches share."""
     return replace(objective, tolerance=0.0)
 
 
 def build_quiet_objective(objective: Objective, scenarios: int, accurate: CommandExcess) -> Objective:
-    """Return the objective of the second search, scaled by the loudness of the gains of least error."""
+    """Return the objective of the search for quiet gains, scaled by the excess of the most accurate gains."""
     return replace(
         objective,
         tolerance=compute_training_tolerance(objective.limit, scenarios),
@@ -78,11 +79,11 @@ def build_quiet_objective(objective: Objective, scenarios: int, accurate: Comman
 def compute_command_excess(
     validation: Validation, task: int, start: StartResult, objective: Objective
 ) -> CommandExcess:
-    """Return the loudness of a start's gains on the training scenarios."""
+    """Compute the excess noise and peaks of the force command with a start's gains, on training scenarios."""
     tuned_task = validation.tasks[task]
     without, beside = (
-        float(validation.losses(weighed, [task], start.coordinates[None, None])[0, 0])
-        for weighed in (replace(objective, command_weight=weight) for weight in (0.0, 1.0))
+        float(validation.losses(weighted, [task], start.coordinates[None, None])[0, 0])
+        for weighted in (replace(objective, command_weight=weight) for weight in (0.0, 1.0))
     )
     noise = max(
         0.0, compute_noise_amplification(tuned_task.mechanism, tuned_task.compensator, start.gains) - 1
@@ -91,7 +92,7 @@ def compute_command_excess(
 
 
 def choose_quiet_starts(starts: Sequence[StartResult], number: int) -> Float[np.ndarray, "number gains"]:
-    """Return the starts of the second search: the best separated final points of the first."""
+    """Choose starts for the search for quiet gains: the best distinct results of the first search."""
     ranked = sorted((start for start in starts if math.isfinite(start.rms)), key=lambda start: start.rms)
     return select_distant_points(
         np.stack([start.coordinates for start in ranked]), None, min(number, len(ranked))

@@ -1,4 +1,4 @@
-"""Scan of the gains' ranges for the best separated points, on a few scenarios."""
+"""Scan of the gains' ranges for good starts of the solver, evaluated on a few scenarios."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,10 +12,10 @@ from tuning.gains.tasks import spread_points
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import select_distant_points, select_points_at_distance
 
-SCAN_SCENARIOS = 32  # number of scenarios on which the points of a scan are evaluated
-PRESCREEN_SCENARIOS = 8  # number of these that suffice to discard most points
-POINTS_PER_CALL = 16  # points of a task that are evaluated together on all `SCAN_SCENARIOS`
-ROUNDING_TOLERANCE = 1e-9  # relative rounding error of a value
+SCAN_SCENARIOS = 32  # number of scenarios on which a scan evaluates its points
+PRESCREEN_SCENARIOS = 8  # number of scenarios that suffice to discard most points
+POINTS_PER_CALL = 16  # points per task that one call evaluates on all `SCAN_SCENARIOS`
+ROUNDING_TOLERANCE = 1e-9  # relative rounding error of an objective
 
 
 def scan_gain_ranges(
@@ -27,9 +27,9 @@ def scan_gain_ranges(
     scanned: int,
     beside: list[np.ndarray] | None = None,
 ) -> list[Float[np.ndarray, "number gains"]]:
-    """Return the `number` best points of a scan of each task of `which`.
+    """Scan the gains of the tasks `which`; return the `number` best points of each task.
 
-    The points are separated from each other and from those of `beside`.
+    The points keep a minimum distance from each other and from the points in `beside`.
     """
     centres = [validation.coordinates(i, [validation.tasks[i].literature])[0] for i in which]
     points = np.stack([spread_points(centre, max(scanned, 2 * number), seed)[1:] for centre in centres])
@@ -52,10 +52,10 @@ def scan_gain_ranges(
 def _evaluate_points(
     validation, which, points, prior, number, objective
 ) -> Float[np.ndarray, "which points"]:
-    """Return the values of a scan's points, infinite if `number` separated points are certainly better.
+    """Evaluate the objective at the points of a scan; give points that cannot be selected an infinite value.
 
-    A sum of squares over some of the scenarios is a lower bound of that over all, by which most points are
-    discarded.
+    A few scenarios yield a lower bound of the objective. A point is discarded without full evaluation if
+    `number` points at sufficient distances are better than its lower bound.
     """
     share = PRESCREEN_SCENARIOS / min(SCAN_SCENARIOS, validation.tasks[0].lanes)
     if share > 0.5 or not _is_sum_of_squares(validation, which, objective):
@@ -87,7 +87,7 @@ def _evaluate_points(
 def _is_sum_of_squares(
     validation: Validation, which: list[int], objective: Objective | Sequence[Objective]
 ) -> bool:
-    """Return whether the objective on some of the scenarios bounds that on all of them from below."""
+    """Return whether the sum of squares over a few scenarios is a lower bound of the sum over all."""
     if validation.tasks[0].probed or not isinstance(validation.tasks[0].mechanism, Mechanism):
         return False
     objectives = list_objectives(objective, len(validation.tasks))
@@ -98,6 +98,6 @@ def _is_sum_of_squares(
 
 
 def count_scan_evaluations(validation: Validation, number: int, scanned: int) -> int:
-    """Return the number of evaluations on all scenarios that a scan for `number` starts equals."""
+    """Return the cost of a scan for `number` starts, in evaluations of the objective on all scenarios."""
     scenarios = validation.tasks[0].lanes
     return -(-max(scanned, 2 * number) * min(SCAN_SCENARIOS, scenarios) // scenarios)

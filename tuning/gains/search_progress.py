@@ -1,7 +1,7 @@
-"""Progress of a long search, and checkpoints of its steps for a restart after an interruption.
+"""Progress report of a long search, with checkpoints from which an interrupted search continues.
 
-Work is counted in simulated runs: one per scenario of a batch, and 1 + P per scenario of a Jacobian over P
-gains. The number of runs of a search is known beforehand except for its convergence.
+Work is counted in simulated runs. One evaluation of one scenario is one run; its Jacobian with respect to P
+gains counts as 1 + P runs. The total number of runs is an estimate, because convergence cannot be predicted.
 """
 
 from collections.abc import Callable
@@ -9,28 +9,28 @@ from typing import Any
 
 from tuning.caches.checkpoints import NO_CHECKPOINTS, StepCheckpoints
 
-# Arguments: description of the current stage, share of all work that is done (0 to 1), and share that came
-# from the cache.
+# Arguments: description of the current stage, completed share of all work (0 to 1), and share of all work
+# that was read from the cache (0 to 1).
 SearchProgressCallback = Callable[[str, float, float], None]
 
 
 class SearchProgress:
-    """Progress counter of a search; code that does some of the work reports it here."""
+    """Progress counter of a search, to which every part of the search reports its completed runs."""
 
     def __init__(self, tell: SearchProgressCallback = lambda text, share, cached: None):
         self._tell = tell
-        self.name = ""  # name of the current block
-        self.runs_after_group = 0.0  # runs after the current block
-        self.journal: StepCheckpoints = NO_CHECKPOINTS.journal("", None)  # checkpoints of the block's steps
+        self.name = ""  # name of the current group of mechanisms
+        self.runs_after_group = 0.0  # number of runs that remain after the current group
+        self.journal: StepCheckpoints = NO_CHECKPOINTS.journal("", None)  # checkpoints of the group's steps
         self._text, self._kept, self._done, self._left = "", 0.0, 0.0, 0.0
 
     def keep(self, text: str, runs: float) -> None:
-        """Report that the current block, of about so many runs, came from the cache."""
+        """Report that the current group, of about `runs` runs, was read from the cache."""
         self._kept += runs
         self.begin(text, 0.0)
 
     def begin(self, text: str, left: float) -> None:
-        """Begin a stage; `left` runs of the current block remain, those of the stage included."""
+        """Begin a stage; `left` runs of the current group remain, including the runs of the stage."""
         self._left = left
         self.say(text)
 
@@ -46,7 +46,10 @@ class SearchProgress:
         self._show()
 
     def step(self, name: str, kind: Any, make: Callable[[], Any]) -> Any:
-        """Return the result of `make`, of type `kind`, or its checkpoint from before an interruption."""
+        """Return the step's checkpoint from before an interruption; without one, call `make` and save it.
+
+        `kind` is the type of the result of `make`.
+        """
         return self.journal.step(name, kind, make)
 
     def _show(self) -> None:

@@ -7,28 +7,28 @@ from tuning.gains.objective import RMS_OBJECTIVE, Objective
 
 @dataclass(frozen=True)
 class TuneSettings:
-    """Settings of `tuning.gains.tune`, the same for all mechanisms of a run."""
+    """Settings of a tuning run, the same for all mechanisms."""
 
     # number of training scenarios; None: 32, or 128 with sensor noise (`tuning.gains.tasks`)
     scenarios: int | None = None
-    # starts of the solver in every batch (`tuning.gains.multistart`)
+    # number of starts of the solver in a batch (`tuning.gains.multistart`)
     starts: int = 4
     steps: int = 25  # largest number of solver steps from each start
-    validation: int = 511  # number of fresh scenarios on which the gains are evaluated
+    validation: int = 511  # number of fresh scenarios that evaluate the tuned gains
     seed: int = 0  # seed of scenarios and starts
     objective: Objective = RMS_OBJECTIVE  # objective to minimise
-    polish: int = 160  # evaluations of the final search without derivatives, per gain
-    # whether to compare the tuned gains with those of a search of the gains' whole ranges
+    polish: int = 160  # evaluations of the objective by the final derivative-free search, per gain
+    # whether to compare the tuned gains with a global search over the gains' whole ranges
     global_search: bool = False
-    scanned: int = 256  # points of a scan, the best of which become starts
-    # name of a setting of the compensator's gains that is evaluated instead of tuning
+    scanned: int = 256  # number of points in a scan; the best points become starts
+    # name of one of the compensator's fixed sets of gains, which is evaluated without tuning; None: tune
     setting: str | None = None
-    # whether to search for the quietest gains within the objective's limit if sensors are noisy
+    # whether to search for the quietest gains within the objective's limit if a sensor has noise
     quiet: bool = False
-    # whether to evaluate transparency even if the objective does not weight it
+    # whether to evaluate transparency even if its weight in the objective is 0
     evaluate_transparency: bool = False
 
     @property
     def probed(self) -> bool:
-        """Return whether every scenario has its transparency probes (`tuning.transparency.probes`)."""
+        """Return whether every scenario includes transparency probes (`tuning.transparency.probes`)."""
         return self.evaluate_transparency or self.objective.transparency_weight > 0

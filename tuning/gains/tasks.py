@@ -1,7 +1,7 @@
-"""Tuning tasks: one mechanism each, with the scenarios on which its gains are tuned.
+"""Tuning tasks: a mechanism, a compensator and the training scenarios for which its gains are tuned.
 
-Tasks whose loops differ only in the length of their delay lines share one compiled program, and are solved in
-one batch.
+Tasks whose loops differ only in the length of their delay lines share a compiled program and are tuned
+together.
 """
 
 import dataclasses
@@ -30,41 +30,40 @@ from tuning.gains.common_program import CommonProgram
 from tuning.optimisation.unit_box import GainBounds, to_gains
 from tuning.transparency.probes import LANES_PER_SCENARIO, build_probed_scenarios
 
-# In training a contact fails if it takes longer than PATIENCE undelayed durations plus SHORTEST_PATIENCE.
+# Time limit of a contact in training: this factor times the ideal contact's duration, plus the offset.
 TIME_LIMIT_FACTOR = 2.0
 TIME_LIMIT_OFFSET = 0.15  # s
 
-DEFAULT_SCENARIOS, DEFAULT_NOISY_SCENARIOS = (
-    32,
-    128,
-)  # default training scenarios without noise; with it, probes included
+# default number of training scenarios without sensor noise, and with noise (including probes)
+DEFAULT_SCENARIOS, DEFAULT_NOISY_SCENARIOS = 32, 128
 
 
 @dataclass(frozen=True)
 class TuneTask:
-    """Tuning task of one mechanism."""
+    """One mechanism with the compensator to tune for it and the training scenarios."""
 
-    mechanism: AnyMechanism  # mechanism to tune for
-    compensator: str  # compensator whose gains are tuned
-    literature: dict[str, float]  # the compensator's gains by the literature's rule, or those of a setting
+    mechanism: AnyMechanism
+    compensator: str  # name of the compensator
+    # initial gains of the compensator: by the literature's rule, or one of the compensator's fixed sets
+    literature: dict[str, float]
     scenarios: Any  # training scenarios
-    loop: Any  # loop that runs the scenarios
-    common: CommonProgram | None = None  # program shared with unlike mechanisms, if any
-    probed: bool = False  # whether each scenario has its transparency probes
+    loop: Any  # static properties of the simulated loop
+    common: CommonProgram | None = None  # program shared with mechanisms of another kind, or None
+    probed: bool = False  # whether each scenario includes transparency probes
 
     @property
     def number(self) -> int:
-        """Return the number of scenarios without probes."""
+        """Return the number of scenarios, not counting their probes."""
         return self.lanes // (LANES_PER_SCENARIO if self.probed else 1)
 
     @property
     def lanes(self) -> int:
-        """Return the number of scenarios with their probes."""
+        """Return the number of scenarios and probes together."""
         return count_lanes(self.scenarios)
 
     @property
     def contacts(self) -> int:
-        """Return the rows of a scenario's outcome: its contacts, or both errors of each six-axis episode."""
+        """Return the number of rows in a scenario's outcome: contacts, or two errors per six-axis episode."""
         return self.model.rows(self.mechanism)
 
     @property
@@ -74,7 +73,7 @@ class TuneTask:
 
     @property
     def tuned(self) -> tuple[Gain, ...]:
-        """Return the gains that are tuned for this mechanism."""
+        """Return the gains of the compensator that are tuned for this mechanism."""
         mechanism: Any = self.mechanism
         return tuple(
             gain for gain in get_compensator(self.compensator, self.model.axes).gains if gain.tuned(mechanism)
@@ -90,12 +89,13 @@ def build_task(
     setting: str | None = None,
     probed: bool = False,
 ) -> TuneTask:
-    """Build a task with quasi-random training scenarios, whose contacts have a time limit.
+    """Build a tuning task with quasi-random training scenarios, whose contacts have a time limit.
 
-    Each scenario has its own realisation of the sensors' noise. With noise the default number of `scenarios`
-    is larger, since gains can be fitted to a few realisations; transparency probes (`probed`) count as
-    scenarios. `setting` names a setting whose gains replace the literature's. Raise ValueError for probed
-    tasks of a `common` program.
+    Each scenario has its own realisation of the sensor noise. With noise, the default number of `scenarios`
+    is larger, since gains would fit a few realisations too closely; it includes transparency probes if
+    `probed` is true. `setting` names one of the compensator's fixed sets of gains, which replaces the gains
+    by the literature's rule.
+    Raise ValueError if `probed` is true and a `common` program is given.
     """
     if probed and common is not None:
         raise ValueError("probed: found True, expected False for mechanisms that share a program")
@@ -122,7 +122,7 @@ def build_task(
 
 
 def has_sensor_noise(mechanism: AnyMechanism) -> bool:
-    """Return whether the force or position sensor has noise in any scenario."""
+    """Return whether the force sensor or the position sensor has noise in at least one scenario."""
     rig = mechanism.rig
     paths = "rig.force_sensor.noise_std", "rig.position_sensor.noise_std"
     deviations = rig.force_sensor.noise_std, rig.position_sensor.noise_std
@@ -131,9 +131,9 @@ def has_sensor_noise(mechanism: AnyMechanism) -> bool:
 
 
 def group_by_program(loops: list[Any], scenarios: list[Any]) -> list[list[int]]:
-    """Group loops that share a compiled program; return lists of indices in order of the first index.
+    """Group loops that can share a compiled program; return the indices of each group.
 
-    The loops of a group differ only in the length of their delay lines; their scenarios have equal shapes.
+    The loops of a group differ only in the length of their delay lines. Their scenarios have equal shapes.
     """
     groups: dict[Any, list[int]] = {}
     for index, (loop, batch) in enumerate(zip(loops, scenarios, strict=True)):
@@ -144,13 +144,13 @@ def group_by_program(loops: list[Any], scenarios: list[Any]) -> list[list[int]]:
 
 
 def join_loops(loops: list[Any]) -> Any:
-    """Return the loop that serves all `loops` of a group, with the longest of their delay lines."""
+    """Return one loop for all `loops` of a group, with the longest of their delay lines."""
     longest = {name: max(getattr(loop, name) for loop in loops) for name in _list_delay_line_fields(loops[0])}
     return dataclasses.replace(loops[0], **longest)
 
 
 def _list_delay_line_fields(loop: Any) -> list[str]:
-    """Return the fields of a loop that are lengths of delay lines."""
+    """Return the names of a loop's fields that hold the length of a delay line."""
     return [name for name in ("ring", "controller_ring") if hasattr(loop, name)]
 
 
@@ -165,7 +165,10 @@ def list_tuned_gains(tasks: list[TuneTask]) -> tuple[str, ...]:
 
 
 def build_gain_bounds(task: TuneTask, names: tuple[str, ...]) -> GainBounds:
-    """Return the bounds (gains,) of a task; both are the literature's value for a gain that is not tuned."""
+    """Return the lower and upper bounds (gains,) of the gains `names`.
+
+    Both bounds of a gain that is not tuned for the task are the gain's literature value.
+    """
     gains = {gain.name: gain for gain in get_compensator(task.compensator, task.model.axes).gains}
     moved = {gain.name for gain in task.tuned}
 
@@ -185,9 +188,9 @@ def convert_to_gains(
     bounds: GainBounds,
     coordinates: Float[np.ndarray, "*points gains"],
 ) -> dict[str, Float[np.ndarray, "*points"]]:
-    """Return all gains of the compensator at unit coordinates of the gains `names`.
+    """Convert unit coordinates of the gains `names` to values of all gains of the compensator.
 
-    Gains that are not tuned for the task have the literature's value.
+    Gains that are not tuned for the task get their literature value.
     """
     moved = {gain.name for gain in task.tuned}
     values = dict(zip(names, np.moveaxis(to_gains(coordinates, bounds), -1, 0), strict=True))
@@ -198,9 +201,10 @@ def convert_to_gains(
 
 
 def spread_points(first: np.ndarray, number: int, seed: int | tuple[int, ...]) -> np.ndarray:
-    """Return points (number, gains) of the unit box: `first`, then Sobol points.
+    """Return points (number, gains) in unit coordinates: `first`, then points of a Sobol sequence.
 
-    Every other Sobol point lies within 1/8 of each gain's range from `first`, the rest anywhere.
+    Every second Sobol point differs from `first` by at most 1/8 in each coordinate. The others cover the
+    whole range.
     """
     points = qmc.Sobol(len(first), rng=np.random.default_rng(seed)).random(
         1 << max(number - 1, 1).bit_length()
@@ -212,13 +216,13 @@ def spread_points(first: np.ndarray, number: int, seed: int | tuple[int, ...]) -
 
 @partial(jax.jit, static_argnums=0)
 def _compute_time_limit(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*batch"]:
-    """Return the time limit [s] of a contact in training (`TIME_LIMIT_FACTOR`)."""
+    """Return the time limit [s] of a contact in each training scenario (`TIME_LIMIT_FACTOR`)."""
     shape = scenarios.phase.shape
     mass = jnp.broadcast_to(scenarios.equivalent_mass, shape)
     velocity = jnp.broadcast_to(scenarios.velocity, shape)
     reference = law.reference(parameters_by_slot(scenarios.contact), mass, velocity)
     longest = TIME_LIMIT_FACTOR * jnp.max(reference.duration, axis=0) + TIME_LIMIT_OFFSET
-    # A noisy command never dies out, so that every contact ends later; the limit allows for that.
+    # A noisy command does not decay, so that a contact ends later, after the longest wait for its decay.
     sensor = scenarios.force_sensor
     longest = longest + jnp.where((sensor.noise_std != 0) | (sensor.bias != 0), MAX_DECAY_WAIT, 0.0)
     return jnp.minimum(longest, scenarios.time_limit)

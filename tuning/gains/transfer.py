@@ -1,7 +1,7 @@
-"""Transfer of gains tuned for one mechanism, as a start for similar mechanisms.
+"""Transfer of tuned gains to a similar mechanism, as a start of its tuning.
 
-`compute_mechanism_distance` measures how different two mechanisms are, `find_nearest` selects the nearest
-mechanism already tuned, and `transfer_gains` converts its gains to another mechanism.
+`compute_mechanism_distance` measures how much two mechanisms differ, `find_nearest` selects the most similar
+tuned mechanism, and `transfer_gains` converts gains from one mechanism to another.
 """
 
 import functools
@@ -21,61 +21,61 @@ from tuning.gain_file import validity_envelope
 
 
 class MechanismTraits(NamedTuple):
-    """Nominal properties that determine a mechanism's restitution without compensation."""
+    """Nominal properties of a mechanism and its rig that determine the restitution without compensation."""
 
-    slowest: float  # omega of the slowest contact [rad/s]
-    fastest: float  # omega of the fastest contact [rad/s]
+    slowest: float  # angular frequency of the slowest contact [rad/s]
+    fastest: float  # angular frequency of the fastest contact [rad/s]
     force_delay: float  # delay plus lag of the force sensor [s]
-    simulator_delay: float  # delay plus lag of the motion simulator and its command [s]
+    simulator_delay: float  # delay plus lag of the motion simulator, including the command's delay [s]
     control_period: float  # [s]
-    damping_ratio: float  # [1]
+    damping_ratio: float  # largest damping ratio of all contacts [1]
     law: str  # name of the contact law
-    two_sided: bool  # whether there are two surfaces
+    two_sided: bool  # whether there are two contact surfaces
 
 
 @dataclass(frozen=True)
 class EarlierGains:
-    """Gains of an earlier tuning."""
+    """Gains that were tuned earlier, for another mechanism."""
 
-    mechanism: Mechanism  # mechanism they were tuned for
+    mechanism: Mechanism  # mechanism for which the gains were tuned
     gains: Mapping[str, float]  # [SI units]
-    source: str  # origin of the gains, for messages
+    source: str  # file or mechanism from which the gains come, for messages
 
     @functools.cached_property
     def traits(self) -> MechanismTraits:
-        """Return the traits of the mechanism."""
+        """Return the properties by which the mechanism is compared with others."""
         return compute_traits(self.mechanism)
 
 
 def compute_mechanism_distance(a: Mechanism, b: Mechanism) -> float:
-    """Return the distance of two mechanisms [1], which is symmetric, and 0 for equal ones.
+    """Return a dimensionless distance between two mechanisms, symmetric and 0 for equal mechanisms.
 
-    It is the root of the sum of squares of
+    The distance is the root of the sum of squares of
 
         ln(omega_a / omega_b) / sqrt(2)     for the slowest and for the fastest contact
-        (pi/2) omega (tau_a - tau_b)        for the delays of force and motion simulator and the control
-                                            period, omega the geometric mean of all four frequencies
+        (pi/2) omega (tau_a - tau_b)        for force delay, motion simulator delay and control period; omega
+                                            is the geometric mean of the four contact frequencies
         pi (xi_a - xi_b)                    for the damping ratio
         1                                   if contact law or number of surfaces differ
 
-    so that each term is about its effect on ln e: a delay in the loop multiplies the restitution by about
-    exp(pi omega tau / 2), damping by about exp(-pi xi).
+    Each term approximates the effect of its property on ln e: a delay in the loop multiplies the restitution
+    e by about exp(pi omega tau / 2), and damping by about exp(-pi xi).
     """
     return _compute_trait_distance(compute_traits(a), compute_traits(b))
 
 
 def compute_traits(mechanism: Mechanism) -> MechanismTraits:
-    """Return the traits of the nominal run.
+    """Compute the nominal properties by which a mechanism is compared with others.
 
-    The stiffness k of a nonlinear law is that of the linear contact with the same peak force
-    (`validity_envelope`). The damping ratio, the largest of all contacts, is b/(2 sqrt(k M)), or chi v/pi for
-    Hunt and Crossley's law, from e = 1 - chi v.
+    The contact frequencies of a nonlinear law are those of the linear contact with the same peak force
+    (`validity_envelope`). The damping ratio is b/(2 sqrt(k M)), or for the law of Hunt and Crossley chi v/pi,
+    which follows from e = 1 - chi v.
     """
     nominal = build_scenarios(mechanism)
     frequency = validity_envelope(mechanism, nominal)["contact_frequency"]
     slowest, fastest = (2 * math.pi * frequency[end] for end in ("low", "high"))
     simulator, sensor, rig = nominal.simulator, nominal.force_sensor, mechanism.rig
-    # The lag of num(s)/den(s) behind a uniform motion: the difference of their slopes at s = 0.
+    # In uniform motion, the output of num(s)/den(s) lags by den'(0)/den(0) - num'(0)/num(0).
     slopes = [
         float(polynomial[-2, 0] / polynomial[-1, 0]) if len(polynomial) > 1 else 0.0
         for polynomial in (np.asarray(simulator.denominator), np.asarray(simulator.numerator))
@@ -100,7 +100,7 @@ def compute_traits(mechanism: Mechanism) -> MechanismTraits:
 
 
 def find_nearest(mechanism: Mechanism, tuned: Sequence[EarlierGains]) -> EarlierGains:
-    """Return the tuned mechanism nearest to `mechanism`, the first of equally distant ones."""
+    """Return the tuned gains whose mechanism has the smallest distance from `mechanism`."""
     target = compute_traits(mechanism)
     return min(tuned, key=lambda candidate: _compute_trait_distance(target, candidate.traits))
 
@@ -108,7 +108,10 @@ def find_nearest(mechanism: Mechanism, tuned: Sequence[EarlierGains]) -> Earlier
 def find_nearest_of_each(
     mechanism: AnyMechanism, sources: Sequence[Sequence[EarlierGains]]
 ) -> list[EarlierGains]:
-    """Return the nearest mechanism of each source; none in six axes, where no distance is defined."""
+    """Return the nearest tuned gains of each source.
+
+    The list is empty for a six-axis mechanism, because the distance is defined for one axis only.
+    """
     if not isinstance(mechanism, Mechanism):
         return []
     return [find_nearest(mechanism, tuned) for tuned in sources]
@@ -117,11 +120,11 @@ def find_nearest_of_each(
 def transfer_gains(
     compensator: str, gains: Mapping[str, float], source: Mechanism, target: Any
 ) -> dict[str, float]:
-    """Convert gains of `compensator` tuned for `source` to `target`.
+    """Convert gains that were tuned for the mechanism `source` to the mechanism `target`.
 
     A gain on a logarithmic scale keeps its ratio to the literature's value. Any other gain keeps its
-    difference from the literature's value as a share of the gain's range. Both are then clipped to the
-    target's bounds. For equal mechanisms the gains do not change.
+    difference from the literature's value, as a fraction of the gain's range. All gains are clipped to the
+    bounds for `target`. If the two mechanisms are equal, the gains do not change.
     """
     old_literature, new_literature = (
         literature_gains(source, compensator),
@@ -132,7 +135,7 @@ def transfer_gains(
         old, new = old_literature[gain.name], new_literature[gain.name]
         lower, upper = float(gain.lower(target)), float(gain.upper(target))
         span = float(gain.upper(source)) - float(gain.lower(source))
-        # In this form a factor of 1 leaves every digit of the gain unchanged.
+        # These forms leave a gain unchanged to the last digit if the mechanisms are equal.
         if gain.logarithmic and old > 0:
             value = gains[gain.name] * (new / old)
         else:
@@ -142,14 +145,14 @@ def transfer_gains(
     return converted
 
 
-def _compute_trait_distance(ours: MechanismTraits, theirs: MechanismTraits) -> float:
-    omega = ((ours.slowest * ours.fastest) * (theirs.slowest * theirs.fastest)) ** 0.25
+def _compute_trait_distance(a: MechanismTraits, b: MechanismTraits) -> float:
+    omega = ((a.slowest * a.fastest) * (b.slowest * b.fastest)) ** 0.25
     squares = [
-        (math.log(ours.slowest) - math.log(theirs.slowest)) ** 2 / 2,
-        (math.log(ours.fastest) - math.log(theirs.fastest)) ** 2 / 2,
-        (math.pi * (ours.damping_ratio - theirs.damping_ratio)) ** 2,
-        float((ours.law, ours.two_sided) != (theirs.law, theirs.two_sided)),
+        (math.log(a.slowest) - math.log(b.slowest)) ** 2 / 2,
+        (math.log(a.fastest) - math.log(b.fastest)) ** 2 / 2,
+        (math.pi * (a.damping_ratio - b.damping_ratio)) ** 2,
+        float((a.law, a.two_sided) != (b.law, b.two_sided)),
     ]
     for name in ("force_delay", "simulator_delay", "control_period"):
-        squares.append((math.pi / 2 * omega * (getattr(ours, name) - getattr(theirs, name))) ** 2)
+        squares.append((math.pi / 2 * omega * (getattr(a, name) - getattr(b, name))) ** 2)
     return math.sqrt(sum(squares))

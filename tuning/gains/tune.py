@@ -1,4 +1,4 @@
-"""Tuning of mechanisms of one program, and evaluation of the gains on fresh scenarios."""
+"""Tuning of mechanisms that share a compiled program, and evaluation of the gains on fresh scenarios."""
 
 import math
 import time
@@ -33,66 +33,73 @@ from tuning.transparency.probes import compute_probe_metrics
 
 
 class ErrorMetrics(NamedTuple):
-    """Metrics of the restitution errors e - e* of all contacts of a batch."""
+    """Metrics of all contacts in a batch of scenarios: restitution errors e - e*, forces and durations."""
 
     rms: float  # root mean square of e - e* [1]
     p99: float  # 99th percentile of |e - e*| [1]
     max: float  # maximum of |e - e*| [1]
     mean: float  # mean of e - e* [1]
-    diverging: float  # share of contacts with e > e* [1]
-    peak_ratio: float  # largest |F_c| over the ideal contact's peak force [1]
+    diverging: float  # fraction of contacts with e > e* [1]
+    peak_ratio: float  # largest ratio of the peak command to the ideal contact's peak force [1]
     chatter: float  # root mean square of the chatter [1] (`jaxhil.simulation.outcome.Outcome`)
     failed: int  # number of contacts that did not end
-    # 99th percentile of the largest real force over the ideal contact's peak force [1]
+    # 99th percentile of the real peak force divided by the ideal contact's peak force [1]
     peak_force_ratio: float = math.nan
-    # 1st and 99th percentile of the time with a real force over the ideal contact's duration [1]
+    # 1st and 99th percentiles of the contact duration divided by the ideal contact's duration [1]
     duration_ratio: tuple[float, float] = (math.nan, math.nan)
-    # share of contacts with a force or duration ratio beyond `jaxhil.simulation.contact_bounds` [1]
+    # fraction of contacts whose force or duration ratio violates `jaxhil.simulation.contact_bounds` [1]
     unlike: float = 0.0
 
 
 class GainTolerance(NamedTuple):
-    """Tolerance of a gain: the change that raises the loss by 1 %, as a share of the gain's range."""
+    """Change of a gain that raises the loss by 1 %, as a fraction of the gain's range."""
 
-    alone: float  # with all other gains fixed
-    together: float  # with all other gains at their best
+    alone: float  # change if all other gains are fixed [1]
+    together: float  # change if all other gains are readjusted to minimise the loss [1]
 
 
 @dataclass(frozen=True)
 class TuneResult:
-    """Result of tuning for one mechanism; "before" means without compensation."""
+    """Result of tuning a compensator for one mechanism.
 
-    compensator: str  # compensator that was tuned
-    mechanism: AnyMechanism  # mechanism it was tuned for
-    gains: dict[str, float]  # all tuned gains of the compensator
-    literature: dict[str, float]  # gains by the literature's rule
-    figures: dict[str, ErrorMetrics]  # of "before", "literature" and "tuned" on the same fresh scenarios
-    nominal: dict[str, ErrorMetrics]  # the same of the nominal run
-    starts: list[StartResult]  # every start of the solver
-    outcomes: dict[str, Outcome]  # on the fresh scenarios, for plots
+    The keys of `figures`, `nominal`, `outcomes` and `transparency` are "before" (no compensation),
+    "literature" (gains by the literature's rule) and "tuned".
+    """
+
+    compensator: str  # name of the compensator
+    mechanism: AnyMechanism  # mechanism for which the gains were tuned
+    gains: dict[str, float]  # all gains of the compensator after tuning
+    literature: dict[str, float]  # all gains by the literature's rule
+    figures: dict[str, ErrorMetrics]  # metrics on the fresh scenarios
+    nominal: dict[str, ErrorMetrics]  # metrics of the nominal run
+    starts: list[StartResult]  # results of all starts of the solver
+    outcomes: dict[str, Outcome]  # outcomes of the fresh scenarios, for plots
     scenarios: Any  # fresh scenarios, for plots
     settings: TuneSettings  # settings of the tuning
     timings: dict[str, float] = field(default_factory=dict)  # duration of each stage [s]
-    intervals: ErrorIntervals | None = None  # 95 % intervals of the tuned figures
-    first: tuple[EarlierGains, ...] = ()  # origins of the gains of the last starts of the first batch
+    intervals: ErrorIntervals | None = None  # 95 % confidence intervals of the "tuned" metrics
+    first: tuple[EarlierGains, ...] = ()  # earlier gains that replaced the last starts of the first batch
     freedom: dict[str, GainTolerance] = field(default_factory=dict)  # tolerance of each tuned gain
-    global_comparison: GlobalComparison | None = None  # comparison with a global search, if there was one
-    # transparency, slope and peak of "before", "literature" and "tuned", if the scenarios have probes
+    global_comparison: GlobalComparison | None = None  # None if no global search was requested
+    # transparency, slope and peak; empty if the scenarios have no probes
     transparency: dict[str, dict[str, IntervalEstimate]] = field(default_factory=dict)
-    # of the tuned gains on the same fresh scenarios without the sensors' noise; None if there is no noise
+    # metrics of the tuned gains on the fresh scenarios without sensor noise; None if no sensor has noise
     without_noise: ErrorMetrics | None = None
-    quiet: bool = False  # whether these are the quietest gains within the limit, not those of least error
+    quiet: bool = False  # whether the gains are the quietest within the limit, instead of the most accurate
 
     @property
     def usual_starts(self) -> int:
-        """Return the number of starts of the first batch that do not come from earlier gains (`first`)."""
+        """Return the number of starts of the first batch that are not earlier gains (`first`)."""
         return max(self.settings.starts, 1 + len(self.first)) - len(self.first)
 
 
 def tune_group(
     tasks: list[TuneTask], settings: TuneSettings, work: SearchProgress, near: list[list[EarlierGains]]
 ) -> list[TuneResult]:
-    """Tune mechanisms of one program and evaluate the gains; `near` holds further starts of each."""
+    """Tune mechanisms that share a program, and evaluate the gains on fresh scenarios.
+
+    `near` holds, for each mechanism, earlier gains of similar mechanisms, which serve as additional starts.
+    """
     clock, validation = _StageClock(), build_validation(tasks, settings.validation, settings.seed, work)
     evaluating, beforehand = _count_evaluation_runs(tasks, settings), _count_baseline_runs(tasks, settings)
     work.runs_after_group += evaluating - beforehand
@@ -154,7 +161,7 @@ def tune_group(
 def _compare_globally(
     validation: Validation, searched: list[MultistartResult], settings: TuneSettings
 ) -> list[GlobalComparison | None]:
-    """Compare the gains of every task with those of a global search."""
+    """Compare the tuned gains of every task with the best gains of a global search."""
     work, comparisons = validation.work, []
     for i, result in enumerate(searched):
         left = (
@@ -175,7 +182,7 @@ def estimate_group_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:
 
 
 def describe_group(tasks: Sequence[TuneTask]) -> str:
-    """Return the name, for messages, of mechanisms that are tuned together."""
+    """Return a description for messages: the mechanism's name, or the number of mechanisms."""
     return tasks[0].mechanism.name if len(tasks) == 1 else f"{len(tasks)} mechanisms"
 
 
@@ -185,7 +192,7 @@ def _count_search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
 
 
 def _count_evaluation_runs(tasks: list[TuneTask], settings: TuneSettings) -> float:
-    """Return the runs of the evaluation and of the global search, if there is one."""
+    """Return the number of runs for the evaluation and, if requested, the global search."""
     noisy = any(has_sensor_noise(task.mechanism) for task in tasks)
     evaluation = (2.0 if noisy else 1.5) * _count_baseline_runs(tasks, settings)
     global_search = EVALUATION_FACTOR * _count_search_runs(tasks, settings) if settings.global_search else 0
@@ -193,7 +200,7 @@ def _count_evaluation_runs(tasks: list[TuneTask], settings: TuneSettings) -> flo
 
 
 def _count_baseline_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
-    """Return the runs to evaluate no compensation and the literature's gains."""
+    """Return the number of runs that evaluate no compensation and the literature's gains."""
     return 2 * len(tasks) * count_evaluated_runs(settings.validation, tasks[0].probed)
 
 
@@ -203,9 +210,9 @@ def _search_gains(
     near: list[list[EarlierGains]],
     meanwhile: Callable[[], object],
 ) -> list[MultistartResult]:
-    """Search the best gains of every task; the result is empty without gains to tune or with a setting.
+    """Search for the best gains of every task; call `meanwhile` while the solver compiles.
 
-    `meanwhile` is called while the solver compiles.
+    The results are empty if no gain is tunable, or if the settings specify one of the fixed sets of gains.
     """
     tasks = validation.tasks
     if settings.setting is not None or not any(task.tuned for task in tasks):
@@ -221,7 +228,7 @@ def _search_gains(
 
 
 def _evaluate_baselines(validation: Validation) -> dict[str, list]:
-    """Evaluate no compensation and the literature's gains, which needs no search."""
+    """Evaluate the mechanisms without compensation ("before") and with the literature's gains."""
     literature = [task.literature for task in validation.tasks]
     task = validation.tasks[0]
     plain = [remove_compensation(task.compensator, gains, task.model.axes) for gains in literature]
@@ -234,7 +241,7 @@ def _evaluate_baselines(validation: Validation) -> dict[str, list]:
 def _compute_transparency(
     validation: Validation, task: int, outcomes: Mapping[str, Outcome | None]
 ) -> dict[str, dict[str, IntervalEstimate]]:
-    """Return the transparency of a task under several gains; empty if its scenarios have no probes."""
+    """Return the transparency metrics of a task for each set of gains; empty without probes."""
     probed = validation.probed[task]
     if probed is None:
         return {}
@@ -248,7 +255,7 @@ def _compute_transparency(
 def _compute_tolerances(
     task: TuneTask, names: tuple[str, ...], best: StartResult | None
 ) -> dict[str, GainTolerance]:
-    """Return the tolerances of the gains tuned for the task, from the solver's last J^T J."""
+    """Return the tolerance of each gain that is tuned for the task, from the solver's final J^T J."""
     moved = [i for i, name in enumerate(names) if name in {gain.name for gain in task.tuned}]
     if best is None or not moved or not np.all(np.isfinite(best.curvature)):
         return {}
@@ -260,7 +267,7 @@ def _compute_tolerances(
 
 
 def compute_error_metrics(outcome: Outcome) -> ErrorMetrics:
-    """Compute the metrics of a batch, NaN if no contact ended."""
+    """Compute the error metrics of a batch of scenarios; they are NaN if no contact ended."""
     errors = outcome.error[outcome.good]
     failed = int(np.sum(outcome.wanted & ~outcome.good))
     if not len(errors):
@@ -283,7 +290,7 @@ def compute_error_metrics(outcome: Outcome) -> ErrorMetrics:
 
 
 def _compare_real_contacts(outcome: Outcome) -> dict[str, Any]:
-    """Return the fields of `ErrorMetrics` that compare real with ideal contacts."""
+    """Return the fields of `ErrorMetrics` that compare the real contacts with the ideal contacts."""
     good = outcome.good
     lowest, highest = np.nanpercentile(outcome.duration_ratio[good], (1, 99))
     return {
@@ -294,7 +301,10 @@ def _compare_real_contacts(outcome: Outcome) -> dict[str, Any]:
 
 
 def compute_metrics_by_error(result: TuneResult) -> dict[str, dict[str, ErrorMetrics]]:
-    """Return the metrics of each error by its name; empty if the rig model has only one error."""
+    """Return the metrics of each error of a six-axis rig, by error and key of `TuneResult`.
+
+    The result is empty for one axis, where the restitution error is the only one.
+    """
     model = choose_rig_model(result.mechanism)
     if len(model.errors) == 1:
         return {}
@@ -308,9 +318,10 @@ def compute_metrics_by_error(result: TuneResult) -> dict[str, dict[str, ErrorMet
 def remove_compensation(
     compensator: str, gains: dict[str, float], axes: int = 1
 ) -> tuple[str, dict[str, float]]:
-    """Return the compensator and gains that leave the measured force unchanged, for "before".
+    """Return a compensator and gains that leave the measured force unchanged.
 
-    Neutral gains need no other program. A compensator without neutral gains is replaced by "none".
+    They are the same compensator with neutral gains, which needs no other compiled program. A compensator
+    without neutral gains is replaced by the compensator "none".
     """
     specifications = get_compensator(compensator, axes).gains
     if not any(gain.neutral is not None for gain in specifications):
@@ -319,7 +330,7 @@ def remove_compensation(
 
 
 def neutralise_gains(compensator: str, gains: dict[str, float], axes: int = 1) -> dict[str, float]:
-    """Return the gains with neutral values where the compensator defines them."""
+    """Replace every gain that has a neutral value by this value."""
     neutral = {
         gain.name: gain.neutral
         for gain in get_compensator(compensator, axes).gains
@@ -329,7 +340,7 @@ def neutralise_gains(compensator: str, gains: dict[str, float], axes: int = 1) -
 
 
 class _StageClock:
-    """Stop watch of named stages [s]."""
+    """Stop watch that stores the duration [s] of each named stage."""
 
     def __init__(self):
         self.laps, self._last = {}, time.perf_counter()

@@ -1,7 +1,7 @@
-"""Tuning of many mechanisms, block by block in this process or in parallel by the workers of a cluster.
+"""Tuning of many mechanisms in groups, one after the other in this process or in parallel on a cluster.
 
-Each result is cached when it is complete, and before that every step of a search in this process, if there is
-a cache (`tuning.caches.checkpoints`).
+If there is a cache (`tuning.caches.checkpoints`), it stores every result and, during a search in this
+process, a checkpoint after every step.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -35,18 +35,18 @@ from tuning.gains.validation import draw_fresh_scenarios
 from tuning.statistics.bootstrap import ErrorIntervals
 from tuning.statistics.intervals import IntervalEstimate
 
-MAX_GROUP_SIZE = 16  # mechanisms tuned and evaluated together; an interruption loses at most one block
+MAX_GROUP_SIZE = 16  # mechanisms that are tuned together; an interruption loses at most one group
 
 
 class _TuneGroup(NamedTuple):
-    """Mechanisms that are tuned together."""
+    """Mechanisms that are tuned together, with earlier gains as starts."""
 
-    tasks: list[TuneTask]  # one per mechanism
-    near: list[list[EarlierGains]]  # per mechanism, the origins of the gains of its last starts
+    tasks: list[TuneTask]  # one task per mechanism
+    near: list[list[EarlierGains]]  # for each mechanism, earlier gains of similar mechanisms
 
 
 class _CachedResult(NamedTuple):
-    """Cached part of a `TuneResult`: the fields that the inputs do not determine, with outcomes as arrays."""
+    """Fields of a `TuneResult` that are cached, with outcomes as arrays; the inputs determine the others."""
 
     gains: dict[str, float]
     figures: dict[str, ErrorMetrics]
@@ -65,7 +65,7 @@ class _CachedResult(NamedTuple):
 def tune(
     mechanism: AnyMechanism, compensator: str, settings: TuneSettings, work: SearchProgress | None = None
 ) -> TuneResult:
-    """Tune the gains of `compensator` for `mechanism`; `work` reports the progress."""
+    """Tune the gains of `compensator` for one mechanism; `work` reports the progress."""
     return next(tune_all([mechanism], compensator, settings, work))[1]
 
 
@@ -79,17 +79,17 @@ def tune_all(
     pieces: Checkpoints = NO_CHECKPOINTS,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, TuneResult]]:
-    """Yield (index, result) of every mechanism, in the order in which they finish.
+    """Tune the gains of `compensator` for many mechanisms; yield (index, result) when a mechanism is done.
 
-    Mechanisms that share a program are tuned together; with a `common` program unlike ones share it too. The
-    gains of the nearest mechanism of `tuned`, with the same compensator, replace one of the last starts of
-    each mechanism, but never the literature's. So do those of the nearest mechanism of the first block in the
-    other blocks.
+    Mechanisms that share a program are tuned together; a `common` program lets different kinds of mechanisms
+    share one. The tuned gains of the most similar mechanism in `tuned` are a start of each mechanism. In all
+    groups but the first, the gains of the most similar mechanism of the first group are a start too. These
+    starts never replace the literature's gains.
 
-    Each result is cached in `pieces` under its mechanism's name, for the same set of mechanisms tuned
-    together, since these affect its last bits. With a `scheduler`, the workers of a cluster tune the blocks.
+    `pieces` caches each result under the mechanism's name and group, since the other mechanisms of the group
+    affect the last bits. If `scheduler` is given, the workers of a cluster tune the groups.
     """
-    work, first_block = work or SearchProgress(), []
+    work, first_group = work or SearchProgress(), []
     tasks = _build_tasks(mechanisms, compensator, settings, common)
     indices = [
         group[begin : begin + MAX_GROUP_SIZE]
@@ -98,40 +98,43 @@ def tune_all(
     ]
     left = sum(estimate_group_runs([tasks[i] for i in members], settings) for members in indices)
     afterwards = work.runs_after_group
-    for groups in (indices[:1], indices[1:]):
-        sources = [source for source in (tuned, first_block) if source]
+    for members_of_groups in (indices[:1], indices[1:]):
+        sources = [source for source in (tuned, first_group) if source]
         sources = sources[: max(settings.starts - 1, 1 if tuned else 0)]
-        blocks = [
+        groups = [
             _TuneGroup(
                 [tasks[i] for i in members], [find_nearest_of_each(mechanisms[i], sources) for i in members]
             )
-            for members in groups
+            for members in members_of_groups
         ]
         work.runs_after_group = afterwards + left
         if scheduler is None:
-            computed = _tune_locally(blocks, settings, work, pieces)
+            computed = _tune_locally(groups, settings, work, pieces)
         else:
-            computed = _tune_on_cluster(scheduler, blocks, settings, work, pieces)
+            computed = _tune_on_cluster(scheduler, groups, settings, work, pieces)
         for index, results in computed:
-            if not first_block:
-                first_block = [
+            if not first_group:
+                first_group = [
                     EarlierGains(result.mechanism, result.gains, result.mechanism.name)
                     for result in results
                     if isinstance(result.mechanism, Mechanism)
                 ]
-            yield from zip(groups[index], results, strict=True)
-        left -= sum(estimate_group_runs(block.tasks, settings) for block in blocks)
+            yield from zip(members_of_groups[index], results, strict=True)
+        left -= sum(estimate_group_runs(group.tasks, settings) for group in groups)
 
 
 def _build_tasks(
     mechanisms: Sequence[AnyMechanism], compensator: str, settings: TuneSettings, common: CommonProgram | None
 ) -> list[TuneTask]:
-    asked = settings.scenarios, settings.seed, common, settings.setting, settings.probed
-    return [build_task(mechanism, compensator, *asked) for mechanism in mechanisms]
+    options = settings.scenarios, settings.seed, common, settings.setting, settings.probed
+    return [build_task(mechanism, compensator, *options) for mechanism in mechanisms]
 
 
 def _group_tasks(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int]]:
-    """Group the indices of tasks that share a program and, with a user's function, the number of contacts."""
+    """Group tasks that share a program (and, with a user's objective function, the number of contacts).
+
+    Return the indices of the tasks in each group.
+    """
     groups = group_by_program([task.loop for task in tasks], [task.scenarios for task in tasks])
     if settings.objective.function is None:
         return groups
@@ -141,56 +144,56 @@ def _group_tasks(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int
 
 
 def _tune_locally(
-    blocks: list[_TuneGroup], settings: TuneSettings, work: SearchProgress, pieces: Checkpoints
+    groups: list[_TuneGroup], settings: TuneSettings, work: SearchProgress, pieces: Checkpoints
 ) -> Iterator[tuple[int, list[TuneResult]]]:
-    """Yield (index, results) of every block, in order."""
-    for index, block in enumerate(blocks):
-        runs = estimate_group_runs(block.tasks, settings)
+    """Tune the groups in order; yield (index of the group, results)."""
+    for index, group in enumerate(groups):
+        runs = estimate_group_runs(group.tasks, settings)
         work.runs_after_group -= runs
-        work.name = describe_group(block.tasks)
-        results = _read_results(block, settings, pieces)
+        work.name = describe_group(group.tasks)
+        results = _read_results(group, settings, pieces)
         if results is not None:
             work.keep("as kept", runs)
         else:
             if pieces.is_enabled:
-                work.journal = pieces.journal(_list_names(block)[0], _list_inputs(block, settings))
-            results = tune_group(block.tasks, settings, work, block.near)
-            _write_results(block, settings, pieces, map(_select_cached_fields, results))
+                work.journal = pieces.journal(_list_names(group)[0], _list_inputs(group, settings))
+            results = tune_group(group.tasks, settings, work, group.near)
+            _write_results(group, settings, pieces, map(_select_cached_fields, results))
             work.journal.finish()
         yield index, results
 
 
 def _tune_on_cluster(
     scheduler: str,
-    blocks: list[_TuneGroup],
+    groups: list[_TuneGroup],
     settings: TuneSettings,
     work: SearchProgress,
     pieces: Checkpoints,
 ) -> Iterator[tuple[int, list[TuneResult]]]:
-    """Yield (index, results) of every block, in the order in which workers finish them."""
+    """Tune the groups on a cluster; yield (index of the group, results) when a worker finishes a group."""
     missing = []
-    for index, block in enumerate(blocks):
-        runs = estimate_group_runs(block.tasks, settings)
-        results = _read_results(block, settings, pieces)
+    for index, group in enumerate(groups):
+        runs = estimate_group_runs(group.tasks, settings)
+        results = _read_results(group, settings, pieces)
         if results is not None:
             work.runs_after_group -= runs
             work.keep("as kept", runs)
             yield index, results
             continue
-        mechanisms = [task.mechanism for task in block.tasks]
-        first = block.tasks[0]
-        missing.append(WorkUnit(index, (mechanisms, first.compensator, settings, first.common, block.near)))
-    what = f"tune-{compute_digest([_list_inputs(block, settings) for block in blocks])[:16]}"
+        mechanisms = [task.mechanism for task in group.tasks]
+        first = group.tasks[0]
+        missing.append(WorkUnit(index, (mechanisms, first.compensator, settings, first.common, group.near)))
+    what = f"tune-{compute_digest([_list_inputs(group, settings) for group in groups])[:16]}"
     work.begin("on the cluster", 0.0)
     for index, content in run_on_workers(scheduler, tune_and_encode, missing, get_process_setting(), what):
-        block, cached = blocks[index], decode_value(content, list[_CachedResult])
-        runs = estimate_group_runs(block.tasks, settings)
+        group, cached = groups[index], decode_value(content, list[_CachedResult])
+        runs = estimate_group_runs(group.tasks, settings)
         work.runs_after_group -= runs
-        work.name = describe_group(block.tasks)
+        work.name = describe_group(group.tasks)
         work.begin("tuned on the cluster", runs)
         work.report_runs(runs)
-        _write_results(block, settings, pieces, cached)
-        yield index, _restore_results(block, cached, settings)
+        _write_results(group, settings, pieces, cached)
+        yield index, _restore_results(group, cached, settings)
 
 
 def tune_and_encode(
@@ -200,42 +203,42 @@ def tune_and_encode(
     common: CommonProgram | None,
     near: list[list[EarlierGains]],
 ) -> bytes:
-    """Return the encoded part of a block's results that is cached; called on a worker."""
+    """Tune a group of mechanisms on a cluster worker; return the encoded fields that are cached."""
     tasks = _build_tasks(mechanisms, compensator, settings, common)
     return encode_value(
         [_select_cached_fields(result) for result in tune_group(tasks, settings, SearchProgress(), near)]
     )
 
 
-def _list_inputs(block: _TuneGroup, settings: TuneSettings) -> list[Any]:
-    """Return all inputs that determine a block's results."""
-    first = block.tasks[0]
+def _list_inputs(group: _TuneGroup, settings: TuneSettings) -> list[Any]:
+    """Return all inputs that the results of a group depend on, as a key of the cache."""
+    first = group.tasks[0]
     return [
-        *("tune", first.compensator, [to_plain_data(task.mechanism) for task in block.tasks]),
+        *("tune", first.compensator, [to_plain_data(task.mechanism) for task in group.tasks]),
         *(settings, first.common),
-        [[(to_plain_data(t.mechanism), t.gains, t.source) for t in neighbours] for neighbours in block.near],
+        [[(to_plain_data(t.mechanism), t.gains, t.source) for t in neighbours] for neighbours in group.near],
     ]
 
 
-def _list_names(block: _TuneGroup) -> list[str]:
-    return [f"tune {task.mechanism.name}" for task in block.tasks]
+def _list_names(group: _TuneGroup) -> list[str]:
+    return [f"tune {task.mechanism.name}" for task in group.tasks]
 
 
-def _read_results(block: _TuneGroup, settings: TuneSettings, pieces: Checkpoints) -> list[TuneResult] | None:
-    """Read a block's results from the cache; return None if one is missing."""
+def _read_results(group: _TuneGroup, settings: TuneSettings, pieces: Checkpoints) -> list[TuneResult] | None:
+    """Read the results of a group from the cache; return None if one result is missing."""
     if not pieces.is_enabled:
         return None
-    inputs = _list_inputs(block, settings)
-    cached = [pieces.read(name, (inputs, i), _CachedResult) for i, name in enumerate(_list_names(block))]
-    return _restore_results(block, cached, settings) if all(cached) else None
+    inputs = _list_inputs(group, settings)
+    cached = [pieces.read(name, (inputs, i), _CachedResult) for i, name in enumerate(_list_names(group))]
+    return _restore_results(group, cached, settings) if all(cached) else None
 
 
 def _write_results(
-    block: _TuneGroup, settings: TuneSettings, pieces: Checkpoints, results: Iterable[_CachedResult]
+    group: _TuneGroup, settings: TuneSettings, pieces: Checkpoints, results: Iterable[_CachedResult]
 ) -> None:
     if pieces.is_enabled:
-        inputs = _list_inputs(block, settings)
-        for i, (name, result) in enumerate(zip(_list_names(block), results, strict=True)):
+        inputs = _list_inputs(group, settings)
+        for i, (name, result) in enumerate(zip(_list_names(group), results, strict=True)):
             pieces.write(name, (inputs, i), result)
 
 
@@ -246,10 +249,10 @@ def _select_cached_fields(result: TuneResult) -> _CachedResult:
 
 
 def _restore_results(
-    block: _TuneGroup, parts: list[_CachedResult], settings: TuneSettings
+    group: _TuneGroup, parts: list[_CachedResult], settings: TuneSettings
 ) -> list[TuneResult]:
     number, results = len(Metrics._fields), []
-    for task, near, cached in zip(block.tasks, block.near, parts, strict=True):
+    for task, near, cached in zip(group.tasks, group.near, parts, strict=True):
         arrays: dict[str, list[Any]] = {**cached.outcomes}
         outcomes = {key: Outcome(Metrics(*a[:number]), *a[number:]) for key, a in arrays.items()}
         result = TuneResult(

@@ -1,6 +1,7 @@
-"""Evaluation of gains without derivatives, on fresh scenarios and, for searches, on training scenarios.
+"""Evaluation of gains without derivatives, on fresh scenarios and (during searches) on training scenarios.
 
-Both use the compiled program of `jaxhil.simulation.evaluation`, with the same number of lanes in every call.
+All calls have the same number of lanes, so that they share a compiled program of
+`jaxhil.simulation.evaluation`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,35 +36,37 @@ from tuning.transparency.probes import (
     mask_probes,
 )
 
-# Offset that makes the seed of validation differ from that of training.
-VALIDATION_SEED_OFFSET = 0x5EED
+VALIDATION_SEED_OFFSET = 0x5EED  # added to the seed of training, so that fresh scenarios differ
 
 
 @dataclass(frozen=True)
 class Validation:
-    """Evaluator of gains for like tasks with fresh scenarios, built by `build_validation`."""
+    """Evaluator of gains for tasks that share a compiled program; `build_validation` builds it."""
 
     tasks: list[TuneTask]  # tasks with their training scenarios
     fresh: list[Any]  # fresh scenarios of each task
-    # fresh scenarios of each task with their transparency probes; None for tasks without probes
+    # fresh scenarios of each task together with their transparency probes; None for tasks without probes
     probed: list[ProbedScenarios | None]
-    loop: Any  # loop of all tasks
-    names: tuple[str, ...]  # names of the gains that are tuned for any of the tasks
-    bounds: list[GainBounds]  # bounds of those gains, per task
-    # lanes of all tasks: of each task the fresh scenarios, with any probes, then its nominal run
+    loop: Any  # static properties of the simulated loop, common to all tasks
+    names: tuple[str, ...]  # names of the gains that are tuned in at least one task
+    bounds: list[GainBounds]  # bounds of the gains `names`, for each task
+    # scenarios to evaluate: for each task the fresh scenarios, with probes if any, then the nominal run
     judged: Any
     training: Any  # training scenarios, (tasks, ..., scenarios)
-    lanes: int  # number of lanes of `judged` per task
-    work: SearchProgress  # progress report
+    lanes: int  # number of lanes per task in `judged`
+    work: SearchProgress  # progress counter
 
     def judge(
         self, gains: list[dict[str, float]], compensator: str | None = None, noise: bool = True
     ) -> list[tuple[Outcome, Outcome | None]]:
-        """Evaluate one set of gains of every task on its fresh scenarios; return a pair of outcomes per task.
+        """Evaluate one set of gains for each task on the task's fresh scenarios.
 
-        The first outcome is that of the fresh scenarios and, last, of the nominal run. The second one, of
-        probed tasks only, has leaves (slots, scenarios, `LANES_PER_SCENARIO`) of the scenarios with their
-        probes. `compensator` replaces that of the tasks; `noise=False` removes the sensors' noise.
+        `compensator` replaces the tasks' compensator. `noise=False` removes the sensor noise.
+
+        Returns:
+            for each task, an outcome of the fresh scenarios followed by the nominal run, and an outcome of
+            the scenarios with their probes, arrays (contacts, scenarios, `LANES_PER_SCENARIO`). The second
+            outcome is None for tasks without probes.
         """
         model, loop = self.tasks[0].model, self.loop
         if compensator is not None:
@@ -91,10 +94,11 @@ class Validation:
         scenarios: int | None = None,
         lanes: int = 0,
     ) -> Float[np.ndarray, "which points"]:
-        """Return `evaluate_objective` at points of the unit box, on training scenarios of the tasks `which`.
+        """Evaluate the objective at points in unit coordinates, on training scenarios of the tasks `which`.
 
-        `scenarios` limits these to the first ones of each task, probes counted. `objective` is one of all
-        tasks or one per task. At least `lanes` lanes are computed per call.
+        `objective` is common to all tasks, or a list with one per task. Only the first `scenarios` training
+        scenarios of each task are used, where probes count as scenarios. A call computes at least `lanes`
+        lanes.
         """
         objectives = list_objectives(objective, len(self.tasks))
         noise = any(objectives[task].noise_weight > 0 for task in which)
@@ -104,7 +108,7 @@ class Validation:
         losses = np.empty((len(which), points))
         lanes = max(lanes, self.lanes * len(self.tasks))
         at_once = max(1, lanes // number)
-        # Every call has equally many points per task, so that all calls use the same placed scenarios.
+        # All calls have the same number of points per task, so that they share scenarios on the devices.
         tasks_per_call = min(len(which), at_once)
         points_per_call = at_once // tasks_per_call
         calls = [
@@ -112,7 +116,7 @@ class Validation:
             for first in range(0, len(which), tasks_per_call)
             for point in range(0, points, points_per_call)
         ]
-        # All calls are queued first, so that the device computes while the results are read.
+        # All calls are queued first, so that the devices compute while the host reads results.
         read = _keep_contact_terms if objectives[which[0]].function is None else _keep_outcome
         running = [
             self._begin(noise, which[rows], coordinates[rows, columns], number, lanes, read)
@@ -122,7 +126,7 @@ class Validation:
             outcome, amplification = result()
             shape, pairs = amplification.shape, amplification.size
             self.work.report_runs(pairs * number)
-            # (slots, tasks, points, scenarios)
+            # arrays (contacts, tasks, points, scenarios)
             terms = [term.reshape(-1, *shape, number) for term in compute_contact_terms(outcome)]
             wanted = outcome.wanted.reshape(terms[0].shape)
             probes = mask_probes(number) & self.tasks[0].probed
@@ -144,7 +148,7 @@ class Validation:
     def _evaluate_function(
         self, objective: Objective, outcome: Outcome, pairs: int
     ) -> Float[np.ndarray, "pairs"] | None:
-        """Return the user's function, if there is one, for every pair of task and point."""
+        """Evaluate the user's function for every pair of task and point; return None without a function."""
         if objective.function is None:
             return None
         task = self.tasks[0]
@@ -155,9 +159,9 @@ class Validation:
     def _begin(
         self, noise, which, coordinates, number, lanes, read
     ) -> Callable[[], tuple[Outcome, Float[np.ndarray, "which points"]]]:
-        """Start the evaluation of points of each task; return a function that waits for the result.
+        """Start the evaluation of several points of each task; return a function that waits for the result.
 
-        The result is the part of the outcome that `read` selects, and the amplification of the noise.
+        The result is the part of the outcome that `read` selects, and the noise amplification of each point.
         """
         gains = [self._gains(task, points) for task, points in zip(which, coordinates, strict=True)]
         names = self.tasks[0].literature
@@ -167,7 +171,7 @@ class Validation:
         ended = self.tasks[0].model.begin_batch(self.loop, values, batch, read)
         if not noise:
             return lambda: (ended(), np.ones(shape))
-        # The mean over the scenarios, as `tuning.gains.objective.residuals` has it.
+        # The mean over all scenarios, as in `tuning.gains.objective.compute_residuals`.
         constants = KnownConstants(
             jax.numpy.asarray(scenarios.control_period), jax.numpy.asarray(scenarios.clearance)
         )
@@ -177,22 +181,22 @@ class Validation:
 
     @cached_property
     def _evaluated_batch(self) -> Batch:
-        # Padded to the lanes of the training scenarios, a small batch shares their program.
+        # A small batch is padded to the lanes of the training scenarios, so that both share a program.
         return self.tasks[0].model.place_batch(self.judged, at_least=count_lanes(self.training))
 
     @cached_property
     def _noiseless_batch(self) -> Batch:
-        # The noise is multiplied by 0, so that the same program is used.
+        # The noise is multiplied by 0, so that runs with and without noise share a program.
         model = self.tasks[0].model
         return model.place_batch(model.without_noise(self.judged), at_least=count_lanes(self.training))
 
     @cached_property
     def _placed(self) -> Callable[[tuple[int, ...], int, int, int], tuple[Any, Batch]]:
-        """Return `_place_training_scenarios`, cached because a search needs the same scenarios many times."""
+        """Return `_place_training_scenarios` with a cache, because a search reuses the same scenarios."""
         return lru_cache(maxsize=4)(partial(_place_training_scenarios, self.tasks[0].model, self.training))
 
     def gains(self, task: int, coordinates: Float[np.ndarray, "gains"]) -> dict[str, float]:
-        """Return all gains of the compensator at a point of the unit box."""
+        """Convert unit coordinates to all gains of the compensator."""
         return {name: float(gain) for name, gain in self._gains(task, coordinates).items()}
 
     def _gains(
@@ -203,7 +207,7 @@ class Validation:
     def coordinates(
         self, task: int, several: Sequence[Mapping[str, float]]
     ) -> Float[np.ndarray, "several gains"]:
-        """Return the points of the unit box of several sets of gains."""
+        """Convert several sets of gains to unit coordinates."""
         gains = np.array([[values[name] for name in self.names] for values in several])
         return to_coordinates(gains.reshape(len(several), len(self.names)), self.bounds[task])
 
@@ -213,14 +217,17 @@ def _keep_outcome(outcome: Outcome) -> Outcome:
 
 
 def _keep_contact_terms(outcome: Any) -> Any:
-    """Return the outcome with only the fields that `compute_contact_terms` needs."""
+    """Remove all fields from the outcome that `compute_contact_terms` does not need."""
     return outcome._replace(metrics=None, reference_restitution=None, reference_peak_force=None)
 
 
 def _place_training_scenarios(
     model: RigModel, training: Any, which: tuple[int, ...], points: int, number: int, lanes: int
 ) -> tuple[Any, Batch]:
-    """Return the first `number` training scenarios of tasks, once per point, on the host and the devices."""
+    """Repeat the first `number` training scenarios of each task for each point.
+
+    Return the repeated scenarios on the host, and as a batch on the devices.
+    """
 
     def side_by_side(leaf):
         picked = np.moveaxis(leaf[np.repeat(which, points)][..., :number], 0, -2)
@@ -233,7 +240,7 @@ def _place_training_scenarios(
 def build_validation(
     tasks: list[TuneTask], scenarios: int, seed: int, work: SearchProgress | None = None
 ) -> Validation:
-    """Draw `scenarios` fresh scenarios of each of the like tasks (`tuning.gains.tasks.alike`)."""
+    """Build the evaluator of tasks that share a program, with `scenarios` fresh scenarios for each task."""
     drawn = [_draw_evaluation_lanes(task, scenarios, seed + VALIDATION_SEED_OFFSET) for task in tasks]
     fresh, probed, judged, loops = (list(column) for column in zip(*drawn, strict=True))
     names = list_tuned_gains(tasks)
@@ -255,12 +262,12 @@ def build_validation(
 
 
 def count_evaluated_runs(scenarios: int, probed: bool) -> int:
-    """Return the number of runs of a task under one set of gains, the nominal run included."""
+    """Return the number of runs that evaluate one set of gains: scenarios, probes and the nominal run."""
     return scenarios * (LANES_PER_SCENARIO if probed else 1) + 1
 
 
 def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
-    """Split an outcome of `Validation.judge` into those of the fresh scenarios and of the nominal run."""
+    """Split an outcome of `Validation.judge` into one of the fresh scenarios and one of the nominal run."""
     fresh, nominal = (
         jax.tree.map(lambda leaf, part=part: leaf[..., part], outcome)
         for part in (slice(-1), slice(-1, None))
@@ -269,7 +276,7 @@ def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
 
 
 def draw_fresh_scenarios(task: TuneTask, number: int, seed: int) -> Any:
-    """Draw scenarios of a task that differ from its training scenarios of the same seed."""
+    """Draw `number` scenarios of a task that differ from its training scenarios."""
     seed += VALIDATION_SEED_OFFSET
     return task.model.scenarios(task.mechanism, draw(task.mechanism, number, seed), seed)
 
@@ -277,7 +284,10 @@ def draw_fresh_scenarios(task: TuneTask, number: int, seed: int) -> Any:
 def _draw_evaluation_lanes(
     task: TuneTask, number: int, seed: int
 ) -> tuple[Any, ProbedScenarios | None, Any, Any]:
-    """Return a task's fresh scenarios, the same with probes (if any), its lanes to evaluate, and its loop."""
+    """Draw the fresh scenarios of a task.
+
+    Return the scenarios, the scenarios with probes or None, the joined scenarios to evaluate, and the loop.
+    """
     drawn = draw(task.mechanism, number, seed)
     fresh, probed = task.model.scenarios(task.mechanism, drawn, seed), None
     if task.probed and isinstance(task.mechanism, Mechanism):
