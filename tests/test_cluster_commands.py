@@ -70,7 +70,7 @@ def test_sweep_resumes_after_interrupt_and_lost_scheduler(tmp_path):
         code, out, messages = ended(process)
         assert code == 2 and out == "" and len(messages) == 1
         assert messages[0].startswith(f"jaxhil: --scheduler: {cluster.address}: lost, ")
-        assert messages[0].endswith("; what is finished is kept, --resume goes on")
+        assert messages[0].endswith("; finished results are cached, continue with --resume")
     (tmp_path / "later").mkdir()
     with started(tmp_path / "later") as cluster:
         cluster.worker()

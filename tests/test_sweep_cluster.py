@@ -53,7 +53,7 @@ def test_sweep_without_a_scheduler_is_one_line_and_leaves_nothing(tmp_path):
 
 @pytest.mark.parametrize(
     ("says", "reason"),
-    ((b"", "nothing that answers within"), (b"HTTP/1.1 400 Bad", "something else answers")),
+    ((b"", "nothing that answers within"), (b"HTTP/1.1 400 Bad", "another program answers")),
 )
 def test_sweep_on_a_port_without_an_answering_scheduler_is_one_line(monkeypatch, says, reason):
     pytest.importorskip("distributed")

@@ -114,7 +114,7 @@ def test_sweep_stops_at_a_width(jaxhil, gains, tmp_path):
     assert code == 1 and f"Stopped after {result['scenarios']} of at most 1000" in out
     assert "valid under repeated" in out
     assert jaxhil("replay", tmp_path / "n", 0)[0] == 0
-    refused(jaxhil("replay", tmp_path / "n", 999), "before the sweep stopped")
+    refused(jaxhil("replay", tmp_path / "n", 999), "before the sweep's end")
 
 
 def test_sweep_reports_quantiles(jaxhil, gains, store):
@@ -291,7 +291,7 @@ def test_replay_detects_changes(jaxhil, gains, tmp_path):
     assert code == 1 and "Bad: differs" in out and "duration_1" in out
     rows["error_1"] = rows["error_1"] * (1 + 1e-15)
     write_chunk(opened, 0, rows)
-    refused(jaxhil("replay", folder, 3), "parts/part-000000.parquet: found damage, or a part of something")
+    refused(jaxhil("replay", folder, 3), "parts/part-000000.parquet: found a damaged file or one of another")
 
 
 def test_sweep_and_replay_refuse_impossible_arguments(jaxhil, gains, store, tmp_path):
@@ -314,7 +314,7 @@ def test_sweep_and_replay_refuse_impossible_arguments(jaxhil, gains, store, tmp_
     refused(jaxhil("sweep", gains, *new, "--rare", "--limit", "inf"), "--rare")
     refused(jaxhil("sweep", tmp_path / "none.json", *new), "none.json")
     refused(jaxhil("sweep", gains, *TINY, "-o", store), "--resume")
-    refused(jaxhil("sweep", gains, *TINY, "-o", store, "--resume"), "limit: found 1.5, asked for 0.01")
+    refused(jaxhil("sweep", gains, *TINY, "-o", store, "--resume"), "limit: found 1.5, requested 0.01")
     (tmp_path / "file").touch()
     refused(jaxhil("sweep", gains, *TINY, "-o", tmp_path / "file" / "store"), "cannot be written")
     refused(jaxhil("replay", store, 100), "found 100, expected 0 to 99")

@@ -49,7 +49,7 @@ def test_manifest_has_a_width_if_there_is_one():
     assert b"until_width" not in encode_manifest(GOOD) and "until_width" not in DOCUMENT
     wide = manifest(until_width=0.1)
     assert decode_manifest(encode_manifest(wide), "f") == wide and wide.until_width == 0.1
-    assert list_input_differences(GOOD, wide) == ["until_width: found nothing, asked for 0.1"]
+    assert list_input_differences(GOOD, wide) == ["until_width: found nothing, requested 0.1"]
     with pytest.raises(InputError, match="until_width: found with sobol, expected with random"):
         manifest(until_width=0.1, sampling="sobol", scenarios=96, chunk=32)
 

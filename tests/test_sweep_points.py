@@ -35,19 +35,19 @@ def test_finished_study_points_are_not_run_again(asked, tmp_path, monkeypatch):
             yield one
 
     running = PointRunSettings(
-        ran.append, result.append, Checkpoints(tmp_path / "kept"), interrupted, several=10
+        ran.append, result.append, Checkpoints(tmp_path / "kept"), interrupted, max_batches=10
     )
     with pytest.raises(KeyboardInterrupt):
         run_points(*what, running)
-    again = running._replace(kept=Checkpoints(tmp_path / "kept", resume=True), computer=run_locally)
+    again = running._replace(checkpoints=Checkpoints(tmp_path / "kept", resume=True), computer=run_locally)
     assert list_different_columns(run_points(*what, again), rows) == []
     assert len(result) == 3 and sum(ran) == NUMBER and sum(result) == sum(ran[:3])
-    assert again.kept.other == []
+    assert again.checkpoints.other == []
 
 
 def test_study_points_of_other_noise_are_run_anew(asked, tmp_path):
     sweep, inputs, noise, rows = asked
-    running = LOCAL_RUN._replace(kept=Checkpoints(tmp_path / "kept", resume=True))
+    running = LOCAL_RUN._replace(checkpoints=Checkpoints(tmp_path / "kept", resume=True))
     run_points(sweep, inputs, noise, running)
     other = run_points(sweep, inputs, noise + 1, running)
     assert np.any(other["worst_error"] != rows["worst_error"])
@@ -57,7 +57,10 @@ def test_equal_study_points_are_run_once(asked):
     sweep, inputs, noise, rows = asked
     ran = []
     twice = run_points(
-        sweep, np.tile(inputs[:32], (3, 1)), np.tile(noise[:32], 3), LOCAL_RUN._replace(done=ran.append)
+        sweep,
+        np.tile(inputs[:32], (3, 1)),
+        np.tile(noise[:32], 3),
+        LOCAL_RUN._replace(report_computed=ran.append),
     )
     assert ran == [32]
     np.testing.assert_array_equal(twice["worst_error"], np.tile(rows["worst_error"][:32], 3))

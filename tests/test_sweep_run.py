@@ -189,7 +189,7 @@ def test_sweep_stops_at_the_first_look_that_is_narrow_enough(whole, stopped):
             == []
         )
     assert replay_scenario(read_store(store.folder), 32 * looks - 1).different_columns == []
-    with pytest.raises(InputError, match="expected those before the sweep stopped"):
+    with pytest.raises(InputError, match="expected a scenario before the sweep"):
         replay_scenario(store, 299)
 
 
@@ -199,7 +199,7 @@ def test_stopped_sweep_is_not_continued(stopped):
     _, _, again = log.sweep(store.folder, label=UNTIL)
     assert again == tally and parts_of(store) == parts
     assert (log.found, log.computed) == (tally.scenarios, 0)
-    with pytest.raises(InputError, match=r"until_width: found 0\.25, asked for 0\.1"):
+    with pytest.raises(InputError, match=r"until_width: found 0\.25, requested 0\.1"):
         Log().sweep(store.folder, label=manifest(case(), scenarios=300, limit=1.5, until_width=0.1))
 
 

@@ -130,7 +130,7 @@ def test_store_ignores_a_part_rewritten_by_another_program(store):
     table = parquet.read_table(path)
     parquet.write_table(table, path)
     assert table.schema.metadata.keys() == parquet.read_table(path).schema.metadata.keys()
-    with refused("part-000000.parquet: found damage, or a part of something else", "--resume"):
+    with refused("part-000000.parquet: found a damaged file or one of another sweep", "--resume"):
         read_intact_chunk(store, 0)
 
 
@@ -174,7 +174,7 @@ def test_store_refuses_a_folder_that_is_not_empty(store, tmp_path):
 
 
 def test_store_refuses_other_inputs_by_name(store):
-    with refused("other inputs", "seed: found 0, asked for 7"):
+    with refused("other inputs", "seed: found 0, requested 7"):
         open_store(store.folder, manifest(case(2), seed=7), resume=True)
 
 
@@ -184,7 +184,7 @@ def test_store_refuses_a_missing_column_by_name(tmp_path):
     old = msgspec.structs.replace(MANIFEST, columns=columns)
     old = msgspec.structs.replace(old, sha256=digest(msgspec.to_builtins(old)))
     folder = open_store(tmp_path / "store", old, resume=False).folder
-    difference = "columns: found others than this version writes"
+    difference = "columns: found other columns than this version writes"
     with refused("other code", difference):
         open_store(folder, MANIFEST, resume=True)
     # It can still be read, with a warning.
@@ -252,7 +252,7 @@ def test_store_is_continued_by_the_code_that_made_it(tmp_path):
     old = msgspec.structs.replace(MANIFEST, sources_sha256="0" * 64)
     old = msgspec.structs.replace(old, sha256=digest(msgspec.to_builtins(old)))
     folder = open_store(tmp_path / "store", old, resume=False).folder
-    what_to_do = "expected a new folder, or --resume with the version that made this one"
+    what_to_do = "expected a new folder, or --resume with the version that wrote this store"
     with refused("store: was made by other code: sources_sha256: found 000000000000...", what_to_do):
         open_store(folder, MANIFEST, resume=True)
 

@@ -35,7 +35,7 @@ def compute_sobol_indices(
         indices = compute_error_indices(sweep, number, running)
     with collect_input_errors(unwritten):
         write_study(store, request, indices)
-        running.kept.remove()
+        running.checkpoints.remove()
     return indices._asdict()
 
 
@@ -62,7 +62,7 @@ def run_subset_simulation(
         estimate = estimate_rare_failure(sweep, limit, running)
     with collect_input_errors(unwritten):
         write_study(store, request, estimate)
-        running.kept.remove()
+        running.checkpoints.remove()
     return _subset_simulation_entry(limit, estimate)
 
 
@@ -80,7 +80,7 @@ def _study_runner(
         checkpoints = Checkpoints(store.folder / CHECKPOINT_FOLDER, options.resume)
         running = PointRunSettings(lambda more: bar.advance(more, study), bar.skip, checkpoints)
         if workers is not None:
-            running = running._replace(computer=build_point_computer(workers), several=BATCHES_PER_STUDY)
+            running = running._replace(computer=build_point_computer(workers), max_batches=BATCHES_PER_STUDY)
         yield running
 
 

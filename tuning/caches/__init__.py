@@ -1,1 +1,1 @@
-"""Checkpoints of results on disk, and workers of a cluster."""
+"""Checkpoints on disk, with which interrupted work can resume, and distribution of work to a cluster."""

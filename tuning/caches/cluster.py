@@ -1,7 +1,7 @@
-"""Distribution of work units ("pieces") to the workers of a dask.distributed cluster.
+"""Distribution of work units to the workers of a dask.distributed cluster.
 
-If a worker dies, its pieces are computed again. A piece that several workers died of, and any piece while
-there are no workers, is computed in this process. `tuning.caches.worker` is the workers' side.
+If a worker dies, another worker computes the worker's units. If several workers died while they computed the
+same unit, or if there are no workers, this process computes the unit. The workers run `tuning.caches.worker`.
 """
 
 import asyncio
@@ -18,16 +18,16 @@ from typing import Any, NamedTuple
 from jaxhil.errors import InputError, format_value, to_one_line
 from tuning.caches.worker import ProcessSetting, run_pickled_call
 
-SCHEDULER_TIMEOUT = 10  # s; limit on the time in which a scheduler must answer
-IDLE_TIMEOUT = 20.0  # s without a finished piece, after which the workers are counted again
-WORKER_COUNT_INTERVAL = 2.0  # s; time between counts of the workers
-UNITS_PER_WORKER = 2  # number of submitted pieces per worker
+SCHEDULER_TIMEOUT = 10  # s; a scheduler must answer within this time
+IDLE_TIMEOUT = 20.0  # s; if no unit finishes within this time, the workers are counted again
+WORKER_COUNT_INTERVAL = 2.0  # s; shortest time between two counts of the workers
+UNITS_PER_WORKER = 2  # submitted units per worker, so that a worker need not wait for the next unit
 
 
 class WorkUnit(NamedTuple):
-    """Work unit."""
+    """One call of a function that a worker computes."""
 
-    name: Any  # unique name
+    name: Any  # unique name of the unit
     arguments: tuple[Any, ...]  # arguments of the function
 
 
@@ -38,23 +38,23 @@ def run_on_workers(
     setting: ProcessSetting | None,
     what: str,
 ) -> Generator[tuple[Any, Any], None, None]:
-    """Call `Workers.run` with the workers of the scheduler at this address."""
+    """Connect to the scheduler at `address`, and yield from `ClusterWorkers.run`."""
     with connect_workers(address) as workers:
         yield from workers.run(function, pieces, setting, what)
 
 
 @contextmanager
 def connect_workers(address: str) -> Iterator["ClusterWorkers"]:
-    """Connect to the workers of the scheduler at this address. Raise `InputError` if there is none."""
+    """Connect to the workers of the scheduler at `address`; raise `InputError` if no scheduler answers."""
     with ExitStack() as stack:
         try:
             import distributed  # pyright: ignore[reportMissingImports]
         except ImportError:
-            missing = "nothing installed for it, expected once `pip install jaxhil[distributed]` was done"
-            raise InputError(f"--scheduler: found {missing}") from None
+            missing = "found no package dask.distributed, expected it: run `pip install jaxhil[distributed]`"
+            raise InputError(f"--scheduler: {missing}") from None
         stack.enter_context(_suppress_logs())
         try:
-            with ThreadPoolExecutor(1) as thread:  # the caller's thread may already run an event loop
+            with ThreadPoolExecutor(1) as thread:  # needed because this thread may already run an event loop
                 thread.submit(asyncio.run, _check_answer(address)).result()
             client = stack.enter_context(
                 distributed.Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
@@ -62,15 +62,15 @@ def connect_workers(address: str) -> Iterator["ClusterWorkers"]:
         except (OSError, ValueError, TypeError) as error:  # a TimeoutError is an OSError
             reason = to_one_line(str(error), 100)
             raise InputError(
-                f"--scheduler: found {format_value(address)}, expected a scheduler's: {reason}"
+                f"--scheduler: found {format_value(address)}, expected the address of a scheduler: {reason}"
             ) from None
         yield ClusterWorkers(address, client)
 
 
 async def _check_answer(address: str) -> None:
-    """Check that a scheduler answers in time, for which a client would wait without limit.
+    """Raise OSError or ValueError if no scheduler answers at `address` within `SCHEDULER_TIMEOUT`.
 
-    Raise OSError or ValueError if it does not.
+    A client would wait for the answer without a time limit.
     """
     from distributed import Security  # pyright: ignore[reportMissingImports]
     from distributed.comm.core import connect  # pyright: ignore[reportMissingImports]
@@ -84,14 +84,17 @@ async def _check_answer(address: str) -> None:
         return  # The client's configuration may contain the missing encryption settings.
     except TimeoutError:
         raise TimeoutError(f"nothing that answers within {SCHEDULER_TIMEOUT} s") from None
-    except (MemoryError, struct.error):  # the length and the content of a greeting
-        raise OSError("something else answers") from None
+    except (MemoryError, struct.error):  # the answer does not have the format of a scheduler's greeting
+        raise OSError("another program answers") from None
     await greeted.close()
 
 
 @contextmanager
 def _suppress_logs() -> Iterator[None]:
-    """Suppress the logs of dask.distributed, since a lost scheduler is reported in one line."""
+    """Suppress the log messages of dask.distributed during a `with` block.
+
+    A lost scheduler is reported as one error message instead.
+    """
     loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if "distributed" in name]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -104,7 +107,7 @@ def _suppress_logs() -> Iterator[None]:
 
 
 class ClusterWorkers:
-    """Workers of a connected scheduler."""
+    """Workers of a scheduler to which this process is connected."""
 
     def __init__(self, address: str, client: Any):
         self._address, self._client = address, client
@@ -116,11 +119,19 @@ class ClusterWorkers:
         setting: ProcessSetting | None,
         what: str,
     ) -> Generator[tuple[Any, Any], None, None]:
-        """Yield (name, result of `function`) of every piece, in the order in which workers finish them.
+        """Call `function` for every work unit on the workers; yield (name, result) when a unit finishes.
 
-        Workers may join later. `function` is defined at the top of a module. Workers must have the `setting`;
-        with None the function has to check it. `what` is a unique name of the work. Raise `InputError` if the
-        cluster is lost or a worker has another setting, and any exception that the function raises.
+        Workers can join while this runs.
+
+        Args:
+            function: function at the top level of a module.
+            pieces: work units.
+            setting: process setting that every worker must have; None if `function` checks it.
+            what: unique name of the work.
+
+        Raises:
+            InputError: the scheduler is lost, or a worker has another setting. Exceptions of `function` are
+                raised too.
         """
         with _raise_if_lost(self._address):
             from cloudpickle import dumps  # pyright: ignore[reportMissingImports]
@@ -129,12 +140,13 @@ class ClusterWorkers:
             ended: SimpleQueue[Any] = SimpleQueue()
 
             def submit(number: int) -> None:
-                for piece in islice(waiting, number):
-                    # Unpickling may import JAX; the worker does it after setting the flags of JAX.
-                    content = dumps((function, piece.arguments))
-                    key = f"jaxhil-{what}-{piece.name}"
+                for unit in islice(waiting, number):
+                    # The worker unpickles the content after setting the flags of JAX, because unpickling can
+                    # import JAX.
+                    content = dumps((function, unit.arguments))
+                    key = f"jaxhil-{what}-{unit.name}"
                     future = client.submit(run_pickled_call, content, setting, key=key, pure=False)
-                    running[future] = piece
+                    running[future] = unit
                     future.add_done_callback(ended.put)
 
             workers, counted = _count_workers(client), time.monotonic()
@@ -150,13 +162,12 @@ class ClusterWorkers:
                     future.cancel()
                 else:
                     continue
-                piece = running.pop(future)
+                unit = running.pop(future)
                 submit(max(1, UNITS_PER_WORKER * workers - len(running)))
-                yield piece.name, function(*piece.arguments) if result is None else result[0]
+                yield unit.name, function(*unit.arguments) if result is None else result[0]
 
 
 def _count_workers(client: Any) -> int:
-    """Return the number of workers."""
     return client.scheduler_info(n_workers=0)["n_workers"]
 
 
@@ -169,7 +180,7 @@ def _wait_for_next(ended: "SimpleQueue[Any]") -> Any:
 
 
 def _get_result(future: Any) -> tuple[Any] | None:
-    """Return a worker's result as a tuple of length 1, or None if several workers died of the piece."""
+    """Return the result of a unit as a tuple of length 1, or None if the unit killed several workers."""
     from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
 
     try:
@@ -185,12 +196,12 @@ def _get_result(future: Any) -> tuple[Any] | None:
 
 @contextmanager
 def _raise_if_lost(address: str) -> Iterator[None]:
-    """Raise `InputError` if the scheduler is lost."""
+    """Convert the errors of a lost scheduler to an `InputError`, during a `with` block."""
     from distributed import CancelledError  # pyright: ignore[reportMissingImports]
 
     try:
         yield
     except (CancelledError, OSError) as error:
         reason = to_one_line(str(getattr(error, "reason", None) or error) or type(error).__name__, 100)
-        advice = "what is finished is kept, --resume goes on"
+        advice = "finished results are cached, continue with --resume"
         raise InputError(f"--scheduler: {to_one_line(address)}: lost, {reason}; {advice}") from None

@@ -1,7 +1,8 @@
 """Code that runs on the workers of a dask.distributed cluster.
 
-A worker imports this module with its first piece, and JAX only after the flags of JAX are set, as a command
-does. If other code on the worker starts JAX earlier, this module has to be a preload: `PRELOAD_COMMAND`.
+A worker imports this module with its first work unit. It then sets the flags of JAX like a command, and
+imports JAX afterwards. If other code on the worker imports JAX earlier, dask must preload this module, with
+`PRELOAD_COMMAND`.
 """
 
 import pickle
@@ -14,32 +15,33 @@ from jaxhil.simulation.source_fingerprint import dependency_versions, sources_sh
 
 PRELOAD_COMMAND = "dask worker ADDRESS --preload tuning.caches.worker"
 
-# A worker may have several threads, but only one program may run at a time.
+# A worker can have several threads, but only one compiled program may run at a time.
 _run_lock = threading.Lock()
 
 
 class ProcessSetting(NamedTuple):
     """Properties of a process that affect the last bits of a result."""
 
-    sources_sha256: str  # SHA-256 of the packages' files
+    sources_sha256: str  # SHA-256 of the source files of jaxhil and tuning
     versions: dict[str, str]  # versions of Python and of the dependencies
-    xla_flags: str | None  # flags of XLA that change rounding; None: any flags are allowed
+    xla_flags: str | None  # XLA flags that change rounding; None: any flags are allowed
 
 
 def get_process_setting() -> ProcessSetting:
-    """Return the setting of this process."""
+    """Return the code, package versions and XLA flags of this process."""
     return ProcessSetting(sources_sha256(), dependency_versions(), rounding_flags(active_xla_flags()))
 
 
 def dask_setup(worker: Any) -> None:
-    """Start JAX with the flags of a command, when dask preloads this module."""
+    """Start JAX with the flags of a command; dask calls this function when it preloads the module."""
     prepare_jax()
 
 
 def run_pickled_call(content: bytes, asked: ProcessSetting | None) -> Any:
-    """Call a pickled function with its pickled arguments.
+    """Call a pickled function with its pickled arguments; return the result.
 
-    Raise `InputError` if this process does not have the setting `asked`, and any exception of the function.
+    Raise `InputError` if this process does not have the setting `asked`. Exceptions of the function are
+    raised too.
     """
     with _run_lock:
         prepare_jax()
@@ -50,19 +52,25 @@ def run_pickled_call(content: bytes, asked: ProcessSetting | None) -> Any:
 
 
 def check_process_setting(asked: ProcessSetting, here: ProcessSetting) -> None:
-    """Raise `InputError` if the results of a worker may differ from those of the process that asks."""
+    """Raise `InputError` if the setting `here` of a worker differs from the requested setting `asked`.
+
+    The worker's results could then differ in their last bits.
+    """
     for name in ProcessSetting._fields:
-        found, allowed = getattr(here, name), getattr(asked, name)
-        if found == allowed or allowed is None:
+        actual, expected = getattr(here, name), getattr(asked, name)
+        if actual == expected or expected is None:
             continue
         if name == "sources_sha256":
             raise build_setting_error(
-                f"{name}: found {found[:12]}, expected {allowed[:12]} (another jaxhil)", False
+                f"{name}: found {actual[:12]}, expected {expected[:12]} (another version of jaxhil)", False
             )
-        raise build_setting_error(f"{name}: found {found}, expected {allowed}", name == "xla_flags")
+        raise build_setting_error(f"{name}: found {actual}, expected {expected}", name == "xla_flags")
 
 
 def build_setting_error(what: str, flags: bool) -> InputError:
-    """Return the error for a worker with another setting; if `flags` differ, it says how to start workers."""
+    """Build the error for a worker with the wrong setting `what`.
+
+    If the XLA flags differ (`flags`), the message contains the command that starts workers correctly.
+    """
     advice = f"; start workers by: {PRELOAD_COMMAND}" if flags else ""
     return InputError(f"--scheduler: a worker: {what}: its results would differ{advice}")

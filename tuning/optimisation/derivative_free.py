@@ -1,8 +1,8 @@
-"""Batched derivative-free optimisation in the unit box, near a point or in the whole box.
+"""Derivative-free optimisation in the unit box: local search by CMA-ES, and global search with restarts.
 
-Unlike gradient methods, these searches pass kinks and leave the nearest basin. The objective is a function
-from NumPy to NumPy arrays, called with the same number of points each time, so that a compiled one is
-compiled once. A point has unit coordinates: 0 is a gain's lower bound, 1 its upper bound.
+Unlike gradient methods, these searches are not stopped by kinks and can leave the nearest basin. The loss
+function maps NumPy arrays to NumPy arrays. All calls have the same number of points, so that a compiled
+function is compiled once. A point has unit coordinates: 0 is a gain's lower bound, 1 is the upper bound.
 """
 
 from collections.abc import Callable
@@ -12,26 +12,25 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import qmc
 
-POLISH_CANDIDATES = 16  # candidates in a generation of `polish`
-# candidates in a generation of `search_globally`, for each basin of the first round
+POLISH_CANDIDATES = 16  # candidates per generation of `polish`
+# candidates per generation and basin in the first round of `search_globally`
 CANDIDATES_PER_BASIN = 32
-SIMULTANEOUS_BASINS = 8  # basins that `search_globally` searches simultaneously
-SCAN_BUDGET_DIVISOR = 8  # the scan of `search_globally` uses 1/SCAN of the budget
-MIN_START_DISTANCE = 0.1  # minimum distance of starts, relative to the box's diagonal
-# `reach` of the first, the intermediate and the last round of `search_globally`
+SIMULTANEOUS_BASINS = 8  # number of basins that `search_globally` searches at the same time
+SCAN_BUDGET_DIVISOR = 8  # the scan of `search_globally` uses 1/8 of all evaluations
+MIN_START_DISTANCE = 0.1  # minimum distance between starts, relative to the diagonal of the unit box
+# initial standard deviation in the first, the middle and the last round of `search_globally`
 INITIAL_STD_BY_ROUND = 0.1, 0.2, 0.01
-# Loss of a failed evaluation, which is worse than all others but finite.
-FAILED_LOSS = np.finfo(float).max
+FAILED_LOSS = np.finfo(float).max  # loss of a failed evaluation; finite, but larger than all others
 
 LossFunction = Callable[[Float[np.ndarray, "candidates gains"]], Float[np.ndarray, "candidates"]]
 
 
 class SearchResult(NamedTuple):
-    """Result of a search, or of several searches by `polish`."""
+    """Best point of a derivative-free search, or of several independent searches by `polish`."""
 
-    point: Float[np.ndarray, "*starts gains"]  # best point
+    point: Float[np.ndarray, "*starts gains"]  # best point, in unit coordinates
     loss: Float[np.ndarray, "*starts"]  # loss at the best point
-    evaluations: int  # number of evaluations of the objective, per start
+    evaluations: int  # number of evaluations of the loss, per start
 
 
 def polish(
@@ -46,22 +45,27 @@ def polish(
     covariance: Float[np.ndarray, "*starts gains gains"] | None = None,
     seed: int = 0,
 ) -> SearchResult:
-    """Find a local minimum near `start` by CMA-ES; the result is never worse than `start`.
+    """Find a local minimum near each start by CMA-ES; no result is worse than its start.
 
-    Points outside the box are mirrored back into it. The first generation contains the start itself. Source:
-    Hansen, "The CMA Evolution Strategy: A Tutorial" (2016), with positive weights and the default constants
-    for the number of candidates.
+    Candidates outside the unit box are reflected into the box. The first generation contains the start.
+
+    Source: Hansen, "The CMA Evolution Strategy: A Tutorial" (2016), with positive weights and the default
+    constants.
 
     Args:
-        losses: function from (*starts, candidates, gains) to (*starts, candidates).
-        start: starting points, which are searched independently of each other.
-        evaluations: number of evaluations per start, rounded down to whole generations, at least one.
-        candidates: number of candidates in a generation.
-        reach: initial standard deviation, relative to the box, on average over the gains.
-        covariance: shape of the initial distribution, of any scale. The inverse Hessian of least squares,
-            (J^T J / (2 L) + 16)^-1 with the residuals' Jacobian J and the loss L, saves the adaptation; 16
-            limits the spread of gains without effect to a quarter of the box.
+        losses: function that returns the losses (*starts, candidates) of points (*starts, candidates, gains).
+        start: starting points of independent searches, in unit coordinates.
+        evaluations: number of evaluations per start, rounded down to complete generations, at least one.
+        candidates: number of candidates per generation.
+        reach: initial standard deviation in unit coordinates, averaged over the gains.
+        covariance: covariance of the initial distribution, up to a factor; None: isotropic. The search needs
+            fewer generations with the inverse Hessian of least squares, (J^T J / (2 L) + 16)^-1, where J is
+            the Jacobian of the residuals and L the loss. The 16 limits the standard deviation of a gain
+            without effect to a quarter of its range.
         seed: seed of the random numbers.
+
+    Returns:
+        The best point of each search.
     """
     start = np.clip(np.asarray(start, float), 0, 1)
     state = _make_first_generation(start, reach, covariance)
@@ -97,21 +101,31 @@ def search_globally(
     basins: int = SIMULTANEOUS_BASINS,
     seed: int = 0,
 ) -> SearchResult:
-    """Find the best point of the whole box within `budget` evaluations, by a scan and restarts of CMA-ES.
+    """Find the best point of the whole unit box within `budget` evaluations.
 
-    An eighth of the budget is a scrambled Sobol sequence. Its best points with a minimum distance start
-    simultaneous runs of `polish`, in rounds of equal cost. Each round continues from the better half of the
-    minima, with twice as many candidates (which average over a rough objective) and a new isotropic
-    distribution. The last round refines the best minimum. `losses` always gets basins * candidates points;
-    `basins` is a power of two.
+    A scan of a scrambled Sobol sequence uses an eighth of the evaluations. The best points that keep a
+    minimum distance start simultaneous runs of `polish`, in rounds of equal cost. Each round continues from
+    the better half of the minima, with an isotropic distribution and twice as many candidates, which average
+    out the roughness of the loss. The last round refines the best minimum.
 
     Source: restarts with a growing population, Auger and Hansen, "A restart CMA evolution strategy with
-    increasing population size" (2005); halving, Jamieson and Talwalkar (2016).
+    increasing population size" (2005); successive halving, Jamieson and Talwalkar (2016).
+
+    Args:
+        losses: function that returns the losses of basins * candidates points.
+        gains: number of gains.
+        budget: number of evaluations of the loss.
+        candidates: number of candidates per generation and basin in the first round.
+        basins: number of basins in the first round, a power of two.
+        seed: seed of the random numbers.
+
+    Returns:
+        The best point of the search.
     """
     together = basins * candidates
     scan = max(1, budget // (SCAN_BUDGET_DIVISOR * together))
     sequence = qmc.Sobol(gains, rng=np.random.default_rng(seed))
-    # A Sobol sequence is drawn in a power of two; its first points are used, in order.
+    # The number of drawn Sobol points must be a power of two; only the first points are used.
     points = sequence.random(1 << (scan * together - 1).bit_length())[: scan * together]
     points = points.reshape(scan, together, gains)
     scanned = np.concatenate([_replace_nonfinite(losses(batch)) for batch in points])
@@ -145,25 +159,25 @@ def search_globally(
 
 
 def reflect_into_box(points: Float[np.ndarray, "*points"]) -> Float[np.ndarray, "*points"]:
-    """Reflect coordinates outside [0, 1] at its ends."""
+    """Reflect coordinates outside [0, 1] at the nearest bound, repeatedly if necessary."""
     folded = np.mod(points, 2)
     return np.where(folded > 1, 2 - folded, folded)
 
 
 class _Generation(NamedTuple):
-    """Normal distribution of the candidates, for every start."""
+    """Normal distribution of the candidates in one generation of CMA-ES, for every start."""
 
-    mean: np.ndarray  # mean
-    step: np.ndarray  # step size sigma
-    covariance: np.ndarray  # C; the covariance of the distribution is sigma^2 C
+    mean: np.ndarray  # mean of the distribution
+    step: np.ndarray  # step size sigma; the covariance of the distribution is sigma^2 C
+    covariance: np.ndarray  # matrix C
     root: np.ndarray  # symmetric square root of C
-    inverse_root: np.ndarray  # its inverse
-    step_path: np.ndarray  # evolution path of the step
+    inverse_root: np.ndarray  # inverse of the square root of C
+    step_path: np.ndarray  # evolution path of the step size
     shape_path: np.ndarray  # evolution path of C
 
 
 class _CmaConstants(NamedTuple):
-    """Constants of CMA-ES; the tutorial's names are in brackets."""
+    """Constants of CMA-ES, with their symbols in Hansen's tutorial in brackets."""
 
     weights: np.ndarray  # weights of the better half of the candidates
     step_rate: float  # learning rate of the step size's path (c_sigma)
@@ -176,7 +190,7 @@ class _CmaConstants(NamedTuple):
 
 
 def _compute_constants(gains: int, candidates: int) -> _CmaConstants:
-    """Return the tutorial's default constants."""
+    """Return the default constants of CMA-ES from Hansen's tutorial."""
     half = candidates // 2
     weights = np.log(candidates / 2 + 0.5) - np.log(np.arange(1, half + 1))
     weights /= weights.sum()
@@ -197,7 +211,7 @@ def _compute_constants(gains: int, candidates: int) -> _CmaConstants:
 
 
 def _make_first_generation(start, reach, covariance) -> _Generation:
-    """Return the initial distribution of every start."""
+    """Return the initial distribution of the candidates for every start."""
     gains = start.shape[-1]
     shape = np.broadcast_to(np.eye(gains), (*start.shape[:-1], gains, gains))
     if covariance is not None:
@@ -211,7 +225,7 @@ def _make_first_generation(start, reach, covariance) -> _Generation:
 
 
 def _evolve(state, points, constants, generation) -> _Generation:
-    """Return the next distribution from points sorted by their loss."""
+    """Return the distribution of the next generation, from candidates in ascending order of loss."""
     gains = state.mean.shape[-1]
     weights = constants.weights
     steps = (points[..., : len(weights), :] - state.mean[..., None, :]) / state.step[..., None, None]
@@ -220,7 +234,8 @@ def _evolve(state, points, constants, generation) -> _Generation:
     whitened = np.einsum("...ij,...j->...i", state.inverse_root, move)
     step_path = (1 - rate) * state.step_path + np.sqrt(rate * (2 - rate) * constants.effective) * whitened
     size = np.linalg.norm(step_path, axis=-1)
-    # While the path is long, the step size grows; the covariance's path then does not grow as well.
+    # A long step-size path makes the step size grow; the path of the covariance must not grow at the same
+    # time.
     scale = np.sqrt(1 - (1 - rate) ** (2 * (generation + 1)))
     grows = (size / scale < (1.4 + 2 / (gains + 1)) * constants.length)[..., None]
     rate = constants.path_rate
@@ -234,7 +249,7 @@ def _evolve(state, points, constants, generation) -> _Generation:
         + constants.rank_mu * np.einsum("c,...ci,...cj->...ij", weights, steps, steps)
     )
     growth = constants.step_rate / constants.damping * (size / constants.length - 1)
-    # If the distribution is wider than the box, mirrored points are uniform and carry no information.
+    # If the distribution is wider than the box, reflected candidates are uniform and carry no information.
     step = np.clip(state.step * np.exp(np.minimum(growth, 1)), 1e-12, 0.5)
     root, inverse_root = _compute_square_roots(covariance)
     return _Generation(
@@ -243,7 +258,7 @@ def _evolve(state, points, constants, generation) -> _Generation:
 
 
 def _compute_square_roots(covariance):
-    """Return the symmetric square root of a covariance and its inverse."""
+    """Return the symmetric square root of a covariance matrix, and the inverse of the square root."""
     values, vectors = np.linalg.eigh(covariance)
     roots = np.sqrt(np.maximum(values, 1e-20 * np.max(values, axis=-1, keepdims=True)))
     root = (vectors * roots[..., None, :]) @ _transpose(vectors)
@@ -260,9 +275,10 @@ def _replace_nonfinite(losses):
 
 
 def select_distant_points(ranked, fixed_points, number):
-    """Return `number` points: the `fixed_points`, then the best `ranked` ones at a distance from all others.
+    """Select `number` points: all `fixed_points`, then the best of `ranked` that are far from the others.
 
-    The distance is a tenth of the box's diagonal, or less if there are not enough such points.
+    `ranked` is in ascending order of loss. The minimum distance is a tenth of the unit box's diagonal, and
+    smaller if there are not enough such points.
     """
     fixed_points = np.zeros((0, ranked.shape[-1])) if fixed_points is None else fixed_points
     distance = MIN_START_DISTANCE * np.sqrt(ranked.shape[-1])
@@ -274,7 +290,7 @@ def select_distant_points(ranked, fixed_points, number):
 
 
 def select_points_at_distance(ranked, fixed_points, number, distance=None):
-    """Return points as `select_distant_points` does, or fewer if not enough have the `distance`."""
+    """Select points like `select_distant_points`, but fewer if not enough points keep the `distance`."""
     distance = MIN_START_DISTANCE * np.sqrt(ranked.shape[-1]) if distance is None else distance
     chosen = list(np.clip(fixed_points[:number], 0, 1))
     for point in ranked:

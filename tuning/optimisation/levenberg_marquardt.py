@@ -1,8 +1,8 @@
-"""Levenberg-Marquardt method in the unit box, with many starts in one program, by optimistix.
+"""Levenberg-Marquardt solver in the unit box, based on optimistix, for many problems in one program.
 
-A step minimises the damped linear model within the box: gains that the model would move beyond a bound stop
-at it, and the others move as if those were constant (`_BoxedDescent`). The residuals' Jacobian is computed in
-forward mode, once per step and together with the residuals.
+A step minimises the damped linear model within the box. A gain that the model would move beyond a bound stops
+at the bound, and the other gains then move as if this gain were constant (`_BoxedDescent`). Each step
+computes residuals and Jacobian together, in forward mode.
 """
 
 import math
@@ -22,12 +22,10 @@ from jaxtyping import Array, Float, Int
 from tuning.optimisation.solution import SolverResult
 from tuning.optimisation.unit_box import GainBounds, to_gains
 
-INITIAL_DAMPING = 0.1  # damping of the first step, relative to the mean diagonal of J^T J
-MIN_STEP_LENGTH = 1e-6  # a step shorter than this, relative to the box, means convergence
-PROGRESS_STEPS, MIN_LOSS_DECREASE = (
-    5,
-    1e-3,
-)  # number of steps, and relative decrease of the loss required within them
+INITIAL_DAMPING = 0.1  # damping of the first step, relative to the mean diagonal element of J^T J [1]
+MIN_STEP_LENGTH = 1e-6  # a problem has converged if all gains move less than this, in unit coordinates
+# A problem has converged if the relative decrease of the loss in so many steps is below the minimum.
+PROGRESS_STEPS, MIN_LOSS_DECREASE = 5, 1e-3
 
 
 @partial(jax.jit, static_argnames=("residuals", "static", "longest", "tile"))
@@ -43,24 +41,27 @@ def solve_least_squares(
     rtol: float = 1e-4,
     atol: float = 1e-6,
 ) -> SolverResult:
-    """Minimise sum(residuals(static, gains, arguments)^2) / 2 for many problems, sharded over the devices.
+    """Minimise half the sum of squared residuals for many problems, distributed over the devices.
 
-    A problem has converged when residuals and coordinates have settled (`rtol`, `atol`), when a step is
-    shorter than `MIN_STEP_LENGTH`, or when the relative decrease of the loss in `PROGRESS_STEPS` steps is
-    below `MIN_LOSS_DECREASE`.
+    A problem has converged if residuals and coordinates change by less than `rtol` and `atol` permit, if a
+    step is shorter than `MIN_STEP_LENGTH`, or if the relative decrease of the loss in `PROGRESS_STEPS` steps
+    is below `MIN_LOSS_DECREASE`.
 
     Args:
-        residuals: function of `static`, gains and arguments with a leading axis of problems, which it must
-            not mix.
+        residuals: function that returns the residuals (problems, residuals). The residuals of a problem must
+            depend only on the gains and arguments of this problem.
         static: first argument of `residuals`, a constant of the compiled program.
-        arguments: third argument of `residuals`, with a leading axis of problems.
-        bounds: bounds of the gains.
-        starts: unit coordinates of the gains at the start of each problem.
-        steps: limit on the number of steps, not above `longest`.
-        longest: limit on `steps`, a constant of the compiled program.
-        tile: number of problems that are evaluated together; by default all problems of a device.
+        arguments: third argument of `residuals`, arrays with a leading axis of problems.
+        bounds: bounds of the gains of each problem.
+        starts: starting points in unit coordinates.
+        steps: largest number of steps, at most `longest`.
+        longest: upper limit on `steps`, a constant of the compiled program.
+        tile: number of problems that are evaluated together; None: all problems of a device.
         rtol: relative tolerance of convergence.
         atol: absolute tolerance of convergence.
+
+    Returns:
+        The best point of each problem, and the history of the loss.
     """
 
     def of_coordinates(coordinates, arguments):
@@ -93,7 +94,7 @@ def solve_least_squares(
 
 
 def _shard_over_devices(one_device: Callable[..., SolverResult], *arguments: Any) -> tuple[Array, ...]:
-    """Call `one_device` on each device with its share of the arguments' leading axis."""
+    """Split the arguments along their leading axis, and call `one_device` with one part on each device."""
     leaves, structure = jax.tree.flatten(arguments)
     devices = math.gcd(jax.device_count(), len(leaves[0]))
     # Tracing is done outside `jax.shard_map`, because the solver's linear algebra cannot be traced inside.
@@ -103,17 +104,16 @@ def _shard_over_devices(one_device: Callable[..., SolverResult], *arguments: Any
         (devices,), ("device",), axis_types=(AxisType.Auto,), devices=jax.devices()[:devices]
     )
     spec = PartitionSpec("device")
-    # Devices exchange nothing, so that none waits for another.
+    # The devices exchange no data, so that no device waits for another.
     run = jax.shard_map(jaxpr_as_fun(traced), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
     return tuple(run(*leaves))
 
 
 def _with_jacobian(residuals, free, arguments, tile=None):
-    """Return a function that returns (residuals, loss) of one problem, for a `jax.vmap` over all problems.
+    """Return a function that computes (residuals, loss) of one problem, for a `jax.vmap` over all problems.
 
-    Its derivative is one product with a Jacobian that is computed once, in forward mode, for `tile` problems
-    at a time. `free` and `arguments` are examples of the function's arguments, with a leading axis of
-    problems.
+    The function's derivative multiplies by a Jacobian that is computed once, in forward mode, for `tile`
+    problems at a time. `free` and `arguments` are example arguments with a leading axis of problems.
     """
 
     def value_and_jacobian(free, arguments):
@@ -121,12 +121,12 @@ def _with_jacobian(residuals, free, arguments, tile=None):
             directions = jnp.broadcast_to(direction, free.shape)
             return jax.jvp(lambda free: residuals(free, arguments), (free,), (directions,))
 
-        # Since problems do not mix, one direction serves all of them.
+        # All problems share one direction, because the residuals of a problem depend only on its own gains.
         basis = jnp.eye(free.shape[-1], dtype=free.dtype)
         return jax.vmap(along, out_axes=(None, -1))(basis)
 
     def in_tiles(free, arguments):
-        # A tile waits only for its slowest problem, and its data stay in the processor's cache.
+        # A problem delays only its tile, and the data of a tile fit into the processor's cache.
         size = math.gcd(len(free), tile or len(free))
         shape = len(free) // size, size
         tiles = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), (free, arguments))
@@ -140,14 +140,14 @@ def _with_jacobian(residuals, free, arguments, tile=None):
 
     @jax.custom_batching.custom_vmap
     def several(free, arguments):
-        # A single problem is repeated to the traced number of problems.
+        # A single problem is repeated, because the traced function needs `number` problems.
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), (free, arguments))
         return tuple(leaf[0] for leaf in traced(*jax.tree.leaves(copies)))
 
     @several.def_vmap
     def rule(axis_size, in_batched, free, arguments):
         if not all(jax.tree.leaves(in_batched)):
-            raise NotImplementedError("every argument must be mapped")
+            raise NotImplementedError("vmap: found an argument without a batch axis, expected one for each")
         return tuple(traced(*jax.tree.leaves((free, arguments)))), (True, True)
 
     @jax.custom_jvp
@@ -175,10 +175,10 @@ class _LinearModel(NamedTuple):
 
 
 class _BoxedDescent(optx.AbstractDescent):
-    """Step d in the unit box from the damped linear model.
+    """Descent of optimistix whose step d minimises the damped linear model within the unit box.
 
-    It solves (J^T J + D) d = -J^T r for the gains that are free, D = `INITIAL_DAMPING` mean(diag(J^T J)) /
-    step_size.
+    For the gains that are not at a bound, d solves (J^T J + D 1) d = -J^T r, with the damping
+    D = `INITIAL_DAMPING` mean(diag(J^T J)) / step_size.
     """
 
     def init(self, y, f_info_struct):
@@ -194,7 +194,7 @@ class _BoxedDescent(optx.AbstractDescent):
         number, dtype = len(coordinates), coordinates.dtype
         damping = INITIAL_DAMPING * jnp.trace(curvature) / number / step_size.astype(dtype)
         identity = jnp.eye(number, dtype=dtype)
-        # The small number keeps gains in place on which no residual depends, since their curvature is 0.
+        # The added small number makes the matrix regular for gains without effect, whose curvature is 0.
         damped = curvature + (damping + jnp.finfo(dtype).tiny ** 0.5) * identity
         room = -coordinates, 1 - coordinates
         free = ~((coordinates <= 0) & (gradient > 0) | (coordinates >= 1) & (gradient < 0))
@@ -209,7 +209,7 @@ class _BoxedDescent(optx.AbstractDescent):
             inside = jnp.clip(unbounded, *room)
             return free & (unbounded == inside), jnp.where(free, inside, step)
 
-        # Each iteration fixes at least one further gain at a bound, or the step is final.
+        # Each iteration fixes at least one more gain at a bound, unless the step is already final.
         _, step = jax.lax.fori_loop(0, number + 1, bind, (free, jnp.zeros_like(coordinates)))
         return step, optx.RESULTS.successful
 
@@ -227,7 +227,8 @@ class _BoxedLevenbergMarquardt(optx.AbstractGaussNewton):
     def __init__(self, rtol: float, atol: float):
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = _BoxedDescent()
-        # The trust region grows already if the model is roughly right; the default condition is never met.
+        # The trust region grows if the decrease is 0.75 of the predicted one; the default condition is never
+        # met.
         self.search = optx.ClassicalTrustRegion(0.75, 1e-3, 3.0, 0.25)
         self.verbose = lambda **_: None
 
@@ -279,7 +280,7 @@ class _LossRecordingSolver(optx.AbstractLeastSquaresSolver):
 
 
 def _find_status(result, converged, loss):
-    """Return the index into `STATUSES` for a result of optimistix."""
+    """Convert a result of optimistix to an index into `SOLVER_STATUSES`."""
     ended = (result == optx.RESULTS.successful) | (result == optx.RESULTS.nonlinear_max_steps_reached)
     status = jnp.where(ended, jnp.where(converged, 0, 1), 3)
     return jnp.where(jnp.isfinite(loss), status, 2).astype(jnp.int32)

@@ -1,6 +1,6 @@
-"""Tolerance of each gain: its distance from the optimum at which the objective rises by a given share.
+"""Tolerance of each tuned gain: the change of the gain that raises the objective by `LOSS_RISE`.
 
-It follows from the residuals' Jacobian at the optimum, and does not take kinks of the objective into account.
+The tolerances follow from the Jacobian of the residuals at the optimum. They ignore kinks of the objective.
 """
 
 from typing import NamedTuple
@@ -8,25 +8,26 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-LOSS_RISE = 0.01  # relative rise of the loss
+LOSS_RISE = 0.01  # relative rise of the objective that defines a tolerance [1]
 
 
 class GainTolerances(NamedTuple):
-    """Tolerance of each gain, as a share of its range."""
+    """Tolerance of each gain, as a fraction of the gain's range."""
 
-    alone: Float[np.ndarray, "gains"]  # with all other gains fixed
-    together: Float[np.ndarray, "gains"]  # with all other gains readjusted to their best values
+    alone: Float[np.ndarray, "gains"]  # tolerance if all other gains are fixed [1]
+    together: Float[np.ndarray, "gains"]  # tolerance if the other gains are readjusted to the optimum [1]
 
 
 def compute_gain_tolerance(jacobian: Float[np.ndarray, "residuals gains"], loss: float) -> GainTolerances:
-    """Return the tolerance of each gain at the optimum of the objective L = |r|^2 / 2.
+    """Compute the tolerance of each gain at the optimum of the objective L = |r|^2 / 2.
 
-    `jacobian` is J = dr/du, with the gains u as shares of their ranges. Around the optimum
+    `jacobian` is J = dr/du, where r are the residuals and u the unit coordinates of the gains. `loss` is L at
+    the optimum. Around the optimum
 
-        L(u + d) = L (1 + d^T A d rise),    A = J^T J / (2 rise L)
+        L(u + d) = L (1 + rise d^T A d),    A = J^T J / (2 rise L),    rise = `LOSS_RISE`
 
-    so that L rises by at most `LOSS_RISE` of itself for d^T A d <= 1. To limit the movement of a gain to its
-    range, B = A + 1 replaces A, and
+    so that d^T A d = 1 where L has risen by the fraction `LOSS_RISE`. B = A + 1 replaces A, so that no gain
+    moves by more than its range, and
 
         alone_p = B_pp^(-1/2),        together_p = ((B^-1)_pp)^(1/2)
 
@@ -37,11 +38,11 @@ def compute_gain_tolerance(jacobian: Float[np.ndarray, "residuals gains"], loss:
     models and optimization", Phys. Rev. E 83, 036701 (2011).
     """
     gains = jacobian.shape[1]
-    # With fewer residuals than gains, zero rows add the directions on which no residual depends.
+    # If there are fewer residuals than gains, rows of zeros add the directions without effect on residuals.
     padded = np.concatenate([jacobian, np.zeros((max(0, gains - len(jacobian)), gains))])
     _, values, directions = np.linalg.svd(padded, full_matrices=False)
     scale = 2 * LOSS_RISE * max(loss, np.finfo(float).tiny)
-    # These are the semi-axes of the region.
+    # semi-axes of the ellipsoid d^T B d = 1
     radius = 1 / np.hypot(values / np.sqrt(scale), 1)
     covariance = (directions.T * radius**2) @ directions
     alone = 1 / np.sqrt(np.sum(jacobian**2, axis=0) / scale + 1)

@@ -1,4 +1,7 @@
-"""Result of the solver with derivatives, without an import of the solver, which a cached program spares."""
+"""Result of the Levenberg-Marquardt solver.
+
+This module does not import the solver, so that a cached program can run without the slow import.
+"""
 
 from typing import NamedTuple
 
@@ -8,11 +11,12 @@ SOLVER_STATUSES = ("converged", "step limit", "not finite", "failed")
 
 
 class SolverResult(NamedTuple):
-    """Result of the solver for each start."""
+    """Result of the Levenberg-Marquardt solver for each start."""
 
     coordinates: Float[Array, "starts gains"]  # unit coordinates of the gains
-    curvature: Float[Array, "starts gains gains"]  # J^T J, J = Jacobian of the residuals by the coordinates
+    # J^T J, where J is the Jacobian of the residuals with respect to the coordinates
+    curvature: Float[Array, "starts gains gains"]
     loss: Float[Array, "starts"]  # half the sum of squared residuals
-    history: Float[Array, "starts steps"]  # loss after every step; the last one repeats
-    steps: Int[Array, "starts"]  # number of steps
+    history: Float[Array, "starts steps"]  # loss after every step; the final loss fills the unused entries
+    steps: Int[Array, "starts"]  # number of steps taken
     status: Int[Array, "starts"]  # index into `SOLVER_STATUSES`

@@ -1,4 +1,7 @@
-"""Conversion between gains and unit coordinates, which are shares of a linear or logarithmic range."""
+"""Conversion between gains and unit coordinates.
+
+A unit coordinate is 0 at a gain's lower bound and 1 at the upper bound, on a linear or logarithmic scale.
+"""
 
 from typing import Any, NamedTuple
 
@@ -9,7 +12,7 @@ from jaxtyping import Array, Float
 
 
 class GainBounds(NamedTuple):
-    """Range of each gain."""
+    """Bounds and scale of each gain."""
 
     lower: Float[Array | np.ndarray, "*problems gains"]  # lower bound
     upper: Float[Array | np.ndarray, "*problems gains"]  # upper bound
@@ -17,9 +20,9 @@ class GainBounds(NamedTuple):
 
 
 def to_gains(coordinates: Float[Any, "*points gains"], bounds: GainBounds) -> Float[Any, "*points gains"]:
-    """Return the gains at unit `coordinates`, as NumPy or JAX arrays like the input.
+    """Convert unit coordinates to gains; NumPy arrays give NumPy arrays, JAX arrays give JAX arrays.
 
-    A coordinate outside [0, 1] is clipped, but keeps the derivative of one inside.
+    A coordinate outside [0, 1] is clipped, but has the same derivative as if it were not clipped.
     """
     xp = jnp if isinstance(coordinates, jax.Array) else np
     inside = xp.clip(coordinates, 0, 1)
@@ -34,7 +37,7 @@ def to_gains(coordinates: Float[Any, "*points gains"], bounds: GainBounds) -> Fl
 def to_coordinates(
     gains: Float[np.ndarray, "*points gains"], bounds: GainBounds
 ) -> Float[np.ndarray, "*points gains"]:
-    """Return the unit coordinates of gains, clipped to [0, 1]; 0 if both bounds are equal."""
+    """Convert gains to unit coordinates, clipped to [0, 1]; a gain with equal bounds has coordinate 0."""
     lower, upper = np.asarray(bounds.lower), np.asarray(bounds.upper)
     curved = (np.asarray(bounds.logarithmic) > 0) & (upper > lower)
     span = np.where(upper > lower, upper - lower, 1)

@@ -188,10 +188,9 @@ def replicate_interval(failures: ArrayLike, number: int, level: float = CONFIDEN
       probability (1 - d)^R, which is at most (1 - level) / 2 if d >= 1 - ((1 - level) / 2)^(1/R). The half
       width of the interval is at least this d, divided by n.
     - *There are few failures (or successes),* less than `MIN_STUDENT_FAILURES`. The distribution of the
-    fractions
-      is then too skewed for Student's interval. The interval also includes the exact binomial interval of all
-      points. The binomial interval is conservative if the counts spread less than those of independent
-      points; if they spread more, Student's interval is wider.
+      fractions is then too skewed for Student's interval. The interval also includes the exact binomial
+      interval of all points. The binomial interval is conservative if the counts spread less than those of
+      independent points; if the counts spread more, Student's interval is wider.
     - *There is no failure,* and therefore no spread. If the counts spread no more than those of independent
       points, one scrambling has no failure with a probability of at most 1 / (1 + n p / (1 - p)) (Cantelli's
       inequality). The probability for R scramblings is the Rth power. Therefore p is below c / (n + c), with

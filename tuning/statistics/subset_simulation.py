@@ -104,10 +104,9 @@ def subset_simulation(
     0, and the upper bound uses the probability that this replicate has reached.
 
     Args:
-        performance: function that returns the performance of scenarios, from standard normals (batch, inputs)
-        to
-            (batch,). Each call has replicates * samples / 10 scenarios. A value that is not finite counts as
-            a failure.
+        performance: function that returns the performance (batch,) of scenarios, which are given as standard
+            normals (batch, inputs). Each call has replicates * samples / 10 scenarios. A value that is not
+            finite counts as a failure.
         inputs: number of standard normals in a scenario, 1 or more.
         limit: limit of the performance, finite; a larger performance is a failure.
         seed: seed of the random numbers, 0 or more.

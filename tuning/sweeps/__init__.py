@@ -1,10 +1,10 @@
-"""Monte Carlo sweeps: scenarios by index, computed in chunks, in a store that survives interruptions.
+"""Monte Carlo sweeps: many random scenarios, computed in chunks, and stored so that a sweep can resume.
 
-The values allowed for options are defined here, without importing JAX, which must be configured first.
+This module defines the allowed values of options without importing JAX, because options configure JAX.
 """
 
 SAMPLINGS = ("random", "sobol")
 PRECISIONS = ("float64", "float32")
-MAX_SCENARIOS = 2**32  # largest number of scenarios; the noise's random keys have 32 bits for the index
-MAX_CHUNK_SIZE = 2**20  # largest number of scenarios of a chunk
+MAX_SCENARIOS = 2**32  # largest number of scenarios; the random keys of the noise have 32 bits for the index
+MAX_CHUNK_SIZE = 2**20  # largest number of scenarios in a chunk
 MAX_SEED = 2**63 - 1

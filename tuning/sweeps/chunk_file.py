@@ -1,8 +1,8 @@
-"""Parts of a store: rows of a sweep as Parquet files with a checksum.
+"""Parquet file of one chunk of a sweep: rows with a checksum.
 
-The metadata of a part hold the manifest's digest and a SHA-256 of the file, computed with zeros in place of
-its own digits. pandas, DuckDB and Arrow read a part like any Parquet file. The checksum is checked before the
-file is parsed; the rows' outcomes must then follow from their errors and statuses.
+pandas, DuckDB and Arrow can read the file. Its metadata hold the manifest's digest and a SHA-256 checksum of
+the file, computed while zeros replace the checksum's digits. Reading checks the checksum before parsing the
+file, and then checks that the rows' outcomes follow from their errors and statuses.
 """
 
 import hashlib
@@ -18,21 +18,21 @@ from tuning.sweeps.manifest import Manifest, load_gains
 
 SWEEP_DIGEST_KEY = b"jaxhil.sweep.sha256"
 CHECKSUM_KEY = b"jaxhil.part.sha256"
-BLANK_CHECKSUM = b"0" * 64  # replaces the checksum's digits while it is computed
+BLANK_CHECKSUM = b"0" * 64  # replaces the checksum's digits while the checksum is computed
 FORCE_RANGE_KEY = "rig.force_sensor.range"
 CONTROL_PERIOD_KEY = "rig.control_period"
 
 
 def encode_chunk(manifest: Manifest, rows: Mapping[str, np.ndarray]) -> bytearray:
-    """Return the content of a part's file."""
+    """Encode the rows of a chunk as a Parquet file with a checksum."""
     import pyarrow as pa
     from pyarrow import parquet
 
     buffer = pa.BufferOutputStream()
     table = to_table(manifest, rows)
     texts = [column.name for column in manifest.columns if column.kind == "text"]
-    # Numbers hardly repeat: stronger compression would save a tenth of the size in twice the time. Rows are
-    # searched by index only, so that no other column needs statistics.
+    # Stronger compression saves only a tenth of the size and takes twice the time. Only the index column
+    # needs statistics, because readers search rows by index.
     options: dict[str, Any] = {"compression": "lz4", "use_dictionary": texts, "write_statistics": ["index"]}
     with parquet.ParquetWriter(buffer, table.schema, **options) as writer:
         writer.write_table(table)
@@ -45,7 +45,10 @@ def encode_chunk(manifest: Manifest, rows: Mapping[str, np.ndarray]) -> bytearra
 
 
 def decode_chunk(manifest: Manifest, part: int, content: bytes) -> dict[str, np.ndarray] | None:
-    """Return the rows that `encode_chunk` encoded; None if the content is damaged or of another part."""
+    """Decode and check the rows of chunk number `part`.
+
+    Return None if the file is damaged or belongs to another chunk or sweep.
+    """
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -58,12 +61,15 @@ def decode_chunk(manifest: Manifest, part: int, content: bytes) -> dict[str, np.
         table = parquet.ParquetFile(pa.BufferReader(content)).read()
         return _check_rows(manifest, part, table)
     except (pa.ArrowException, InputError, LookupError, OSError, TypeError, ValueError):
-        # The checksum is valid, but another program wrote the content.
+        # The checksum is valid, but another program wrote the file.
         return None
 
 
 def _check_rows(manifest: Manifest, part: int, table: Any) -> dict[str, np.ndarray] | None:
-    """Return the rows of a table; None if they are not those of this part or contradict themselves."""
+    """Convert an Arrow table to the rows of chunk number `part`.
+
+    Return None if the table belongs to another chunk, or if outcomes contradict errors and statuses.
+    """
     first, number = manifest.chunk_range(part)
     if (table.schema.metadata or {}).get(
         SWEEP_DIGEST_KEY
@@ -76,7 +82,7 @@ def _check_rows(manifest: Manifest, part: int, table: Any) -> dict[str, np.ndarr
         return None
     mechanism = load_gains(manifest).mechanism
     if isinstance(mechanism, SixAxisMechanism):
-        # The range is the least of the three force channels, drawn or nominal.
+        # The sensor's range is the smallest of the three force channels, each drawn or nominal.
         forces = [f"{FORCE_RANGE_KEY}_{axis}" for axis in (1, 2, 3)]
         ranges = zip(forces, mechanism.rig.force_sensor.range[:3], strict=True)
         values = (rows.get(name, nominal) for name, nominal in ranges)
@@ -91,7 +97,7 @@ def _check_rows(manifest: Manifest, part: int, table: Any) -> dict[str, np.ndarr
 
 
 def list_different_columns(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray]) -> list[str]:
-    """Return the names of the columns that differ in type or in any bit, where all NaN are equal."""
+    """Return the names of columns that differ in type or in any bit; all NaN count as equal."""
     return [
         name
         for name in a
@@ -101,7 +107,7 @@ def list_different_columns(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarr
 
 
 def build_arrow_schema(manifest: Manifest) -> Any:
-    """Return the Arrow schema of every part; units and meanings are metadata of the fields."""
+    """Return the Arrow schema of a chunk's table, with units and descriptions as metadata of the fields."""
     import pyarrow as pa
 
     kinds = {
@@ -122,7 +128,7 @@ def build_arrow_schema(manifest: Manifest) -> Any:
 
 
 def to_table(manifest: Manifest, rows: Mapping[str, np.ndarray]) -> Any:
-    """Convert rows to an Arrow table with null for NaN and texts for their indices."""
+    """Convert rows to an Arrow table; NaN becomes null, and indices of texts become the texts."""
     import pyarrow as pa
 
     arrays = []
@@ -140,7 +146,7 @@ def to_table(manifest: Manifest, rows: Mapping[str, np.ndarray]) -> Any:
 
 
 def from_table(manifest: Manifest, table: Any) -> dict[str, np.ndarray]:
-    """Convert a table of `to_table` back to rows."""
+    """Convert an Arrow table to rows; reverses `to_table`."""
     rows = {}
     for column in manifest.columns:
         array = table.column(column.name).combine_chunks()
@@ -155,7 +161,7 @@ def from_table(manifest: Manifest, table: Any) -> dict[str, np.ndarray]:
 
 
 def _locate_checksum(content: bytes | bytearray) -> slice:
-    """Return the position of the checksum's digits, behind its name, a header byte and a length byte."""
+    """Return the slice of the checksum's digits, which follow its key, a header byte and a length byte."""
     start = content.rfind(CHECKSUM_KEY) + len(CHECKSUM_KEY) + 2
     return slice(start, start + len(BLANK_CHECKSUM))
 

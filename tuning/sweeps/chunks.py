@@ -1,7 +1,7 @@
-"""Computation of the chunks of a sweep on all cores: from indices of scenarios to rows of the store.
+"""Computation of a sweep's chunks on all cores: draw scenarios, run them, and build the rows of the store.
 
-One compiled program serves every chunk. Its delay lines are sized for the extremes of all possible draws, so
-that a scenario's row is identical to the bit in any chunk.
+All chunks share one compiled program. Its delay lines are long enough for every possible draw, so that the
+row of a scenario does not depend on the chunk, to the bit.
 """
 
 from collections.abc import Callable, Generator, Iterable
@@ -27,12 +27,12 @@ CONTROL_PERIOD_KEY = "rig.control_period"
 
 
 class SweepProgram(NamedTuple):
-    """Sweep of a manifest with its loop, ready to run."""
+    """Everything that is needed to run scenarios of a sweep."""
 
     manifest: Manifest
-    mechanism: AnyMechanism  # mechanism in the gain file
-    loop: Any  # loop for all possible draws (`build_widest_loop`)
-    gains: dict[str, float]  # gains in the gain file
+    mechanism: AnyMechanism  # mechanism of the gain file
+    loop: Any  # static properties of the loop, valid for all possible draws (`build_widest_loop`)
+    gains: dict[str, float]  # gains of the gain file
 
     @property
     def model(self) -> RigModel:
@@ -41,24 +41,27 @@ class SweepProgram(NamedTuple):
 
 
 class _ScenarioBatch(NamedTuple):
-    """Scenarios to run."""
+    """Consecutive scenarios of a sweep, with the values that were drawn for them."""
 
     first: int  # index of the first scenario
-    draws: dict[str, np.ndarray]  # drawn values by dotted path
-    scenarios: Any
+    draws: dict[str, np.ndarray]  # drawn values by key of the mechanism file
+    scenarios: Any  # batch with one lane per scenario
 
 
 def build_sweep(manifest: Manifest) -> SweepProgram:
-    """Build the sweep of a manifest; raise `InputError` if its gain file is invalid."""
+    """Build the program of a sweep from its manifest; raise `InputError` if the gain file is invalid."""
     loaded = load_gains(manifest)
     return SweepProgram(manifest, loaded.mechanism, build_widest_loop(loaded, manifest.works), loaded.gains)
 
 
 def build_widest_loop(loaded: LoadedGains, works: bool) -> Any:
-    """Return the loop for all possible draws; with `works`, mechanical works are computed exactly."""
+    """Build a loop whose delay lines are long enough for all possible draws.
+
+    If `works` is true, the loop computes the mechanical work of every contact, with the exact response.
+    """
     draws = draw_extremes(loaded.mechanism)
     if CONTROL_PERIOD_KEY in draws:
-        # Reversed, the longest delay meets the shortest period, which needs the longest delay line.
+        # The longest delay line is needed for the longest delay together with the shortest control period.
         draws[CONTROL_PERIOD_KEY] = draws[CONTROL_PERIOD_KEY][::-1]
     model = choose_rig_model(loaded.mechanism)
     scenarios = model.scenarios(loaded.mechanism, draws)
@@ -66,39 +69,40 @@ def build_widest_loop(loaded: LoadedGains, works: bool) -> Any:
 
 
 def run_chunk(sweep: SweepProgram, first: int, number: int, precision: str | None = None) -> Rows:
-    """Compute the rows of scenarios `first` to `first + number - 1`; `number` is at most that of a chunk.
+    """Compute the rows of `number` scenarios from index `first`, at most the size of a chunk.
 
-    A run that fails or becomes non-finite gives a row with that status.
+    A run that fails or becomes non-finite yields a row with this status. `precision` replaces the precision
+    of the manifest.
     """
     return _begin_evaluation(sweep, _draw_batch(sweep, first, number, precision))()
 
 
 def run_chunks(sweep: SweepProgram, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
-    """Yield the number and rows of each part; the next part is computed while the caller uses them."""
+    """Compute chunks; yield each chunk's number and rows while the next chunk is being computed."""
     running = None
     for part in parts:
-        # The next part is queued behind the running one, so that no core is idle. The first part starts the
+        # The next chunk is queued while one is running, so that no core is idle. The first chunk starts the
         # threads of JAX, which must be allowed to use all cores.
         with use_half_the_cores(0) if running is not None else nullcontext():
-            begun = (
+            started = (
                 part,
                 _begin_evaluation(sweep, _draw_batch(sweep, *sweep.manifest.chunk_range(part), None)),
             )
         if running is not None:
             yield _finish_chunk(running)
-        running = begun
+        running = started
     if running is not None:
         yield _finish_chunk(running)
 
 
 def convert_precision(scenarios: Any, precision: str) -> Any:
-    """Convert the scenarios' floating-point numbers, and thereby the program, to the precision."""
+    """Convert all floating-point numbers of the scenarios to `precision`, in which the program then runs."""
 
     def cast(leaf: Any) -> Any:
         leaf = np.asarray(leaf)
         if leaf.dtype.kind != "f":
             return leaf
-        # A number broadcast to all lanes stays one number in memory.
+        # A number that is broadcast to all lanes stays a single number in memory.
         values = leaf[..., :1] if leaf.strides[-1] == 0 else leaf
         return np.broadcast_to(values.astype(precision, copy=False), leaf.shape)
 
@@ -112,7 +116,7 @@ def _draw_batch(sweep: SweepProgram, first: int, number: int, precision: str | N
 
 
 def _begin_evaluation(sweep: SweepProgram, batch: _ScenarioBatch) -> Callable[[], Rows]:
-    """Start the computation of a batch; return a function that waits for its rows."""
+    """Start the computation of a batch; return a function that waits for the batch's rows."""
     manifest = sweep.manifest
     limit, works = manifest.error_limit, manifest.works
     read = partial(select_read_fields, sweep.mechanism, works)

@@ -1,7 +1,7 @@
-"""Columns of a sweep's store, with names, units and meanings.
+"""Columns of a sweep's store, with names, units and descriptions.
 
-A metric of a contact has one column per contact (`error_1`, `error_2`, ...), a drawn list one column per
-entry (`contact.stiffness_1`). Metrics that a failed or unreached contact lacks are null.
+A metric has one column per contact (`error_1`, `error_2`, ...). A drawn list has one column per entry
+(`contact.stiffness_1`). A metric that a failed or unreached contact does not have is null.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -38,7 +38,7 @@ UNLIKE_IDEAL_MEANING = (
 )
 SATURATED_MEANING = "a force beyond the sensor's range, or a limit of the motion simulator that bound"
 CONTACT_STATUSES = tuple(CONTACT_STATUS_NAMES.values())
-# From harmless to worst; every status of a failed run is an outcome.
+# In ascending order of severity; every status of a failed run is also an outcome.
 SCENARIO_OUTCOMES = (
     GOOD,
     BEYOND_LIMIT,
@@ -51,20 +51,20 @@ ColumnKind = Literal["integer", "input", "number", "flag", "text"]
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Column of the store."""
+    """Description of one column of a sweep's store."""
 
     name: str
-    kind: ColumnKind  # inputs are in float64, numbers in the sweep's precision
-    unit: str  # SI; "" for none, "1" for a ratio
-    meaning: str
+    kind: ColumnKind  # type of the values; "input" is float64, "number" has the sweep's precision
+    unit: str  # SI unit; "" if there is none, "1" for a ratio
+    meaning: str  # description in words
 
 
 class ContactMetric(NamedTuple):
-    """Metric of every contact."""
+    """Description of a metric that is stored for every contact."""
 
-    name: str  # name of its column, without the contact's number
-    unit: str  # SI; "1" for a ratio
-    meaning: str
+    name: str  # name of the column, without the contact's number
+    unit: str  # SI unit; "1" for a ratio
+    meaning: str  # description in words
 
 
 CONTACT_METRICS = (
@@ -82,7 +82,7 @@ CONTACT_METRICS = (
     ContactMetric("energy_in", "J", "kinetic energy of the numerical model before the contact"),
     ContactMetric("energy_out", "J", "kinetic energy of the numerical model after the contact"),
 )
-# Metrics that six-axis episodes share with contacts; two errors replace the restitution error.
+# Metrics that are also stored for six-axis episodes, where `SIX_AXIS_ERRORS` replace the restitution error.
 EPISODE_METRICS = ("restitution", "reference_restitution", "peak_force", "reference_peak_force", "peak_ratio")
 EPISODE_METRICS = (*EPISODE_METRICS, "duration", "reference_duration", "approach_velocity")
 SIX_AXIS_ERRORS = {
@@ -93,7 +93,7 @@ WORK_METRICS = (
     ContactMetric("work_in", "J", "work done on the mechanism by the real contact force"),
     ContactMetric("work_out", "J", "work returned by the mechanism"),
 )
-# Metrics that are also stored for a contact that did not end, up to the end of the run.
+# Metrics that are also stored for a contact that did not end; they cover the time until the run ended.
 UNENDED_METRICS = (
     "peak_force",
     "peak_command",
@@ -105,21 +105,21 @@ UNENDED_METRICS = (
 
 
 class ContactColumns(NamedTuple):
-    """Columns of one contact, or of one error of an episode."""
+    """Names of the error and status columns of one contact, or of one error of a six-axis episode."""
 
     number: int  # number of the contact or episode, from 1
-    error: str  # column of its error
-    status: str  # column of its status
+    error: str  # name of the error's column
+    status: str  # name of the status's column
 
 
 def list_contact_columns(mechanism: AnyMechanism) -> list[ContactColumns]:
-    """Return the slots of an outcome's rows: every contact, or every error of every episode."""
+    """Return the column names for each row of an outcome: each contact, or each error of each episode."""
     model = choose_rig_model(mechanism)
     return list_error_columns(model.errors, model.runs(mechanism))
 
 
 def list_error_columns(errors: Iterable[str], runs: int) -> list[ContactColumns]:
-    """Return the slots of every error of `runs` contacts or episodes."""
+    """Return the column names of every error of `runs` contacts or episodes."""
     numbers = range(1, runs + 1)
     return [
         ContactColumns(number, f"{error}_{number}", f"status_{number}")
@@ -129,7 +129,7 @@ def list_error_columns(errors: Iterable[str], runs: int) -> list[ContactColumns]
 
 
 def list_sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
-    """Return the columns of a sweep over `mechanism` in their order."""
+    """Return all columns of a sweep of `mechanism`, in the order in which they are stored."""
     columns = [Column("index", "integer", "", "number of the scenario")]
     columns += [
         Column(name, "input", find_key_unit(mechanism, path), f"{path}, drawn")
@@ -158,12 +158,12 @@ def list_sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
 
 
 def list_allowed_texts(column: str) -> tuple[str, ...]:
-    """Return the allowed texts of a text column; rows hold indices into them."""
+    """Return the allowed texts of the text column `column`; the rows hold indices into this tuple."""
     return SCENARIO_OUTCOMES if column == "outcome" else CONTACT_STATUSES
 
 
 def _list_stored_metrics(mechanism: AnyMechanism, works: bool) -> list[ContactMetric]:
-    """Return the metrics that are stored for every contact."""
+    """Return the metrics that are stored for every contact or six-axis episode."""
     if choose_rig_model(mechanism).axes == 1:
         return [*CONTACT_METRICS, *(WORK_METRICS if works else ())]
     errors = [ContactMetric(name, "1", meaning) for name, meaning in SIX_AXIS_ERRORS.items()]
@@ -171,7 +171,7 @@ def _list_stored_metrics(mechanism: AnyMechanism, works: bool) -> list[ContactMe
 
 
 def find_key_unit(mechanism: AnyMechanism, path: str) -> str:
-    """Return the SI unit of a real-valued key of the mechanism file."""
+    """Return the SI unit of a numeric key of the mechanism file, given as a dotted path."""
     table, _, key = path.rpartition(".")
     contacts: dict[str, Any] = {"contact": mechanism.contact}
     if not isinstance(mechanism, Mechanism):
@@ -183,7 +183,7 @@ def find_key_unit(mechanism: AnyMechanism, path: str) -> str:
 
 
 def list_input_columns(mechanism: AnyMechanism, path: str) -> list[str]:
-    """Return the columns of a drawn key: the path itself, or one name per entry, counted from 1."""
+    """Return the column names of a drawn key: `path` for a number, `path_1`, `path_2`, ... for a list."""
     if path == PHASE_KEY and isinstance(mechanism, Mechanism):
         shape: tuple[int, ...] = (mechanism.approach.contacts,)
     else:
@@ -192,7 +192,7 @@ def list_input_columns(mechanism: AnyMechanism, path: str) -> list[str]:
 
 
 def select_read_fields(mechanism: AnyMechanism, works: bool, outcome: Outcome) -> Any:
-    """Return the outcome with the fields that `build_rows` reads, and None for all others."""
+    """Replace all fields of an outcome that `build_rows` does not read by None."""
     names = {
         "status",
         "restitution",
@@ -214,7 +214,10 @@ def build_rows(
     limit: float,
     works: bool,
 ) -> dict[str, np.ndarray]:
-    """Return one array (number,) per column; missing metrics are NaN, texts are indices."""
+    """Build the rows of a store from the outcome of a batch of scenarios: one array (scenarios,) per column.
+
+    Missing metrics are NaN. A text is stored as an index into `list_allowed_texts`.
+    """
     metrics, contacts = outcome.metrics, list_contact_columns(mechanism)
     number = metrics.status.shape[-1]
     rows = {"index": np.arange(first, first + number)}
@@ -246,14 +249,14 @@ def build_rows(
 
 
 def find_force_range(scenarios: Any) -> np.ndarray:
-    """Return the largest force [N] that the sensor reads (number,), the least of three channels."""
+    """Return the force sensor's range [N] in each scenario; for six axes, the smallest of three channels."""
     if hasattr(scenarios, "sensor"):
         return np.min(np.asarray(scenarios.sensor.errors.range)[:3], axis=0)
     return np.asarray(scenarios.force_sensor.range)
 
 
 def _compute_energies(scenarios: Any, metrics: Any) -> dict[str, np.ndarray]:
-    """Return the kinetic energy [J] before and after each contact; empty in six axes."""
+    """Return the kinetic energies [J] before and after each contact; empty for six axes."""
     if not hasattr(scenarios, "equivalent_mass"):
         return {}
     rebound = metrics.restitution * metrics.approach_velocity
@@ -268,14 +271,14 @@ def classify_outcomes(
     period: np.ndarray,
     limit: float,
 ) -> dict[str, np.ndarray]:
-    """Return `worst_error`, `outcome` and `failed`, which follow from the columns of every contact.
+    """Compute the columns `worst_error`, `outcome` and `failed` from the columns of all contacts.
 
     Args:
         rows: columns by name. Stores of an earlier version lack the ideal contact's peak force and duration,
-            so that no row is `UNLIKE_IDEAL`.
-        made: contacts or episodes.
-        force_range: range of the force sensor [N], per row or of all rows.
-        period: control period [s], per row or of all rows.
+            so that no row becomes `UNLIKE_IDEAL`.
+        made: column names of the contacts or episodes.
+        force_range: range of the force sensor [N], common to all rows or for each row.
+        period: control period [s], common to all rows or for each row.
         limit: limit of the error [1].
     """
 
@@ -287,7 +290,7 @@ def classify_outcomes(
     peak = stacked(f"peak_force_{slot.number}" for slot in made)
     size = np.where(status == OK, np.abs(error), -1)
     worst = np.take_along_axis(error, np.argmax(size, axis=0)[None], axis=0)[0]
-    # Peak and shortfall of an unreached contact are NaN, for which the comparisons are false.
+    # An unreached contact has a peak and a shortfall of NaN, so that both comparisons are false.
     beyond_range = peak > force_range.astype(peak.dtype)
     saturated = np.any(beyond_range, axis=0)
     for name in {f"position_shortfall_{slot.number}" for slot in made} & set(rows):
@@ -298,7 +301,7 @@ def classify_outcomes(
 
 
 def _find_unlike(rows: Mapping[str, np.ndarray], numbers: Iterable[int], period: np.ndarray) -> np.ndarray:
-    """Return which rows have a real contact that is too hard, too short or too long."""
+    """Return whether each row has a contact whose peak force or duration differs too much from the ideal."""
     unlike = np.zeros(len(rows["index"]), bool)
     for number in numbers:
         ideal = [rows.get(f"reference_{name}_{number}") for name in ("peak_force", "duration")]
@@ -313,7 +316,7 @@ def _find_unlike(rows: Mapping[str, np.ndarray], numbers: Iterable[int], period:
 def _choose_worst_outcomes(
     status: np.ndarray, beyond: np.ndarray, unlike: np.ndarray, saturated: np.ndarray
 ) -> np.ndarray:
-    """Return the worst outcome that applies to every scenario, as index into `SCENARIO_OUTCOMES`."""
+    """Return the most severe outcome of each scenario, as an index into `SCENARIO_OUTCOMES`."""
     outcome = np.where(beyond, SCENARIO_OUTCOMES.index(BEYOND_LIMIT), SCENARIO_OUTCOMES.index(GOOD))
     outcome = np.where(unlike, SCENARIO_OUTCOMES.index(UNLIKE_IDEAL), outcome)
     outcome = np.where(saturated, SCENARIO_OUTCOMES.index(SATURATED), outcome)

@@ -1,12 +1,10 @@
-"""Draws of scenarios by index, where draw i is a function of the seed and of i only.
+"""Draws of a sweep's scenarios. Scenario i and its sensor noise depend only on the seed and on i.
 
-Scenario i and its sensors' noise do not depend on chunks, devices, number of scenarios or interruptions.
-
-- `random`: independent draws, from counter-based generators (`jaxhil.mechanism.uncertainty.draw`).
-- `sobol`: R = `SOBOL_REPLICATES` independently scrambled Sobol sequences; scenario i is point i // R of
-    sequence
-  i % R. The means of the R sequences are independent and identically distributed, which gives an interval
-  (Owen, "Monte Carlo theory, methods and examples", ch. 17: randomised quasi-Monte Carlo).
+- `random` sampling draws independent scenarios (`jaxhil.mechanism.uncertainty.draw`).
+- `sobol` sampling uses R = `SOBOL_REPLICATES` independently scrambled Sobol sequences. Scenario i is point
+  i // R of sequence i % R. The means of the R sequences are independent and identically distributed, which
+  yields a confidence interval (Owen, "Monte Carlo theory, methods and examples", ch. 17: randomised
+  quasi-Monte Carlo).
 """
 
 from functools import lru_cache
@@ -19,13 +17,13 @@ from jaxhil.mechanism.uncertainty import count_dimensions, draw, draw_at_points
 from jaxhil.rig_models import choose_rig_model
 
 SOBOL_REPLICATES = 16
-SOBOL_BITS = 30  # bits of a Sobol point's coordinate
+SOBOL_BITS = 30  # number of bits of a coordinate of a Sobol point
 
 
 def draw_scenarios(
     mechanism: AnyMechanism, sampling: str, seed: int, first: int, number: int
 ) -> tuple[dict[str, np.ndarray], Any]:
-    """Return the draws, by dotted path as of `draw`, and scenarios `first` to `first + number - 1`."""
+    """Draw scenarios `first` to `first + number - 1`; return the drawn values by key, and the scenarios."""
     if sampling == "random":
         draws = draw(mechanism, number, seed, first)
     else:
@@ -36,9 +34,9 @@ def draw_scenarios(
 
 
 def draw_sobol_points(dimension: int, seed: int, first: int, number: int) -> np.ndarray:
-    """Return points `first` to `first + number - 1` of the interleaved sequences, (number, dimension).
+    """Return points `first` to `first + number - 1` of the interleaved Sobol sequences, (number, dimension).
 
-    Coordinates are within 0 to 1, exclusively: each is the middle of its cell of width 2**-30.
+    Each coordinate is the centre of a cell of width 2**-30, so that it is above 0 and below 1.
     """
     points = np.empty((number, dimension))
     for replicate in range(SOBOL_REPLICATES):
@@ -51,17 +49,17 @@ def draw_sobol_points(dimension: int, seed: int, first: int, number: int) -> np.
 
 
 class _SobolSequence:
-    """Scrambled Sobol sequence with random access; sequential reads need no fast-forward."""
+    """Scrambled Sobol sequence with access to any point; sequential access is fastest."""
 
     def __init__(self, dimension: int, seed: int, replicate: int):
-        # This import takes most of a second.
+        # This import takes almost a second, so that it is deferred until it is needed.
         from scipy.stats import qmc
 
         generator = np.random.default_rng([seed, replicate])
         self._engine = qmc.Sobol(dimension, scramble=True, bits=SOBOL_BITS, rng=generator)
 
     def rows(self, begin: int, number: int) -> np.ndarray:
-        """Return points `begin` to `begin + number - 1`, (number, dimension)."""
+        """Return points `begin` to `begin + number - 1` of the sequence, (number, dimension)."""
         if begin < self._engine.num_generated:
             self._engine.reset()
         if begin > self._engine.num_generated:
@@ -70,7 +68,7 @@ class _SobolSequence:
 
 
 def _draw_without_warning(engine, number: int) -> np.ndarray:
-    """Return the next points without SciPy's warning about a first batch that is no power of two."""
+    """Return the next points, and avoid SciPy's warning that their number is not a power of two."""
     if number == 0:
         return np.empty((0, engine.d))
     if engine.num_generated:

@@ -1,7 +1,7 @@
-"""Manifest of a sweep: all inputs that determine its rows (`schema = "jaxhil/sweep/2"`), as JSON.
+"""Manifest of a sweep: a JSON file with all inputs that determine the rows (`schema = "jaxhil/sweep/2"`).
 
-It is written before the sweep and identifies the store. Every part of the store holds the `digest` of its
-content, so that parts of other sweeps are detected.
+The manifest is written before the sweep starts, and identifies the store. Every chunk file holds the
+manifest's digest, so that chunks of other sweeps are detected.
 """
 
 import json
@@ -29,45 +29,44 @@ from tuning.sweeps.draws import SOBOL_REPLICATES
 MANIFEST_SCHEMA = "jaxhil/sweep/2"
 MANIFEST_FILE = "manifest.json"
 DEFAULT_CHUNK_SIZE = 16384  # default number of scenarios per chunk
-MAX_FILE_BYTES = 8 * 1024 * 1024  # largest size of a file [bytes]
-COLUMN_DIFFERENCE = "columns: found others than this version writes"
+MAX_FILE_BYTES = 8 * 1024 * 1024  # largest size of a manifest or study file [bytes]
+COLUMN_DIFFERENCE = "columns: found other columns than this version writes"
 Sha256Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 
 
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """All inputs that determine a sweep's rows."""
+    """Content of a sweep's manifest file: all inputs that determine the rows."""
 
     schema: Literal["jaxhil/sweep/2"]
-    scenarios: Annotated[
-        int, Meta(ge=1, le=MAX_SCENARIOS)
-    ]  # number of scenarios, the largest one with `until_width`
-    chunk: Annotated[int, Meta(ge=1, le=MAX_CHUNK_SIZE)]  # scenarios per part
+    # number of scenarios; with `until_width`, the largest number
+    scenarios: Annotated[int, Meta(ge=1, le=MAX_SCENARIOS)]
+    chunk: Annotated[int, Meta(ge=1, le=MAX_CHUNK_SIZE)]  # number of scenarios per chunk
     seed: Annotated[int, Meta(ge=0, le=MAX_SEED)]
     sampling: Literal["random", "sobol"]
-    replicates: Annotated[int, Meta(ge=1)]  # Sobol sequences; 1 for random sampling
+    replicates: Annotated[int, Meta(ge=1)]  # number of Sobol sequences; 1 for random sampling
     precision: Literal["float64", "float32"]
     limit: Annotated[float, Meta(ge=0)] | None  # limit of the restitution error [1]; None: no limit
     works: bool  # whether mechanical works are computed
     columns: list[Column]
     gains_sha256: Sha256Digest  # digest of the gain file
-    mechanism_sha256: Sha256Digest  # digest of its mechanism's file
+    mechanism_sha256: Sha256Digest  # digest of the mechanism file for which the gains were tuned
     gain_file: dict[str, Any]  # content of the gain file
-    sources_sha256: Sha256Digest  # digest of the code that computes the rows
-    versions: dict[str, str]  # versions of the packages that the code uses
-    xla_flags: str  # compiler flags that may change the last bits
-    created: str  # date
-    sha256: Sha256Digest  # digest of all but the date
-    # the sweep ends with the first part after which the confidence sequence has this width [1]
+    sources_sha256: Sha256Digest  # digest of the source code that computes the rows
+    versions: dict[str, str]  # versions of the packages that compute the rows
+    xla_flags: str  # compiler flags that can change the last bits
+    created: str  # date and time in UTC
+    sha256: Sha256Digest  # digest of the manifest without the date
+    # the sweep ends when the confidence interval of the failure probability is at most this wide [1]
     until_width: Annotated[float, Meta(gt=0, le=1)] | None = None
 
     @property
     def parts(self) -> int:
-        """Return the number of parts of the store, all of `chunk` rows but the last."""
+        """Return the number of chunks; all chunks but the last have `chunk` rows."""
         return -(-self.scenarios // self.chunk)
 
     @property
     def error_limit(self) -> float:
-        """Return the limit of the restitution error [1]; infinite if there is none."""
+        """Return the limit of the restitution error [1], infinite if the manifest has no limit."""
         return math.inf if self.limit is None else self.limit
 
     @property
@@ -76,13 +75,13 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return self.gain_file.get("axes", 1)
 
     def chunk_range(self, part: int) -> tuple[int, int]:
-        """Return the index of a part's first scenario, and the number of its scenarios."""
+        """Return the first index and the number of the scenarios in chunk number `part`."""
         first = part * self.chunk
         return first, min(self.chunk, self.scenarios - first)
 
 
 class ManifestOptions(NamedTuple):
-    """Options of a sweep, which are fields of `Manifest`."""
+    """Options with which a sweep is requested; `Manifest` describes the fields."""
 
     scenarios: int
     seed: int = 0
@@ -95,7 +94,7 @@ class ManifestOptions(NamedTuple):
 
 
 def build_manifest(loaded: LoadedGains, choices: ManifestOptions) -> Manifest:
-    """Build the manifest of a sweep of a checked gain file; raise `InputError` for an invalid option."""
+    """Build the manifest of a sweep with a loaded gain file; raise `InputError` if an option is invalid."""
     if choices.sampling == "sobol" and choices.scenarios < SOBOL_REPLICATES:
         allowed = f"{SOBOL_REPLICATES} or more, the replicates of sobol sampling"
         raise InputError(f"--scenarios: found {choices.scenarios}, expected {allowed}")
@@ -119,13 +118,13 @@ def build_manifest(loaded: LoadedGains, choices: ManifestOptions) -> Manifest:
 
 
 def encode_manifest(manifest: Manifest) -> bytes:
-    """Return the content of the manifest file."""
+    """Encode the manifest as the content of its JSON file."""
     document = msgspec.to_builtins(manifest)
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode("ascii")
 
 
 def decode_manifest(content: bytes, source: str) -> Manifest:
-    """Parse the content of a manifest file called `source`; raise `InputError` if it is invalid."""
+    """Parse the content of a manifest file; raise `InputError`, with the name `source`, if it is invalid."""
     try:
         document = json.loads(content.decode("utf-8"), parse_constant=_reject_constant)
     except (ValueError, RecursionError) as error:
@@ -159,29 +158,32 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def load_gains(manifest: Manifest, source: str = "sweep") -> LoadedGains:
-    """Return the gain file within a manifest, checked like a file."""
+    """Load and check the gain file that a manifest contains; raise `InputError` if it is invalid."""
     return check_document(manifest.gain_file, f"{source}: gain_file", any_axes=True)
 
 
 def list_input_differences(old: Manifest, new: Manifest) -> list[str]:
-    """Return the differences of the inputs, each as "key: found OLD, asked for NEW"."""
+    """Return how the inputs of two manifests differ, each as "key: found OLD, requested NEW"."""
     keys = ("gains_sha256", *ManifestOptions._fields, "xla_flags")
     values = ((key, getattr(old, key), getattr(new, key)) for key in keys)
     return [
-        f"{key}: found {_shorten(before)}, asked for {_shorten(now)}"
+        f"{key}: found {_shorten(before)}, requested {_shorten(now)}"
         for key, before, now in values
         if before != now
     ]
 
 
 def list_code_differences(old: Manifest, new: Manifest) -> list[str]:
-    """Return the differences of the code that computes the rows, likewise."""
+    """Return how the code that computes the rows differs, each as "key: found OLD, here NEW"."""
     changes = _list_version_differences(old, new.sources_sha256, new.versions)
     return changes + ([COLUMN_DIFFERENCE] if old.columns != new.columns else [])
 
 
 def list_process_differences(manifest: Manifest) -> list[str]:
-    """Return the differences of this process from the manifest that may change the rows' last bits."""
+    """Return how code and settings of this process differ from the manifest, each as text.
+
+    Each of these differences can change the last bits of the rows.
+    """
     flags = rounding_flags(active_xla_flags())
     loaded = load_gains(manifest)
     changes = _list_version_differences(manifest, _compute_sources_digest(loaded), dependency_versions())
@@ -232,7 +234,7 @@ def _convert_document(document: Mapping[str, Any], source: str) -> Manifest:
         raise InputError(f"{source}: until_width: found with {manifest.sampling}, expected with random")
     for key, inner in (("gains_sha256", "sha256"), ("mechanism_sha256", "mechanism_sha256")):
         if manifest.gain_file.get(inner) != getattr(manifest, key):
-            raise InputError(f"{source}: {key}: found another than the gain file's, expected the same")
+            raise InputError(f"{source}: {key}: found another digest than in gain_file, expected the same")
     return manifest
 
 

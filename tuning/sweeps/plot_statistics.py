@@ -1,7 +1,8 @@
-"""Statistics over two inputs for the plots of a sweep, accumulated part by part in constant memory.
+"""Statistics for the plots of a sweep, accumulated chunk by chunk in constant memory.
 
-They are counts of errors per cell of a grid, the first scenarios as points, and numbers of failures up to
-some numbers of scenarios. Parts may come in any order and size; the grid does not depend on the draws.
+They are counts of errors in the cells of a grid over two inputs, the first scenarios as points, and the
+number of failures as a function of the number of scenarios. Chunks can have any order and size. The grid does
+not depend on the draws.
 """
 
 from collections.abc import Mapping
@@ -29,70 +30,69 @@ Rows = Mapping[str, np.ndarray]
 
 PREFERRED_INPUTS = ("contact.stiffness", "rig.force_sensor.delay")
 INPUT_LABELS = {"contact.stiffness": "contact stiffness", "rig.force_sensor.delay": "force delay"}
-# Factor and display unit by SI unit.
+# for each SI unit, the displayed unit and the factor that converts to it
 DISPLAY_UNITS = {"s": (1e3, "ms"), "m": (1e3, "mm"), "m/s": (1e3, "mm/s"), "N/m": (1e-3, "kN/m")}
-END_PROBABILITIES = 0.001, 0.999  # probabilities of the grid's ends; values outside count in the outer cells
+# The grid extends between these quantiles of an input; the outer cells also count all values outside.
+END_PROBABILITIES = 0.001, 0.999
 CONTACTS_PER_CELL = 150  # average number of contacts per cell
 MAX_CELLS = 28  # largest number of cells along an axis
-MAX_POINTS, MAX_FAILED_POINTS = (
-    4000,
-    2000,
-)  # number of first scenarios and of first failed ones that are points
-LOOK_COUNT = 200  # approximate number of looks, i.e. numbers of scenarios up to which failures are counted
+MAX_POINTS, MAX_FAILED_POINTS = 4000, 2000  # largest numbers of plotted scenarios, and of plotted failed ones
+LOOK_COUNT = 200  # approximate number of scenario counts at which the number of failures is stored
 
 
 class PlotInput(NamedTuple):
-    """Input as an axis of a plot."""
+    """Uncertain input that is an axis of a plot."""
 
     name: str  # displayed name
     unit: str  # displayed unit
-    columns: tuple[str, ...]  # column per contact, or one per scenario
-    factor: float  # displayed value over the column's value
+    columns: tuple[str, ...]  # names of the input's columns: one per contact, or one per scenario
+    factor: float  # factor that converts a value of the column to the displayed unit
     low: float  # low end of the axis in the displayed unit
     high: float  # high end of the axis in the displayed unit
-    logarithmic: bool
+    logarithmic: bool  # whether the axis is logarithmic
 
     @property
     def label(self) -> str:
         return f"{self.name} [{self.unit or '1'}]"
 
     def edges(self, cells: int) -> np.ndarray:
-        """Return the edges of equal cells, (cells + 1,)."""
+        """Return the edges (cells + 1,) of cells that have equal widths on the plot."""
         spaced = np.geomspace if self.logarithmic else np.linspace
         return spaced(self.low, self.high, cells + 1)
 
     def values(self, rows: Rows, contact: int = 0) -> np.ndarray:
-        """Return the value of each row in the displayed unit."""
+        """Return the input's value in each row, in the displayed unit."""
         return self.factor * rows[self.columns[contact]]
 
 
 class PlotPlan(NamedTuple):
-    """Inputs, grid and looks for which statistics are accumulated."""
+    """Inputs, grid and scenario counts for which the statistics of a sweep are accumulated."""
 
-    per_contact: tuple[PlotInput, ...]  # up to two inputs with a column per contact; none if nothing varies
-    per_scenario: tuple[PlotInput, ...]  # the same inputs with one column per scenario
+    per_contact: tuple[PlotInput, ...]  # up to two inputs, with one column per contact
+    per_scenario: tuple[PlotInput, ...]  # the same inputs, with one column per scenario
     cells: int  # number of cells along an axis
-    looks: np.ndarray  # numbers of scenarios up to which failures are counted
-    contacts: tuple[ContactColumns, ...]
-    replicates: int
+    looks: np.ndarray  # ascending scenario counts at which the number of failures is stored
+    contacts: tuple[ContactColumns, ...]  # columns of error and status of every contact
+    replicates: int  # number of replicates of the sampling
 
 
 class PlotPoints(NamedTuple):
-    """Scenarios as points of a plot, in order of their index."""
+    """Scenarios that a plot shows as points, in ascending order of their index."""
 
-    index: np.ndarray  # (points,)
-    inputs: np.ndarray  # (inputs, points)
-    size: np.ndarray  # worst |error|, infinite if a contact did not end (points,)
+    index: np.ndarray  # index of the scenario (points,)
+    inputs: np.ndarray  # inputs in displayed units (inputs, points)
+    size: np.ndarray  # worst |error| [1], infinite if a contact did not end (points,)
     failed: np.ndarray  # whether the scenario failed (points,)
 
 
 class PlotStatistics(NamedTuple):
-    """Accumulated statistics."""
+    """Statistics of the accumulated rows of a sweep, for plots."""
 
-    sizes: np.ndarray  # contacts per cell and bin of |error| (cells, ..., bins); infinity is in the last bin
+    # number of contacts per cell and bin of |error| (cells, ..., bins); the last bin includes infinity
+    sizes: np.ndarray
     points: PlotPoints
-    seen: np.ndarray  # scenarios between looks, per replicate (looks + 1, replicates)
-    failures: np.ndarray  # failed scenarios among `seen`
+    seen: np.ndarray  # number of scenarios between two looks, per replicate (looks + 1, replicates)
+    failures: np.ndarray  # number of failed scenarios between two looks, same shape as `seen`
 
     @property
     def scenarios(self) -> int:
@@ -104,9 +104,9 @@ class PlotStatistics(NamedTuple):
 
 
 def read_regions(store: SweepStore, mechanism: AnyMechanism) -> tuple[PlotPlan | None, PlotStatistics | None]:
-    """Return the statistics of the parts before the first missing one; None if that is the first.
+    """Accumulate the statistics of all chunks before the first missing chunk, reading one at a time.
 
-    One part is read at a time.
+    Return (None, None) if the first chunk is missing.
     """
     plan = regions = None
     for part in range(store.manifest.parts):
@@ -119,10 +119,10 @@ def read_regions(store: SweepStore, mechanism: AnyMechanism) -> tuple[PlotPlan |
 
 
 def plan_statistics(manifest: Manifest, mechanism: AnyMechanism, rows: Rows) -> PlotPlan:
-    """Plan the statistics over stiffness and force delay, if drawn.
+    """Choose two inputs, a grid and scenario counts for the statistics of a sweep.
 
-    Otherwise the inputs are those with the strongest rank correlation with |error| among `rows`, the first
-    part.
+    The inputs are contact stiffness and force delay. If one of them is not drawn, the input whose rank
+    correlation with |error| is strongest in `rows`, the first chunk, replaces it.
     """
     size = compute_error_sizes(rows)
     strengths = {
@@ -151,7 +151,7 @@ def plan_statistics(manifest: Manifest, mechanism: AnyMechanism, rows: Rows) -> 
 
 
 def build_empty_statistics(plan: PlotPlan) -> PlotStatistics:
-    """Return the statistics of no scenarios."""
+    """Return statistics that contain no scenarios yet."""
     inputs = len(plan.per_contact)
     empty = np.empty(0)
     points = PlotPoints(empty.astype(np.int64), np.empty((inputs, 0)), empty, empty.astype(bool))
@@ -161,9 +161,9 @@ def build_empty_statistics(plan: PlotPlan) -> PlotStatistics:
 
 
 def add_to_statistics(plan: PlotPlan, regions: PlotStatistics, rows: Rows) -> PlotStatistics:
-    """Return the statistics with more rows.
+    """Return the statistics with further rows added.
 
-    The rows need the inputs, `index`, `error_*`, `status_*`, `worst_error`, `outcome` and `failed`.
+    `rows` must contain the inputs, `index`, `error_*`, `status_*`, `worst_error`, `outcome` and `failed`.
     """
     index, failed = rows["index"], rows["failed"]
     inputs = np.array([quantity.values(rows) for quantity in plan.per_scenario])
@@ -184,21 +184,21 @@ def add_to_statistics(plan: PlotPlan, regions: PlotStatistics, rows: Rows) -> Pl
 
 
 def compute_error_quantile(sizes: np.ndarray, order: float, least: int) -> np.ndarray:
-    """Return the quantile of |error| from bin counts along the last axis of `sizes`, within 0.5 %.
+    """Estimate the quantile of order `order` of |error|, with a relative accuracy of 0.5 %.
 
-    It is at least the first edge of the bins, so that its logarithm is finite, and NaN if fewer than `least`
-    errors were counted.
+    The last axis of `sizes` holds the counts per bin. The quantile is at least the lowest edge of the bins,
+    so that its logarithm is finite. It is NaN if the counts sum to less than `least`.
     """
     values = np.maximum(binned_estimate(sizes, order), BIN_EDGES[0])
     return np.where(np.sum(sizes, axis=-1) >= least, values, np.nan)
 
 
 def _count_errors(plan: PlotPlan, rows: Rows, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the counts of contacts per cell and bin of |error|."""
+    """Count the contacts of the rows in each cell of the grid and each bin of |error|."""
     counts = np.zeros(int(np.prod(shape)), np.int64)
     good = np.ones(len(rows["index"]), bool)
     for contact, slot in enumerate(plan.contacts):
-        # A contact that did not end counts as an infinite error, and later contacts do not count.
+        # A contact that did not end counts as an infinite error. Later contacts of the scenario do not count.
         counted = good
         good = good & (rows[slot.status] == CONTACT_STATUSES.index(CONTACT_STATUS_NAMES[OK]))
         size = np.where(good, np.abs(rows[slot.error].astype(float)), np.inf)
@@ -213,7 +213,7 @@ def _count_errors(plan: PlotPlan, rows: Rows, shape: tuple[int, ...]) -> np.ndar
 
 
 def _select_first_points(points: PlotPoints) -> PlotPoints:
-    """Return the first `MAX_POINTS` points and the first `MAX_FAILED_POINTS` failed ones."""
+    """Select the first `MAX_POINTS` points and the first `MAX_FAILED_POINTS` failed points, by index."""
     order = np.argsort(points.index, kind="stable")
     failed = points.failed[order]
     selected = order[
@@ -225,7 +225,10 @@ def _select_first_points(points: PlotPoints) -> PlotPoints:
 def _compute_rank_correlations(
     mechanism: AnyMechanism, path: str, rows: Rows, size: np.ndarray
 ) -> np.ndarray:
-    """Return |rank correlation| (Spearman 1904) of each entry with `size`; NaN if the entry does not vary."""
+    """Return the magnitude of Spearman's rank correlation (1904) of each entry of an input with `size`.
+
+    It is NaN for an entry that does not vary.
+    """
     _, low, high = _find_input_range(mechanism, path)
 
     def ranks(values: np.ndarray) -> np.ndarray:
@@ -242,7 +245,7 @@ def _compute_rank_correlations(
 
 
 def _find_input_range(mechanism: AnyMechanism, path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return nominal value, low end and high end of each entry of an input."""
+    """Return the nominal value and the quantiles `END_PROBABILITIES` of each entry of an input."""
     points = np.repeat(
         np.array(END_PROBABILITIES)[:, None], sum(count_dimensions(mechanism).values()), axis=1
     )
@@ -252,7 +255,7 @@ def _find_input_range(mechanism: AnyMechanism, path: str) -> tuple[np.ndarray, n
 
 
 def _build_contact_input(mechanism: AnyMechanism, path: str) -> PlotInput:
-    """Return the input with a column per contact; a list of values has one entry per contact."""
+    """Describe an input with one column per contact; contacts may use different entries of a list."""
     names, (_, low, high) = list_input_columns(mechanism, path), _find_input_range(mechanism, path)
     contacts = range(len(list_contact_columns(mechanism)))
     listed = path == PHASE_KEY or (
@@ -272,9 +275,9 @@ def _build_contact_input(mechanism: AnyMechanism, path: str) -> PlotInput:
 
 
 def _build_scenario_input(mechanism: AnyMechanism, path: str, entry: int) -> PlotInput:
-    """Return the input with one column per scenario, that of an entry.
+    """Describe an input with one column per scenario, which holds entry `entry` of the input.
 
-    If all entries are drawn together, the value is shown relative to nominal, which applies to all.
+    If all entries are drawn together, the plot shows their common ratio to the nominal values.
     """
     names, (nominal, low, high) = list_input_columns(mechanism, path), _find_input_range(mechanism, path)
     name = INPUT_LABELS.get(path, path)

@@ -1,7 +1,7 @@
-"""Scenarios at selected points of the unit box of all uncertain numbers, run by a sweep's program.
+"""Runs of scenarios that a study selects as points in the unit cube of all uncertain numbers.
 
-They run in pieces, in this process or on the workers of a cluster. Each finished piece is cached, since its
-result depends only on the sweep and its points.
+The points run in batches with the program of a sweep, in this process or on the workers of a cluster. Each
+finished batch is cached, since its result depends only on the sweep and the points.
 """
 
 import hashlib
@@ -16,26 +16,26 @@ from tuning.caches.checkpoints import NO_CHECKPOINTS, Checkpoints
 from tuning.sweeps.chunks import Rows, SweepProgram, convert_precision
 from tuning.sweeps.columns import build_rows
 
-MIN_POINTS_PER_BATCH = 256  # least number of points per piece if there are several
+MIN_POINTS_PER_BATCH = 256  # smallest number of points per batch if there are several batches
 POINT_COLUMNS = ("outcome", "worst_error")
 
 CountCallback = Callable[[int], None]  # called with a number of scenarios
 
 
 class PointBatch(NamedTuple):
-    """Piece of the points to run."""
+    """Points of the unit cube that run together."""
 
     name: str  # unique name, from the digest of points and noise
-    points: Float[np.ndarray, "number inputs"]  # points of the unit box
-    noise: Int[np.ndarray, "number"]  # indices of the noise realisations
+    points: Float[np.ndarray, "number inputs"]  # coordinates from 0 to 1
+    noise: Int[np.ndarray, "number"]  # index of the noise realisation of each point
 
 
-# Runs pieces and yields their names and rows in any order.
+# Runs batches and yields their names and rows in any order.
 PointComputer = Callable[[SweepProgram, Iterable[PointBatch]], Iterator[tuple[str, Rows]]]
 
 
 def run_batch(sweep: SweepProgram, points: np.ndarray, noise: np.ndarray) -> Rows:
-    """Compute `POINT_COLUMNS` of the scenarios at the points, at most a chunk, in order."""
+    """Run the scenarios at the points, at most as many as a chunk; return `POINT_COLUMNS` for each."""
     manifest = sweep.manifest
     scenarios = sweep.model.scenarios(sweep.mechanism, draw_at_points(sweep.mechanism, points), manifest.seed)
     key = np.stack([scenarios.key[0], noise.astype(np.uint32)])
@@ -45,19 +45,19 @@ def run_batch(sweep: SweepProgram, points: np.ndarray, noise: np.ndarray) -> Row
     return {name: rows[name] for name in POINT_COLUMNS}
 
 
-def run_locally(sweep: SweepProgram, pieces: Iterable[PointBatch]) -> Iterator[tuple[str, Rows]]:
-    """Run pieces one after the other in this process."""
-    return ((piece.name, run_batch(sweep, piece.points, piece.noise)) for piece in pieces)
+def run_locally(sweep: SweepProgram, batches: Iterable[PointBatch]) -> Iterator[tuple[str, Rows]]:
+    """Run batches one after the other in this process."""
+    return ((batch.name, run_batch(sweep, batch.points, batch.noise)) for batch in batches)
 
 
 class PointRunSettings(NamedTuple):
-    """Settings with which points are run."""
+    """Settings for running the points of a study: progress, cache and computer."""
 
-    done: CountCallback = lambda _: None  # called with the number of scenarios that were run
-    found: CountCallback = lambda _: None  # called with the number of scenarios that were in the cache
-    kept: Checkpoints = NO_CHECKPOINTS  # cache of finished pieces
-    computer: PointComputer = run_locally
-    several: int = 1  # number of pieces if there are at least `MIN_POINTS_PER_BATCH` points for each
+    report_computed: CountCallback = lambda _: None  # called with the number of scenarios of each new batch
+    report_cached: CountCallback = lambda _: None  # called with the number of scenarios of each cached batch
+    checkpoints: Checkpoints = NO_CHECKPOINTS  # cache of finished batches
+    computer: PointComputer = run_locally  # runs the batches that are not in the cache
+    max_batches: int = 1  # largest number of batches, if the chunk size permits
 
 
 LOCAL_RUN = PointRunSettings()
@@ -66,27 +66,28 @@ LOCAL_RUN = PointRunSettings()
 def run_points(
     sweep: SweepProgram, points: np.ndarray, noise: np.ndarray, running: PointRunSettings = LOCAL_RUN
 ) -> Rows:
-    """Compute `POINT_COLUMNS` of the scenarios at points (number, inputs) of the unit box, in order.
+    """Run the scenarios at points (number, inputs) of the unit cube; return `POINT_COLUMNS` for each.
 
-    `noise` (number,) holds indices of realisations. Results do not depend on the pieces, to the bit.
+    `noise` (number,) holds the index of each scenario's noise realisation. The division into batches does not
+    change a bit of the result.
     """
     number, label = len(points), sweep.manifest.sha256
-    size = min(sweep.manifest.chunk, max(MIN_POINTS_PER_BATCH, -(-number // running.several)))
-    cuts = (slice(begin, begin + size) for begin in range(0, number, size))
-    order = [_build_batch(points[cut], noise[cut]) for cut in cuts]
-    pieces = {piece.name: piece for piece in order}
+    size = min(sweep.manifest.chunk, max(MIN_POINTS_PER_BATCH, -(-number // running.max_batches)))
+    slices = (slice(begin, begin + size) for begin in range(0, number, size))
+    order = [_build_batch(points[part], noise[part]) for part in slices]
+    batches = {batch.name: batch for batch in order}
     rows: dict[str, Rows] = {}
-    for name, piece in pieces.items():
-        cached = running.kept.read(name, (label, piece), dict[str, np.ndarray])
+    for name, batch in batches.items():
+        cached = running.checkpoints.read(name, (label, batch), dict[str, np.ndarray])
         if cached is not None:
             rows[name] = cached
-            running.found(len(piece.points))
-    missing = [piece for name, piece in pieces.items() if name not in rows]
+            running.report_cached(len(batch.points))
+    missing = [batch for name, batch in batches.items() if name not in rows]
     for name, computed in running.computer(sweep, missing) if missing else ():
-        running.kept.write(name, (label, pieces[name]), computed)
+        running.checkpoints.write(name, (label, batches[name]), computed)
         rows[name] = computed
-        running.done(len(pieces[name].points))
-    return {column: np.concatenate([rows[piece.name][column] for piece in order]) for column in POINT_COLUMNS}
+        running.report_computed(len(batches[name].points))
+    return {column: np.concatenate([rows[batch.name][column] for batch in order]) for column in POINT_COLUMNS}
 
 
 def _build_batch(points: np.ndarray, noise: np.ndarray) -> PointBatch:

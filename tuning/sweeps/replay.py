@@ -1,4 +1,4 @@
-"""Replay of one scenario of a store, identical to the bit, and its motion at every tick."""
+"""Replay of one stored scenario: a recomputed row, identical to the bit, and the motion at every tick."""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 
 class ScenarioReplay(NamedTuple):
-    """Stored and recomputed row of a scenario."""
+    """Stored row and recomputed row of one scenario."""
 
     sweep: SweepProgram
     stored: dict[str, np.ndarray]  # stored row, arrays of length 1
-    again: dict[str, np.ndarray]  # recomputed row
+    again: dict[str, np.ndarray]  # recomputed row, arrays of length 1
     different_columns: list[str]  # names of the columns that differ
 
 
 def replay_scenario(store: SweepStore, index: int) -> ScenarioReplay:
-    """Run scenario `index` again, alone, in the program that ran its chunk.
+    """Run scenario `index` again with the sweep's program, and compare the row with the stored row.
 
-    Raise `InputError` for an index that the store does not hold.
+    Raise `InputError` if the store does not contain the index.
     """
     stored = read_row(store, index)
     sweep = build_sweep(store.manifest)
@@ -39,7 +39,7 @@ def replay_scenario(store: SweepStore, index: int) -> ScenarioReplay:
 
 
 def compute_motion(sweep: SweepProgram, index: int) -> list[RunMotion]:
-    """Return the motion of a one-axis scenario at every tick, for plots, in float64."""
+    """Compute the motion of a one-axis scenario at every tick, in float64, for plots."""
     loaded = load_gains(sweep.manifest)
     gains: Any = {name: np.full(1, value) for name, value in loaded.gains.items()}
     lane = jax.tree.map(np.asarray, _draw_scenario(sweep, index))
@@ -47,7 +47,7 @@ def compute_motion(sweep: SweepProgram, index: int) -> list[RunMotion]:
 
 
 def record_six_axes(sweep: SweepProgram, index: int) -> "Recorded":
-    """Record every tick of a six-axis scenario."""
+    """Compute the motion of a six-axis scenario at every tick."""
     from jaxhil.sixdof.recording import record_scenario
 
     assert isinstance(sweep.mechanism, SixAxisMechanism)
@@ -56,6 +56,6 @@ def record_six_axes(sweep: SweepProgram, index: int) -> "Recorded":
 
 
 def _draw_scenario(sweep: SweepProgram, index: int) -> Any:
-    """Return the scenario as a batch of one lane, in float64."""
+    """Draw scenario `index` as a batch with a single lane, in float64."""
     manifest = sweep.manifest
     return draw_scenarios(sweep.mechanism, manifest.sampling, manifest.seed, index, 1)[1]

@@ -1,11 +1,11 @@
-"""Computation of the parts that a sweep's store lacks, in this process or by a cluster.
+"""Run of a sweep: computation of all chunks that are missing in its store, in this process or on a cluster.
 
-The rows do not depend on where they are computed. After an interruption the store holds the parts that were
-written, and another run computes the missing ones.
+After an interruption, another run computes only the missing chunks. The rows do not depend on interruptions
+or on the computer.
 
-A sweep with `until_width` evaluates its parts in order of their numbers, whenever they are computed. It ends
-with the first part after which the interval is narrow enough, and removes later parts. The end depends on the
-rows only.
+A sweep with `until_width` ends with the first chunk after which the confidence interval is narrow enough. The
+chunks are evaluated in the order of their numbers, even if they finish in another order, so that the end
+depends on the rows only. Later chunks are removed.
 """
 
 from collections.abc import Callable, Generator, Iterable
@@ -22,30 +22,34 @@ from tuning.sweeps.tally import Tally, add_to_tally, build_empty_tally
 
 COMPARED_SCENARIOS = 4096  # number of scenarios that a float32 sweep also runs in float64
 
-# Called with the number of rows of a part, found or computed, and the tally so far.
+# Called after each chunk with the chunk's number of rows and the tally of all chunks so far.
 ChunkProgress = Callable[[int, Tally], None]
-# Computes parts of a sweep and yields their numbers and rows in any order.
+# Computes chunks of a sweep, given their numbers; yields each number with the rows, in any order.
 ChunkComputer = Callable[[SweepProgram, Iterable[int]], Generator[tuple[int, Rows], None, None]]
 
 
 class PrecisionComparison(NamedTuple):
-    """Comparison of float32 with float64 on the first scenarios of a sweep."""
+    """Comparison of float32 with float64 results on the first scenarios of a sweep.
 
-    scenarios: int  # number of scenarios
-    largest_difference: float | None  # of a contact's error [1] if it ended in both; None if none did
-    median_difference: float | None  # of the same [1]
-    changed_outcomes: int  # number of scenarios with another outcome
-    failed_float32: int
-    failed_float64: int
+    Differences are magnitudes, over all contacts that ended in both precisions; None if there is no such
+    contact.
+    """
+
+    scenarios: int  # number of compared scenarios
+    largest_difference: float | None  # largest difference of a contact's error [1]
+    median_difference: float | None  # median difference of a contact's error [1]
+    changed_outcomes: int  # number of scenarios whose outcome differs
+    failed_float32: int  # number of failed scenarios in float32
+    failed_float64: int  # number of failed scenarios in float64
 
 
 def run_sweep(
     store: SweepStore, found: ChunkProgress, computed: ChunkProgress, computer: ChunkComputer = run_chunks
 ) -> tuple[SweepProgram, Tally]:
-    """Compute and write every missing part, up to the end of the sweep; return the sweep and its tally.
+    """Compute and write all missing chunks of a sweep; return the sweep's program and tally.
 
-    `found` is called for stored parts, `computed` for new ones. Raise `InputError` if a part cannot be
-    written or a cluster cannot be reached.
+    `found` is called for every stored chunk, `computed` for every new chunk. Raise `InputError` if a chunk
+    cannot be written or a cluster cannot be reached.
     """
     manifest = store.manifest
     sweep = build_sweep(manifest)
@@ -67,7 +71,7 @@ def run_sweep(
 
 
 def compare_precisions(sweep: SweepProgram, number: int = COMPARED_SCENARIOS) -> PrecisionComparison:
-    """Compare float32 with float64 on the first `number` scenarios."""
+    """Run the first `number` scenarios of a sweep in float32 and in float64, and compare the results."""
     number = min(number, sweep.manifest.chunk, sweep.manifest.scenarios)
     single, double = (run_chunk(sweep, 0, number, precision) for precision in ("float32", "float64"))
     names = [slot.error for slot in list_contact_columns(sweep.mechanism)]
@@ -84,7 +88,7 @@ def compare_precisions(sweep: SweepProgram, number: int = COMPARED_SCENARIOS) ->
 
 
 def count_outcomes(tally: Tally) -> dict[str, int]:
-    """Return the number of scenarios of each outcome that occurred."""
+    """Return the number of scenarios of each outcome that occurred at least once."""
     return {name: count for name, count in zip(SCENARIO_OUTCOMES, tally.outcomes, strict=True) if count}
 
 
@@ -95,14 +99,14 @@ def _run_until_narrow(
     computed: ChunkProgress,
     computer: ChunkComputer,
 ) -> Tally:
-    """Run a sweep with `until_width`; return the tally of the parts up to its end."""
+    """Run a sweep that ends at the width `until_width`; return the tally of the chunks up to the end."""
     manifest = store.manifest
     tally = build_empty_tally(manifest.replicates, manifest.scenarios, looked_at=True)
     width: Any = manifest.until_width
     following, new = 0, set()
 
     def look(rows: Rows) -> bool:
-        """Add the following part; return whether it is the last."""
+        """Add the rows of the next chunk to the tally; return whether the sweep ends with this chunk."""
         nonlocal tally, following
         tally = add_to_tally(tally, rows)
         report = computed if following in new else found
@@ -112,7 +116,7 @@ def _run_until_narrow(
         return is_narrow_enough(tally.looks, width) or following == manifest.parts
 
     def look_at_stored() -> bool:
-        """Add the stored parts up to the first missing one; return whether the last part was among them."""
+        """Add stored chunks up to the first missing one; return whether the sweep ends with one of them."""
         while (rows := read_chunk(store, following)) is not None:
             if look(rows):
                 return True
@@ -124,7 +128,7 @@ def _run_until_narrow(
             for part, rows in parts:
                 write_chunk(store, part, rows)
                 new.add(part)
-                # A cluster computes parts in any order; an early one waits in the store.
+                # A cluster can finish a later chunk first; that chunk waits in the store.
                 if part == following and (look(rows) or look_at_stored()):
                     break
     remove_chunks(store, following)

@@ -6,12 +6,11 @@
     DIR/verdict.json
     DIR/studies/drivers-1024.json, ... (`tuning.sweeps.stored_studies`)
 
-`DIR/parts` is a Parquet dataset for pandas, DuckDB or Arrow; units are in the fields' metadata. Parts are
-written atomically (under another name, flushed to disk, then renamed) and have a checksum
-(`tuning.sweeps.chunk_file`). After any interruption the same code can compute the missing parts, and the rows
-are those of an uninterrupted sweep.
+`DIR/parts` is a Parquet dataset for pandas, DuckDB or Arrow, with units in the metadata of its fields. Chunk
+files are written atomically and have a checksum (`tuning.sweeps.chunk_file`). After an interruption, the same
+code computes the missing chunks; the rows equal those of an uninterrupted sweep.
 
-A folder that holds other files than a store is never changed.
+A folder that holds files other than a store is never changed.
 """
 
 import os
@@ -54,33 +53,35 @@ CHUNK_FILE_PATTERN = re.compile(r"part-(\d{6,})\.parquet")
 
 
 class SweepStore(NamedTuple):
-    """Open store."""
+    """Folder of a sweep's store, with the manifest."""
 
     folder: Path
     manifest: Manifest
 
     def chunk_path(self, part: int) -> Path:
-        """Return the path of a part's file."""
+        """Return the path of the file of chunk number `part`."""
         return self.folder / CHUNK_FOLDER / f"part-{part:06d}.parquet"
 
 
 def open_store(folder: Path, manifest: Manifest, resume: bool) -> SweepStore:
-    """Create the store of `manifest`, or with `resume` open the existing one.
+    """Create a store for `manifest`, or open the existing store if `resume` is true.
 
-    Temporary files of an interrupted run are removed. Raise `InputError` if the folder holds a store that is
-    not to be resumed, or other files, if its store was made with other inputs or by other code, or if it
-    cannot be written.
+    Remove temporary files of an interrupted run.
+
+    Raises:
+        InputError: the folder holds a store but `resume` is false, the store comes from other inputs or other
+            code, the folder holds other files, or the folder cannot be written.
     """
     where = to_one_line(str(folder))
     exists = _is_store(folder)
     if exists and not resume:
-        raise InputError(f"{where}: found a sweep, expected an empty folder, or --resume")
+        raise InputError(f"{where}: found a sweep, expected an empty folder, or --resume to continue it")
     old = read_manifest(folder) if exists else None
     if old and (differing := list_input_differences(old, manifest)):
         raise InputError(f"{where}: was made with other inputs: {'; '.join(differing[:3])}")
     if old and (differing := list_code_differences(old, manifest)):
-        allowed = "a new folder, or --resume with the version that made this one"
-        raise InputError(f"{where}: was made by other code: {'; '.join(differing[:2])}: expected {allowed}")
+        allowed = "a new folder, or --resume with the version that wrote this store"
+        raise InputError(f"{where}: was made by other code: {'; '.join(differing[:2])}; expected {allowed}")
     with report_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     with report_write_errors(folder / CHUNK_FOLDER):
@@ -95,15 +96,15 @@ def open_store(folder: Path, manifest: Manifest, resume: bool) -> SweepStore:
 
 
 def read_store(folder: Path) -> SweepStore:
-    """Open the existing store in `folder`; raise `InputError` if there is none."""
+    """Open the existing store in `folder`; raise `InputError` if its manifest is missing or invalid."""
     return SweepStore(folder, read_manifest(folder))
 
 
 @contextmanager
 def lock_store(folder: Path) -> Iterator[None]:
-    """Lock the store for writing.
+    """Lock the store in `folder` against other writing processes, during a `with` block.
 
-    Raise `InputError` if another process holds the lock or the folder holds other files than a store.
+    Raise `InputError` if another process holds the lock or the folder holds files other than a store.
     """
     _is_store(folder)
     with report_write_errors(folder):
@@ -113,21 +114,24 @@ def lock_store(folder: Path) -> Iterator[None]:
             try:
                 locks.enter_context(lock_file(folder / LOCK_FILE))
             except BlockingIOError:
-                reason = "another sweep is writing to this store"
+                reason = "found another sweep that is writing, expected none; wait until it ends"
                 raise InputError(f"{to_one_line(str(folder))}: {reason}") from None
         yield
 
 
 def write_chunk(store: SweepStore, part: int, rows: Mapping[str, np.ndarray]) -> None:
-    """Write a part atomically; raise `InputError` if it cannot be written."""
+    """Write the file of chunk number `part` atomically; raise `InputError` if writing fails."""
     path = store.chunk_path(part)
-    # The next part is prepared on the other half of the cores at the same time.
+    # Meanwhile the next chunk is prepared on the other half of the cores.
     with use_half_the_cores(1), report_write_errors(path):
         write_atomically(path, encode_chunk(store.manifest, rows))
 
 
 def read_chunk(store: SweepStore, part: int) -> dict[str, np.ndarray] | None:
-    """Read the rows of a part; return None if it is missing, damaged, or of another sweep."""
+    """Read the rows of chunk number `part`.
+
+    Return None if the file is missing, damaged or from another sweep.
+    """
     try:
         with open_regular(store.chunk_path(part)) as file:
             content = file.read()
@@ -137,29 +141,29 @@ def read_chunk(store: SweepStore, part: int) -> dict[str, np.ndarray] | None:
 
 
 def read_intact_chunk(store: SweepStore, part: int) -> dict[str, np.ndarray] | None:
-    """Read the rows of a part; return None if it is missing.
+    """Read the rows of chunk number `part`; return None if the file is missing.
 
-    Raise `InputError` if it is damaged or of another sweep.
+    Raise `InputError` if the file is damaged or from another sweep.
     """
     rows, path = read_chunk(store, part), store.chunk_path(part)
     if rows is None and os.path.lexists(path):
-        reason = "found damage, or a part of something else, expected as it was written"
+        reason = "found a damaged file or one of another sweep, expected a file of this sweep"
         raise InputError(
             f"{to_one_line(str(store.folder))}: {CHUNK_FOLDER}/{path.name}: {reason} (`jaxhil sweep "
-            "--resume` makes it)"
+            "--resume` writes it again)"
         )
     return rows
 
 
 def write_verdict(store: SweepStore, document: Mapping[str, Any]) -> None:
-    """Write the verdict atomically; raise `InputError` if it cannot be written."""
+    """Write the sweep's verdict as a JSON file, atomically; raise `InputError` if writing fails."""
     path = store.folder / VERDICT_FILE
     with report_write_errors(path):
         write_atomically(path, terminal.format_json(document).encode("ascii"))
 
 
 def remove_chunks(store: SweepStore, first: int) -> None:
-    """Remove the parts from number `first` on; raise `InputError` if one cannot be removed."""
+    """Remove the files of chunk number `first` and all later chunks; raise `InputError` if this fails."""
     with report_write_errors(store.folder / CHUNK_FOLDER), os.scandir(store.folder / CHUNK_FOLDER) as entries:
         for entry in entries:
             name = CHUNK_FILE_PATTERN.fullmatch(entry.name)
@@ -168,7 +172,10 @@ def remove_chunks(store: SweepStore, first: int) -> None:
 
 
 def read_row(store: SweepStore, index: int) -> dict[str, Any]:
-    """Read one row, arrays of length 1; raise `InputError` for an index that the store does not hold."""
+    """Read the row of scenario `index`, as arrays of length 1.
+
+    Raise `InputError` if the store does not contain this scenario.
+    """
     manifest = store.manifest
     where = to_one_line(str(store.folder))
     if not 0 <= index < manifest.scenarios:
@@ -177,32 +184,32 @@ def read_row(store: SweepStore, index: int) -> dict[str, Any]:
     rows = read_intact_chunk(store, part)
     if rows is None:
         if manifest.until_width is not None:
-            raise InputError(f"{where}: index: found {index}, expected those before the sweep stopped")
+            raise InputError(f"{where}: index: found {index}, expected a scenario before the sweep's end")
         name = store.chunk_path(part).name
-        raise InputError(f"{where}: {CHUNK_FOLDER}/{name}: missing (`jaxhil sweep --resume` makes it)")
+        raise InputError(f"{where}: {CHUNK_FOLDER}/{name}: missing (`jaxhil sweep --resume` computes it)")
     return {name: values[row : row + 1] for name, values in rows.items()}
 
 
 def _is_store(folder: Path) -> bool:
-    """Return whether the folder holds a sweep's manifest; False if it is missing or empty.
+    """Return True if the folder holds a sweep's manifest, False if the folder is missing or empty.
 
-    An empty store without manifest counts as empty. Raise `InputError` if the folder holds other files or
-    cannot be read.
+    Lock file, temporary files and an empty chunk folder do not count. Raise `InputError` if the folder holds
+    other files or cannot be read.
     """
     try:
         names = set(os.listdir(folder)) if os.path.lexists(folder) else set()
         if MANIFEST_FILE in names:
             return True
-        foreign = names - {LOCK_FILE, CHUNK_FOLDER} or (
+        others = names - {LOCK_FILE, CHUNK_FOLDER} or (
             set(os.listdir(folder / CHUNK_FOLDER)) if CHUNK_FOLDER in names else set()
         )
-        foreign = {name for name in foreign if not is_temporary(name)}
+        others = {name for name in others if not is_temporary(name)}
     except OSError as error:
         reason = to_one_line(error.strerror or str(error), 100)
         raise InputError(f"{to_one_line(str(folder))}: cannot be read: {reason}") from None
-    if foreign:
-        allowed = "an empty folder, or a sweep's and --resume"
+    if others:
+        allowed = "an empty folder, or a sweep's folder and --resume"
         raise InputError(
-            f"{to_one_line(str(folder))}: found {format_value(min(foreign))} and no sweep, expected {allowed}"
+            f"{to_one_line(str(folder))}: found {format_value(min(others))} and no sweep, expected {allowed}"
         )
     return False

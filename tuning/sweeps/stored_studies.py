@@ -1,10 +1,11 @@
-"""Files of a sweep's studies in its store, as JSON that is read back exactly to the bit.
+"""JSON files of a sweep's studies in the sweep's store.
 
     DIR/studies/drivers-1024.json, rare-0.04-10x1000.json, ...
 
-The sweep's manifest and a few arguments determine a study to the bit. Its file (`schema = "jaxhil/study/1"`)
-holds both and a digest of its content. A file that is damaged or of another sweep is ignored, and the study
-can be run again. JSON has no non-finite numbers; null stands for the only one that a field can have.
+The sweep's manifest and a few arguments determine a study's result to the bit. The file of a study
+(`schema = "jaxhil/study/1"`) holds these arguments, the manifest's digest, the result and a digest of its own
+content. A file that is damaged or from another sweep is ignored, so that the study runs again. JSON cannot
+store infinity and NaN. Each field can have only one of these values, and null represents it.
 """
 
 import json
@@ -23,7 +24,7 @@ from tuning.sweeps.store import STUDY_FOLDER, SweepStore
 from tuning.sweeps.studies import SUBSET_REPLICATES, SUBSET_SAMPLES, ErrorIndices, InputIndices
 
 STUDY_SCHEMA = "jaxhil/study/1"
-# Value of null in the numbers of a record, and in fields that differ from their record.
+# number that null represents in each record, and in fields that differ from the rest of their record
 NULL_VALUES: dict[Any, float | None] = {
     InputIndices: math.nan,
     ErrorIndices: None,
@@ -33,16 +34,16 @@ FIELD_NULL_VALUES = {"thresholds": math.nan}
 
 
 class IndicesRequest(NamedTuple):
-    """Arguments of `tuning.sweeps.studies.error_indices`."""
+    """Arguments of the study `compute_error_indices`."""
 
-    number: int
+    number: int  # number of base samples, a power of two
 
 
 class RareFailureRequest(NamedTuple):
-    """Arguments of `tuning.sweeps.studies.rare_failure`."""
+    """Arguments of the study `estimate_rare_failure`."""
 
     limit: float  # limit of the restitution error [1]
-    samples: int = SUBSET_SAMPLES  # samples per level and replicate
+    samples: int = SUBSET_SAMPLES  # number of samples per level and replicate
     replicates: int = SUBSET_REPLICATES  # number of independent runs
 
 
@@ -51,7 +52,7 @@ StudyResult = ErrorIndices | SubsetSimulation
 
 
 def study_path(store: SweepStore, request: StudyRequest) -> Path:
-    """Return the path of the file of a study with these arguments."""
+    """Return the path of the file that stores the study with the arguments `request`."""
     if isinstance(request, IndicesRequest):
         return store.folder / STUDY_FOLDER / f"drivers-{request.number}.json"
     name = f"rare-{float(request.limit)!r}-{request.replicates}x{request.samples}.json"
@@ -59,7 +60,7 @@ def study_path(store: SweepStore, request: StudyRequest) -> Path:
 
 
 def write_study(store: SweepStore, request: StudyRequest, found: StudyResult) -> None:
-    """Write the result of a study; raise `InputError` if it cannot be written."""
+    """Write the result of a study to the store; raise `InputError` if writing fails."""
     path = study_path(store, request)
     with report_write_errors(path):
         content = encode_study(store.manifest, request, found)
@@ -68,7 +69,7 @@ def write_study(store: SweepStore, request: StudyRequest, found: StudyResult) ->
 
 
 def read_study(store: SweepStore, request: StudyRequest) -> Any:
-    """Read the result of a study; return None if it is missing, damaged, or of another sweep."""
+    """Read the result of a study; return None if the file is missing, damaged or from another sweep."""
     try:
         with open_regular(study_path(store, request)) as file:
             content = file.read(MAX_FILE_BYTES + 1)
@@ -78,14 +79,14 @@ def read_study(store: SweepStore, request: StudyRequest) -> Any:
 
 
 def encode_study(manifest: Manifest, request: StudyRequest, found: StudyResult) -> bytes:
-    """Return the content of a study's file; raise ValueError for values that JSON lacks."""
+    """Encode the result of a study as JSON; raise ValueError if null cannot represent a non-finite value."""
     document = {**_describe_study(manifest, request), "result": _convert_to_plain(found, None)}
     document["sha256"] = digest(document)
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode("ascii")
 
 
 def decode_study(manifest: Manifest, request: StudyRequest, content: bytes) -> Any:
-    """Return the result that `encode_study` encoded; None if the content is damaged or of another study."""
+    """Decode the result of a study; return None if the file is damaged or from another study."""
     kind = ErrorIndices if isinstance(request, IndicesRequest) else SubsetSimulation
     try:
         document = json.loads(content)
@@ -94,7 +95,7 @@ def decode_study(manifest: Manifest, request: StudyRequest, content: bytes) -> A
         result = _restore_records(kind, content_of_result, None)
         valid = valid and _convert_to_plain(result, None) == content_of_result
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError, msgspec.MsgspecError):
-        # A file of another program can be wrong in any way.
+        # A file that another program wrote can raise any of these errors.
         return None
     if not valid or document != _describe_study(manifest, request):
         return None
@@ -102,7 +103,7 @@ def decode_study(manifest: Manifest, request: StudyRequest, content: bytes) -> A
 
 
 def _describe_study(manifest: Manifest, request: StudyRequest) -> dict[str, Any]:
-    """Return the entries of a study's file besides its result and the digest."""
+    """Return the entries of a study's file that identify the study: all but result and digest."""
     return {
         "schema": STUDY_SCHEMA,
         "study": "drivers" if isinstance(request, IndicesRequest) else "rare",
@@ -114,7 +115,7 @@ def _describe_study(manifest: Manifest, request: StudyRequest) -> dict[str, Any]
 
 
 def _convert_to_plain(value: Any, null: float | None) -> Any:
-    """Convert records to mappings, arrays to lists, and the non-finite number `null` to None."""
+    """Convert records to dictionaries, arrays to lists, and the non-finite number `null` to None."""
     if hasattr(value, "_fields"):
         null = NULL_VALUES[type(value)]
         return {
@@ -131,7 +132,10 @@ def _convert_to_plain(value: Any, null: float | None) -> Any:
 
 
 def _restore_records(kind: Any, value: Any, null: float | None) -> Any:
-    """Convert the result of `_convert_to_plain` to a `kind`. Raise ValueError or TypeError on a misfit."""
+    """Convert plain data to a value of type `kind`; reverses `_convert_to_plain`.
+
+    Raise ValueError or TypeError if the data do not match the type.
+    """
     if hasattr(kind, "_fields"):
         hints, null = get_type_hints(kind), NULL_VALUES[kind]
         if value.keys() != hints.keys():
@@ -152,7 +156,7 @@ def _restore_records(kind: Any, value: Any, null: float | None) -> Any:
 
 
 def _has_matching_shapes(rare: SubsetSimulation, request: RareFailureRequest) -> bool:
-    """Return whether the shapes of the result's arrays agree with the request and with each other."""
+    """Return whether the shapes of the result's arrays match the request and each other."""
     shape = (request.replicates,)
     fits = rare.estimates.shape == rare.formula_coefficients.shape == rare.thresholds.shape[1:] == shape
     return fits and rare.worst_points.ndim == 2 and rare.worst_points.shape[:1] == rare.worst_values.shape

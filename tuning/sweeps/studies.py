@@ -1,7 +1,7 @@
 """Two studies of a sweep: Sobol indices of the uncertain inputs, and the probability of a rare failure.
 
-Both select scenarios as points of the unit box of all uncertain numbers, and run them in the sweep's program.
-The sensors' noise is a further uncertain input, whose realisation is selected by an index.
+Both studies select scenarios as points of the unit cube of all uncertain numbers, and run them with the
+sweep's program. Sensor noise is one more uncertain input; an index selects its realisation.
 """
 
 from typing import NamedTuple
@@ -25,48 +25,46 @@ from tuning.sweeps.point_batches import LOCAL_RUN, PointRunSettings, run_points
 from tuning.sweeps.tally import compute_error_sizes
 
 NOISE_INPUT = "sensor noise"
-KEY_SEPARATOR = " + "  # joins the keys that are one input
-CAP_IN_LIMITS = 10.0  # cap on |error| for Sobol indices, in multiples of the limit
-CAP_WITHOUT_LIMIT = 10.0  # cap on |error| [1] if there is no limit
-SUBSET_SAMPLES, SUBSET_REPLICATES = (
-    1000,
-    10,
-)  # subset simulation: samples per level and replicate, number of replicates
-# spread of replicates over the formula's, beyond which they found different failure regions
+KEY_SEPARATOR = " + "  # between the keys of correlated numbers, which together are one input
+CAP_IN_LIMITS = 10.0  # cap on |error| for Sobol indices, in multiples of the error limit
+CAP_WITHOUT_LIMIT = 10.0  # cap on |error| [1] if there is no error limit
+SUBSET_SAMPLES, SUBSET_REPLICATES = 1000, 10  # samples per level and replicate, number of replicates
+# Ratio of the observed spread of replicates to the spread that the formula predicts [1]; a larger ratio means
+# that the replicates found different failure regions.
 MAX_SPREAD_RATIO = 2.0
 
 
 class InputIndices(NamedTuple):
     """Sobol indices of an uncertain input, with 95 % intervals; NaN if the error does not vary."""
 
-    input: str  # its key, or the keys of correlated numbers, joined by `KEY_SEPARATOR`
-    first_order: float  # share of the variance without interactions [1]
-    first_order_low: float  # low end of the interval
-    first_order_high: float  # high end of the interval
-    total: float  # share of the variance with all interactions [1]
-    total_low: float  # low end of the interval
-    total_high: float  # high end of the interval
+    input: str  # key of the input, or the keys of correlated inputs, joined by `KEY_SEPARATOR`
+    first_order: float  # first-order index [1]: share of the variance without interactions
+    first_order_low: float  # low end of the first-order index's interval [1]
+    first_order_high: float  # high end of the first-order index's interval [1]
+    total: float  # total index [1]: share of the variance with all interactions
+    total_low: float  # low end of the total index's interval [1]
+    total_high: float  # high end of the total index's interval [1]
 
 
 class ErrorIndices(NamedTuple):
-    """Sobol indices of the worst |error| cut at `cap`."""
+    """Sobol indices of the worst |error| of a scenario, clipped at `cap`."""
 
     inputs: tuple[InputIndices, ...]  # in descending order of the total index
-    cap: float
+    cap: float  # largest |error| that the indices distinguish [1]
     evaluations: int  # number of scenarios that were run
-    capped: int  # number of scenarios that reached the cap or had no error
+    capped: int  # number of scenarios whose error was clipped or missing
 
 
 def compute_error_indices(
     sweep: SweepProgram, number: int, running: PointRunSettings = LOCAL_RUN
 ) -> ErrorIndices:
-    """Compute Sobol indices of the worst |error| from `number` (a power of two) x (inputs + 2) scenarios.
+    """Compute Sobol indices of the worst |error|, from `number` x (inputs + 2) scenarios.
 
-    An input is a key of the mechanism's uncertainty with all its entries. Correlated keys are one input,
-    since the indices assume independent inputs. The phases of all contacts are one input, and so is noise, if
-    there is any: rows of the design's matrix B have other realisations than those of A. An |error| beyond the
-    cap, or a run without an error, counts as the cap, so that a few diverging runs do not dominate the
-    variance.
+    `number` is a power of two. Each uncertain key of the mechanism file is one input, with all entries of a
+    list. Correlated keys are one input, since the indices assume independent inputs. The phases of all
+    contacts are one input, and so is sensor noise, which has other realisations in matrix B of the design
+    than in matrix A. A run whose |error| exceeds the cap, or that has no error, counts as the cap, so that a
+    few diverging runs do not dominate the variance.
     """
     inputs = group_independent_inputs(sweep.mechanism)
     names, entries = list(inputs), [len(columns) for columns in inputs.values()]
@@ -88,7 +86,7 @@ def compute_error_indices(
 
 
 def group_independent_inputs(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
-    """Return the columns of each input among those of `count_dimensions`; correlated keys are one input."""
+    """Return the indices of each input's dimensions in the unit cube; correlated keys are one input."""
     columns = count_dimensions(mechanism)
     ends = dict(zip(columns, np.cumsum(list(columns.values())), strict=True))
     group = {key: keys for keys in find_correlated_groups(mechanism) for key in keys}
@@ -101,9 +99,9 @@ def group_independent_inputs(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
 
 
 def count_most_scenarios(samples: int = SUBSET_SAMPLES, replicates: int = SUBSET_REPLICATES) -> int:
-    """Return the largest number of scenarios that `estimate_rare_failure` runs.
+    """Return the largest number of scenarios that `estimate_rare_failure` can run.
 
-    Each level but the first reuses a share of the scenarios of the level before.
+    Every level but the first reuses some scenarios of the previous level.
     """
     return replicates * (samples + (MAX_LEVELS - 1) * (samples - samples // CHAIN_LENGTH))
 
@@ -115,11 +113,11 @@ def estimate_rare_failure(
     samples: int = SUBSET_SAMPLES,
     replicates: int = SUBSET_REPLICATES,
 ) -> SubsetSimulation:
-    """Estimate the probability that a scenario fails, by subset simulation, with `limit` [1] on the error.
+    """Estimate the probability that a scenario fails, by subset simulation.
 
-    The performance is the worst |error|, infinite if the scenario fails for another reason. Every scenario
-    has its own realisation of the noise, which a chain accepts or rejects with the scenario. This is an
-    independent proposal of the noise, so that the chain keeps its distribution.
+    A scenario fails if its worst |error| exceeds `limit` [1], or for another reason, which counts as an
+    infinite error. Every proposed scenario has a new realisation of sensor noise. The Markov chain accepts or
+    rejects both together, so that its distribution is correct.
     """
     unlike, run = SCENARIO_OUTCOMES.index(UNLIKE_IDEAL), 0
 
@@ -135,7 +133,7 @@ def estimate_rare_failure(
 
 
 def is_spread_beyond_formula(rare: SubsetSimulation) -> bool:
-    """Return whether replicates differ by far more than the formula for one run's chains predicts."""
+    """Return whether the replicates of a subset simulation differ much more than the formula predicts."""
     return rare.coefficient_of_variation > MAX_SPREAD_RATIO * rare.formula_coefficient_of_variation
 
 

@@ -1,11 +1,11 @@
-"""Statistics of a running sweep: counts of outcomes, bins of errors, worst scenarios, and intervals.
+"""Statistics of a running sweep: counts of outcomes, histograms of errors, worst scenarios and intervals.
 
-A tally does not depend on the order of the parts, unless it is evaluated after each part in order to stop
-early. Its memory does not depend on the number of parts.
+A tally does not depend on the order of the chunks, unless the sweep can stop early. Its memory does not
+depend on the number of chunks.
 
-The replicates of Sobol sampling are compared at equal numbers of points. If the number of scenarios is no
-multiple of the number of replicates, the last few scenarios count as outcomes and among the worst, but
-neither in the probability nor in the quantiles.
+The replicates of Sobol sampling must have equal numbers of scenarios. If the number of scenarios is not a
+multiple of the number of replicates, the last few scenarios are counted in the outcomes and the worst
+scenarios, but not in the failure probability and the quantiles.
 """
 
 from collections.abc import Mapping
@@ -34,14 +34,14 @@ QUANTILE_ORDERS = (0.5, 0.95, 0.99, 0.999)
 
 
 class Tally(NamedTuple):
-    """Statistics of the scenarios so far."""
+    """Statistics of the scenarios that a sweep has computed so far."""
 
-    outcomes: tuple[int, ...]  # number of scenarios of each of `SCENARIO_OUTCOMES`
-    whole: int  # number of first scenarios that fill all replicates equally
-    replicates: tuple[tuple[int, int], ...]  # per replicate, scenarios and failures
-    errors: tuple[tuple[int, ...], ...]  # per replicate, error bins (`tuning.statistics.quantiles.counts`)
-    worst: tuple[tuple[int, float, int], ...]  # worst scenarios first: rank of the outcome, |error|, index
-    looks: SequentialState | None = None  # confidence sequence, if the tally is evaluated part by part
+    outcomes: tuple[int, ...]  # number of scenarios with each of `SCENARIO_OUTCOMES`
+    whole: int  # largest multiple of the number of replicates that does not exceed the number of scenarios
+    replicates: tuple[tuple[int, int], ...]  # number of scenarios and of failures in each replicate
+    errors: tuple[tuple[int, ...], ...]  # histogram of |error| in each replicate (`count_in_bins`)
+    worst: tuple[tuple[int, float, int], ...]  # (severity of the outcome, |error|, index), worst first
+    looks: SequentialState | None = None  # confidence sequence; None if the sweep cannot stop early
 
     @property
     def scenarios(self) -> int:
@@ -53,7 +53,7 @@ class Tally(NamedTuple):
 
     @property
     def left_out(self) -> int:
-        """Return the number of scenarios that are not in `replicates`."""
+        """Return the number of scenarios that `replicates` does not count."""
         return self.scenarios - sum(number for number, _ in self.replicates)
 
 
@@ -76,9 +76,10 @@ class QuantileEstimate(NamedTuple):
 
 
 def build_empty_tally(replicates: int, scenarios: int = MAX_SCENARIOS, looked_at: bool = False) -> Tally:
-    """Return the tally of no rows, for a sweep of `scenarios`.
+    """Return a tally without rows, for a sweep of `scenarios` scenarios.
 
-    With `looked_at`, rows are added in order of the index, and the interval is valid at any stopping time.
+    If `looked_at` is true, rows must be added in the order of their index; the confidence interval is then
+    valid even if the sweep stops early.
     """
     return Tally(
         (0,) * len(SCENARIO_OUTCOMES),
@@ -91,22 +92,22 @@ def build_empty_tally(replicates: int, scenarios: int = MAX_SCENARIOS, looked_at
 
 
 def add_to_tally(tally: Tally, rows: Mapping[str, np.ndarray]) -> Tally:
-    """Return the tally with more rows, which need `index`, `outcome`, `failed` and `worst_error`."""
+    """Return the tally with further rows, with columns `index`, `outcome`, `failed` and `worst_error`."""
     index, outcome, failed = rows["index"], rows["outcome"], rows["failed"]
     outcomes = np.bincount(outcome, minlength=len(SCENARIO_OUTCOMES))
     replicates, errors = _add_to_replicates(tally, rows)
     # Scenarios that are good or beyond the limit are ranked by their error only.
-    badness = np.where(outcome <= SCENARIO_OUTCOMES.index(BEYOND_LIMIT), 0, outcome)
+    severity = np.where(outcome <= SCENARIO_OUTCOMES.index(BEYOND_LIMIT), 0, outcome)
     error = np.nan_to_num(np.abs(rows["worst_error"].astype(float)), nan=-1.0, posinf=np.inf)
     # Only candidates for the worst scenarios are sorted.
-    size = np.where(badness > 0, np.inf, error)
+    size = np.where(severity > 0, np.inf, error)
     few = np.flatnonzero(
         size >= np.partition(size, -MAX_WORST_SCENARIOS)[-MAX_WORST_SCENARIOS]
         if len(size) > MAX_WORST_SCENARIOS
         else size >= -1
     )
-    first = few[np.lexsort((index[few], -error[few], -badness[few].astype(int)))[:MAX_WORST_SCENARIOS]]
-    worst = [(int(badness[i]), float(error[i]), int(index[i])) for i in first]
+    first = few[np.lexsort((index[few], -error[few], -severity[few].astype(int)))[:MAX_WORST_SCENARIOS]]
+    worst = [(int(severity[i]), float(error[i]), int(index[i])) for i in first]
     looks = tally.looks
     return Tally(
         tuple(a + int(b) for a, b in zip(tally.outcomes, outcomes, strict=True)),
@@ -129,11 +130,11 @@ def compute_error_sizes(rows: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def estimate_failure_probability(tally: Tally) -> ProbabilityEstimate:
-    """Estimate the probability that a scenario fails.
+    """Estimate the probability that a scenario fails, with a 95 % interval.
 
-    The interval (`tuning.statistics.intervals`) is `binomial_interval` for independent draws,
-    `replicate_interval` for Sobol replicates, 0 to 1 while these are of unequal size, and
-    `confidence_sequence` if the tally is evaluated part by part.
+    The method of the interval (`tuning.statistics.intervals`) is a confidence sequence if the sweep can stop
+    early, `binomial_interval` for independent draws, and `replicate_interval` for Sobol replicates. While the
+    Sobol replicates have unequal numbers of scenarios, the interval is 0 to 1.
     """
     numbers, failures = (np.array(column) for column in zip(*tally.replicates, strict=True))
     number = int(np.sum(numbers))
@@ -167,7 +168,7 @@ def estimate_error_quantiles(tally: Tally) -> list[QuantileEstimate]:
 
 
 def _add_to_replicates(tally: Tally, rows: Mapping[str, np.ndarray]):
-    """Return (scenarios, failures) and error bins of every replicate with the rows added."""
+    """Add the rows to the replicates; return (scenarios, failures) and the histogram of each replicate."""
     used = rows["index"] < tally.whole
     replicate = rows["index"][used] % len(tally.replicates)
     sizes, failed = compute_error_sizes(rows)[used], rows["failed"][used]
