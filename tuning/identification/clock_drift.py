@@ -72,8 +72,7 @@ def estimate_clock_drift(
 
     Raises:
         InputError: If there are too few contacts, if all contacts are at one time, or if the forces do not
-            follow
-            the motion.
+            follow the motion.
     """
     period, longest = timing.control_period, MAX_FORCE_DELAY + timing.control_period
     time = np.array([run.begin + period * run.tick[len(run.tick) // 2] for run in runs])

@@ -84,15 +84,13 @@ def condition_on_prior(draws: DrawsByKey, prior: Mechanism, frequency: float, se
     """Combine posterior draws with the normal marginals of a prior and their correlation.
 
     The result also contains parameters that only the prior determines: those of the simulator, and those in
-        the
-    prior's `[correlation]`.
+    the prior's `[correlation]`.
 
     Args:
         draws: Draws from the logs, by key.
         prior: Mechanism with `[uncertainty]`.
         frequency: Contact frequency [Hz]. An error of the simulator's phase delay at this frequency changes
-            the
-            estimated force delay.
+            the estimated force delay.
         seed: Seed of the random numbers.
 
     Raises:
@@ -138,7 +136,9 @@ def condition_on_prior(draws: DrawsByKey, prior: Mechanism, frequency: float, se
 def _update_draws(
     draws: np.ndarray, select: np.ndarray, values: np.ndarray, exact: bool = False
 ) -> np.ndarray:
-    """Return the draws after the update with further knowledge (see the module's text).
+    """Update posterior draws with further knowledge about linear combinations of the parameters.
+
+    The module's docstring gives the formula and the symbols.
 
     Args:
         draws: Draws theta_i, shape (parameters, draws).

@@ -262,7 +262,8 @@ def _drop_readings_near_edges(problem: ContactProblem, posterior: Posterior) -> 
 def _add_surface_uncertainty(posterior: Posterior, seed: int) -> Posterior:
     """Add the uncertainty of an assumed surface position to the posterior.
 
-    A surface further away lacks as much force as a dead zone removes: the readings determine only their sum.
+    A surface that is further away reduces the force like a dead zone. The readings determine only the sum of
+    both effects.
     """
     names, draws = posterior.names, posterior.draws.copy()
     # The first coefficient of every law is its stiffness at the surface.
@@ -311,7 +312,7 @@ def _estimate_clock_drift(
     law: Law | str | None,
     plane,
 ) -> ClockDrift:
-    """Estimate the drift of the force clock; unknown noise is assumed as a share of the largest force."""
+    """Estimate the drift of the force clock; if the noise is unknown, assume a share of the largest force."""
     if noise is None or noise.silent:
         readings = ForceReadings.of(runs, 1.0)
         readings = replace(readings, std=ASSUMED_NOISE_SHARE * float(np.abs(readings.force).max()))
@@ -327,10 +328,10 @@ def _has_dead_zone(posterior: Posterior) -> bool:
 
 
 def _is_silent_outside(runs: Sequence[LoggedRun], problem: ContactProblem, posterior: Posterior) -> bool:
-    """Return whether most readings before and after the contacts are exactly 0.
+    """Return whether most readings before and after the contacts are exactly 0, as with a dead zone.
 
-    Then the sensor has a dead zone. A fit does not show it if the surface is nearer than assumed, because the
-    readings then lack no force.
+    A fit does not show a dead zone if the surface is nearer than assumed, because the greater penetration
+    replaces the force that the dead zone removes.
     """
     delay, plane, _ = posterior.best
     position, _ = problem.motion.at(delay)

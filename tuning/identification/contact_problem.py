@@ -1,7 +1,8 @@
 """Linear least-squares fit of a contact law at a given force delay and surface position.
 
 The logged commands determine the motion of the mechanism (`motion`). For a given force delay and surface
-position, the predicted force is linear in the coefficients: stiffness, damping and the bias of the sensor.
+position ("plane"), the predicted force is linear in the coefficients: stiffness, damping and the bias of the
+sensor. The factors of the coefficients in this linear combination are the functions of the contact law.
 """
 
 from __future__ import annotations
@@ -35,40 +36,39 @@ from tuning.identification.sensor_filter import (
 )
 
 MAX_FORCE_DELAY = 0.02  # s, longest force delay in a search
-COARSE_DELAY_STEP = 0.0005  # s, between the delays of a first search
-MAX_NEWTON_STEPS = 6  # Newton steps for the plane
-MIN_LIKELIHOOD_GAIN = 2.0  # gain of log likelihood below which no further Newton step is taken
-STEP = 1e-7  # m, step of differences by the plane
-FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants after which a filter's response is below rounding
+COARSE_DELAY_STEP = 0.0005  # s, step between the delays of a first search
+MAX_NEWTON_STEPS = 6  # largest number of Newton steps in the search of a surface position
+MIN_LIKELIHOOD_GAIN = 2.0  # gain of log likelihood; a Newton step with a smaller gain is the last one
+STEP = 1e-7  # m, step of finite differences with respect to the surface position
+FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants; then the response of a filter is below rounding errors
 
 
 class _NearbyRows(NamedTuple):
     """Rows that are in contact for at least one of several surface positions ("planes")."""
 
     rows: np.ndarray  # (rows,), indices of the rows
-    depth: np.ndarray  # m, (planes, rows); 0 out of contact
-    rate: np.ndarray  # m/s, (rows,), rate of the depth
-    # (planes, coefficients, rows), the law's function for each coefficient except the bias
-    columns: np.ndarray
+    depth: np.ndarray  # m, (planes, rows), penetration; 0 out of contact
+    rate: np.ndarray  # m/s, (rows,), rate of the penetration
+    columns: np.ndarray  # (planes, coefficients, rows), functions of the law, without the bias
 
 
 class _Onsets(NamedTuple):
-    """Onsets of contact within control periods, which a sensor's lag has to integrate exactly."""
+    """Onsets of contact within control periods, with the weights of the forces in a lagged reading."""
 
     plane: np.ndarray  # (onsets,), index of the surface position
     row: np.ndarray  # (onsets,), index into `_NearbyRows.rows` of the row after the onset
-    columns: np.ndarray  # (coefficients, onsets), the law's functions just after the onset
+    columns: np.ndarray  # (coefficients, onsets), functions of the law just after the onset
     after: np.ndarray  # (onsets,), weight of the force just after the onset (`compute_onset_weights`)
     end: np.ndarray  # (onsets,), weight of the force at the end of the period
 
 
 class ContactProblem:
-    """Least-squares problem of a contact law for known motion of the mechanism.
+    """Least-squares problem that fits a contact law to force readings, for known motion of the mechanism.
 
-    The surface position `plane` [m] is None if it is estimated. Readings out of contact depend only on the
-    bias. Therefore three sums represent all these readings, and the law's functions are computed only near
-    contact. If the sensor has a lag (`time_constant` [s]) or the noise is coloured, the functions are
-    filtered like the readings.
+    The surface position `plane` [m] is None if the fit estimates it. Readings out of contact depend only on
+    the bias. Three sums therefore represent all these readings, and the functions of the law are computed
+    only near contact. If the sensor has a lag (`time_constant` [s]) or coloured noise, the functions are
+    filtered in the same way as the readings.
     """
 
     def __init__(
@@ -85,10 +85,11 @@ class ContactProblem:
         self.min_delay = -COARSE_DELAY_STEP * float(np.floor(max(motion.delay, 0.0) / COARSE_DELAY_STEP))
         self.plain = len(readings.whitening) == 1 and time_constant == 0.0
         self.kept = np.flatnonzero(readings.counts)
-        # Place of each row among those that are used, or -1; the last one is that of no row.
+        # Index of each row among the used rows, or -1 for an unused row. The additional last entry is -1,
+        # for the row index -1.
         self.places = np.full(readings.counts.size + 1, -1)
         self.places[self.kept] = np.arange(len(self.kept))
-        # Filters also need the rows that are not used.
+        # Filters also need the rows that fits do not use.
         self.where = self.kept if self.plain else np.arange(readings.counts.size)
         self.target = self.whiten(readings.force).ravel()[self.kept] / readings.std
         self.damping_indices = [i for i, name in enumerate(self.names) if name.startswith("damping")]
@@ -114,17 +115,18 @@ class ContactProblem:
         return [*numbered, *law.names[own_count:], "bias"]
 
     def whiten(self, values: np.ndarray) -> np.ndarray:
-        """Return values of shape (..., rows, lanes) with white noise, filtered along the rows."""
+        """Apply the whitening filter along the rows of an array (..., rows, lanes)."""
         return _whitened(values.swapaxes(-1, -2), self.readings.whitening).swapaxes(-1, -2)
 
     def changed(self, law: Law, time_constant: float) -> ContactProblem:
-        """Return the same problem with another law and another lag of the sensor [s]."""
+        """Return the same problem with another contact law and another time constant of the sensor [s]."""
         return ContactProblem(self.motion, self.readings, law, self.plane, time_constant)
 
     def at(self, delay: float, plane: float, pseudo: PseudoRows | None = None) -> CoefficientFit:
-        """Fit the coefficients at one delay [s] and plane [m], to the readings and to pseudo-rows.
+        """Fit the coefficients at one force delay [s] and surface position [m].
 
-        Rows in which the force of the law would be negative are treated as out of contact.
+        `pseudo` adds rows that represent further readings. Rows in which the force of the law would be
+        negative are treated as out of contact.
         """
         near, flags, fit = self._fit_until_consistent(delay, np.array([plane]), pseudo)
         (inner,) = self._make_fits(fit)
@@ -142,11 +144,11 @@ class ContactProblem:
     def fit_surfaces(
         self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None = None
     ) -> list[CoefficientFit]:
-        """Fit the coefficients at several planes at once, without derivatives by the plane."""
+        """Fit the coefficients at several surface positions [m], without derivatives by the position."""
         return self._make_fits(self._fit_until_consistent(delay, planes, pseudo)[2])
 
     def _fit_until_consistent(self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None):
-        """Fit at each plane, with the rows in contact updated until they agree with the fit.
+        """Fit the coefficients at each surface position, and update the rows in contact until both agree.
 
         Returns:
             The rows near contact, flags of the rows in contact, and the fit for each surface position.
@@ -166,7 +168,7 @@ class ContactProblem:
         return near, flags, fit
 
     def _make_fits(self, fit: LeastSquaresFit) -> list[CoefficientFit]:
-        """Return the fits of all planes as records, with the log posterior of each."""
+        """Return one record per surface position, with the fit and its log posterior."""
         coefficients, covariance, misfit = fit.coefficients, fit.covariance, fit.misfit
         allowed = sum(
             special.log_ndtr(coefficients[:, i] / np.sqrt(covariance[:, i, i])) for i in self.damping_indices
@@ -177,30 +179,30 @@ class ContactProblem:
         ]
 
     def _motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position [m] and rate [m/s] in the rows `where`, for each time in `before`."""
+        """Return position [m] and velocity [m/s] in the rows `where`, for each time in `before`."""
         if self._at is None or self._at[0] != delay:
             moved = self.motion_at(delay)
             self._at = delay, [(x.ravel()[self.where], v.ravel()[self.where]) for x, v in moved]
         return self._at[1]
 
     def motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position and rate at all rows, for each time in `before`."""
+        """Return position [m] and velocity [m/s] in all rows, for each time in `before`."""
         return [self.motion.at(delay + part * self.motion.period) for part in self.before]
 
     def onsets_between(self, delay: float, low: float, high: float) -> np.ndarray:
-        """Return the surface positions [m] from `low` to `high` at which another row enters the contact."""
+        """Return the surface positions [m] from `low` to `high` at which the rows in contact change."""
         position, rate = self._motion_at(delay)[0]
         return np.unique(position[(rate > 0.0) & (position > low) & (position < high)])
 
     def _near(self, position, rate, where, planes: np.ndarray) -> _NearbyRows:
-        """Return the rows that are in contact for at least one of the planes."""
-        # Differences by the plane need the rows that enter next.
+        """Return the rows that are in contact for at least one of the surface positions `planes` [m]."""
+        # Finite differences also need the rows that are in contact with a slightly nearer surface.
         rows = np.flatnonzero(position > planes.min() - (STEP if self.time_constant else 0.0))
         depth, rate = np.maximum(position[rows] - planes[:, None], 0.0), rate[rows]
         return _NearbyRows(rows, depth, rate, self._columns(depth, rate, where[rows]))
 
     def _columns(self, depth: np.ndarray, rate: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return the law's functions in the given rows, shape (planes, coefficients, rows)."""
+        """Compute the functions of the law in the given rows, shape (planes, coefficients, rows)."""
         own_columns, entries = self.law.entry_functions(depth, rate), self.readings.entries
         if len(entries) > 1:
             entry = self.readings.entry.ravel()[rows]
@@ -217,14 +219,15 @@ class ContactProblem:
         if coefficients is None or self.law.pulls or not self.damping_indices:
             return inside
         pushing = inside & (compute_force(coefficients, near.columns) > 0.0)
-        # With the wrong sign of the force the law pulls in most rows; keep them, so that the fit shows it.
+        # If the force has the wrong sign, the law pulls in most rows. These rows remain in contact, so that
+        # the fit shows the wrong sign.
         sound = 2 * pushing.sum(axis=1) > inside.sum(axis=1)
         return np.where(sound[:, None], pushing, inside)
 
     def _onsets(self, near: _NearbyRows, positions: list[np.ndarray], planes: np.ndarray) -> _Onsets | None:
-        """Return the onsets of contact within control periods, or None without a lag of the sensor.
+        """Find the onsets of contact within control periods; return None if the sensor has no lag.
 
-        `positions` [m] are those at all rows and half a period earlier.
+        `positions` holds the positions [m] in all rows, at the rows and half a period earlier.
         """
         if self.time_constant == 0.0:
             return None
@@ -238,19 +241,19 @@ class ContactProblem:
         return _Onsets(plane, row, columns, *compute_onset_weights(rate, left[plane, row]))
 
     def _packed(self, near: list[_NearbyRows]) -> PackedRows:
-        """Return the rows at which the filters respond to the rows near contact."""
+        """Return the rows in which filtered values depend on the rows near contact."""
         return pack_rows([part.rows for part in near], self.readings.force.shape, self.memory)
 
     def _filtered(self, near, tables: list[np.ndarray], onsets, first, where: PackedRows, whitening):
-        """Return columns as the sensor with its lag reads them, whitened, at packed rows.
+        """Apply the lag of the sensor and the whitening filter to the functions of the law.
 
         Args:
             near: Rows near contact, for each time in `before`.
             tables: Values of the functions in these rows, for each time in `before`.
-            onsets: Onsets of contact, or None without a lag.
+            onsets: Onsets of contact, or None if the sensor has no lag.
             first: Values of the functions just after the onsets, shape (functions, onsets), or None.
             where: Rows of the result.
-            whitening: Whitening filter of the noise.
+            whitening: Coefficients of the whitening filter.
         """
         full, places = [], [where.places(part.rows) for part in near]
         for columns, columns_in_table in zip(tables, places, strict=True):
@@ -268,7 +271,7 @@ class ContactProblem:
         return lagged
 
     def inside(self, delay: float, planes: np.ndarray) -> np.ndarray:
-        """Return the design at the used rows, (planes, coefficients, rows), if all rows are in contact."""
+        """Return the design matrix (planes, coefficients, used rows) of lanes that are always in contact."""
         tables, shape = [], self.readings.force.shape
         rows = np.arange(self.readings.force.size).reshape(shape).T.ravel()
         for position, rate in self.motion_at(delay):
@@ -292,11 +295,14 @@ class ContactProblem:
     def _design(
         self, near: list[_NearbyRows], flags: list[np.ndarray], onsets: _Onsets | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the design near contact, (planes, coefficients, rows), and the readings, over the noise."""
+        """Return the design matrix (planes, coefficients, rows) and the readings near contact.
+
+        Both are divided by the standard deviation of the noise.
+        """
         std, tables, first = self.readings.std, [], None
         for rows_near, flag in zip(near, flags, strict=True):
-            # The last column is that of the bias: 1 in rows in contact if there is a dead zone, else in all
-            # rows.
+            # The last column belongs to the bias. It is 1 in all rows or, if there is a dead zone, only in
+            # rows in contact.
             table = np.empty((len(flag), rows_near.columns.shape[1] + 1, len(rows_near.rows)))
             np.multiply(rows_near.columns, flag[:, None] / std, out=table[:, :-1])
             table[:, -1] = flag / std if self.local else 1.0 / std
@@ -314,9 +320,9 @@ class ContactProblem:
         return design, self.target[used[used >= 0]]
 
     def _solve(self, near, flags, onsets, pseudo: PseudoRows | None) -> LeastSquaresFit:
-        """Fit the coefficients at each plane to the rows in contact by `flags`, and to pseudo-rows."""
+        """Fit the coefficients at each surface position, with the rows in contact that `flags` marks."""
         design, target = self._design(near, flags, onsets)
-        # The rows that depend on the bias alone.
+        # number, sum and sum of squares of the readings that depend on the bias alone
         count, total, square = (
             full - part for full, part in zip(self.sums, sum_and_squares(target), strict=True)
         )
@@ -328,7 +334,7 @@ class ContactProblem:
     def _by_plane(
         self, delay: float, plane: float, coefficients, near: list[_NearbyRows], flag: np.ndarray
     ) -> np.ndarray:
-        """Return the predicted readings' derivative by the plane, over the noise, at the design's rows."""
+        """Return the derivative of the predicted readings by the surface position, divided by the noise."""
         scale = 2.0 * STEP * self.readings.std
         if self.time_constant:
             shifted = self._all_rows_near_contact(
@@ -351,7 +357,7 @@ class ContactProblem:
         return table[0, 0, self.places[where.rows] >= 0]
 
     def force(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
-        """Return the predicted readings [N], bias included, (rows, lanes)."""
+        """Return the predicted force readings [N], including the bias, (rows, lanes)."""
         moved = [(position.ravel(), rate.ravel()) for position, rate in self.motion_at(delay)]
         near, flags, onsets = self._all_rows_near_contact(moved, np.array([plane]), coefficients)
         where = self._packed(near)
@@ -361,7 +367,7 @@ class ContactProblem:
         return force if self.local else force + coefficients[-1]
 
     def _predicted(self, near, flags, onsets, coefficients, where: PackedRows, whitening) -> np.ndarray:
-        """Return the whitened readings at packed rows [N], without a bias of all rows, (planes, rows)."""
+        """Return the predicted and whitened force readings [N], (planes, rows), without a constant bias."""
         offset, first = self.local * coefficients[-1], None
         tables = [
             ((compute_force(coefficients, part.columns) + offset) * flag)[:, None]
@@ -381,10 +387,10 @@ class ContactProblem:
         return flags
 
     def _all_rows_near_contact(self, moved, planes: np.ndarray, coefficients: np.ndarray):
-        """Return the rows near contact, flags of the rows in contact, and the onsets, among all rows.
+        """Search all rows for contact; return rows near contact, flags of rows in contact, and onsets.
 
         Args:
-            moved: Position and rate in all rows, for each time in `before`.
+            moved: Position [m] and velocity [m/s] in all rows, for each time in `before`.
             planes: Surface positions [m].
             coefficients: Coefficients of the law.
         """
@@ -396,7 +402,7 @@ class ContactProblem:
         return near, flags, onsets
 
     def find_best_surface(self, delay: float, plane: float) -> tuple[float, CoefficientFit, float]:
-        """Return the plane of least misfit at a delay, a fit nearby, and the gain of log likelihood.
+        """Search the surface position of least misfit at one force delay by Newton's method.
 
         Args:
             delay: Force delay [s].
@@ -404,7 +410,7 @@ class ContactProblem:
 
         Returns:
             The best surface position [m], the fit before the last Newton step, and the gain of log likelihood
-            that this step adds to the fit.
+            by the last Newton step.
         """
         inner = self.at(delay, plane)
         for _ in range(MAX_NEWTON_STEPS):
@@ -420,7 +426,7 @@ class ContactProblem:
 
 
 def _whitened(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:
-    """Return values filtered along the last axis."""
+    """Apply the whitening filter along the last axis."""
     filtered = values.copy() if len(whitening) > 1 else values
     for lag, weight in enumerate(whitening[1:], 1):
         filtered[..., lag:] += weight * values[..., :-lag]

@@ -2,11 +2,9 @@
 
 At each delay and surface position of the grid, linear least squares determine the coefficients. The
 likelihood is not approximated by its derivatives with respect to the delay: during contact, a change of the
-delay acts like a
-    change of
-the damping, and at the onset of contact the likelihood has kinks. The prior is flat in delay and surface
-position, and excludes negative damping. All results, such as means, intervals and correlations, come from
-draws of the posterior.
+delay acts like a change of the damping, and at the onset of contact the likelihood has kinks. The prior is
+flat in delay and surface position, and excludes negative damping. All results, such as means, intervals and
+correlations, come from draws of the posterior.
 """
 
 from __future__ import annotations
@@ -68,9 +66,8 @@ def compute_posterior(
     Args:
         problem: Readings, motion and contact law.
         seed: Seed of the random numbers.
-        near: Approximate delay [s] and surface position [m], or None. All delays are searched if it is None,
-            or if
-            the best delay may be outside the search range around it.
+        near: Approximate delay [s] and surface position [m], or None. All delays are searched without an
+            approximate delay, or if the best delay may be far from the approximate one.
         size: Numbers of delays and surface positions of the final grid.
     """
     delays, start = (
@@ -160,7 +157,7 @@ def _find_likely_delays(
 def _fit_grid(
     problem: ContactProblem, delays: np.ndarray, surface: tuple[np.ndarray, np.ndarray], across: int
 ) -> tuple[np.ndarray, list[CoefficientFit]]:
-    """Fit the coefficients at each delay, at planes within the plane's uncertainty there.
+    """Fit the coefficients on a grid of delays and, at each delay, of plausible surface positions.
 
     The force of damped contact jumps at the onset. The likelihood is therefore smooth in the surface position
     only between positions at which another row enters the contact. These positions are the edges of the grid
@@ -210,7 +207,7 @@ def divide_into_cells(low: float, high: float, at: np.ndarray, number: int) -> n
 def _marginalise_over_surface(
     places: np.ndarray, cells: list[CoefficientFit], count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return, for each delay, its marginal log posterior, and the surface's mean and standard deviation."""
+    """Return the log posterior of each delay, and mean and std of the surface position at this delay."""
     heights, planes = (
         _compute_cell_posteriors(places, cells).reshape(count, -1),
         places[:, 1].reshape(count, -1),

@@ -1,4 +1,4 @@
-"""Linear least squares for the coefficients of a contact law, at several positions of the surface at once."""
+"""Linear least squares for the coefficients of a contact law, at several surface positions ("planes")."""
 
 from __future__ import annotations
 
@@ -10,34 +10,41 @@ import numpy as np
 
 @dataclass(frozen=True)
 class CoefficientFit:
-    """Linear fit of the coefficients at one delay and surface."""
+    """Linear fit of the coefficients of a contact law, at one force delay and surface position."""
 
-    coefficients: np.ndarray
-    covariance: np.ndarray
-    misfit: float  # chi-squared: sum of squares over the variance of the noise
-    evidence: float  # log posterior density of delay and plane, up to a constant
-    slope: float = 0.0  # derivative of misfit / 2 by the plane [1/m]
-    curvature: float = 0.0  # second derivative by the plane, coefficients fitted [1/m^2]
-    plane: float = 0.0  # m, plane of the fit
-    by_plane: np.ndarray | None = None  # derivative of the coefficients by the plane, if that is fitted
+    coefficients: np.ndarray  # (coefficients,), in SI units; the last one is the bias [N]
+    covariance: np.ndarray  # (coefficients, coefficients), covariance of the coefficients
+    misfit: float  # chi-squared: sum of squared residuals divided by the variance of the noise
+    evidence: float  # log posterior density of force delay and surface position, up to a constant
+    slope: float = 0.0  # 1/m, derivative of misfit / 2 with respect to the surface position
+    curvature: float = 0.0  # 1/m^2, second derivative of misfit / 2, with refitted coefficients
+    plane: float = 0.0  # m, surface position of the fit
+    # derivative of the coefficients with respect to the surface position; None if the position is specified
+    by_plane: np.ndarray | None = None
 
 
 class PseudoRows(NamedTuple):
-    """Few rows that have the same sum of squares, for all coefficients, as many readings."""
+    """Few rows that replace many readings: for all coefficients, both have the same sum of squares.
 
-    design: np.ndarray  # (planes, coefficients, rows), over the noise's standard deviation
-    target: np.ndarray  # (rows,), over the noise's standard deviation
-    by_plane: np.ndarray  # 1/m, derivative of `design` by the plane
+    Design matrix and target are divided by the noise's standard deviation.
+    """
+
+    design: np.ndarray  # (planes, coefficients, rows), design matrix
+    target: np.ndarray  # (rows,), values to fit
+    by_plane: np.ndarray  # 1/m, derivative of `design` with respect to the surface position
 
 
 class LeastSquaresFit(NamedTuple):
-    """Fit at each plane; design and residuals are divided by the noise's standard deviation."""
+    """Least-squares fit at several surface positions.
+
+    Design matrix and residuals are divided by the noise's standard deviation.
+    """
 
     coefficients: np.ndarray  # (planes, coefficients)
-    covariance: np.ndarray  # (planes, coefficients, coefficients)
+    covariance: np.ndarray  # (planes, coefficients, coefficients), covariance of the coefficients
     misfit: np.ndarray  # (planes,), chi-squared
-    residual: np.ndarray  # (planes, rows)
-    design: np.ndarray  # (planes, coefficients, rows)
+    residual: np.ndarray  # (planes, rows), prediction minus reading
+    design: np.ndarray  # (planes, coefficients, rows), design matrix
 
 
 def fit_coefficients(
@@ -47,14 +54,14 @@ def fit_coefficients(
     bias_alone: float,
     bias_prior: tuple[float, float] | None,
 ) -> LeastSquaresFit:
-    """Return the least-squares fit at each plane.
+    """Fit the coefficients of a contact law by least squares at each surface position.
 
     Args:
-        design: Functions of the law and, last, the bias, (planes, coefficients, rows).
-        target: Readings, (rows,).
-        rest: Number, sum and sum of squares of the readings that depend on the bias alone.
-        bias_alone: Such a reading for a bias of 1 N.
-        bias_prior: Bias [N] and its standard deviation from runs at rest, or None.
+        design: Design matrix: functions of the law, then the bias, (planes, coefficients, rows).
+        target: Readings to fit, (rows,).
+        rest: Number, sum and sum of squares of further readings, which depend on the bias alone.
+        bias_alone: Value of such a further reading for a bias of 1 N.
+        bias_prior: Mean and standard deviation of the bias [N] from runs at rest, or None.
     """
     count, total, square = rest
     normal, right = design @ design.swapaxes(1, 2), sum_products(design, target)
@@ -79,18 +86,18 @@ def fit_coefficients(
 
 
 def compute_force(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the force of the law without the bias, (planes, rows)."""
+    """Return the force [N] of the contact law without the bias, (planes, rows)."""
     return (coefficients[..., None, :-1] @ columns)[:, 0]
 
 
 def sum_products(table: np.ndarray, values: np.ndarray) -> Any:
-    """Return the sums of products along the rows.
+    """Return the sum of `table` times `values` over the rows (last axis).
 
-    BLAS would split the sum by its number of threads, which changes the last bits.
+    BLAS is not used, because its number of threads would change the last bits of the sum.
     """
     return np.einsum("...m,m->...", table, values)
 
 
 def sum_and_squares(values: np.ndarray) -> tuple[int, float, float]:
-    """Return the number of values, their sum and that of their squares."""
+    """Return the number of values, the sum of the values and the sum of their squares."""
     return len(values), float(values.sum()), float(sum_products(values, values))

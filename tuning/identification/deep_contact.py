@@ -1,10 +1,11 @@
-"""Long presses as few pseudo-rows: the same misfit at a fraction of the cost.
+"""Replacement of long press runs by a few pseudo-rows, which makes fits faster but not less accurate.
 
-A slow press has ten thousands of readings, but its motion has few degrees of freedom. While a lane stays
-deep in contact, what the sensor reads is a smooth function of delay and surface position. The law's
-functions are therefore computed at a few delays and surface positions (Chebyshev nodes) and interpolated by
-polynomials. The triangular factor of these columns and of the readings has the sums of squares of all rows,
-so its rows stand for them (Golub and Van Loan, "Matrix Computations", section 5.3).
+A slow press has tens of thousands of readings, but its motion has few degrees of freedom. A lane (run, or
+segment of a run) that always stays well below the surface is deep. Its readings are smooth functions of
+force delay and surface position. The functions of the contact law are therefore computed at a few delays and
+surface positions (Chebyshev nodes), and interpolated by polynomials. A matrix factorisation of these
+functions and of the readings gives pseudo-rows with the same sums of squares as all rows (Golub and Van Loan,
+"Matrix Computations", section 5.3).
 """
 
 from __future__ import annotations
@@ -20,44 +21,45 @@ from tuning.identification.contact_profile import estimate_surface_from_onset
 from tuning.identification.contact_regression import CoefficientFit, PseudoRows, compute_force
 from tuning.identification.motion import MotionResponse
 
-MIN_DEEP_LANES = 6  # deep lanes that are worth the effort
-LANES_FOR_LAW_CHOICE = 8  # deep lanes that suffice to find the exponent or the depths of a contact law
-MIN_DEPTH_SHARE = 0.1  # share of a lane's median depth that its least depth exceeds
-DELAY_RANGE = 0.002  # s, delays that one interpolation covers
-DELAY_NODES = 8  # delays at which it is exact
-# surface positions at which it is exact: for a force that is linear in the depth, and others
+MIN_DEEP_LANES = 6  # smallest number of deep lanes for which pseudo-rows save time
+LANES_FOR_LAW_CHOICE = 8  # number of deep lanes that suffice to fit the shape of a contact law
+MIN_DEPTH_SHARE = 0.1  # in a deep lane, the smallest depth exceeds this fraction of the median depth
+DELAY_RANGE = 0.002  # s, range of delays that one interpolation covers
+DELAY_NODES = 8  # number of delays at which the interpolation is exact
+# number of surface positions at which the interpolation is exact: for a linear force, and for other forces
 SURFACE_NODES = 2, 4
-SURFACE_RANGE_SHARE = 0.1  # surface positions that it covers, over the least depth, for nonlinear forces
-# standard deviations by which the interpolation may be off, all readings together
+# range of surface positions that one interpolation of a nonlinear force covers, relative to the least depth
+SURFACE_RANGE_SHARE = 0.1
+# largest norm of the interpolation errors of all readings, in standard deviations of the noise
 MAX_INTERPOLATION_ERROR = 0.01
-LANES_PER_BLOCK = 50  # lanes whose functions are computed at once
-MAX_TABLES = 60  # interpolations beyond which searches go too far for them to pay
-MIN_SINGULAR_VALUE = 1e-8  # relative singular value below which a pseudo-row is rounding
+LANES_PER_BLOCK = 50  # number of lanes whose functions are computed together, to limit the memory
+MAX_TABLES = 60  # largest number of interpolations; a search that needs more is faster without them
+MIN_SINGULAR_VALUE = 1e-8  # pseudo-rows with a smaller relative singular value contain only rounding errors
 
 
 def find_deep_lanes(motion: MotionResponse, plane: float) -> np.ndarray:
-    """Return whether each lane stays deep in contact with a surface at `plane` [m], for all force delays."""
+    """Return which lanes stay deep in contact with a surface at `plane` [m], for all force delays."""
     depths = [motion.at(delay)[0] - plane for delay in (0.0, MAX_FORCE_DELAY / 2.0, MAX_FORCE_DELAY)]
     least = np.min([depth.min(axis=0) for depth in depths], axis=0)
     return least > MIN_DEPTH_SHARE * np.maximum(np.median(depths[1], axis=0), 0.0)
 
 
 def summarise_deep_lanes(problem: ContactProblem, near: tuple[float, float] | None) -> ContactProblem:
-    """Return the problem with pseudo-rows in place of its deep lanes, if it has enough of these.
+    """Replace the deep lanes of a contact problem by pseudo-rows, if the problem has enough deep lanes.
 
     Args:
         problem: Problem with all rows.
-        near: Force delay [s] and surface position [m] about which most fits will be, if they are known.
+        near: Force delay [s] and surface position [m] near which most fits will be, or None if unknown.
     """
     delay, plane = near or (MAX_FORCE_DELAY / 4.0, _approximate_surface(problem))
     deep = find_deep_lanes(problem.motion, plane) & problem.readings.counts.any(axis=0)
-    # A problem without any lane has no functions to fit.
+    # The problem of the other lanes needs at least one lane.
     deep[-1] = False
     return SummarisedProblem(problem, deep, delay) if deep.sum() >= MIN_DEEP_LANES else problem
 
 
 def select_representative_lanes(problem: ContactProblem) -> np.ndarray:
-    """Return the lanes of a problem without most of its deep ones, which are alike."""
+    """Return all lanes that are not deep, and `LANES_FOR_LAW_CHOICE` of the deep lanes, which are similar."""
     deep = np.flatnonzero(find_deep_lanes(problem.motion, _approximate_surface(problem)))
     dropped = np.delete(
         deep, np.linspace(0, len(deep) - 1, min(LANES_FOR_LAW_CHOICE, len(deep))).round().astype(int)
@@ -66,7 +68,7 @@ def select_representative_lanes(problem: ContactProblem) -> np.ndarray:
 
 
 def _approximate_surface(problem: ContactProblem) -> float:
-    """Return an approximate position of the surface [m]."""
+    """Return the specified surface position [m], or the best one for a typical force delay."""
     if problem.plane is not None:
         return problem.plane
     return problem.find_best_surface(
@@ -75,10 +77,10 @@ def _approximate_surface(problem: ContactProblem) -> float:
 
 
 class SummarisedProblem(ContactProblem):
-    """Problem with pseudo-rows in place of its deep lanes, wherever they are accurate."""
+    """Contact problem that replaces its deep lanes by pseudo-rows wherever these are accurate enough."""
 
     def __init__(self, problem: ContactProblem, deep: np.ndarray, delay: float):
-        """Split the lanes of a problem; `deep` flags those to summarize, `delay` [s] is a likely one."""
+        """Split the lanes of a problem; `deep` marks the deep lanes, and `delay` [s] is a likely delay."""
         motion, readings, law = problem.motion, problem.readings, problem.law
         super().__init__(motion, readings, law, problem.plane, problem.time_constant)
         self.deep, self.delay = deep, delay
@@ -91,12 +93,12 @@ class SummarisedProblem(ContactProblem):
         self.planes = SURFACE_NODES
 
     def changed(self, law: Law, time_constant: float) -> ContactProblem:
-        """Return the same problem with another law and another lag of the sensor [s]."""
+        """Return the same problem with another contact law and another time constant of the sensor [s]."""
         delay = self.delay + self.time_constant - time_constant
         return SummarisedProblem(super().changed(law, time_constant), self.deep, delay)
 
     def at(self, delay: float, plane: float, pseudo: PseudoRows | None = None) -> CoefficientFit:
-        """Fit the coefficients at one delay [s] and plane [m]."""
+        """Fit the coefficients at one force delay [s] and surface position [m]."""
         table = self._table(delay, np.array([plane]))
         if table is not None and pseudo is None:
             inner = self.others.at(delay, plane, table.rows(delay, np.array([plane])))
@@ -107,7 +109,7 @@ class SummarisedProblem(ContactProblem):
     def fit_surfaces(
         self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None = None
     ) -> list[CoefficientFit]:
-        """Fit the coefficients at several planes at once, without derivatives by the plane."""
+        """Fit the coefficients at several surface positions [m], without derivatives by the position."""
         table = self._table(delay, planes)
         if table is not None and pseudo is None:
             fits = self.others.fit_surfaces(delay, planes, table.rows(delay, planes))
@@ -116,13 +118,13 @@ class SummarisedProblem(ContactProblem):
         return super().fit_surfaces(delay, planes, pseudo)
 
     def _pushes(self, table: _DesignTable, fits: list[CoefficientFit]) -> bool:
-        """Return whether the force of all fits is positive in all deep rows."""
+        """Return whether all fits have a positive force in every row of the deep lanes."""
         if self.law.pulls or not self.damping_indices:
             return True
         return all(np.all(compute_force(fit.coefficients[None], table.extreme) > 0.0) for fit in fits)
 
     def _table(self, delay: float, planes: np.ndarray) -> _DesignTable | None:
-        """Return the interpolation there, or None if none is accurate."""
+        """Find or compute an interpolation for a delay and surface positions; None if it is not accurate."""
         for table in self.tables:
             if table.covers(delay, planes):
                 return table
@@ -135,7 +137,7 @@ class SummarisedProblem(ContactProblem):
         return None
 
     def _new_table(self, delay: float, plane: float, count: int) -> _DesignTable:
-        """Return an interpolation that covers a delay and a plane, with `count` planes."""
+        """Compute an interpolation around a delay and a surface position, with `count` positions as nodes."""
         low = (
             self.delay + DELAY_RANGE * np.floor((delay - self.delay) / DELAY_RANGE + 0.5) - DELAY_RANGE / 2.0
         )
@@ -143,11 +145,11 @@ class SummarisedProblem(ContactProblem):
         delays = _chebyshev_nodes(low, low + DELAY_RANGE, DELAY_NODES)
         moved = [block.motion.at(node) for node in delays for block in self.blocks]
         lowest = min(float(x.min()) for x, _ in moved)
-        # Between two nodes the motion may reach lower.
+        # At delays between two nodes, the smallest depth may be smaller than at the nodes.
         lowest -= DELAY_RANGE / DELAY_NODES * max(float(np.abs(v).max()) for _, v in moved)
         half = 0.5 * SURFACE_RANGE_SHARE * max(lowest - plane, 1e-9)
         planes = _chebyshev_nodes(plane - half, plane + half, count)
-        # A law pulls, if anywhere, where the mechanism recedes fastest for its depth.
+        # A law becomes negative first in the row with the fastest retraction relative to the depth.
         rate, depth = min(
             ((v.ravel()[row], x.ravel()[row] - plane) for x, v in moved
              for row in [int(np.argmin(v / np.maximum(x - plane, 1e-9)))]),
@@ -161,23 +163,24 @@ class SummarisedProblem(ContactProblem):
 
 @dataclass(frozen=True)
 class _DesignTable:
-    """Factor of the law's functions in deep rows at nodes of delay and plane."""
+    """Interpolation table of pseudo-rows, over force delay and surface position."""
 
-    delays: np.ndarray  # s, nodes
-    planes: np.ndarray  # m, nodes
-    ends: tuple[float, float]  # s, delays that it covers
-    limit: tuple[float, float]  # m, planes that it covers
-    extreme: np.ndarray  # the law's functions at the row that pulls first
-    factor: np.ndarray  # (rows, delays x planes x functions + 2); last the bias and the readings
-    check: np.ndarray  # (rows, functions), the functions between the nodes
+    delays: np.ndarray  # s, delays of the nodes
+    planes: np.ndarray  # m, surface positions of the nodes
+    ends: tuple[float, float]  # s, smallest and largest delay that the table covers
+    limit: tuple[float, float]  # m, smallest and largest surface position that the table covers
+    extreme: np.ndarray  # functions of the law in the row whose force becomes negative first
+    # (rows, delays x planes x functions + 2), functions of the law at all nodes, then bias and readings
+    factor: np.ndarray
+    check: np.ndarray  # (rows, functions), functions of the law between the nodes, to test the accuracy
 
     def covers(self, delay: float, planes: np.ndarray) -> bool:
-        """Return whether a delay and all planes lie within the range of the table."""
+        """Return whether a delay [s] and all surface positions [m] lie within the range of the table."""
         low, high = self.limit
         return self.ends[0] <= delay <= self.ends[1] and low <= planes.min() and planes.max() < high
 
     def rows(self, delay: float, planes: np.ndarray) -> PseudoRows:
-        """Return the pseudo-rows at a delay [s] and at planes [m]."""
+        """Interpolate the pseudo-rows at a delay [s] and at surface positions [m]."""
         by_delay = _interpolator(self.delays)(delay)
         nodes = self.factor[:, :-2].reshape(len(self.factor), len(self.delays), len(self.planes), -1)
         columns = np.einsum("rdpc,d->rpc", nodes, by_delay)
@@ -192,7 +195,7 @@ class _DesignTable:
         )
 
     def is_accurate(self) -> bool:
-        """Return whether the interpolated force of the best fit is exact between the nodes."""
+        """Return whether the interpolated force of the best fit is accurate enough between the nodes."""
         delay, plane = _point_between_nodes(self.delays, self.planes)
         rows = self.rows(delay, np.array([plane]))
         best = np.linalg.lstsq(rows.design[0].T, rows.target, rcond=None)[0]
@@ -201,7 +204,7 @@ class _DesignTable:
 
 
 def _split_into_blocks(problem: ContactProblem, lanes: np.ndarray) -> list[ContactProblem]:
-    """Return problems of at most `LANES_PER_BLOCK` deep lanes each, without rows that no filter needs."""
+    """Split the deep lanes into problems with at most `LANES_PER_BLOCK` lanes, without unneeded rows."""
     counts = problem.readings.counts[:, lanes]
     begin = max(int(np.argmax(counts.any(axis=1))) - problem.memory, 0)
     parts = np.array_split(lanes, -(-len(lanes) // LANES_PER_BLOCK))
@@ -220,9 +223,10 @@ def _split_into_blocks(problem: ContactProblem, lanes: np.ndarray) -> list[Conta
 def _factorise_columns(
     blocks: list[ContactProblem], delays: np.ndarray, planes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangular factor of functions, bias and readings, up to a rotation of its rows.
+    """Compute pseudo-rows from the functions of the law in all rows.
 
-    The second array continues it by the functions between the nodes.
+    Return two arrays with the same rows: functions at the nodes, bias and readings; and functions between the
+    nodes.
     """
     total, count = 0.0, 0
     delay, plane = _point_between_nodes(delays, planes)
@@ -240,16 +244,16 @@ def _factorise_columns(
 
 
 def _point_between_nodes(delays: np.ndarray, planes: np.ndarray) -> tuple[float, float]:
-    """Return a delay and a plane between the nodes."""
+    """Return a delay and a surface position halfway between the first two nodes."""
     return 0.5 * float(delays[0] + delays[1]), 0.5 * float(planes[0] + planes[1])
 
 
 def _chebyshev_nodes(low: float, high: float, count: int) -> np.ndarray:
-    """Return the Chebyshev nodes of an interval."""
+    """Return `count` Chebyshev nodes of the interval from `low` to `high`, in ascending order."""
     angles = np.pi * (np.arange(count) + 0.5) / count
     return 0.5 * (low + high) - 0.5 * (high - low) * np.cos(angles)
 
 
 def _interpolator(nodes: np.ndarray) -> BarycentricInterpolator:
-    """Return the polynomial interpolation from the nodes, as the weight of each node at any point."""
+    """Return a function that computes the weight of each node in the polynomial interpolation at a point."""
     return BarycentricInterpolator(nodes, np.eye(len(nodes)))

@@ -3,7 +3,7 @@
 These readings distinguish damping from force delay. A higher-order filter, a dead zone or a resampled force
 changes the readings for some milliseconds after a jump of the force. In one contact, the noise hides this
 change. The mean residual over all contacts, aligned at the edge and weighted by the approach speeds, reveals
-it. The estimates are then assumed to be in error by the same number of standard deviations as the mean
+the change. The estimates are then assumed to be wrong by the same number of standard deviations as the mean
 residuals.
 """
 
@@ -55,7 +55,7 @@ def check_contact_edges(
 
 
 def average_edge_residuals(contact: ContactFit, runs: Sequence[LoggedRun]) -> np.ndarray:
-    """Return the weighted mean residual, over its standard deviation, at each row near the two edges."""
+    """Return the weighted mean residual divided by its standard deviation, at each row near the two edges."""
     delay, plane, coefficient_fit = contact.posterior.best
     problem, readings = contact.problem, contact.readings
     predicted = problem.force(delay, plane, coefficient_fit.coefficients)

@@ -103,8 +103,8 @@ def _estimate_from_draws(
     """Return the estimate of a parameter from its draws.
 
     `at_bound` holds the draws of the damping coefficients that accumulate at 0. The interval of such a
-    coefficient is one-sided. The logs hardly distinguish damping from force delay, so the interval of the
-    force delay also includes the delays that zero damping would imply.
+    coefficient is one-sided. The logs hardly distinguish damping from force delay. The interval of the force
+    delay therefore also includes the delays that zero damping would imply.
     """
     low, high = np.quantile(values, (0.025, 0.975))
     if key in at_bound:

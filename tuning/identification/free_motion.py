@@ -200,9 +200,10 @@ def concatenate_lines(spectra: Sequence[Spectrum], timing: CampaignTiming) -> Sp
 
 
 def estimate_static_gain(fit: SpectrumFit, lines: SpectralLines) -> tuple[float, float]:
-    """Estimate the static gain, which the model fixes at 1; return it with its standard deviation.
+    """Estimate the static gain of the motion simulator, which the model fixes at 1.
 
-    One Newton step from the fit is taken, with the gain as an additional parameter.
+    The estimate is one Newton step from the fit, with the gain as an additional parameter. Return the gain
+    and its standard deviation.
     """
     s, command = lines.images
     scale = np.sqrt(2.0) / lines.std

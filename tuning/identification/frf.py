@@ -2,12 +2,10 @@
 
 If the command is periodic (a multisine), its periods are averaged. Differences between periods are noise.
 Power at frequency lines without excitation is nonlinear distortion: friction and dead bands appear at odd
-lines,
-    and
-asymmetry appears at even lines (Pintelon and Schoukens, System Identification: A Frequency Domain Approach,
-2012). For any other command, the local polynomial method separates the response from the transient and the
-noise. Around each line, it fits response and transient by polynomials of degree 2 over 13 lines (Schoukens et
-al. 2009). Readings of lost rows are omitted.
+lines, and asymmetry appears at even lines (Pintelon and Schoukens, System Identification: A Frequency Domain
+Approach, 2012). For any other command, the local polynomial method separates the response from the transient
+and the noise. Around each line, the method fits response and transient by polynomials of degree 2 over 13
+lines (Schoukens et al. 2009). Readings of lost rows are omitted.
 """
 
 from __future__ import annotations
@@ -47,7 +45,7 @@ class Spectrum:
 
 
 def find_repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100) -> tuple[int, slice] | None:
-    """Find the period of a command and the rows at which the command equals that of one period earlier.
+    """Find the period of a command, and the rows in which the command repeats after one period.
 
     The command need not be periodic from its first row, because a multisine usually fades in.
 

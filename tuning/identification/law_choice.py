@@ -53,9 +53,9 @@ class EvaluatedLaw:
 def choose_contact_law(
     motion: MotionResponse, readings: ForceReadings, plane: float | None, names=None
 ) -> list[EvaluatedLaw]:
-    """Fit and evaluate all laws, or those named; return them with the chosen one first.
+    """Fit and evaluate all contact laws or the named laws; return them with the chosen law first.
 
-    The parts of a long press are alike, so exponents and depths are fitted to a few of them.
+    The segments of a long press are similar, so that exponents and depths are fitted to a few segments.
     """
     judged = []
     lanes = select_representative_lanes(ContactProblem(motion, readings, kelvin_voigt(), plane))

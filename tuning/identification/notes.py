@@ -66,7 +66,7 @@ def collect_notes(
 
 
 def note_absent_dead_zone(contact: ContactFit | None, specified: float) -> list[str]:
-    """Return a note if a dead zone [N] was specified but readings at rest do not show it."""
+    """Return a note if the user specified a dead zone [N] that readings at rest do not show."""
     if contact is None or contact.dead_zone or not specified:
         return []
     return [

@@ -1,7 +1,7 @@
-"""Rows near contact of all lanes, one after the other in a single sequence, for filters along the rows.
+"""Single sequence of the rows near contact of all lanes, so that one call filters all lanes.
 
-Each lane has the rows from its first to its last contact, and as many more as the filters remember. What a
-filter returns there depends on no other lane.
+For each lane, the sequence holds the rows from the first to the last contact, and further rows in which the
+response of the filters decays. The filtered values of a lane therefore do not depend on other lanes.
 """
 
 from __future__ import annotations
@@ -13,30 +13,30 @@ import numpy as np
 
 
 class PackedRows(NamedTuple):
-    """Sequence of rows of several lanes."""
+    """Rows of several lanes, one lane after the other in a single sequence."""
 
-    rows: np.ndarray  # row of the readings, counted along (rows, lanes); -1 behind the end of a lane
-    starts: np.ndarray  # (lanes,), place in the sequence where row 0 of each lane is or would be
+    rows: np.ndarray  # flat index into an array (rows, lanes) for each element; -1 after the end of a lane
+    starts: np.ndarray  # (lanes,), index in the sequence of row 0 of each lane, even if it is not included
 
     def places(self, rows: np.ndarray) -> np.ndarray:
-        """Return the places of rows of the readings in the sequence."""
+        """Convert flat indices into an array (rows, lanes) to indices in the sequence."""
         row, lane = np.divmod(rows, len(self.starts))
         return self.starts[lane] + row
 
 
 def pack_rows(near: Sequence[np.ndarray], shape: tuple[int, int], memory: int) -> PackedRows:
-    """Return the sequence that holds rows near contact.
+    """Build the sequence of rows near contact.
 
     Args:
-        near: Sorted rows near contact, counted along (rows, lanes), several times.
+        near: Arrays of rows near contact, as sorted flat indices into an array (rows, lanes).
         shape: Numbers of rows and lanes.
-        memory: Rows that the filters remember.
+        memory: Number of rows until the response of the filters has decayed.
     """
     length, lanes = shape
     first, last = np.full(lanes, length), np.full(lanes, -1)
     for rows in near:
         row, lane = np.divmod(rows, lanes)
-        # Of several values for one lane the last assignment counts.
+        # If an index occurs several times, NumPy keeps the last assigned value.
         lasting, beginning = last.copy(), first.copy()
         lasting[lane], beginning[lane[::-1]] = row, row[::-1]
         first, last = np.minimum(first, beginning), np.maximum(last, lasting)

@@ -57,7 +57,7 @@ def find_bias_prior(
 def find_surface_of_press(
     position: np.ndarray, force: np.ndarray, counts: np.ndarray, bias: tuple[float, float]
 ) -> float | None:
-    """Return the surface position [m]: where the line through the forces of a press reaches the bias.
+    """Return the surface position [m] at which the line through the forces of a press reaches the bias.
 
     Returns None if the force does not increase with the position.
     """

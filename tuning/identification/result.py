@@ -66,8 +66,7 @@ class Identification:
             (draws, parameters).
         combinations: Parameter combinations that the logs determine better than the single parameters.
         confounded: Pairs of confounded parameters: two keys, their correlation, and the experiment that
-            separates
-            them.
+            separates the parameters.
         lines: Results of the checks.
         mechanism: Content of a mechanism file, or None if a value is missing or invalid.
         limit: Largest allowed sum of the defects' effects, on the restitution e and on its error e - e*.

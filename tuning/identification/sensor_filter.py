@@ -34,10 +34,10 @@ def compute_lag_weights(rate: float) -> tuple[float, tuple[float, float, float]]
 
 
 def compute_onset_weights(rate: float, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights of two forces in the reading at the end of a period with an onset of contact.
+    """Return the weights of the forces just after an onset of contact and at the end of the control period.
 
-    The two forces are those just after the onset and at the end of the period. The force is 0 before the
-    onset and linear in time after the onset.
+    They give the change of the reading during the period if the force is 0 before the onset and linear in
+    time after the onset.
 
     Args:
         rate: Control period divided by the time constant.

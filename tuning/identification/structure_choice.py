@@ -1,9 +1,9 @@
 """Choice of the motion simulator's model structure: the smallest one that explains the measured spectra.
 
-The Bayesian information criterion (Schwarz 1978) compares the candidates. If chi-squared per degree of
-freedom exceeds 1 even for the best candidate, the noise variance of all candidates is multiplied by it.
-Otherwise, additional poles would fit nonlinear friction. A candidate is excluded if a zero cancels a pole, or
-if the spectra hardly determine one of its parameters, because a smaller structure is then equivalent.
+The Bayesian information criterion (Schwarz 1978) compares the candidates. If even the best candidate has a
+chi-squared per degree of freedom above 1, the noise variance of all candidates is multiplied by this value,
+because additional poles would otherwise fit nonlinear friction. A candidate is excluded if a zero cancels a
+pole, or if the spectra hardly determine a parameter, because a smaller structure is then equivalent.
 """
 
 from __future__ import annotations

@@ -58,12 +58,12 @@ class CheckResult:
 
     @property
     def counted(self) -> float:
-        """Return the effect on e that the verdict adds up: 0 if the defect is absent or not included."""
+        """Return the defect's effect on e in the verdict: 0 if the defect is absent or not included."""
         return self.effect if self.there and self.counts else 0.0
 
     @property
     def counted_error(self) -> float:
-        """Return the effect on e - e* that the verdict adds up: 0 if the defect is absent or not included."""
+        """Return the defect's effect on e - e* in the verdict: 0 if the defect is absent or not included."""
         effect = self.effect if self.on_error is None else self.on_error
         return effect if self.there and self.counts else 0.0
 

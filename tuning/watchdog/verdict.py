@@ -30,8 +30,7 @@ def add_verdict(rates: Mapping[str, Any], allowed: AllowedAlarmRates, scenarios:
 
     Args:
         rates: result of `tuning.watchdog.alarms.compute_alarm_rates`. If faults were injected, `fault_runs`
-        is
-            the result of `tuning.watchdog.fault_injection.compute_fault_rates`.
+            is the result of `tuning.watchdog.fault_injection.compute_fault_rates`.
         allowed: largest acceptable rates.
         scenarios: number of drawn scenarios.
 

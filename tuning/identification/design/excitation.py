@@ -53,9 +53,8 @@ class Excitation:
     """Position command of one run, and the multisine in it.
 
     Attributes:
-        position: Position command in each control period [m], relative to the start of a free run, or
-            absolute for
-            a press.
+        position: Position command in each control period [m]; relative to the start in a free run, absolute
+            in a press.
         frequency: Frequency lines of the multisine [Hz].
         amplitude: Amplitude at each line [m].
         crest: Crest factor (peak over rms) of the signal that is closest to its limit.
@@ -112,8 +111,7 @@ def design_excitation(
         mechanism: Mechanism with the approximate parameters.
         stroke: Largest excursion of the multisine in either direction [m].
         slopes_by: Function that returns the derivatives of e - e* with respect to given keys, shape
-            (contacts, keys);
-            for example `differentiate_error`.
+            (contacts, keys), for example `differentiate_error`.
         seed: Seed of the random phases.
 
     Raises:
@@ -275,7 +273,7 @@ class _MultisinePlan:
         )
 
     def _group(self, mechanism, index, response, std, limits, periods) -> powers.RunLines:
-        """Return the Fisher information of unit power at each line, and its use of each limit.
+        """Return, for unit power at each line, the Fisher information and the used share of each limit.
 
         Args:
             mechanism: Mechanism with the approximate parameters.

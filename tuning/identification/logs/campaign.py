@@ -1,9 +1,8 @@
 """Reading of a campaign from log files and their mapping, with checks and one row per tick.
 
 A run has at most one contact: a log with several contacts is divided in the middle between successive
-    contacts. If
-the log has no channel `contact_index`, the contacts of a file are numbered in their order. The number of a
-contact is its index into the contact lists of a mechanism file.
+contacts. If the log has no channel `contact_index`, the contacts of a file are numbered in their order. The
+number of a contact is the index into the contact lists of a mechanism file.
 """
 
 from __future__ import annotations
@@ -249,7 +248,7 @@ class _RunsOfFile:
         contact: tuple[int, int] | None,
         number: int | None,
     ) -> LoggedRun:
-        """Return a part of a segment as a run; `number` is the contact index if no channel contains it."""
+        """Convert a part of a segment to a run; `number` is the contact index if no channel contains it."""
         channels = {
             name: None if values is None else values[part] for name, values in segment.channels.items()
         }

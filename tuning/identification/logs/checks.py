@@ -2,9 +2,7 @@
 
 With a wrong sign, unit or row convention, the model may fit the logs well but describe another rig. The
 numerical model is known exactly and reveals such errors: by Newton's law, the force command determines the
-position
-    commands,
-and the measured force determines the change of speed in a contact.
+position commands, and the measured force determines the change of speed in a contact.
 """
 
 from __future__ import annotations
@@ -192,7 +190,7 @@ def find_change_interval(values: np.ndarray) -> int:
 
 
 def _detect_resolution(values: np.ndarray) -> float:
-    """Return the resolution of rounded values: all differences are multiples of it; 0 without rounding."""
+    """Return the resolution, of which all differences of rounded values are multiples; 0 without rounding."""
     steps = np.diff(np.unique(values[np.isfinite(values)][:MAX_EVALUATED_ROWS]))
     least = float(np.min(steps, initial=np.inf))
     return least if np.median(np.abs(steps / least - np.rint(steps / least))) < 0.01 else 0.0

@@ -44,8 +44,7 @@ def check_command(
         label: Name of the log in messages.
         segment: Segment of the log without a long gap.
         contacts: For each contact, its first row and the row after its last row. Other rows are not checked,
-            because
-            something else may command the rig there.
+            because another program may command the rig there.
         period: Control period [s].
         mass: Equivalent mass of the numerical model [kg].
         row: Row convention of the mapping.
@@ -161,12 +160,11 @@ def _interpolate_gaps(values: np.ndarray) -> np.ndarray:
 def _fit_conventions(
     moves: list[tuple[np.ndarray, np.ndarray, np.ndarray]], width: int, ways: list[tuple[str, str]]
 ) -> FitsByConvention:
-    """Fit the second differences of the positions by those that the force command causes.
+    """Fit the second differences of the positions by the second differences that the force command causes.
 
     Args:
         moves: For each contact, the positions, the second difference that the force of each row causes, and
-            the flags
-            of valid rows.
+            the flags of valid rows.
         width: Number of rows between the positions of a second difference.
         ways: Pairs of row convention and integrator.
 

@@ -91,8 +91,7 @@ def detect_integrator(x: np.ndarray, v: np.ndarray | None, period: float) -> str
 def _detect_integrator_over_span(x: np.ndarray, v: np.ndarray, period: float) -> str | None:
     """Detect the integrator from the motion over `INTEGRATOR_SPAN_ROWS` rows, despite rounding or jitter.
 
-    Integrators differ in the velocity that they use for a step: at its start, at its end, or the mean of
-        both.
+    Integrators differ in the velocity of a step: at the start, at the end, or the mean of both.
     """
     finite = np.isfinite(v)
     summed = np.cumsum(np.where(finite, v, 0.0))

@@ -2,9 +2,7 @@
 
 The name of a column indicates the channel and, in brackets or after an underscore, the unit. If a unit is
 missing, it is guessed from the values. The signs also follow from the values: positions increase where the
-force is
-    large, and
-a force that pushes the bodies apart is positive.
+force is large, and a force that pushes the bodies apart is positive.
 """
 
 from __future__ import annotations

@@ -104,13 +104,12 @@ def detect_reading_offset(runs: Sequence[LoggedRun]) -> int | None:
 
 
 def _find_latest_reading(commands: np.ndarray, columns: np.ndarray) -> int | None:
-    """Return the row offset from a command to the latest reading that affects it, or None if it is not clear.
+    """Return the row offset from a command to the latest reading that affects the command; None if unclear.
 
     Args:
         commands: Twice differenced second differences of the commands.
-        columns: Regressors; the first one is the reading `ROWS_AFTER_COMMAND` rows after the command, and
-            each further
-            reading is one row earlier.
+        columns: Regressors. The first regressor is the reading `ROWS_AFTER_COMMAND` rows after the command;
+            each further regressor is the reading of the previous row.
     """
     if len(commands) < MIN_REGRESSION_ROWS or _correlate_neighbours(columns) > MAX_NEIGHBOUR_CORRELATION:
         return None
@@ -142,8 +141,7 @@ def _make_regression_columns(run: LoggedRun) -> tuple[np.ndarray, np.ndarray] | 
     """Return the columns of the regression for one run, or None if the run has no contact.
 
     The first array contains the second differences of the commands. The second array contains the regressors:
-        force
-    readings of adjacent rows, and the position and velocity of the numerical model. All columns are
+    force readings of adjacent rows, and the position and velocity of the numerical model. All columns are
     differenced twice more. Only rows in and near contact are included, because other rows may not depend on
     the force.
 

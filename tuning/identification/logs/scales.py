@@ -83,7 +83,7 @@ def ask_for_length_unit(factor: float, tolerance: float) -> str:
 
 
 def _ask_for_units(units: list[tuple[float, str]], factors: tuple[float, ...], tolerance: float) -> str:
-    """Return a question with the texts of the closest factors, or an empty string."""
+    """Return a question that names the units with the closest factors, or an empty string."""
     texts: list[str] = []
     for factor in factors:
         distances = sorted(
@@ -113,8 +113,7 @@ def check_impulse(
         period: Control period [s].
         mass: Equivalent mass of the numerical model [kg].
         mass_is_verified: Whether the force command moves the model with this mass, so that positions and mass
-            have
-            the right units.
+            have the right units.
         clipped: Whether force readings are clipped, so that part of the impulse is missing.
 
     Raises:

@@ -1,8 +1,8 @@
 """Detection of a change in the mean by the generalised likelihood ratio (Siegmund and Venkatraman 1995).
 
-Let z_1 ... z_n be the normalized deviations of a metric in all contacts: independent and standard normal
-    without a
-change. For a change of the mean at contact c to an unknown value, twice the log likelihood ratio is
+Let z_1 ... z_n be the normalized deviations of a metric in all contacts. Without a change, they are
+independent and standard normal. For a change of the mean at contact c to an unknown value, twice the log
+likelihood ratio is
 
     sum(z_c ... z_n)^2 / (n - c + 1).
 
