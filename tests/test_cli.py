@@ -114,7 +114,7 @@ def test_tune_command_reports_tables_or_json(jaxhil, table, tmp_path):
     words = ("before", "literature", "tuned", "rms", "99th", "chatter", "lead_filter", "step limit")
     for word in (*words, "exceeds 0.01", "No sensor noise"):
         assert word in out
-    assert "judging on 16 fresh scenarios" in err
+    assert "evaluating on 16 fresh scenarios" in err
     arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
     ran = jaxhil(*arguments, "--json", "--limit", "inf")
     assert ran.code == 0

@@ -167,7 +167,7 @@ def test_identify_delay_and_lag_errors_reach_cramer_rao_bound():
 
         def force(numbers, problem=problem):
             lag = ContactProblem(problem.motion, problem.readings, problem.law, None, numbers[1])
-            return lag.force(numbers[0], numbers[2], numbers[3:]).ravel()[problem.kept] / 0.5
+            return lag.force(numbers[0], numbers[2], numbers[3:]).ravel()[problem.used_rows] / 0.5
 
         slopes = np.array(
             [(force(true + step) - force(true - step)) / (2.0 * step.sum()) for step in np.diag(steps)]

@@ -64,7 +64,7 @@ def test_pseudo_rows_have_the_misfit_of_all_rows(law, lag, whitening, threshold)
         (across,) = few.fit_surfaces(delay - lag, np.array([plane]))
         assert across.misfit == pytest.approx(fit.misfit, rel=1e-9)
     # They were used at all: only touches and the ends of the press were computed row by row.
-    assert len(few.tables) > 0 and len(few.others.kept) < 0.6 * len(full.kept)
+    assert len(few.tables) > 0 and len(few.others.used_rows) < 0.6 * len(full.used_rows)
 
 
 @pytest.mark.parametrize(

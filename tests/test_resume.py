@@ -170,7 +170,7 @@ def test_front_is_checkpointed_too(jaxhil, tmp_path):
         assert jaxhil(*arguments).code == 130
     resumed = jaxhil(*arguments, "--resume")
     again = jaxhil(*arguments, "--resume")
-    assert "front as kept" in again.err and "steps" not in again.err
+    assert "front from the cache" in again.err and "steps" not in again.err
     shutil.rmtree(tmp_path)
     fresh = jaxhil(*arguments)
     expected = outputs(fresh.out, tmp_path)

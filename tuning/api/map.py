@@ -180,7 +180,7 @@ def _compute(
 def _axes(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, float], x: str, y: str
 ) -> "tuple[MapAxis, MapAxis]":
-    """Return both axes. Raise `InputError`, with the option that is wrong, if they are unusable."""
+    """Build both axes of the map; raise `InputError`, which names the wrong option, if this fails."""
     from jaxhil.laws.compensators import COMPENSATORS
     from tuning.stability_map.axes import check_axes, parse_axis
 
@@ -250,7 +250,7 @@ def _build_document(
 
 
 def _nominal(nominal: "NominalPoint") -> dict[str, Any]:
-    """Return the nominal point's entry of the document."""
+    """Return the JSON entry of the nominal point."""
     margins = {
         "error": nominal.error_margins,
         "contact": nominal.contact_margins,

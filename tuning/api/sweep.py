@@ -166,10 +166,10 @@ def sweep(
 def run_study(
     gains: Any, options: SweepOptions, folder: Path, progress: bool, keep: bool = True
 ) -> SweepStudy:
-    """Compute the scenarios that the store in `folder` lacks, and the additional studies of the options.
+    """Compute all scenarios that are missing in the store in `folder`, and the requested additional studies.
 
-    With `keep`, also write plots and the JSON document to the folder; otherwise, the result contains the
-    rows.
+    If `keep` is true, also write plots and the JSON document to the folder. Otherwise, the result contains
+    the rows.
     """
     path = gains if hasattr(gains, "document") else arguments.find_gain_file(gains)
     with jax_context(), _connect_workers(options.scheduler) as workers:
@@ -230,7 +230,7 @@ def _add_studies(
     keep: bool,
     workers: "ClusterWorkers | None",
 ) -> list[InputError]:
-    """Add plots and additional studies to the document; with `keep`, write the document after every step.
+    """Add plots and additional studies to the document; if `keep`, write the document after every step.
 
     Return the errors of files that could not be written. These errors are not raised, so that the results are
     not lost if the disk is full.

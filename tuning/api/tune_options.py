@@ -154,7 +154,7 @@ class TuneOptions:
             arguments.check_one_axis_arguments(mechanism, objective=self.objective)
 
     def settings(self, axes: int = 1) -> "TuneSettings":
-        """Return the settings of the tuning for a number of axes. Raise `InputError`. This imports jax."""
+        """Build the settings of the tuning for 1 or 6 axes; raise `InputError` if an option is invalid."""
         from tuning.gains.settings import TuneSettings
 
         arguments.check_setting_name(self.compensator, self.setting)

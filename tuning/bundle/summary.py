@@ -32,7 +32,7 @@ td, th { white-space: nowrap; } img { width: 100%; margin-top: 2mm; } .note { co
 
 
 def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> bytes:
-    """Return the HTML page for a checked gain document.
+    """Return the HTML page that summarises a checked gain document.
 
     `drawn` is the plot as PNG; None to draw a new plot.
     """

@@ -209,7 +209,7 @@ _DAMAGE_KINDS = (*ControllerInputs._fields[2:6], "stuck", "clock", "motion")
 
 
 def _draw_extreme(source: random.Random, value: float) -> float:
-    """Return a random choice of the extreme values and of changed copies of `value`."""
+    """Return a random extreme value, or `value` with its sign, size or digits changed."""
     return source.choice((*EXTREME_VALUES, 1e3 * value, -value, value + source.gauss(0.0, 1.0)))
 
 

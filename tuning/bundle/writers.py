@@ -56,7 +56,7 @@ def ros2_files(document: Mapping[str, Any]) -> dict[str, bytes]:
         pass
 
     class Text(str):
-        """Text that is written with quotes."""
+        """Text that the YAML file contains in quotes."""
 
     Dumper.add_representer(
         Text, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", str(text), style='"')

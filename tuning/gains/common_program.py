@@ -50,7 +50,7 @@ class CommonProgram:
     beforehand: bool  # whether ideal contacts without a closed form are integrated before the simulation
 
     def law(self, beforehand: bool | None = None) -> LawMixture:
-        """Return the mixture of all contact laws; it integrates ideal contacts if `beforehand` is false."""
+        """Return one law that mixes all contact laws; unless `beforehand`, it integrates ideal contacts."""
         return LawMixture(self._kinds, self.beforehand if beforehand is None else beforehand)
 
     @property

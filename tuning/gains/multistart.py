@@ -113,7 +113,7 @@ def find_gains(
         objectives[i], ends[i] = quiet_objective, quiet_starts
     if polishing:
         runs = polishing * len(tasks) * tasks[0].lanes
-        validation.work.begin("searching on without derivatives", runs)
+        validation.work.begin("final search without derivatives", runs)
     best = polish_best_starts(validation, ends, polishing, settings.seed, objectives)
     return [
         MultistartResult(
@@ -160,7 +160,7 @@ def _search_quieter_gains(
 
 
 def _count_batch_starts(settings: TuneSettings, first: Sequence[Sequence[Mapping[str, float]]] | None) -> int:
-    """Return the number of starts in a batch: room for all gains in `first` and for the literature's."""
+    """Return the number of starting points in a batch: at least one more than the gains in `first`."""
     return max(settings.starts, 1 + max(map(len, first))) if first else settings.starts
 
 
@@ -175,9 +175,9 @@ def estimate_search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
 def _solve_batches(
     validation, settings, first, agreed, searches: list[_SearchState], meanwhile: Callable[[], object]
 ) -> list[int]:
-    """Solve up to `MAX_START_BATCHES` batches of starts.
+    """Run the solver for up to `MAX_START_BATCHES` batches of starting points.
 
-    Return the indices of the tasks whose starts still disagree about the best value.
+    Return the indices of the tasks for which fewer than `MIN_AGREEING_STARTS` results have the best value.
     """
     tasks, objective, work = validation.tasks, settings.objective, validation.work
     numbers = [len(gains) for gains in first] if first else [0 for _ in tasks]
@@ -220,7 +220,7 @@ def choose_starts(
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
     scanned: int = TuneSettings.scanned,
 ) -> list[Float[np.ndarray, "starts gains"]]:
-    """Choose the starts of every task: the literature's gains, then the best distinct points of a scan.
+    """Choose the solver's starting points for every task: the literature's gains, then the best of a scan.
 
     `first` holds, for each task, gains that replace the last points of the scan.
     """
@@ -243,9 +243,9 @@ def polish_best_starts(
     seed: int,
     objective: Objectives = RMS_OBJECTIVE,
 ) -> list[StartResult | None]:
-    """Improve the best start of every task by a derivative-free search with `evaluations` evaluations.
+    """Improve the best solver result of every task by a derivative-free search of `evaluations` evaluations.
 
-    The search is `tuning.optimisation.derivative_free.polish`. A task whose starts all failed yields None.
+    The search is `tuning.optimisation.derivative_free.polish`. A task without a valid result yields None.
     """
     best = [ranked[0] if (ranked := _rank_starts(starts)) else None for starts in solved]
     indices = [i for i, top in enumerate(best) if top]
@@ -288,10 +288,10 @@ def _restart_stuck_starts(
     seed: int,
     objective: Objectives,
 ) -> tuple[list[StartResult], int]:
-    """Restart a derivative-free search from every start that ended above the best value.
+    """Continue from every solver result above the best value by a derivative-free search.
 
     The solver can get stuck at the kink of the objective where the compensator's correction reaches its
-    limit. Return all starts, and the number of evaluations of the search.
+    limit. Return all results, and the number of evaluations of the search.
     """
     ranked = _rank_starts(starts)
     stuck = [i for i, start in enumerate(starts) if ranked and start.rms > (1 + agreed) * ranked[0].rms]
@@ -314,7 +314,7 @@ def _restart_stuck_starts(
 def _recompute_exact_values(
     validation: Validation, task: int, starts: list[StartResult], objective: Objective
 ) -> list[StartResult]:
-    """Replace the smooth norm that the solver minimised by the exact objective in every start."""
+    """Replace the objective in each solver result, which is a smooth norm, by the exact objective."""
     if objective.name == "rms" or not starts:
         return starts
     values = validation.losses(objective, [task], np.stack([start.coordinates for start in starts])[None])[0]
@@ -347,7 +347,7 @@ def _compile_in_thread(validation: Validation, number: int, objective: Objective
 def _move_start(
     validation: Validation, task: int, start: StartResult, point: np.ndarray, loss: float
 ) -> StartResult:
-    """Return the start with the gains and loss of `point`; unchanged if `point` is where the start ended."""
+    """Return a solver result with the gains and the loss of `point`, where a further search ended."""
     if (point == start.coordinates).all():
         return start
     history = [*start.history, float(loss)]
@@ -360,7 +360,7 @@ def _rank_starts(starts: list[StartResult]) -> list[StartResult]:
 
 
 def _is_minimum_repeated(starts: list[StartResult], agreed: float) -> bool:
-    """Return whether the `MIN_AGREEING_STARTS` best starts agree within the relative difference `agreed`."""
+    """Return whether the `MIN_AGREEING_STARTS` best objectives differ by at most the fraction `agreed`."""
     ranked = _rank_starts(starts)
     return (
         len(ranked) >= MIN_AGREEING_STARTS

@@ -409,5 +409,5 @@ def _map_over_tiles(function: Callable[[Any], Outcome], arguments: Any) -> Outco
 
 
 def _flatten_lanes(leaf: Array) -> Array:
-    """Reshape (problems, ..., scenarios) to (..., lanes)."""
+    """Join the axes of problems and scenarios: reshape (problems, ..., scenarios) to (..., lanes)."""
     return jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], leaf.shape[0] * leaf.shape[-1])

@@ -163,13 +163,13 @@ def _build_tasks(results: Sequence[TuneResult]) -> list[TuneTask]:
 def _compute_locally(
     groups: list[_FrontGroup], work: SearchProgress, pieces: Checkpoints
 ) -> Iterator[tuple[int, list[ParetoFront]]]:
-    """Compute the fronts group by group; yield (index of the group, fronts)."""
+    """Compute the Pareto fronts of each group of mechanisms; yield (index of the group, fronts)."""
     for index, group in enumerate(groups):
         work.runs_after_group -= group.runs
         work.name = describe_group(group.tasks)
         group_fronts = _read_fronts(group, pieces)
         if group_fronts is not None:
-            work.keep("front as kept", group.runs)
+            work.keep("front from the cache", group.runs)
         else:
             if pieces.is_enabled:
                 work.journal = pieces.journal(group.names[0], group.inputs)
@@ -182,7 +182,7 @@ def _compute_locally(
 def _compute_on_cluster(
     scheduler: str, groups: list[_FrontGroup], work: SearchProgress, pieces: Checkpoints
 ) -> Iterator[tuple[int, list[ParetoFront]]]:
-    """Compute the fronts on a cluster; yield (index of the group, fronts) when a worker finishes a group."""
+    """Compute Pareto fronts on a cluster; yield (index of the group, fronts) when a worker is done."""
     missing = []
     for index, group in enumerate(groups):
         group_fronts = _read_fronts(group, pieces)
@@ -192,7 +192,7 @@ def _compute_on_cluster(
             missing.append(WorkUnit(index, (light, group.number, group.axis)))
             continue
         work.runs_after_group -= group.runs
-        work.keep("front as kept", group.runs)
+        work.keep("front from the cache", group.runs)
         yield index, group_fronts
     what = f"pareto-{compute_digest([group.inputs for group in groups])[:16]}"
     work.begin("on the cluster", 0.0)
@@ -235,12 +235,12 @@ def _compute_group_fronts(group: _FrontGroup, work: SearchProgress) -> list[Pare
     work.begin(f"accuracy against {axis.name}, {number} points", group.runs)
     validation = build_validation(tasks, settings.validation, settings.seed, work)
     points = solve_weight_ladders(validation, tuned, number, settings, axis)
-    work.begin(f"judging {number} points", _count_evaluation_runs(tasks, settings, number))
+    work.begin(f"evaluating {number} points", _count_evaluation_runs(tasks, settings, number))
     return _evaluate_fronts(validation, tuned, points, settings, axis)
 
 
 def _count_evaluation_runs(tasks: list[TuneTask], settings: TuneSettings, number: int) -> int:
-    """Return the number of runs that evaluate all points, the literature's gains and the earlier gains."""
+    """Return the number of simulated runs that evaluate all gains of the Pareto fronts."""
     return (number + 2) * len(tasks) * count_evaluated_runs(settings.validation, tasks[0].probed)
 
 

@@ -54,7 +54,7 @@ PARETO_CRITERIA = {axis.name: axis for axis in (NOISE_CRITERION, PEAK_CRITERION,
 
 
 def choose_default_criterion(compensator: str) -> ParetoCriterion | None:
-    """Return a compensator's default second criterion: noise, else the peak command, else None."""
+    """Return a compensator's second criterion in Pareto fronts: noise, else the peak command, else None."""
     if has_noise_trade_off(compensator):
         return NOISE_CRITERION
     return PEAK_CRITERION if COMPENSATORS[compensator].anticipates else None
@@ -99,7 +99,10 @@ def solve_weight_ladders(
     settings: TuneSettings,
     axis: ParetoCriterion = NOISE_CRITERION,
 ) -> list[list[tuple[float, dict[str, float]]]]:
-    """Search the gains of every point of every task; return (weight in the unit of `Objective`, gains)."""
+    """Search the best gains for every weight of every task's Pareto front.
+
+    Return, for each task, (weight in the unit of `Objective`, gains) of every point.
+    """
     unit = settings.objective.unit(axis.weight)
     weight = unit * getattr(settings.objective, axis.weight)
     pools = [
@@ -159,7 +162,7 @@ def replace_weight(objective: Objective, axis: ParetoCriterion, weight: float) -
 def _choose_first_starts(
     validation: Validation, tuned: list[TuneResult], objectives: list[list[Objective]], settings: TuneSettings
 ) -> list[list[np.ndarray]]:
-    """Return the starts of every point of each task: those of `choose_starts`, with the tuned gains last."""
+    """Choose starting gains for each weight of each task: those of `choose_starts`, and the tuned gains."""
     number, first = max(settings.starts, 2), [[result.gains] for result in tuned]
     by_point = [
         choose_starts(validation, number, settings.seed, of_point, first)
@@ -171,7 +174,7 @@ def _choose_first_starts(
 def _choose_neighbour_starts(
     validation: Validation, picked: list[list[_LadderCandidate]]
 ) -> list[list[np.ndarray]]:
-    """Return the starts of every point of each task: gains of the point and of its neighbouring weights."""
+    """Choose starting gains for each weight of each task: the best gains of this and adjacent weights."""
     return [
         [validation.coordinates(task, gains) for gains in _collect_neighbour_gains(points)]
         for task, points in enumerate(picked)
@@ -181,7 +184,7 @@ def _choose_neighbour_starts(
 def _solve_points(
     validation: Validation, starts, objectives, settings, axis: ParetoCriterion
 ) -> list[list[_LadderCandidate]]:
-    """Run the solver from all starts of all points; return the resulting candidates of each task."""
+    """Run the solver for all weights of all tasks; return the resulting gains of each task as candidates."""
     number = len(objectives[0])
     tasks = [task for task in validation.tasks for _ in range(number)]
     flat = list(chain(*objectives))
@@ -208,7 +211,7 @@ def _collect_candidates(
     weight: float,
     starts: list[StartResult],
 ) -> list[_LadderCandidate]:
-    """Convert the results of a task's starts, which were solved with one weight, into candidates."""
+    """Convert the solver's results for one task and one weight into candidates."""
     task = validation.tasks[index]
     if axis == NOISE_CRITERION:
         return _collect_noise_candidates(task, weight, starts)
@@ -229,7 +232,7 @@ def _collect_candidates(
 def _collect_noise_candidates(
     task: TuneTask, weight: float, starts: list[StartResult]
 ) -> list[_LadderCandidate]:
-    """Convert starts into candidates for the noise criterion, which depends on the gains alone."""
+    """Convert the solver's results into candidates if the second criterion is noise amplification."""
     candidates = []
     for start in starts:
         excess = max(0.0, compute_noise_amplification(task.mechanism, task.compensator, start.gains) - 1)
@@ -240,12 +243,12 @@ def _collect_noise_candidates(
 
 
 def _pick_candidates(pool: list[_LadderCandidate], weights: np.ndarray) -> list[_LadderCandidate]:
-    """Return the best candidate of the pool for each weight."""
+    """Return for each weight the candidate with the least objective."""
     return [min(pool, key=lambda candidate, weight=weight: candidate.value(weight)) for weight in weights]
 
 
 def _collect_neighbour_gains(picked: list[_LadderCandidate]) -> list[list[dict[str, float]]]:
-    """Return the distinct gains of each point and of the points with the next smaller and larger weight."""
+    """Return for each weight the distinct gains of the candidates for this and the adjacent weights."""
     neighbourhoods = []
     for index, point in enumerate(picked):
         near = [point, *picked[max(index - 1, 0) : index], *picked[index + 1 : index + 2]]

@@ -57,7 +57,7 @@ def is_quiet_search_needed(task: TuneTask, settings: TuneSettings) -> bool:
 
 
 def compute_training_tolerance(limit: float, scenarios: int) -> float:
-    """Return the largest rms error [1] on training scenarios with which other scenarios meet the limit."""
+    """Return the rms error [1] on training scenarios up to which fresh scenarios should meet the limit."""
     return limit / (1 + GENERALISATION_MARGIN / math.sqrt(scenarios))
 
 

@@ -144,7 +144,7 @@ def group_by_program(loops: list[Any], scenarios: list[Any]) -> list[list[int]]:
 
 
 def join_loops(loops: list[Any]) -> Any:
-    """Return one loop for all `loops` of a group, with the longest of their delay lines."""
+    """Return one simulated loop that can replace all `loops` of a group; it has the longest delay lines."""
     longest = {name: max(getattr(loop, name) for loop in loops) for name in _list_delay_line_fields(loops[0])}
     return dataclasses.replace(loops[0], **longest)
 

@@ -114,7 +114,7 @@ def tune_group(
     work.runs_after_group -= evaluating - beforehand
     clock.lap("tune")
     work.begin(
-        f"judging on {settings.validation} fresh scenarios", evaluating - (beforehand if baselines else 0)
+        f"evaluating on {settings.validation} fresh scenarios", evaluating - (beforehand if baselines else 0)
     )
     best = [
         result.best.gains if result.best else task.literature
@@ -167,7 +167,7 @@ def _compare_globally(
         left = (
             EVALUATION_FACTOR * validation.tasks[0].lanes * sum(later.evaluations for later in searched[i:])
         )
-        work.begin(f"searching everywhere, {i + 1} of {len(searched)}", left)
+        work.begin(f"global search, {i + 1} of {len(searched)}", left)
 
         def compare(i: int = i, result: MultistartResult = result) -> GlobalComparison | None:
             return compare_with_global_search(validation, i, result, settings)
@@ -255,7 +255,7 @@ def _compute_transparency(
 def _compute_tolerances(
     task: TuneTask, names: tuple[str, ...], best: StartResult | None
 ) -> dict[str, GainTolerance]:
-    """Return the tolerance of each gain that is tuned for the task, from the solver's final J^T J."""
+    """Return the tolerance of each tuned gain, from the solver's final J^T J; empty without a result."""
     moved = [i for i, name in enumerate(names) if name in {gain.name for gain in task.tuned}]
     if best is None or not moved or not np.all(np.isfinite(best.curvature)):
         return {}

@@ -146,14 +146,14 @@ def _group_tasks(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int
 def _tune_locally(
     groups: list[_TuneGroup], settings: TuneSettings, work: SearchProgress, pieces: Checkpoints
 ) -> Iterator[tuple[int, list[TuneResult]]]:
-    """Tune the groups in order; yield (index of the group, results)."""
+    """Tune each group of mechanisms in order; yield (index of the group, results)."""
     for index, group in enumerate(groups):
         runs = estimate_group_runs(group.tasks, settings)
         work.runs_after_group -= runs
         work.name = describe_group(group.tasks)
         results = _read_results(group, settings, pieces)
         if results is not None:
-            work.keep("as kept", runs)
+            work.keep("from the cache", runs)
         else:
             if pieces.is_enabled:
                 work.journal = pieces.journal(_list_names(group)[0], _list_inputs(group, settings))
@@ -170,14 +170,14 @@ def _tune_on_cluster(
     work: SearchProgress,
     pieces: Checkpoints,
 ) -> Iterator[tuple[int, list[TuneResult]]]:
-    """Tune the groups on a cluster; yield (index of the group, results) when a worker finishes a group."""
+    """Tune groups of mechanisms on a cluster; yield (index of the group, results) when a worker is done."""
     missing = []
     for index, group in enumerate(groups):
         runs = estimate_group_runs(group.tasks, settings)
         results = _read_results(group, settings, pieces)
         if results is not None:
             work.runs_after_group -= runs
-            work.keep("as kept", runs)
+            work.keep("from the cache", runs)
             yield index, results
             continue
         mechanisms = [task.mechanism for task in group.tasks]

@@ -148,7 +148,7 @@ class Validation:
     def _evaluate_function(
         self, objective: Objective, outcome: Outcome, pairs: int
     ) -> Float[np.ndarray, "pairs"] | None:
-        """Evaluate the user's function for every pair of task and point; return None without a function."""
+        """Evaluate a user's objective function for every pair of task and point; return None if unused."""
         if objective.function is None:
             return None
         task = self.tasks[0]
@@ -217,7 +217,7 @@ def _keep_outcome(outcome: Outcome) -> Outcome:
 
 
 def _keep_contact_terms(outcome: Any) -> Any:
-    """Remove all fields from the outcome that `compute_contact_terms` does not need."""
+    """Keep the fields of an outcome that `compute_contact_terms` needs; replace all others by None."""
     return outcome._replace(metrics=None, reference_restitution=None, reference_peak_force=None)
 
 
@@ -267,7 +267,7 @@ def count_evaluated_runs(scenarios: int, probed: bool) -> int:
 
 
 def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
-    """Split an outcome of `Validation.judge` into one of the fresh scenarios and one of the nominal run."""
+    """Split an outcome into that of the fresh scenarios and that of the nominal run, its last lane."""
     fresh, nominal = (
         jax.tree.map(lambda leaf, part=part: leaf[..., part], outcome)
         for part in (slice(-1), slice(-1, None))

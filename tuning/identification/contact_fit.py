@@ -175,7 +175,7 @@ def fit_contact(
         readings = _drop_readings_near_edges(problem, posterior)
         problem, posterior = _fit_laws(motion, readings, (law,), plane, None, noise_is_hidden, seed)
         posterior = _add_surface_uncertainty(posterior, seed)
-    freedom = len(problem.kept) - len(posterior.names)
+    freedom = len(problem.used_rows) - len(posterior.names)
     error = 0.0 if noise is None or noise_is_hidden else noise.std_std / max(noise.std, 1e-300)
     is_specified = plane_option is not None
     return ContactFit(
@@ -370,7 +370,7 @@ def _estimate_noise_from_contact(
     for _ in range(3):
         problem = ContactProblem(motion, result, kelvin_voigt(), plane)
         delay, at, misfit = search_coarsely(problem)
-        std = result.std * np.sqrt(max(misfit, 0.0) / max(len(problem.kept) - 5, 1))
+        std = result.std * np.sqrt(max(misfit, 0.0) / max(len(problem.used_rows) - 5, 1))
         std = max(std, MIN_NOISE_SHARE * peak)
         counts = readings.counts
         if readings.threshold:
@@ -411,7 +411,7 @@ def refit_without(fit: ContactFit, held_out: np.ndarray, seed: int = 0) -> Conta
     readings, problem = fit.readings, fit.problem
     rest = replace(readings, counts=readings.counts & ~held_out)
     rest = ContactProblem(problem.motion, rest, fit.law, problem.plane, problem.time_constant)
-    freedom = len(rest.kept) - len(fit.posterior.names)
+    freedom = len(rest.used_rows) - len(fit.posterior.names)
     delay, plane, inner = fit.posterior.best
     rest = summarise_deep_lanes(rest, (delay, plane))
     if rest.time_constant:

@@ -83,28 +83,28 @@ class ContactProblem:
         self.time_constant = time_constant
         # The force delay is relative to the delay of the position sensor, so it may be negative.
         self.min_delay = -COARSE_DELAY_STEP * float(np.floor(max(motion.delay, 0.0) / COARSE_DELAY_STEP))
-        self.plain = len(readings.whitening) == 1 and time_constant == 0.0
-        self.kept = np.flatnonzero(readings.counts)
+        self.is_unfiltered = len(readings.whitening) == 1 and time_constant == 0.0
+        self.used_rows = np.flatnonzero(readings.counts)
         # Index of each row among the used rows, or -1 for an unused row. The additional last entry is -1,
         # for the row index -1.
-        self.places = np.full(readings.counts.size + 1, -1)
-        self.places[self.kept] = np.arange(len(self.kept))
+        self.used_indices = np.full(readings.counts.size + 1, -1)
+        self.used_indices[self.used_rows] = np.arange(len(self.used_rows))
         # Filters also need the rows that fits do not use.
-        self.where = self.kept if self.plain else np.arange(readings.counts.size)
-        self.target = self.whiten(readings.force).ravel()[self.kept] / readings.std
+        self.needed_rows = self.used_rows if self.is_unfiltered else np.arange(readings.counts.size)
+        self.target = self.whiten(readings.force).ravel()[self.used_rows] / readings.std
         self.damping_indices = [i for i, name in enumerate(self.names) if name.startswith("damping")]
         # A dead zone changes only the readings in contact; a bias changes all readings.
-        self.local = bool(readings.threshold)
+        self.has_dead_zone = bool(readings.threshold)
         # Whitened and normalized reading out of contact for a bias of 1 N.
-        self.bias_alone = 0.0 if self.local else float(np.sum(readings.whitening)) / readings.std
+        self.bias_alone = 0.0 if self.has_dead_zone else float(np.sum(readings.whitening)) / readings.std
         self.sums = sum_and_squares(self.target)
         self.memory = len(readings.whitening) + int(
             np.ceil(FILTER_MEMORY_TIME_CONSTANTS * time_constant / motion.period)
         )
         # Times at which the force is computed, in periods before a row; a lag integrates the force between
         # rows.
-        self.before = (0.0,) if time_constant == 0.0 else (0.0, 0.5)
-        self._at: tuple[float, list[tuple[np.ndarray, np.ndarray]]] | None = None
+        self.periods_before = (0.0,) if time_constant == 0.0 else (0.0, 0.5)
+        self._cached_motion: tuple[float, list[tuple[np.ndarray, np.ndarray]]] | None = None
         self._guess: np.ndarray | None = None
 
     @cached_property
@@ -154,7 +154,7 @@ class ContactProblem:
             The rows near contact, flags of the rows in contact, and the fit for each surface position.
         """
         moved = self._motion_at(delay)
-        near = [self._near(*motion, self.where, planes) for motion in moved]
+        near = [self._near(*motion, self.needed_rows, planes) for motion in moved]
         flags = [self._touching(rows, self._guess) for rows in near]
         onsets = self._onsets(near[0], [x for x, _ in moved], planes)
         fit = self._solve(near, flags, onsets, pseudo)
@@ -179,15 +179,18 @@ class ContactProblem:
         ]
 
     def _motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position [m] and velocity [m/s] in the rows `where`, for each time in `before`."""
-        if self._at is None or self._at[0] != delay:
+        """Return position [m] and velocity [m/s] in `needed_rows`, for each of `periods_before`."""
+        if self._cached_motion is None or self._cached_motion[0] != delay:
             moved = self.motion_at(delay)
-            self._at = delay, [(x.ravel()[self.where], v.ravel()[self.where]) for x, v in moved]
-        return self._at[1]
+            self._cached_motion = (
+                delay,
+                [(x.ravel()[self.needed_rows], v.ravel()[self.needed_rows]) for x, v in moved],
+            )
+        return self._cached_motion[1]
 
     def motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position [m] and velocity [m/s] in all rows, for each time in `before`."""
-        return [self.motion.at(delay + part * self.motion.period) for part in self.before]
+        """Return position [m] and velocity [m/s] in all rows, for each of `periods_before`."""
+        return [self.motion.at(delay + part * self.motion.period) for part in self.periods_before]
 
     def onsets_between(self, delay: float, low: float, high: float) -> np.ndarray:
         """Return the surface positions [m] from `low` to `high` at which the rows in contact change."""
@@ -236,7 +239,7 @@ class ContactProblem:
         last = np.where(before >= 0, now[np.maximum(before, 0)], now[near.rows])
         left = compute_onset_shares(last, half[near.rows], now[near.rows], planes[:, None])
         plane, row = np.nonzero(left)
-        columns = self._columns(np.zeros((1, len(row))), near.rate[row], self.where[near.rows[row]])[0]
+        columns = self._columns(np.zeros((1, len(row))), near.rate[row], self.needed_rows[near.rows[row]])[0]
         rate = self.motion.period / self.time_constant
         return _Onsets(plane, row, columns, *compute_onset_weights(rate, left[plane, row]))
 
@@ -248,8 +251,8 @@ class ContactProblem:
         """Apply the lag of the sensor and the whitening filter to the functions of the law.
 
         Args:
-            near: Rows near contact, for each time in `before`.
-            tables: Values of the functions in these rows, for each time in `before`.
+            near: Rows near contact, for each of `periods_before`.
+            tables: Values of the functions in these rows, for each of `periods_before`.
             onsets: Onsets of contact, or None if the sensor has no lag.
             first: Values of the functions just after the onsets, shape (functions, onsets), or None.
             where: Rows of the result.
@@ -286,7 +289,7 @@ class ContactProblem:
             drive = np.asarray(lfilter(self.readings.whitening, [1.0, -pole], drive))
         else:
             drive = _whitened(drive, self.readings.whitening)
-        used = drive.swapaxes(2, 3).reshape(*drive.shape[:2], -1)[:, :, self.kept]
+        used = drive.swapaxes(2, 3).reshape(*drive.shape[:2], -1)[:, :, self.used_rows]
         bias = np.full(
             (len(planes), 1, used.shape[2]), float(np.sum(self.readings.whitening)) / self.readings.std
         )
@@ -305,17 +308,17 @@ class ContactProblem:
             # rows in contact.
             table = np.empty((len(flag), rows_near.columns.shape[1] + 1, len(rows_near.rows)))
             np.multiply(rows_near.columns, flag[:, None] / std, out=table[:, :-1])
-            table[:, -1] = flag / std if self.local else 1.0 / std
+            table[:, -1] = flag / std if self.has_dead_zone else 1.0 / std
             tables.append(table)
         if onsets is not None:
             ones = np.ones((1, len(onsets.row)))
             first = np.vstack([onsets.columns, ones]) * flags[0][onsets.plane, onsets.row] / std
-        if self.plain:
+        if self.is_unfiltered:
             return tables[0], self.target[near[0].rows]
         where = self._packed(near)
-        used = self.places[where.rows]
+        used = self.used_indices[where.rows]
         design = self._filtered(near, tables, onsets, first, where, self.readings.whitening)[:, :, used >= 0]
-        if not self.local:
+        if not self.has_dead_zone:
             design[:, -1] = self.bias_alone
         return design, self.target[used[used >= 0]]
 
@@ -342,19 +345,19 @@ class ContactProblem:
             )
             where = self._packed(near)
             high, low = self._predicted(*shifted, coefficients, where, self.readings.whitening)
-            return (high - low)[self.places[where.rows] >= 0] / scale
+            return (high - low)[self.used_indices[where.rows] >= 0] / scale
         now = near[0]
-        rows = self.where[now.rows]
+        rows = self.needed_rows[now.rows]
         up, down = (
             compute_force(coefficients, self._columns(np.maximum(now.depth + d, 0.0), now.rate, rows))
             for d in (STEP, -STEP)
         )
         table = ((down - up) * flag / scale)[:, None]
-        if self.plain:
+        if self.is_unfiltered:
             return table[0, 0]
         where = self._packed(near)
         table = self._filtered(near, [table], None, None, where, self.readings.whitening)
-        return table[0, 0, self.places[where.rows] >= 0]
+        return table[0, 0, self.used_indices[where.rows] >= 0]
 
     def force(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """Return the predicted force readings [N], including the bias, (rows, lanes)."""
@@ -364,11 +367,11 @@ class ContactProblem:
         force, real = np.zeros(self.readings.force.shape), where.rows >= 0
         values = self._predicted(near, flags, onsets, coefficients, where, (1.0,))[0]
         force.ravel()[where.rows[real]] = values[real]
-        return force if self.local else force + coefficients[-1]
+        return force if self.has_dead_zone else force + coefficients[-1]
 
     def _predicted(self, near, flags, onsets, coefficients, where: PackedRows, whitening) -> np.ndarray:
         """Return the predicted and whitened force readings [N], (planes, rows), without a constant bias."""
-        offset, first = self.local * coefficients[-1], None
+        offset, first = self.has_dead_zone * coefficients[-1], None
         tables = [
             ((compute_force(coefficients, part.columns) + offset) * flag)[:, None]
             for part, flag in zip(near, flags, strict=True)
@@ -390,7 +393,7 @@ class ContactProblem:
         """Search all rows for contact; return rows near contact, flags of rows in contact, and onsets.
 
         Args:
-            moved: Position [m] and velocity [m/s] in all rows, for each time in `before`.
+            moved: Position [m] and velocity [m/s] in all rows, for each of `periods_before`.
             planes: Surface positions [m].
             coefficients: Coefficients of the law.
         """

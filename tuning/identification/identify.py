@@ -259,7 +259,7 @@ def _fit_and_check_contact(
     )
     if options.bootstrap:
         say(f"fitting {options.bootstrap} bootstrap samples of the contacts")
-        fit = bootstrap(fit, options.bootstrap, options.seed, options.scheduler, options.kept, say)
+        fit = bootstrap(fit, options.bootstrap, options.seed, options.scheduler, options.checkpoints, say)
     say("evaluating a fit on contacts that it does not use")
     left_out = select_held_out_contacts(runs, options.hold_out)
     if not left_out.any():

@@ -57,24 +57,28 @@ def choose_contact_law(
 
     The segments of a long press are similar, so that exponents and depths are fitted to a few segments.
     """
-    judged = []
+    evaluated = []
     lanes = select_representative_lanes(ContactProblem(motion, readings, kelvin_voigt(), plane))
-    few, few_readings = motion.of(lanes), readings.select_lanes(lanes)
+    few_lanes, few_readings = motion.of(lanes), readings.select_lanes(lanes)
     is_same, fitted_families = len(lanes) == readings.force.shape[1], {}
     _, plane_there, _ = guess = _fit_coarsely(motion, readings, kelvin_voigt(), plane, None)
-    judging = replace(readings, counts=readings.counts & ~flag_rows_near_edges(motion, readings, guess))
+    evaluated_readings = replace(
+        readings, counts=readings.counts & ~flag_rows_near_edges(motion, readings, guess)
+    )
     deepest = float(np.max(motion.at(guess[0])[0][readings.counts])) - plane_there
     for family in list_law_families(deepest, len(readings.entries), names):
         law, result = _fit_shape(
-            family, lambda candidate: _fit_coarsely(few, few_readings, candidate, plane, guess)
+            family, lambda candidate: _fit_coarsely(few_lanes, few_readings, candidate, plane, guess)
         )
         result = result if is_same else _fit_coarsely(motion, readings, law, plane, guess)
         fitted_families[id(law)] = family
-        judged.append((law, result, _cross_validate(motion, readings, judging, law, plane, result)))
-    totals = [likelihood.sum() for _, _, likelihood in judged]
-    best = judged[int(np.argmax(totals))][2]
+        evaluated.append(
+            (law, result, _cross_validate(motion, readings, evaluated_readings, law, plane, result))
+        )
+    totals = [likelihood.sum() for _, _, likelihood in evaluated]
+    best = evaluated[int(np.argmax(totals))][2]
     results = []
-    for law, (delay, at, misfit), likelihood in judged:
+    for law, (delay, at, misfit), likelihood in evaluated:
         behind = best - likelihood
         error = float(np.sqrt(len(behind)) * behind.std(ddof=1)) if len(behind) > 1 else 0.0
         results.append(EvaluatedLaw(law, delay, at, misfit, likelihood, (float(behind.sum()), error)))
@@ -84,13 +88,13 @@ def choose_contact_law(
     damped = [fit for fit in results if "damping" in fit.law.names] or results
     # The delay also replaces damping at the onset if the damping of the law is zero at zero depth.
     least = min(fit.misfit for fit in results)
-    at_once = [fit for fit in damped if has_onset_damping(fit.law)]
+    damped_at_onset = [fit for fit in damped if has_onset_damping(fit.law)]
     if any(
         fit.likelihood_deficit[0] <= ONSET_DAMPING_EXCLUSION_ERRORS * fit.likelihood_deficit[1] + 1e-9
         and fit.misfit <= least + ONSET_DAMPING_EXCLUSION_ERRORS**2
-        for fit in at_once
+        for fit in damped_at_onset
     ):
-        damped = at_once
+        damped = damped_at_onset
     good = [
         fit
         for fit in damped
@@ -99,15 +103,15 @@ def choose_contact_law(
     ]
     good = good or [min(damped, key=lambda fit: fit.likelihood_deficit[0])]
     # Among laws of equal complexity, the first one is chosen; the misfits would depend on noise.
-    taken = min(good, key=lambda fit: fit.law.complexity)
-    others = [fit for fit in results if fit is not taken]
-    if not is_same and taken.law.shape:
+    chosen = min(good, key=lambda fit: fit.law.complexity)
+    others = [fit for fit in results if fit is not chosen]
+    if not is_same and chosen.law.shape:
         law, (delay, at, misfit) = _fit_shape(
-            fitted_families[id(taken.law)],
+            fitted_families[id(chosen.law)],
             lambda candidate: _fit_coarsely(motion, readings, candidate, plane, guess),
         )
-        taken = replace(taken, law=law, delay=delay, plane=at, misfit=misfit)
-    return [taken, *sorted(others, key=lambda fit: fit.likelihood_deficit[0])]
+        chosen = replace(chosen, law=law, delay=delay, plane=at, misfit=misfit)
+    return [chosen, *sorted(others, key=lambda fit: fit.likelihood_deficit[0])]
 
 
 def has_onset_damping(law: Law) -> bool:
@@ -205,7 +209,9 @@ def flag_rows_near_edges(motion: MotionResponse, readings: ForceReadings, guess:
     return np.any(flags, axis=0) & ~np.all(flags, axis=0)
 
 
-def _cross_validate(motion, readings, judging: ForceReadings, law, plane, start: CoarseFit) -> np.ndarray:
+def _cross_validate(
+    motion, readings, evaluated_readings: ForceReadings, law, plane, start: CoarseFit
+) -> np.ndarray:
     """Return the log likelihood of each odd contact under a fit to the even contacts, and vice versa.
 
     With too few contacts, the result is one value: minus half the information criterion.
@@ -221,7 +227,9 @@ def _cross_validate(motion, readings, judging: ForceReadings, law, plane, start:
         problem = ContactProblem(motion, taught, law, plane)
         delay, at, _ = search_coarsely(problem, start, 1)
         coefficients = problem.at(delay, at).coefficients
-        likelihood[mine] = -0.5 * compute_contact_misfits(problem, judging, delay, at, coefficients)[mine]
+        likelihood[mine] = (
+            -0.5 * compute_contact_misfits(problem, evaluated_readings, delay, at, coefficients)[mine]
+        )
     return likelihood
 
 

@@ -179,7 +179,7 @@ def _make_contact_fit(
         (delay, plane, inner),
     )
     error = 0.0 if noise is None or noise.silent else noise.std_std / max(noise.std, 1e-300)
-    return ContactFit(law, (), problem, posterior, len(problem.kept), error, has_dead_zone)
+    return ContactFit(law, (), problem, posterior, len(problem.used_rows), error, has_dead_zone)
 
 
 def _estimate_force_noise(runs: Sequence[LoggedRun]) -> NoiseEstimate | None:

@@ -29,7 +29,7 @@ class IdentificationOptions:
     clock: float = 2e-5  # s, minimum standard uncertainty of a delay: no log reveals an error of its clock
     seed: int = 0  # seed of the random numbers
     scheduler: str | None = None  # address of a cluster's scheduler for the bootstrap
-    kept: Checkpoints = NO_CHECKPOINTS  # checkpoints of the bootstrap
+    checkpoints: Checkpoints = NO_CHECKPOINTS  # checkpoints of the bootstrap
 
 
 MIN_BOOTSTRAP_FITS = 20  # minimum number of fits that determine the scatter

@@ -74,7 +74,7 @@ def estimate_sensor_lag(problem: ContactProblem, posterior: Posterior, seed: int
     def fit(value: float) -> CoarseFit:
         return at(value)[1]
 
-    needed = MIN_CRITERION_GAIN + np.log(len(problem.kept))
+    needed = MIN_CRITERION_GAIN + np.log(len(problem.used_rows))
     if inner.misfit - min(fit(value)[2] for value in TRIAL_TIME_CONSTANTS) < 0.5 * needed:
         return _average_over_lag(problem, posterior, at, seed)
     period = problem.motion.period

@@ -192,7 +192,7 @@ def list_input_columns(mechanism: AnyMechanism, path: str) -> list[str]:
 
 
 def select_read_fields(mechanism: AnyMechanism, works: bool, outcome: Outcome) -> Any:
-    """Replace all fields of an outcome that `build_rows` does not read by None."""
+    """Keep the fields of an outcome that `build_rows` reads; replace all others by None."""
     names = {
         "status",
         "restitution",

@@ -3,8 +3,8 @@
 The expected restitution is a polynomial in p = sqrt(k_0/k) - 1, w = v/v_0 - 1 and z = b/(2 sqrt(k M)). Here v
 is the approach speed, M the equivalent mass, and k and b are the stiffness and damping that the watchdog
 estimates (`jaxhil.rig.watchdog`). An unknown delay delta of the force changes the estimate of k only by the
-factor cos(omega delta), but the estimate of b by -k delta. The rig cannot distinguish this from damping.
-Therefore b is used only if it reduces the error for contacts that were not part of the fit.
+factor cos(omega delta), but the estimate of b by -k delta, which the rig cannot distinguish from damping. The
+polynomial therefore contains b only if this reduces the error for contacts that were not part of the fit.
 """
 
 from collections.abc import Sequence

@@ -2,8 +2,8 @@
 
 If the expected restitution is accurate, the sum of the margin and the error of the expectation is below the
 limit, so that no bad run is missed. If neither damping nor delay is known, the error of the expectation is
-too large for this, because an unknown delay looks like damping (`tuning.watchdog.expectation`). Then a small
-margin would stop good runs. The margin is widened until good runs pass, and
+larger, because an unknown delay looks like damping (`tuning.watchdog.expectation`), and a small margin would
+stop good runs. The margin is then widened until good runs pass, and
 `tuning.watchdog.alarms.find_detectable_error` computes which errors are still detected.
 """
 

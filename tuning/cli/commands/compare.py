@@ -18,10 +18,11 @@ PLOTS = ("errors.png", "honesty.png")
 
 
 def run(options: Compare) -> int:
-    """Compare the compensators, and write and print the results, after an interruption the finished ones.
+    """Compare the compensators, and write and print the results.
 
-    With `--resume`, finished work is not repeated. Return the exit code: 0, 1 if the evaluation of a
-    compensator failed, or 130 after an interruption.
+    After an interruption, the finished results are written and printed. With `--resume`, finished work is not
+    repeated. Return the exit code: 1 if the evaluation of a compensator failed, 130 after an interruption,
+    else 0.
     """
     options.check()
     loaded = _load(options)

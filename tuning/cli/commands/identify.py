@@ -62,7 +62,7 @@ def run(options: IdentifyOptions) -> int:
         limit=options.limit,
         seed=options.seed,
         scheduler=options.scheduler,
-        kept=checkpoints,
+        checkpoints=checkpoints,
     )
     with terminal.show_stages(STAGE_COUNT + 2 + -(-options.bootstrap // FITS_PER_CHUNK)) as stages:
         stages.turn_to("reading the logs")

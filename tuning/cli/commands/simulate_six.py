@@ -112,7 +112,7 @@ def _worst_error(episode: "Episode") -> float:
 
 
 def _is_unlike_ideal(result: "SixAxisRun") -> list[bool]:
-    """Return for each episode whether real peak force or duration is out of bounds of the ideal contact's."""
+    """Return for each episode whether its peak force or duration differs too much from the ideal contact."""
     from jaxhil.simulation.contact_bounds import is_contact_out_of_bounds
 
     period = result.mechanism.rig.control_period

@@ -102,7 +102,7 @@ def _six_axis_error_table(options: Tune, result: Any, entry: dict[str, Any]) -> 
 
 
 def _cells(figures: Any) -> tuple[Any, ...]:
-    """Return the cells of the size and the mean of errors."""
+    """Return the table cells of restitution errors: rms, 99th percentile, maximum and mean."""
     return figures.rms, figures.p99, figures.max, f"{figures.mean:+.4f}"
 
 
