@@ -29,10 +29,7 @@ CHECKPOINT_SUFFIX = ".piece"
 
 
 class Checkpoints:
-    """Checkpoints in a folder.
-
-    Existing checkpoints are read only if `resume` is true. Without a folder, nothing is stored or read.
-    """
+    """Checkpoints in a folder, read only if `resume` is true; without a folder, nothing is stored or read."""
 
     def __init__(self, folder: Path | None = None, resume: bool = False):
         self._folder, self._resume = folder, resume
@@ -91,10 +88,7 @@ class Checkpoints:
         return StepCheckpoints(steps, inputs)
 
     def remove(self) -> None:
-        """Remove all checkpoints, and their folder if it is then empty.
-
-        If removing fails, add the error to `unwritten`.
-        """
+        """Remove all checkpoints, and their folder if it is then empty; add a write error to `unwritten`."""
         if self._folder is None or not self._folder.is_dir():
             return
         with self._recording_errors(self._folder):
@@ -106,7 +100,6 @@ class Checkpoints:
                 self._folder.rmdir()
 
     def _path(self, name: str) -> Path | None:
-        """Return the path of the checkpoint `name`, or None if there is no folder."""
         return None if self._folder is None else self._folder / f"{_build_file_name(name)}{CHECKPOINT_SUFFIX}"
 
     @contextmanager
@@ -155,10 +148,7 @@ def compute_digest(inputs: Any) -> str:
 
 
 def encode_value(value: Any, order: Literal["deterministic"] | None = None) -> bytes:
-    """Encode mappings, sequences, records, arrays, text and numbers as MessagePack.
-
-    Raise TypeError for a value of another type.
-    """
+    """Encode mappings, sequences, records, arrays, text and numbers as MessagePack, or raise TypeError."""
     return msgspec.msgpack.encode(value, enc_hook=_convert_to_plain, order=order)
 
 
@@ -168,7 +158,6 @@ def decode_value(content: bytes | msgspec.Raw, kind: Any) -> Any:
 
 
 def _build_file_name(name: str) -> str:
-    """Return a unique and readable file name for the checkpoint `name`."""
     readable = re.sub(r"[^A-Za-z0-9-]+", "-", name)[:80]
     return f"{readable}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 

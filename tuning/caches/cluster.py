@@ -91,10 +91,7 @@ async def _check_answer(address: str) -> None:
 
 @contextmanager
 def _suppress_logs() -> Iterator[None]:
-    """Suppress the log messages of dask.distributed during a `with` block.
-
-    A lost scheduler is reported as one error message instead.
-    """
+    """Suppress the log messages of dask.distributed during a `with` block; errors are reported separately."""
     loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if "distributed" in name]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -119,19 +116,11 @@ class ClusterWorkers:
         setting: ProcessSetting | None,
         what: str,
     ) -> Generator[tuple[Any, Any], None, None]:
-        """Call `function` for every work unit on the workers; yield (name, result) when a unit finishes.
+        """Call `function` for every work unit on the workers; yield (name, result) when a unit is done.
 
-        Workers can join while this runs.
-
-        Args:
-            function: function at the top level of a module.
-            pieces: work units.
-            setting: process setting that every worker must have; None if `function` checks it.
-            what: unique name of the work.
-
-        Raises:
-            InputError: the scheduler is lost, or a worker has another setting. Exceptions of `function` are
-                raised too.
+        Workers can join later. `function` is defined at the top level of a module. Unless `setting` is None, every
+        worker must have this process setting. `what` is a unique name of the work. Raise `InputError` if the
+        scheduler is lost or a worker has another setting. Exceptions of `function` are raised too.
         """
         with _raise_if_lost(self._address):
             from cloudpickle import dumps  # pyright: ignore[reportMissingImports]

@@ -52,10 +52,7 @@ def run_pickled_call(content: bytes, asked: ProcessSetting | None) -> Any:
 
 
 def check_process_setting(asked: ProcessSetting, here: ProcessSetting) -> None:
-    """Raise `InputError` if the setting `here` of a worker differs from the requested setting `asked`.
-
-    The worker's results could then differ in their last bits.
-    """
+    """Raise `InputError` if the setting `here` of a worker differs from the requested setting `asked`."""
     for name in ProcessSetting._fields:
         actual, expected = getattr(here, name), getattr(asked, name)
         if actual == expected or expected is None:
@@ -68,9 +65,6 @@ def check_process_setting(asked: ProcessSetting, here: ProcessSetting) -> None:
 
 
 def build_setting_error(what: str, flags: bool) -> InputError:
-    """Build the error for a worker with the wrong setting `what`.
-
-    If the XLA flags differ (`flags`), the message contains the command that starts workers correctly.
-    """
+    """Build the error for a worker with a wrong setting; if `flags`, name the command that starts workers."""
     advice = f"; start workers by: {PRELOAD_COMMAND}" if flags else ""
     return InputError(f"--scheduler: a worker: {what}: its results would differ{advice}")

@@ -35,10 +35,7 @@ def compare_with_global_search(
     settings: TuneSettings,
     factor: int = EVALUATION_FACTOR,
 ) -> GlobalComparison | None:
-    """Compare the tuned gains of one task with a global search of `factor` times as many evaluations.
-
-    Return None if tuning failed from every start.
-    """
+    """Compare tuned gains with a search of `factor` times as many evaluations; None if tuning failed."""
     if found.best is None:
         return None
 

@@ -175,10 +175,7 @@ def estimate_search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
 def _solve_batches(
     validation, settings, first, agreed, searches: list[_SearchState], meanwhile: Callable[[], object]
 ) -> list[int]:
-    """Run the solver for up to `MAX_START_BATCHES` batches of starting points.
-
-    Return the indices of the tasks for which fewer than `MIN_AGREEING_STARTS` results have the best value.
-    """
+    """Solve batches of starting points; return tasks with fewer than `MIN_AGREEING_STARTS` best results."""
     tasks, objective, work = validation.tasks, settings.objective, validation.work
     numbers = [len(gains) for gains in first] if first else [0 for _ in tasks]
     number = _count_batch_starts(settings, first)

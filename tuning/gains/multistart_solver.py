@@ -138,10 +138,7 @@ def solve_tasks(
 
 
 def _mark_converged(problems: list[_StartState], before: list[float]) -> None:
-    """Mark problems as converged if the round reduced the objective by less than the minimum improvement.
-
-    `before` holds each problem's loss before the round.
-    """
+    """Mark problems as converged whose loss `before` the round fell by less than the minimum improvement."""
     for problem, loss in zip(problems, before, strict=True):
         if problem.status == STEP_LIMIT and problem.loss > (1 - MIN_RELATIVE_IMPROVEMENT) ** 2 * loss:
             problem.status = SOLVER_STATUSES.index("converged")
@@ -237,10 +234,7 @@ def assign_to_devices(size: int) -> np.ndarray:
 
 
 def _build_call(tasks, names, bounds, objectives, number):
-    """Return the static arguments of `_solve_call`, and a function that builds the other arguments.
-
-    The function takes the problems and the number of steps.
-    """
+    """Return the static arguments of `_solve_call`, and a function that builds the other arguments."""
     loop = join_loops([task.loop for task in tasks])
     fixed = [{k: v for k, v in task.literature.items() if k not in names} for task in tasks]
     weights = [objective.weights for objective in objectives]

@@ -141,10 +141,7 @@ class ObjectiveTerms(NamedTuple):
 
 
 class ObjectiveWeights(NamedTuple):
-    """Weights of the objective of each problem, as arguments of the compiled program.
-
-    C, N, S and H are the terms of `Objective`.
-    """
+    """Weights of each problem's objective (terms C, N, S and H of `Objective`), arguments of the program."""
 
     divergence: Float[Array, "*problems"]  # weight of squared positive errors over that of negative ones [1]
     command: Float[Array, "*problems"]  # weight of the excess peak command C [1]

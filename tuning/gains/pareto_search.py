@@ -99,10 +99,7 @@ def solve_weight_ladders(
     settings: TuneSettings,
     axis: ParetoCriterion = NOISE_CRITERION,
 ) -> list[list[tuple[float, dict[str, float]]]]:
-    """Search the best gains for every weight of every task's Pareto front.
-
-    Return, for each task, (weight in the unit of `Objective`, gains) of every point.
-    """
+    """Search the best gains for every weight of every task; return (weight, gains) of every point."""
     unit = settings.objective.unit(axis.weight)
     weight = unit * getattr(settings.objective, axis.weight)
     pools = [

@@ -46,10 +46,7 @@ class SearchProgress:
         self._show()
 
     def step(self, name: str, kind: Any, make: Callable[[], Any]) -> Any:
-        """Return the step's checkpoint from before an interruption; without one, call `make` and save it.
-
-        `kind` is the type of the result of `make`.
-        """
+        """Read a step's result, of type `kind`, from a checkpoint; if there is none, call `make` and save it."""
         return self.journal.step(name, kind, make)
 
     def _show(self) -> None:

@@ -165,10 +165,7 @@ def list_tuned_gains(tasks: list[TuneTask]) -> tuple[str, ...]:
 
 
 def build_gain_bounds(task: TuneTask, names: tuple[str, ...]) -> GainBounds:
-    """Return the lower and upper bounds (gains,) of the gains `names`.
-
-    Both bounds of a gain that is not tuned for the task are the gain's literature value.
-    """
+    """Return the bounds (gains,) of the gains `names`; both are the literature's value for untuned gains."""
     gains = {gain.name: gain for gain in get_compensator(task.compensator, task.model.axes).gains}
     moved = {gain.name for gain in task.tuned}
 

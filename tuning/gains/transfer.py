@@ -108,10 +108,7 @@ def find_nearest(mechanism: Mechanism, tuned: Sequence[EarlierGains]) -> Earlier
 def find_nearest_of_each(
     mechanism: AnyMechanism, sources: Sequence[Sequence[EarlierGains]]
 ) -> list[EarlierGains]:
-    """Return the nearest tuned gains of each source.
-
-    The list is empty for a six-axis mechanism, because the distance is defined for one axis only.
-    """
+    """Return the nearest tuned gains of each source; none for six axes, where no distance is defined."""
     if not isinstance(mechanism, Mechanism):
         return []
     return [find_nearest(mechanism, tuned) for tuned in sources]

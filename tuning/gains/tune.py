@@ -161,7 +161,6 @@ def tune_group(
 def _compare_globally(
     validation: Validation, searched: list[MultistartResult], settings: TuneSettings
 ) -> list[GlobalComparison | None]:
-    """Compare the tuned gains of every task with the best gains of a global search."""
     work, comparisons = validation.work, []
     for i, result in enumerate(searched):
         left = (
@@ -301,10 +300,7 @@ def _compare_real_contacts(outcome: Outcome) -> dict[str, Any]:
 
 
 def compute_metrics_by_error(result: TuneResult) -> dict[str, dict[str, ErrorMetrics]]:
-    """Return the metrics of each error of a six-axis rig, by error and key of `TuneResult`.
-
-    The result is empty for one axis, where the restitution error is the only one.
-    """
+    """Return the metrics of each error of a six-axis rig, by error and set of gains; empty for one axis."""
     model = choose_rig_model(result.mechanism)
     if len(model.errors) == 1:
         return {}

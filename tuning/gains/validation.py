@@ -224,10 +224,7 @@ def _keep_contact_terms(outcome: Any) -> Any:
 def _place_training_scenarios(
     model: RigModel, training: Any, which: tuple[int, ...], points: int, number: int, lanes: int
 ) -> tuple[Any, Batch]:
-    """Repeat the first `number` training scenarios of each task for each point.
-
-    Return the repeated scenarios on the host, and as a batch on the devices.
-    """
+    """Repeat the first training scenarios of each task for each point; return them on host and devices."""
 
     def side_by_side(leaf):
         picked = np.moveaxis(leaf[np.repeat(which, points)][..., :number], 0, -2)
@@ -284,10 +281,7 @@ def draw_fresh_scenarios(task: TuneTask, number: int, seed: int) -> Any:
 def _draw_evaluation_lanes(
     task: TuneTask, number: int, seed: int
 ) -> tuple[Any, ProbedScenarios | None, Any, Any]:
-    """Draw the fresh scenarios of a task.
-
-    Return the scenarios, the scenarios with probes or None, the joined scenarios to evaluate, and the loop.
-    """
+    """Return a task's fresh scenarios, those with probes or None, all scenarios to evaluate, and the loop."""
     drawn = draw(task.mechanism, number, seed)
     fresh, probed = task.model.scenarios(task.mechanism, drawn, seed), None
     if task.probed and isinstance(task.mechanism, Mechanism):

@@ -181,11 +181,8 @@ class ContactProblem:
     def _motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return position [m] and velocity [m/s] in `needed_rows`, for each of `periods_before`."""
         if self._cached_motion is None or self._cached_motion[0] != delay:
-            moved = self.motion_at(delay)
-            self._cached_motion = (
-                delay,
-                [(x.ravel()[self.needed_rows], v.ravel()[self.needed_rows]) for x, v in moved],
-            )
+            moved, rows = self.motion_at(delay), self.needed_rows
+            self._cached_motion = delay, [(x.ravel()[rows], v.ravel()[rows]) for x, v in moved]
         return self._cached_motion[1]
 
     def motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -298,10 +295,7 @@ class ContactProblem:
     def _design(
         self, near: list[_NearbyRows], flags: list[np.ndarray], onsets: _Onsets | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the design matrix (planes, coefficients, rows) and the readings near contact.
-
-        Both are divided by the standard deviation of the noise.
-        """
+        """Return design matrix (planes, coefficients, rows) and readings near contact, in units of the noise."""
         std, tables, first = self.readings.std, [], None
         for rows_near, flag in zip(near, flags, strict=True):
             # The last column belongs to the bias. It is 1 in all rows or, if there is a dead zone, only in

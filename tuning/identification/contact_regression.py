@@ -24,10 +24,7 @@ class CoefficientFit:
 
 
 class PseudoRows(NamedTuple):
-    """Few rows that replace many readings: for all coefficients, both have the same sum of squares.
-
-    Design matrix and target are divided by the noise's standard deviation.
-    """
+    """Few rows with the same sum of squares as many readings, divided by the noise's standard deviation."""
 
     design: np.ndarray  # (planes, coefficients, rows), design matrix
     target: np.ndarray  # (rows,), values to fit
@@ -35,10 +32,7 @@ class PseudoRows(NamedTuple):
 
 
 class LeastSquaresFit(NamedTuple):
-    """Least-squares fit at several surface positions.
-
-    Design matrix and residuals are divided by the noise's standard deviation.
-    """
+    """Least-squares fit at several surface positions, to readings in units of the noise's std."""
 
     coefficients: np.ndarray  # (planes, coefficients)
     covariance: np.ndarray  # (planes, coefficients, coefficients), covariance of the coefficients

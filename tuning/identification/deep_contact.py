@@ -249,7 +249,6 @@ def _point_between_nodes(delays: np.ndarray, planes: np.ndarray) -> tuple[float,
 
 
 def _chebyshev_nodes(low: float, high: float, count: int) -> np.ndarray:
-    """Return `count` Chebyshev nodes of the interval from `low` to `high`, in ascending order."""
     angles = np.pi * (np.arange(count) + 0.5) / count
     return 0.5 * (low + high) - 0.5 * (high - low) * np.cos(angles)
 

@@ -62,9 +62,7 @@ def choose_contact_law(
     few_lanes, few_readings = motion.of(lanes), readings.select_lanes(lanes)
     is_same, fitted_families = len(lanes) == readings.force.shape[1], {}
     _, plane_there, _ = guess = _fit_coarsely(motion, readings, kelvin_voigt(), plane, None)
-    evaluated_readings = replace(
-        readings, counts=readings.counts & ~flag_rows_near_edges(motion, readings, guess)
-    )
+    test_readings = replace(readings, counts=readings.counts & ~flag_rows_near_edges(motion, readings, guess))
     deepest = float(np.max(motion.at(guess[0])[0][readings.counts])) - plane_there
     for family in list_law_families(deepest, len(readings.entries), names):
         law, result = _fit_shape(
@@ -72,9 +70,7 @@ def choose_contact_law(
         )
         result = result if is_same else _fit_coarsely(motion, readings, law, plane, guess)
         fitted_families[id(law)] = family
-        evaluated.append(
-            (law, result, _cross_validate(motion, readings, evaluated_readings, law, plane, result))
-        )
+        evaluated.append((law, result, _cross_validate(motion, readings, test_readings, law, plane, result)))
     totals = [likelihood.sum() for _, _, likelihood in evaluated]
     best = evaluated[int(np.argmax(totals))][2]
     results = []
@@ -209,9 +205,7 @@ def flag_rows_near_edges(motion: MotionResponse, readings: ForceReadings, guess:
     return np.any(flags, axis=0) & ~np.all(flags, axis=0)
 
 
-def _cross_validate(
-    motion, readings, evaluated_readings: ForceReadings, law, plane, start: CoarseFit
-) -> np.ndarray:
+def _cross_validate(motion, readings, tested: ForceReadings, law, plane, start: CoarseFit) -> np.ndarray:
     """Return the log likelihood of each odd contact under a fit to the even contacts, and vice versa.
 
     With too few contacts, the result is one value: minus half the information criterion.
@@ -222,14 +216,13 @@ def _cross_validate(
         return np.array([-0.5 * start[2] - size])
     likelihood = np.empty(lanes)
     for parity in (0, 1):
-        mine = np.arange(lanes) % 2 == parity
-        taught = replace(readings, counts=readings.counts & ~mine)
-        problem = ContactProblem(motion, taught, law, plane)
+        is_test = np.arange(lanes) % 2 == parity
+        training = replace(readings, counts=readings.counts & ~is_test)
+        problem = ContactProblem(motion, training, law, plane)
         delay, at, _ = search_coarsely(problem, start, 1)
         coefficients = problem.at(delay, at).coefficients
-        likelihood[mine] = (
-            -0.5 * compute_contact_misfits(problem, evaluated_readings, delay, at, coefficients)[mine]
-        )
+        misfits = compute_contact_misfits(problem, tested, delay, at, coefficients)
+        likelihood[is_test] = -0.5 * misfits[is_test]
     return likelihood
 
 

@@ -190,7 +190,6 @@ class _CmaConstants(NamedTuple):
 
 
 def _compute_constants(gains: int, candidates: int) -> _CmaConstants:
-    """Return the default constants of CMA-ES from Hansen's tutorial."""
     half = candidates // 2
     weights = np.log(candidates / 2 + 0.5) - np.log(np.arange(1, half + 1))
     weights /= weights.sum()
@@ -211,7 +210,6 @@ def _compute_constants(gains: int, candidates: int) -> _CmaConstants:
 
 
 def _make_first_generation(start, reach, covariance) -> _Generation:
-    """Return the initial distribution of the candidates for every start."""
     gains = start.shape[-1]
     shape = np.broadcast_to(np.eye(gains), (*start.shape[:-1], gains, gains))
     if covariance is not None:

@@ -1,7 +1,4 @@
-"""Result of the Levenberg-Marquardt solver.
-
-This module does not import the solver, so that a cached program can run without the slow import.
-"""
+"""Result of the Levenberg-Marquardt solver, in a module without the slow import of the solver."""
 
 from typing import NamedTuple
 

@@ -1,7 +1,4 @@
-"""Conversion between gains and unit coordinates.
-
-A unit coordinate is 0 at a gain's lower bound and 1 at the upper bound, on a linear or logarithmic scale.
-"""
+"""Conversion between gains and unit coordinates, which are 0 at the lower and 1 at the upper bound."""
 
 from typing import Any, NamedTuple
 

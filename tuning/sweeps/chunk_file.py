@@ -45,10 +45,7 @@ def encode_chunk(manifest: Manifest, rows: Mapping[str, np.ndarray]) -> bytearra
 
 
 def decode_chunk(manifest: Manifest, part: int, content: bytes) -> dict[str, np.ndarray] | None:
-    """Decode and check the rows of chunk number `part`.
-
-    Return None if the file is damaged or belongs to another chunk or sweep.
-    """
+    """Decode the rows of chunk number `part`; return None if the file is damaged or of another chunk."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -66,10 +63,7 @@ def decode_chunk(manifest: Manifest, part: int, content: bytes) -> dict[str, np.
 
 
 def _check_rows(manifest: Manifest, part: int, table: Any) -> dict[str, np.ndarray] | None:
-    """Convert an Arrow table to the rows of chunk number `part`.
-
-    Return None if the table belongs to another chunk, or if outcomes contradict errors and statuses.
-    """
+    """Convert a table to rows; return None if the rows are not those of the chunk or are inconsistent."""
     first, number = manifest.chunk_range(part)
     if (table.schema.metadata or {}).get(
         SWEEP_DIGEST_KEY

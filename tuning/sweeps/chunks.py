@@ -55,10 +55,7 @@ def build_sweep(manifest: Manifest) -> SweepProgram:
 
 
 def build_widest_loop(loaded: LoadedGains, works: bool) -> Any:
-    """Build a loop whose delay lines are long enough for all possible draws.
-
-    If `works` is true, the loop computes the mechanical work of every contact, with the exact response.
-    """
+    """Build a loop whose delay lines are long enough for all draws; `works` adds exact mechanical works."""
     draws = draw_extremes(loaded.mechanism)
     if CONTROL_PERIOD_KEY in draws:
         # The longest delay line is needed for the longest delay together with the shortest control period.

@@ -41,19 +41,13 @@ def build_point_computer(workers: ClusterWorkers) -> point_batches.PointComputer
 
 
 def run_manifest_chunk(content: bytes, part: int) -> Rows:
-    """Compute the rows of chunk number `part` on a worker, for the sweep of an encoded manifest.
-
-    Raise `InputError` if code or settings of the worker differ from the manifest.
-    """
+    """Compute a chunk's rows on a worker; raise `InputError` if code or settings differ from the manifest."""
     sweep = _load_sweep(content)
     return run_chunk(sweep, *sweep.manifest.chunk_range(part))
 
 
 def run_manifest_points(content: bytes, at: np.ndarray, noise: np.ndarray) -> Rows:
-    """Compute the scenarios at the points `at` on a worker, for the sweep of an encoded manifest.
-
-    Raise `InputError` if code or settings of the worker differ from the manifest.
-    """
+    """Run the scenarios at the points `at` on a worker, with the same check as `run_manifest_chunk`."""
     return point_batches.run_batch(_load_sweep(content), at, noise)
 
 

@@ -180,10 +180,7 @@ def list_code_differences(old: Manifest, new: Manifest) -> list[str]:
 
 
 def list_process_differences(manifest: Manifest) -> list[str]:
-    """Return how code and settings of this process differ from the manifest, each as text.
-
-    Each of these differences can change the last bits of the rows.
-    """
+    """Return how code and settings of this process differ from the manifest, which may change last bits."""
     flags = rounding_flags(active_xla_flags())
     loaded = load_gains(manifest)
     changes = _list_version_differences(manifest, _compute_sources_digest(loaded), dependency_versions())

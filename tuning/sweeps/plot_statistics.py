@@ -225,10 +225,7 @@ def _select_first_points(points: PlotPoints) -> PlotPoints:
 def _compute_rank_correlations(
     mechanism: AnyMechanism, path: str, rows: Rows, size: np.ndarray
 ) -> np.ndarray:
-    """Return the magnitude of Spearman's rank correlation (1904) of each entry of an input with `size`.
-
-    It is NaN for an entry that does not vary.
-    """
+    """Return |rank correlation| (Spearman 1904) of each entry of an input with `size`; NaN if constant."""
     _, low, high = _find_input_range(mechanism, path)
 
     def ranks(values: np.ndarray) -> np.ndarray:

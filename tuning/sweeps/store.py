@@ -128,10 +128,7 @@ def write_chunk(store: SweepStore, part: int, rows: Mapping[str, np.ndarray]) ->
 
 
 def read_chunk(store: SweepStore, part: int) -> dict[str, np.ndarray] | None:
-    """Read the rows of chunk number `part`.
-
-    Return None if the file is missing, damaged or from another sweep.
-    """
+    """Read the rows of chunk number `part`; None if the file is missing, damaged or from another sweep."""
     try:
         with open_regular(store.chunk_path(part)) as file:
             content = file.read()
@@ -172,10 +169,7 @@ def remove_chunks(store: SweepStore, first: int) -> None:
 
 
 def read_row(store: SweepStore, index: int) -> dict[str, Any]:
-    """Read the row of scenario `index`, as arrays of length 1.
-
-    Raise `InputError` if the store does not contain this scenario.
-    """
+    """Read the row of scenario `index`, as arrays of length 1; raise `InputError` if it is not stored."""
     manifest = store.manifest
     where = to_one_line(str(store.folder))
     if not 0 <= index < manifest.scenarios:

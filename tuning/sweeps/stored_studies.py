@@ -132,10 +132,7 @@ def _convert_to_plain(value: Any, null: float | None) -> Any:
 
 
 def _restore_records(kind: Any, value: Any, null: float | None) -> Any:
-    """Convert plain data to a value of type `kind`; reverses `_convert_to_plain`.
-
-    Raise ValueError or TypeError if the data do not match the type.
-    """
+    """Reverse `_convert_to_plain` for a value of type `kind`; raise ValueError or TypeError on a mismatch."""
     if hasattr(kind, "_fields"):
         hints, null = get_type_hints(kind), NULL_VALUES[kind]
         if value.keys() != hints.keys():
