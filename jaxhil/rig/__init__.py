@@ -1,8 +1,8 @@
 """Controller of the rig in plain Python: floats, a fixed order of operations, no JAX.
 
-`Controller.from_file(path)` reads a gain file; `step` is then called once per control period. Importing this
-package imports the compensators in the folders of `jaxhil.laws`, which register in `COMPENSATORS`. A bundle
-contains controller, one compensator and the modules that they import in one file, `jaxhil_runtime.py`.
+`Controller.from_file(path)` reads a gain file; the rig then calls `step` once per control period. Importing
+this package imports the compensators in the folders of `jaxhil.laws`, which register in `COMPENSATORS`. The
+file `jaxhil_runtime.py` of a bundle contains the controller, one compensator and all modules that they need.
 """
 
 from importlib import import_module

@@ -1,18 +1,18 @@
-"""Guard of the tick times: detects early, late and missed ticks, and a clock that drifts from the ticks."""
+"""Monitor of the tick times: detects early, late and missed ticks, and a clock that is too fast or slow."""
 
 from math import inf, isfinite
 
 from jaxhil.rig.faults import CLOCK, EARLY_TICK, LATE_TICK, MISSED_TICK
 from jaxhil.rig.types import Limits, NonNegative, Positive, SmallInt
 
-MAX_MISSED = 1_000_000  # periods; one gap counts no more, however wrong the clock is
-MAX_GAP = 1.5  # periods; after a longer gap a tick is missing
-DRIFT_DECAY_FACTOR = 0.99  # share of the clock's drift that remains after a tick: it decays over 100 ticks
-MAX_DRIFT = 1.5  # periods; a clock that is 1.5 % fast or slow reaches it, jitter does not
+MAX_MISSED = 1_000_000  # periods; limits the missed ticks of one gap, because a clock may jump by any time
+MAX_GAP = 1.5  # periods; a longer gap means that at least one tick is missing
+DRIFT_DECAY_FACTOR = 0.99  # per tick, so that past drift decays with a time constant of 100 ticks
+MAX_DRIFT = 1.5  # periods; a clock that is 1.5 % fast or slow reaches this drift, jitter does not
 
 
 class Clock:
-    """Guard of the tick times.
+    """Monitor of the tick times, with counts of missed and late ticks.
 
     Attributes:
         missed: number of missed ticks.
@@ -21,8 +21,8 @@ class Clock:
     """
 
     __slots__ = (
-        "_awaited", "_drift", "_early_gap", "_in_a_row", "_late_gap", "_missing", "_period", "_time",
-        "_tolerated", "fatal", "late", "missed",
+        "_awaited", "_drift", "_early_gap", "_in_a_row", "_late_gap", "_max_in_a_row", "_missing", "_period",
+        "_time", "fatal", "late", "missed",
     )  # fmt: skip
     _period: Positive
 
@@ -31,25 +31,25 @@ class Clock:
         self._missing = MAX_GAP * period
         self._late_gap = (1.0 + limits["late_fraction"]) * period
         self._early_gap = (1.0 - limits["late_fraction"]) * period
-        self._tolerated = limits["missed_in_a_row"]
+        self._max_in_a_row = limits["missed_in_a_row"]
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last tick and the counts."""
+        """Set both counts to 0 and forget the last tick's time."""
         self.missed = 0
         self.late = 0
         self.pause()
 
     def pause(self) -> None:
-        """Accept any time until the next tick."""
+        """Forget the last tick's time and the drift, so that the next tick may come at any time."""
         self._time = -inf
-        self._drift = 0.0  # periods by which the clock is ahead of the ticks, missed ones included
-        self._awaited = 0  # ticks counted as missed that may still arrive
-        self._in_a_row = 0  # ticks missed one after another
+        self._drift = 0.0  # periods by which the clock is ahead of the ticks, including missed ticks
+        self._awaited = 0  # number of ticks counted as missed that may still arrive
+        self._in_a_row = 0  # number of successive missed ticks
         self.fatal = False
 
     def tick(self, time: float) -> int:
-        """Return the fault of a tick at `time` [s], 0 if it is on time."""
+        """Check a tick at `time` [s]; return its fault bit, 0 if the tick is on time."""
         self.fatal = False
         if not isfinite(time):
             self.fatal = True
@@ -71,7 +71,7 @@ class Clock:
         if gap < self._early_gap:
             fault = EARLY_TICK
             if self._awaited:
-                # A tick that was counted as missed was only late, by more than half a period.
+                # An earlier tick was counted as missed, but was only late by more than half a period.
                 self._awaited -= 1
                 drift += 1.0
         else:
@@ -79,23 +79,23 @@ class Clock:
             if gap > self._late_gap:
                 self.late += 1
                 fault = LATE_TICK
-        return self._part(drift, fault)
+        return self._check_drift(drift, fault)
 
     def _miss(self, periods: NonNegative) -> int:
-        """Count the ticks missed in a gap of `periods` control periods; return the fault."""
-        left_out: SmallInt = MAX_MISSED - 1
+        """Count the ticks missed in a gap of `periods` control periods; return the fault bit."""
+        missed: SmallInt = MAX_MISSED - 1
         drift = 0.0
         if periods <= MAX_MISSED:
-            left_out = int(periods + 0.5) - 1
-            drift = DRIFT_DECAY_FACTOR * self._drift + (periods - 1.0 - left_out)
-        self.missed += left_out
-        self._awaited = left_out
-        self._in_a_row += left_out
-        self.fatal = self._in_a_row > self._tolerated
-        return self._part(drift, MISSED_TICK)
+            missed = int(periods + 0.5) - 1
+            drift = DRIFT_DECAY_FACTOR * self._drift + (periods - 1.0 - missed)
+        self.missed += missed
+        self._awaited = missed
+        self._in_a_row += missed
+        self.fatal = self._in_a_row > self._max_in_a_row
+        return self._check_drift(drift, MISSED_TICK)
 
-    def _part(self, drift: float, fault: int) -> int:
-        """Store the drift [periods]; return the tick's fault, or `CLOCK` if the drift is too large."""
+    def _check_drift(self, drift: float, fault: int) -> int:
+        """Store the drift [periods]; return `CLOCK` if the drift is too large, otherwise `fault`."""
         self._drift = drift
         if abs(drift) > MAX_DRIFT:
             self.fatal = True

@@ -1,9 +1,9 @@
 """Controller that the rig calls once per control period.
 
-It checks the inputs (`inputs`), audits the energy of every contact (`watchdog`), computes the force with the
-compensator that the gain file names, and limits the outputs (`outputs`). `faults` lists the faults that they
-detect and the reactions. A trip is latched until `reset`: the force ramps to 0, the position command comes to
-rest out of contact. After construction no method raises, and each takes bounded time.
+The controller checks the inputs (`inputs`), audits the energy of every contact (`watchdog`), computes the
+force with the compensator that the gain file names, and limits the outputs (`outputs`). `faults` lists all
+faults and reactions. A trip is latched until `reset`: the force ramps to 0 and the position command comes to
+rest out of contact. After construction no method raises, and each method takes bounded time.
 """
 
 import os
@@ -35,12 +35,12 @@ from jaxhil.rig.watchdog import Watchdog
 
 
 class Controller:
-    """Compensator with its gains, its guards and its state.
+    """Controller of the rig: a compensator with checks of its inputs, outputs and contacts.
 
     Attributes:
-        faults: bits of the faults of this tick (`faults.FAULTS`).
-        seen: bits of the faults of all ticks since `reset`.
-        cause: bits of the faults that tripped the controller, 0 if none has.
+        faults: bits of the present tick's faults (`faults.FAULTS`).
+        seen: bits of all faults since `reset`.
+        cause: bits of the faults that tripped the controller; 0 if it is not tripped.
     """
 
     __slots__ = (
@@ -61,15 +61,15 @@ class Controller:
             self._law = law(gain_file.gains, period, clearance)
         except ValueError as error:
             raise make_gain_file_error(
-                source, "gains", str(error), "gains that fit the control period"
+                source, "gains", str(error), "gains suitable for the control period"
             ) from None
         try:
             self._guard(gain_file.limits, period, clearance)
         except ValueError as error:
-            raise make_gain_file_error(source, "limits.alignment", str(error), "a delay that fits") from None
+            raise make_gain_file_error(source, "limits.alignment", str(error), "a shorter delay") from None
 
     def _guard(self, limits: Limits, period: Positive, clearance: float) -> None:
-        """Create the guards of inputs, contacts and outputs, and reset the controller."""
+        """Create the checks of tick times, inputs, contacts and outputs, and reset the controller."""
         self._clock = Clock(limits, period)
         self._tare = Tare(limits)
         self._inputs = InputGuard(limits, period, clearance)
@@ -82,7 +82,7 @@ class Controller:
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> "Controller":
-        """Return the controller of a gain file.
+        """Create a controller from a gain file.
 
         Args:
             path: path of the gain file.
@@ -95,7 +95,7 @@ class Controller:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "Controller":
-        """Return the controller of a gain document.
+        """Create a controller from the content of a gain file.
 
         Args:
             document: content of a gain file.
@@ -130,7 +130,7 @@ class Controller:
 
     @property
     def status(self) -> str:
-        """Return `ok`, or `tripped: ` and the cause."""
+        """Return "ok", or "tripped: " and the names of the causing faults."""
         if not self.cause:
             return "ok"
         return f"tripped: {', '.join(fault_names(self.cause))}" + (
@@ -144,22 +144,22 @@ class Controller:
 
     @property
     def bias(self) -> float:
-        """Return the force sensor's bias [N] by the last successful tare."""
+        """Return the force sensor's bias [N] from the last successful tare; 0 before a tare."""
         return self._tare.bias
 
     @property
     def missed_ticks(self) -> int:
-        """Return the number of missed ticks since `reset`, by the times passed to `step`."""
+        """Return the number of missed ticks since `reset`, from the times passed to `step`."""
         return self._clock.missed
 
     @property
     def late_ticks(self) -> int:
-        """Return the number of late ticks since `reset`, by the times passed to `step`."""
+        """Return the number of late ticks since `reset`, from the times passed to `step`."""
         return self._clock.late
 
     @property
     def identified(self) -> tuple[float, float]:
-        """Return identified stiffness [N/m] and damping [N s/m]; (0, 0) if none are identified."""
+        """Return the identified stiffness [N/m] and damping [N s/m]; (0, 0) if nothing is identified."""
         return self._law.identified
 
     @property
@@ -169,30 +169,31 @@ class Controller:
 
     @property
     def law_status(self) -> str:
-        """Return the compensator's status of the last command, a name in `law_status.STATUSES`."""
+        """Return the compensator's status at the last command, a name in `law_status.STATUSES`."""
         return STATUS_NAMES[self._status()]
 
     def _status(self) -> SmallInt:
-        """Return the number of the compensator's status of the last command."""
+        """Return the number of the compensator's status at the last command."""
         return self._law.status
 
     @property
     def last_contact(self) -> ContactRecord:
-        """Return the statuses of the last audited contact; its number is 0 before the first one.
+        """Return the compensator status of the last audited contact; the number is 0 before the first.
 
-        They remain until the next audit, even after `reset`.
+        The record remains until the next audit, even after `reset`.
         """
         return contact_record(self._last_count())
 
     def _last_count(self) -> ContactCount:
-        """Return the statuses of the last audited contact, which remain even after `reset`."""
+        """Return the compensator status of the last audited contact; `reset` does not change it."""
         return self._watchdog.record
 
     def tare(self, force_measured: float) -> bool:
-        """Add one reading of the force sensor out of contact; return True once there are enough.
+        """Add one force reading out of contact to the tare; return True when the tare has ended.
 
-        Call it once per tick before a run. The mean of the readings is then subtracted from every reading
-        until the next tare. Unusable readings trip the controller with the fault `tare`.
+        Call this method once per tick before a run, until it returns True. The controller then subtracts the
+        mean of these readings from every reading until the next tare. Unusable readings trip the controller
+        with the fault `tare`.
 
         Args:
             force_measured: force reading [N].
@@ -221,11 +222,11 @@ class Controller:
             position_desired: position of the numerical model [m].
             velocity_desired: velocity of the numerical model [m/s].
             position_measured: position reading of the motion simulator [m].
-            time: time of the tick [s]; without it, late and missed ticks are not detected.
+            time: time of the tick [s]; if None, the controller does not detect late and missed ticks.
         """
         forces, inputs = self._forces, self._inputs
         self.faults = 0
-        # The rig passes floats: converting only other types saves time.
+        # The rig usually passes floats: to skip their conversion saves time.
         measured = position_measured if type(position_measured) is float else _float(position_measured)
         inputs.locate(measured)
         if self.cause:
@@ -250,7 +251,7 @@ class Controller:
         if not fatal:
             try:
                 command = law.step(inputs.force, position, velocity, inputs.measured)
-            except Exception:  # of any compensator: the rig always needs a command
+            except Exception:  # whatever a compensator raises, the rig needs a command
                 command = nan
             faults |= forces.limit(command)
             fatal = forces.fatal
@@ -266,13 +267,14 @@ class Controller:
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
         """Return the position [m] to command for the numerical model's motion after this tick's step.
 
-        Two commands in a row differ by at most `velocity_limit` times the period. A run's first command
-        differs as little from the measured position; out of contact, where moving drives lag behind, it may
-        differ by `start_distance`. Before a run's first `step`, the model's position stands for the measured
-        one if it is out of contact.
+        Two successive commands differ by at most `velocity_limit` times the period. A run's first command
+        may differ from the measured position by this step, or out of contact by `start_distance`, because
+        moving drives lag behind. Before a run's first `step`, the model's position replaces the measured
+        position if the model is out of contact.
 
-        After a trip the commands lead to rest out of contact. They begin at the last command; without one, at
-        the last measured position; without either, at a position out of contact.
+        After a trip, the commands move to rest out of contact. They start from the last command, or if there
+        is none, from the last measured position. If there is neither, they start from a position out of
+        contact.
 
         Args:
             position: position of the numerical model [m].
@@ -296,20 +298,20 @@ class Controller:
         return positions.output
 
     def _sent(self, position: float, velocity: float, acceleration: float) -> float:
-        """Return the compensator's position command [m], NaN if the motion is not finite or it raises."""
+        """Return the compensator's position command [m]; NaN if it raises or the motion is not finite."""
         if not (isfinite(position) and isfinite(velocity) and isfinite(acceleration)):
             return nan
         try:
             return self._law.position_command(position, velocity, acceleration)
-        except Exception:  # of any compensator: the rig always needs a command
+        except Exception:  # whatever a compensator raises, the rig needs a command
             return nan
 
     def emergency_stop(self, active: bool) -> None:
         """Set the state of the rig's emergency stop; an active stop trips the controller.
 
-        Call it with True while the stop is active (once is enough). The force ramps to 0 and the position
-        command comes to rest; then `at_rest` is True and the drives may be switched off. Call it with False
-        after the stop is released. The trip stays latched until `reset`, which returns False before.
+        Call this method with True when the stop is pressed. The force ramps to 0 and the position command
+        comes to rest; then `at_rest` is True and the drives may be switched off. Call it with False when the
+        stop is released; before this call, `reset` has no effect. The trip stays latched until `reset`.
 
         Args:
             active: whether the stop is active.
@@ -319,11 +321,11 @@ class Controller:
             self._fail(EMERGENCY_STOP, "")
 
     def reset(self) -> bool:
-        """Restart everything but the tare; return False, without effect, while the emergency stop is active.
+        """Restart everything except the tare. While the emergency stop is active, only return False.
 
-        Filters, identified parameters, trip and counts of ticks restart. Force and position command continue
-        without a jump from their last values, within the limits. If the drives have been moved since by other
-        means, call `next_contact` as well.
+        Filters, identified parameters, trip and tick counts restart. Force and position command continue
+        from their last values without a jump. If something else has moved the drives since the trip, also
+        call `next_contact`.
         """
         if self._stopped or self.cause & UNUSABLE:
             return False
@@ -343,10 +345,10 @@ class Controller:
     def next_contact(self) -> None:
         """Begin a new run for the next contact: restart filters, delay lines and covariance.
 
-        Call it when the rig has been moved to the start of the run: the first position command continues from
-        the measured position, not from the last command. Identified parameters remain, a trip stays latched,
-        and the time until the next tick does not count as missed. A contact that is not over yet is audited
-        first; its faults are in `faults` until the next `step`.
+        Call this method after the rig has moved to the start of the run: the first position command continues
+        from the measured position, not from the last command. Identified parameters remain, a trip stays
+        latched, and the gap before the next tick counts no missed ticks. If a contact has not ended, it is
+        audited first, and `faults` has its faults until the next `step`.
         """
         if self.cause:
             return
@@ -365,7 +367,7 @@ class Controller:
         self._positions.release()
 
     def _fail(self, cause: int, detail: str) -> None:
-        # The first cause is the one to look at: later faults may be its consequences.
+        # Keep the first cause: later faults may be its consequences.
         if not self.cause:
             self.cause = cause
             self._detail = detail
@@ -374,7 +376,7 @@ class Controller:
 
 
 def _float(value: Any) -> float:
-    """Convert the value to a float; return NaN if it is no number."""
+    """Convert the value to a float; return NaN if this is not possible."""
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):
@@ -385,7 +387,7 @@ READING_NAMES = "time", "force_measured", "position_desired", "velocity_desired"
 
 
 def _detail(fatal: int, watchdog: Watchdog, values: tuple[Any, ...]) -> str:
-    """Describe a cause by the watchdog's audit or by the values of `READING_NAMES` that are not finite."""
+    """Describe a trip by the watchdog's audit, or by the arguments of `step` that are not finite."""
     if fatal & RESTITUTION:
         return watchdog.detail()
     if fatal & (FORCE_NOT_FINITE | POSITION_NOT_FINITE | MODEL_NOT_FINITE | CLOCK):
@@ -394,6 +396,6 @@ def _detail(fatal: int, watchdog: Watchdog, values: tuple[Any, ...]) -> str:
             for item in zip(READING_NAMES, values, strict=True)
             if item[1] is not None or item[0] != "time"
         )
-        bad = (item for item in items if not isfinite(_float(item[1])))
-        return ", ".join(f"{name} is {format_value(value)}" for name, value in bad)
+        invalid = (item for item in items if not isfinite(_float(item[1])))
+        return ", ".join(f"{name} is {format_value(value)}" for name, value in invalid)
     return ""

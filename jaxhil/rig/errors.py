@@ -1,12 +1,12 @@
-"""Error of an invalid gain file, with a message of one printable line."""
+"""Exception for an invalid gain file, and helpers that format its message as one printable line."""
 
 
 class GainFileError(ValueError):
-    """Error of an invalid gain file; the message names file, key, what was found and what is allowed."""
+    """Exception for an invalid gain file; the message is `FILE: KEY: found X, expected Y`."""
 
 
 def printable(text: str) -> str:
-    """Return the text with all non-printable characters escaped, line breaks included."""
+    """Escape all non-printable characters of the text, including line breaks."""
     return "".join(
         character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
         for character in text
@@ -14,7 +14,7 @@ def printable(text: str) -> str:
 
 
 def format_value(value: object, longest: int = 60) -> str:
-    """Return a value as short ASCII text on one line, for an error message."""
+    """Format a value for an error message, as one line of at most `longest` ASCII characters."""
     if isinstance(value, dict):
         return "an object"
     if isinstance(value, (list, tuple)):
@@ -30,6 +30,6 @@ def format_value(value: object, longest: int = 60) -> str:
 
 
 def make_gain_file_error(source: str, key: str, found: str, allowed: str) -> GainFileError:
-    """Return the error for `key` of the file `source`; an empty key stands for the whole file."""
+    """Return the error about `key` in the file `source`; an empty key means the whole file."""
     location = f"{source}: {key}" if key else source
     return GainFileError(printable(f"{location}: found {found}, expected {allowed}"))

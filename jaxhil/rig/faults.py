@@ -1,16 +1,16 @@
 """Faults that the controller detects on the rig, and its reactions.
 
-Every fault is one bit, set in `Controller.faults` on the tick on which the fault occurs. `FAULTS` is the
-source of documentation, exports and error texts; the bits are the same in the C controller.
+Each fault is one bit, which `Controller.faults` has set on the tick on which the fault occurs. Documentation,
+exports and error texts are made from `FAULTS`. The bits are the same in the C controller.
 
-A *trip* is latched: until `reset` the force ramps to 0 and the position command comes to rest out of contact.
+A *trip* is latched until `reset`: the force ramps to 0 and the position command comes to rest out of contact.
 """
 
 from typing import NamedTuple
 
 
 class Fault(NamedTuple):
-    """Fault with its condition and the controller's reaction."""
+    """Entry of the fault table: bit, name, condition and the controller's reaction."""
 
     bit: int  # bit in `Controller.faults`
     name: str  # name in texts and exports
@@ -41,10 +41,10 @@ EMERGENCY_STOP = 0x80000
 TARE = 0x100000
 LAW_IN_DOUBT = 0x200000
 EARLY_TICK = 0x400000
-UNUSABLE = 1 << 30  # cause of a C controller with invalid gains or limits: Python raises an error instead
+UNUSABLE = 1 << 30  # only in C: gains or limits are invalid; Python raises an error instead
 
-_BRIDGED = "the last good reading is used; more than `held_readings` in a row trip"
-_BRIDGED_AFTER_FIRST = f"{_BRIDGED}, and so does one on a run's first tick"
+_BRIDGED = "the last good reading is used; more than `held_readings` successive bad readings trip"
+_BRIDGED_AFTER_FIRST = f"{_BRIDGED}, and so does a bad reading on a run's first tick"
 _TRIPS = "trips"
 
 FAULTS = (
@@ -73,42 +73,43 @@ FAULTS = (
     Fault(
         FORCE_STUCK,
         "force_stuck",
-        "in contact, the force reading has stayed the same to the bit while the measured position moved "
-        "by more than `force_stuck_travel`, or, at a reading of no force, deeper by as much",
+        "in contact, the force reading has not changed by a bit while the measured position moved by more "
+        "than `force_stuck_travel` (with a force of 0: moved deeper by more than this travel)",
         _TRIPS,
     ),
     Fault(
         POSITION_STUCK,
         "position_stuck",
-        "the position reading has stayed the same to the bit while the numerical model moved by more than "
+        "the position reading has not changed by a bit while the numerical model moved by more than "
         "`position_stuck_travel`",
         _TRIPS,
     ),
     Fault(
         FORCE_IN_FLIGHT,
         "force_in_flight",
-        "a force beyond `free_force` is read though the mechanism has been out of contact by "
-        "`free_distance` for longer than `settling`: a bias, or a surface that is not where it should be",
-        "flagged; more than `held_readings` in a row trip",
+        "the force reading exceeds `free_force` although the mechanism has been farther than "
+        "`free_distance` from contact for longer than `settling`: a bias, or a misplaced surface",
+        "flagged; more than `held_readings` successive ticks trip",
     ),
     Fault(
         LATE_TICK,
         "late_tick",
-        "the time since the last tick is longer than the period by more than `late_fraction` of it, and at "
-        "most one and a half periods",
+        "the time since the last tick exceeds the period by more than the share `late_fraction`, and is at "
+        "most 1.5 periods",
         "flagged and counted",
     ),
     Fault(
         MISSED_TICK,
         "missed_tick",
-        "more than one and a half periods have passed since the last tick",
-        "flagged and counted, the law is stepped once; more than `missed_in_a_row` one after another trip",
+        "more than 1.5 periods have passed since the last tick",
+        "flagged and counted; the compensator makes one step; more than `missed_in_a_row` successive missed "
+        "ticks trip",
     ),
     Fault(
         CLOCK,
         "clock",
-        "the tick's time is not finite, or not after the last tick's; or over about 100 ticks the time "
-        "has drifted from the ticks, missed ones included, by more than one and a half periods",
+        "the tick's time is not finite or not later than the last tick's; or within about 100 ticks (with "
+        "missed ticks) the time has drifted by more than 1.5 periods from the number of ticks",
         _TRIPS,
     ),
     Fault(FORCE_LIMIT, "force_limit", "the compensated force is beyond `force_limit`", _TRIPS),
@@ -116,28 +117,29 @@ FAULTS = (
         FORCE_SLEW,
         "force_slew",
         "the compensated force changes faster than `force_slew`",
-        "the change is cut to the limit; more than `limited_in_a_row` ticks trip",
+        "the change is limited; more than `limited_in_a_row` successive limited changes trip",
     ),
     Fault(STROKE, "stroke", "the position command is outside `command_lowest` to `command_highest`", _TRIPS),
     Fault(
         VELOCITY_LIMIT,
         "velocity_limit",
         "the position command changes faster than `velocity_limit`",
-        "the change is cut to the limit; more than `limited_in_a_row` ticks trip, except on the way to the "
-        "numerical model at the beginning of a run and after `reset`",
+        "the change is limited; more than `limited_in_a_row` successive limited changes trip, except while "
+        "the command approaches the numerical model at the beginning of a run and after `reset`",
     ),
     Fault(COMMAND_NOT_FINITE, "command_not_finite", "the compensated force is not a finite number", _TRIPS),
     Fault(
         RESTITUTION,
         "restitution",
-        "watchdog: a contact's restitution differs from the expected by more than `restitution_margin`",
+        "watchdog: a contact's restitution differs from the expected restitution by more than "
+        "`restitution_margin`",
         _TRIPS,
     ),
     Fault(
         ENERGY_BALANCE,
         "energy_balance",
-        "watchdog: over a contact the numerical model's kinetic energy has not changed by the work of the "
-        "controller's force: the model integrates another force",
+        "watchdog: during a contact, the change of the numerical model's kinetic energy differs from the "
+        "work of the controller's force: the model integrates a different force",
         _TRIPS,
     ),
     Fault(
@@ -150,22 +152,22 @@ FAULTS = (
     Fault(
         TARE,
         "tare",
-        "the readings to tare are not finite, differ by more than `tare_spread`, or their mean is beyond "
-        "`bias_limit`",
+        "the force readings of a tare are not finite, differ by more than `tare_spread`, or have a mean "
+        "beyond `bias_limit`",
         _TRIPS,
     ),
     Fault(
         LAW_IN_DOUBT,
         "law_in_doubt",
-        "watchdog: a contact is over, and the law's status was unsure, too short or noisy on more than two "
-        "fifths of its ticks, or unexplained or saturated on the last one, or no force was measured",
-        "flagged; `last_contact` says which",
+        "watchdog: a contact has ended, and the compensator's status was unsure, too short or noisy on more "
+        "than 40 % of its ticks, or unexplained or saturated on its last tick, or no force was measured",
+        "flagged; `last_contact` names the status",
     ),
     Fault(
         EARLY_TICK,
         "early_tick",
-        "the time since the last tick is shorter than the period by more than `late_fraction` of it: a "
-        "repeated tick, or one that follows a late one",
+        "the time since the last tick is shorter than the period by more than the share `late_fraction`: a "
+        "repeated tick, or a tick after a late tick",
         "flagged",
     ),
 )

@@ -1,6 +1,6 @@
 """Discrete filters of the compensators, with one sample per control period.
 
-Each evaluates its equation from left to right as written and allocates nothing per tick.
+Each filter evaluates its equation from left to right as written, and allocates no memory per tick.
 """
 
 from math import floor
@@ -14,8 +14,8 @@ class LeadFilter:
 
     y = ((2 T_2 - T) y_prev + (2 T_1 + T) u - (2 T_1 - T) u_prev) / (2 T_2 + T)
 
-    T is the period. The filter begins at rest, y_prev = u_prev = 0. Times are in s; the output has the
-    input's unit.
+    T is the control period. The filter begins at rest, y_prev = u_prev = 0. Times are in s; the output has
+    the input's unit.
     """
 
     __slots__ = ("_denominator", "_input", "_of_input", "_of_output", "_of_previous", "_output")
@@ -29,12 +29,12 @@ class LeadFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Set past input and output to 0."""
+        """Set the previous input and output to 0."""
         self._input = 0.0
         self._output = 0.0
 
     def step(self, value: float) -> float:
-        """Return the filtered value."""
+        """Return the filter's output for the next input `value`."""
         output = (
             self._of_output * self._output + self._of_input * value - self._of_previous * self._input
         ) / self._denominator
@@ -48,8 +48,8 @@ class VelocityFilter:
 
     w = ((2 T_v - T) w_prev + 2 (x - x_prev)) / (2 T_v + T)
 
-    T is the period. The past is 0 unless `start` sets it. Position x in m, velocity w in m/s, times in s; x
-    may also be a force [N].
+    T is the control period. The previous values are 0 unless `start` sets them. x is a position [m], and w a
+    velocity [m/s]; x may also be a force [N], and w then is the rate of the force [N/s]. Times are in s.
     """
 
     __slots__ = ("_denominator", "_of_velocity", "_period", "_position", "_velocity")
@@ -62,7 +62,7 @@ class VelocityFilter:
         self._velocity = 0.0
 
     def start(self, position: float, velocity: float) -> None:
-        """Set the past to a uniform motion [m/s] that reaches `position` [m] at the next step."""
+        """Set the previous values to a uniform motion [m/s] that reaches `position` [m] at the next step."""
         self._position = position - self._period * velocity
         self._velocity = velocity
 
@@ -77,12 +77,12 @@ class VelocityFilter:
 
 
 class DelayLine:
-    """Delay of a position by any time tau >= 0, linear between samples.
+    """Delay line for a position, with linear interpolation between samples for any delay tau >= 0.
 
     r = tau/T, q = floor(r + 1e-9), f = r - q, output (1 - f) x[n-q] + f x[n-q-1]
 
-    T is the period. `start` must precede the first `step`. The constructor raises ValueError if the delay
-    spans more than `LONGEST` periods.
+    T is the control period. Call `start` before the first `step`. The constructor raises ValueError if the
+    delay is longer than `LONGEST` periods.
     """
 
     LONGEST = 100_000
@@ -94,7 +94,7 @@ class DelayLine:
         ratio = delay / period
         if not 0.0 <= ratio <= self.LONGEST:
             raise ValueError(f"a delay of {ratio!r} periods, expected 0 to {self.LONGEST}")
-        # The margin keeps a whole number of periods whole if the ratio is rounded down.
+        # The margin of 1e-9 gives the right integer if rounding makes the ratio slightly too small.
         self._whole = floor(ratio + 1e-9)
         self._fraction = ratio - self._whole
         self._remainder = 1.0 - self._fraction
@@ -104,7 +104,7 @@ class DelayLine:
         self._head = 0
 
     def start(self, position: float, velocity: float) -> None:
-        """Set the past samples, j < 0, to the uniform motion position + j T velocity."""
+        """Set the samples before the first step (index j < 0) to the motion position + j T velocity."""
         period = self._period
         samples = self._samples
         size = self._size
@@ -117,7 +117,7 @@ class DelayLine:
         head = self._head
         samples = self._samples
         samples[head] = position
-        # Negative indices wrap: the line stores exactly the `whole + 2` latest samples.
+        # A negative index counts from the end: the list stores exactly the latest `whole + 2` samples.
         newer: Index = head - self._whole
         older: Index = newer - 1
         delayed = self._remainder * samples[newer] + self._fraction * samples[older]

@@ -1,9 +1,9 @@
-"""Reader of gain files: returns checked numbers or raises a `GainFileError` of one line.
+"""Reader of gain files: returns checked values or raises a `GainFileError` with a message of one line.
 
-It checks the form first (JSON, schema, digest), then the content (compensator, gains, units, bounds, control
-period). Whoever changes a file can compute its digest anew: gains must therefore be within the file's bounds
-and those of the code (`bounds`), limits within those of the code. The digest is the SHA-256 of the document's
-canonical JSON without the date, the timings and the digest itself.
+The reader first checks the form (JSON, schema, digest), then the content (compensator, gains, units, bounds,
+control period). The digest is the SHA-256 of the document's canonical JSON without date, timings and digest.
+A digest does not prevent edits, because anyone can recompute it. Therefore gains must be within the bounds in
+the file and in the code (`bounds`), and limits within the bounds in the code.
 """
 
 import errno
@@ -21,21 +21,21 @@ from jaxhil.rig.limits import LIMITS, NO_LIMITS, complete_limits
 from jaxhil.rig.registry import COMPENSATORS, GainSpecification
 
 SCHEMA = "jaxhil/gains/1"
-MAX_FILE_BYTES = 4 * 1024 * 1024  # bytes of a file
-MAX_NESTING = 32  # levels of nesting
-KEYS_OUTSIDE_DIGEST = ("created", "timings", "sha256")  # keys without influence on the digest
+MAX_FILE_BYTES = 4 * 1024 * 1024  # bytes; much larger than any gain file
+MAX_NESTING = 32  # levels of nested JSON objects and lists; keeps recursive code safe
+KEYS_OUTSIDE_DIGEST = ("created", "timings", "sha256")  # keys that the digest does not cover
 RETIRED_COMPENSATORS = ("retrospective_reference", "retrospective_delay_bank")  # replaced by `impulse_ledger`
 NO_FURTHER_GAINS: Mapping[str, Mapping[str, GainSpecification]] = {}
 
 
 class GainFile(NamedTuple):
-    """Checked content of a gain file."""
+    """Checked values of a gain file that the controller needs."""
 
-    compensator: str  # name
-    gains: Mapping[str, float]  # by name, in SI units
-    control_period: float  # [s]
-    clearance: float  # of a two-sided contact [m]; infinite for a one-sided one
-    limits: Mapping[str, float] = NO_LIMITS  # by name, in SI units
+    compensator: str  # name of the compensator
+    gains: Mapping[str, float]  # gains by name, in SI units
+    control_period: float  # control period [s]
+    clearance: float  # clearance of a two-sided contact [m]; infinite for a one-sided contact
+    limits: Mapping[str, float] = NO_LIMITS  # limits by name, in SI units
 
 
 def digest(document: Mapping[str, Any]) -> str:
@@ -58,7 +58,7 @@ def digest(document: Mapping[str, Any]) -> str:
 
 
 def read_gain_document(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the JSON object in a file. Raise GainFileError if there is none."""
+    """Read the JSON object in a gain file. Raise GainFileError if the file has none or is unreadable."""
     source = os.fspath(path)
     try:
         mode = os.stat(source).st_mode
@@ -95,14 +95,14 @@ def check_gain_document(
     others: Mapping[str, Mapping[str, GainSpecification]] = NO_FURTHER_GAINS,
     axes: tuple[int, ...] = (1,),
 ) -> GainFile:
-    """Check a gain document and return what the controller needs of it.
+    """Check a gain document and return the values that the controller needs.
 
     Args:
         document: content of a gain file.
         source: name of the document in error messages.
-        others: gains of the compensators that can only be simulated, by compensator; a controller's gains of
-            that name do not count.
-        axes: numbers of axes that the gains may be for.
+        others: gain specifications of compensators that can only be simulated, by compensator name. They
+            take precedence over those of the registered compensators.
+        axes: accepted numbers of axes.
 
     Raises:
         GainFileError: if the document is invalid.
@@ -150,7 +150,7 @@ def _check_form(document: Mapping[str, Any], source: str) -> None:
     try:
         actual = digest(document)
     except (TypeError, ValueError, RecursionError) as error:
-        raise make_gain_file_error(source, "", f"what JSON cannot express ({error})", "JSON values") from None
+        raise make_gain_file_error(source, "", f"a value not of JSON ({error})", "JSON values") from None
     if stated != actual:
         allowed = f"'{actual}', the digest of its content (was it edited?)"
         raise make_gain_file_error(source, "sha256", format_value(stated, 80), allowed)
@@ -167,7 +167,7 @@ def _gains(
     gains = {}
     for name, specification in specifications.items():
         if name not in entries:
-            allowed = f"all gains of {law} (is it of an earlier version? `jaxhil tune` makes a new file)"
+            allowed = f"all gains of {law} (for a file of an earlier version, run `jaxhil tune` again)"
             raise make_gain_file_error(source, f"gains.{name}", "nothing", allowed)
         entry = _object(entries, name, source, "gains.")
         prefix = f"gains.{name}."
@@ -208,12 +208,12 @@ def _limits(document: Mapping[str, Any], source: str) -> dict[str, float]:
     try:
         return complete_limits(limits)
     except ValueError as error:
-        raise make_gain_file_error(source, "limits", str(error), "limits that fit one another") from None
+        raise make_gain_file_error(source, "limits", str(error), "consistent limits") from None
 
 
 def _entry(mapping: Mapping[str, Any], key: str, source: str, prefix: str) -> Any:
     if key not in mapping:
-        raise make_gain_file_error(source, prefix + key, "nothing", "this key is required")
+        raise make_gain_file_error(source, prefix + key, "nothing", "a value")
     return mapping[key]
 
 
@@ -225,7 +225,7 @@ def _object(mapping: Mapping[str, Any], key: str, source: str, prefix: str) -> M
 
 
 def _number(value: object, key: str, source: str) -> float:
-    # bool is an int to Python, and an integer of JSON may be too large for a float.
+    # In Python, bool is a subclass of int. An integer in JSON may be too large for a float.
     if not isinstance(value, bool) and isinstance(value, (int, float)):
         try:
             number = float(value)
@@ -257,7 +257,7 @@ def _is_shallow(document: Mapping[str, Any]) -> bool:
 
 
 def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a number of JSON")
+    raise ValueError(f"{name} is not a JSON number")
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Checks of the inputs: sensor readings and the numerical model's motion.
 
-The last good sensor reading replaces a bad one. `InputGuard.check` returns the faults of a tick and stores
-which of them trip; `force` and `measured` are then the inputs of the compensator.
+The last good sensor reading replaces a bad reading. `InputGuard.check` returns the faults of a tick, and
+stores in `fatal` the faults that trip the controller. The compensator then gets `force` and `measured`.
 """
 
 from math import inf, isfinite, nan
@@ -19,11 +19,11 @@ from jaxhil.rig.faults import (
 )
 from jaxhil.rig.types import Count, Limits, Positive
 
-TARE_ROUNDING = 1e-9  # relative; by this the mean of 1e6 equal readings may differ from them
+TARE_ROUNDING = 1e-9  # relative; largest rounding error of the mean of 1e6 equal readings
 
 
 class Tare:
-    """Tare of the force sensor: its bias is the mean of `tare_ticks` readings out of contact.
+    """Tare of the force sensor: the bias is the mean of `tare_ticks` readings out of contact.
 
     Attributes:
         bias: force to subtract from every reading [N].
@@ -51,7 +51,7 @@ class Tare:
         self.fatal = False
 
     def take(self, reading: float) -> bool:
-        """Add a reading [N]; return whether the tare is over, successful or `fatal`."""
+        """Add a force reading [N]; return whether the tare has ended, with success or with `fatal` set."""
         if not self._count < self._ticks:
             return True
         if self._count == 0:
@@ -75,26 +75,26 @@ class Tare:
         return True
 
     def restart(self) -> None:
-        """Let the next reading begin a new tare; the bias remains until that tare is over."""
+        """Begin a new tare at the next reading; keep the bias until the new tare succeeds."""
         self._begin()
 
 
 class InputGuard:
-    """Guard of the inputs; see `faults.FAULTS` for its checks.
+    """Checks of sensor readings and model motion on each tick; `faults.FAULTS` lists the faults.
 
     Attributes:
-        force: force of the last tick without bias [N], for the compensator.
-        measured: measured position of the last tick [m], for the compensator.
-        fatal: bits of the last tick's faults that trip.
-        located: position where the drives were measured last [m]; NaN before.
-        is_located: whether `located` is a reading of this run in range.
+        force: last good force reading minus the bias [N], for the compensator.
+        measured: last good position reading [m], for the compensator.
+        fatal: bits of the last tick's faults that trip the controller.
+        located: last measured position of the drives [m]; NaN before the first reading.
+        is_located: whether `located` is an in-range reading of this run.
     """
 
     __slots__ = (
-        "_bad_forces", "_bad_positions", "_clearance", "_desired", "_flight", "_force_limit",
-        "_force_reading", "_force_stuck", "_force_travel", "_forces_in_flight", "_free_distance",
-        "_free_force", "_held", "_highest", "_known", "_lowest", "_position_stuck", "_position_travel",
-        "_range", "_settling", "fatal", "force", "is_located", "located", "measured",
+        "_bad_forces", "_bad_positions", "_clearance", "_desired", "_force_limit", "_force_reading",
+        "_force_stuck", "_force_travel", "_forces_in_flight", "_free_distance", "_free_force",
+        "_free_ticks", "_has_reading", "_highest", "_lowest", "_max_bad", "_position_stuck",
+        "_position_travel", "_range", "_settling", "fatal", "force", "is_located", "located", "measured",
     )  # fmt: skip
 
     def __init__(self, limits: Limits, period: Positive, clearance: float) -> None:
@@ -102,7 +102,7 @@ class InputGuard:
         self._range = limits["force_range"]
         self._lowest = limits["measured_lowest"]
         self._highest = limits["measured_highest"]
-        self._held = limits["held_readings"]
+        self._max_bad = limits["held_readings"]
         self._force_stuck = limits["force_stuck_travel"]
         self._position_stuck = limits["position_stuck_travel"]
         self._free_distance = limits["free_distance"]
@@ -113,12 +113,12 @@ class InputGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the readings so far, but not where the drives were measured last."""
-        self._known = False
+        """Forget past readings and counts of bad readings, but keep `located`."""
+        self._has_reading = False
         self._bad_forces = 0
         self._bad_positions = 0
         self._forces_in_flight = 0
-        self._flight = 0
+        self._free_ticks = 0
         self._force_reading = 0.0
         self._force_travel = 0.0
         self._position_travel = 0.0
@@ -128,9 +128,9 @@ class InputGuard:
         self.fatal = 0
 
     def locate(self, position: float) -> None:
-        """Store where the drives are measured [m], also after a trip.
+        """Store the measured position of the drives [m], also after a trip.
 
-        Before a run's first reading in range, any reading that a rig can have is stored.
+        Until the run's first in-range reading, accept every reading within `bounds.POSITIONS`.
         """
         if self._lowest <= position <= self._highest:
             self.is_located = True
@@ -139,7 +139,7 @@ class InputGuard:
             self.located = position
 
     def check(self, reading: float, desired: float, velocity: float, position: float, bias: float) -> int:
-        """Return the faults of a tick.
+        """Check the inputs of one tick; return the bits of all faults.
 
         Args:
             reading: force reading [N].
@@ -153,10 +153,10 @@ class InputGuard:
             return MODEL_NOT_FINITE
         faults = 0
         self.fatal = 0
-        first = not self._known
-        if first:
-            # Without a reading before the first tick, assume no force and the desired position.
-            self._known = True
+        is_first = not self._has_reading
+        if is_first:
+            # Before the first tick there is no reading: assume no force and the desired position.
+            self._has_reading = True
             self._desired = desired
             self.measured = desired
             self._force_reading = inf
@@ -170,7 +170,7 @@ class InputGuard:
                 self._position_travel = 0.0
             self.measured = position
         else:
-            faults = self._bad_position(position, first)
+            faults = self._bad_position(position, is_first)
         self._desired = desired
         measured = self.measured
 
@@ -186,43 +186,43 @@ class InputGuard:
             faults |= self._bad_force(reading)
 
         if measured < -self._free_distance and measured > self._free_distance - self._clearance:
-            self._flight += 1
+            self._free_ticks += 1
         else:
-            self._flight = 0
-        if self._flight > self._settling and abs(self.force) > self._free_force:
+            self._free_ticks = 0
+        if self._free_ticks > self._settling and abs(self.force) > self._free_force:
             faults |= FORCE_IN_FLIGHT
             self._forces_in_flight += 1
-            self.fatal |= FORCE_IN_FLIGHT if self._forces_in_flight > self._held else 0
+            self.fatal |= FORCE_IN_FLIGHT if self._forces_in_flight > self._max_bad else 0
         else:
             self._forces_in_flight = 0
         return faults
 
-    # The unusual cases are functions of their own, so that a usual tick does not pay for them.
+    # Each rare case has its own function, so that a normal tick stays fast.
 
-    def _bad_position(self, position: float, first: bool) -> int:
-        # On the first tick there is no good reading yet, and the position of the drives is unknown.
+    def _bad_position(self, position: float, is_first: bool) -> int:
+        # A bad reading on the first tick is fatal, because the position of the drives is unknown.
         fault = POSITION_OUT_OF_RANGE if isfinite(position) else POSITION_NOT_FINITE
         self._bad_positions += 1
-        self.fatal |= fault if first or self._bad_positions > self._held else 0
+        self.fatal |= fault if is_first or self._bad_positions > self._max_bad else 0
         return fault
 
     def _bad_force(self, reading: float) -> int:
         fault = FORCE_OUT_OF_RANGE if isfinite(reading) else FORCE_NOT_FINITE
         self._bad_forces += 1
-        self.fatal |= fault if self._bad_forces > self._held else 0
+        self.fatal |= fault if self._bad_forces > self._max_bad else 0
         return fault
 
     def _same_position(self, travel: float) -> int:
-        """Add the model's travel [m] under an unchanged position reading; return the fault."""
+        """Add to the model's travel [m] since the position reading last changed; return the fault bit."""
         self._position_travel += travel
         fault = POSITION_STUCK if self._position_travel > self._position_stuck else 0
         self.fatal |= fault
         return fault
 
     def _same_force(self, deeper: float) -> int:
-        """Add the travel into contact [m] under an unchanged force reading; return the fault."""
+        """Add to the travel in contact [m] since the force reading last changed; return the fault bit."""
         if abs(self.force) <= TARE_ROUNDING * abs(self._force_reading):
-            # A damped mechanism may move out of contact without a force, but none moves deeper.
+            # Without a force, a damped mechanism may move out of contact, but no mechanism moves deeper.
             travel = self._force_travel + deeper
             self._force_travel = travel if travel > 0.0 else 0.0
         else:

@@ -1,19 +1,19 @@
 """Status of a compensator after each tick, and status of a whole contact.
 
-Every status is one number, the same in the C controller. The table `STATUSES` is the source of documentation
-and exports. Over a contact the statuses are counted. The first condition that holds gives its status:
+Each status is a number, which is the same in the C controller. Documentation and exports are made from the
+table `STATUSES`. The status of a whole contact is the first in this list whose condition holds:
 
     not_reached    no force was measured
-    unsure         the compensator did not act at all
+    unsure         the compensator never acted
     unsure, too_short or noisy
-                   their ticks are more than `MAX_DOUBTFUL_SHARE` of the ticks on which the compensator acted:
-                   the most frequent of the three
+                   together, these three statuses occurred on more than `MAX_DOUBTFUL_SHARE` of the ticks on
+                   which the compensator acted; the most frequent of the three counts
     unexplained or saturated
                    it was the status of the last tick on which the compensator acted
-    identified     otherwise
+    identified     none of the conditions above holds
 
-Unless it is identified, the compensator did not identify the contact, or its correction had little time or
-was at its limit.
+Every status except `identified` means that the compensator did not identify the contact, or that its
+correction had little time or reached its limit.
 """
 
 from typing import NamedTuple
@@ -24,29 +24,29 @@ MAX_DOUBTFUL_SHARE = 0.4  # share of the ticks on which the compensator acts
 
 
 class Status(NamedTuple):
-    """Status of a compensator."""
+    """Entry of the status table: number, name and meaning."""
 
-    number: int  # same in C
+    number: int  # number in Python and C
     name: str  # name in texts and exports
-    meaning: str  # one line
+    meaning: str  # description in one line
 
 
 OUT_OF_CONTACT, IDENTIFIED, UNSURE, SATURATED, TOO_SHORT, UNSTATED = range(6)
-NOISY, NOT_REACHED, UNEXPLAINED = 7, 8, 9  # 6 was `displaced`, of retired laws
+NOISY, NOT_REACHED, UNEXPLAINED = 7, 8, 9  # 6 was a status of retired compensators
 
 STATUSES = (
-    Status(OUT_OF_CONTACT, "out_of_contact", "the law does not act"),
-    Status(IDENTIFIED, "identified", "the command follows from an identified contact"),
-    Status(UNSURE, "unsure", "nothing is identified yet, or the approach speed is unknown"),
-    Status(SATURATED, "saturated", "identified, and the correction is at its limit"),
+    Status(OUT_OF_CONTACT, "out_of_contact", "the compensator does not act"),
+    Status(IDENTIFIED, "identified", "the command uses an identified contact"),
+    Status(UNSURE, "unsure", "no contact is identified yet, or the approach speed is unknown"),
+    Status(SATURATED, "saturated", "the contact is identified, and the correction is at its limit"),
     Status(
         TOO_SHORT,
         "too_short",
-        "most of the contact was over when the hardware touched: little time is left",
+        "most of the contact had passed when the hardware touched: little time remains for the correction",
     ),
-    Status(UNSTATED, "unstated", "the law has no status"),
-    Status(NOISY, "noisy", "noise of force or position, or a dead zone, leaves the contact uncertain"),
-    Status(NOT_REACHED, "not_reached", "status of a whole contact: no force was measured in it"),
+    Status(UNSTATED, "unstated", "the compensator has no status"),
+    Status(NOISY, "noisy", "noise of force or position, or a dead zone, makes the identification uncertain"),
+    Status(NOT_REACHED, "not_reached", "only for a whole contact: no force was measured in the contact"),
     Status(
         UNEXPLAINED,
         "unexplained",
@@ -57,43 +57,53 @@ STATUS_NAMES = {status.number: status.name for status in STATUSES}
 
 
 class ContactCount(NamedTuple):
-    """Statuses of one contact: the number of ticks with each, and that of the whole contact."""
+    """Compensator status of one contact, with the number of ticks for each doubtful status."""
 
-    number: int  # of the contact; 0 before the first
-    ticks: int  # on which the compensator acted
-    unsure: int  # ticks with this status, likewise below
-    saturated: int
-    too_short: int
-    noisy: int
+    number: int  # number of the contact; 0 before the first contact
+    ticks: int  # number of ticks on which the compensator acted
+    unsure: int  # number of ticks with the status `unsure`
+    saturated: int  # number of ticks with the status `saturated`
+    too_short: int  # number of ticks with the status `too_short`
+    noisy: int  # number of ticks with the status `noisy`
     last: SmallInt  # status of the last tick on which the compensator acted
-    status: SmallInt  # of the whole contact
+    status: SmallInt  # status of the whole contact
 
 
 class ContactRecord(NamedTuple):
-    """Statuses of one contact, by name."""
+    """Compensator status of one contact, with the number of ticks for each doubtful status.
 
-    number: int = 0  # of the contact; 0 before the first
-    status: str = STATUS_NAMES[UNSTATED]  # of the whole contact, a name in `STATUSES`
-    ticks: int = 0  # on which the compensator acted
-    unsure: int = 0  # ticks with this status, likewise below
+    Attributes:
+        number: number of the contact; 0 before the first contact.
+        status: status of the whole contact, a name in `STATUSES`.
+        ticks: number of ticks on which the compensator acted.
+        unsure: number of ticks with the status `unsure`.
+        saturated: number of ticks with the status `saturated`.
+        too_short: number of ticks with the status `too_short`.
+        noisy: number of ticks with the status `noisy`.
+    """
+
+    number: int = 0
+    status: str = STATUS_NAMES[UNSTATED]
+    ticks: int = 0
+    unsure: int = 0
     saturated: int = 0
     too_short: int = 0
     noisy: int = 0
 
     @property
     def in_doubt(self) -> bool:
-        """Return whether the compensator has a status and did not fully identify and correct the contact."""
+        """Return whether the compensator reports a status other than `identified` for the contact."""
         return self.status not in (STATUS_NAMES[UNSTATED], STATUS_NAMES[IDENTIFIED])
 
 
 def contact_record(count: ContactCount) -> ContactRecord:
-    """Return the record of a contact, with the name of its status."""
+    """Convert the counts of a contact to a `ContactRecord`, with the status as a name."""
     number, ticks, unsure, saturated, too_short, noisy, _, status = count
     return ContactRecord(number, STATUS_NAMES[status], ticks, unsure, saturated, too_short, noisy)
 
 
 class StatusCount:
-    """Counter of a compensator's statuses over a contact."""
+    """Counter of the ticks with each compensator status during one contact."""
 
     __slots__ = ("_last", "_noisy", "_saturated", "_ticks", "_too_short", "_unsure")
 
@@ -101,7 +111,7 @@ class StatusCount:
         self.restart()
 
     def restart(self) -> None:
-        """Begin another contact."""
+        """Set all counts to 0 for the next contact."""
         self._ticks = 0
         self._unsure = 0
         self._saturated = 0
@@ -127,7 +137,12 @@ class StatusCount:
             self._noisy += 1
 
     def count(self, number: int, measured: bool) -> ContactCount:
-        """Return the counts of contact `number`, which is over; `measured`: whether a force was measured."""
+        """Return counts and status of the contact that has ended.
+
+        Args:
+            number: number of the contact.
+            measured: whether a force was measured in the contact.
+        """
         ticks, unsure, too_short, noisy = self._ticks, self._unsure, self._too_short, self._noisy
         status = IDENTIFIED
         if not measured:

@@ -1,9 +1,9 @@
 """Limits of the outputs: the force on the numerical model and the position command to the drives.
 
-Both guards continue from their last output, so that neither a trip nor a reset makes it jump. At the
-beginning of a run the position command continues from the measured position. After a trip the force ramps to
-0. The position command brakes; in contact, or nearer to a surface than `free_distance`, it moves away at
-`retreat_velocity`; then it comes to rest.
+Both guards continue from their last output, so that no output jumps at a trip or a reset. At the beginning
+of a run the position command continues from the measured position. After a trip the force ramps to 0 and the
+position command brakes. In contact, or nearer to a surface than `free_distance`, the position command moves
+away at `retreat_velocity`; then it comes to rest.
 """
 
 from math import isfinite
@@ -21,29 +21,29 @@ from jaxhil.rig.types import Limits, Positive
 
 
 class ForceGuard:
-    """Limiter of the force on the numerical model (`force_limit`) and of its change (`force_slew`).
+    """Guard of the force on the numerical model: magnitude (`force_limit`) and rate (`force_slew`).
 
     Attributes:
         output: last force [N].
-        fatal: bits of the faults that trip.
+        fatal: bits of the last command's faults that trip the controller.
     """
 
-    __slots__ = ("_cut", "_cut_tolerated", "_limit", "_most", "fatal", "output")
+    __slots__ = ("_limit", "_limited_ticks", "_max_change", "_max_limited_ticks", "fatal", "output")
 
     def __init__(self, limits: Limits, period: Positive) -> None:
         self._limit = limits["force_limit"]
-        self._most = limits["force_slew"] * period
-        self._cut_tolerated = limits["limited_in_a_row"]
+        self._max_change = limits["force_slew"] * period
+        self._max_limited_ticks = limits["limited_in_a_row"]
         self.output = 0.0
         self.restart()
 
     def restart(self) -> None:
         """Forget the faults; the next command continues from the last output."""
-        self._cut = 0
+        self._limited_ticks = 0
         self.fatal = 0
 
     def limit(self, command: float) -> int:
-        """Move the output to the command [N] as far as the limits allow; return the faults."""
+        """Move the output to the command [N] as far as the limits allow; return the fault bits."""
         self.fatal = 0
         if not isfinite(command):
             self.fatal = COMMAND_NOT_FINITE
@@ -51,60 +51,61 @@ class ForceGuard:
         if abs(command) > self._limit:
             self.fatal = FORCE_LIMIT
             return FORCE_LIMIT
-        if abs(command - self.output) <= self._most:
-            self._cut = 0
+        if abs(command - self.output) <= self._max_change:
+            self._limited_ticks = 0
             self.output = command
             return 0
-        self._cut += 1
-        if self._cut > self._cut_tolerated:
+        self._limited_ticks += 1
+        if self._limited_ticks > self._max_limited_ticks:
             self.fatal = FORCE_SLEW
         else:
-            self.output = _towards(self.output, command, self._most)
+            self.output = _move_towards(self.output, command, self._max_change)
         return FORCE_SLEW
 
     def fade(self) -> None:
-        """Move the output towards 0 as far as `force_slew` allows."""
-        self.output = _towards(self.output, 0.0, self._most)
+        """Move the output towards 0 by one period's step at `force_slew`."""
+        self.output = _move_towards(self.output, 0.0, self._max_change)
 
 
 class PositionGuard:
-    """Limiter of the position command (stroke) and of its change (`velocity_limit`).
+    """Guard of the position command: range (stroke) and rate (`velocity_limit`).
 
-    Two commands in a row differ by at most what the velocity limit allows in a period. A run's first command
-    differs as little from the measured position; out of contact, where moving drives lag behind, it may
-    differ by `start_distance`. A command is outside the stroke only on the way back into it.
+    Two successive commands differ by at most one period's travel at `velocity_limit`. A run's first command
+    may differ from the measured position by this travel, or out of contact by `start_distance`, because
+    moving drives lag behind. A command is outside the stroke only while it returns into the stroke.
 
     Attributes:
         output: last command [m].
-        known: whether there has been a command.
-        at_rest: whether the last command after a trip did not move.
-        fatal: bits of the faults that trip.
+        known: whether there is a last command.
+        at_rest: whether the position command has come to rest after a trip.
+        fatal: bits of the last command's faults that trip the controller.
     """
 
     __slots__ = (
-        "_braking", "_clearance", "_cut", "_cut_tolerated", "_distance", "_engaged", "_highest", "_lowest",
-        "_most", "_rate", "_retreat", "_start", "at_rest", "fatal", "known", "output",
+        "_braking", "_clearance", "_distance", "_engaged", "_highest", "_limited_ticks", "_lowest",
+        "_max_change", "_max_limited_ticks", "_rate", "_retreat", "_start", "at_rest", "fatal", "known",
+        "output",
     )  # fmt: skip
 
     def __init__(self, limits: Limits, period: Positive, clearance: float) -> None:
         self._clearance = clearance
         self._lowest = limits["command_lowest"]
         self._highest = limits["command_highest"]
-        self._most = limits["velocity_limit"] * period
+        self._max_change = limits["velocity_limit"] * period
         self._braking = limits["deceleration"] * period * period
         self._retreat = limits["retreat_velocity"] * period
-        # In a narrow gap the safest position is the middle.
+        # In a narrow gap, the position command comes to rest in the middle.
         distance, middle = limits["free_distance"], 0.5 * clearance
         self._distance = distance if distance < middle else middle
-        self._cut_tolerated = limits["limited_in_a_row"]
+        self._max_limited_ticks = limits["limited_in_a_row"]
         self._start = limits["start_distance"]
         self.output = 0.0
         self.known = False
         self.restart()
 
     def restart(self) -> None:
-        """Forget the faults; changes may be cut without limit until the output reaches the next command."""
-        self._cut = 0
+        """Forget the faults; until the output first reaches a command, limited changes do not trip."""
+        self._limited_ticks = 0
         self._engaged = False
         self._rate = 0.0
         self.at_rest = False
@@ -116,13 +117,13 @@ class PositionGuard:
         self.restart()
 
     def limit(self, command: float, position: float, measured: float, is_fresh: bool) -> int:
-        """Move the output to the command as far as the limits allow; return the faults.
+        """Move the output to the command as far as the limits allow; return the fault bits.
 
         Args:
-            command: position to command [m].
+            command: position command [m].
             position: position of the numerical model [m].
             measured: last measured position of the drives [m]; NaN if there is none.
-            is_fresh: whether that measurement is of this run.
+            is_fresh: whether `measured` was measured in this run.
         """
         self.fatal = 0
         if not isfinite(command):
@@ -132,49 +133,54 @@ class PositionGuard:
             self.fatal = STROKE
             return STROKE
         if not self.known:
-            # Moving drives lag behind. Without a reading the drives are assumed at the model's position.
-            near = abs(command - (measured if is_fresh else position)) <= self._start
-            if near and deflection(position, self._clearance) == 0.0:
+            # Moving drives lag behind. Without a reading, assume that they are at the model's position.
+            is_near = abs(command - (measured if is_fresh else position)) <= self._start
+            if is_near and deflection(position, self._clearance) == 0.0:
                 self.known = True
                 self.output = command
             else:
                 self._stand(measured, position)
         before = self.output
-        if abs(command - before) <= self._most:
+        if abs(command - before) <= self._max_change:
             self._engaged = True
-            self._cut = 0
+            self._limited_ticks = 0
             self._rate = command - before
             self.output = command
             return 0
         if self._engaged:
-            self._cut += 1
-            if self._cut > self._cut_tolerated:
+            self._limited_ticks += 1
+            if self._limited_ticks > self._max_limited_ticks:
                 self.fatal = VELOCITY_LIMIT
                 return VELOCITY_LIMIT
-        self.output = _towards(before, command, self._most)
+        self.output = _move_towards(before, command, self._max_change)
         self._rate = self.output - before
         return VELOCITY_LIMIT
 
     def retreat(self, measured: float, position: float) -> None:
-        """Move the output by one period on the way to rest out of contact; arguments as in `limit`."""
+        """Move the output by one period's step towards rest out of contact.
+
+        Args:
+            measured: last measured position of the drives [m]; NaN if there is none.
+            position: position of the numerical model [m].
+        """
         if not self.known:
             self._stand(measured, position)
         output = self.output
-        wanted = 0.0
+        target_rate = 0.0
         if output > -self._distance:
-            wanted = -self._retreat
+            target_rate = -self._retreat
         elif output < self._distance - self._clearance:
-            wanted = self._retreat
+            target_rate = self._retreat
         rate = self._rate
-        change = wanted - rate
+        change = target_rate - rate
         if change > self._braking:
             rate += self._braking
         elif change < -self._braking:
             rate -= self._braking
         else:
-            rate = wanted
+            rate = target_rate
         moved = output + rate
-        # An output outside the stroke may come back, but does not move further out.
+        # An output outside the stroke may move back into the stroke, but not further out.
         if moved < self._lowest and rate < 0.0:
             moved = output if output < self._lowest else self._lowest
             rate = 0.0
@@ -183,10 +189,10 @@ class PositionGuard:
             rate = 0.0
         self._rate = rate
         self.output = moved
-        self.at_rest = rate == 0.0 and wanted == 0.0
+        self.at_rest = rate == 0.0 and target_rate == 0.0
 
     def _stand(self, measured: float, position: float) -> None:
-        """Begin at the measured position; without one, at the model's, moved into stroke and free space."""
+        """Set the output to `measured`, or if that is NaN to `position`, clamped to the free stroke."""
         self.known = True
         self.output = measured
         if isfinite(measured):
@@ -203,10 +209,10 @@ class PositionGuard:
         self.output = start
 
 
-def _towards(start: float, target: float, most: float) -> float:
-    """Return the value nearest to the target that differs by at most `most` from the start."""
+def _move_towards(start: float, target: float, max_change: float) -> float:
+    """Move from `start` towards `target` by at most `max_change`."""
     if target > start:
-        moved = start + most
+        moved = start + max_change
         return moved if moved < target else target
-    moved = start - most
+    moved = start - max_change
     return moved if moved > target else target

@@ -1,7 +1,7 @@
-"""Interface of the rig's compensators, and the table of registered ones.
+"""Interface of the rig's compensators, and the table `COMPENSATORS` of registered compensators.
 
-A compensator is a class with the methods of `Compensator`, from which it may inherit the defaults;
-`@register(name)` adds it to the table under the name that gain files use.
+A compensator is a class with the methods of `Compensator`; it may inherit their defaults. `@register(name)`
+adds the class to the table; gain files refer to the compensator by this name.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,9 +13,9 @@ from jaxhil.rig.types import Gains, Positive
 
 
 class GainSpecification(NamedTuple):
-    """Unit and absolute bounds of a gain, which no gain file can widen (`bounds`)."""
+    """Unit and absolute bounds of a gain; a gain file cannot widen the bounds (`bounds`)."""
 
-    unit: str  # "1" if it has none
+    unit: str  # "1" if dimensionless
     lowest: float = -inf  # lower bound
     highest: float = inf  # upper bound
 
@@ -36,14 +36,14 @@ class Compensator(Protocol):
     __slots__ = ()
 
     gains: ClassVar[Mapping[str, GainSpecification]]
-    # Status of the last command, a number of `law_status`; either always UNSTATED or never.
+    # Status of the last command, a number of `law_status`. A compensator without a status has UNSTATED.
     status: int = UNSTATED
 
     def __init__(self, gains: Gains, period: Positive, clearance: float) -> None: ...
 
     @property
     def identified(self) -> tuple[float, float]:
-        """Return identified stiffness [N/m] and damping [N s/m]; (0, 0) if none are identified."""
+        """Return the identified stiffness [N/m] and damping [N s/m]; (0, 0) if nothing is identified."""
         return 0.0, 0.0
 
     @property
@@ -58,15 +58,15 @@ class Compensator(Protocol):
         velocity_desired: float,
         position_measured: float,
     ) -> float:
-        """Return the force F_c on the numerical model [N]; all arguments are finite, in N, m and m/s."""
+        """Return the force F_c [N] on the numerical model; all arguments are finite, in N, m and m/s."""
         ...
 
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """Return the position to command [m] for the numerical model's new motion [m, m/s, m/s^2]."""
+        """Return the position command [m] for the numerical model's new motion [m, m/s, m/s^2]."""
         return position
 
     def reset(self) -> None:
-        """Restart everything, identified parameters included."""
+        """Restart everything, including the identified parameters."""
 
     def next_contact(self) -> None:
         """Restart filters, delay lines and covariance; keep the identified parameters."""
@@ -81,8 +81,8 @@ COMPENSATORS: dict[str, type[Compensator]] = {}
 def register(name: str) -> Callable[[AnyCompensator], AnyCompensator]:
     """Return a class decorator that adds a compensator to `COMPENSATORS` under `name`."""
 
-    def enter(compensator: AnyCompensator) -> AnyCompensator:
+    def decorate(compensator: AnyCompensator) -> AnyCompensator:
         COMPENSATORS[name] = compensator
         return compensator
 
-    return enter
+    return decorate

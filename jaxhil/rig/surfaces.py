@@ -1,9 +1,9 @@
-"""Surfaces of the mechanism: at position 0, and at -clearance if the contact is two-sided."""
+"""Contact surfaces of the mechanism: at position 0, and at -clearance if the contact is two-sided."""
 
 
 def deflection(position: float, clearance: float) -> float:
-    """Return by how much [m] a position x is beyond a surface: x > 0, x + clearance < 0, or 0 in between."""
+    """Return the penetration [m] at position x: x if x > 0, x + clearance if that is < 0, otherwise 0."""
     if position > 0.0:
         return position
-    far = position + clearance
-    return far if far < 0.0 else 0.0
+    beyond = position + clearance
+    return beyond if beyond < 0.0 else 0.0

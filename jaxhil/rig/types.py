@@ -1,4 +1,4 @@
-"""Types of the rig's numbers, with properties that the C99 generator (`jaxhil.codegen`) reads."""
+"""Annotated number types of the rig's code; the C99 generator (`jaxhil.codegen`) reads the annotations."""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -6,8 +6,8 @@ from typing import Annotated
 Positive = Annotated[float, "> 0"]
 NonNegative = Annotated[float, ">= 0"]
 Count = Annotated[int, ">= 0"]
-Index = Annotated[int, "index"]  # into a list; Python code assures that it is in range: C does not test it
+Index = Annotated[int, "index"]  # into a list; the Python code ensures its range, because C does not check it
 Bits = Annotated[int, "uint32_t"]
 SmallInt = Annotated[int, "int"]
-Limits = Annotated[Mapping[str, float], "limits"]  # by name
-Gains = Annotated[Mapping[str, float], "gains"]  # by name
+Limits = Annotated[Mapping[str, float], "limits"]  # limit names and values
+Gains = Annotated[Mapping[str, float], "gains"]  # gain names and values

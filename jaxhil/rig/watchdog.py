@@ -1,29 +1,30 @@
-"""Watchdog: an energy audit of every contact, from the motion of the numerical model.
+"""Watchdog: energy audit of every contact, from the motion of the numerical model.
 
-A contact begins on the tick on which the model's or the measured position is beyond a specified surface, or
-the compensator acts (it may detect a nearer surface). It is audited once none of this has been so for
-`settling`, the model moves away and the force has decayed; the audit waits for that at most `MAX_DECAY_WAIT`.
-No threshold depends on the noise, because a noisy force that happens to be small may still have impulse to
-give. At the latest, the audit takes place in the middle of the gap or when the next contact is announced.
-With v_in the model's velocity on the tick before the contact and v now, the audit asks:
+A contact begins on the first tick on which the model's or the measured position is beyond a specified
+surface, or on which the compensator acts (it may detect a nearer surface). When none of these conditions has
+held for `settling`, the model moves away and the force has decayed, the watchdog audits the contact. It waits
+for the decay for at most `MAX_DECAY_WAIT`. No threshold depends on the noise, because a noisy force can be
+small by chance before it has given its whole impulse. The audit takes place at the latest in the middle of
+the gap or at the call of `next_contact`. With v_in and v, the model's velocities on the tick before the
+contact and on the present tick, the audit checks three conditions:
 
-- Is the energy consistent? M (v^2 - v_in^2)/2 must be the work -T sum F_c(n) (v(n) + v(n+1))/2 of the
-  controller's force, an identity for every integrator with v(n+1) = v(n) - T F_c(n)/M.
-- Is the restitution |v|/|v_in| the expected one, within `restitution_margin`?
-- Did the compensator identify the contact, by its own status (`law_status`)? Without `equivalent_mass` this
-  is the only question. A contact in which no force reading is beyond `fading` counts as not reached.
+- Energy: M (v^2 - v_in^2)/2 equals the work -T sum F_c(n) (v(n) + v(n+1))/2 of the controller's force. This
+  is an identity for every integrator with v(n+1) = v(n) - T F_c(n)/M.
+- Restitution: |v|/|v_in| differs from the expected restitution by at most `restitution_margin`.
+- Status: the compensator reports that it identified the contact (`law_status`). Without `equivalent_mass`
+  the audit checks only this condition. A contact with no force reading above `fading` is `not_reached`.
 
-The expected restitution depends on stiffness k and damping b of this contact: the least-squares fit of the
-measured force to the measured position, delayed by `alignment`, and its rate, over the whole contact. An
-error delta of the delay changes k only by a factor cos(omega delta), whatever the compensator does; it
-changes b by -k delta, which nothing on the rig can distinguish from damping. The polynomial therefore has
-terms in z only where they help (`tuning.watchdog.expectation`):
+The expected restitution depends on stiffness k and damping b of this contact. They are the least-squares fit
+of the measured force to the measured position, delayed by `alignment`, and its rate, over the whole contact.
+If the delay is wrong by delta, k changes only by a factor cos(omega delta) with any compensator. But b
+changes by -k delta, which on the rig is indistinguishable from damping. The polynomial therefore has terms in
+z only if they improve the fit (`tuning.watchdog.expectation`):
 
     p = sqrt(reference_stiffness / k) - 1,  w = |v_in| / reference_velocity - 1,  z = b / (2 sqrt(k M)),
     e* = c_1 + c_p p + c_pp p^2 + c_ppp p^3 + c_w w + c_ww w^2 + c_pw p w
-         + c_z z + c_zz z^2 + c_pz p z + c_wz w z,   within 0 and 1,
+         + c_z z + c_zz z^2 + c_pz p z + c_wz w z,
 
-each of p, w, z limited to the range over which the polynomial was fitted.
+where p, w and z are clamped to the ranges for which the polynomial was fitted, and e* to 0 to 1.
 """
 
 from math import inf, sqrt
@@ -41,34 +42,34 @@ from jaxhil.rig.law_status import (
 from jaxhil.rig.surfaces import deflection
 from jaxhil.rig.types import Limits, Positive
 
-FORCE_DECAY_RATIO = 1e-6  # share of the peak force, or of the approach's momentum: the force has decayed
 MAX_DECAY_WAIT = 0.1  # s; longest wait for the force to decay
+FORCE_DECAY_RATIO = 1e-6  # [1]; of the peak force, or of the approach momentum divided by `MAX_DECAY_WAIT`
 
 
 class Watchdog:
-    """Audit of one contact after another.
+    """Audit of successive contacts: energy, restitution and compensator status.
 
     Args:
         limits: limits by name, in SI units.
         period: control period [s].
-        clearance: clearance of a two-sided contact [m]; infinite for a one-sided one.
-        stated: whether the compensator has a status.
+        clearance: clearance of a two-sided contact [m]; infinite for a one-sided contact.
+        stated: whether the compensator reports a status.
 
     Attributes:
-        on: whether there is anything to audit.
+        on: whether the watchdog audits the energy or the compensator's status.
         contacts: number of audited contacts.
-        record: statuses of the last audited contact.
-        restitution: restitution of that contact [1], until `restart`.
-        expected: expected restitution of that contact [1], until `restart`.
-        balance: energy error of that contact [J], until `restart`.
+        record: compensator status of the last audited contact.
+        restitution: restitution of the last audited contact [1]; 0 after `restart`.
+        expected: expected restitution of the last audited contact [1]; 0 after `restart`.
+        balance: energy error of the last audited contact [J]; 0 after `restart`.
     """
 
     __slots__ = (
-        "_aligned", "_alignment", "_clearance", "_entry", "_expectation", "_faded", "_fading", "_force",
-        "_known", "_longest", "_margin", "_mass", "_measured", "_middle", "_open", "_peak", "_period",
-        "_quiet", "_quiet_ticks", "_side", "_stated", "_statuses", "_svf", "_svv", "_sxf", "_sxv", "_sxx",
-        "_ticks", "_tolerance", "_unfelt", "_velocity", "_work", "balance", "contacts", "expected", "on",
-        "record", "restitution",
+        "_aligned", "_alignment", "_clearance", "_entry_velocity", "_expectation", "_fading", "_force",
+        "_free_ticks", "_has_motion", "_longest", "_margin", "_mass", "_max_settling_ticks", "_measured",
+        "_middle", "_negligible_force", "_open", "_peak", "_period", "_settling_ticks", "_side", "_stated",
+        "_statuses", "_svf", "_svv", "_sxf", "_sxv", "_sxx", "_ticks", "_tolerance", "_velocity", "_work",
+        "balance", "contacts", "expected", "on", "record", "restitution",
     )  # fmt: skip
     _period: Positive
 
@@ -80,8 +81,8 @@ class Watchdog:
         self._middle = -0.5 * clearance
         self._period = period
         self._mass = limits["equivalent_mass"]
-        self._quiet_ticks = limits["settling"] / period
-        self._faded = (limits["settling"] + MAX_DECAY_WAIT) / period
+        self._settling_ticks = limits["settling"] / period
+        self._max_settling_ticks = (limits["settling"] + MAX_DECAY_WAIT) / period
         self._longest = limits["longest_contact"] / period if self._mass > 0.0 else inf
         self._fading = limits["fading"]
         self._margin = limits["restitution_margin"]
@@ -93,18 +94,18 @@ class Watchdog:
         self.record = ContactCount(0, 0, 0, 0, 0, 0, OUT_OF_CONTACT, UNSTATED)
 
     def restart(self) -> None:
-        """Forget the current contact and the motion so far, but not `contacts` and `record`."""
-        self._known = False
+        """Forget the current contact and the past motion, but keep `contacts` and `record`."""
+        self._has_motion = False
         self._open = False
-        self._entry = 0.0
+        self._entry_velocity = 0.0
         self._side = 1.0
-        self._quiet = 0
+        self._free_ticks = 0
         self._ticks = 0
         self._velocity = 0.0
         self._force = 0.0
         self._aligned = 0.0
         self._peak = 0.0
-        self._unfelt = 0.0
+        self._negligible_force = 0.0
         self._work = 0.0
         self._measured = False
         self._statuses.restart()
@@ -122,20 +123,20 @@ class Watchdog:
         velocity: float,
         measured: float,
     ) -> int:
-        """Return the faults that this tick shows, 0 if none.
+        """Process one tick and audit a contact that has ended; return the fault bits, 0 if none.
 
         Args:
-            previous_force: force F_c of the tick before [N].
-            status: the compensator's status of that force.
+            previous_force: force F_c on the previous tick [N].
+            status: the compensator's status on the previous tick.
             force: force reading of this tick [N].
             position: position of the numerical model [m].
             velocity: velocity of the numerical model [m/s].
             measured: position reading of this tick [m].
         """
-        if self._known:
+        if self._has_motion:
             before = self._velocity
         else:
-            self._known = True
+            self._has_motion = True
             self._alignment.start(measured, velocity)
             before, previous_force = velocity, 0.0
         clearance = self._clearance
@@ -151,23 +152,25 @@ class Watchdog:
             self._begin(before, side)
         if self._open:
             if in_contact:
-                self._quiet = 0
+                self._free_ticks = 0
             else:
-                self._quiet += 1
+                self._free_ticks += 1
             self._ticks += 1
             self._statuses.take(status)
             self._measured = self._measured or abs(force) > self._fading
             self._work += self._period * previous_force * 0.5 * (before + velocity)
-            size = abs(previous_force)
-            if size > self._peak:
-                self._peak = size
+            magnitude = abs(previous_force)
+            if magnitude > self._peak:
+                self._peak = magnitude
             self._regress(force, aligned)
-            faded = (
-                size <= FORCE_DECAY_RATIO * self._peak or size <= self._unfelt or self._quiet >= self._faded
+            has_decayed = (
+                magnitude <= FORCE_DECAY_RATIO * self._peak
+                or magnitude <= self._negligible_force
+                or self._free_ticks >= self._max_settling_ticks
             )
-            outside = not in_contact and self._quiet >= self._quiet_ticks
-            leaving = outside and self._side * velocity < 0.0 and faded
-            if leaving or side != self._side:
+            has_settled = not in_contact and self._free_ticks >= self._settling_ticks
+            is_leaving = has_settled and self._side * velocity < 0.0 and has_decayed
+            if is_leaving or side != self._side:
                 fault = self._audit(velocity)
             elif self._ticks > self._longest:
                 fault = CONTACT_TOO_LONG
@@ -177,11 +180,11 @@ class Watchdog:
         return fault
 
     def conclude(self, previous_force: float, status: int) -> int:
-        """Audit the current contact, if there is one, and return the faults.
+        """End and audit the current contact, if there is one; return the fault bits.
 
         Args:
-            previous_force: force F_c of the last tick [N].
-            status: the compensator's status of that force.
+            previous_force: force F_c on the last tick [N].
+            status: the compensator's status on the last tick.
         """
         if not self._open:
             return 0
@@ -194,16 +197,16 @@ class Watchdog:
         return self._audit(velocity)
 
     def detail(self) -> str:
-        """Return the last audit in words."""
+        """Describe the last audit: contact number, restitution, expected restitution, compensator status."""
         text = f"contact {self.contacts}: restitution {self.restitution:.4g}, expected {self.expected:.4g}"
         return f"{text}, law {STATUS_NAMES[self.record.status].replace('_', ' ')}" if self._stated else text
 
     def _begin(self, entry: float, side: float) -> None:
         self._open = True
-        self._entry = entry
-        self._unfelt = FORCE_DECAY_RATIO * self._mass * abs(entry) / MAX_DECAY_WAIT
+        self._entry_velocity = entry
+        self._negligible_force = FORCE_DECAY_RATIO * self._mass * abs(entry) / MAX_DECAY_WAIT
         self._side = side
-        self._quiet = 0
+        self._free_ticks = 0
         self._ticks = 0
         self._peak = 0.0
         self._work = 0.0
@@ -212,8 +215,8 @@ class Watchdog:
         self._sxx = self._sxv = self._svv = self._sxf = self._svf = 0.0
 
     def _regress(self, force: float, aligned: float) -> None:
-        """Add the interval between two ticks to the regression if both its ends are in contact."""
-        # A condition on the force would select the larger of noisy readings and bias the stiffness.
+        """Add the interval since the last tick to the regression sums if both ticks are in contact."""
+        # A threshold on noisy forces would prefer large readings and bias the stiffness.
         side = self._side
         before = self._aligned
         if aligned * side > 0.0 and before * side > 0.0:
@@ -229,14 +232,14 @@ class Watchdog:
     def _audit(self, velocity: float) -> int:
         self._open = False
         self.contacts += 1
-        doubt = 0
+        law_fault = 0
         if self._stated:
             self.record = self._statuses.count(self.contacts, self._measured)
-            doubt = LAW_IN_DOUBT if self.record.status != IDENTIFIED else 0
-        return doubt | (self._energies(velocity, self._mass) if self._mass > 0.0 else 0)
+            law_fault = LAW_IN_DOUBT if self.record.status != IDENTIFIED else 0
+        return law_fault | (self._energies(velocity, self._mass) if self._mass > 0.0 else 0)
 
     def _energies(self, velocity: float, mass: Positive) -> int:
-        entry = self._entry
+        entry = self._entry_velocity
         energy = 0.5 * mass * entry * entry
         self.balance = 0.5 * mass * velocity * velocity - energy + self._work
         if not abs(self.balance) <= self._tolerance * energy:
@@ -257,7 +260,7 @@ class Watchdog:
 
 
 class Expectation:
-    """Expected restitution of a contact, a polynomial of its stiffness, damping and approach speed."""
+    """Polynomial for the expected restitution from a contact's stiffness, damping and approach speed."""
 
     __slots__ = (
         "_coefficients", "_loss", "_reference_stiffness", "_reference_velocity", "_softness", "_speed",
@@ -277,7 +280,7 @@ class Expectation:
         ]
 
     def restitution(self, stiffness: float, damping: float, speed: float, mass: Positive) -> float:
-        """Return the polynomial of the module's docstring; a stiffness <= 0 counts as the softest.
+        """Return the expected restitution [1]; for a stiffness <= 0, use the largest p and the least z.
 
         Args:
             stiffness: identified stiffness [N/m].
@@ -298,7 +301,7 @@ class Expectation:
 
 
 def _within(value: float, span: tuple[float, float]) -> float:
-    # NaN is not above the lower end, so that it gives the lower end.
+    # The comparison with NaN is false, so that NaN gives the lower bound.
     if not value > span[0]:
         return span[0]
     return value if value < span[1] else span[1]
