@@ -76,7 +76,7 @@ def test_single_file_keeps_comments_and_labels_each_part(exported):
     _, folder = exported
     text = (folder / "jaxhil_runtime.py").read_text()
     assert "# ---- jaxhil.rig.controller ---" in text
-    assert "# bool is an int to Python" in text
+    assert "# In Python, bool is a subclass of int." in text
     # Examples in docstrings may import the package.
     assert not re.search(r"^\s*(from \.|from jaxhil|import jax)", text, re.MULTILINE)
 

@@ -1,22 +1,22 @@
 """Compensators, one folder each: `simulation.py` is the JAX version, `rig.py` the class that the rig runs.
 
-A compensator for six axes of motion has `simulation_six_axes.py`, beside the files for one axis or alone: a
-name stands for one idea, whose versions for one axis and for six share parts where they can. A compensator is
-found by these files; no list names it. Each of the JAX files binds the compensator to `COMPENSATOR`, and
-`rig.py` registers its class with `@register(NAME)`. `shared` contains common parts. Importing this package,
-or any `rig.py`, does not import JAX.
+`simulation_six_axes.py` is the JAX version for six axes of motion; a folder may have it alone or with the
+files for one axis. The files define which compensators exist; there is no list of names. Each JAX file
+assigns the compensator to `COMPENSATOR`, and `rig.py` registers its class with `@register(NAME)`. The folder
+`shared` contains parts that several compensators use. Importing this package, or any `rig.py`, does not
+import JAX.
 """
 
 from functools import cache
 from pathlib import Path
 
 _FOLDER = Path(__file__).parent
-_FILES = {1: "simulation", 6: "simulation_six_axes"}  # by the number of axes
+_FILES = {1: "simulation", 6: "simulation_six_axes"}  # number of axes: name of the module
 
 
 @cache
 def built_in_compensators(axes: int = 1) -> tuple[str, ...]:
-    """Return the names of the compensators: `none`, then the others in alphabetical order.
+    """Return the names of the built-in compensators: `none`, then all others in alphabetical order.
 
     Args:
         axes: number of axes of motion, 1 or 6.
@@ -31,5 +31,5 @@ def built_in_compensators(axes: int = 1) -> tuple[str, ...]:
 
 
 def module_name(name: str, axes: int = 1) -> str:
-    """Return the full name of the module with a compensator's JAX version."""
+    """Return the full name of the Python module with a compensator's JAX version."""
     return f"{__name__}.{name}.{_FILES[axes]}"

@@ -1,7 +1,7 @@
-"""Tables of the compensators in JAX, and their gains by the literature's rules.
+"""Tables of all compensators in JAX, and their gains by the rules of the literature.
 
-Simulation, tuning, gain files and the command line use the compensators in these tables: those of this
-package's folders, and those that `jaxhil.register` adds.
+Simulation, tuning, gain files and the command line use the compensators in these tables: the built-in
+compensators and all that `jaxhil.register` adds.
 """
 
 from importlib import import_module
@@ -23,9 +23,9 @@ SIX_AXIS_COMPENSATORS: dict[str, SixAxisCompensator] = _load_compensators(6)
 
 
 def get_compensator(name: str, axes: int = 1) -> Compensator | SixAxisCompensator:
-    """Return the compensator with this name for a number of axes. Raise KeyError if there is none.
+    """Return the compensator with this name. Raise KeyError if there is none.
 
-    With one axis, the result may be a compensator for six axes only.
+    For 6 axes, or if it has no version for 1 axis, return the version for 6 axes.
     """
     return SIX_AXIS_COMPENSATORS[name] if axes == 6 or name not in COMPENSATORS else COMPENSATORS[name]
 
@@ -38,19 +38,20 @@ def axes_of(mechanism: Mechanism | SixAxisMechanism) -> int:
 def literature_gains(
     mechanism: Mechanism | SixAxisMechanism, compensator: str, setting: str | None = None
 ) -> dict[str, float]:
-    """Return the gains by the literature's rules for a mechanism, or one of the compensator's settings.
+    """Return a compensator's gains for a mechanism by the rules of the literature, or from a setting.
 
     Args:
         mechanism: mechanism with its rig.
         compensator: name of the compensator.
-        setting: name of the setting; its gains are limited to their bounds for the mechanism.
+        setting: name of one of the compensator's settings. The gains of the setting, clipped to their bounds
+            for the mechanism, replace the gains of the literature.
 
     Raises:
         KeyError: if there is no such compensator or setting.
     """
     law = get_compensator(compensator, axes_of(mechanism))
     chosen = law.settings[setting] if setting is not None else {}
-    source: Any = mechanism  # of the class that the compensator's rules read
+    source: Any = mechanism  # the rules of a compensator accept only its class of mechanism
     gains = {}
     for gain in law.gains:
         value = float(gain.nominal(source))

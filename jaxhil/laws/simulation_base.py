@@ -1,8 +1,8 @@
 """Interface of all compensators in JAX: a force before the integration, a position command after it.
 
-A compensator is stateless. Its state is an explicit pytree of arrays of the batch shape (rings have a leading
-axis of samples). Its gains are a dict of arrays, scalar or of the batch shape; `gains` lists them with unit,
-bounds and the literature's rule, for tuning, gain files and the rig.
+A compensator object does not change. Its methods take and return the state, a pytree of arrays of the batch
+shape; ring buffers have an additional leading axis of samples. Gains are a dict of arrays, scalar or of the
+batch shape. `Compensator.gains` lists them with unit, bounds and the rule of the literature.
 """
 
 import abc
@@ -22,19 +22,30 @@ Gains = dict[str, Array]
 
 
 class Gain(NamedTuple):
-    """Tunable number of a compensator."""
+    """Specification of one gain of a compensator.
+
+    Attributes:
+        name: name of the gain.
+        unit: SI unit; "1" if dimensionless.
+        lower: lower bound as a function of the mechanism.
+        upper: upper bound as a function of the mechanism.
+        nominal: value by the rule of the literature, as a function of the mechanism.
+        logarithmic: whether tuning searches on a logarithmic scale.
+        neutral: value that makes the gain ineffective, or None. If all gains are neutral, the force command
+            is the measured force.
+        tuned: returns whether tuning changes the gain for a mechanism; otherwise it keeps its nominal value.
+        begins: initial value for tuning, as a function of the mechanism; None for any value within the
+            bounds. Tuning also starts from the nominal value.
+    """
 
     name: str
-    unit: str  # "1" if it has none
-    lower: Callable[[Mechanism], float]  # lower bound for a mechanism
-    upper: Callable[[Mechanism], float]  # upper bound for a mechanism
-    nominal: Callable[[Mechanism], float]  # value by the literature's rule for a mechanism
-    logarithmic: bool = False  # whether tuning searches on a logarithmic scale
-    # value without effect, if any; with all such values the compensated force is the measured force
+    unit: str
+    lower: Callable[[Mechanism], float]
+    upper: Callable[[Mechanism], float]
+    nominal: Callable[[Mechanism], float]
+    logarithmic: bool = False
     neutral: float | None = None
-    # whether tuning changes it for a mechanism; if not, it stays at the nominal value
     tuned: Callable[[Mechanism], bool] = lambda mechanism: True
-    # value in all starts of tuning but the literature's; None: any value within the bounds
     begins: Callable[[Mechanism], float] | None = None
 
 
@@ -48,62 +59,68 @@ def rig_gain(
     nominal: Callable[[Mechanism], float],
     **others: Any,
 ) -> Gain:
-    """Return the gain `name` of a compensator that the rig also has, with the unit stated there.
+    """Create a `Gain` with the unit that a compensator in `jaxhil.rig` states for this name.
 
-    The other arguments are fields of `Gain`. Raise KeyError if no compensator of the rig has the gain.
+    `others` are further fields of `Gain`. Raise KeyError if no compensator of the rig has the gain.
     """
     return Gain(name, _GAIN_UNITS[name], lower, upper, nominal, **others)
 
 
 class Signals(NamedTuple):
-    """Inputs of the compensator at a tick."""
+    """Inputs of the compensator on one tick."""
 
-    force_measured: Float[Array, "*batch"]  # [N]
-    position_desired: Float[Array, "*batch"]  # x_d of the numerical model [m]
-    velocity_desired: Float[Array, "*batch"]  # v_d of the numerical model [m/s]
-    position_measured: Float[Array, "*batch"]  # x_a of the motion simulator [m]
-    age: Int[Array, "*batch"]  # ticks since this run began, 0 on its first tick
+    force_measured: Float[Array, "*batch"]  # force reading F [N]
+    position_desired: Float[Array, "*batch"]  # position x_d of the numerical model [m]
+    velocity_desired: Float[Array, "*batch"]  # velocity v_d of the numerical model [m/s]
+    position_measured: Float[Array, "*batch"]  # measured position x_a of the motion simulator [m]
+    age: Int[Array, "*batch"]  # number of ticks since the run began; 0 on the first tick
 
 
 class KnownConstants(NamedTuple):
     """Constants of the rig that the compensator knows."""
 
-    control_period: Float[Array, "*batch"]  # T [s]
-    clearance: Float[Array, "*batch"]  # of a two-sided contact [m]; infinite for a one-sided one
+    control_period: Float[Array, "*batch"]  # control period T [s]
+    clearance: Float[Array, "*batch"]  # clearance of a two-sided contact [m]; infinite for one-sided contact
 
 
 def clear_lanes(state: Any, begins: Array) -> Any:
-    """Set the state to zero on the lanes where a run begins."""
+    """Set the state to zero on the lanes in which a run begins."""
     return jax.tree.map(lambda leaf: jnp.where(begins, 0, leaf), state)
 
 
 class Compensator(eqx.Module):
-    """Interface of a compensator; see the module's docstring."""
+    """Interface of a compensator in JAX.
+
+    Attributes:
+        name: name of the compensator.
+        knows: values of mechanism and rig that the compensator needs (`jaxhil.laws.shared.nominal_values`).
+        gains: specifications of the gains.
+        settings: named sets of gains for any mechanism; a set contains the gains that are not nominal.
+        estimates_delay: whether the compensator estimates the delay of the force measurement.
+        reads_position: whether the compensator uses the measured position.
+        waits_for_contact: whether, without noise, F_c is 0 and the state does not change before the hardware
+            is in contact, so that the approach may be skipped. Every class sets this attribute itself.
+        anticipates: whether the compensator computes a reference motion that it could follow without any
+            regard to the hardware.
+        is_large: whether `step` is so large that solvers are compiled separately from runs.
+    """
 
     name: eqx.AbstractClassVar[str]
-    # Required knowledge of mechanism and rig, by the names in `jaxhil.laws.shared.nominal_values`.
     knows: eqx.AbstractClassVar[tuple[str, ...]]
     gains: eqx.AbstractClassVar[tuple[Gain, ...]]
-    # Named sets of gains that serve any mechanism; each has only the gains that differ from the nominal ones.
     settings: ClassVar[Mapping[str, Mapping[str, float]]] = MappingProxyType({})
-    # Whether it estimates the delay of the force measurement (`force_delay`).
     estimates_delay: ClassVar[bool] = False
-    # Whether it reads the measured position.
     reads_position: ClassVar[bool] = True
-    # Whether, without noise, F_c is 0 and the state that of the first tick until the hardware touches: the
-    # approach may then be skipped. Each class states this itself; it is not inherited.
     waits_for_contact: ClassVar[bool] = False
-    # Whether it computes a reference motion that it could follow whatever the hardware does.
     anticipates: ClassVar[bool] = False
-    # Whether its step is so large that solvers are compiled separately from its runs.
     is_large: ClassVar[bool] = False
 
     def prepare(self, gains: Gains, constants: KnownConstants) -> Any:
-        """Return what `step` computes from the gains only once per run; by default the gains."""
+        """Return the values that `step` needs, computed from the gains once per run; by default the gains."""
         return gains
 
     def init(self, gains: Gains, constants: KnownConstants, ring: int) -> Any:
-        """Return the state before the first tick; by default there is none.
+        """Return the state before the first tick; by default an empty tuple.
 
         Args:
             gains: gains by name.
@@ -113,55 +130,56 @@ class Compensator(eqx.Module):
         return ()
 
     def restart(self, gains: Gains, state: Any, begins: Array, fresh: Array) -> Any:
-        """Return the state before the first tick of a run, on the lanes where `begins`; by default zeros.
-
-        Filters and delay lines restart.
+        """Return the state with filters and delay lines restarted on the lanes `begins`; by default zeros.
 
         Args:
             gains: gains by name.
             state: state after the last tick.
-            begins: lanes where a run begins.
-            fresh: lanes where this is the next contact of a schedule; elsewhere the same run continues, with
-                its estimates, after a skipped free flight.
+            begins: lanes in which a run begins.
+            fresh: lanes in which the run is for the next contact of a schedule. In all other lanes the same
+                run continues after a skipped free flight, and its estimates remain.
         """
         return clear_lanes(state, begins)
 
     @abc.abstractmethod
     def step(self, prepared: Any, state: Any, signals: Signals, tick: Array) -> tuple[Array, Any]:
-        """Return F_c [N] of this tick and the next state.
+        """Return the force command F_c [N] of this tick, and the next state.
 
         Args:
             prepared: result of `prepare`.
             state: state after the last tick.
             signals: inputs of this tick.
-            tick: number of this tick, common to all lanes; it never restarts.
+            tick: number of this tick, common to all lanes; a new run does not reset it.
         """
 
     def position_command(
         self, gains: Gains, state: Any, position: Array, velocity: Array, acceleration: Array
     ) -> tuple[Array, Any]:
-        """Return the position command [m] and the state, by default the model's position.
+        """Return the position command [m] and the state; by default, command the model's position.
 
         Args:
             gains: gains by name.
             state: state after this tick's `step`.
             position: new position of the numerical model [m].
-            velocity: its velocity [m/s].
-            acceleration: its acceleration [m/s^2].
+            velocity: new velocity of the numerical model [m/s].
+            acceleration: new acceleration of the numerical model [m/s^2].
         """
         return position, state
 
     def noise_amplification(self, gains: Gains, constants: KnownConstants) -> Float[Array, "*batch"]:
-        """Return the standard deviation of F_c in steady contact over that of white force noise [1].
+        """Return the ratio of standard deviations, F_c in steady contact to white noise of the force [1].
 
-        It is 1 by default, for the measured force itself, and differentiable with respect to the gains.
+        The default is 1, for F_c = F. The ratio is differentiable with respect to the gains.
         """
         return jnp.ones_like(constants.control_period)
 
     def identified(self, state: Any) -> tuple[Array, Array] | None:
-        """Return identified stiffness [N/m] and damping [N s/m]; None if it identifies none."""
+        """Return the identified stiffness [N/m] and damping [N s/m]; None without an identification."""
         return None
 
     def force_delay(self, gains: Gains, state: Any) -> Float[Array, "*batch"]:
-        """Return the estimated delay [s] of the force measurement, if the class `estimates_delay`."""
-        raise NotImplementedError(f"{self.name} estimates no delay")
+        """Return the estimated delay [s] of the force measurement.
+
+        Raise NotImplementedError if the class does not set `estimates_delay`.
+        """
+        raise NotImplementedError(f"{self.name}: does not estimate the force delay")

@@ -1,8 +1,9 @@
 """Interface of compensators in six axes in JAX: a wrench before the integration, a pose command after it.
 
-As on one axis (`jaxhil.laws.simulation_base`), a compensator is stateless: its state is an explicit pytree of
-arrays, lanes last. Its gains are a dict of arrays, scalar or of the batch shape. Wrenches, poses and twists
-are six numbers (x, y, z, rx, ry, rz) in T axes (notebooks/guide/six_axes.md, section 1).
+As on one axis (`jaxhil.laws.simulation_base`), a compensator object does not change. Its methods take and
+return the state, a pytree of arrays whose last axes are the lanes. Gains are a dict of arrays, scalar or of
+the batch shape. Wrenches, poses and twists are six numbers (x, y, z, rx, ry, rz) along the axes of the target
+frame T (notebooks/guide/six_axes.md, section 1).
 """
 
 import abc
@@ -24,34 +25,36 @@ Six = Float[Array, "6 *batch"]
 
 
 class SixAxisSignals(NamedTuple):
-    """Inputs of the compensator at a tick."""
+    """Inputs of the compensator on one tick."""
 
-    wrench: tuple[Array, ...]  # measured, about T's origin [N, N m], six arrays (*batch)
+    wrench: tuple[Array, ...]  # measured wrench about T's origin [N, N m], six arrays (*batch)
     pose_desired: Six  # coordinates of the numerical model [m, rad]
     twist_desired: Six  # twist of the numerical model [m/s, rad/s]
     pose_measured: Six | None  # coordinates of the hardware [m, rad]; None unless the class `reads_pose`
-    age: Int[Array, "*batch"]  # ticks since this run began, 0 on its first tick
+    age: Int[Array, "*batch"]  # number of ticks since the run began; 0 on the first tick
 
 
 class SixAxisConstants(NamedTuple):
     """Constants of the rig that the compensator knows."""
 
-    control_period: Float[Array, "*batch"]  # T [s]
+    control_period: Float[Array, "*batch"]  # control period T [s]
     mass_matrix: Float[Array, "6 6 *batch"]  # relative mass matrix M at the docking pose
-    inverse_mass: Float[Array, "6 6 *batch"]  # its inverse
-    # (1 - M_t M^-1)^-1, the contact's wrench per reading, about C's origin; the identity without a tool
+    inverse_mass: Float[Array, "6 6 *batch"]  # inverse of M
+    # (1 - M_t M^-1)^-1 about the origin of frame C: converts a reading, which contains the inertia of the
+    # tool, to the contact's wrench; the identity without a tool
     tool_correction: Float[Array, "6 6 *batch"]
 
     @property
     def of_channel(self) -> KnownConstants:
-        """Constants of a compensator for one axis that acts on one channel."""
+        """Constants for a single-axis compensator that acts on one channel of the wrench."""
         return KnownConstants(self.control_period, jnp.full_like(self.control_period, jnp.inf))
 
 
 class SixAxisCompensator(eqx.Module):
-    """Interface of a compensator in six axes; see the module's docstring.
+    """Interface of a compensator in six axes.
 
-    The class variables are those of `jaxhil.laws.simulation_base.Compensator`.
+    `jaxhil.laws.simulation_base.Compensator` explains the class variables; `reads_pose` is whether the
+    compensator uses the measured pose.
     """
 
     name: eqx.AbstractClassVar[str]
@@ -63,16 +66,16 @@ class SixAxisCompensator(eqx.Module):
     is_large: ClassVar[bool] = False
 
     def prepare(self, gains: Gains, constants: SixAxisConstants) -> Any:
-        """Return what `step` computes from gains and constants only once per run; by default the gains."""
+        """Return the values that `step` needs, computed once per run; by default the gains."""
         return gains
 
     def init(self, prepared: Any, constants: SixAxisConstants, start: SixAxisSignals, ring: int) -> Any:
-        """Return the state before the first tick; by default there is none.
+        """Return the state before the first tick; by default an empty tuple.
 
         Args:
             prepared: result of `prepare`.
             constants: constants of the rig.
-            start: signals of uniform motion without a wrench; `pose_measured` is None.
+            start: signals before the first tick: uniform motion, no wrench, and None for `pose_measured`.
             ring: number of samples that a delay line must store, a power of two.
         """
         return ()
@@ -91,9 +94,9 @@ class SixAxisCompensator(eqx.Module):
         """
 
     def pose_command(self, gains: Gains, pose: Six, rates: Six) -> Six:
-        """Return the pose command for the coordinates of the numerical model and their rates.
+        """Return the pose command from the numerical model's coordinates `pose` and their `rates`.
 
-        By default, each coordinate is led by its gain `lag_lead_...`, if the class has these gains.
+        By default, the command is pose + lead * rates with the gains `lag_lead_...`; without them, the pose.
         """
         if LAG_LEADS[0] not in gains:
             return pose
@@ -102,11 +105,13 @@ class SixAxisCompensator(eqx.Module):
 
 
 def lag_leads(equalise: bool) -> tuple[Gain, ...]:
-    """Return the gains by which the command of each coordinate is led.
+    """Return the gains `lag_lead_...`, one lead time of the pose command for each coordinate.
+
+    Tuning does not change these gains.
 
     Args:
-        equalise: whether their nominal values are the lags beyond the shortest one, so that all coordinates
-            lag equally; otherwise they are 0. Tuning does not change them.
+        equalise: if True, the nominal lead time is the coordinate's lag minus the shortest lag, so that all
+            coordinates lag equally; if False, it is 0.
     """
 
     def gain(index: int, name: str) -> Gain:

@@ -1,1 +1,1 @@
-"""Dead zone observer: adds the force that the dead zone of the sensor removes."""
+"""Dead-zone observer: adds the force that the dead zone of the force sensor removes."""

@@ -1,9 +1,9 @@
 """Phase lead with an observer of the force that the force sensor's dead zone removes.
 
-A dead zone subtracts clip(F, -dz, dz) from the force F. The observer uses k_n d for F, where d is the
-deflection by the measured position, delayed like the force, and adds the result behind a first-order low-pass
-filter; the phase lead acts on the sum. After Li et al. 2026 (phase lead and a disturbance observer near 1
-below 15 Hz).
+A dead zone subtracts clip(F, -dz, dz) from the force F. The observer estimates this difference as
+clip(k_n d, -dz, dz), where d is the measured penetration, delayed like the force. A first-order low-pass
+filter smooths the estimate, and the phase lead acts on the sum of measured force and estimate. After Li et
+al. 2026 (phase lead, and a disturbance observer with a gain near 1 below 15 Hz).
 """
 
 from collections.abc import Mapping
@@ -52,7 +52,7 @@ class DeadZoneObserver(Compensator):
         self._started = False
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """Return the phase lead of measured force plus observed dead-zone force [N]."""
+        """Return the lead-filtered sum [N] of the measured force and the observed dead-zone force."""
         alignment = self._alignment
         if not self._started:
             alignment.start(position_measured, velocity_desired)
@@ -68,7 +68,7 @@ class DeadZoneObserver(Compensator):
         return self._lead.step(force_measured + observed)
 
     def reset(self) -> None:
-        """Restart filters and delay line."""
+        """Restart the filters and the delay line."""
         self._lead.reset()
         self._withheld = 0.0
         self._observed = 0.0

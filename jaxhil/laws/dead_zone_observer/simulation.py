@@ -1,19 +1,19 @@
 """Phase lead with an observer of the force that the force sensor's dead zone removes.
 
-    F_c = lead(F + Q(s) clip(k_n d, -dz, dz)),     d the deflection by x_a, delayed like F
+    F_c = lead(F + Q(s) clip(k_n d, -dz, dz)),     d the penetration of x_a, delayed like F
 
-After Li et al. 2026 (phase lead and a disturbance observer, |Q| near 1 below 15 Hz). No more of it is known
-here: the rest is our realisation. A disturbance observer adds Q (F_n - F), F_n the force by a nominal model.
-More is known of a dead zone: it removes F - sign(F) max(0, |F| - dz) = clip(F, -dz, dz), so that the nominal
-model k_n d only replaces F in this expression. If k_n is right, both observers are the same. Otherwise the
-error is limited to |F| < dz; above it the observer adds dz, whatever k_n is.
+After Li et al. 2026 (phase lead and a disturbance observer, |Q| near 1 below 15 Hz). The source states no
+details; the realisation here is our own. A disturbance observer adds Q (F_n - F), where F_n is the force of a
+nominal model. A dead zone is known more exactly: it removes F - sign(F) max(0, |F| - dz) = clip(F, -dz, dz).
+The nominal model k_n d therefore replaces F only in this expression. If k_n is correct, both observers are
+equal. If k_n is wrong, the error occurs only for |F| < dz; for larger forces the observer adds exactly dz.
 
-Q = 1/(1 + s/(2 pi f)) by Tustin's rule. |Q| >= 0.9 up to 15 Hz needs f >= 15 Hz/sqrt(1/0.81 - 1), 31 Hz. The
-lag of Q, 1/(2 pi f), would be a delay: x_a is therefore delayed by that much less (`identification_delay`),
-for which f must be at least 1/(2 pi tau_f), tau_f being the force delay.
+Q = 1/(1 + s/(2 pi f)) by Tustin's rule. |Q| >= 0.9 up to 15 Hz needs f >= 15 Hz/sqrt(1/0.81 - 1) = 31 Hz. Q
+lags by 1/(2 pi f). To compensate for this lag, the delay of x_a (`identification_delay`) is shorter by the
+same time; this requires f >= 1/(2 pi tau_f), where tau_f is the force delay.
 
-A dead zone moves the surface of a linear contact by dz/k. The restitution stays the same for any delay, but
-the hardware is pressed deeper, with a force larger by dz. The observer corrects this.
+A dead zone moves the surface of a linear contact by dz/k. The restitution does not change, but the hardware
+moves deeper into the mechanism, and its force is larger by dz. The observer corrects this.
 """
 
 import math
@@ -50,11 +50,11 @@ from jaxhil.laws.shared.nominal_values import (
 from jaxhil.laws.simulation_base import Compensator, Gain, Gains, clear_lanes, rig_gain
 from jaxhil.mechanism.structs import Mechanism
 
-PASSBAND = 15.0, 0.9  # frequency [Hz] up to which |Q| is at least the second number
+PASSBAND = 15.0, 0.9  # [Hz], [1]; up to this frequency, |Q| is at least this gain
 
 
 def _max_bandwidth(mechanism: Mechanism) -> float:
-    """Return the bandwidth [Hz] at which Q's pole is 0; beyond it the output alternates from tick to tick."""
+    """Return the bandwidth [Hz] at which Q's pole is 0; a wider Q has an output of alternating sign."""
     return 1 / (math.pi * mechanism.rig.control_period)
 
 
@@ -70,27 +70,28 @@ def _nominal_alignment(mechanism: Mechanism) -> float:
 
 
 class DeadZoneObserverState(NamedTuple):
-    """State of the observer from tick to tick."""
+    """State of the dead-zone observer after a tick."""
 
     lead: LeadState
     withheld: Float[Array, "*batch"]  # input of Q on the last tick [N]
     observed: Float[Array, "*batch"]  # output of Q on the last tick [N]
-    line: DelayLine  # measured positions
+    line: DelayLine  # delay line of the measured positions
 
 
 class PreparedObserver(NamedTuple):
-    """Gains and filter coefficients, computed once per run."""
+    """Gains and filter coefficients of the dead-zone observer, computed once per run."""
 
     gains: Gains
-    clearance: Float[Array, "*batch"]  # of a two-sided contact [m]
+    clearance: Float[Array, "*batch"]  # clearance of a two-sided contact [m]
     lead: LeadFilter
-    pole: Float[Array, "*batch"]  # of Q, y(n) = pole y(n-1) + share (u(n) + u(n-1)) [1]
-    share: Float[Array, "*batch"]  # of Q's input [1]
-    delay: DelayInPeriods  # of the positions, to align them with the force
+    # coefficients [1] of Q, y(n) = pole y(n-1) + share (u(n) + u(n-1))
+    pole: Float[Array, "*batch"]
+    share: Float[Array, "*batch"]
+    delay: DelayInPeriods  # delay that aligns the measured positions with the force
 
 
 class DeadZoneObserver(Compensator):
-    """Phase lead of measured force plus observed dead-zone force; see the module's docstring."""
+    """Compensator F_c = lead(F + Q clip(k_n d, -dz, dz)); see the module's docstring."""
 
     name: ClassVar[str] = "dead_zone_observer"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, STIFFNESS, DEAD_ZONE)

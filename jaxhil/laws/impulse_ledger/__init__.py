@@ -1,1 +1,1 @@
-"""Impulse ledger, the compensator of this project; its parts are the subfolders."""
+"""Impulse ledger: this project's own compensator; each subfolder contains one part of the method."""

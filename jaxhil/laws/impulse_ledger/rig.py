@@ -1,22 +1,25 @@
-"""Impulse ledger: a reference trajectory at the time of the readings, bridged to the present.
+"""Impulse ledger: a reference trajectory at the time of the force readings, predicted to the present.
 
-A force reading is the force that should have acted on the numerical model D ago. D is the lag of hardware and
-force behind the model, measured in free flight at the onset. The compensator fits a contact model to the
-readings (`contact_model`), advances a reference trajectory at the time of the readings
-(`reference_trajectory`), bridges the D seconds to the present with the fitted model, and controls the
-numerical model's velocity towards the result:
+A force reading is the force that should have acted on the numerical model a time D earlier. D is the lag of
+hardware and force measurement behind the model, measured in free flight immediately before the onset. The
+compensator has four steps:
+
+1. Fit a contact model to the readings (`contact_model`).
+2. Advance a reference trajectory at the time of the readings (`reference_trajectory`).
+3. Predict the trajectory over the time D to the present with the fitted model.
+4. Control the numerical model's velocity to follow the prediction:
 
     F_c = f_p + clip(c (v_d - T f_p/2 - v_p), -limit p, (1 + limit) p - f_p)
 
-f_p and v_p are force and speed of the bridged trajectory at the middle of the coming period, v_d is the
-model's velocity, c the velocity gain and p the peak force of contact as far as it is known. Forces are scaled
-by equivalent mass and approach speed, so that one set of gains serves every mechanism. In free flight, until
-the onset is detected (`onset_detection`), F_c = 0. In a run that begins in contact the approach speed is
+f_p and v_p are force and speed of the predicted trajectory in the middle of the next period, v_d is the
+model's velocity, c the velocity gain, and p the present estimate of the contact's peak force. Forces are
+scaled by equivalent mass and approach speed, so that one set of gains serves every mechanism. In free flight,
+before the onset is detected (`onset_detection`), F_c = 0. If a run begins in contact, the approach speed is
 unknown, and F_c is the measured force.
 
-Where the force delay is uncertain (`delay_spread` > 0), the delay is estimated when the hardware leaves the
-surface. The estimate corrects the speed at which this contact ends. From the next contact on, it also aligns
-positions with readings and so lengthens D.
+If the force delay is uncertain (`delay_spread` > 0), the compensator estimates the delay when the hardware
+leaves the surface. The estimate corrects the speed at which this contact ends. In the following contacts it
+also aligns positions with readings, so that D includes it.
 """
 
 from collections.abc import Mapping
@@ -32,27 +35,27 @@ from jaxhil.rig.law_status import IDENTIFIED, NOISY, OUT_OF_CONTACT, SATURATED, 
 from jaxhil.rig.registry import Compensator, GainSpecification, register
 from jaxhil.rig.surfaces import deflection
 
-RELEASE_TIME = 0.03  # s; the compensator acts so long after the hardware has left the surface
-LEAST_MOMENTUM = 1e-9  # kg m/s; with less, forces cannot be scaled
+RELEASE_TIME = 0.03  # s; the compensator continues to act for this time after the hardware leaves the surface
+LEAST_MOMENTUM = 1e-9  # kg m/s; with less momentum, forces cannot be scaled
 LONGEST_LAG = 0.2  # s; upper bound of the lag D
-ONSET_PLACE = -0.5  # travel per period; the last free reading relative to the surface
-MISFIT = 0.005  # relative error of the contact model's force over `MISFIT_TIME`
+ONSET_PLACE = -0.5  # periods of travel; depth of the hardware at the last reading of free flight
+MISFIT = 0.005  # [1]; relative error of the contact model's force, averaged over `MISFIT_TIME`
 MISFIT_TIME = 0.001  # s
-SLOWEST = 1e-9  # speed [1]; a slower motion is rest with rounding errors
-SHALLOW = 0.001  # s; depth below which the secant stiffness is not computed
-LEAST_PEAK = 0.3  # 1/s; peak force of the softest contact, 0.05 Hz
-FEW_READINGS = 5  # readings in contact; with fewer the status is `unsure`
-LATE = 0.8  # share of the contact that is over at the onset; with more the status is `too_short`
-UNCERTAIN = 0.006  # standard deviation of the reference speed [1]; with more the status is `noisy`
-MOST_GAIN = 0.01  # energy that a contact may seem to add beyond the model [1]
-MOST_LOSS = 0.014  # energy that a contact may lose beyond the model [1]
-USUAL_PRELOAD = 1.0  # 1/s; prior standard deviation of the preload, in addition to a specified one
-LARGEST_DELAY_SPREAD = 0.004  # s; with more the first order in the delay is not accurate
-MOST_SPREADS = 3.0  # standard deviations; largest difference of the delay from the specified one
-ONSET_TICKS = 0.3  # periods; standard deviation of the onset, 1/sqrt(12)
-ONSET_MEAN = 0.25  # share of the force at which the onset is detected: mean force at the onset
-ONSET_SPREAD = 0.4  # share of the same force: its standard deviation at the onset
-# gains: the prior standard deviations of the contact model
+SLOWEST = 1e-9  # [1]; a speed below this value is a rounding error
+SHALLOW = 0.001  # s; lower bound of the depth by which the secant stiffness is divided
+LEAST_PEAK = 0.3  # 1/s; peak force of the softest contact, with 0.05 Hz
+FEW_READINGS = 5  # readings in contact; with fewer readings the status is `unsure`
+LATE = 0.8  # [1]; if a larger share of the contact has passed at the onset, the status is `too_short`
+UNCERTAIN = 0.006  # [1]; with a larger standard deviation of the reference speed the status is `noisy`
+MOST_GAIN = 0.01  # [1]; largest energy that a contact may gain compared with the contact model
+MOST_LOSS = 0.014  # [1]; largest energy that a contact may lose compared with the contact model
+USUAL_PRELOAD = 1.0  # 1/s; standard deviation of the preload that is added to the specified one
+LARGEST_DELAY_SPREAD = 0.004  # s; for a larger uncertainty, a first-order correction is not accurate
+MOST_SPREADS = 3.0  # standard deviations; largest difference between estimated and specified delay
+ONSET_TICKS = 0.3  # periods; standard deviation of the time of the onset, 1/sqrt(12)
+ONSET_MEAN = 0.25  # [1]; mean force at the onset, divided by the force at which the onset is detected
+ONSET_SPREAD = 0.4  # [1]; standard deviation of the force at the onset, divided by the same force
+# Names of the gains that are the prior standard deviations of the contact model.
 SPREADS = (
     "prior_stiffness_spread",
     "prior_slope_spread",
@@ -66,7 +69,7 @@ SPREADS = (
 
 @register("impulse_ledger")
 class ImpulseLedger(Compensator):
-    """Compensator with contact model, reference trajectory and bridge; see the module's docstring."""
+    """Compensator that follows a predicted reference trajectory; see the module's docstring."""
 
     __slots__ = (
         "_alignment", "_clearance", "_correction_limit", "_deepest", "_delay", "_delay_spread",
@@ -114,17 +117,17 @@ class ImpulseLedger(Compensator):
         self.reset()
 
     def reset(self) -> None:
-        """Restart everything."""
-        self._delay = 0.0  # estimated delay of the force beyond the specified one [s]
-        self._variance = self._delay_spread * self._delay_spread  # of the delay [s^2]
+        """Restart everything, including the estimated delay."""
+        self._delay = 0.0  # estimated minus specified force delay [s]
+        self._variance = self._delay_spread * self._delay_spread  # variance of the force delay [s^2]
         self.next_contact()
 
     def next_contact(self) -> None:
-        """Restart everything but the estimate of the delay."""
-        self._since_start = 0.0  # ticks of this run
-        self._side = 1.0  # direction in which the surface is approached
+        """Restart everything except the estimated delay."""
+        self._since_start = 0.0  # number of ticks since the run began
+        self._side = 1.0  # direction of the approach, 1 or -1
         self._speed = 0.0  # approach speed [m/s]; 0 if unknown
-        self._outside = 0.0  # ticks since the hardware left the surface
+        self._outside = 0.0  # number of ticks since the hardware left the surface
         self._in_contact = False
         self._detector.restart()
         self.status = OUT_OF_CONTACT
@@ -146,7 +149,7 @@ class ImpulseLedger(Compensator):
             self._in_contact = reach != 0.0
             self._side = 1.0 if reach > 0.0 else -1.0
         if self._in_contact and not self._speed > 0.0:
-            # The run began in contact: pass the force on until model and hardware are outside.
+            # The run began in contact: return the measured force until model and hardware are out of contact.
             self.status = UNSURE
             inside = self._side * deflection(position_desired, self._clearance) > 0.0
             self._in_contact = inside or self._side * deflection(position, self._clearance) > 0.0
@@ -165,12 +168,12 @@ class ImpulseLedger(Compensator):
     def _approach(
         self, force: float, position_desired: float, velocity_desired: float, position: float, settled: bool
     ) -> None:
-        """Test a reading of free flight for contact; without contact, let contact begin after it."""
+        """Test a force reading for contact; if it shows free flight, prepare for contact on the next tick."""
         side = 1.0 if velocity_desired > 0.0 or self._clearance == inf else -1.0
         speed = side * velocity_desired
         approaches = self._mass * speed > LEAST_MOMENTUM
         detector = self._detector
-        # The bias is known only after a reading of free flight, at an approach speed towards this side.
+        # The bias is known only after a reading of free flight during an approach in this direction.
         settled = settled and approaches and self._speed > 0.0 and side == self._side
         detector.watch(force, side, self._floor * (self._mass * speed), settled)
         if detector.total > 0.0:
@@ -189,7 +192,14 @@ class ImpulseLedger(Compensator):
         self._reference.begin((side * position - self._origin) / speed, self._model.theta)
 
     def _follow(self, force: float, velocity_desired: float, position: float, velocity: float) -> float:
-        """Return the command [N] after one reading of force [N], position [m] and velocity [m/s]."""
+        """Process one reading during a contact; return the force command [N].
+
+        Args:
+            force: force reading without bias [N].
+            velocity_desired: velocity of the numerical model [m/s].
+            position: position of the hardware, delayed like the force [m].
+            velocity: velocity of the hardware, delayed like the force [m/s].
+        """
         period, side, speed = self._period, self._side, self._speed
         model, reference = self._model, self._reference
         weight = self._mass * speed
@@ -210,18 +220,26 @@ class ImpulseLedger(Compensator):
             stiffness = dot(phi[:HINGES], model.mean[:HINGES]) / max(depth, SHALLOW)
             stiffness -= sqrt(max(model.covariance[0][0], 0.0))
             peak = max(peak, sqrt(max(stiffness, 0.0)))
-        wanted = self._gain * (side * velocity_desired / speed - 0.5 * period * push - ahead)
+        unlimited = self._gain * (side * velocity_desired / speed - 0.5 * period * push - ahead)
         limit = self._correction_limit * peak
-        correction = min(max(wanted, -limit), peak + limit - push)
+        correction = min(max(unlimited, -limit), peak + limit - push)
         if self._in_contact:
-            self.status = self._evaluate(peak, noise, correction == wanted)
+            self.status = self._evaluate(peak, noise, correction == unlimited)
         self._outside = 0.0 if depth > 0.0 else self._outside + 1.0
         if self._in_contact and reference.released and self._outside * period > RELEASE_TIME:
             self._end()
         return side * weight * (push + correction)
 
     def _learn(self, phi: Vector, depth: float, rate: float, reading: float, noise: float) -> None:
-        """Update contact model and delay by a reading [1/s] with this variance of its noise [1/s^2]."""
+        """Update the contact model and the estimated delay with one reading of the contact.
+
+        Args:
+            phi: regressor of the contact model.
+            depth: depth of the hardware [s].
+            rate: speed of the hardware [1].
+            reading: force reading [1/s].
+            noise: noise variance of the reading [1/s^2].
+        """
         model, period, floor = self._model, self._period, self._floor
         model_error = MISFIT * reading
         variance = noise + floor * floor + model_error * model_error * (MISFIT_TIME / period)
@@ -237,21 +255,24 @@ class ImpulseLedger(Compensator):
             model.conclude(self._estimate[0] if ended else 0.0)
 
     def _evaluate(self, peak: float, noise: float, free: bool) -> int:
-        """Return the status for a peak force [1/s] and the variance of the force's noise [1/s^2].
+        """Return the compensator's status during a contact.
 
-        `free`: the correction is within its limits.
+        Args:
+            peak: estimated peak force of the contact [1/s].
+            noise: noise variance of a force reading [1/s^2].
+            free: whether the correction is within its limits.
         """
         reference, model = self._reference, self._model
         if model.count < FEW_READINGS:
             return UNSURE
         if self._lag * peak > LATE * pi:
             return TOO_SHORT
-        # The readings before the onset lack an impulse of (DRIFT sigma)^2/(2 k); peak^2 is about k.
-        unseen = 0.5 * (DRIFT * DRIFT) * noise / (peak * peak)
-        if reference.spread(model.covariance, 0.0) + unseen > UNCERTAIN:
+        # Before the detection, an impulse of (DRIFT sigma)^2/(2 k) is lost in the noise; peak^2 is about k.
+        lost_impulse = 0.5 * (DRIFT * DRIFT) * noise / (peak * peak)
+        if reference.spread(model.covariance, 0.0) + lost_impulse > UNCERTAIN:
             return NOISY
         if reference.released:
-            # A force that is older than specified, or behind a lag, seems to add energy.
+            # If the force has a larger delay or lag than specified, the contact seems to add energy.
             spread = reference.spread(model.covariance, self._estimate[1])
             lost = reference.imbalance()
             if spread > UNCERTAIN or lost < -MOST_GAIN or lost > MOST_LOSS + 3.0 * spread:
@@ -259,7 +280,7 @@ class ImpulseLedger(Compensator):
         return IDENTIFIED if free else SATURATED
 
     def _end(self) -> None:
-        """End the contact and keep the estimate of the delay."""
+        """End the contact; store the estimated delay for the following contacts."""
         limit = MOST_SPREADS * self._delay_spread
         shift, self._variance = self._estimate
         self._delay = min(max(self._delay + shift, -limit), limit)

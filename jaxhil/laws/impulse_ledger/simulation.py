@@ -1,4 +1,4 @@
-"""Impulse ledger in JAX: the batched compensator of `rig.py` in this folder, which states the equations."""
+"""Impulse ledger in JAX: batched version of `rig.py` in this folder, which states the equations."""
 
 from typing import ClassVar, NamedTuple
 
@@ -28,17 +28,17 @@ from jaxhil.laws.shared.delay_line import (
 )
 from jaxhil.laws.simulation_base import Compensator, Gain, Gains, KnownConstants, clear_lanes, rig_gain
 
-USUAL_UNLOADING = 0.5  # 1/s^2; prior spread of the unloading parameter where the mechanism has less
-VELOCITY_GAIN = 105.0  # 1/s
+USUAL_UNLOADING = 0.5  # 1/s^2; lower bound of the nominal `prior_unloading_spread`
+VELOCITY_GAIN = 105.0  # 1/s; nominal value, unless the control period requires a smaller gain
 
 
 def _from_file(name: str, upper, nominal, lower=lambda m: 0.0) -> Gain:
-    """Return a gain that follows from the mechanism file; tuning does not change it."""
+    """Create a gain whose value follows from the mechanism file, so that tuning does not change it."""
     return rig_gain(name, lower, upper, nominal, tuned=lambda m: False)
 
 
 def _prior(name: str, lower: float, upper: float, nominal: float, tuned=lambda m: True) -> Gain:
-    """Return a gain with the same bounds and nominal value for every mechanism."""
+    """Create a gain with the same bounds and nominal value for every mechanism."""
     return rig_gain(name, lambda m: lower, lambda m: upper, lambda m: nominal, logarithmic=True, tuned=tuned)
 
 
@@ -80,44 +80,44 @@ GAINS: tuple[Gain, ...] = (
 
 
 class LedgerContact(NamedTuple):
-    """State of one contact."""
+    """State of the impulse ledger during one contact."""
 
-    side: Float[Array, "*batch"]  # direction in which the surface is approached, 1 or -1
+    side: Float[Array, "*batch"]  # direction of the approach, 1 or -1
     speed: Float[Array, "*batch"]  # approach speed [m/s]; 0 if unknown
     origin: Float[Array, "*batch"]  # position of the surface, in the direction of `side` [m]
-    lag: Float[Array, "*batch"]  # D [s]
+    lag: Float[Array, "*batch"]  # lag D of hardware and force behind the model [s]
     deepest: Float[Array, "*batch"]  # largest depth of the hardware [s]
-    peak: Float[Array, "*batch"]  # largest reading so far [1/s]
-    outside: Float[Array, "*batch"]  # ticks since the hardware left the surface
-    estimate: ContactModelEstimate  # of the contact model
+    peak: Float[Array, "*batch"]  # largest force reading so far [1/s]
+    outside: Float[Array, "*batch"]  # number of ticks since the hardware left the surface
+    estimate: ContactModelEstimate
     reference: ReferenceTrajectory
-    delay: Float[Array, "*batch"]  # mean of the delay after this contact [s]
-    variance: Float[Array, "*batch"]  # its variance [s^2]
+    delay: Float[Array, "*batch"]  # mean of the delay that this contact estimates [s]
+    variance: Float[Array, "*batch"]  # variance of this delay [s^2]
 
 
 class LedgerState(NamedTuple):
-    """State of the impulse ledger from tick to tick."""
+    """State of the impulse ledger after a tick."""
 
-    line: DelayLine  # of the measured position
-    aligned: Aligned  # measured positions as old as the force
-    flight: FreeFlight  # readings in free flight
+    line: DelayLine  # delay line of the measured position
+    aligned: Aligned  # measured positions, delayed like the force
+    flight: FreeFlight  # statistics of the force readings in free flight
     in_contact: Bool[Array, "*batch"]
     contact: LedgerContact
-    delay: Float[Array, "*batch"]  # estimated delay of the force beyond the specified one [s]
-    variance: Float[Array, "*batch"]  # of the delay [s^2]
+    delay: Float[Array, "*batch"]  # estimated minus specified force delay [s]
+    variance: Float[Array, "*batch"]  # variance of the force delay [s^2]
 
 
 class PreparedLedger(NamedTuple):
-    """Gains and constants, computed once per run."""
+    """Gains and constants of the impulse ledger, computed once per run."""
 
-    gains: Gains  # of the batch shape
+    gains: Gains  # arrays of the batch shape
     constants: KnownConstants
-    delay: DelayInPeriods  # of the delay line
-    share: Float[Array, "*batch"]  # weight of the previous sample, for the rest of the delay [1]
+    delay: DelayInPeriods  # delay of the delay line, one tick shorter than the force delay
+    share: Float[Array, "*batch"]  # weight of the line's previous sample, for the remaining delay [1]
 
 
 class ImpulseLedger(Compensator):
-    """Compensator with contact model, reference trajectory and bridge; see the module's docstring."""
+    """Compensator that follows a predicted reference trajectory; see `rig.py` in this folder."""
 
     name: ClassVar[str] = "impulse_ledger"
     knows: ClassVar[tuple[str, ...]] = (
@@ -179,7 +179,7 @@ class ImpulseLedger(Compensator):
         flight, contact = self._approach(prepared, state, contact, signals, position, in_contact)
         acts = in_contact | (flight.total > LEVEL)
         follows = (in_contact | (flight.total > 0)) & ~passes
-        # Lanes of a tile touch at about the same time: most ticks of free flight need no contact.
+        # All lanes of a tile have contact at about the same time: on most ticks, no lane needs `_follow`.
         command, contact = jax.lax.cond(
             jnp.any(follows),
             lambda old: select_lanes(
@@ -205,20 +205,23 @@ class ImpulseLedger(Compensator):
         )
 
     def _prior(self, gains, variance):
-        """Return mean and variances of the contact model's prior for a variance of the delay [s^2]."""
+        """Return prior means and variances of the contact model; `variance` [s^2] is that of the delay."""
         spreads = [gains[name] for name in rig.SPREADS]
         spreads[-1] = jnp.sqrt(spreads[-1] ** 2 + rig.USUAL_PRELOAD**2)
         return contact_model.prior(gains["prior_stiffness"], spreads, variance)
 
     def _approach(self, prepared, state, contact, signals, position, in_contact):
-        """Return free flight and contact, which begins after every reading of free flight."""
+        """Test the force readings for contact; on lanes in free flight, prepare a contact on the next tick.
+
+        Return the statistics of free flight and the contact.
+        """
         gains, (period, clearance), flight = prepared.gains, prepared.constants, state.flight
         side = jnp.where((signals.velocity_desired > 0) | jnp.isinf(clearance), 1, -1)
         speed = side * signals.velocity_desired
         approaches = gains["equivalent_mass"] * speed > rig.LEAST_MOMENTUM
         sigma = safe_sqrt(onset_detection.variance(flight, gains["force_noise"]))
         sigma = sigma + gains["force_noise_floor"] * (gains["equivalent_mass"] * speed)
-        # The bias is known only after a reading of free flight, at an approach speed towards this side.
+        # The bias is known only after a reading of free flight during an approach in this direction.
         settled = ~(signals.age.astype(period.dtype) * period < SETTLING)
         settled = settled & approaches & (contact.speed > 0) & (side == contact.side)
         deviation = side * (signals.force_measured - flight.bias) / jnp.where(approaches, sigma, 1)
@@ -242,7 +245,7 @@ class ImpulseLedger(Compensator):
         return select_lanes(free, onset_detection.learn(flight, signals.force_measured), flight), contact
 
     def _follow(self, prepared, contact, signals, position, velocity, flight, delay_variance):
-        """Return command [N] and contact after one reading."""
+        """Process one reading during a contact; return the force command [N] and the contact."""
         gains, period = prepared.gains, prepared.constants.control_period
         side, speed = contact.side, jnp.where(contact.speed > 0, contact.speed, 1)
         estimate = contact.estimate
@@ -262,12 +265,12 @@ class ImpulseLedger(Compensator):
         onset = rig.ONSET_TICKS * period * contact_model.slope(estimate.mean, deepest)
         onset = onset + gains["force_noise_floor"] + safe_sqrt(noise)
         spread = jnp.sqrt(gains["prior_preload_spread"] ** 2 + (rig.ONSET_SPREAD * onset) ** 2)
-        left = ~(depth > 0)
+        is_outside = ~(depth > 0)
         delay = contact_model.estimate_delay(
             estimate, prior_mean, prior_variances, rig.ONSET_MEAN * onset, spread
         )
-        mean, variance = select_lanes(left, delay, (contact.delay, contact.variance))
-        ended = left & (rate < 0)
+        mean, variance = select_lanes(is_outside, delay, (contact.delay, contact.variance))
+        ended = is_outside & (rate < 0)
         theta = contact_model.conclude(estimate, prior_variances, jnp.where(ended, mean, 0))
         theta = jnp.where((learns | ended)[None], theta, estimate.theta)
         reference = reference_trajectory.correct(contact.reference, theta - estimate.theta)
@@ -279,13 +282,13 @@ class ImpulseLedger(Compensator):
         largest = jnp.maximum(contact.peak, reading)
         peak = jnp.maximum(largest, jnp.where(rate > rig.SLOWEST, predicted, 0))
         desired = side * signals.velocity_desired / speed
-        wanted = gains["velocity_gain"] * (desired - 0.5 * period * push - ahead)
+        unlimited = gains["velocity_gain"] * (desired - 0.5 * period * push - ahead)
         limit = gains["correction_limit"] * peak
-        correction = jnp.minimum(jnp.maximum(wanted, -limit), peak + limit - push)
+        correction = jnp.minimum(jnp.maximum(unlimited, -limit), peak + limit - push)
         return side * weight * (push + correction), contact._replace(
             deepest=deepest,
             peak=largest,
-            outside=jnp.where(left, contact.outside + 1, 0),
+            outside=jnp.where(is_outside, contact.outside + 1, 0),
             estimate=estimate._replace(theta=theta),
             reference=reference,
             delay=mean,

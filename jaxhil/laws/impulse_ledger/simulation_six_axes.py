@@ -1,9 +1,10 @@
 """Impulse ledger in six axes in JAX.
 
-A wrench that is read now is the wrench that should have acted on the numerical model D ago, where D is the
-delay of the whole loop. The compensator credits the impulse of every reading to the model's time t - D,
-bridges the time since then with a scalar model of the contact, and commands the impulse that the numerical
-model still owes. `six_axes/README.md` states the equations, with the letters in brackets of the comments.
+The present reading is the wrench that should have acted on the numerical model a time D earlier, where D is
+the delay of the whole loop. The compensator adds the impulse of every reading to a reference at the time t -
+D. It predicts the impulse from t - D to the present with a scalar model of the contact. The command then
+corrects the difference between the reference's impulse and the impulse commanded so far. `six_axes/README.md`
+states the equations; comments refer to them by a letter in brackets.
 """
 
 from typing import ClassVar
@@ -21,12 +22,12 @@ from jaxhil.laws.shared import nominal_values
 from jaxhil.laws.simulation_base import Gain
 from jaxhil.laws.six_axis_base import SixAxisCompensator
 
-LONG_AGO = 1e9  # ticks since a contact before the run
+LONG_AGO = 1e9  # ticks; at the beginning of a run, the last contact counts as this long ago
 SPREADS = "stiffness_spread", "damping_spread", "force_spread", "curvature_spread"
 
 
 class ImpulseLedger(SixAxisCompensator):
-    """Compensator that books impulses at the time of the numerical model; see the module's docstring."""
+    """Compensator that corrects the impulse on the numerical model; see the module's docstring."""
 
     name: ClassVar[str] = "impulse_ledger"
     knows: ClassVar[tuple[str, ...]] = (
@@ -53,7 +54,7 @@ class ImpulseLedger(SixAxisCompensator):
     def init(self, prepared, constants, start, ring):
         period = constants.control_period
         zero, zeros = jnp.zeros_like(period), jnp.zeros_like(start.pose_desired)
-        # The slot of tick k contains uniform motion of tick k - ring.
+        # Before the run the motion is uniform: the slot of tick k contains the motion of tick k - ring.
         ticks = jnp.arange(-ring, 0, dtype=period.dtype).reshape(-1, 1, *[1] * period.ndim)
         moving = start.pose_desired[None] + ticks * (period[None] * start.twist_desired)[None]
         still = jnp.zeros_like(moving)

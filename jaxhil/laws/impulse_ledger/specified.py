@@ -1,4 +1,4 @@
-"""Prior standard deviations of the impulse ledger's estimates, from the uncertainty in a mechanism file."""
+"""Prior standard deviations of the impulse ledger's parameters, from the uncertainty in a mechanism file."""
 
 import math
 
@@ -10,7 +10,7 @@ DELAY = "rig.force_sensor.delay"
 
 
 def delay_spread(mechanism: Mechanism) -> float:
-    """Return the standard deviation [s] of the force delay in the file, at most 4 ms; 0 if it has none."""
+    """Return the force delay's standard deviation [s] in the file, at most 4 ms; 0 if there is none."""
     uncertainty = mechanism.uncertainty.get(DELAY)
     is_range = uncertainty is not None and uncertainty.std is None
     spread = _spread(mechanism, DELAY)
@@ -18,17 +18,20 @@ def delay_spread(mechanism: Mechanism) -> float:
 
 
 def friction(mechanism: Mechanism) -> float:
-    """Return the largest dry friction over mass and approach speed [1/s]; 0 if there is none."""
+    """Return the file's largest dry friction, divided by mass and approach speed [1/s]."""
     return _scaled(mechanism, "contact.friction")
 
 
 def preload(mechanism: Mechanism) -> float:
-    """Return the largest preload over mass and approach speed [1/s]; 0 if there is none."""
+    """Return the file's largest preload, divided by mass and approach speed [1/s]."""
     return _scaled(mechanism, "contact.preload")
 
 
 def unloading(mechanism: Mechanism) -> float:
-    """Return the largest excess of unloading over loading stiffness, over mass [1/s^2]; 0 without a ratio."""
+    """Return the file's largest unloading minus loading stiffness, divided by mass [1/s^2].
+
+    Return 0 if the contact law has no unloading ratio.
+    """
     ratio = mechanism.contact.unloading_ratio
     if ratio is None:
         return 0.0
@@ -42,7 +45,7 @@ def _scaled(mechanism: Mechanism, path: str) -> float:
 
 
 def _spread(mechanism: Mechanism, path: str) -> float:
-    """Return the standard deviation of a number, or half-width of its range; 0 if the file has neither."""
+    """Return the standard deviation of a number in the file, or the half-width of its range; else 0."""
     uncertainty = mechanism.uncertainty.get(path)
     if uncertainty is None:
         return 0.0

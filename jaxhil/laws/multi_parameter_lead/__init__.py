@@ -1,1 +1,1 @@
-"""Multi-parameter phase lead, by pole placement at the contact frequency."""
+"""Multi-parameter phase lead, with gains from pole placement at the contact frequency."""

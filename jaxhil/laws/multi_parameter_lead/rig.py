@@ -1,4 +1,4 @@
-"""Multi-parameter phase lead: measured force and its filtered rate, each with a gain."""
+"""Multi-parameter phase lead: weighted sum of the measured force and its filtered rate."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -12,8 +12,8 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 class MultiParameterLead(Compensator):
     """Compensator F_c = a F + b w, w = s/(1 + T_2 s) F by Tustin's rule.
 
-    a = force_gain, b = force_rate_gain, T_2 = lead_filter; the literature places a root of the delayed
-    contact's characteristic equation with a and b (Osaki, Konno).
+    a = force_gain, b = force_rate_gain, T_2 = lead_filter. The literature chooses a and b to place a root of
+    the delayed contact's characteristic equation (Osaki, Konno).
     """
 
     __slots__ = ("_force_gain", "_force_rate_gain", "_rate")
@@ -30,10 +30,10 @@ class MultiParameterLead(Compensator):
         self._rate = VelocityFilter(gains["lead_filter"], period)
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """Return the weighted sum of measured force and its rate [N]."""
+        """Return the weighted sum of the measured force and its rate [N]."""
         rate = self._rate.step(force_measured)
         return self._force_gain * force_measured + self._force_rate_gain * rate
 
     def reset(self) -> None:
-        """Restart the filter from no force."""
+        """Restart the filter with a force of 0."""
         self._rate.start(0.0, 0.0)

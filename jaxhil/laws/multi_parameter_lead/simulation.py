@@ -1,12 +1,13 @@
 """Multi-parameter phase lead (Osaki, Konno): a F + b dF/dt, by pole placement at the contact frequency.
 
-The filter is a + b s/(1 + T_2 s) by Tustin's rule at the control period; phase lead is a = 1, b = T_lead. The
-literature's rule places a root of the contact delayed by tau, s^2 + omega^2 (a + b s) e^(-s tau) = 0, at the
-root of the damped oscillation with the desired restitution (notebooks/guide/model.md section 6, item 16).
+The filter is a + b s/(1 + T_2 s) by Tustin's rule at the control period; phase lead is the special case
+a = 1, b = T_lead. A contact with the delay tau has the characteristic equation
+s^2 + omega^2 (a + b s) e^(-s tau) = 0. The rule of the literature places one of its roots at the root of a
+damped oscillation with the desired restitution (notebooks/guide/model.md section 6, item 16).
 
-The nominal restitution is 1, and tau is the delay of the force measurement plus the lag of the motion
-simulator. This compensates for the loop, while the mechanism's own damping, which the model does not have,
-still acts.
+For the nominal gains, the desired restitution is 1, and tau is the delay of the force measurement plus the
+lag of the motion simulator. These gains compensate for the loop; the mechanism's own damping still acts,
+because the equation does not contain it.
 """
 
 import cmath
@@ -29,9 +30,10 @@ from jaxhil.mechanism.structs import Mechanism
 
 
 def pole_placement(frequency: float, delay: float, restitution: float) -> tuple[float, float]:
-    """Return the gains a [1] and b [s] with which a delayed contact has the desired restitution.
+    """Compute the gains a [1] and b [s] that give a delayed contact the desired restitution.
 
-    They solve a + b s_d = -(s_d^2/omega^2) e^(s_d tau), s_d being the root of the damped oscillation.
+    The gains solve a + b s_d = -(s_d^2/omega^2) e^(s_d tau), where s_d is the desired root, the root of a
+    damped oscillation.
 
     Args:
         frequency: angular frequency omega of the contact [rad/s], above 0.
@@ -62,7 +64,7 @@ def _nominal_gains(mechanism: Mechanism) -> tuple[float, float]:
 
 
 def multi_parameter_filter(gains: Gains, constants: KnownConstants) -> LeadFilter:
-    """Return the coefficients of a + b s/(1 + T_2 s), T_2 = lead_filter, by Tustin's rule."""
+    """Compute the discrete coefficients of a + b s/(1 + T_2 s), T_2 = lead_filter, by Tustin's rule."""
     period = constants.control_period
     slow = 2 * gains["lead_filter"]
     scale = 1 / (slow + period)
@@ -75,12 +77,12 @@ def multi_parameter_filter(gains: Gains, constants: KnownConstants) -> LeadFilte
 
 
 class MultiParameterLead(PhaseLead):
-    """Compensator F_c = a F + b dF/dt, filtered."""
+    """Compensator F_c = a F + b s/(1 + T_2 s) F; see the module's docstring."""
 
     name: ClassVar[str] = "multi_parameter_lead"
     knows: ClassVar[tuple[str, ...]] = (CONTACT_FREQUENCY, FORCE_DELAY, SIMULATOR_LAG)
     waits_for_contact: ClassVar[bool] = True
-    # a is negative for a delay of more than a quarter of an oscillation, b for more than half of one.
+    # a is negative for delays above a quarter of the oscillation period, b for delays above half of it.
     gains: ClassVar[tuple[Gain, ...]] = (
         rig_gain(
             "force_gain",

@@ -1,4 +1,4 @@
-"""No compensation: the numerical model feels the measured force, F_c = F."""
+"""No compensation: the measured force acts on the numerical model, F_c = F."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -8,7 +8,7 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 
 @register("none")
 class NoCompensation(Compensator):
-    """Baseline F_c = F, whose contacts diverge because of the loop's delay."""
+    """Compensator F_c = F, the baseline: its contacts diverge because of the delays in the loop."""
 
     __slots__ = ()
 

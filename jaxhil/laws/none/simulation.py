@@ -6,7 +6,7 @@ from jaxhil.laws.simulation_base import Compensator, Gain
 
 
 class NoCompensator(Compensator):
-    """Baseline F_c = F."""
+    """Compensator F_c = F, the baseline."""
 
     name: ClassVar[str] = "none"
     knows: ClassVar[tuple[str, ...]] = ()

@@ -1,4 +1,4 @@
-"""No compensation in six axes: the measured wrench."""
+"""No compensation in six axes: the measured wrench acts on the numerical model."""
 
 from typing import ClassVar
 
@@ -7,7 +7,7 @@ from jaxhil.laws.six_axis_base import SixAxisCompensator
 
 
 class NoCompensation(SixAxisCompensator):
-    """Wrench as measured."""
+    """Compensator that returns the measured wrench, the baseline."""
 
     name: ClassVar[str] = "none"
     knows: ClassVar[tuple[str, ...]] = ()

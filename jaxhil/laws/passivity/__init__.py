@@ -1,1 +1,1 @@
-"""Passivity control: a variable damper dissipates the energy that the contact seems to generate."""
+"""Passivity control: a variable damper dissipates the energy that delays add to a contact."""

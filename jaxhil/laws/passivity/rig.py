@@ -9,10 +9,10 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 
 @register("passivity")
 class Passivity(Compensator):
-    """Compensator F_c = F, or F_c = -E_before/(T v_d) where E = E_before + T F v_d < 0, which makes E = 0.
+    """Compensator F_c = F, or F_c = -E_before/(T v_d) if E = E_before + T F v_d would be negative.
 
-    This is virtual damping alpha = -E/(T v_d^2). Because E_before >= 0, T v_d is not 0 there and F_c lies
-    between 0 and F.
+    The second force makes E = 0; it corresponds to a virtual damping alpha = -E/(T v_d^2). Because
+    E_before >= 0, the divisor T v_d is then not 0, and F_c is between 0 and F.
     """
 
     __slots__ = ("_energy", "_period")
@@ -24,18 +24,18 @@ class Passivity(Compensator):
         self._energy = 0.0
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """Return the measured force [N], reduced if the contact would return more energy than it took."""
+        """Return the measured force [N], reduced if the contact would return more energy than it absorbed."""
         travel = self._period * velocity_desired
         before = self._energy
         energy = before + force_measured * travel
         if energy < 0.0:
             self._energy = 0.0
             return -before / travel
-        # An infinite or NaN energy is not stored: it would remain so.
+        # Do not store an infinite or NaN energy, because it would never become finite again.
         if energy < inf:
             self._energy = energy
         return force_measured
 
     def reset(self) -> None:
-        """Set the energy to 0."""
+        """Set the observed energy to 0."""
         self._energy = 0.0

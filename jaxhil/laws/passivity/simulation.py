@@ -1,11 +1,11 @@
 """Time-domain passivity control (De Stefano et al.): the contact never returns more energy than it took.
 
-    E(n) = E(n-1) + T F(n) v_d(n),     where E < 0:  F_c = F + alpha v_d,  alpha = -E/(T v_d^2)
+    E(n) = E(n-1) + T F(n) v_d(n),     if E < 0:  F_c = F + alpha v_d,  alpha = -E/(T v_d^2)
 
-E is the energy that the numerical model has given to the contact. The energy that the virtual damping alpha
-dissipates counts in E, which therefore returns to 0. Then F_c = -E(n-1)/(T v_d), between 0 and F however
-small v_d is. The compensator needs no gain and no knowledge of the rig. However, energy that a damped contact
-has dissipated is a reserve that later contacts of the run may spend, and energy from sampling is not observed
+E is the energy that the numerical model has given to the contact. The virtual damping alpha dissipates -E, so
+that E returns to 0. Then F_c = -E(n-1)/(T v_d), which is between 0 and F for any small v_d. The compensator
+needs no gain and no knowledge of the rig. Two limitations remain: later contacts of the run can gain the
+energy that an earlier, damped contact has dissipated, and energy that the sampling adds is not observed
 (notebooks/guide/model.md section 6, item 17).
 """
 
@@ -17,7 +17,7 @@ from jaxhil.laws.simulation_base import Compensator, Gain
 
 
 class Passivity(Compensator):
-    """Compensator F_c = F + alpha v_d where the observed energy is negative; see the module's docstring."""
+    """Compensator F_c = F + alpha v_d while the observed energy is negative; see the module's docstring."""
 
     name: ClassVar[str] = "passivity"
     knows: ClassVar[tuple[str, ...]] = ()
@@ -40,7 +40,7 @@ class Passivity(Compensator):
         energy = state + force * travel
         active = energy < 0
         corrected = -state / jnp.where(active, travel, 1)
-        # An infinite or NaN energy is not stored: it would remain so.
+        # Do not store an infinite or NaN energy, because it would never become finite again.
         energy = jnp.where(active, 0, jnp.where(energy < jnp.inf, energy, state))
         return jnp.where(active, corrected, force), energy
 

@@ -1,4 +1,4 @@
-"""Phase-lead force compensation: the filtered first-order inverse of a force delay."""
+"""Phase lead of the measured force: filtered first-order inverse of the force delay."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -12,8 +12,8 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 class PhaseLead(Compensator):
     """Compensator F_c = (1 + T_1 s)/(1 + T_2 s) F by Tustin's rule.
 
-    T_1 = phase_lead + lead_filter, T_2 = lead_filter: the net lead is `phase_lead`, by the literature's rule
-    the delay of the force measurement.
+    T_1 = phase_lead + lead_filter, T_2 = lead_filter: the net lead is `phase_lead`. The rule of the
+    literature sets it to the delay of the force measurement.
     """
 
     __slots__ = ("_lead",)
@@ -27,7 +27,7 @@ class PhaseLead(Compensator):
         self._lead = LeadFilter(gains["phase_lead"], gains["lead_filter"], period)
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """Return the phase lead of the measured force [N]."""
+        """Return the lead-filtered force [N]."""
         return self._lead.step(force_measured)
 
     def reset(self) -> None:

@@ -1,4 +1,4 @@
-"""Phase-lead force compensation (Shimoji): F + T_lead dF/dt, the first-order inverse of a force delay."""
+"""Phase lead of the measured force (Shimoji): F + T_lead dF/dt, first-order inverse of the force delay."""
 
 from typing import ClassVar
 
@@ -17,7 +17,7 @@ from jaxhil.laws.simulation_base import Compensator, Gain
 
 
 class PhaseLead(Compensator):
-    """Compensator F_c = F + T_lead dF/dt, filtered."""
+    """Compensator F_c = F + T_lead dF/dt, with a filtered derivative."""
 
     name: ClassVar[str] = "phase_lead"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)

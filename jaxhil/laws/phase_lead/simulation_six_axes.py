@@ -1,4 +1,4 @@
-"""Phase lead of each channel of the wrench, with the same lead time."""
+"""Phase lead in six axes, with one lead time for all channels of the wrench."""
 
 from typing import ClassVar
 
@@ -17,14 +17,14 @@ from jaxhil.laws.six_axis_base import COORDINATES, SixAxisCompensator, lag_leads
 
 
 class PhaseLead(SixAxisCompensator):
-    """Compensator F_c = F + T_lead dF/dt of each channel, filtered."""
+    """Compensator F_c = F + T_lead dF/dt on each channel of the wrench, with a filtered derivative."""
 
     name: ClassVar[str] = "phase_lead"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)
     gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER, *lag_leads(equalise=False))
 
     def channel(self, gains: Gains, name: str) -> Gains:
-        """Return the gains of the channel of one coordinate, with the names of this class."""
+        """Return the gains of the lead filter for one channel of the wrench, by name."""
         return gains
 
     def prepare(self, gains, constants):

@@ -1,1 +1,1 @@
-"""Phase lead with a lead time for each channel of the wrench."""
+"""Phase lead in six axes, with a separate lead time for each channel of the wrench."""

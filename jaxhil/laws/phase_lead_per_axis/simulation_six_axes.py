@@ -1,7 +1,7 @@
-"""Phase lead with a lead time for each of six axes: F + T_lead dF/dt, channel by channel.
+"""Phase lead in six axes: F + T_lead dF/dt on each channel of the wrench, with a separate lead time.
 
-The axes of a rig have different delays, and each lead time can compensate for that of its channel. The lead
-filter is common to all channels.
+The axes of a rig have different delays; each lead time can compensate for the delay of its channel. All
+channels have the same time constant of the lead filter.
 """
 
 from typing import ClassVar
@@ -13,7 +13,7 @@ from jaxhil.laws.six_axis_base import COORDINATES, lag_leads
 
 
 class PhaseLeadPerAxis(PhaseLead):
-    """Compensator F_c = F + T_lead dF/dt of each channel, with a lead time of its own, filtered."""
+    """Compensator F_c = F + T_lead dF/dt on each channel, with separate T_lead and filtered derivative."""
 
     name: ClassVar[str] = "phase_lead_per_axis"
     gains: ClassVar[tuple[Gain, ...]] = (

@@ -1,1 +1,1 @@
-"""Lead of the commanded position by the inverse of the motion simulator."""
+"""Position lead: the position command compensates for the motion simulator's lag."""

@@ -1,4 +1,4 @@
-"""Position lead: the position command is ahead of the model by the motion simulator's lag."""
+"""Position lead: the position command leads the model's position by the motion simulator's lag."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -11,7 +11,7 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 class PositionLead(Compensator):
     """Compensator F_c = F, command x + a_1 v + a_2 a, a_1 = position_lead, a_2 = acceleration_lead.
 
-    With a_1 and a_2 of the motion simulator's inverse, 1 + a_1 s + a_2 s^2 + ..., its lag is compensated.
+    a_1 and a_2 of the motion simulator's inverse, 1 + a_1 s + a_2 s^2 + ..., compensate for its lag.
     """
 
     __slots__ = ("_of_acceleration", "_of_velocity")
@@ -30,5 +30,5 @@ class PositionLead(Compensator):
         return force_measured
 
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
-        """Return the lead of the numerical model's position [m]."""
+        """Return the position command [m], extrapolated from the numerical model's motion."""
         return position + self._of_velocity * velocity + self._of_acceleration * acceleration

@@ -1,1 +1,1 @@
-"""Phase lead, response error and identified contact."""
+"""Response-error compensation with phase lead and identification of the contact."""

@@ -1,10 +1,12 @@
-"""Response-error force compensation with real-time identification of the contact.
+"""Response-error compensation with real-time identification of the contact.
 
-F_c = y + gate (g k (x_d - x_m) + g_b b (v_d - v_m)): y is the force behind the phase lead, k and b are the
-identified contact stiffness and damping, and x_d - x_m is the distance by which the motion simulator lags
-behind the numerical model. No model of the simulator is used. The response term acts while the gate is open,
-that is while the aligned position is in contact; the gate opens and closes within two periods, depending on
-when between two ticks the surface was crossed. F_c is not clamped, because a clamp increases the divergence.
+    F_c = y + gate (g k (x_d - x_m) + g_b b (v_d - v_m))
+
+y is the lead-filtered force, k and b are the identified contact stiffness and damping, and x_d - x_m is the
+distance by which the motion simulator lags behind the numerical model. The compensator needs no model of the
+simulator. The gate is open while the aligned position is in contact. It opens and closes smoothly within two
+periods, depending on the time between two ticks at which the position crosses the surface. F_c is not
+clamped, because a clamp increases the divergence.
 
 Source: Qi, Zhao, Gao, Ren, Hu, "Divergence compensation for hardware-in-the-loop simulation of
 stiffness-varying discrete contact in space", Acta Astronautica 2016, and later papers of that group.
@@ -23,11 +25,11 @@ from jaxhil.rig.surfaces import deflection
 
 @register("response_error")
 class ResponseError(Compensator):
-    """Phase lead, plus the force that is missing because of the motion simulator's response error.
+    """Compensator that adds the force which is missing because the motion simulator lags; with phase lead.
 
-    The measured force is later than the measured position. The identification therefore regresses it on the
-    position delayed by `identification_delay` (the aligned position). The weight of a reading is the gate of
-    the contact times the gate of the force above `contact_threshold`.
+    The measured force is older than the measured position. The identification therefore fits the force to
+    the aligned position, which is delayed by `identification_delay`. The weight of a reading is the product
+    of two gates: aligned position in contact, and force above `contact_threshold`.
     """
 
     __slots__ = (
@@ -76,7 +78,7 @@ class ResponseError(Compensator):
 
     @property
     def identified(self) -> tuple[float, float]:
-        """Return identified stiffness [N/m] and damping [N s/m]."""
+        """Return the identified stiffness [N/m] and damping [N s/m]."""
         return self._identification.stiffness, self._identification.damping
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
@@ -125,7 +127,7 @@ class ResponseError(Compensator):
         aligned = alignment.step(position)
         self._aligned_velocity.start(aligned, velocity)
         self._aligned = aligned - self._period * velocity
-        # The step above only computed the aligned position: the tick itself stores the sample.
+        # Undo the step above, which only served to compute the aligned position.
         alignment.start(position, velocity)
         self._force = 0.0
         self._contact_share = 0.0
@@ -133,13 +135,13 @@ class ResponseError(Compensator):
         self._started = True
 
     def reset(self) -> None:
-        """Restart filters, delay line and identification."""
+        """Restart the filters, the delay line and the identification."""
         self._lead.reset()
         self._identification.reset()
         self._started = False
 
     def next_contact(self) -> None:
-        """Restart filters, delay line and covariance; keep the identified stiffness and damping."""
+        """Restart the filters, the delay line and the covariance; keep identified stiffness and damping."""
         self._lead.reset()
         self._identification.restart_covariance()
         self._started = False

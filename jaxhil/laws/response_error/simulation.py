@@ -1,17 +1,17 @@
-"""Compensation of Qi et al.: phase lead, response error and delay-aligned real-time identification.
+"""Response-error compensation of Qi et al. with phase lead and real-time identification of the contact.
 
     F_c = lead(F) + gate (g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a))
 
-The phase lead compensates for the delay of the force measurement, the response error for the dynamics of the
-motion simulator, of which no model is used (Qi et al. 2016; notebooks/guide/model.md section 5). k_hat and
-b_hat are a recursive least-squares fit of the measured force to the measured position, delayed by the same
-time (`identification_delay`): without this alignment they are biased (section 6, item 6). v_a is a filtered
-difference, s/(1 + T_v s) by Tustin's rule.
+The phase lead compensates for the delay of the force measurement. The response error compensates for the
+dynamics of the motion simulator without a model of the simulator (Qi et al. 2016; notebooks/guide/model.md
+section 5). k_hat and b_hat are a recursive least-squares fit of the measured force to the measured position.
+For the fit, the position is delayed like the force (`identification_delay`); without this alignment, k_hat
+and b_hat are biased (section 6, item 6). v_a is a filtered difference, s/(1 + T_v s) by Tustin's rule.
 
-`gate` is 1 while the aligned position is in contact and 0 outside. It opens and closes within two periods,
-depending on when between two ticks the surface was crossed (`jaxhil.laws.shared.gates`). The weight of a
-reading in the identification is this gate times that of the measured force above `contact_threshold`, so that
-F_c is continuous in the delays.
+`gate` is 1 while the aligned position is in contact and 0 outside. It opens and closes smoothly within two
+periods, depending on the time between two ticks at which the position crosses the surface
+(`jaxhil.laws.shared.gates`). The weight of a reading in the identification is this gate times a gate of the
+force above `contact_threshold`. F_c is therefore a continuous function of the delays.
 """
 
 from typing import ClassVar, NamedTuple
@@ -51,45 +51,45 @@ from jaxhil.laws.simulation_base import Compensator, Gain, Gains, clear_lanes, r
 
 
 def _stiffness_covariance(mechanism) -> float:
-    """Return the covariance [1/m^2] with which a sample at 3 % of the peak depth sets half of k_hat."""
+    """Return the initial covariance [1/m^2] that gives a first sample at 3 % of the peak depth weight 1/2."""
     return 1 / (0.03 * peak_force(mechanism) / typical_stiffness(mechanism)) ** 2
 
 
 def _damping_covariance(mechanism) -> float:
-    """Return the covariance [s^2/m^2] with which a sample at approach speed sets half of b_hat."""
+    """Return the initial covariance [s^2/m^2] that gives a first sample at the approach speed weight 1/2."""
     return 1 / mechanism.approach.velocity**2
 
 
 def _never_tuned(mechanism) -> bool:
-    """Return False: tuning this gain would reduce the error by less than a fifth and hinder the search."""
+    """Return False: tuning the gain would reduce the error by less than 20 % and make the search harder."""
     return False
 
 
 class ResponseErrorState(NamedTuple):
-    """State of the compensator from tick to tick."""
+    """State of the response-error compensator after a tick."""
 
     lead: LeadState
-    position: Float[Array, "*batch"]  # measured on the last tick [m]
-    velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
-    aligned: Float[Array, "*batch"]  # position as old as the force, on the last tick [m]
-    aligned_velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
+    position: Float[Array, "*batch"]  # measured position [m]
+    velocity: Float[Array, "*batch"]  # filtered rate of `position` [m/s]
+    aligned: Float[Array, "*batch"]  # measured position, delayed like the force [m]
+    aligned_velocity: Float[Array, "*batch"]  # filtered rate of `aligned` [m/s]
     contact_share: Float[Array, "*batch"]  # share of the last period in contact [1]
     force_share: Float[Array, "*batch"]  # share of the last period with a force above the threshold [1]
-    identified: ContactEstimate  # stiffness and damping
-    line: DelayLine  # measured positions
+    identified: ContactEstimate  # identified stiffness and damping
+    line: DelayLine  # delay line of the measured positions
 
 
 class PreparedResponseError(NamedTuple):
-    """Gains and filter coefficients, computed once per run."""
+    """Gains and filter coefficients of the response-error compensator, computed once per run."""
 
     gains: Gains
     period: Float[Array, "*batch"]  # control period [s]
-    clearance: Float[Array, "*batch"]  # of a two-sided contact [m]
+    clearance: Float[Array, "*batch"]  # clearance of a two-sided contact [m]
     lead: LeadFilter
-    # of the velocity filter v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1))
+    # coefficients [1] and [1/s] of the velocity filter v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1))
     rate_pole: Float[Array, "*batch"]
-    rate_gain: Float[Array, "*batch"]  # of that filter [1/s]
-    delay: DelayInPeriods  # of the positions, to align them with the force
+    rate_gain: Float[Array, "*batch"]
+    delay: DelayInPeriods  # delay that aligns the measured positions with the force
 
 
 class ResponseError(Compensator):
@@ -224,9 +224,9 @@ class ResponseError(Compensator):
         )
 
     def noise_amplification(self, gains, constants):
-        # This is the lead filter's share alone. The noise of k_hat is smaller in F_c by (x_d - x_a)/depth and
-        # by the square root of the number of samples that the identification remembers. Only at the beginning
-        # of a contact, when k_hat depends on a few shallow samples, is F_c noisier.
+        # Only the lead filter counts. The noise of k_hat enters F_c reduced by the factor (x_d - x_a)/depth,
+        # and by the square root of the number of samples in the identification's memory. F_c is noisier only
+        # at the beginning of a contact, when k_hat depends on a few samples at small depth.
         return lead_amplification(build_lead_filter(gains, constants))
 
     def identified(self, state):

@@ -1,9 +1,10 @@
-"""Compensation of Qi et al. along the approach axis of a rig in six axes, and phase lead of every channel.
+"""Response-error compensation of Qi et al. along the docking axis, with phase lead on all six channels.
 
-    F_c = lead(F),  plus  g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a)  along the docking axis, in contact
+    F_c = lead(F),  in contact plus g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a) along the docking axis
 
-The literature states the method for one axis (`simulation.py` in this folder): it knows where the surface is.
-Here x is the travel along the docking axis, and the surface is where the force exceeded `contact_threshold`.
+The literature states the method for one axis with a known surface (`simulation.py` in this folder). Here x is
+the travel along the docking axis. The surface is at the travel at which the force exceeds
+`contact_threshold`.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -32,34 +33,34 @@ from jaxhil.laws.simulation_base import Gain, Gains, Signals, rig_gain
 from jaxhil.laws.six_axis_base import COORDINATES, SixAxisCompensator, lag_leads
 
 AXIS = 2  # index of the docking axis z
-USUAL_SPEED = 0.02  # m/s; of an approach that the file does not state
-SHALLOW = 1e-3  # s; a sample at this depth over the approach speed sets half of k_hat
+USUAL_SPEED = 0.02  # m/s; approach speed if the mechanism file has none
+SHALLOW = 1e-3  # s; depth divided by approach speed, at which a first sample has weight 1/2 in k_hat
 
 
 class ResponseErrorState(NamedTuple):
-    """State of the compensator from tick to tick."""
+    """State of the six-axis response-error compensator after a tick."""
 
     leads: tuple[LeadState, ...]
-    line: DelayLine  # of the measured travel
-    position: Float[Array, "*batch"]  # measured on the last tick [m]
-    velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
-    aligned: Float[Array, "*batch"]  # travel as old as the force, on the last tick [m]
-    aligned_velocity: Float[Array, "*batch"]  # its filtered rate [m/s]
-    surface: Float[Array, "*batch"]  # the same before contact [m]
+    line: DelayLine  # delay line of the measured travel
+    position: Float[Array, "*batch"]  # measured travel [m]
+    velocity: Float[Array, "*batch"]  # filtered rate of `position` [m/s]
+    aligned: Float[Array, "*batch"]  # measured travel, delayed like the force [m]
+    aligned_velocity: Float[Array, "*batch"]  # filtered rate of `aligned` [m/s]
+    surface: Float[Array, "*batch"]  # `aligned` on the last tick before contact [m]
     in_contact: Bool[Array, "*batch"]
-    identified: ContactEstimate  # stiffness and damping
+    identified: ContactEstimate  # identified stiffness and damping
 
 
 class Prepared(NamedTuple):
-    """Gains and filter coefficients, computed once per run."""
+    """Gains and filter coefficients of the six-axis response-error compensator, computed once per run."""
 
     gains: Gains
     period: Float[Array, "*batch"]  # control period [s]
     lead: LeadFilter
-    # of the velocity filter v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1))
+    # coefficients [1] and [1/s] of the velocity filter v(n) = rate_pole v(n-1) + rate_gain (x(n) - x(n-1))
     rate_pole: Float[Array, "*batch"]
-    rate_gain: Float[Array, "*batch"]  # [1/s]
-    delay: DelayInPeriods  # of the travel, to align it with the force
+    rate_gain: Float[Array, "*batch"]
+    delay: DelayInPeriods  # delay that aligns the measured travel with the force
 
 
 def approach_speed(mechanism: Any) -> float:
@@ -70,7 +71,7 @@ def approach_speed(mechanism: Any) -> float:
 
 
 def noise_level(mechanism: Any) -> float:
-    """Return a force along the docking axis that noise hardly ever exceeds [N]."""
+    """Return a force [N] above the sensor noise along the docking axis: 4 sigma plus bias and quantum."""
     sensor = mechanism.rig.force_sensor
     return 4 * sensor.noise_std[AXIS] + abs(sensor.bias[AXIS]) + sensor.quantum[AXIS]
 
@@ -80,14 +81,14 @@ def _never(mechanism: Any) -> bool:
 
 
 def _covariance(name: str, size: Any) -> Gain:
-    """Return an initial covariance whose nominal value is `size` of a mechanism."""
+    """Return the gain of an initial covariance; `size(mechanism)` is its nominal value."""
     return rig_gain(
         name, lambda m: 1e-3 * size(m), lambda m: 1e1 * size(m), size, logarithmic=True, tuned=_never
     )
 
 
 class ResponseError(SixAxisCompensator):
-    """Phase lead of every channel, and response error along the docking axis; see the module's docstring."""
+    """Compensator with response error along the docking axis and phase lead on all channels of the wrench."""
 
     name: ClassVar[str] = "response_error"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)

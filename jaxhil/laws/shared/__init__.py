@@ -1,1 +1,1 @@
-"""Common parts of several compensators."""
+"""Parts that several compensators use."""

@@ -1,4 +1,4 @@
-"""Delay line of the measured position, linear between samples, with uniform motion before the run."""
+"""Delay line of the measured position, with linear interpolation and uniform motion before the run."""
 
 from typing import NamedTuple
 
@@ -11,37 +11,37 @@ from jaxhil.laws.simulation_base import Signals
 
 
 class DelayInPeriods(NamedTuple):
-    """Delay in control periods."""
+    """Delay as a whole number and a fraction of control periods."""
 
-    lookback: Int[Array, "*batch"]  # whole periods
-    fraction: Float[Array, "*batch"]  # rest of a period [1]
+    lookback: Int[Array, "*batch"]  # whole number of periods
+    fraction: Float[Array, "*batch"]  # fraction of a period [1]
     period: Float[Array, "*batch"]  # control period [s]
 
 
 class DelayLine(NamedTuple):
-    """Delay line of the measured position."""
+    """State of the delay line of the measured position."""
 
-    first_position: Float[Array, "*batch"]  # first reading of the run [m]
-    first_velocity: Float[Array, "*batch"]  # velocity on the first tick [m/s]
-    ring: Float[Array, "samples *batch"]  # readings [m]
+    first_position: Float[Array, "*batch"]  # measured position on the run's first tick [m]
+    first_velocity: Float[Array, "*batch"]  # velocity of the model on the run's first tick [m/s]
+    ring: Float[Array, "samples *batch"]  # ring buffer of measured positions [m]
 
 
 def split_delay(delay: Array, period: Array) -> DelayInPeriods:
-    """Convert a delay [s] >= 0 to periods, with a tolerance of 1e-9 below a whole number."""
+    """Convert a delay [s] >= 0 to control periods; a fraction above 1 - 1e-9 counts as a whole period."""
     periods = delay / period
     whole = jax.lax.stop_gradient(jnp.floor(periods + 1e-9))
     return DelayInPeriods(whole.astype(jnp.int32), periods - whole, period)
 
 
 def empty_delay_line(ring: int, zeros: Float[Array, "*batch"]) -> DelayLine:
-    """Return a line of `ring` samples, a power of two; no sample is read before it is written."""
+    """Return a delay line with `ring` samples, a power of two; `read_delayed` reads only written samples."""
     return DelayLine(zeros, zeros, jnp.zeros((ring, *zeros.shape), zeros.dtype))
 
 
 def read_delayed(
     delay: DelayInPeriods, line: DelayLine, signals: Signals, tick: Array
 ) -> tuple[Array, DelayLine]:
-    """Return the measured position [m] one delay ago, and the line with this tick's reading."""
+    """Add this tick's measured position to the line; return the delayed position [m] and the line."""
     measured, age = signals.position_measured, signals.age
     begins = age == 0
     first_position = jnp.where(begins, measured, line.first_position)

@@ -1,7 +1,7 @@
 """Lead filter (1 + T_1 s)/(1 + T_2 s) by Tustin's rule in JAX, and its two gains.
 
-T_1 = phase_lead + lead_filter and T_2 = lead_filter: the net lead is `phase_lead`. By the literature's rule
-it is the delay of the force measurement, and T_2 is one control period.
+T_1 = phase_lead + lead_filter and T_2 = lead_filter, so that the net lead is `phase_lead`. The rule of the
+literature sets `phase_lead` to the delay of the force measurement, and `lead_filter` to one control period.
 """
 
 from typing import NamedTuple
@@ -31,20 +31,20 @@ LEAD_FILTER = rig_gain(
 class LeadState(NamedTuple):
     """State of the lead filter after a tick."""
 
-    force: Float[Array, "*batch"]  # input [N]
-    output: Float[Array, "*batch"]  # [N]
+    force: Float[Array, "*batch"]  # input of the last tick [N]
+    output: Float[Array, "*batch"]  # output of the last tick [N]
 
 
 class LeadFilter(NamedTuple):
-    """Coefficients of y(n) = pole y(n-1) + now F(n) + before F(n-1)."""
+    """Coefficients [1] of the lead filter y(n) = pole y(n-1) + now F(n) + before F(n-1)."""
 
-    pole: Array  # of the last output [1]
-    now: Array  # of this force [1]
-    before: Array  # of the last force [1]
+    pole: Array
+    now: Array
+    before: Array
 
 
 def build_lead_filter(gains: Gains, constants: KnownConstants) -> LeadFilter:
-    """Return the coefficients for T_1 = phase_lead + lead_filter and T_2 = lead_filter."""
+    """Compute the lead filter's coefficients from the gains `phase_lead` and `lead_filter`."""
     period = constants.control_period
     slow = 2 * gains["lead_filter"]
     fast = slow + 2 * gains["phase_lead"]
@@ -53,16 +53,16 @@ def build_lead_filter(gains: Gains, constants: KnownConstants) -> LeadFilter:
 
 
 def apply_lead_filter(filter_: LeadFilter, state: LeadState, force: Array) -> tuple[Array, LeadState]:
-    """Return the filter's output [N] for the force [N] of a tick, and its state."""
+    """Filter the force [N] of one tick; return the output [N] and the filter's next state."""
     output = filter_.pole * state.output + filter_.now * force + filter_.before * state.force
     return output, LeadState(force, output)
 
 
 def lead_amplification(filter_: LeadFilter) -> Array:
-    """Return the standard deviation of the filter's output over that of white noise at its input [1].
+    """Return the filter's noise amplification [1]: output over input standard deviation for white noise.
 
-    The stationary variance of y(n) = p y(n-1) + a F(n) + b F(n-1) for F of unit variance is the sum of the
-    squares of its impulse response a, pa + b, p(pa + b), ...: (a^2 + b^2 + 2 a b p)/(1 - p^2).
+    For y(n) = p y(n-1) + a F(n) + b F(n-1) with F of unit variance, the stationary variance is the sum of the
+    squared impulse response a, pa + b, p(pa + b), ..., which is (a^2 + b^2 + 2 a b p)/(1 - p^2).
     """
     pole, now, before = filter_
     return jnp.sqrt((now**2 + before**2 + 2 * now * before * pole) / (1 - pole**2))

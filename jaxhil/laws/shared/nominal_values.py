@@ -1,7 +1,8 @@
-"""Estimates of mechanism and rig that a compensator has before a run: nominal values of the file.
+"""Nominal values of mechanism and rig, which are all that a compensator knows before a run.
 
-They are never the values of a scenario: where the file states an uncertainty, the drawn value differs from
-the estimate. `Compensator.knows` lists the estimates that a compensator needs.
+The values come from the mechanism file, not from a scenario. If the file states an uncertainty, the value
+that is drawn for a scenario therefore differs from the nominal value. `Compensator.knows` lists the nominal
+values that a compensator needs.
 """
 
 import math
@@ -28,9 +29,9 @@ def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
 
 
 def simulator_inverse(mechanism: Mechanism) -> tuple[float, float]:
-    """Return a_1 [s] and a_2 [s^2] of 1 + a_1 s + a_2 s^2 + ..., the series of e^(s tau)/G(s).
+    """Return the coefficients a_1 [s] and a_2 [s^2] of the series e^(s tau)/G(s) = 1 + a_1 s + a_2 s^2 + ...
 
-    tau is the transport delay of the motion simulator plus the average delay of the command: L T with linear
+    tau is the transport delay of the motion simulator plus the mean delay of the command: L T with linear
     interpolation, (L - 1/2) T with zero-order hold (notebooks/guide/model.md section 6, item 7).
     """
     rig = mechanism.rig
@@ -41,15 +42,15 @@ def simulator_inverse(mechanism: Mechanism) -> tuple[float, float]:
 
 
 def simulator_lag(mechanism: Mechanism) -> float:
-    """Return the time [s] by which the motion simulator lags in uniform motion: a_1 of the inverse."""
+    """Return the motion simulator's lag [s] in uniform motion: a_1 of `simulator_inverse`."""
     return simulator_inverse(mechanism)[0]
 
 
 def axis_lags(mechanism: SixAxisMechanism) -> list[float]:
-    """Return the delay [s] of each coordinate in uniform motion.
+    """Return the motion simulator's lag [s] of each coordinate in uniform motion.
 
-    With two robots it is the mean of both delays, weighted by their shares. A hexapod's legs have six delays,
-    each of which affects all coordinates: the result is their mean.
+    With two robots, the lag is the mean of both robots' lags, weighted by their shares of the motion. In a
+    hexapod every leg affects all coordinates, so that the lag is the mean of the legs' lags.
     """
     simulator = mechanism.rig.simulator
     lags, robot = _lags(simulator, simulator), simulator.target_robot
@@ -69,7 +70,7 @@ def is_damped(mechanism: Mechanism) -> bool:
 
 
 def peak_force(mechanism: Mechanism) -> float:
-    """Return the order of the peak contact force [N], for the stiffest stiffness in the file."""
+    """Return an estimate of the peak contact force [N], for the largest stiffness in the file."""
     contact = mechanism.contact
     stiffness = [max(k) if isinstance(k, list | tuple) else k for k in contact.stiffness]
     mass, velocity = mechanism.bodies.mass, mechanism.approach.velocity
@@ -77,29 +78,29 @@ def peak_force(mechanism: Mechanism) -> float:
 
 
 def typical_stiffness(mechanism: Mechanism) -> float:
-    """Return the order of the contact stiffness [N/m], M omega^2 for the stiffest stiffness in the file."""
+    """Return an estimate of the contact stiffness [N/m]: F^2/(M v^2), where F is `peak_force`."""
     return (peak_force(mechanism) / mechanism.approach.velocity) ** 2 / mechanism.bodies.mass
 
 
 def contact_frequency(mechanism: Mechanism) -> float:
-    """Return the order of the contact's angular frequency [rad/s], with the typical stiffness."""
+    """Return an estimate of the contact's angular frequency [rad/s], from `typical_stiffness`."""
     return math.sqrt(typical_stiffness(mechanism) / mechanism.bodies.mass)
 
 
 def critical_damping(mechanism: Mechanism) -> float:
-    """Return the critical damping 2 sqrt(k M) [N s/m], with the typical stiffness."""
+    """Return the critical damping 2 sqrt(k M) [N s/m], where k is `typical_stiffness`."""
     return 2 * math.sqrt(typical_stiffness(mechanism) * mechanism.bodies.mass)
 
 
 def noise_bound(mechanism: Mechanism) -> float:
-    """Return a force [N] that noise hardly ever exceeds."""
+    """Return a force [N] above the noise: 4 standard deviations plus bias and quantum of the force sensor."""
     sensor = mechanism.rig.force_sensor
-    # 3 standard deviations are not enough: one reading above, at a small depth, identifies a wrong stiffness.
+    # With 3 standard deviations, noise at a small depth sometimes causes a wrong identified stiffness.
     return 4 * sensor.noise_std + abs(sensor.bias) + sensor.quantum
 
 
 def _lags(simulator: Simulator, robot: Simulator | TargetRobot) -> list[float]:
-    """Return the delay [s] of each axis of a robot in uniform motion: transport delay plus -G'(0)."""
+    """Return the lag [s] of each axis of a robot in uniform motion: transport delay minus G'(0)."""
 
     def of(key: str) -> list[float]:
         return getattr(robot, key) or getattr(simulator, key)
@@ -120,7 +121,7 @@ def _lags(simulator: Simulator, robot: Simulator | TargetRobot) -> list[float]:
 
 
 def _inverse_series(simulator) -> tuple[float, float]:
-    """Return the coefficients of s [s] and s^2 [s^2] in the series of 1/G."""
+    """Return the coefficients a_1 [s] and a_2 [s^2] of the series 1/G(s) = 1 + a_1 s + a_2 s^2 + ..."""
     if simulator.model == "first_order":
         return simulator.time_constant, 0.0
     if simulator.model == "second_order":
@@ -129,7 +130,7 @@ def _inverse_series(simulator) -> tuple[float, float]:
     if simulator.model == "third_order":
         return simulator.coefficients[0], simulator.coefficients[1]
     if simulator.model == "transfer_function":
-        # Series division of denominator by numerator, with low powers first.
+        # Divide the denominator by the numerator as power series, in ascending powers.
         low = [*reversed(simulator.denominator), 0.0, 0.0][:3]
         num = [*reversed(simulator.numerator), 0.0, 0.0][:3]
         first = (low[1] - low[0] / num[0] * num[1]) / num[0]

@@ -1,8 +1,8 @@
-"""Ring buffer of past samples, written in place; each lane may read a different number of ticks back.
+"""Ring buffer of past samples, updated in place; each lane may read a sample of a different age.
 
-The first axis is that of the samples, and its length is a power of two. `tick` is common to all lanes. The
-compiler updates a ring in place only if it can see that the read comes first; otherwise it copies the ring.
-`depend_on` therefore makes the written sample depend on what was read.
+The first axis of the array is that of the samples; its length is a power of two. All lanes have the same
+`tick`. XLA updates the array in place only if the write depends on all reads; otherwise it copies the array.
+`depend_on` creates this dependence.
 """
 
 from typing import Any
@@ -22,8 +22,8 @@ def look_back(
 ) -> Float[Array, "*batch"]:
     """Return the sample written `ticks` before `tick`, or `otherwise` where `is_available` is false.
 
-    `ticks` is less than `samples`. If all lanes look back equally far, the result is one row of the ring,
-    which is much faster than a gather.
+    `ticks` must be less than `samples`. If `ticks` is equal on all lanes, the function reads one row of the
+    ring, which is much faster than a gather.
     """
     first, mask = ticks.reshape(-1)[0], ring.shape[0] - 1
 
@@ -45,14 +45,15 @@ def look_back(
 def write_sample(
     ring: Float[Array, "samples *batch"], tick: Int[Array, ""], value: Float[Array, "*batch"]
 ) -> Float[Array, "samples *batch"]:
-    """Store `value` as the sample of `tick`."""
+    """Return the ring with `value` stored as the sample of `tick`."""
     return lax.dynamic_update_index_in_dim(ring, value, tick & (ring.shape[0] - 1), 0)
 
 
 def write_samples(rings: Any, tick: Int[Array, ""], values: Any) -> Any:
-    """Store each leaf of `values` in the same leaf of `rings`, one after the other.
+    """Return the pytree `rings` with each leaf of `values` stored in the corresponding ring.
 
-    The compiler would merge independent writes into one loop over the whole rings.
+    Each write depends on the previous write, because XLA would merge independent writes into one loop over
+    all samples.
     """
     leaves, structure = jax.tree.flatten(rings)
     written = []
@@ -65,7 +66,7 @@ def write_samples(rings: Any, tick: Int[Array, ""], values: Any) -> Any:
 
 
 def depend_on(value: Float[Array, "*batch"], *reads: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return `value`, but dependent on `reads`: NaN where one of them is NaN."""
+    """Return `value`, or NaN where one of `reads` is NaN: to the compiler it depends on `reads`."""
     for read in reads:
         value = jnp.where(read == read, value, read)
     return value

@@ -1,1 +1,1 @@
-"""Smith predictor behind a phase lead."""
+"""Smith predictor for the motion simulator's lag, with phase lead for the force delay."""

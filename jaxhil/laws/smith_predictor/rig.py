@@ -1,4 +1,4 @@
-"""Smith predictor of the force: phase lead for its delay, prediction for the motion simulator's lag."""
+"""Smith predictor of the force: phase lead for the force delay, prediction for the motion simulator's lag."""
 
 from jaxhil.laws.shared.smith.rig import Smith
 from jaxhil.rig.registry import register
@@ -6,10 +6,10 @@ from jaxhil.rig.registry import register
 
 @register("smith_predictor")
 class SmithPredictor(Smith):
-    """Compensator F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F, with the filters of `Smith`."""
+    """Compensator F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F."""
 
     __slots__ = ()
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """Return the force behind lead and predictor [N]."""
+        """Return the predicted force [N]."""
         return self._predictor.step(self._lead.step(force_measured))

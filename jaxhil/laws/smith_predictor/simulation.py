@@ -1,9 +1,9 @@
 """Smith predictor of the force: (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F.
 
-The second factor is phase lead for the force delay T_l, filtered as in `phase_lead`. The first factor
-compensates for the lag T_s of the motion simulator: a Smith predictor adds F_0 - F_0 e^(-s T_s) for the
-undelayed force F_0. Here e^(-s T_s) is replaced by its first-order Pade approximation, F_0 by the force
-behind the lead. The formula in the source can also be read in a way that leaves a larger error
+The second factor is the phase lead for the force delay T_l, filtered as in `phase_lead`. The first factor
+compensates for the lag T_s of the motion simulator: a Smith predictor adds F_0 - F_0 e^(-s T_s), where F_0 is
+the undelayed force. Here the lead-filtered force replaces F_0, and a first-order Pade approximation replaces
+e^(-s T_s). The formula in the source is ambiguous; its other interpretation has a larger error
 (notebooks/guide/model.md section 6, item 14).
 """
 

@@ -1,1 +1,1 @@
-"""Force of a virtual spring and damper at the desired position."""
+"""Virtual contact: a virtual spring and damper act on the numerical model."""

@@ -1,4 +1,4 @@
-"""Virtual contact (EPOS): spring and damper on the commanded motion, in addition to the real contact."""
+"""Virtual contact (EPOS): a virtual spring and damper act on the model in addition to the real contact."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -10,7 +10,7 @@ from jaxhil.rig.surfaces import deflection
 
 @register("virtual_contact")
 class VirtualContact(Compensator):
-    """Compensator F_c = F + k_v d + b_v v_d while the model is beyond a surface by d; else F_c = F."""
+    """Compensator F_c = F + k_v d + b_v v_d while the model has the penetration d; otherwise F_c = F."""
 
     __slots__ = ("_clearance", "_damping", "_stiffness")
 
@@ -25,7 +25,7 @@ class VirtualContact(Compensator):
         self._clearance = clearance
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """Return measured force plus force of the virtual contact [N]."""
+        """Return the sum [N] of the measured force and the virtual contact's force."""
         depth = deflection(position_desired, self._clearance)
         if depth == 0.0:
             return force_measured

@@ -1,8 +1,8 @@
-"""Virtual contact (EPOS; Zebenay, Boge): spring and damper on the commanded motion.
+"""Virtual contact (EPOS; Zebenay, Boge): a virtual spring and damper act on the numerical model.
 
-    F_c = F + k_v d + b_v d',     d the deflection by x_d, d' = v_d, while x_d is in contact
+    F_c = F + k_v d + b_v d' while x_d is in contact,     d the penetration of x_d, d' = v_d
 
-Both act on the numerical model without delay. The operators of the rig chose both by experiment. The nominal
+The virtual forces have no delay. The operators of the EPOS rig chose k_v and b_v by experiment. The nominal
 b_v is the stability limit (notebooks/guide/model.md section 6, item 15), at which the contact neither gains
 nor loses energy; damping of the mechanism is neglected.
 """
@@ -29,9 +29,9 @@ from jaxhil.mechanism.structs import Mechanism
 
 
 def damping_at_the_limit(stiffness: float, frequency: float, delay: float) -> tuple[float, float]:
-    """Return b_v [N s/m] and omega_c [rad/s] at the stability limit of M s^2 + b_v s + k e^(-s tau) = 0.
+    """Compute b_v [N s/m] and omega_c [rad/s] at the stability limit of M s^2 + b_v s + k e^(-s tau) = 0.
 
-    Of several limits it is that of the lowest frequency: with more damping the contact is stable.
+    If there are several limits, return the limit of the lowest frequency: above its b_v, contact is stable.
 
     Args:
         stiffness: k [N/m], above 0.
@@ -39,8 +39,9 @@ def damping_at_the_limit(stiffness: float, frequency: float, delay: float) -> tu
         delay: tau [s], at least 0.
     """
     angle = frequency * delay
-    # cos(u angle) - u^2 decreases and is concave from u = 0 to this share, where it is not positive. Newton's
-    # method therefore approaches the root from above, and passes it only by rounding.
+    # The function cos(u angle) - u^2 decreases and is concave from u = 0 to this initial share, where it is
+    # not positive. Newton's method therefore approaches the root from above, and passes the root only by
+    # rounding.
     share = min(1.0, math.pi / 2 / angle) if angle > 0 else 1.0
     for _ in range(100):
         excess = math.cos(share * angle) - share**2
@@ -57,7 +58,7 @@ def _nominal_damping(mechanism: Mechanism) -> float:
 
 
 class VirtualContact(Compensator):
-    """Compensator F_c = F + k_v d + b_v d' on the commanded motion; see the module's docstring."""
+    """Compensator F_c = F + k_v d + b_v d' for the penetration d of the model; see the module's docstring."""
 
     name: ClassVar[str] = "virtual_contact"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, SIMULATOR_LAG, STIFFNESS, CONTACT_FREQUENCY)

@@ -1,1 +1,1 @@
-"""Position and velocity as old as the measured force."""
+"""Alignment: measured position and velocity, delayed like the force measurement."""

@@ -1,4 +1,4 @@
-"""Alignment of the measured position with the force: position and velocity as old as the force reading."""
+"""Alignment: measured position and velocity, delayed like the force measurement."""
 
 from typing import Annotated
 
@@ -7,7 +7,7 @@ from jaxhil.rig.types import Positive
 
 
 class Alignment:
-    """Position and velocity of the hardware, delayed like the force by `delay` [s]."""
+    """Delay of the measured position and velocity by the force delay `delay` [s]."""
 
     __slots__ = ("_last", "_line", "_middle", "_period", "_share")
     _line: Annotated[DelayLine, "identification_delay"]
@@ -15,16 +15,19 @@ class Alignment:
 
     def __init__(self, delay: float, period: Positive) -> None:
         self._period = period
-        # The line delays by one tick less, so that the velocity can be a central difference.
+        # The delay of the line is shorter by one tick, so that the velocity can be a central difference.
         self._line = DelayLine(max(delay - period, 0.0), period)
         self._share = min(delay / period, 1.0)
         self._middle = 0.0
         self._last = 0.0
 
     def step(self, position: float, velocity: float, begins: bool) -> tuple[float, float]:
-        """Return delayed position [m] and velocity [m/s].
+        """Return the delayed position [m] and velocity [m/s].
 
-        `position` [m] is measured on this tick. A run `begins` in uniform motion at `velocity` [m/s].
+        Args:
+            position: position measured on this tick [m].
+            velocity: velocity of the numerical model [m/s]; the motion before the run is uniform.
+            begins: whether a run begins on this tick.
         """
         period = self._period
         if begins:

@@ -1,4 +1,4 @@
-"""Alignment of the measured position with the force: position and velocity as old as the force reading."""
+"""Alignment in JAX: measured position and velocity, delayed like the force measurement."""
 
 from typing import NamedTuple
 
@@ -9,18 +9,18 @@ from jaxhil.laws.simulation_base import Signals
 
 
 class Aligned(NamedTuple):
-    """Measured positions of the last tick."""
+    """State of the alignment: two delayed positions; tau is the force delay."""
 
-    middle: Float[Array, "*batch"]  # delayed by tau on this tick [m]
-    last: Float[Array, "*batch"]  # delayed by tau + T on this tick [m]
+    middle: Float[Array, "*batch"]  # on the next tick, the position measured tau ago [m]
+    last: Float[Array, "*batch"]  # on the next tick, the position measured tau + T ago [m]
 
 
 def align(
     old: Aligned, newest: Array, share: Array, signals: Signals, period: Array
 ) -> tuple[Array, Array, Aligned]:
-    """Return measured position [m] and velocity [m/s], as old as the force, and the state.
+    """Return the measured position [m] and velocity [m/s], delayed like the force, and the next state.
 
-    `newest` is the position [m] measured one tick less than the delay ago.
+    `newest` [m] is the measured position with a delay that is shorter by one tick.
     """
     begins = signals.age == 0
     stride = period * signals.velocity_desired

@@ -1,1 +1,1 @@
-"""Contact model that is estimated from the readings."""
+"""Contact model: force-penetration model that is estimated from the readings during a contact."""

@@ -1,4 +1,4 @@
-"""Contact model: a piecewise-linear force-penetration model with dissipation, fitted while contact lasts.
+"""Contact model: piecewise-linear force-penetration model with dissipation, fitted during a contact.
 
     f(x, v, x_m) = preload + sum_j hinge_j max(0, x - kappa_j)
                    + (damping + depth_damping x/REACH) v - unloading (x_m - x)
@@ -6,18 +6,19 @@
 
 x is the depth, v the speed and x_m the largest depth so far. All values are scaled by the approach speed v0
 and the equivalent mass M: depth x/v0 [s], speed v/v0 [1], force F/(M v0) [1/s]. The slope at a depth is the
-sum of the hinges of smaller knots, so that slopes which change by independent amounts from knot to knot have
-a diagonal prior covariance. The parameters theta are estimated by recursive least squares.
+sum of all hinges whose knots kappa_j are smaller. Changes of the slope at the knots are a priori independent,
+so that the prior covariance of the hinges is diagonal. Recursive least squares estimates the parameters
+theta.
 
-A force that is older than specified by d adds d k(x) (1 - v) to the readings, k being the slope; d is the
-last parameter. A damper looks like a newer force, so that d is used only once contact is over
-(`estimate_delay`). Then the posterior is a mixture of two models, with and without dissipation, weighted by
-prior odds and evidence. The larger the squared innovations, the less the readings count.
+The last parameter is d, the delay of the force beyond the specified delay. It adds d k(x) (1 - v) to the
+readings, where k is the slope. Because damping has a similar effect with the opposite sign, d is estimated
+only after the contact (`estimate_delay`). Then the posterior is a mixture of two models, with and without
+dissipation, weighted by prior odds and evidence. Large squared innovations reduce the weight of the readings.
 
-Sources: recursive least squares, Ljung, "System Identification" (1999), section 11.2; a parameter that is
-zero with a given probability, Mitchell and Beauchamp, "Bayesian variable selection in linear regression"
-(1988); moments of a factor that is not normal, Minka, "Expectation propagation" (2001); the probability of a
-model by the density at zero, Dickey, "The weighted likelihood ratio" (1971).
+Sources: recursive least squares, Ljung, "System Identification" (1999), section 11.2; prior with a positive
+probability of zero, Mitchell and Beauchamp, "Bayesian variable selection in linear regression" (1988);
+moments of a non-normal factor, Minka, "Expectation propagation" (2001); Bayes factor from the density at
+zero, Dickey, "The weighted likelihood ratio" (1971).
 """
 
 from collections.abc import Sequence
@@ -27,35 +28,40 @@ from typing import Annotated
 
 from jaxhil.rig.types import Count, Positive
 
-KNOTS = (0.0, 0.003, 0.008, 0.015, 0.024, 0.034, 0.046, 0.06, 0.076, 0.1, 0.12)  # s; the slope changes there
+KNOTS = (0.0, 0.003, 0.008, 0.015, 0.024, 0.034, 0.046, 0.06, 0.076, 0.1, 0.12)  # s; depths of slope changes
 HINGES = len(KNOTS)
 PARAMETERS = HINGES + 6
 DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION, PRELOAD, DELAY = range(HINGES, PARAMETERS)
-DISSIPATIVE = (DAMPING, DEPTH_DAMPING, UNLOADING)  # parameters that are zero or positive
-CONCLUDED = (*DISSIPATIVE, DELAY)  # parameters that are conditioned during contact
-DELAY_PARAMETERS = (*CONCLUDED, 0, PRELOAD)  # parameters in the estimate of the delay
-WANDER = 0.03  # s; over this depth the slope changes by one prior standard deviation
-REACH = 0.03  # s; depth at which depth_damping counts like damping
-SLOW = 0.03  # speed at which friction changes its sign
-# Prior variance of each parameter but the delay: index of its standard deviation in `Spreads`, and factor.
+DISSIPATIVE = (DAMPING, DEPTH_DAMPING, UNLOADING)  # indices of parameters that are zero or positive
+CONCLUDED = (*DISSIPATIVE, DELAY)  # indices of parameters that `conclude` constrains
+DELAY_PARAMETERS = (*CONCLUDED, 0, PRELOAD)  # indices of parameters in the estimate of the delay
+WANDER = 0.03  # s; depth over which the slope changes by one prior standard deviation
+REACH = 0.03  # s; depth at which depth_damping and damping have the same effect
+SLOW = 0.03  # [1]; speed below which friction changes its sign smoothly
+# The prior variance of a parameter (except the delay) is a squared entry of `Spreads`, selected by
+# `SPREAD_INDICES`, times the parameter's entry of `FACTORS`.
 SPREAD_INDICES = (0, *[1] * (HINGES - 1), 2, 3, 4, 5, 6)
 FACTORS = (1.0, *[(deeper - depth) / WANDER for depth, deeper in pairwise(KNOTS)], *[1.0] * 5)
-ZERO_PROBABILITY = 0.75  # prior probability that a dissipative parameter is zero
+ZERO_PROBABILITY = 0.75  # [1]; prior probability that a dissipative parameter is zero
 ODDS = ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi)
-ELASTIC_ODDS = 19.0  # prior odds of contact without dissipation
-WIDE_STIFFNESS = (200.0, 300.0)  # 1/s^2; prior mean and spread of the first slope in `estimate_delay`
-SURPLUS = 1.4  # factor of the readings' variance, because the misfits of one contact are correlated
-EXACT = 1e18  # precision of a parameter that is known
-LEAST_VARIANCE = 1e-12  # of a dissipative parameter; with less it counts as known
+ELASTIC_ODDS = 19.0  # [1]; prior odds of a contact without dissipation
+WIDE_STIFFNESS = (200.0, 300.0)  # 1/s^2; prior mean and deviation of the first slope in `estimate_delay`
+SURPLUS = 1.4  # [1]; increases the readings' variance, because errors of the model are correlated
+EXACT = 1e18  # 1/variance of a parameter that is known exactly
+LEAST_VARIANCE = 1e-12  # lower bound of a parameter's variance, avoids division by 0
 Vector = Annotated[list[float], PARAMETERS]
 Matrix = Annotated[list[list[float]], PARAMETERS, PARAMETERS]
 Spreads = Annotated[list[float], 7]
 
 
 def features(depth: float, speed: float, deepest: float, delay_effect: float) -> Vector:
-    """Return the features phi, so that the force is phi.theta; zeros out of contact.
+    """Return the regressor phi of the contact model, whose force is phi.theta; zeros out of contact.
 
-    Arguments are depth [s], speed [1], largest depth so far [s] and effect of the delay, k (1 - v) [1/s^2].
+    Args:
+        depth: depth x [s].
+        speed: speed v [1].
+        deepest: largest depth x_m so far [s].
+        delay_effect: derivative k (1 - v) of the force with respect to the delay [1/s^2].
     """
     if not depth > 0.0:
         return [0.0] * PARAMETERS
@@ -66,7 +72,7 @@ def features(depth: float, speed: float, deepest: float, delay_effect: float) ->
 
 
 def force(theta: Sequence[float], depth: float, speed: float, deepest: float) -> float:
-    """Return the force [1/s] of the parameters `theta`, which is phi.theta without a delay."""
+    """Return the force [1/s] of the contact model with parameters `theta` and no delay."""
     if not depth > 0.0:
         return 0.0
     total = theta[PRELOAD]
@@ -82,7 +88,7 @@ def force(theta: Sequence[float], depth: float, speed: float, deepest: float) ->
 
 
 def slope(theta: Sequence[float], depth: float) -> float:
-    """Return the slope [1/s^2] at a depth [s], at least 0."""
+    """Return the contact model's slope [1/s^2] at a depth [s], at least 0."""
     total = 0.0
     for hinge, knot in zip(theta, KNOTS, strict=False):
         if not depth > knot:
@@ -92,13 +98,13 @@ def slope(theta: Sequence[float], depth: float) -> float:
 
 
 class ContactModel:
-    """Estimate of the parameters theta.
+    """Recursive least-squares estimate of the contact model's parameters theta.
 
     Attributes:
-        mean: posterior mean, dissipative parameters of either sign.
-        covariance: posterior covariance.
-        theta: posterior mean, dissipative parameters zero or positive.
-        count: number of readings.
+        mean: posterior mean without constraints.
+        covariance: posterior covariance without constraints.
+        theta: posterior mean with dissipative parameters that are zero or positive.
+        count: number of readings in the estimate.
     """
 
     __slots__ = ("_prior_mean", "_squares", "_variances", "count", "covariance", "mean", "theta")
@@ -107,11 +113,14 @@ class ContactModel:
     theta: Vector
 
     def restart(self, stiffness: float, spreads: Spreads, delay_variance: float) -> None:
-        """Return to the prior.
+        """Set the estimate to the prior.
 
-        `stiffness` [1/s^2] is the prior mean of the slope at depth 0; `spreads` are the standard deviations
-        of that slope [1/s^2], of its change over `WANDER` [1/s^2], of damping [1/s], depth damping [1/s],
-        unloading [1/s^2], friction [1/s] and preload [1/s]; `delay_variance` is in s^2.
+        Args:
+            stiffness: prior mean of the slope at depth 0 [1/s^2].
+            spreads: prior standard deviations of the slope at depth 0 [1/s^2], the change of the slope over
+                `WANDER` [1/s^2], damping [1/s], depth damping [1/s], unloading [1/s^2], friction [1/s] and
+                preload [1/s].
+            delay_variance: prior variance of the delay [s^2].
         """
         variances = [0.0] * PARAMETERS
         for j in range(DELAY):
@@ -127,16 +136,16 @@ class ContactModel:
         self.covariance = [[0.0] * PARAMETERS for _ in range(PARAMETERS)]
         for j, variance in enumerate(variances):
             self.covariance[j][j] = variance
-        self._squares = 0.0  # sum of squared innovations over their variances
+        self._squares = 0.0  # sum of squared innovations, each divided by its variance
         self.count = 0.0
 
     def learn(self, phi: Vector, force: float, variance: float) -> None:
-        """Update the estimate with one reading of the force [1/s] whose noise has this variance [1/s^2]."""
+        """Update the estimate with one force reading [1/s] with the noise variance `variance` [1/s^2]."""
         covariance = self.covariance
         column = [dot(row, phi) for row in covariance]
         total = variance + dot(phi, column)
         if not total > 0.0:
-            return  # rounding has spoilt the covariance
+            return  # the covariance is not positive because of rounding
         share = 1.0 / total
         error = force - dot(phi, self.mean)
         self.mean = [mean + entry * (share * error) for mean, entry in zip(self.mean, column, strict=True)]
@@ -147,7 +156,7 @@ class ContactModel:
         self.count += 1.0
 
     def conclude(self, delay: float) -> None:
-        """Compute `theta` for a known delay [s]."""
+        """Compute `theta` from the estimate, for a known `delay` [s] and non-negative dissipation."""
         theta = list(self.mean)
         rows = [list(self.covariance[j]) for j in CONCLUDED]
         observe(theta, rows, len(DISSIPATIVE), DELAY, EXACT * delay, EXACT)
@@ -157,14 +166,17 @@ class ContactModel:
         self.theta = theta
 
     def estimate_delay(self, preload: float, preload_spread: float) -> tuple[float, float]:
-        """Return mean [s] and variance [s^2] of the delay after a contact.
+        """Estimate the delay d after a contact; return its mean [s] and variance [s^2].
 
-        `preload` and `preload_spread` [1/s] are mean and standard deviation of the force at the onset.
+        Args:
+            preload: prior mean of the force at the onset [1/s].
+            preload_spread: prior standard deviation of the force at the onset [1/s].
         """
         mean = [self.mean[j] for j in DELAY_PARAMETERS]
         rows = [[self.covariance[i][j] for j in DELAY_PARAMETERS] for i in DELAY_PARAMETERS]
         last = len(DISSIPATIVE)  # index of the delay
-        # The prior for control reduces the slope of a stiff contact, which would look like a damper.
+        # Replace the prior of the first slope: it reduces the slope of a stiff contact, which looks like
+        # damping.
         for index in range(last + 1, last + 3):
             j = DELAY_PARAMETERS[index]
             value = WIDE_STIFFNESS[0] if j == 0 else preload
@@ -181,11 +193,11 @@ class ContactModel:
             ratio = max(self._variances[DAMPING + index], LEAST_VARIANCE) / variance
             evidence += 0.5 * (log(ratio) - mean[index] * mean[index] / (variance * excess))
             observe(mean, rows, index, index, 0.0, EXACT)
-        odds = exp(min(max(evidence, -50.0), 50.0))  # of elastic contact by the readings alone
+        odds = exp(min(max(evidence, -50.0), 50.0))  # odds of an elastic contact, from the readings alone
         share = ELASTIC_ODDS * odds / (1.0 + ELASTIC_ODDS * odds)
         difference = mean[last] - lossy[last]
         delay = lossy[last] + share * difference
-        share = odds / (1.0 + odds)  # the variance does not rely on the prior odds
+        share = odds / (1.0 + odds)  # the variance shall not depend on the prior odds
         variance = lossy_rows[last][last] + share * (rows[last][last] - lossy_rows[last][last])
         variance += share * (1.0 - share) * (difference * difference)
         prior_variance = self._variances[DELAY]
@@ -195,9 +207,13 @@ class ContactModel:
         return weakened * delay / variance / (excess * excess), weakened
 
     def _dissipate(self, mean: list[float], rows: list[list[float]], first: Count, certain: bool) -> None:
-        """Make dissipative parameters zero or positive, in place, in mean and rows of the covariance.
+        """Constrain the dissipative parameters to zero or positive values, in place.
 
-        They have the first rows, and the indices from `first` on. If `certain`, they are known afterwards.
+        Args:
+            mean: mean of some parameters.
+            rows: rows of the covariance; the first rows are those of the dissipative parameters.
+            first: index of the first dissipative parameter in `mean` and in a row.
+            certain: whether the constrained parameters count as exactly known.
         """
         for row in range(len(DISSIPATIVE)):
             index = first + row
@@ -210,10 +226,15 @@ class ContactModel:
 def observe(
     mean: list[float], rows: list[list[float]], row: Count, index: Count, information: float, precision: float
 ) -> None:
-    """Update mean and rows of the covariance, in place, by an observation of one parameter.
+    """Condition a normal distribution, in place, on an observation of one parameter.
 
-    The parameter has a `row` and an `index` in mean and rows. An observed value with a variance has the
-    precision 1/variance and the information value/variance; negative ones remove a prior.
+    Args:
+        mean: mean of the parameters.
+        rows: rows of the covariance.
+        row: row of the observed parameter.
+        index: index of the observed parameter in `mean` and in a row.
+        information: observed value, divided by its variance.
+        precision: 1/variance of the observed value; negative to remove an earlier observation.
     """
     observed = list(rows[row])
     total = 1.0 + precision * observed[index]
@@ -229,8 +250,13 @@ def observe(
 def zero_or_positive(mean: float, variance: Positive, prior_variance: float) -> tuple[float, float]:
     """Return posterior mean and variance of a parameter that is zero with `ZERO_PROBABILITY` or positive.
 
-    `mean` and `variance` are those of the posterior without this constraint. Boyd's bound of Mills' ratio,
-    pi/((pi - 1) t + sqrt(t^2 + 2 pi)), approximates the tail of the normal distribution.
+    Boyd's bound of Mills' ratio, pi/((pi - 1) t + sqrt(t^2 + 2 pi)), approximates the tail of the normal
+    distribution.
+
+    Args:
+        mean: posterior mean without the constraint.
+        variance: posterior variance without the constraint.
+        prior_variance: prior variance without the constraint.
     """
     spread = sqrt(variance)
     ratio = mean / spread
@@ -245,7 +271,7 @@ def zero_or_positive(mean: float, variance: Positive, prior_variance: float) -> 
 
 
 def dot(left: Sequence[float], right: Sequence[float]) -> float:
-    """Return the sum of products, added from the first to the last."""
+    """Return the scalar product, added from the first term to the last."""
     total = 0.0
     for first, second in zip(left, right, strict=True):
         total += first * second

@@ -1,6 +1,6 @@
-"""Contact model in JAX: batched estimate, force and features of `rig.py` in this folder.
+"""Contact model in JAX: batched version of `rig.py` in this folder.
 
-`rig.py` states model, equations, arguments and sources. The first axis of arrays is that of the parameters.
+`rig.py` states model, equations, arguments and sources. The first axis of an array is that of the parameters.
 """
 
 import math
@@ -18,31 +18,31 @@ from jaxhil.laws.impulse_ledger.contact_model.rig import DAMPING, DELAY, DISSIPA
 
 
 class ContactModelEstimate(NamedTuple):
-    """Estimate of the parameters theta; attributes as of `ContactModel`."""
+    """Recursive least-squares estimate of the contact model's parameters theta."""
 
-    mean: Float[Array, "parameters *batch"]
-    covariance: Float[Array, "parameters parameters *batch"]
-    theta: Float[Array, "parameters *batch"]
-    squares: Float[Array, "*batch"]  # sum of squared innovations over their variances
-    count: Float[Array, "*batch"]
+    mean: Float[Array, "parameters *batch"]  # posterior mean without constraints
+    covariance: Float[Array, "parameters parameters *batch"]  # posterior covariance without constraints
+    theta: Float[Array, "parameters *batch"]  # posterior mean with dissipative parameters >= 0
+    squares: Float[Array, "*batch"]  # sum of squared innovations, each divided by its variance
+    count: Float[Array, "*batch"]  # number of readings in the estimate
 
 
 def prior(stiffness: Array, spreads: Sequence[Array], delay_variance: Array) -> tuple[Array, Array]:
-    """Return prior mean and variances."""
+    """Return prior means and variances of the parameters; arguments as in `rig.ContactModel.restart`."""
     variances = [spreads[k] ** 2 * factor for k, factor in zip(rig.SPREAD_INDICES, rig.FACTORS, strict=True)]
     mean = jnp.stack([stiffness, *[jnp.zeros_like(stiffness)] * (PARAMETERS - 1)])
     return mean, jnp.stack([*variances, delay_variance])
 
 
 def begin(mean: Array, variances: Array) -> ContactModelEstimate:
-    """Return the estimate before contact, from the prior's mean and variances."""
+    """Return the estimate before a contact from the prior means and variances."""
     zeros = jnp.zeros_like(mean[0])
     identity = np.eye(PARAMETERS, dtype=bool).reshape(PARAMETERS, PARAMETERS, *[1] * zeros.ndim)
     return ContactModelEstimate(mean, jnp.where(identity, variances[None], 0), mean, zeros, zeros)
 
 
 def features(depth: Array, speed: Array, deepest: Array, delay_effect: Array) -> Array:
-    """Return the features phi, so that the force is phi.theta; zeros out of contact."""
+    """Return the regressor phi of the contact model, whose force is phi.theta; zeros out of contact."""
     hinges = [jnp.where(depth > knot, depth - knot, 0) for knot in rig.KNOTS]
     turning = speed / jnp.sqrt(speed * speed + rig.SLOW * rig.SLOW)
     losses = [speed, depth * speed / rig.REACH, jnp.where(depth < deepest, depth - deepest, 0), turning]
@@ -50,12 +50,12 @@ def features(depth: Array, speed: Array, deepest: Array, delay_effect: Array) ->
 
 
 def force(theta: Array, depth: Array, speed: Array, deepest: Array) -> Float[Array, "*batch"]:
-    """Return the force [1/s] of the parameters `theta`, which is phi.theta without a delay."""
+    """Return the force [1/s] of the contact model with parameters `theta` and no delay."""
     return dot(theta, features(depth, speed, deepest, jnp.zeros_like(depth)))
 
 
 def slope(theta: Array, depth: Array) -> Float[Array, "*batch"]:
-    """Return the slope [1/s^2] at a depth [s], at least 0."""
+    """Return the contact model's slope [1/s^2] at a depth [s], at least 0."""
     total = reduce(
         add, (jnp.where(depth > knot, hinge, 0) for hinge, knot in zip(theta, rig.KNOTS, strict=False))
     )
@@ -65,10 +65,10 @@ def slope(theta: Array, depth: Array) -> Float[Array, "*batch"]:
 def learn(
     old: ContactModelEstimate, phi: Array, force: Array, variance: Array, used: Bool[Array, "*batch"]
 ) -> ContactModelEstimate:
-    """Update the estimate, where `used`, with one reading of the force [1/s] of this variance [1/s^2]."""
+    """Update the estimate on the lanes `used` with a force reading [1/s] and its noise variance [1/s^2]."""
     column = reduce(add, (old.covariance[j] * phi[j][None] for j in range(PARAMETERS)))
     total = variance + dot(phi, column)
-    used = used & (total > 0)  # unless rounding has spoilt the covariance
+    used = used & (total > 0)  # false if the covariance is not positive because of rounding
     share = jnp.where(used, 1 / jnp.where(used, total, 1), 0)
     error = force - dot(phi, old.mean)
     return ContactModelEstimate(
@@ -83,7 +83,7 @@ def learn(
 def conclude(
     estimate: ContactModelEstimate, prior_variances: Array, delay: Array
 ) -> Float[Array, "parameters *batch"]:
-    """Return theta for a known delay [s], with dissipative parameters zero or positive."""
+    """Return theta from the estimate, for a known `delay` [s] and non-negative dissipation."""
     rows = [estimate.covariance[j] for j in rig.CONCLUDED]
     mean, rows = _observe(estimate.mean, rows, len(DISSIPATIVE), DELAY, rig.EXACT * delay, rig.EXACT)
     theta, _ = _dissipate(mean, rows, DAMPING, prior_variances, True)
@@ -94,7 +94,7 @@ def conclude(
 def estimate_delay(
     estimate: ContactModelEstimate, prior_mean: Array, variances: Array, preload: Array, preload_spread: Array
 ) -> tuple[Array, Array]:
-    """Return mean [s] and variance [s^2] of the delay after a contact."""
+    """Estimate the delay d after a contact; return its mean [s] and variance [s^2]."""
     mean = jnp.stack([estimate.mean[j] for j in rig.DELAY_PARAMETERS])
     rows = [
         jnp.stack([estimate.covariance[i, j] for j in rig.DELAY_PARAMETERS]) for i in rig.DELAY_PARAMETERS
@@ -114,11 +114,11 @@ def estimate_delay(
         ratio = _above(variances[DAMPING + index], rig.LEAST_VARIANCE) / variance
         evidence += 0.5 * (jnp.log(ratio) - mean[index] ** 2 / (variance * excess))
         mean, rows = _observe(mean, rows, index, index, 0.0, rig.EXACT)
-    odds = jnp.exp(jnp.clip(evidence, -50, 50))  # of elastic contact by the readings alone
+    odds = jnp.exp(jnp.clip(evidence, -50, 50))  # odds of an elastic contact, from the readings alone
     share = rig.ELASTIC_ODDS * odds / (1 + rig.ELASTIC_ODDS * odds)
     difference = mean[last] - lossy[last]
     delay = lossy[last] + share * difference
-    share = odds / (1 + odds)  # the variance does not rely on the prior odds
+    share = odds / (1 + odds)  # the variance shall not depend on the prior odds
     variance = lossy_rows[last][last] + share * (rows[last][last] - lossy_rows[last][last])
     variance = variance + share * (1 - share) * difference**2
     usable = (variance > 0) & (variance < variances[DELAY])
@@ -131,7 +131,7 @@ def estimate_delay(
 def _dissipate(
     mean: Array, rows: list[Array], first: int, prior_variances: Array, certain: bool
 ) -> tuple[Array, list[Array]]:
-    """Return mean and rows of the covariance with dissipative parameters zero or positive."""
+    """Return mean and covariance rows with the dissipative parameters constrained to zero or positive."""
     for row in range(len(DISSIPATIVE)):
         index = first + row
         variance = _above(rows[row][index], rig.LEAST_VARIANCE)
@@ -144,7 +144,7 @@ def _dissipate(
 def _observe(
     mean: Array, rows: list[Array], row: int, index: int, information: Array | float, precision: Array | float
 ) -> tuple[Array, list[Array]]:
-    """Return mean and rows of the covariance after an observation of one parameter."""
+    """Return mean and covariance rows, conditioned on an observation of one parameter."""
     observed = rows[row]
     total = 1 + precision * observed[index]
     share = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
@@ -153,7 +153,7 @@ def _observe(
 
 
 def zero_or_positive(mean: Array, variance: Array, prior_variance: Array) -> tuple[Array, Array]:
-    """Return posterior mean and variance of a parameter that is zero or positive."""
+    """Return posterior mean and variance of a parameter that is zero with `ZERO_PROBABILITY` or positive."""
     spread = jnp.sqrt(variance)
     ratio = mean / spread
     size = jnp.abs(ratio)
@@ -169,11 +169,11 @@ def zero_or_positive(mean: Array, variance: Array, prior_variance: Array) -> tup
 def dot(left: Array, right: Array) -> Array:
     """Return the sum of products over the first axis, added term by term.
 
-    The compiler computes this sum within the loop over lanes, but a reduction in a loop of its own.
+    XLA fuses these additions with the loop over the lanes; a reduction would be a separate loop.
     """
     return reduce(add, (left[j] * right[j] for j in range(len(left))))
 
 
 def _above(value: Array, least: float) -> Array:
-    """Return the larger of value and `least`."""
+    """Return the larger of `value` and `least`."""
     return jnp.where(value > least, value, least)

@@ -1,1 +1,1 @@
-"""Onset detection by a cumulative sum."""
+"""Detection of the onset of contact by a cumulative sum of force readings."""

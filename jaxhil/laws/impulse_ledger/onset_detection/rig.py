@@ -1,28 +1,28 @@
-"""Onset detection by a cumulative sum of force readings, with bias and noise of the sensor in free flight.
+"""Detection of the onset of contact by a cumulative sum (CUSUM) of force readings.
 
-    S = max(0, S + (y - bias)/sigma - DRIFT),    contact is detected at S > LEVEL
+    S = max(0, S + (y - bias)/sigma - DRIFT),    contact is detected if S > LEVEL
 
-y is the force in the direction in which the surface pushes. Its bias and standard deviation sigma are those
-of the readings of this run with S = 0. Contact begins after the last reading with S = 0 before the detection.
+y is the force reading; the surface pushes in its positive direction. The readings of this run with S = 0 give
+the bias and the standard deviation sigma. The onset is after the last reading with S = 0.
 
 Source: Page, "Continuous inspection schemes", Biometrika 41 (1954).
 """
 
 from math import sqrt
 
-DRIFT = 2.0  # standard deviations; a reading increases S if it exceeds the bias by more
-LEVEL = 8.0  # sum at which contact is detected
-SETTLING = 0.004  # s; until then after the start of a run, readings only serve the bias
-LONGEST_MEAN = 2000.0  # readings; longest time scale of the mean of the bias
-FEW = 9.0  # readings; with more, their differences show the noise
+DRIFT = 2.0  # standard deviations; only a reading with a larger excess over the bias increases S
+LEVEL = 8.0  # standard deviations; contact is detected when S exceeds this level
+SETTLING = 0.004  # s; no detection during this time after the start of a run
+LONGEST_MEAN = 2000.0  # readings; limits the memory of the bias, which may drift slowly
+FEW = 9.0  # readings; with fewer, sigma is the specified noise
 
 
 class OnsetDetector:
-    """Detector of the onset of contact.
+    """Detector of the onset of contact by a cumulative sum of force readings.
 
     Attributes:
-        bias: mean of the readings in free flight [N].
-        total: the cumulative sum S; 0 in free flight.
+        bias: bias of the force sensor, the mean of the readings in free flight [N].
+        total: cumulative sum S [1]; 0 in free flight.
     """
 
     __slots__ = ("_before", "_count", "_known", "_square", "bias", "total")
@@ -32,7 +32,7 @@ class OnsetDetector:
         self.restart()
 
     def restart(self) -> None:
-        """Begin a run: forget the readings of bias and noise; keep the specified noise."""
+        """Begin a run: forget the estimates of bias and noise, but keep the specified noise."""
         self._count = 0.0
         self._square = 0.0
         self._before = 0.0
@@ -41,13 +41,17 @@ class OnsetDetector:
 
     @property
     def variance(self) -> float:
-        """Return the variance of a force reading [N^2]: as specified, or larger as seen in free flight."""
+        """Return the noise variance of a force reading [N^2]: specified, or if larger, from free flight."""
         return max(self._known, self._square) if self._count > FEW else self._known
 
     def watch(self, force: float, side: float, floor: float, settled: bool) -> None:
-        """Add one reading of the force [N] to the cumulative sum, or set it to 0 unless `settled`.
+        """Update the cumulative sum with one force reading [N].
 
-        `side` is the sign of a pushing force; `floor` [N] is added to the noise's standard deviation.
+        Args:
+            force: force reading [N].
+            side: sign of a force with which the surface pushes, 1 or -1.
+            floor: force that is added to the standard deviation of the noise [N].
+            settled: whether a contact may be detected; otherwise the sum is set to 0.
         """
         if not settled:
             self.total = 0.0
@@ -56,7 +60,7 @@ class OnsetDetector:
         self.total = total if total > 0.0 else 0.0
 
     def learn(self, force: float) -> None:
-        """Update bias and noise with one reading [N] of free flight."""
+        """Update the estimates of bias and noise with one force reading [N] of free flight."""
         if self._count > 0.0:
             step = force - self._before
             self._square += (0.5 * (step * step) - self._square) / self._count

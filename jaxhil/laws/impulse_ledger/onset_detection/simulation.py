@@ -1,4 +1,4 @@
-"""Onset detection in JAX: the batched cumulative sum of `rig.py` in this folder."""
+"""Onset detection in JAX: batched version of `rig.py` in this folder."""
 
 from typing import NamedTuple
 
@@ -9,29 +9,29 @@ from jaxhil.laws.impulse_ledger.onset_detection.rig import DRIFT, FEW, LONGEST_M
 
 
 class FreeFlight(NamedTuple):
-    """Statistics of readings in free flight, and the cumulative sum."""
+    """Statistics of the force readings in free flight, and the cumulative sum of the onset detection."""
 
-    count: Float[Array, "*batch"]  # number of readings
-    square: Float[Array, "*batch"]  # mean of half the squared differences of readings [N^2]
+    count: Float[Array, "*batch"]  # number of readings in free flight
+    square: Float[Array, "*batch"]  # noise variance, from half the squared differences of readings [N^2]
     before: Float[Array, "*batch"]  # last reading [N]
     bias: Float[Array, "*batch"]  # mean of the readings [N]
     total: Float[Array, "*batch"]  # cumulative sum S [1]
 
 
 def variance(flight: FreeFlight, noise: Array) -> Float[Array, "*batch"]:
-    """Return the variance of a force reading [N^2]: as specified, or larger as seen in free flight."""
+    """Return the noise variance of a force reading [N^2]: specified, or if larger, from free flight."""
     specified = noise**2
     return jnp.where((flight.count > FEW) & (flight.square > specified), flight.square, specified)
 
 
 def watch(flight: FreeFlight, deviation: Array, settled: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return the cumulative sum after a reading whose pushing force over sigma is `deviation`."""
+    """Return the next cumulative sum; `deviation` is the reading minus the bias, divided by sigma."""
     total = flight.total + deviation - DRIFT
     return jnp.where(settled & (total > 0), total, 0)
 
 
 def learn(old: FreeFlight, force: Array) -> FreeFlight:
-    """Update bias and noise with one reading [N] of free flight."""
+    """Update the estimates of bias and noise with one force reading [N] of free flight."""
     step = force - old.before
     change = (0.5 * (step * step) - old.square) / jnp.maximum(old.count, 1)
     square = old.square + jnp.where(old.count > 0, change, 0)

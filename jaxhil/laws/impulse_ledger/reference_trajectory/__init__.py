@@ -1,1 +1,1 @@
-"""Reference trajectory and its sensitivities."""
+"""Reference trajectory: desired motion of the numerical model at the time of the force readings."""

@@ -1,15 +1,15 @@
-"""Reference trajectory: the motion that the numerical model should have had at the time of the force reading.
+"""Reference trajectory: motion that the numerical model should have at the time of the force readings.
 
     x_r'' = -F_r,    F_r = max(f(x_r, v_r) + y - f(X, V), min(0, y))
 
-f is the contact model, (X, V) the hardware's motion, as old as the reading y. The trajectory is integrated
-once, from the onset on. When the estimate of the model's parameters changes by d theta, the sensitivities
-s = d x_r/d theta, which are integrated as well, correct it:
+f is the contact model, and (X, V) is the motion of the hardware, delayed like the reading y. The trajectory
+is integrated once, from the onset on. When the estimate of the contact model's parameters changes by d theta,
+the sensitivities s = d x_r/d theta correct the trajectory:
 
     x_r += s.d theta,   v_r += s'.d theta,   s'' = -[phi(x_r, v_r) - phi(X, V) + k s + b s']
 
-k and b are slope and damping of the contact model at x_r. `bridge` continues the trajectory to the present.
-All values are scaled as in `contact_model`.
+k and b are the slope and the damping of the contact model at x_r. `bridge` continues the trajectory to the
+present. All values are scaled as in `contact_model`.
 
 Source: sensitivity equations, Khalil, "Nonlinear Systems" (2002), section 3.3.
 """
@@ -31,18 +31,18 @@ from jaxhil.laws.impulse_ledger.contact_model.rig import (
     slope,
 )
 
-STEPS = 12  # of the integration from the last reading to the present
-FASTEST = 2.0  # largest speed [1]; contact returns no more energy than it took
-FARTHEST = 10.0  # s; largest depth, three times that of a contact of 0.05 Hz
+STEPS = 12  # number of integration steps from the last reading to the present
+FASTEST = 2.0  # [1]; limits the speed, which without added energy is at most 1
+FARTHEST = 10.0  # s; limits the depth; three times the depth of a contact with 0.05 Hz
 
 
 class ReferenceTrajectory:
-    """State of the reference trajectory at the time of the last reading.
+    """Reference trajectory with its sensitivities, at the time of the last reading.
 
     Attributes:
-        depth: depth [s].
-        speed: speed [1].
-        force: force [1/s].
+        depth: depth x_r [s].
+        speed: speed v_r [1].
+        force: force F_r [1/s].
         deepest: largest depth so far [s].
         released: whether the trajectory has left the surface.
     """
@@ -53,7 +53,7 @@ class ReferenceTrajectory:
         self.begin(0.0, [0.0] * PARAMETERS)
 
     def begin(self, depth: float, theta: Vector) -> None:
-        """Begin at the onset, at a depth [s] and the speed 1, with the parameters `theta`."""
+        """Start the trajectory at the onset with a depth [s], the speed 1 and the parameters `theta`."""
         self.depth = depth
         self.speed = 1.0
         self.force = 0.0
@@ -62,10 +62,10 @@ class ReferenceTrajectory:
         self._theta = theta
         self._depths = [0.0] * PARAMETERS  # s
         self._speeds = [0.0] * PARAMETERS  # s'
-        self._losses = [0.0] * (PRELOAD - DAMPING)  # mechanical work of each feature that dissipates
+        self._losses = [0.0] * (PRELOAD - DAMPING)  # mechanical work per unit of each dissipative parameter
 
     def correct(self, theta: Vector) -> None:
-        """Correct the trajectory for new parameters `theta`."""
+        """Correct the trajectory to first order for new parameters `theta` of the contact model."""
         changes = [new - old for new, old in zip(theta, self._theta, strict=True)]
         self._theta = theta
         if not self.released:
@@ -73,7 +73,13 @@ class ReferenceTrajectory:
         self.speed = within(self.speed + dot(self._speeds, changes), FASTEST)
 
     def advance(self, period: float, reading: float, measured: Vector) -> None:
-        """Advance by one control period [s] to the time of a reading [1/s] with the features `measured`."""
+        """Advance the trajectory by one control period to the time of the next reading.
+
+        Args:
+            period: control period [s].
+            reading: force reading y [1/s].
+            measured: regressor phi(X, V) of the hardware's motion.
+        """
         theta = self._theta
         depth = self.depth + period * self.speed - 0.5 * (period * period) * self.force
         speed = self.speed - period * self.force
@@ -94,7 +100,12 @@ class ReferenceTrajectory:
         self.force = push
 
     def spread(self, covariance: Matrix, delay_variance: float) -> float:
-        """Return the standard deviation of the speed, sqrt(s' P s'), for a delay of this variance [s^2]."""
+        """Return the standard deviation of the speed [1], sqrt(s' P s').
+
+        Args:
+            covariance: covariance P of the contact model's parameters.
+            delay_variance: variance of the delay [s^2], which replaces the variance in P.
+        """
         columns = [dot(row, self._speeds) for row in covariance]
         total, variance = dot(self._speeds, columns), covariance[DELAY][DELAY]
         if variance > 0.0:
@@ -103,12 +114,12 @@ class ReferenceTrajectory:
         return sqrt(total) if total > 0.0 else 0.0
 
     def imbalance(self) -> float:
-        """Return the energy lost by the trajectory that the model's dissipation does not explain [1]."""
+        """Return the energy loss of the trajectory minus the dissipation of the contact model [1]."""
         dissipated = dot(self._losses, self._theta[DAMPING:PRELOAD])
         return 0.5 * (1.0 - self.speed * self.speed) - dissipated
 
     def bridge(self, duration: float) -> tuple[float, float]:
-        """Return force [1/s] and speed after a `duration` [s] under the contact model."""
+        """Predict force [1/s] and speed [1] with the contact model, `duration` [s] after the last reading."""
         theta = self._theta
         step = duration / STEPS
         depth, speed, push = self.depth, self.speed, self.force
@@ -129,7 +140,7 @@ class ReferenceTrajectory:
     ) -> None:
         theta, depths, speeds = self._theta, self._depths, self._speeds
         damping = theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH if depth > 0.0 else 0.0
-        # The integration is stable only up to these values.
+        # With larger stiffness or damping, the integration would be unstable.
         stiffness = min(slope(theta, depth), 1.0 / (period * period))
         damping = min(damping, 1.0 / period)
         for j in range(PARAMETERS):
@@ -140,5 +151,5 @@ class ReferenceTrajectory:
 
 
 def within(value: float, limit: float) -> float:
-    """Return the value, limited to -limit to limit."""
+    """Clip the value to the range from -limit to limit."""
     return max(min(value, limit), -limit)

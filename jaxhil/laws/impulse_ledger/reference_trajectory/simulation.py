@@ -1,7 +1,4 @@
-"""Reference trajectory in JAX: batched trajectory, sensitivities and bridge of `rig.py` in this folder.
-
-`rig.py` states equations and source.
-"""
+"""Reference trajectory in JAX: batched version of `rig.py` in this folder, which states the equations."""
 
 from typing import NamedTuple
 
@@ -15,19 +12,22 @@ from jaxhil.laws.impulse_ledger.reference_trajectory.rig import FARTHEST, FASTES
 
 
 class ReferenceTrajectory(NamedTuple):
-    """State of the reference trajectory at the time of the last reading."""
+    """Reference trajectory with its sensitivities, at the time of the last reading."""
 
     depth: Float[Array, "*batch"]  # x_r [s]
     speed: Float[Array, "*batch"]  # v_r [1]
     force: Float[Array, "*batch"]  # F_r [1/s]
     deepest: Float[Array, "*batch"]  # largest depth so far [s]
-    released: Bool[Array, "*batch"]  # whether it has left the surface
+    released: Bool[Array, "*batch"]  # whether the trajectory has left the surface
     depths: Float[Array, "parameters *batch"]  # sensitivities s of the depth
     speeds: Float[Array, "parameters *batch"]  # sensitivities s' of the speed
 
 
 def begin(depth: Array, like: Array) -> ReferenceTrajectory:
-    """Return the trajectory at the onset, at a depth [s]; `like` has the shape of the parameters."""
+    """Return the trajectory at the onset with a depth [s] and the speed 1.
+
+    `like` is an array with the shape of the contact model's parameters.
+    """
     zeros = jnp.zeros_like(depth)
     return ReferenceTrajectory(
         depth, zeros + 1, zeros, depth, zeros > 0, jnp.zeros_like(like), jnp.zeros_like(like)
@@ -35,7 +35,7 @@ def begin(depth: Array, like: Array) -> ReferenceTrajectory:
 
 
 def correct(old: ReferenceTrajectory, changes: Array) -> ReferenceTrajectory:
-    """Return the trajectory corrected for these `changes` of the parameters."""
+    """Correct the trajectory to first order for `changes` of the contact model's parameters."""
     moved = jnp.where(old.released, 0, dot(old.depths, changes))
     speed = jnp.clip(old.speed + dot(old.speeds, changes), -FASTEST, FASTEST)
     return old._replace(depth=jnp.clip(old.depth + moved, -FARTHEST, FARTHEST), speed=speed)
@@ -44,7 +44,15 @@ def correct(old: ReferenceTrajectory, changes: Array) -> ReferenceTrajectory:
 def advance(
     old: ReferenceTrajectory, theta: Array, period: Array, reading: Array, measured: Array
 ) -> ReferenceTrajectory:
-    """Return the trajectory one control period [s] later, at a reading [1/s] with the features `measured`."""
+    """Advance the trajectory by one control period to the time of the next reading.
+
+    Args:
+        old: trajectory at the time of the last reading.
+        theta: parameters of the contact model.
+        period: control period [s].
+        reading: force reading y [1/s].
+        measured: regressor phi(X, V) of the hardware's motion.
+    """
     depth = old.depth + period * old.speed - 0.5 * (period * period) * old.force
     speed = old.speed - period * old.force
     deepest = jnp.where(depth > old.deepest, depth, old.deepest)
@@ -54,7 +62,7 @@ def advance(
     push = dot(theta, undelayed) + (reading - dot(theta, measured))
     push = jnp.where(released, 0, jnp.where(push > least, push, least))
     damping = jnp.where(depth > 0, theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH, 0)
-    # The integration is stable only up to these values.
+    # With larger stiffness or damping, the integration would be unstable.
     stiffness = jnp.minimum(slope(theta, depth), 1 / (period * period))
     damping = jnp.minimum(damping, 1 / period)
     tick, moves = period[None], (push != 0)[None]
@@ -67,7 +75,7 @@ def advance(
 
 
 def bridge(now: ReferenceTrajectory, theta: Array, duration: Array) -> tuple[Array, Array]:
-    """Return force [1/s] and speed after a `duration` [s] under the contact model."""
+    """Predict force [1/s] and speed [1] with the contact model, `duration` [s] after the last reading."""
     step = duration / STEPS
 
     def advanced(_, old):
@@ -80,6 +88,6 @@ def bridge(now: ReferenceTrajectory, theta: Array, duration: Array) -> tuple[Arr
         later = jnp.where(released | (later < 0), 0, later)
         return depth, speed - 0.5 * step * (push + later), later, deepest, released
 
-    # A loop is compiled only once.
+    # XLA compiles the body of this loop only once.
     _, speed, push, _, _ = lax.fori_loop(0, STEPS, advanced, now[:5])
     return push, speed

@@ -1,1 +1,1 @@
-"""Parts of the impulse ledger in six axes; README.md states the method."""
+"""Parts of the impulse ledger in six axes; README.md in this folder states the method."""

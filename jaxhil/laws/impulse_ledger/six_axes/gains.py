@@ -1,7 +1,8 @@
-"""Gains of the impulse ledger in six axes: unit, bounds and nominal values.
+"""Gains of the impulse ledger in six axes: units, bounds and nominal values.
 
-None depends on the contact. Tuning changes the first two; the optimum of the others is flat, and the last
-ones are those of the mechanism file.
+No gain depends on the contact. Tuning changes only `velocity_gain` and `position_gain`, because the objective
+is insensitive to the other gains near their optimum. The last gains of the list follow from the mechanism
+file.
 """
 
 from collections.abc import Callable
@@ -11,33 +12,33 @@ from jaxhil.laws.shared.nominal_values import force_delay
 from jaxhil.laws.simulation_base import Gain
 from jaxhil.laws.six_axis_base import lag_leads
 
-POSE_FILTER = 3e-3  # s; lag of the pose filter where the measured pose has noise or a quantum
+POSE_FILTER = 3e-3  # s; lag of the pose filter if the position sensor has noise or a quantum
 
 
 def _fixed(name: str, unit: str, lower: float, upper: float, nominal: float) -> Gain:
-    """Return a gain that tuning does not change."""
+    """Create a gain that tuning does not change."""
     return Gain(name, unit, lambda m: lower, lambda m: upper, lambda m: nominal, tuned=lambda m: False)
 
 
 def _from_file(name: str, unit: str, upper: Callable[[Any], float], nominal: Callable[[Any], float]) -> Gain:
-    """Return a gain that follows from the mechanism file."""
+    """Create a gain whose nominal value follows from the mechanism file; tuning does not change it."""
     return Gain(name, unit, lambda m: 0.0, upper, nominal, tuned=lambda m: False)
 
 
 def reading_delay(mechanism: Any) -> float:
-    """Return the delay of the force reading beyond that of the measured pose [s]."""
+    """Return the force measurement's delay minus the pose measurement's delay [s], at least 0."""
     return max(force_delay(mechanism) - mechanism.rig.position_sensor.delay, 0.0)
 
 
 def noise(mechanism: Any, part: slice) -> float:
-    """Return the largest standard deviation of some channels of the force sensor, rounding included."""
+    """Return the largest standard deviation of noise plus rounding in the force sensor's channels `part`."""
     sensor = mechanism.rig.force_sensor
     pairs = zip(sensor.noise_std[part], sensor.quantum[part], strict=True)
     return max((deviation**2 + quantum**2 / 12) ** 0.5 for deviation, quantum in pairs)
 
 
 def pose_filter(mechanism: Any) -> float:
-    """Return the lag of the pose filter [s]: 0 for an exact sensor."""
+    """Return the lag of the pose filter [s]; 0 if the position sensor has no noise and no quantum."""
     sensor = mechanism.rig.position_sensor
     return POSE_FILTER if any(sensor.noise_std) or any(sensor.quantum) else 0.0
 

@@ -1,6 +1,6 @@
 """Linear algebra and delay line of the impulse ledger in six axes in JAX.
 
-Vectors are (6, *batch), matrices (6, 6, *batch).
+Vectors have the shape (6, *batch), matrices (6, 6, *batch).
 """
 
 import jax.numpy as jnp
@@ -9,47 +9,47 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 def product(matrix: Array, vector: Array) -> Float[Array, "6 *batch"]:
-    """Return matrix @ vector."""
+    """Return the product matrix @ vector on all lanes."""
     return jnp.sum(matrix * vector[None], axis=1)
 
 
 def dot(a: Array, b: Array) -> Float[Array, "*batch"]:
-    """Return the scalar product."""
+    """Return the scalar product of two vectors on all lanes."""
     return jnp.sum(a * b, axis=0)
 
 
 def cross(left: Array, right: Array) -> Float[Array, "3 *batch"]:
-    """Return the vector product."""
+    """Return the vector product of two vectors of length 3 on all lanes."""
     (a, b, c), (x, y, z) = left, right
     return jnp.stack([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
 def wrench_at_chaser(wrench: Array, pose: Array) -> Float[Array, "6 *batch"]:
-    """Return a wrench about C's origin from one about T's; `pose` are coordinates of C against T."""
+    """Move a wrench's reference point from the origin of frame T to that of C; `pose` is C relative to T."""
     return jnp.concatenate([wrench[:3], wrench[3:] - cross(pose[:3], wrench[:3])])
 
 
 def wrench_at_target(wrench: Array, pose: Array) -> Float[Array, "6 *batch"]:
-    """Return a wrench about T's origin from one about C's; `pose` are coordinates of C against T."""
+    """Move a wrench's reference point from the origin of frame C to that of T; `pose` is C relative to T."""
     return jnp.concatenate([wrench[:3], wrench[3:] + cross(pose[:3], wrench[:3])])
 
 
 def look_back(
     ring: Float[Array, "samples rows *batch"], tick: Int[Array, ""], ticks: Float[Array, "rows *batch"]
 ) -> Float[Array, "rows *batch"]:
-    """Return each row so many ticks before `tick`, linear between samples; at most `samples` - 2."""
+    """Return each row of the ring `ticks` before `tick`, interpolated linearly; `ticks` <= `samples` - 2."""
     whole = lax.stop_gradient(jnp.floor(ticks))
     newer, older = (_read(ring, tick - whole.astype(jnp.int32) - more) for more in (0, 1))
     return newer + (ticks - whole) * (older - newer)
 
 
 def running_mean(mean: Array, value: Array, count: Array, used: Bool[Array, "*batch"]) -> Array:
-    """Return the mean (rows, *batch) with one more `value`, where `used`; `count` includes it."""
+    """Update a mean (rows, *batch) with one `value` on the lanes `used`; `count` includes this value."""
     share = jnp.where(used, 1 / jnp.maximum(count, 1), 0)
     return mean + share[None] * (value - mean)
 
 
 def _read(ring: Array, index: Int[Array, "rows *batch"]) -> Float[Array, "rows *batch"]:
-    """Return each row at an index, which may be beyond the ring's ends."""
+    """Return each row of the ring at its index, modulo the ring's length."""
     index = index & (len(ring) - 1)
     return jnp.take_along_axis(ring, index[None], axis=0, mode="promise_in_bounds")[0]

@@ -1,4 +1,4 @@
-"""State of the impulse ledger in six axes in JAX; vectors are (6, *batch)."""
+"""State of the impulse ledger in six axes in JAX; vectors have the shape (6, *batch)."""
 
 from typing import NamedTuple
 
@@ -12,47 +12,47 @@ POSE, DESIRED, TWIST, IMPULSE = (slice(6 * part, 6 * part + 6) for part in range
 
 
 class Prepared(NamedTuple):
-    """Gains and constants, computed once per run."""
+    """Gains and constants of the six-axis impulse ledger, computed once per run."""
 
     gains: Gains
     constants: SixAxisConstants
-    pole: Float[Array, "*batch"]  # of the pose filter [1]
-    back: Float[Array, "*batch"]  # age of the force reading less the filter's lag [ticks]
-    prior: Estimate  # of the tangent model
+    pole: Float[Array, "*batch"]  # pole of the pose filter [1]
+    back: Float[Array, "*batch"]  # age of the force reading minus the lag of the pose filter [ticks]
+    prior: Estimate  # prior of the tangent model
 
 
 class FreeFlightState(NamedTuple):
-    """Means over free flight."""
+    """Means of readings and motion in free flight."""
 
-    bias: Six  # of the readings
-    readings: Float[Array, "*batch"]  # number of readings in it
-    lag: Six  # pose of the model minus that of the hardware, as old as the reading
-    twist: Six  # of the model
-    ticks: Float[Array, "*batch"]  # number of ticks in both
-    quiet: Float[Array, "*batch"]  # ticks since the last reading in contact; many before the first one
+    bias: Six  # mean of the wrench readings [N, N m]
+    readings: Float[Array, "*batch"]  # number of readings in `bias`
+    lag: Six  # mean of the model's pose minus the hardware's pose, which is delayed like the force [m, rad]
+    twist: Six  # mean twist of the model [m/s, rad/s]
+    ticks: Float[Array, "*batch"]  # number of ticks in `lag` and `twist`
+    quiet: Float[Array, "*batch"]  # number of ticks since the last reading in contact; large before the first
 
 
 class SixAxisContact(NamedTuple):
-    """State of one contact."""
+    """State of the six-axis impulse ledger during one contact."""
 
-    delay: Float[Array, "*batch"]  # D [ticks]
-    speed: Float[Array, "*batch"]  # v_0, approach speed along the direction
+    delay: Float[Array, "*batch"]  # D, delay of the loop [ticks]
+    speed: Float[Array, "*batch"]  # v_0, approach speed along the contact's direction
     impulse: Six  # I_r, impulse of the reference up to t - D [N s, N m s]
-    drift: Six  # eps, pose of the model at t - D minus that of the reference
-    direction: Six  # filtered wrench, with continuous sign
-    modelled: Six  # direction for which the tangent model began
+    drift: Six  # eps, pose of the model at t - D minus the reference's pose [m, rad]
+    direction: Six  # filtered wrench, which does not change its sign [N, N m]
+    modelled: Six  # contact's direction when the tangent model was last restarted
     path: Float[Array, "*batch"]  # X, depth of the hardware along the direction since the onset
     peak: Float[Array, "*batch"]  # largest force so far, per unit mass
-    tool: Float[Array, "*batch"]  # largest square of the tool's share of a reading
+    tool: Float[Array, "*batch"]  # largest |W|^2 of the tool's inertia in a reading
 
 
 class LedgerState(NamedTuple):
-    """State of the impulse ledger from tick to tick."""
+    """State of the six-axis impulse ledger after a tick."""
 
-    ring: Float[Array, "samples 24 *batch"]  # measured pose, and pose, twist and impulse of the model
-    filtered: Six  # measured pose behind the filter
-    first: Six  # the same on the first tick
-    aligned: Six  # measured pose as old as the reading of the last tick
+    ring: Float[Array, "samples 24 *batch"]  # hardware's filtered pose; model's pose, twist and impulse
+    filtered: Six  # filtered pose of the hardware [m, rad]
+    first: Six  # filtered pose of the hardware on the run's first tick [m, rad]
+    aligned: Six  # filtered pose of the hardware, delayed like the force [m, rad]
     impulse: Six  # I_c, impulse commanded so far [N s, N m s]
     flight: FreeFlightState
     in_contact: Bool[Array, "*batch"]
@@ -61,11 +61,11 @@ class LedgerState(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """Readings of one tick, and the numerical model D ago."""
+    """Sensor readings of one tick, corrected and aligned."""
 
-    wrench: Six  # W, about C's origin [N, N m]
-    variance: Float[Array, "*batch"]  # of its size by noise
-    pose: Six  # xi_a, measured pose as old as the wrench
-    twist: Six  # its rate
-    moved: Six  # its change since the last tick
-    loud: Bool[Array, "*batch"]  # whether the wrench is that of a contact
+    wrench: Six  # W, wrench of the contact about the origin of frame C [N, N m]
+    variance: Float[Array, "*batch"]  # mean of |W|^2 by noise alone
+    pose: Six  # xi_a, pose of the hardware, delayed like the force [m, rad]
+    twist: Six  # rate of `pose` [m/s, rad/s]
+    moved: Six  # change of `pose` since the last tick [m, rad]
+    loud: Bool[Array, "*batch"]  # whether the wrench is large enough for a contact

@@ -1,13 +1,14 @@
-"""Gates that open and close smoothly with the time between two ticks at which a threshold is crossed."""
+"""Gates that open and close smoothly, depending on the time between two ticks of a threshold crossing."""
 
 
 def share_beyond(excess: float, excess_before: float, moved: float) -> float:
-    """Return the share of the last period that a reading, linear between ticks, was beyond a threshold.
+    """Return the share [1] of the last period in which a reading, linear between ticks, exceeded a threshold.
 
     Args:
-        excess: how far the reading is beyond: 0 within, of slope 1 beyond, negative beyond a lower threshold.
-        excess_before: excess on the tick before.
-        moved: change of the reading since then, in the same unit.
+        excess: reading minus threshold, 0 if the reading does not exceed it; negative beyond a lower
+            threshold.
+        excess_before: excess on the previous tick.
+        moved: change of the reading since the previous tick, in the unit of `excess`.
     """
     if excess > 0.0:
         crossed = excess_before <= 0.0
@@ -21,11 +22,14 @@ def share_beyond(excess: float, excess_before: float, moved: float) -> float:
 
 
 def gate(share: float, share_before: float) -> float:
-    """Return the time beyond a threshold, weighted with a triangle two periods wide: 0 to 1.
+    """Return the gate [1], 0 to 1: the time above the threshold, weighted with a triangle of two periods.
 
-    The arguments are the shares of the last period and of the one before. The result is exact if the
-    threshold was crossed once. Its sum over the ticks is the time beyond in periods, its mean delay one
-    period.
+    The result is exact if the reading crossed the threshold once. The sum of the gate over all ticks is the
+    time above the threshold in periods, and the mean delay of the gate is one period.
+
+    Args:
+        share: share of the last period in which the reading exceeded the threshold.
+        share_before: share of the previous period.
     """
     return (share * share + share_before * share_before) / 2.0 + share * share_before * (
         2.0 - share - share_before

@@ -1,11 +1,11 @@
-"""Gates that open and close smoothly, where a switch would wait for the next tick.
+"""Gates that open and close smoothly, depending on the time between two ticks of a threshold crossing.
 
-A reading is assumed linear between two ticks. From the shares of the last two control periods that it was
-beyond a threshold follows the gate, the time beyond weighted with a triangle two periods wide: 1 beyond the
-threshold, 0 within, once differentiable with respect to the time of the crossing. The sum of the gate over
-the ticks is the time beyond, in periods, and its mean delay is one period, whenever between ticks the
-crossings occur (at least two periods apart). A switch has an error of up to half a period, which is a
-sawtooth function of every delay.
+A reading is assumed to be linear between two ticks. `share_beyond` returns the share of a control period in
+which the reading exceeds a threshold. `gate` weights the shares of the last two periods with a triangle of
+two periods. It is 1 above the threshold, 0 below, and once differentiable with respect to the time of the
+crossing. If crossings are at least two periods apart, the sum of the gate over all ticks is the time above
+the threshold in periods, and the mean delay of the gate is one period. A switch that waits for the next tick
+would have an error of up to half a period, which is a sawtooth function of every delay.
 """
 
 import jax.numpy as jnp
@@ -15,24 +15,25 @@ from jaxtyping import Array, Float
 def share_beyond(
     excess: Float[Array, "*batch"], excess_before: Float[Array, "*batch"], moved: Float[Array, "*batch"]
 ) -> Float[Array, "*batch"]:
-    """Return the share of the last period that a reading, linear between ticks, was beyond a threshold [1].
+    """Return the share [1] of the last period in which a reading, linear between ticks, exceeded a threshold.
 
     Args:
-        excess: how far the reading is beyond: 0 within, of slope 1 beyond, negative beyond a lower threshold.
-        excess_before: excess on the tick before.
-        moved: change of the reading since then, in the same unit.
+        excess: reading minus threshold, 0 if the reading does not exceed it; negative beyond a lower
+            threshold.
+        excess_before: excess on the previous tick.
+        moved: change of the reading since the previous tick, in the unit of `excess`.
     """
     crossed = (jnp.sign(excess) != jnp.sign(excess_before)) & (moved != 0)
-    # While beyond, moved/moved would have rounding errors, and no derivative at a standstill.
+    # Without a crossing, moved/moved would have rounding errors, and no derivative at constant readings.
     crossing = (excess - excess_before) / jnp.where(crossed, moved, 1)
     return jnp.where(crossed, crossing, jnp.where(excess == 0, 0, 1).astype(excess.dtype))
 
 
 def gate(share: Float[Array, "*batch"], share_before: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return the gate (s^2 + l^2)/2 + s l (2 - s - l) for the shares s of the last period, l of that before.
+    """Return the gate (s^2 + l^2)/2 + s l (2 - s - l) of the last period's share s and the previous share l.
 
-    If the threshold was crossed once, this is the integral of a triangle over the time beyond: with the age u
-    [periods], u for u < 1 and 2 - u for 1 <= u < 2. It is s^2/2, then 1/2 + l - l^2/2, on the way in, and it
-    increases with s and l.
+    If the reading crossed the threshold once, the gate is the integral of a triangle over the time above the
+    threshold. At the age u [periods], the triangle is u for u < 1 and 2 - u for 1 <= u < 2. After an upward
+    crossing the gate is s^2/2, then 1/2 + l - l^2/2; it increases with s and l.
     """
     return (share**2 + share_before**2) / 2 + share * share_before * (2 - share - share_before)

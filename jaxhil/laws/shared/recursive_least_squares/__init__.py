@@ -1,1 +1,1 @@
-"""Recursive least squares for contact stiffness and damping."""
+"""Recursive least-squares estimate of contact stiffness and damping."""

@@ -1,4 +1,4 @@
-"""Weighted recursive identification of contact stiffness k and damping b in F = k p + b p', p the depth."""
+"""Weighted recursive least squares for contact stiffness k and damping b in F = k p + b p', p the depth."""
 
 
 class ContactIdentification:
@@ -6,10 +6,10 @@ class ContactIdentification:
 
     With the regressor phi = (p, p') and a reading's weight w, K = w P phi/(lambda_w + w phi' P phi),
     theta += K (F - phi' theta), P = (P - K phi' P)/lambda_w, lambda_w = 1 - w (1 - lambda). The factors of
-    P = U D U', U = [[1, u], [0, 1]], D = diag(d1, d2), keep P symmetric and positive whatever the rounding
+    P = U D U', U = [[1, u], [0, 1]], D = diag(d1, d2), keep P symmetric and positive despite rounding
     (Bierman, "Factorization Methods for Discrete Sequential Estimation", 1977). d1 and d2 never exceed their
-    initial values: a contact at rest has no information on the damping, and forgetting would increase its
-    variance without limit.
+    initial values: a contact at rest has no information on the damping, and forgetting would increase the
+    variance of the damping without limit.
 
     Args:
         stiffness: initial stiffness [N/m].
@@ -48,7 +48,14 @@ class ContactIdentification:
         self.stiffness_variance, self.damping_variance = self._initial_covariance  # d1, d2
 
     def update(self, force: float, deflection: float, rate: float, weight: float) -> None:
-        """Update by one reading: force [N], signed deflection [m], its rate [m/s] and weight, 0 to 1."""
+        """Update the estimate with one reading.
+
+        Args:
+            force: force reading [N].
+            deflection: signed penetration [m].
+            rate: rate of the penetration [m/s].
+            weight: weight of the reading, 0 to 1.
+        """
         u = self.coupling
         d1 = self.stiffness_variance
         d2 = self.damping_variance

@@ -1,10 +1,10 @@
-"""Real-time identification of contact stiffness and damping: weighted recursive least squares, forgetting.
+"""Weighted recursive least squares with forgetting, for contact stiffness and damping in real time.
 
-The model is F = k d + b v; the weight of a reading is 0 (outside contact) to 1. The covariance is stored as
-P = U D U^T, U = [[1, u], [0, 1]], D = diag(d_1, d_2) (Bierman 1977), which remains positive however large the
-initial covariance is. d_1 and d_2 never exceed their initial values: a contact at rest has no information on
-the damping, and forgetting would increase its variance without limit. With d_2 = 0 the damping remains at its
-initial value, and only the stiffness is identified.
+The model is F = k d + b v; the weight of a reading is 0 (outside contact) to 1. The covariance is stored as P
+= U D U^T, U = [[1, u], [0, 1]], D = diag(d_1, d_2) (Bierman 1977), which remains positive for any initial
+covariance. d_1 and d_2 never exceed their initial values: a contact at rest has no information on the
+damping, and forgetting would increase the variance of the damping without limit. With d_2 = 0 the damping
+keeps its initial value, and only the stiffness is identified.
 """
 
 from typing import NamedTuple
@@ -14,13 +14,13 @@ from jaxtyping import Array, Float
 
 
 class ContactEstimate(NamedTuple):
-    """Estimate of theta = (k, b), and its covariance P = U D U^T."""
+    """Estimate of contact stiffness and damping, theta = (k, b), with its covariance P = U D U^T."""
 
     stiffness: Float[Array, "*batch"]  # k [N/m]
     damping: Float[Array, "*batch"]  # b [N s/m]
-    coupling: Float[Array, "*batch"]  # u
-    stiffness_variance: Float[Array, "*batch"]  # d_1
-    damping_variance: Float[Array, "*batch"]  # d_2
+    coupling: Float[Array, "*batch"]  # u [1/s]
+    stiffness_variance: Float[Array, "*batch"]  # d_1 [1/m^2], relative to the force's variance
+    damping_variance: Float[Array, "*batch"]  # d_2 [s^2/m^2], relative to the force's variance
 
 
 def update_estimate(
@@ -32,12 +32,13 @@ def update_estimate(
     force: Array,
     weight: Array,
 ) -> ContactEstimate:
-    """Return the estimate after one reading: deflection [m], rate [m/s], force [N] and weight [1].
+    """Update the estimate with one reading: deflection [m], rate [m/s], force [N] and weight [1].
 
-    With weight w, phi = (deflection, rate) and lambda_w = 1 - w (1 - lambda) the recursion is
-    K = w P phi/(lambda_w + w phi'P phi), theta += K (F - phi'theta), P = (P - K phi'P)/lambda_w. It minimises
-    the sum of w (F - phi'theta)^2, in which every reading multiplies the earlier terms by lambda_w. A weight
-    of 1 gives the textbook's recursion, a weight of 0 no change. d_1 and d_2 are at most `initial_variances`.
+    With weight w, phi = (deflection, rate) and lambda_w = 1 - w (1 - lambda) the recursion is K = w P
+    phi/(lambda_w + w phi'P phi), theta += K (F - phi'theta), P = (P - K phi'P)/lambda_w. The recursion
+    minimises the sum of w (F - phi'theta)^2, where every reading multiplies the earlier terms by its
+    lambda_w. A weight of 1 gives the textbook recursion; a weight of 0 changes nothing. `initial_variances`
+    are the upper bounds of d_1 and d_2.
     """
     factor = 1 - weight * (1 - forgetting)
     f_1 = deflection

@@ -1,1 +1,1 @@
-"""Base of the Smith predictor and of its hybrid with phase lead."""
+"""Base classes of `smith_predictor` and `smith_hybrid`."""

@@ -1,4 +1,4 @@
-"""Base of `smith_predictor` and `smith_hybrid`: a phase lead, and behind it a prediction of the force."""
+"""Base of `smith_predictor` and `smith_hybrid`: a phase lead, followed by a prediction of the force."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -9,9 +9,9 @@ from jaxhil.rig.registry import Compensator, GainSpecification
 
 
 class Smith(Compensator):
-    """Base with the filters 1 + T_l s and 1 + T_s s/(1 + T_s s/2), each by Tustin's rule.
+    """Base class with the filters 1 + T_l s and 1 + T_s s/(1 + T_s s/2), discretised by Tustin's rule.
 
-    T_l = phase_lead, filtered with lead_filter as in `PhaseLead`; T_s = simulator_lag.
+    T_l = phase_lead, with the time constant lead_filter as in `PhaseLead`; T_s = simulator_lag.
     """
 
     __slots__ = ("_lead", "_predictor")

@@ -1,4 +1,4 @@
-"""Base of `smith_predictor` and `smith_hybrid`: a phase lead, and behind it a prediction of the force."""
+"""Base of `smith_predictor` and `smith_hybrid`: a phase lead, followed by a prediction of the force."""
 
 import abc
 from typing import Any, ClassVar, NamedTuple
@@ -18,7 +18,7 @@ from jaxhil.laws.shared.lead_filter import (
 from jaxhil.laws.shared.nominal_values import FORCE_DELAY, SIMULATOR_LAG, simulator_lag
 from jaxhil.laws.simulation_base import Compensator, Gain, Gains, KnownConstants, rig_gain
 
-# An ideal simulator with a zero-order hold is half a period ahead; such a negative lag is not predicted.
+# An ideal simulator with a zero-order hold has a lag of minus half a period; a negative lag counts as 0.
 SIMULATOR_LAG_GAIN = rig_gain(
     "simulator_lag",
     lower=lambda mechanism: 0.0,
@@ -29,24 +29,24 @@ SIMULATOR_LAG_GAIN = rig_gain(
 
 
 class Cascade(NamedTuple):
-    """Two filters in series, or their states."""
+    """Lead filter and predictor in series: their coefficients, or their states."""
 
     lead: Any  # 1 + T_l s, filtered as in `PhaseLead`
     predictor: Any  # (1 + (3/2) T_s s)/(1 + T_s s/2)
 
 
 class Smith(Compensator):
-    """Base that computes F_c from the force behind the lead and behind lead and predictor."""
+    """Base class that computes F_c from the lead-filtered force and the predicted force."""
 
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, SIMULATOR_LAG)
     reads_position: ClassVar[bool] = False
     gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER, SIMULATOR_LAG_GAIN)
-    # A/(T_s/2) of the whole transfer function behind the lead, (1 + A s)/(1 + T_s s/2).
+    # A/(T_s/2), where (1 + A s)/(1 + T_s s/2) is the transfer function from the lead-filtered force to F_c.
     excess: eqx.AbstractClassVar[float]
 
     @abc.abstractmethod
     def combined(self, led: Array, predicted: Array) -> Array:
-        """Return F_c [N]."""
+        """Return F_c [N] from the lead-filtered force `led` and the predicted force `predicted` [N]."""
 
     def prepare(self, gains, constants):
         period, lag = constants.control_period, gains["simulator_lag"]
@@ -68,13 +68,13 @@ class Smith(Compensator):
 
 
 def cascade_amplification(gains: Gains, constants: KnownConstants, excess: float) -> Float[Array, "*batch"]:
-    """Return the noise amplification of the lead and (1 + A s)/(1 + C s), C = T_s/2, A = excess C [1].
+    """Return the noise amplification [1] of the lead filter in series with (1 + A s)/(1 + C s).
 
-    Tustin's rule maps the unit circle to the imaginary axis: the variance of white noise behind the filter is
-    T times the integral (1/2 pi) int |H(j w)/(1 + j w E)|^2 dw, E = T/2, H being the continuous filter. With
-    numerator 1 + b_1 s + b_2 s^2 and denominator 1 + a_1 s + a_2 s^2 + a_3 s^3 the integral is
-    (b_2^2 a_1/a_3 + b_1^2 - 2 b_2 + a_2)/(2 (a_1 a_2 - a_3)) (James, Nichols and Phillips 1947, I_3). In
-    b_2^2/a_3 a factor C cancels, so that T_s = 0 leaves the lead alone.
+    C = T_s/2 and A = excess C. Tustin's rule maps the unit circle to the imaginary axis. The variance of
+    filtered white noise is therefore T times the integral (1/2 pi) int |H(j w)/(1 + j w E)|^2 dw, where
+    E = T/2 and H is the continuous filter. For the numerator 1 + b_1 s + b_2 s^2 and the denominator
+    1 + a_1 s + a_2 s^2 + a_3 s^3 the integral is (b_2^2 a_1/a_3 + b_1^2 - 2 b_2 + a_2)/(2 (a_1 a_2 - a_3))
+    (James, Nichols and Phillips 1947, I_3). A factor C cancels in b_2^2/a_3, so that T_s = 0 is allowed.
     """
     period, pole = constants.control_period, gains["lead_filter"]
     zero = pole + gains["phase_lead"]

@@ -1,1 +1,1 @@
-"""Booking of impulses: onset, reference trajectory, and the command that pays the unpaid impulse."""
+"""Balance of impulses: onset of contact, reference trajectory, and the command that corrects the impulse."""

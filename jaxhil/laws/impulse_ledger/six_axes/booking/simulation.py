@@ -1,4 +1,4 @@
-"""Booking of impulses in JAX: onset, reference trajectory at the model's time, bridge, and command."""
+"""Balance of impulses in JAX: onset, reference trajectory, prediction to the present, and command."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -28,9 +28,9 @@ from jaxhil.laws.six_axis_base import Six, SixAxisSignals
 def onset(
     prepared: Prepared, state: LedgerState, reading: Reading, signals: SixAxisSignals
 ) -> SixAxisContact:
-    """Return the contact that begins with this reading (b).
+    """Return the state of a contact that begins with this reading (b).
 
-    Its impulse is set when the delay line is read.
+    Its impulse is 0 here; `follow` sets it from the delay line.
     """
     period, mass = prepared.constants.control_period, prepared.constants.mass_matrix
     flight, last = state.flight, state.contact
@@ -42,7 +42,7 @@ def onset(
     least = fixed.LEAST_SHARE * safe_sqrt(whole) + fixed.LEAST_TWIST
     is_closing = closing > least
     slowest = fixed.LEAST_SPEED * safe_sqrt(whole) + fixed.LEAST_TWIST
-    # Where the contact is across the motion, the delay is the mean over all directions.
+    # If the contact's direction is perpendicular to the motion, use the mean delay over all directions.
     mean = dot(lag, product(mass, twist)) / (whole + fixed.LEAST_TWIST**2)
     delay = jnp.where(is_closing, -dot(direction, lag) / jnp.where(is_closing, closing, 1), mean) / period
     longest = len(state.ring) - 2.0
@@ -69,14 +69,17 @@ def follow(
     contact: tuple[SixAxisContact, Estimate, Bool[Array, "*batch"]],
     tick: Int[Array, ""],
 ) -> tuple[Six, SixAxisContact, Estimate]:
-    """Return the command about C's origin, and the contact after a reading.
+    """Process one reading of a contact.
 
     Args:
         prepared: gains and constants.
-        state: state with the reading of this tick.
-        reading: reading of this tick.
-        contact: contact and estimate before the reading, and whether the contact begins with it.
+        state: state of the compensator, with this tick in the delay line.
+        reading: readings of this tick.
+        contact: contact and estimate before this reading, and whether the contact begins with this reading.
         tick: number of this tick.
+
+    Returns:
+        Command wrench about the origin of frame C [N, N m], contact, and estimate of the tangent model.
     """
     contact_now, estimate, begins = contact
     gains, period = prepared.gains, prepared.constants.control_period
@@ -87,7 +90,7 @@ def follow(
     )
     old = contact_now._replace(impulse=jnp.where(begins[None], impulse, contact_now.impulse))
     direction, mixed = _direction(prepared, old, reading, begins)
-    # Another surface, or another part of it, needs another model.
+    # If the direction turns, the contact is at a different surface: restart the tangent model.
     along = dot(old.modelled, product(inverse_mass, direction))
     turns = begins | (loud & (along < fixed.TURNED))
     modelled = jnp.where(turns[None], direction, old.modelled)
@@ -96,7 +99,7 @@ def follow(
     force = dot(reading.wrench, product(inverse_mass, direction))
     estimate, tangent = _learned(prepared, old, reading, estimate, (direction, path, force))
 
-    # Reference at its own time t - D (c).
+    # Advance the reference, at the time t - D (c).
     missing = product(inverse_mass, impulse - old.impulse)
     drift = old.drift + period[None] * missing
     deeper = -dot(direction, reading.pose - (desired - drift))
@@ -106,7 +109,7 @@ def follow(
     corrected = jnp.where(loud, corrected, force)
     booked = old.impulse + period[None] * (reading.wrench + (corrected - force)[None] * direction)
 
-    # Bridge from t - D to the middle of the command's period (d).
+    # Predict from t - D to the middle of the command's period (d).
     velocity = -dot(direction, twist - product(inverse_mass, impulse - booked))
     ahead = (old.delay + fixed.AHEAD) * period
     touches = loud & (corrected != 0)
@@ -119,7 +122,7 @@ def follow(
     rest = jnp.where(loud[None], reading.wrench - force[None] * direction, 0)
     unpaid = state.impulse - booked - bridged[None] * direction - ahead[None] * rest
 
-    # Command (e).
+    # Compute the command (e).
     pulled = unpaid + jnp.where(touches, gains["position_gain"], 0)[None] * product(
         prepared.constants.mass_matrix, drift
     )
@@ -135,7 +138,7 @@ def follow(
 def _correction(
     prepared: Prepared, unpaid: Six, stiffness: Float[Array, "*batch"], speed: Float[Array, "*batch"]
 ) -> Six:
-    """Return the wrench that pays the unpaid impulse, with limited size."""
+    """Return the wrench that corrects the missing impulse `unpaid`, with a limited norm."""
     wrench = -prepared.gains["velocity_gain"][None] * unpaid
     limit = prepared.gains["correction_limit"] * jnp.sqrt(stiffness) * speed
     large = safe_sqrt(dot(wrench, product(prepared.constants.inverse_mass, wrench)))
@@ -143,7 +146,7 @@ def _correction(
 
 
 def _size_of(prepared: Prepared, wrench: Six) -> Float[Array, "*batch"]:
-    """Return the size of a wrench, never 0."""
+    """Return the norm |W| = sqrt(W . M^-1 W) of a wrench, or 1 for a wrench of 0."""
     square = dot(wrench, product(prepared.constants.inverse_mass, wrench))
     return jnp.where(square > 0, safe_sqrt(square), 1)
 
@@ -151,9 +154,9 @@ def _size_of(prepared: Prepared, wrench: Six) -> Float[Array, "*batch"]:
 def _direction(
     prepared: Prepared, contact: SixAxisContact, reading: Reading, begins: Bool[Array, "*batch"]
 ) -> tuple[Six, Six]:
-    """Return the contact's direction, and the filtered wrench that determines it.
+    """Return the contact's direction, a unit wrench, and the filtered wrench of the same direction.
 
-    The sign is continuous: a latch that pulls does not turn the direction.
+    A pulling force, for example of a latch, does not reverse the direction.
     """
     old, pole = contact.direction, prepared.gains["direction_pole"][None]
     along = dot(old, product(prepared.constants.inverse_mass, reading.wrench))
@@ -169,7 +172,10 @@ def _learned(
     estimate: Estimate,
     along: tuple[Six, Float[Array, "*batch"], Float[Array, "*batch"]],
 ) -> tuple[Estimate, Tangent]:
-    """Return the estimate after a reading and its tangent; `along` are direction, path and force."""
+    """Update the estimate with one reading; return the estimate and the tangent model.
+
+    `along` contains the contact's direction, the depth along this direction, and the force per unit mass.
+    """
     direction, path, force = along
     gains, period, speed = prepared.gains, prepared.constants.control_period, contact.speed
     growth = gains["forgetting"] ** (-period / 1e-3)

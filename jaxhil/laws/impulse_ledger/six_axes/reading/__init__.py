@@ -1,1 +1,1 @@
-"""Reading of a tick: wrench about C, pose of the same age, gate, and means over free flight."""
+"""Sensor readings of a tick: corrected wrench, aligned pose, contact detection, means over free flight."""

@@ -1,4 +1,4 @@
-"""Reading of a tick in JAX: delay line, pose filter, tool correction, gate, means over free flight."""
+"""Sensor readings of a tick in JAX: pose filter, alignment, tool correction and contact detection."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -19,11 +19,11 @@ from jaxhil.laws.six_axis_base import Six, SixAxisSignals
 def record(
     prepared: Prepared, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]
 ) -> LedgerState:
-    """Filter the measured pose, and write this tick into the delay line."""
+    """Filter the measured pose and write the signals of this tick to the delay line."""
     assert signals.pose_measured is not None
     begins = (signals.age == 0)[None]
     measured, pole = signals.pose_measured, prepared.pole[None]
-    # In uniform motion the filter lags by pole/(1 - pole) ticks.
+    # Start in steady state: in uniform motion, the filter lags by pole/(1 - pole) ticks.
     stride = prepared.constants.control_period[None] * signals.twist_desired
     before = jnp.where(begins, measured - stride * (1 / (1 - pole)), state.filtered)
     filtered = measured + pole * (before - measured)
@@ -38,7 +38,7 @@ def record(
 def read(
     prepared: Prepared, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]
 ) -> tuple[Reading, LedgerState]:
-    """Return the reading of this tick, and the state with the means over free flight."""
+    """Return the corrected readings of this tick, and the state with updated means over free flight."""
     constants, gains = prepared.constants, prepared.gains
     period, inverse_mass = constants.control_period, constants.inverse_mass
     pose = _aligned(prepared, state, signals, tick)
@@ -70,7 +70,7 @@ def read(
 
 
 def noise_variance(prepared: Prepared, pose: Six) -> Float[Array, "*batch"]:
-    """Return the mean square of the size |W| of the noise, whose moment is about T's origin."""
+    """Return the mean of |W|^2 for a wrench W that is only noise; `pose` moves its moment to frame C."""
     gains, inverse_mass = prepared.gains, prepared.constants.inverse_mass
     force, torque = gains["force_noise"] ** 2, gains["torque_noise"] ** 2
     moment = torque + force * jnp.sum(pose[:3] ** 2, axis=0)
@@ -79,7 +79,7 @@ def noise_variance(prepared: Prepared, pose: Six) -> Float[Array, "*batch"]:
 
 
 def _aligned(prepared: Prepared, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]) -> Six:
-    """Return the filtered pose as old as the reading; before the first tick in uniform motion."""
+    """Return the filtered pose, delayed like the force; the motion before the first tick is uniform."""
     back = prepared.back
     recalled = look_back(state.ring[:, POSE], tick, jnp.broadcast_to(back, state.first.shape))
     ago = back - signals.age.astype(back.dtype)
@@ -96,7 +96,7 @@ def _fly(
     uniform: Bool[Array, "*batch"],
     period: Float[Array, "*batch"],
 ) -> FreeFlightState:
-    """Update the bias where the tick is `free`, and lag and twist where the motion is `uniform` as well."""
+    """Update the bias on the lanes `free`, and the means of lag and twist on the lanes `uniform`."""
     readings = jnp.minimum(flight.readings + free.astype(period.dtype), fixed.LONGEST_MEAN)
     ticks = jnp.minimum(flight.ticks + 1, fixed.LONGEST_FLIGHT / period)
     ticks = jnp.where(uniform, ticks, jnp.where(free, 0, flight.ticks))

@@ -1,1 +1,1 @@
-"""Tangent model of a contact: the force along its direction, linear and quadratic in the depth."""
+"""Tangent model: scalar model of the contact force, linear and quadratic in the depth."""

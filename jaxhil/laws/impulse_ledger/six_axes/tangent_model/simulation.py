@@ -1,7 +1,8 @@
-"""Tangent model in JAX: recursive least squares, and the bridge from the last reading to the present.
+"""Tangent model in JAX: scalar force model of the contact, fitted by recursive least squares.
 
-Along the contact's direction the force on a unit mass is F = k x + c x|x| + b x' + F_0, with the depth x
-since the onset. The estimate is of F over the approach speed, so that its prior does not depend on the speed.
+Along the contact's direction, the force on a unit mass is F = k x + c x|x| + b x' + F_0, with the depth x
+since the onset. The fit divides F and x by the approach speed, so that the prior does not depend on the
+speed. `bridge` predicts the impulse from the last reading to the present.
 """
 
 from typing import NamedTuple
@@ -22,7 +23,11 @@ from jaxhil.laws.impulse_ledger.six_axes.simulation import dot
 
 
 class Estimate(NamedTuple):
-    """Estimate of the tangent model: stiffness [1/s^2], damping [1/s], force over speed [1/s], curvature."""
+    """Mean and covariance of the tangent model's parameters.
+
+    The parameters are stiffness k [1/s^2], damping b [1/s], F_0 divided by the approach speed [1/s], and
+    curvature c times `BEND` and the approach speed [1/s^2].
+    """
 
     mean: Float[Array, "features *batch"]
     covariance: Float[Array, "features features *batch"]
@@ -31,15 +36,15 @@ class Estimate(NamedTuple):
 class Tangent(NamedTuple):
     """Tangent model at the depth of the last reading, per unit mass."""
 
-    stiffness: Float[Array, "*batch"]  # [1/s^2]
-    curvature: Float[Array, "*batch"]  # [1/s^3]
-    damping: Float[Array, "*batch"]  # [1/s]
-    path: Float[Array, "*batch"]  # depth over approach speed [s]
-    speed: Float[Array, "*batch"]  # approach speed [m/s, over the direction's size]
+    stiffness: Float[Array, "*batch"]  # k [1/s^2]
+    curvature: Float[Array, "*batch"]  # c times the approach speed [1/s^3]
+    damping: Float[Array, "*batch"]  # b [1/s]
+    path: Float[Array, "*batch"]  # depth divided by approach speed [s]
+    speed: Float[Array, "*batch"]  # approach speed v_0 along the direction
 
 
 def begin_estimate(spreads: tuple[Array, ...]) -> Estimate:
-    """Return the estimate before contact, from the prior standard deviations."""
+    """Return the estimate before a contact from the prior standard deviations of the parameters."""
     zero = jnp.zeros_like(spreads[0])
     variances = jnp.stack([spread**2 for spread in spreads])
     identity = jnp.eye(FEATURES, dtype=zero.dtype).reshape(FEATURES, FEATURES, *[1] * zero.ndim)
@@ -49,16 +54,16 @@ def begin_estimate(spreads: tuple[Array, ...]) -> Estimate:
 def learn(
     old: Estimate, prior: Estimate, path: Array, rate: Array, force: Array, variance: Array, growth: Array
 ) -> Estimate:
-    """Update the estimate with a reading, by recursive least squares with forgetting.
+    """Update the estimate with one reading by recursive least squares with forgetting.
 
     Args:
         old: estimate before the reading.
-        prior: estimate before contact.
-        path: depth over approach speed [s].
-        rate: speed into the surface, over approach speed [1].
-        force: force over approach speed [1/s].
-        variance: variance of the force's noise, over the squared speed [1/s^2].
-        growth: factor by which forgetting increases the covariance in a tick.
+        prior: estimate before the contact.
+        path: depth, divided by the approach speed [s].
+        rate: speed into the surface, divided by the approach speed [1].
+        force: force, divided by the approach speed [1/s].
+        variance: noise variance of the force, divided by the squared approach speed [1/s^2].
+        growth: factor by which forgetting increases the covariance on each tick.
     """
     unit = jnp.ones_like(path)
     features = jnp.stack([path, rate, unit, path * jnp.abs(path) / BEND])
@@ -72,7 +77,7 @@ def learn(
 
 
 def restoring(tangent: Tangent, change: Array) -> Float[Array, "*batch"]:
-    """Return the change of the elastic force for a change of the depth [m]."""
+    """Return the change of the tangent model's elastic force for a change of the depth."""
     later = tangent.path + change / tangent.speed
     bend = later * jnp.abs(later) - tangent.path * jnp.abs(tangent.path)
     return tangent.stiffness * change + tangent.curvature * tangent.speed * bend
@@ -81,17 +86,18 @@ def restoring(tangent: Tangent, change: Array) -> Float[Array, "*batch"]:
 def bridge(
     tangent: Tangent, force: Array, least: Array, deeper: Array, velocity: Array, duration: Array
 ) -> tuple[Array, Array]:
-    """Return impulse and last force of the reference from the last reading to the present.
-
-    A unit mass moves against the tangent model.
+    """Predict the motion of a unit mass against the tangent model from the last reading to the present.
 
     Args:
-        tangent: model at the depth of the last reading.
+        tangent: tangent model at the depth of the last reading.
         force: force on the reference at the last reading.
-        least: least force, 0 or negative.
-        deeper: depth of the hardware beyond that of the reference, at the last reading.
-        velocity: speed of the reference into the surface.
-        duration: time to bridge [s].
+        least: lower bound of the force, 0 or negative.
+        deeper: depth of the hardware minus depth of the reference at the last reading.
+        velocity: speed of the reference into the surface at the last reading.
+        duration: time from the last reading to the present [s].
+
+    Returns:
+        Impulse of the force over the duration, and force at its end.
     """
     step = duration / BRIDGE_STEPS
     start = restoring(tangent, -deeper)
