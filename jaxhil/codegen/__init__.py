@@ -1,8 +1,8 @@
-"""C99 generator: translates the rig's Python code to C that computes the same bits.
+"""C99 generator: translates the rig's Python code to C code with bit-identical results.
 
-`CProgram` lowers functions, methods and classes of Python and returns declarations and definitions in C.
-`subset` describes the subset of Python. Constructs outside it raise `SubsetError` with file, line and what to
-write instead.
+`CProgram` lowers (translates to C) functions, methods and classes of Python, and returns declarations and
+definitions in C. `subset` describes the supported subset of Python. Every other construct raises
+`SubsetError`; the message names file, line and a supported alternative.
 """
 
 from .program import CProgram, GeneratedCode

@@ -1,4 +1,4 @@
-"""Lowering of calls (functions of Python and `math`, methods, constructors) and of attributes."""
+"""Lowering of calls (built-in functions, `math`, functions, methods, constructors) and of attributes."""
 
 import ast
 import inspect
@@ -23,7 +23,7 @@ from .subset import (
     implies_sign,
 )
 
-# Functions of math, with the condition on operands `{0}`, `{1}` and result `{r}` under which Python raises.
+# Condition on the operands `{0}`, `{1}` and the result `{r}` for which a function of `math` raises.
 MATH_DOMAIN_ERRORS = {
     "sqrt": "{0} < 0.0",
     "log": "{0} <= 0.0",
@@ -73,7 +73,8 @@ class CallLowering(ListLowering):
                 value = self.expression(called.value)
                 method = inspect.getattr_static(value.type.of, called.attr, None) if value.type.of else None
                 if value.type.kind != "object" or not inspect.isfunction(method):
-                    raise self.refuse(node, f"a call of .{called.attr}", "a method of a class with a source")
+                    expected = "a method of a class with source code"
+                    raise self.refuse(node, f"a call of .{called.attr}", expected)
                 return self.invoke(method, value, node)
         if inspect.ismethod(target):
             return target(node)
@@ -89,12 +90,10 @@ class CallLowering(ListLowering):
 
     def _no_call(self, node: ast.Call, name: str) -> CExpression:
         is_sum = name in ("sum", "fsum", "hypot", "pow")
-        wanted = "a loop or a product: its rounding is Python's own" if is_sum else "a function with a source"
-        raise self.refuse(
-            node,
-            f"{name}(...)",
-            f"{wanted}, or one of math: {', '.join([*MATH_DOMAIN_ERRORS, *FLOAT_TESTS])}",
-        )
+        # C cannot reproduce the rounding of these functions.
+        expected = "a loop or a product" if is_sum else "a function with source code"
+        functions = ", ".join([*MATH_DOMAIN_ERRORS, *FLOAT_TESTS])
+        raise self.refuse(node, f"{name}(...)", f"{expected}, or a function of math: {functions}")
 
     def builtin_abs(self, node: ast.Call) -> CExpression:
         (value,) = self.operands(node.args, self.number)
@@ -110,7 +109,7 @@ class CallLowering(ListLowering):
         if len(values) < 2 or len({value.type.kind for value in values}) > 1:
             raise self.refuse(node, f"{ast.unparse(node)}", "two or more numbers of one type")
         for value in values[1:]:
-            # The order of the operands treats NaN like Python.
+            # With this order of the operands, NaN has the same result as in Python.
             extreme = self.simple(extreme, "extreme") if extreme.rank == CONDITIONAL else extreme
             text = f"{value.at(SUM)} {mark} {extreme.at(SUM)} ? {value.text} : {extreme.text}"
             extreme = CExpression(
@@ -139,7 +138,7 @@ class CallLowering(ListLowering):
         return CExpression(value.length, INT, sign=">= 0") if length is None else self.program.literal(length)
 
     def builtin_int(self, node: ast.Call, form: str = "{}") -> CExpression:
-        """Lower a conversion to int, which fails for values that are not finite or beyond 2^53."""
+        """Lower a conversion to int; emit a failure for values that are not finite or exceed 2^53."""
         value = self.number(node.args[0])
         if value.type.kind == "int" or len(node.args) > 1:
             return value if len(node.args) == 1 else self._no_call(node, "round to digits")
@@ -147,7 +146,7 @@ class CallLowering(ListLowering):
         if not (value.span and max(map(abs, value.span)) < MAX_SQUARABLE_INT):
             text = self.temporary(value._replace(text=text, rank=ATOM), "whole").text
             self.fail_if(
-                f"!(fabs({text}) <= {MAX_INT64_DOUBLE})", node, "an int of a float that may be too large"
+                f"!(fabs({text}) <= {MAX_INT64_DOUBLE})", node, "a float to int conversion that may fail"
             )
         return CExpression(
             f"(int64_t){text}", INT, UNARY, sign=">= 0" if value.sign in ("> 0", ">= 0") else ""
@@ -179,14 +178,14 @@ class CallLowering(ListLowering):
         return value
 
     def _arguments(self, function: Callable[..., Any], node: ast.Call) -> dict[str, Any]:
-        """Return the arguments of a call by parameter, as syntax trees or default values."""
+        """Return the arguments of a call by parameter name, as syntax trees or default values."""
         parameters = {k: p for k, p in inspect.signature(function).parameters.items() if k != "self"}
         arguments: dict[str, Any] = dict(zip(parameters, node.args, strict=False))
         arguments |= {str(keyword.arg): keyword.value for keyword in node.keywords}
         defaults = {k: p.default for k, p in parameters.items() if p.default is not p.empty}
         arguments |= {k: default for k, default in defaults.items() if k not in arguments}
         if len(node.args) > len(parameters) or {*parameters} != {*arguments}:
-            raise self.refuse(node, "these arguments", "one for each parameter")
+            raise self.refuse(node, "these arguments", "one argument for each parameter")
         return arguments
 
     def _lowered(self, arguments: dict[str, Any], node: ast.AST) -> dict[str, CExpression]:
@@ -197,7 +196,7 @@ class CallLowering(ListLowering):
     def invoke(
         self, function: Callable[..., Any], receiver: CExpression | None, node: ast.Call
     ) -> CExpression:
-        """Lower a call of a function or method that has a source."""
+        """Lower a call of a function, or of a method of `receiver`, that has source code."""
         owner = receiver.type.of if receiver else None
         types_ = self.program.parameters(function, owner)
         arguments = self._arguments(function, node)
@@ -234,28 +233,28 @@ class CallLowering(ListLowering):
         self.check(CExpression("", returns, fails=called.fails))
         return CExpression(array, returns, reads=frozenset({("local", array)}))
 
-    def _argument(self, node: ast.AST, name: str, wanted: ValueType, value: CExpression) -> ValueType:
-        """Return the type that a parameter has in this call."""
-        if wanted.kind == value.type.kind == "list" and wanted.length in (None, value.type.length):
+    def _argument(self, node: ast.AST, name: str, required: ValueType, value: CExpression) -> ValueType:
+        """Return the type of a parameter for one call. Raise SubsetError if the argument does not fit."""
+        if required.kind == value.type.kind == "list" and required.length in (None, value.type.length):
             return value.type
-        self.fit(node, wanted, value, f"for {name}")
-        return wanted
+        self.fit(node, required, value, f"for {name}")
+        return required
 
     def pointer(self, value: CExpression) -> str:
-        """Return the C text of a pointer to an object."""
+        """Return the C code of a pointer to an object."""
         return value.text if value.is_pointer else f"&{value.text}"
 
     def _record(self, target: Any, node: ast.Call) -> CExpression:
-        """Lower a NamedTuple into a local constant."""
+        """Lower the construction of a NamedTuple to a local C constant."""
         values, record = self._lowered(self._arguments(target, node), node), ValueType("record", target)
-        wanted = {name: self.program.field_type(self, record, name, node) for name in target._fields}
-        texts = [self.program.stored(t, values[name]) for name, t in wanted.items() if t.kind != "text"]
+        required = {name: self.program.field_type(self, record, name, node) for name in target._fields}
+        texts = [self.program.stored(t, values[name]) for name, t in required.items() if t.kind != "text"]
         name = self.fresh("record")
         self.emit(f"const {self.program.c_type(record)} {name} = {{{', '.join(texts)}}};")
         return CExpression(name, record)
 
     def construct(self, target: CExpression, class_: type, node: ast.Call) -> None:
-        """Lower `self.name = Class(...)` to a construction in place."""
+        """Lower `self.name = Class(...)` to a call that initialises the member struct `name`."""
         init = inspect.getattr_static(class_, "__init__", None)
         if inspect.isfunction(init):
             value = self.invoke(init, target._replace(samples=()), node)

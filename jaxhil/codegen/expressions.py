@@ -42,35 +42,36 @@ COMPARISONS = {
     ast.NotEq: ("!=", operator.ne),
 }
 HELPER_OPERATORS = {ast.FloorDiv: "floor_division", ast.Mod: "modulo", ast.Pow: "power"}
-LARGEST_INT = 2**53  # of the ints of the subset; a double holds each of them
+LARGEST_INT = 2**53  # largest int of the subset; a double represents all smaller ints exactly
 MAX_SQUARABLE_INT = 94906265  # largest int whose square is at most LARGEST_INT
-# A sum of these that is only compared is not tested: terms of at most LARGEST_INT cannot overflow.
+# Sums of these nodes need no test if they are only compared: terms up to LARGEST_INT cannot overflow.
 TERMS = (ast.BinOp, ast.Add, ast.Sub, ast.Name, ast.Attribute, ast.Constant, ast.expr_context)
-SMALL = 2**10  # a count that grows by this every millisecond needs 278 years to LARGEST_INT
+SMALL = 2**10  # with this increment every millisecond, a counter needs 278 years to reach LARGEST_INT
 
 
 def is_small(value: CExpression) -> bool:
-    """Return whether adding the int again and again cannot lead beyond LARGEST_INT."""
+    """Return whether an int is so small that a counter with this increment cannot reach LARGEST_INT."""
     has_bound = value.type.is_index or bool(value.below) or value.type.c_int != "int64_t"
     return has_bound or (value.span is not None and max(map(abs, value.span)) <= SMALL)
 
 
 class ExpressionLowering(Lowering):
-    """Lowering of expressions; statements that must precede them are emitted."""
+    """Lowering of expressions; emits the C statements that must precede an expression."""
 
     def lower_constant(self, node: ast.Constant) -> CExpression:
         return self.program.constant(node.value) or self.unknown(node, repr(node.value))
 
     def unknown(self, node: ast.AST, what: str) -> CExpression:
-        """Raise the error for a name or constant that has no equivalent in C."""
-        raise self.refuse(node, what, "a number, a bool, a list of them, a class or a function with a source")
+        """Raise SubsetError for a name or constant that has no equivalent in C."""
+        expected = "a number, a bool, a list of numbers, or a class or function with source code"
+        raise self.refuse(node, what, expected)
 
     def lower_name(self, node: ast.Name) -> CExpression:
         if node.id in self.names:
             self.function.reads |= self.names[node.id].reads
             return self.names[node.id]
-        if node.id in self.function.places or node.id not in self.function.namespace:
-            raise self.refuse(node, f"the name {node.id}", "one that is assigned before, here or above")
+        if node.id in self.function.occurrences or node.id not in self.function.namespace:
+            raise self.refuse(node, f"the name {node.id}", "a name that is assigned earlier")
         return self.program.named_constant(node.id, self.function.namespace) or self.unknown(node, node.id)
 
     def lower_binop(self, node: ast.BinOp) -> CExpression:
@@ -119,14 +120,14 @@ class ExpressionLowering(Lowering):
         )
 
     def _limit(self, node: ast.AST, value: CExpression, limit: int, reason: str) -> None:
-        """Emit a test that the magnitude of an int is at most `limit`."""
+        """Emit a test that the absolute value of an int is at most `limit`."""
         self.fail_if(f"{value.text} > {limit} || {value.text} < -{limit}", node, reason)
 
     def _sign(self, op: ast.operator, left: CExpression, right: CExpression) -> str:
         if not {left.sign, right.sign} <= {"> 0", ">= 0"}:
             return ">= 0" if isinstance(op, ast.Mult) and left.text == right.text else ""
         is_one_positive = "> 0" in (left.sign, right.sign)
-        # A product of positive floats may underflow to 0, but not by a factor of 1 or more.
+        # A product of positive floats may underflow to 0, but not if a factor is at least 1.
         is_large = any(factor.constant is not None and factor.constant >= 1 for factor in (left, right))
         if isinstance(op, ast.Mult) and left.sign == right.sign == "> 0" and is_large:
             return "> 0"
@@ -135,7 +136,7 @@ class ExpressionLowering(Lowering):
         return ">= 0" if isinstance(op, (ast.Mult, ast.Div)) else ""
 
     def _divisor(self, node: ast.AST, value: CExpression) -> CExpression:
-        """Emit a test of a divisor unless it cannot be 0; return the divisor."""
+        """Emit a test of a divisor that may be 0; return the divisor."""
         if value.sign and implies_sign(value.sign, "not 0"):
             return value
         value = self.simple(value, "divisor")
@@ -221,7 +222,8 @@ class ExpressionLowering(Lowering):
     def _identity(self, node: ast.Compare, is_same: bool, comparator: ast.expr) -> CExpression:
         value = node.left
         if isinstance(value, ast.Call) and getattr(value.func, "id", "") == "type":
-            # `type(x) is float` saves Python a conversion. In C the type is known, so that it is a constant.
+            # In Python, `type(x) is float` avoids a conversion. In C the type is known: the test is a
+            # constant.
             kind = self.expression(value.args[0]).type.kind
             return self.program.literal((kind == getattr(comparator, "id", "")) == is_same)
         parameter = self.names.get(getattr(value, "id", ""))
@@ -230,7 +232,7 @@ class ExpressionLowering(Lowering):
         return CExpression(f"{parameter.text.lstrip('*')} {'==' if is_same else '!='} NULL", BOOL, EQUALITY)
 
     def _together(self, parts: list[CExpression], is_and: bool) -> CExpression:
-        """Join conditions by `and` or `or`."""
+        """Join conditions with C's `&&` or `||`; evaluate constant conditions."""
         decided = [i for i, part in enumerate(parts) if part.constant is not None and part.constant != is_and]
         if decided:
             is_kept = any(part.writes for part in parts[: decided[0]])

@@ -1,4 +1,4 @@
-"""Lowering of lists and loops: arrays of fixed length, views, samples of run-time length, indices."""
+"""Lowering of lists and loops: arrays of fixed or run-time length, slices, indices, iterations."""
 
 import ast
 import re
@@ -12,18 +12,18 @@ from .subset import ATOM, FLOAT, INT, SUM, TEXT, CExpression, ValueType, implies
 
 
 class LoopRange(NamedTuple):
-    """Iteration of a loop."""
+    """Index range of a C loop, and the values of the Python loop's targets."""
 
-    start: str  # C text of the first index
-    stop: str  # C text of the index after the last
-    values: Callable[[str], list[CExpression]]  # values of an iteration, by its index
+    start: str  # C code of the first index
+    stop: str  # C code of the index after the last
+    values: Callable[[str], list[CExpression]]  # function from the index to the values of the targets
     count: int | None = None  # number of iterations, if known at export
-    step: int = 1
-    constants: tuple[Any, ...] = ()  # values of all iterations, if known at export
+    step: int = 1  # increment of the index, 1 or -1
+    constants: tuple[Any, ...] = ()  # values of the target in all iterations, if known at export
 
 
 def has_text(values: tuple[Any, ...]) -> bool:
-    """Return whether some of the constants are not numbers."""
+    """Return whether any of the values is not a number."""
     return not all(isinstance(value, (int, float)) for value in values)
 
 
@@ -37,13 +37,13 @@ class ListLowering(ExpressionLowering):
     lower_tuple = lower_list
 
     def is_display(self, node: ast.expr) -> bool:
-        """Return whether an expression makes a new list."""
+        """Return whether an expression creates a new list."""
         called = getattr(node.func, "id", "") if isinstance(node, ast.Call) else ""
         is_product = isinstance(node, ast.BinOp) and isinstance(node.left, ast.List)
         return isinstance(node, (ast.List, ast.Tuple, ast.ListComp)) or is_product or called == "list"
 
     def array(self, node: ast.expr, target: CExpression | None, named: str = "") -> CExpression:
-        """Lower a list to an array: the target, or a new local array if there is none."""
+        """Lower a list into the array `target`, or if it is None, into a new local array."""
         if target is not None and target.type.length is None:
             self._fill(target.text, node, target.type)
             return target
@@ -55,7 +55,8 @@ class ListLowering(ExpressionLowering):
         if target is not None and target.type.length != type_.length:
             raise self.refuse(node, f"{type_.length} elements", f"a list of {target.type.length}")
         if target is not None and self.failures == failures and not target.reads & reads:
-            # The elements do not read the old list, and no failure leaves the new one incomplete.
+            # Write to the target directly: no element reads the old list, and no failure leaves it
+            # incomplete.
             self.emit(*(re.sub(rf"\b{name}\b", target.text, line) for line in lines))
             self.function.taken.discard(name)
             return target
@@ -66,7 +67,7 @@ class ListLowering(ExpressionLowering):
         return result
 
     def copy(self, target: CExpression, source: CExpression, node: ast.AST) -> None:
-        """Copy a list to another list."""
+        """Emit code that copies the elements of `source` to `target`."""
         length = source.type.length
         if length is None or target.type.length != length:
             found = f"{length or 'any number of'} elements"
@@ -80,7 +81,7 @@ class ListLowering(ExpressionLowering):
 
     @contextmanager
     def _each(self, stop: str) -> Iterator[str]:
-        """Emit a loop around the lines that the context emits; yield its index."""
+        """Emit a loop around the lines that the context emits; yield the loop's index."""
         index = self.fresh("i")
         self.emit(f"for (int64_t {index} = 0; {index} < {stop}; {index}++) {{")
         with self.captured() as lines:
@@ -89,10 +90,10 @@ class ListLowering(ExpressionLowering):
         self.emit(*lines, "}")
         self.function.taken.discard(index)
 
-    def _fill(self, target: str, node: ast.expr, wanted: ValueType | None) -> ValueType:
-        """Fill the array `target` with the elements of a list; return its type."""
+    def _fill(self, target: str, node: ast.expr, required: ValueType | None) -> ValueType:
+        """Emit code that fills the array `target` with the elements of a list; return the list's type."""
         if isinstance(node, (ast.List, ast.Tuple)):
-            element, length = wanted and wanted.of, 0
+            element, length = required and required.of, 0
             for item in node.elts:
                 if isinstance(item, ast.Starred):
                     part = self.expression(item.value)
@@ -102,14 +103,14 @@ class ListLowering(ExpressionLowering):
                     element, length = self._put(f"{target}[{length}]", item, element), length + 1
             return ValueType("list", element or FLOAT, length)
         if isinstance(node, ast.ListComp):
-            return self._comprehension(target, node, wanted)
+            return self._comprehension(target, node, required)
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "list" and len(node.args) == 1:
-            return self._fill(target, node.args[0], wanted)
+            return self._fill(target, node.args[0], required)
         if isinstance(node, ast.BinOp) and isinstance(node.left, ast.List) and len(node.left.elts) == 1:
             count = self.number(node.right)
             stop = count.text if count.constant is not None else self.program.length_of(self, target, node)
             with self._each(stop) as index:
-                element = self._put(f"{target}[{index}]", node.left.elts[0], wanted and wanted.of)
+                element = self._put(f"{target}[{index}]", node.left.elts[0], required and required.of)
             return ValueType("list", element, count.constant)
         value = self.expression(node)
         if value.type.kind != "list":
@@ -117,21 +118,21 @@ class ListLowering(ExpressionLowering):
         self.copy(CExpression(target, value.type), value, node)
         return value.type
 
-    def _put(self, target: str, node: ast.expr, wanted: ValueType | None) -> ValueType:
-        """Fill one element; return its type."""
-        if self.is_display(node) or (wanted is not None and wanted.kind == "list"):
-            return self._fill(target, node, wanted)
+    def _put(self, target: str, node: ast.expr, required: ValueType | None) -> ValueType:
+        """Emit code that assigns one element of an array; return the element's type."""
+        if self.is_display(node) or (required is not None and required.kind == "list"):
+            return self._fill(target, node, required)
         value = self.expression(node)
-        element = wanted or value.type._replace(sign="", is_index=False, c_int="int64_t")
+        element = required or value.type._replace(sign="", is_index=False, c_int="int64_t")
         self.emit(f"{target} = {self.program.stored(element, value)};")
         self.check(value)
         return element
 
-    def _comprehension(self, target: str, node: ast.ListComp, wanted: ValueType | None) -> ValueType:
+    def _comprehension(self, target: str, node: ast.ListComp, required: ValueType | None) -> ValueType:
         generator, loop = node.generators[0], self.loop(node.generators[0].iter)
         if len(node.generators) > 1 or generator.ifs or loop.count is None:
-            raise self.refuse(node, "this comprehension", "one `for` of known length without `if`")
-        element, hidden = wanted and wanted.of, dict(self.names)
+            raise self.refuse(node, "this comprehension", "a single `for` of known length without `if`")
+        element, hidden = required and required.of, dict(self.names)
         if has_text(loop.constants):
             for index, value in enumerate(loop.constants):
                 self.names[getattr(generator.target, "id", "")] = self.program.literal(value)
@@ -145,14 +146,14 @@ class ListLowering(ExpressionLowering):
         return ValueType("list", element or FLOAT, loop.count)
 
     def targets(self, node: ast.expr, count: int) -> list[str]:
-        """Return the names that a loop binds."""
+        """Return the names of a loop's targets. Raise SubsetError unless there are `count` names."""
         targets = node.elts if isinstance(node, ast.Tuple) else [node]
         if len(targets) != count or not all(isinstance(target, ast.Name) for target in targets):
             raise self.refuse(node, "this target", f"{count} names")
         return [target.id for target in targets if isinstance(target, ast.Name)]
 
     def loop(self, node: ast.expr) -> LoopRange:
-        """Return the iteration of `for ... in` an expression."""
+        """Return the index range and values of a loop `for ... in` the expression `node`."""
         called = node.func.id if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
         if called == "range" and isinstance(node, ast.Call):
             return self._range(node)
@@ -162,7 +163,7 @@ class ListLowering(ExpressionLowering):
             strict = any(k.arg == "strict" and getattr(k.value, "value", 0) for k in node.keywords)
             if None in counts or (strict and len(counts) > 1):
                 found = f"{called} of lists of {counts} elements"
-                raise self.refuse(node, found, "lists of one fixed length")
+                raise self.refuse(node, found, "lists of the same fixed length")
             count = min(number for number in counts if number is not None)
             parts = [loop.values for loop in loops]
             if called == "enumerate":
@@ -203,7 +204,7 @@ class ListLowering(ExpressionLowering):
         return LoopRange(start.text, stop.text, values, count, step)
 
     def at(self, value: CExpression, index: str) -> CExpression:
-        """Return the element of a list at a valid index."""
+        """Return the C expression for the element of a list at an index that needs no test."""
         of, constant = value.type.of, value.constant
         span = (min(constant), max(constant)) if isinstance(constant, tuple) and of.kind == "int" else None
         sign = ">= 0" if span and span[0] >= 0 else of.sign
@@ -223,7 +224,7 @@ class ListLowering(ExpressionLowering):
         return self.at(value, self._index(node, value, index))
 
     def _index(self, node: ast.AST, value: CExpression, index: CExpression) -> str:
-        """Return the C text of an index; test it where it may be outside the list."""
+        """Return the C code of an index; emit a test if the index may be outside the list."""
         size, is_above = value.type.length, implies_sign(index.sign, ">= 0") and index.sign != ""
         length = str(size or value.length)
         if index.constant is not None and size and -size <= index.constant < size:
@@ -246,7 +247,7 @@ class ListLowering(ExpressionLowering):
             key = eval(code, {"__builtins__": {}}, texts)
             sign = self.program.struct_signs[value.type.of][key]
         except Exception:
-            raise self.refuse(node, f"{ast.unparse(node)}", "a gain or limit by its own name") from None
+            raise self.refuse(node, f"{ast.unparse(node)}", "the name of a gain or limit") from None
         return CExpression(f"{value.text}->{key}", FLOAT, sign=sign)
 
     def _slice(self, node: ast.Subscript, value: CExpression, part: ast.Slice) -> CExpression:
@@ -254,7 +255,7 @@ class ListLowering(ExpressionLowering):
         bounds = [None if end is None else self.number(end).constant for end in ends]
         is_known = all(end is None or bound is not None for end, bound in zip(ends, bounds, strict=True))
         if length is None or part.step is not None or not is_known:
-            raise self.refuse(node, "this slice", "constant bounds, of a list of fixed length")
+            raise self.refuse(node, "this slice", "constant bounds and a list of fixed length")
         start, stop, _ = slice(*bounds).indices(length)
         text = value.text if start == 0 else f"({value.text} + {start})"
         return value._replace(text=text, type=value.type._replace(length=stop - start), constant=None)

@@ -1,4 +1,4 @@
-"""Base of the lowering of one function: output, error flag, order of evaluation, facts about numbers."""
+"""Base class for the lowering of a function: output, error flag, evaluation order, facts about numbers."""
 
 import ast
 from collections.abc import Callable, Iterator, Sequence
@@ -24,41 +24,41 @@ if TYPE_CHECKING:
     from .program import CFunction, CProgram
 
 SIGN_IF_TRUE = {ast.Gt: "> 0", ast.GtE: ">= 0", ast.Lt: "not 0", ast.NotEq: "not 0"}  # sign of x if x OP 0
-SIGN_IF_FALSE = {ast.Lt: ">= 0", ast.LtE: "> 0", ast.Eq: "not 0"}
+SIGN_IF_FALSE = {ast.Lt: ">= 0", ast.LtE: "> 0", ast.Eq: "not 0"}  # sign of x if not x OP 0
 
 
 class NumberFact(NamedTuple):
-    """Fact about a number at one position in the code."""
+    """Sign and range of a number that are certain at one position in the code."""
 
     sign: str
-    reads: Locations = frozenset()  # on which it depends
-    span: tuple[Any, Any] | None = None  # least and largest value; the number is not NaN
+    reads: Locations = frozenset()  # locations on which the number depends
+    span: tuple[Any, Any] | None = None  # least and largest value; with a range, the number is not NaN
 
 
 class Lowering:
-    """State of the lowering of one function."""
+    """State of the lowering of one function: names, facts about numbers, and lines of C code."""
 
     def __init__(self, program: "CProgram", function: "CFunction") -> None:
         self.program, self.function = program, function
-        self.names: dict[str, CExpression] = {}  # local names
-        self.facts: dict[str, NumberFact] = {}  # by the C text of a number
+        self.names: dict[str, CExpression] = {}  # C expressions of local names
+        self.facts: dict[str, NumberFact] = {}  # facts about numbers, by their C code
         self.lines: list[str] = []
-        self.failures = 0  # number of tests so far that may leave the function
-        self.effects: list[Locations] = []  # what calls have changed so far
-        self.compared: list[ast.expr] = []  # sums whose value is only compared
+        self.failures = 0  # number of emitted tests that may leave the function
+        self.effects: list[Locations] = []  # locations that the code so far has changed
+        self.compared: list[ast.expr] = []  # sums that are only operands of comparisons
 
     def refuse(self, node: ast.AST, found: str, expected: str) -> SubsetError:
-        """Return the error for a construct outside the subset."""
+        """Return the `SubsetError` for an unsupported construct at `node`."""
         line = getattr(node, "lineno", self.function.node.lineno)
         return refusal(self.function.file, line, found, expected)
 
     def emit(self, *lines: str) -> None:
-        """Add lines; `printing` indents them."""
+        """Add lines of C code; `printing` indents them later."""
         self.lines += lines
 
     @contextmanager
     def captured(self) -> Iterator[list[str]]:
-        """Collect the lines emitted in the context in a new list; drop its facts afterwards."""
+        """Collect the lines that the context emits in a separate list; afterwards, restore the facts."""
         before, facts, effects = self.lines, self.facts, len(self.effects)
         self.lines, self.facts = [], dict(facts)
         yield self.lines
@@ -66,37 +66,37 @@ class Lowering:
         self.lines, self.facts = before, {k: fact for k, fact in facts.items() if not fact.reads & written}
 
     def fresh(self, hint: str) -> str:
-        """Return an unused local name."""
+        """Return an unused local name that begins with `hint`."""
         numbers = (f"{hint}_{number}" for number in range(2, 10_000))
         name = next(candidate for candidate in (hint, *numbers) if candidate not in self.function.taken)
         self.function.taken.add(name)
         return name
 
     def temporary(self, value: CExpression, hint: str) -> CExpression:
-        """Store a value in a local constant."""
+        """Emit a local constant with a value; return the constant."""
         name = self.fresh(hint)
         self.emit(f"const {self.program.c_type(value.type)} {name} = {value.text};")
         self.check(value)
         return CExpression(name, value.type, sign=value.sign)
 
     def simple(self, value: CExpression, hint: str) -> CExpression:
-        """Return a value whose text may be repeated."""
+        """Return a value whose C code may occur several times; store other values in a local constant."""
         is_simple = value.text.replace("->", "").replace(".", "").replace("_", "").isalnum()
         return value if is_simple and not value.writes else self.temporary(value, hint)
 
     def check(self, value: CExpression) -> None:
-        """Leave the function if the call that gave a value failed."""
+        """Emit a return from the function if the call that computed `value` has failed."""
         if value.fails:
             self.fail_if("*error", None)
 
     def fail_if(self, condition: str, node: ast.AST | None, reason: str = "") -> None:
-        """Set the error flag and leave the function if a condition holds."""
+        """Emit code that sets the error flag and returns from the function if a condition holds."""
         self.emit(f"if ({condition}) {{")
         self.fail(node, reason)
         self.emit("}")
 
     def fail(self, node: ast.AST | None, reason: str) -> None:
-        """Leave the function; set the error flag, which is set already if `node` is None."""
+        """Emit a return from the function that sets the error flag; if `node` is None, it is already set."""
         self.failures += 1
         self.function.fails = True
         nothing = {"float": " 0.0", "int": " 0", "bool": " false"}.get(self.function.returns.kind, "")
@@ -107,7 +107,7 @@ class Lowering:
         self.emit(f"return{nothing};")
 
     def expression(self, node: ast.expr) -> CExpression:
-        """Lower an expression."""
+        """Lower an expression, with the facts about its value."""
         if isinstance(node, ast.JoinedStr):
             return CExpression("", TEXT)
         lower = getattr(self, f"lower_{type(node).__name__.lower()}", None)
@@ -120,23 +120,25 @@ class Lowering:
         sign = value.sign if value.sign and implies_sign(value.sign, fact.sign) else fact.sign
         return value._replace(sign=sign, span=fact.span or value.span)
 
-    def fit(self, node: ast.AST, wanted: ValueType, value: CExpression, use: str, expected: str = "") -> None:
-        """Raise SubsetError unless a value has the wanted type and sign."""
-        is_same = (wanted.kind, wanted.of) == (value.type.kind, value.type.of)
-        if not is_same and not (wanted.kind == "float" and value.is_number):
-            raise self.refuse(node, f"a {value.type.kind} {use}", expected or f"a {wanted.kind}")
-        if not implies_sign(value.sign, wanted.sign):
-            raise self.refuse(node, f"a number of unknown sign {use}", f"one that is {wanted.sign}")
+    def fit(
+        self, node: ast.AST, required: ValueType, value: CExpression, use: str, expected: str = ""
+    ) -> None:
+        """Raise SubsetError unless a value has the required type and sign."""
+        is_same = (required.kind, required.of) == (value.type.kind, value.type.of)
+        if not is_same and not (required.kind == "float" and value.is_number):
+            raise self.refuse(node, f"a {value.type.kind} {use}", expected or f"a {required.kind}")
+        if not implies_sign(value.sign, required.sign):
+            raise self.refuse(node, f"a number of unknown sign {use}", f"a number {required.sign}")
 
     def number(self, node: ast.expr) -> CExpression:
-        """Lower an expression that has to be a number."""
+        """Lower an expression. Raise SubsetError if its value is not a number."""
         value = self.expression(node)
         if not value.is_number:
             raise self.refuse(node, f"a {value.type.kind} as an operand", "a number")
         return value
 
     def truth(self, node: ast.expr) -> CExpression:
-        """Lower an expression as a condition."""
+        """Lower an expression to a C condition."""
         value = self.expression(node)
         if value.type.kind == "bool":
             return value
@@ -149,7 +151,7 @@ class Lowering:
     def operands(
         self, nodes: Sequence[ast.expr], lower: Callable[..., CExpression] | None = None
     ) -> list[CExpression]:
-        """Lower expressions that Python evaluates from left to right."""
+        """Lower expressions such that C evaluates them from left to right, as Python does."""
         values: list[CExpression] = []
         for node in nodes:
             position, before = len(self.lines), len(self.effects)
@@ -168,25 +170,25 @@ class Lowering:
         return values
 
     def hint_of(self, node: ast.expr) -> str:
-        """Return a name for the value of a call."""
+        """Return a base for the name of a local constant that holds the value of `node`."""
         called = node.func if isinstance(node, ast.Call) else node
         name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "value")
         return name.lstrip("_")
 
     def note(self, writes: Locations) -> None:
-        """Record what an assignment or a call changes."""
+        """Record the locations that an assignment or a call changes; drop facts that depend on them."""
         if writes:
             self.effects.append(writes)
             self.function.writes |= writes
             self.facts = {key: fact for key, fact in self.facts.items() if not fact.reads & writes}
 
     def explain(self, statement: ast.stmt) -> None:
-        """Print the comment above a statement."""
+        """Emit the Python comment above a statement as a C comment."""
         if text := read_comment_before(self.function.file, statement):
             self.emit(f"/* {escape_comment(text)} */")
 
     def facts_of(self, node: ast.expr, truth: bool) -> dict[str, NumberFact]:
-        """Return the facts about numbers that follow if a condition is true, or false."""
+        """Return the facts about numbers that follow from a condition with the value `truth`."""
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
             return self.facts_of(node.operand, not truth)
         if isinstance(node, ast.BoolOp) and isinstance(node.op, ast.And) == truth:

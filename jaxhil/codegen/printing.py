@@ -1,4 +1,4 @@
-"""Layout of the C text (comments, indentation, long lines), and helpers for Python's operators."""
+"""Layout of the C code (comments, indentation, line breaks), and C helpers for Python's operators."""
 
 import inspect
 import re
@@ -6,9 +6,9 @@ import textwrap
 from collections.abc import Iterable
 
 MAX_LINE_LENGTH = 116
-# Functions that are printed only if used; @ stands for the prefix.
+# C functions that the output contains only if they are called; @ is replaced by the prefix.
 C_HELPERS = {
-    # Without volatile, compilers replace powers with constant exponents by products that round differently.
+    # Without volatile, a compiler may replace a power by products, which have different rounding errors.
     "power": """double @power(double base, double exponent) {
 const volatile double exact = exponent;
 return pow(base, exact);
@@ -40,12 +40,12 @@ return rest != 0 && (rest < 0) != (divisor < 0) ? quotient - 1 : quotient;
 
 
 def escape_comment(text: str) -> str:
-    """Return a text for a C comment: ASCII, without comment marks."""
+    """Escape a text for a C comment: non-ASCII characters, and the marks that begin and end comments."""
     return text.replace("*/", "* /").replace("/*", "/ *").encode("ascii", "backslashreplace").decode()
 
 
 def format_comment(text: str | None) -> str:
-    """Return a docstring as a C comment, "" if there is none."""
+    """Format a docstring as a C comment; return "" for an empty docstring."""
     lines = escape_comment(inspect.cleandoc(text or "")).splitlines()
     if len(lines) < 2:
         return f"/* {lines[0]} */\n" if lines else ""
@@ -53,7 +53,7 @@ def format_comment(text: str | None) -> str:
 
 
 def indent_lines(lines: Iterable[str]) -> str:
-    """Return the lines as text, indented by their braces and broken where too long."""
+    """Join lines of C code: indent them by the depth of their braces, and break long lines."""
     depth, result = 0, []
     for line in lines:
         depth -= line.startswith("}")
@@ -63,7 +63,7 @@ def indent_lines(lines: Iterable[str]) -> str:
 
 
 def _break_line(line: str) -> str:
-    """Break a long line after a comma or before an operator, where the fewest parentheses are open."""
+    """Break a long line after a comma or before an operator, at the lowest depth of parentheses."""
     indent = " " * (len(line) - len(line.lstrip()))
     if len(line) <= MAX_LINE_LENGTH:
         return line

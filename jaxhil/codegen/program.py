@@ -1,4 +1,4 @@
-"""C program: the lowered functions with their structs and constants, in order."""
+"""C program: lowered functions with the structs, constants and helpers that they need."""
 
 import ast
 import inspect
@@ -31,7 +31,7 @@ from .subset import (
 
 
 class CFunction:
-    """C function for a Python function with these types of parameters."""
+    """C function that is the lowering of a Python function for given types of its parameters."""
 
     def __init__(
         self, function: Callable[..., Any], owner: type | None, types: Mapping[str, ValueType]
@@ -42,36 +42,41 @@ class CFunction:
         types = {name: type_ for name, type_ in types.items() if name != "return"}
         self.parameters = {name: type_ for name, type_ in types.items() if type_.kind != "text"}
         self.texts = [name for name in types if name not in self.parameters]
-        self.places = find_name_lines(self.node)
+        self.occurrences = find_name_lines(self.node)
         names = {node.id for node in ast.walk(self.node) if isinstance(node, ast.Name)} | {*types, "self"}
         self.taken = {f"{name}_" if name in C_RESERVED_WORDS else name for name in names} | C_RESERVED_WORDS
         self.reads: Locations = frozenset()
         self.writes: Locations = frozenset()
-        self.changes: set[str] = set()  # parameters whose lists it changes
-        self.retained: dict[str, Locations] = {}  # parameters whose lists it assigns to attributes
+        self.changes: set[str] = set()  # list parameters that the function changes
+        self.retained: dict[str, Locations] = {}  # list parameters that the function assigns to attributes
         self.shared: dict[Any, SubsetError] = {}  # errors for local lists that are also attributes
-        self.replaced: Locations = frozenset()  # attributes to which it assigns another list or object
-        self.fails, self.reason = False, ""  # whether it may fail; file, line and reason
+        self.replaced: Locations = frozenset()  # attributes that get a different list or object
+        self.fails, self.reason = False, ""  # whether the function may fail; file, line and reason
         self.name, self.error = "", "error"
         self.lines: list[str] = []
 
 
 class GeneratedCode(NamedTuple):
-    """C text of a program."""
+    """C code of a program.
 
-    declarations: str  # structs and public prototypes
-    definitions: str  # constants, helpers, functions
+    Attributes:
+        declarations: structs and prototypes of the public functions, for the header.
+        definitions: constants, helpers and functions, for the source file.
+    """
+
+    declarations: str
+    definitions: str
 
 
 class CProgram(StructLowering):
-    """Lowered functions with their structs, constants and helpers.
+    """C program with lowered functions, their structs, constants and helpers.
 
     Args:
-        prefix: prefix of all names in C.
+        prefix: prefix of all C names.
         structs: signs of the fields of structs such as `jaxhil_gains`, by struct and field.
-        names: names of classes in C, without the prefix, where they differ from Python's.
-        public: functions that the header declares, with their names in C.
-        bindings: classes that replace other classes as types (a compensator for its protocol).
+        names: C names of classes, without the prefix, if they differ from the names in Python.
+        public: functions that the header declares, with their C names.
+        bindings: classes that replace a type in annotations, such as a compensator its protocol.
         enumerators: constants that the header already defines, by name.
     """
 
@@ -89,15 +94,15 @@ class CProgram(StructLowering):
         self.enumerators = enumerators or {}
         self.functions: dict[Any, CFunction] = {}
         self.under_way: list[Any] = []
-        self.constants: dict[str, tuple[str, str]] = {}  # text and comment, by name
+        self.constants: dict[str, tuple[str, str]] = {}  # C code and comment of each constant, by name
         self.helpers: set[str] = set()
 
     def add(self, function: Callable[..., Any], owner: type | None = None) -> CFunction:
-        """Lower a function or method with the types of its annotations."""
+        """Lower a function, or a method of `owner`, with the types of its annotations."""
         return self.function(function, owner, self.parameters(function, owner), None)
 
     def parameters(self, function: Callable[..., Any], owner: type | None) -> dict[str, ValueType]:
-        """Return the types of a function's parameters and of its result ("return")."""
+        """Return the types of a function's parameters, and of its result under the key "return"."""
         protocols = [protocol for protocol, bound in self.bindings.items() if bound is owner]
         hints = find_annotations(function, *protocols[:1])
         types = {}
@@ -106,7 +111,7 @@ class CProgram(StructLowering):
             if type_ is None and name != "self":
                 node, file = find_definition(function)
                 what = f"no type in C for {name} of {function.__name__}"
-                raise refusal(file, node.lineno, what, "an annotation: float, int, bool...")
+                raise refusal(file, node.lineno, what, "an annotation such as float, int or bool")
             if name != "self" and type_ is not None:
                 types[name] = type_
         return types
@@ -118,7 +123,7 @@ class CProgram(StructLowering):
         types: Mapping[str, ValueType],
         caller: Lowering | None,
     ) -> CFunction:
-        """Return the C function for these types; lower it on the first call."""
+        """Return the C function for a Python function with parameter types; lower it on the first call."""
         key = (function, owner, *((n, t.length, t.of) for n, t in types.items() if t.kind == "list"))
         if key in self.under_way and caller is not None:
             raise caller.refuse(caller.function.node, f"{function.__name__} calling itself", "a loop")
@@ -131,7 +136,7 @@ class CProgram(StructLowering):
             inner = {key for key in result.writes | result.reads if key[0] in ("local", "parameter")}
             result.writes, result.reads = result.writes - inner, result.reads - inner
             if any(type_.kind == "list" and type_.of.kind == "list" for type_ in result.parameters.values()):
-                # In C a matrix cannot be passed as a pointer to constant arrays.
+                # C does not convert a matrix to a pointer to constant arrays: declare it as changed.
                 result.writes |= {("matrix", "")}
             self.functions[key] = result
         return self.functions[key]
@@ -148,7 +153,7 @@ class CProgram(StructLowering):
         return next(text for text in (base, *alternatives) if text not in taken and not text.endswith("_"))
 
     def local_type(self, function: CFunction, node: ast.expr) -> ValueType | None:
-        """Return the type of a local annotation."""
+        """Return the type of a local variable's annotation, None if C has no equivalent."""
         try:
             hint = eval(compile(ast.Expression(node), function.file, "eval"), function.namespace)
         except Exception:
@@ -156,7 +161,7 @@ class CProgram(StructLowering):
         return type_of_annotation(hint, self.bindings)
 
     def constant(self, value: Any) -> CExpression | None:
-        """Return a constant; None if it is no number, bool, text or sequence."""
+        """Return the C expression for a constant, None if it is no number, bool, text or sequence."""
         if isinstance(value, (str, tuple, list, frozenset)):
             return CExpression("", TEXT, constant=value)
         if isinstance(value, bool):
@@ -171,11 +176,11 @@ class CProgram(StructLowering):
         return CExpression(text, type_, rank, sign=sign_of(value), span=span, constant=value)
 
     def literal(self, value: Any) -> CExpression:
-        """Return a constant, whose text is empty if it has none in C."""
+        """Return the C expression for a constant; its code is empty if C has no equivalent."""
         return self.constant(value) or CExpression("", TEXT, constant=value)
 
     def named_constant(self, name: str, namespace: dict[str, Any]) -> CExpression | None:
-        """Return a module's constant with its name in C; None if C has no equivalent."""
+        """Return the C name of a module's constant as an expression, None if C has no equivalent."""
         value = namespace[name]
         result, named = self.constant(value), f"{self.prefix}{name}".upper()
         if result is not None and self.enumerators.get(name) == value:
@@ -191,26 +196,26 @@ class CProgram(StructLowering):
         else:
             text, result = result.at(16), result._replace(text=named, rank=16)
         if self.constants.get(named, (text, ""))[0] != text:
-            return self.constant(value)  # another module has the name for another value
+            return self.constant(value)  # a different module uses the same name for a different value
         self.constants[named] = (text, read_constant_comment(name, namespace))
         return result
 
     def helper(self, name: str, *texts: str) -> str:
-        """Return the C text of a helper's call."""
+        """Return the C code for a call of a helper."""
         self.helpers.add(name)
         return f"{self.prefix}{name}({', '.join(texts)})"
 
-    def stored(self, wanted: ValueType, value: CExpression) -> str:
-        """Return the C text of a value that is assigned to, or passed for, a type."""
-        if wanted.kind == "object":
+    def stored(self, required: ValueType, value: CExpression) -> str:
+        """Return the C code for a value that is assigned to a variable or parameter of the required type."""
+        if required.kind == "object":
             return value.text if value.is_pointer else f"&{value.text}"
-        if wanted.kind == "float" and value.type.kind == "int":
+        if required.kind == "float" and value.type.kind == "int":
             return as_float(value).text
-        is_cast = wanted.kind == "int" and wanted.c_int not in ("int64_t", value.type.c_int)
-        return f"({wanted.c_int}){value.at(UNARY)}" if is_cast and value.constant is None else value.text
+        is_cast = required.kind == "int" and required.c_int not in ("int64_t", value.type.c_int)
+        return f"({required.c_int}){value.at(UNARY)}" if is_cast and value.constant is None else value.text
 
     def output(self) -> GeneratedCode:
-        """Return the C text of all lowered functions and what they need."""
+        """Return the C code of all lowered functions with their structs, constants and helpers."""
         for keys, error in self.shared:
             if self.changed_in_place & keys:
                 raise error
@@ -219,7 +224,7 @@ class CProgram(StructLowering):
         for function in public:
             if function.fails:
                 found = f"{function.reason} within {function.name}"
-                raise SubsetError(f"{found}, expected what cannot raise, or try around it")
+                raise SubsetError(f"{found}, expected an operation that cannot raise, or `try` around it")
         prototypes = (f"\n{format_comment(ast.get_docstring(f.node))}{self._signature(f)};\n" for f in public)
         structs = self.structs([function.owner for function in lowered if function.owner])
         functions = "".join(self._definition(function) for function in lowered)

@@ -1,4 +1,4 @@
-"""Sources of Python functions: syntax trees, comments, annotations, lines of local names."""
+"""Source code of Python functions: syntax trees, comments, annotations and uses of local names."""
 
 import ast
 import inspect
@@ -15,13 +15,13 @@ from .subset import refusal
 
 @cache
 def parse_file(file: str) -> ast.Module:
-    """Return the syntax tree of a file, or of a notebook's cell."""
+    """Return the syntax tree of a file or of a notebook cell."""
     return ast.parse("".join(linecache.getlines(file)), file)
 
 
 @cache
 def find_definition(function: Callable[..., Any]) -> tuple[ast.FunctionDef, str]:
-    """Return a function's syntax tree and its file. Raise SubsetError if it has no source."""
+    """Return a function's syntax tree and its file. Raise SubsetError if there is no source code."""
     code = function.__code__
     try:
         (node,) = ast.parse(textwrap.dedent(inspect.getsource(function))).body
@@ -29,13 +29,13 @@ def find_definition(function: Callable[..., Any]) -> tuple[ast.FunctionDef, str]
     except (OSError, SyntaxError, ValueError):
         node = None
     if not isinstance(node, ast.FunctionDef):
-        found = f"no source of {function.__qualname__}"
+        found = f"no source code of {function.__qualname__}"
         raise refusal(code.co_filename, code.co_firstlineno, found, "a function in a file")
     return node, code.co_filename
 
 
 def find_annotations(function: Callable[..., Any], protocol: type | None = None) -> dict[str, Any]:
-    """Return the annotations of a function; those of the protocol's method take precedence."""
+    """Return the annotations of a function; annotations of the protocol's method take precedence."""
     method = vars(protocol).get(function.__name__) if protocol is not None else None
     method = method.fget if isinstance(method, property) else method
     more = typing.get_type_hints(method, include_extras=True) if inspect.isfunction(method) else {}
@@ -43,7 +43,7 @@ def find_annotations(function: Callable[..., Any], protocol: type | None = None)
 
 
 def read_comment_before(file: str, statement: ast.stmt) -> str:
-    """Return the comment directly above a statement, without its marks."""
+    """Return the comment directly above a statement, without `#`; "" if there is none."""
     comment, line = "", statement.lineno - 1
     while (text := linecache.getline(file, line).strip()).startswith("#"):
         comment, line = f"{text.lstrip('# ')} {comment}", line - 1
@@ -51,7 +51,7 @@ def read_comment_before(file: str, statement: ast.stmt) -> str:
 
 
 def read_constant_comment(name: str, namespace: dict[str, Any]) -> str:
-    """Return the comment after the assignment of a module's constant, "" if there is none."""
+    """Return the comment on the line of a module constant's assignment, "" if there is none."""
     file = getattr(sys.modules.get(namespace["__name__"]), "__file__", None)
     for node in parse_file(file).body if file else []:
         if isinstance(node, ast.ImportFrom) and any(alias.name == name for alias in node.names):
@@ -65,7 +65,7 @@ def read_constant_comment(name: str, namespace: dict[str, Any]) -> str:
 
 
 def find_name_lines(function: ast.FunctionDef) -> dict[str, list[tuple[int, bool]]]:
-    """Return the lines in which each local name occurs, and whether they assign it."""
+    """Return for each local name its occurrences: line, and whether the occurrence is an assignment."""
     targets = [loop.target for loop in ast.walk(function) if isinstance(loop, (ast.For, ast.comprehension))]
     loops = {id(name) for target in targets for name in ast.walk(target)}
     result: dict[str, list[tuple[int, bool]]] = {}
@@ -73,4 +73,4 @@ def find_name_lines(function: ast.FunctionDef) -> dict[str, list[tuple[int, bool
         if isinstance(node, ast.Name):
             is_store = isinstance(node.ctx, ast.Store) and id(node) not in loops
             result.setdefault(node.id, []).append((node.lineno, is_store))
-    return {name: sorted(places) for name, places in result.items() if any(store for _, store in places)}
+    return {name: sorted(uses) for name, uses in result.items() if any(store for _, store in uses)}

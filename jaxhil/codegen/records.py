@@ -1,4 +1,4 @@
-"""Lowering of classes to structs: names, attributes and their types, lists of run-time length."""
+"""Lowering of classes to C structs: names, attributes and their types, lists of run-time length."""
 
 import ast
 import inspect
@@ -16,50 +16,50 @@ if TYPE_CHECKING:
 
 
 class StructLowering:
-    """Structs of a C program."""
+    """Lowering of classes to the structs of a C program."""
 
     literal: Callable[[Any], CExpression]
 
     def __init__(self, prefix: str, names: Mapping[type, str], bindings: Mapping[type, type]) -> None:
         self.prefix, self.names, self.bindings = prefix, names, bindings
         self.fields: dict[type, dict[str, ValueType]] = {}
-        self.samples: dict[type, list[str]] = {}  # lists of run-time length
-        self.owned: dict[type, dict[str, str]] = {}  # arrays of samples for parts of a class, and their keys
-        self.changed_in_place: frozenset[Any] = frozenset()
-        self.shared: list[tuple[frozenset[Any], SubsetError]] = []  # lists that two attributes share
+        self.samples: dict[type, list[str]] = {}  # attributes that are lists of run-time length, by class
+        self.owned: dict[type, dict[str, str]] = {}  # arrays of samples by owning class, with their keys
+        self.changed_in_place: frozenset[Any] = frozenset()  # locations of lists that change in place
+        self.shared: list[tuple[frozenset[Any], SubsetError]] = []  # locations of one list, and the error
         self.enumerators: Mapping[str, int] = {}
 
     def class_name(self, class_: type) -> str:
-        """Return the name of a class in C."""
+        """Return the C name of a class."""
         snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", class_.__name__).lower()
         return self.prefix + self.names.get(class_, snake)
 
     def c_type(self, type_: ValueType) -> str:
-        """Return the C type of a number or a struct."""
+        """Return the C type of a value, without the brackets of an array."""
         simple = {"float": "double", "int": type_.c_int, "bool": "bool", "none": "void", "list": "void"}
         if type_.kind == "struct":
             return f"{self.prefix}{type_.of}"
         return simple[type_.kind] if type_.kind in simple else self.class_name(type_.of)
 
     def declaration(self, type_: ValueType, name: str) -> str:
-        """Return the declaration of a name, without the semicolon."""
+        """Return the C declaration of a name, without the semicolon."""
         while type_.kind == "list":
             name, type_ = f"{name}[{type_.length}]", type_.of
         return f"{self.c_type(type_)} {name}"
 
     def local(self, name: str) -> str:
-        """Return a local name in C."""
+        """Return the C name of a local variable."""
         return f"{name}_" if name in C_RESERVED_WORDS else name
 
     def class_of(self, function: Any, node: ast.expr) -> type | None:
-        """Return the class that a call constructs in place, None if there is none."""
+        """Return the class whose constructor an expression calls, None if it calls no constructor."""
         called = node.func if isinstance(node, ast.Call) else None
         value = function.namespace.get(called.id) if isinstance(called, ast.Name) else None
         is_class = inspect.isclass(value) and not issubclass(value, tuple) and value.__module__ != "builtins"
         return value if is_class else None
 
     def field(self, body: "Lowering", value: CExpression, name: str, node: ast.AST) -> CExpression:
-        """Return an attribute of an object."""
+        """Return the C expression for an attribute of an object."""
         class_, plain = value.type.of, name.lstrip("_")
         keys = frozenset({(class_, name)})
         body.function.reads |= keys
@@ -86,7 +86,7 @@ class StructLowering:
         return self.local(plain if plain == name or plain not in taken else f"{plain}_")
 
     def _class_constant(self, class_: type, name: str) -> CExpression | None:
-        """Return a constant attribute of the class, None if there is none or methods assign it."""
+        """Return a class attribute as a constant, None if it is no number or a method assigns it."""
         static = inspect.getattr_static(class_, name, None)
         if not isinstance(static, (bool, int, float)):
             return None
@@ -106,16 +106,16 @@ class StructLowering:
         return self.literal(static)
 
     def field_type(self, body: "Lowering", type_: ValueType, name: str, node: ast.AST) -> ValueType:
-        """Return the annotated type of an attribute. Raise SubsetError if there is none."""
+        """Return the type of an attribute from its annotation. Raise SubsetError if there is none."""
         hints = typing.get_type_hints(type_.of, include_extras=True)
         hinted = type_of_annotation(hints.get(name, ...), self.bindings)
         if hinted is None:
-            what = f"{name} of {type_.of.__name__}, whose type is not known here"
+            what = f"{name} of {type_.of.__name__}, which has no known type"
             raise body.refuse(node, what, "an assignment in `__init__`, or an annotation in the class")
         return self.fields.setdefault(type_.of, {}).setdefault(name, hinted)
 
     def known_field(self, body: "Lowering", owner: CExpression, target: ast.Attribute) -> CExpression | None:
-        """Return an attribute, None if its type is not known yet."""
+        """Return the C expression for an attribute, None if the type of the attribute is not yet known."""
         class_, name = owner.type.of, target.attr
         if owner.type.kind != "object":
             raise body.refuse(target, f"an attribute of a {owner.type.kind}", "an object")
@@ -125,7 +125,7 @@ class StructLowering:
     def new_field(
         self, body: "Lowering", owner: CExpression, target: ast.Attribute, type_: ValueType
     ) -> CExpression:
-        """Return an attribute; its type is this one unless it is known already."""
+        """Return the C expression for an attribute, whose type is `type_` unless it is already known."""
         field = self.known_field(body, owner, target)
         if field is not None:
             return field
@@ -136,10 +136,12 @@ class StructLowering:
     def new_samples(
         self, body: "Lowering", owner: CExpression, target: ast.Attribute, count: CExpression
     ) -> None:
-        """Record a list of run-time length; emit a test that it fits its capacity."""
+        """Record an attribute that is a list of run-time length; emit a test of its length."""
         class_, name, plain = owner.type.of, target.attr, target.attr.lstrip("_")
         if body.function.node.name != "__init__" or owner.text != "self":
-            raise body.refuse(target, "a list of a computed length", "one in `__init__`, or of fixed length")
+            raise body.refuse(
+                target, "a list of computed length", "a list of fixed length, or an assignment in `__init__`"
+            )
         if name not in self.samples.setdefault(class_, []):
             self.samples[class_].append(name)
             self.fields.setdefault(class_, {})[f"{plain}_length"] = INT
@@ -149,31 +151,31 @@ class StructLowering:
         body.emit(f"self->{plain}_length = {count.text};")
 
     def length_of(self, body: "Lowering", target: str, node: ast.AST) -> str:
-        """Return the C text of the length of a list that `new_samples` knows."""
+        """Return the C code for the length of a list that `new_samples` has recorded."""
         if body.function.owner is None or target not in self.samples_in(body.function.owner):
-            raise body.refuse(node, "a list of a computed length", "a constant length")
+            raise body.refuse(node, "a list of computed length", "a constant length")
         return f"self->{target}_length"
 
     def samples_in(self, class_: Any) -> tuple[str, ...]:
-        """Return the parameters for the lists of run-time length of a class."""
+        """Return the C parameter names for a class's lists of run-time length."""
         return tuple(name.lstrip("_") for name in self.samples.get(class_, ()))
 
     def capacities(self, body: "Lowering", class_: type, target: CExpression, node: ast.Call) -> list[str]:
-        """Return a constructor's arguments for its lists: arrays of the owner and their capacities."""
+        """Return a constructor's C arguments for its lists of run-time length: arrays and capacities."""
         first, key, arguments = node.args[0] if node.args else None, target.type.key, []
         if isinstance(first, ast.Subscript) and isinstance(first.slice, ast.Constant) and not key:
             key = str(first.slice.value)
         for name in self.samples_in(class_):
             if not key or body.function.owner is None or not target.text.startswith("self->"):
                 expected = "`Annotated[DelayLine, 'name of the gain']`"
-                raise body.refuse(node, "a line of unknown length", expected)
+                raise body.refuse(node, "a delay line of unknown capacity", expected)
             array = f"{target.text}_{name}"
             self.owned.setdefault(body.function.owner, {})[array.removeprefix("self->")] = key
             arguments += [array, f"{self.prefix}{key}_samples".upper()]
         return arguments
 
     def structs(self, owners: list[type]) -> str:
-        """Return the structs of all classes, each one after the structs that it contains."""
+        """Return the C structs of all classes, ordered so that a struct follows its member structs."""
         texts: dict[type, str] = {}
 
         def visit(class_: type) -> None:

@@ -1,4 +1,4 @@
-"""Lowering of statements: assignments, branches, loops, exceptions."""
+"""Lowering of statements: assignments, branches, loops and exceptions."""
 
 import ast
 import re
@@ -18,11 +18,10 @@ class BodyLowering(CallLowering):
 
     def __init__(self, program: "CProgram", function: "CFunction") -> None:
         super().__init__(program, function)
-        self.span = (0, 0)  # lines of the block
-        self.hoisted: list[str] = []  # declarations at the function's top
-        self.aliases: list[
-            tuple[str, CExpression, int]
-        ] = []  # other names of lists and objects, last line of use
+        self.span = (0, 0)  # first and last line of the current block
+        self.hoisted: list[str] = []  # C declarations at the beginning of the function
+        # local names of lists and objects: name, value, last line of use
+        self.aliases: list[tuple[str, CExpression, int]] = []
         for name, type_ in function.parameters.items():
             text, is_list = program.local(name), type_.kind == "list"
             reads: Locations = frozenset({("parameter", name)}) if is_list else frozenset()
@@ -36,13 +35,13 @@ class BodyLowering(CallLowering):
             self.names["self"] = CExpression("self", owner, is_pointer=True, samples=samples)
 
     def run(self) -> list[str]:
-        """Lower the whole function."""
+        """Lower the function; return its lines of C code."""
         self.block(self.function.node.body)
         lines = self.lines[:-1] if self.lines[-1:] == ["return;"] else self.lines
         return [*self.hoisted, *lines]
 
     def block(self, body: list[ast.stmt]) -> bool:
-        """Lower the statements of a block; return whether its end is never reached."""
+        """Lower the statements of a block; return whether control never reaches the end of the block."""
         leaves, outer = False, self.span
         self.span = (body[0].lineno, body[-1].end_lineno or 0) if body else outer
         for statement in body:
@@ -60,7 +59,7 @@ class BodyLowering(CallLowering):
     def do_assign(self, node: ast.Assign) -> None:
         is_simple = isinstance(node.value, (ast.Constant, ast.Attribute, ast.Name))
         if len(node.targets) > 1 and not is_simple:
-            raise self.refuse(node, "several targets of an expression", "one assignment each")
+            raise self.refuse(node, "several targets of an expression", "a separate assignment for each")
         for target in reversed(node.targets):
             if isinstance(target, ast.Tuple):
                 self._unpack(node, target)
@@ -68,10 +67,11 @@ class BodyLowering(CallLowering):
                 self._assign(node, target, node.value)
 
     def do_annassign(self, node: ast.AnnAssign) -> None:
-        wanted = self.program.local_type(self.function, node.annotation)
-        if node.value is None or wanted is None:
-            raise self.refuse(node, "this type or no value", "a float, int, bool or class, and a value")
-        self._assign(node, node.target, node.value, wanted)
+        required = self.program.local_type(self.function, node.annotation)
+        if node.value is None or required is None:
+            expected = "a float, int, bool or class, and a value"
+            raise self.refuse(node, "this annotation, or no value", expected)
+        self._assign(node, node.target, node.value, required)
 
     def do_augassign(self, node: ast.AugAssign) -> None:
         value = ast.copy_location(ast.BinOp(node.target, node.op, node.value), node)
@@ -90,7 +90,8 @@ class BodyLowering(CallLowering):
                 raise self.refuse(node, f"names for a {value.type.kind}", "a list of fixed length")
             values = [self.at(value, str(index)) for index in range(value.type.length)]
         if len(values) != len(target.elts):
-            raise self.refuse(node, f"{len(target.elts)} targets for {len(values)} values", "as many")
+            found = f"{len(target.elts)} targets for {len(values)} values"
+            raise self.refuse(node, found, "the same number")
         for element, value in zip(target.elts, values, strict=True):
             if value.type.kind in ("object", "list") and isinstance(element, ast.Name):
                 self._alias(node, element, value)
@@ -98,7 +99,7 @@ class BodyLowering(CallLowering):
                 self._store(node, element, value)
 
     def _assign(
-        self, node: ast.stmt, target: ast.expr, source: ast.expr, wanted: ValueType | None = None
+        self, node: ast.stmt, target: ast.expr, source: ast.expr, required: ValueType | None = None
     ) -> None:
         class_ = self.program.class_of(self.function, source)
         if isinstance(target, ast.Attribute) and isinstance(source, ast.Call) and class_ is not None:
@@ -113,18 +114,18 @@ class BodyLowering(CallLowering):
             if value.type.kind in ("object", "list") and isinstance(target, ast.Name):
                 self._alias(node, target, value)
             elif value.type.kind != "text":
-                self._store(node, target, value, wanted)
+                self._store(node, target, value, required)
 
     def _alias(self, node: ast.stmt, target: ast.Name, value: CExpression) -> None:
-        """Let a local name stand for an object or a list."""
-        places = self.function.places[target.id]
-        is_local = all(self.span[0] <= line <= self.span[1] for line, _ in places)
-        if target.id in self.names or sum(is_store for _, is_store in places) > 1 or not is_local:
-            expected = "one name for each list or object, in a block"
+        """Bind a local name to an object or a list."""
+        occurrences = self.function.occurrences[target.id]
+        is_local = all(self.span[0] <= line <= self.span[1] for line, _ in occurrences)
+        if target.id in self.names or sum(is_store for _, is_store in occurrences) > 1 or not is_local:
+            expected = "a name that is assigned once, and used only within its block"
             raise self.refuse(node, f"{target.id} assigned twice", expected)
-        uses, tree = [line for line, _ in places], ast.walk(self.function.node)
+        uses, tree = [line for line, _ in occurrences], ast.walk(self.function.node)
         loops = [n for n in tree if isinstance(n, (ast.For, ast.While)) and n.lineno > target.lineno]
-        # A use in a loop comes again after the last statement of the loop.
+        # A use in a loop may follow the last statement of the loop, in the next iteration.
         uses += [(loop.end_lineno or 0) + 1 for loop in loops if loop.lineno <= uses[-1]]
         self.aliases.append((target.id, value, max(uses)))
         name, type_ = self.program.local(target.id), value.type
@@ -138,7 +139,10 @@ class BodyLowering(CallLowering):
         self.names[target.id] = value
 
     def replace(self, node: ast.stmt | ast.expr, keys: Locations, of_element: bool = False) -> None:
-        """Record attributes that get another list or object, which their other names do not get in Python."""
+        """Record attributes that get a different list or object.
+
+        Raise SubsetError if a local name of the old list or object is used later: in Python it keeps the old.
+        """
         self.function.replaced |= keys
         for name, value, last in self.aliases:
             is_outer = of_element and value.type.kind == "list" and value.type.of.kind == "list"
@@ -162,17 +166,17 @@ class BodyLowering(CallLowering):
                     type_ = self.array(source, None).type
                 field = self.program.new_field(self, owner, target, type_)
         if field is None or field.type.kind != "list":
-            raise self.refuse(node, "a list for an element", "a number")
+            raise self.refuse(node, "a list assigned to an element", "a number")
         self.array(source, field)
         self._replace_at(node, target, field)
         self.changed(field, isinstance(target, ast.Subscript))
 
     def _store(
-        self, node: ast.stmt, target: ast.expr, value: CExpression, wanted: ValueType | None = None
+        self, node: ast.stmt, target: ast.expr, value: CExpression, required: ValueType | None = None
     ) -> None:
-        """Assign a value to a name, an attribute or an element."""
+        """Emit the assignment of a value to a name, an attribute or an element."""
         if isinstance(target, ast.Name):
-            self._store_name(node, target.id, value, wanted)
+            self._store_name(node, target.id, value, required)
             return
         if value.fails:
             value = self.temporary(value, self.hint_of(target))
@@ -195,7 +199,7 @@ class BodyLowering(CallLowering):
             self.facts[field.text] = NumberFact(value.sign, field.reads)
 
     def _replace_at(self, node: ast.stmt, target: ast.expr, field: CExpression) -> None:
-        """Record the replacement of a list by an assignment, unless it is one in place."""
+        """Record that an assignment replaces a list, unless it is an assignment in place."""
         if not (isinstance(target, ast.Subscript) and isinstance(target.slice, ast.Slice)):
             self.replace(node, field.reads, isinstance(target, ast.Subscript))
 
@@ -208,15 +212,15 @@ class BodyLowering(CallLowering):
         elif text != field.text:
             self.emit(f"{field.text} = {text};")
 
-    def _store_name(self, node: ast.stmt, name: str, value: CExpression, wanted: ValueType | None) -> None:
+    def _store_name(self, node: ast.stmt, name: str, value: CExpression, required: ValueType | None) -> None:
         text, existing = self.program.local(name), self.names.get(name)
         if existing is None:
-            places = self.function.places[name]
-            type_ = wanted or value.type._replace(c_int="int64_t", sign="")
+            occurrences = self.function.occurrences[name]
+            type_ = required or value.type._replace(c_int="int64_t", sign="")
             declared = f"{self.program.c_type(type_)} {text}"
-            is_once = sum(is_store for _, is_store in places) == 1
+            is_once = sum(is_store for _, is_store in occurrences) == 1
             first, last = max(self.span[0], node.lineno), self.span[1]
-            is_here = all(first <= line <= last for line, _ in places)
+            is_here = all(first <= line <= last for line, _ in occurrences)
             zero = {"float": " = 0.0", "int": " = 0", "bool": " = false"}.get(type_.kind, "")
             if is_here:
                 head = "const " if is_once else ""
@@ -242,7 +246,7 @@ class BodyLowering(CallLowering):
                 raise self.function.shared[key]
 
     def share(self, node: ast.AST, target: Locations, value: CExpression) -> None:
-        """Record a list that an attribute shares with another name; it must not change in place."""
+        """Record a list that an attribute shares with a second name; such a list must not change in place."""
         error = self.refuse(node, "a list that is shared and changed in place", "a copy of it, `list(...)`")
         for key in value.reads:
             if key[0] == "parameter":
@@ -304,7 +308,8 @@ class BodyLowering(CallLowering):
     def do_for(self, node: ast.For) -> None:
         loop = self.loop(node.iter)
         if node.orelse or not loop.stop or has_text(loop.constants):
-            raise self.refuse(node, "a loop through text, or with else", "a loop through numbers, and a flag")
+            found = "a loop through text, or a loop with else"
+            raise self.refuse(node, found, "a loop through numbers without else")
         names = self.targets(node.target, len(loop.values("")))
         is_range = loop.values("i")[0].text == "i" and len(names) == 1 and names[0] != "_"
         index = self.program.local(names[0]) if is_range else self.fresh("i")
@@ -317,7 +322,7 @@ class BodyLowering(CallLowering):
         for name, value in zip(names, loop.values(index), strict=True):
             if value.text != index and name != "_" and value.type.kind != "list":
                 text = self.program.local(name)
-                constant = "" if name in self.function.places else "const "
+                constant = "" if name in self.function.occurrences else "const "
                 self.emit(f"{constant}{self.program.c_type(value.type)} {text} = {value.text};")
                 value = value._replace(text=text, reads=frozenset(), rank=ATOM)
             self.names[name] = value
@@ -347,19 +352,19 @@ class BodyLowering(CallLowering):
     do_continue = do_break
 
     def do_try(self, node: ast.Try) -> bool:
-        """Lower a call whose exceptions are caught."""
+        """Lower `try` around a single call with `except Exception`."""
         statement = node.body[0]
         if len(node.body + node.handlers) != 2 or node.orelse or node.finalbody:
-            raise self.refuse(node, "this try", "one call in it and one `except Exception`")
+            raise self.refuse(node, "this try", "a single call and a single `except Exception`")
         if not isinstance(statement, (ast.Assign, ast.Return)) or not isinstance(statement.value, ast.Call):
-            raise self.refuse(node, "this try", "`name = call(...)` or `return call(...)` in it")
+            raise self.refuse(node, "this try", "`name = call(...)` or `return call(...)` inside")
         function, failures, position = self.function, self.failures, len(self.lines)
         before = function.error, function.fails, function.reason
         flag = self.fresh("failed")
         function.error = f"&{flag}"
         value = self.expression(statement.value)
         if self.failures > failures:
-            raise self.refuse(node, "an operation in try that may raise", "one call alone")
+            raise self.refuse(node, "an operation in try that may raise", "only a call")
         function.error, function.fails, function.reason = before
         fails, value = value.fails, value._replace(fails=False)
         if fails:

@@ -1,17 +1,18 @@
-"""Types of the subset of Python, values of expressions, and the error for other constructs.
+"""Types of the supported subset of Python, values of expressions, and the error for other constructs.
 
-A float is a `double`, an int an `int64_t`; a list has a fixed length, or a capacity that its owner states; a
-class is a struct. Values of type `str` have no equivalent in C and are omitted. Annotations:
+In C, a float is a `double`, an int is an `int64_t`, and a class is a struct. A list has a fixed length, or a
+capacity that an annotation of its owner specifies. C has no equivalent of `str`; the generator omits such
+values. Annotations:
 
-    Annotated[float, ">= 0"]            never below 0, checked wherever it is assigned (also "> 0")
-    Annotated[int, "index"]             trusted as an index: not tested against the length of the list
-    Annotated[int, "uint32_t"]          the type in C
-    Annotated[list[float], 18]          a list of 18 numbers; two lengths for a list of lists
-    Annotated[DelayLine, "lag"]         its samples have the capacity JAXHIL_LAG_SAMPLES
+    Annotated[float, ">= 0"]            number that is never negative; every assignment is checked (also ">
+    0") Annotated[int, "index"]             index that C does not compare with the length of the list
+    Annotated[int, "uint32_t"]          int with this C type Annotated[list[float], 18]          list of 18
+    numbers; two lengths for a list of lists Annotated[DelayLine, "lag"]         delay line with the capacity
+    JAXHIL_LAG_SAMPLES
 
-Exceptions of Python become an error flag: a function that may raise tests the operands (divisors, square
-roots, indices, conversions to int, products and sums of ints) and returns at once. An int ends at 2^53,
-which counts do not reach: sums with a small term are not tested.
+Instead of raising an exception, a C function sets an error flag and returns. To do so, it tests divisors,
+square roots, indices, conversions to int, and products and sums of ints. Ints are limited to 2^53. Because no
+counter reaches this limit, sums with a small term are not tested.
 """
 
 import types
@@ -29,44 +30,44 @@ C_RESERVED_WORDS = frozenset(
 
 
 class SubsetError(ValueError):
-    """Error for a construct outside the subset: one line with file, line, what was found and expected."""
+    """Exception for an unsupported construct; the message is `FILE:LINE: found X, expected Y`."""
 
 
 class ValueType(NamedTuple):
-    """Type of a value."""
+    """Type of a Python value, with the properties that its C type needs."""
 
     kind: str  # float, int, bool, text, none, list, object, record, struct (of gains or limits), optional
     of: Any = None  # element type of a list, class of an object or record, name of a struct
-    length: int | None = None  # of a list; None if known only at run time
-    sign: str = ""  # of a number: "> 0", ">= 0", "not 0" (NaN has every sign), or unknown
-    c_int: str = "int64_t"  # type of an int in C
-    key: str = ""  # of an object with samples: the gain or limit that sizes them
-    is_index: bool = False  # of an int: trusted as an index
+    length: int | None = None  # length of a list; None if it is known only at run time
+    sign: str = ""  # sign of a number: "> 0", ">= 0", "not 0", or "" if unknown; NaN counts as every sign
+    c_int: str = "int64_t"  # C type of an int
+    key: str = ""  # name of the gain or limit that determines the capacity of an object's samples
+    is_index: bool = False  # whether an int is an index that needs no test
 
 
 FLOAT, INT, BOOL, TEXT, NONE = (ValueType(kind) for kind in ("float", "int", "bool", "text", "none"))
-Locations = frozenset[tuple[Any, str]]  # attributes, local lists and parameters: owner and name
+Locations = frozenset[tuple[Any, str]]  # memory locations: pairs of class, "local" or "parameter", and name
 
 
 class CExpression(NamedTuple):
-    """Expression in C."""
+    """C expression for the value of a Python expression."""
 
-    text: str  # C text
-    type: ValueType
-    rank: int = ATOM  # precedence of its operator in C
-    reads: Locations = frozenset()
-    writes: Locations = frozenset()  # what its evaluation changes
-    fails: bool = False  # whether the error flag must be tested afterwards
-    sign: str = ""
+    text: str  # C code
+    type: ValueType  # type of the value
+    rank: int = ATOM  # precedence of the expression's outermost operator in C
+    reads: Locations = frozenset()  # locations that the evaluation reads
+    writes: Locations = frozenset()  # locations that the evaluation changes
+    fails: bool = False  # whether the error flag must be tested after the evaluation
+    sign: str = ""  # sign of the value, as in `ValueType`
     span: tuple[Any, Any] | None = None  # least and largest value, if known at export
-    below: str = ""  # C text of a length above a loop's index
+    below: str = ""  # for the index of a loop: C code of the length that limits the index
     constant: Any = None  # value, if known at export
-    is_pointer: bool = False  # of an object: the text is a pointer
-    samples: tuple[str, ...] = ()  # of an object: C texts of its lists of run-time length
-    length: str = ""  # of a list of run-time length: C text of the length
+    is_pointer: bool = False  # for an object: whether `text` is a pointer
+    samples: tuple[str, ...] = ()  # for an object: C code of its lists of run-time length
+    length: str = ""  # for a list of run-time length: C code of the length
 
     def at(self, rank: int) -> str:
-        """Return the text, in parentheses if its operator has a lower precedence than `rank`."""
+        """Return the C code, in parentheses if its operator has a lower precedence than `rank`."""
         return self.text if self.rank >= rank else f"({self.text})"
 
     @property
@@ -76,7 +77,7 @@ class CExpression(NamedTuple):
 
 
 def as_float(value: CExpression) -> CExpression:
-    """Convert an int to a double."""
+    """Convert an int expression to a double; return other expressions unchanged."""
     if value.type.kind != "int":
         return value
     if value.constant is not None and value.text.lstrip("-").isdigit():
@@ -85,12 +86,12 @@ def as_float(value: CExpression) -> CExpression:
 
 
 def refusal(file: str, line: int, found: str, expected: str) -> SubsetError:
-    """Return the error for a construct outside the subset."""
+    """Return the `SubsetError` for an unsupported construct."""
     return SubsetError(f"{file}:{line}: found {found}, expected {expected}")
 
 
 def type_of_annotation(hint: Any, bindings: Mapping[Any, Any]) -> ValueType | None:
-    """Return the type of an annotation, None if it has no equivalent in C."""
+    """Return the `ValueType` of an annotation, None if C has no equivalent."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         type_ = type_of_annotation(arguments[0], bindings)
@@ -129,19 +130,19 @@ def _apply_annotations(type_: ValueType, notes: Sequence[Any]) -> ValueType:
 
 
 def sign_of(value: Any) -> str:
-    """Return the sign of a constant."""
+    """Return the sign of a constant, "" if the constant is not a number or is NaN."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return ""
     return "> 0" if value > 0 else ">= 0" if value == 0 else "not 0" if value < 0 else ""
 
 
-def implies_sign(sign: str, wanted: str) -> bool:
-    """Return whether every number of one sign also has the wanted sign."""
-    return wanted in ("", sign) or sign == "> 0"
+def implies_sign(sign: str, required: str) -> bool:
+    """Return whether every number with `sign` also has the sign `required`."""
+    return required in ("", sign) or sign == "> 0"
 
 
 def common_sign(signs: Sequence[str]) -> str:
-    """Return the strongest sign that all these signs imply, "" if there is none."""
+    """Return the strongest sign that every one of `signs` implies, "" if there is none."""
     return next(
         (s for s in ("> 0", ">= 0", "not 0") if all(sign and implies_sign(sign, s) for sign in signs)), ""
     )
