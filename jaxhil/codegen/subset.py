@@ -4,11 +4,11 @@ In C, a float is a `double`, an int is an `int64_t`, and a class is a struct. A 
 capacity that an annotation of its owner specifies. C has no equivalent of `str`; the generator omits such
 values. Annotations:
 
-    Annotated[float, ">= 0"]            number that is never negative; every assignment is checked (also ">
-    0") Annotated[int, "index"]             index that C does not compare with the length of the list
-    Annotated[int, "uint32_t"]          int with this C type Annotated[list[float], 18]          list of 18
-    numbers; two lengths for a list of lists Annotated[DelayLine, "lag"]         delay line with the capacity
-    JAXHIL_LAG_SAMPLES
+    Annotated[float, ">= 0"]       number that is never negative; every assignment is checked (also "> 0")
+    Annotated[int, "index"]        index that C does not compare with the length of the list
+    Annotated[int, "uint32_t"]     int with this C type
+    Annotated[list[float], 18]     list of 18 numbers; two lengths for a list of lists
+    Annotated[DelayLine, "lag"]    delay line with the capacity JAXHIL_LAG_SAMPLES
 
 Instead of raising an exception, a C function sets an error flag and returns. To do so, it tests divisors,
 square roots, indices, conversions to int, and products and sums of ints. Ints are limited to 2^53. Because no

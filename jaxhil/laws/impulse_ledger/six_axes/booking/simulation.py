@@ -37,7 +37,7 @@ def onset(
     has_flown = flight.ticks > 0
     lag = jnp.where(has_flown[None], flight.lag, signals.pose_desired - reading.pose)
     twist = jnp.where(has_flown[None], flight.twist, signals.twist_desired)
-    direction = reading.wrench / _size_of(prepared, reading.wrench)[None]
+    direction = reading.wrench / _norm(prepared, reading.wrench)[None]
     closing, whole = -dot(direction, twist), dot(twist, product(mass, twist))
     least = fixed.LEAST_SHARE * safe_sqrt(whole) + fixed.LEAST_TWIST
     is_closing = closing > least
@@ -97,7 +97,7 @@ def follow(
     estimate = select_lanes(turns, prepared.prior, estimate)
     path = jnp.where(turns, 0, old.path - dot(direction, reading.moved))
     force = dot(reading.wrench, product(inverse_mass, direction))
-    estimate, tangent = _learned(prepared, old, reading, estimate, (direction, path, force))
+    estimate, tangent = _update_estimate(prepared, old, reading, estimate, (direction, path, force))
 
     # Advance the reference, at the time t - D (c).
     missing = product(inverse_mass, impulse - old.impulse)
@@ -145,7 +145,7 @@ def _correction(
     return wrench * jnp.where(large > limit, limit / jnp.where(large > 0, large, 1), 1)[None]
 
 
-def _size_of(prepared: Prepared, wrench: Six) -> Float[Array, "*batch"]:
+def _norm(prepared: Prepared, wrench: Six) -> Float[Array, "*batch"]:
     """Return the norm |W| = sqrt(W . M^-1 W) of a wrench, or 1 for a wrench of 0."""
     square = dot(wrench, product(prepared.constants.inverse_mass, wrench))
     return jnp.where(square > 0, safe_sqrt(square), 1)
@@ -162,10 +162,10 @@ def _direction(
     along = dot(old, product(prepared.constants.inverse_mass, reading.wrench))
     wrench = jnp.where((along < 0)[None], -1, 1) * reading.wrench
     mixed = jnp.where((reading.loud & ~begins)[None], wrench + pole * (old - wrench), old)
-    return mixed / _size_of(prepared, mixed)[None], mixed
+    return mixed / _norm(prepared, mixed)[None], mixed
 
 
-def _learned(
+def _update_estimate(
     prepared: Prepared,
     contact: SixAxisContact,
     reading: Reading,

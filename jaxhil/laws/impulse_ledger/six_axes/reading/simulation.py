@@ -65,7 +65,7 @@ def read(
         loud=loud,
     )
     free = ~state.in_contact & ~loud
-    flight = _fly(state.flight, corrected, signals, pose, free, free & ~is_recent, period)
+    flight = _update_free_flight(state.flight, corrected, signals, pose, free, free & ~is_recent, period)
     return reading, state._replace(aligned=pose, flight=flight)
 
 
@@ -87,7 +87,7 @@ def _aligned(prepared: Prepared, state: LedgerState, signals: SixAxisSignals, ti
     return jnp.where((ago > 0)[None], uniform, recalled)
 
 
-def _fly(
+def _update_free_flight(
     flight: FreeFlightState,
     wrench: Six,
     signals: SixAxisSignals,
