@@ -231,14 +231,9 @@ class ImpulseLedger(Compensator):
         return side * weight * (push + correction)
 
     def _learn(self, phi: Vector, depth: float, rate: float, reading: float, noise: float) -> None:
-        """Update the contact model and the estimated delay with one reading of the contact.
+        """Update contact model and estimated delay with one `reading` [1/s] of noise variance `noise`.
 
-        Args:
-            phi: regressor of the contact model.
-            depth: depth of the hardware [s].
-            rate: speed of the hardware [1].
-            reading: force reading [1/s].
-            noise: noise variance of the reading [1/s^2].
+        `phi` is the regressor; `depth` [s] and `rate` [1] are depth and speed of the hardware.
         """
         model, period, floor = self._model, self._period, self._floor
         model_error = MISFIT * reading
@@ -255,12 +250,9 @@ class ImpulseLedger(Compensator):
             model.conclude(self._estimate[0] if ended else 0.0)
 
     def _evaluate(self, peak: float, noise: float, free: bool) -> int:
-        """Return the compensator's status during a contact.
+        """Return the compensator's status during a contact; `free`: the correction is within its limits.
 
-        Args:
-            peak: estimated peak force of the contact [1/s].
-            noise: noise variance of a force reading [1/s^2].
-            free: whether the correction is within its limits.
+        `peak` [1/s] is the estimated peak force, and `noise` [1/s^2] the noise variance of a reading.
         """
         reference, model = self._reference, self._model
         if model.count < FEW_READINGS:

@@ -22,12 +22,9 @@ class Alignment:
         self._last = 0.0
 
     def step(self, position: float, velocity: float, begins: bool) -> tuple[float, float]:
-        """Return the delayed position [m] and velocity [m/s].
+        """Return the delayed position [m] and velocity [m/s] for the `position` measured on this tick [m].
 
-        Args:
-            position: position measured on this tick [m].
-            velocity: velocity of the numerical model [m/s]; the motion before the run is uniform.
-            begins: whether a run begins on this tick.
+        If a run `begins` on this tick, the motion before it is uniform, with the model's `velocity` [m/s].
         """
         period = self._period
         if begins:

@@ -57,11 +57,7 @@ Spreads = Annotated[list[float], 7]
 def features(depth: float, speed: float, deepest: float, delay_effect: float) -> Vector:
     """Return the regressor phi of the contact model, whose force is phi.theta; zeros out of contact.
 
-    Args:
-        depth: depth x [s].
-        speed: speed v [1].
-        deepest: largest depth x_m so far [s].
-        delay_effect: derivative k (1 - v) of the force with respect to the delay [1/s^2].
+    `delay_effect` [1/s^2] is the derivative k (1 - v) of the force with respect to the delay.
     """
     if not depth > 0.0:
         return [0.0] * PARAMETERS
@@ -168,9 +164,7 @@ class ContactModel:
     def estimate_delay(self, preload: float, preload_spread: float) -> tuple[float, float]:
         """Estimate the delay d after a contact; return its mean [s] and variance [s^2].
 
-        Args:
-            preload: prior mean of the force at the onset [1/s].
-            preload_spread: prior standard deviation of the force at the onset [1/s].
+        `preload` and `preload_spread` [1/s] are prior mean and deviation of the force at the onset.
         """
         mean = [self.mean[j] for j in DELAY_PARAMETERS]
         rows = [[self.covariance[i][j] for j in DELAY_PARAMETERS] for i in DELAY_PARAMETERS]
@@ -250,13 +244,9 @@ def observe(
 def zero_or_positive(mean: float, variance: Positive, prior_variance: float) -> tuple[float, float]:
     """Return posterior mean and variance of a parameter that is zero with `ZERO_PROBABILITY` or positive.
 
-    Boyd's bound of Mills' ratio, pi/((pi - 1) t + sqrt(t^2 + 2 pi)), approximates the tail of the normal
+    The arguments are posterior mean, posterior variance and prior variance without this constraint. Boyd's
+    bound of Mills' ratio, pi/((pi - 1) t + sqrt(t^2 + 2 pi)), approximates the tail of the normal
     distribution.
-
-    Args:
-        mean: posterior mean without the constraint.
-        variance: posterior variance without the constraint.
-        prior_variance: prior variance without the constraint.
     """
     spread = sqrt(variance)
     ratio = mean / spread

@@ -24,10 +24,7 @@ class ReferenceTrajectory(NamedTuple):
 
 
 def begin(depth: Array, like: Array) -> ReferenceTrajectory:
-    """Return the trajectory at the onset with a depth [s] and the speed 1.
-
-    `like` is an array with the shape of the contact model's parameters.
-    """
+    """Return the trajectory at the onset with a depth [s], the speed 1, and sensitivities shaped `like`."""
     zeros = jnp.zeros_like(depth)
     return ReferenceTrajectory(
         depth, zeros + 1, zeros, depth, zeros > 0, jnp.zeros_like(like), jnp.zeros_like(like)
@@ -44,15 +41,7 @@ def correct(old: ReferenceTrajectory, changes: Array) -> ReferenceTrajectory:
 def advance(
     old: ReferenceTrajectory, theta: Array, period: Array, reading: Array, measured: Array
 ) -> ReferenceTrajectory:
-    """Advance the trajectory by one control period to the time of the next reading.
-
-    Args:
-        old: trajectory at the time of the last reading.
-        theta: parameters of the contact model.
-        period: control period [s].
-        reading: force reading y [1/s].
-        measured: regressor phi(X, V) of the hardware's motion.
-    """
+    """Advance by one period to the next reading y [1/s]; `measured` is the hardware's phi(X, V)."""
     depth = old.depth + period * old.speed - 0.5 * (period * period) * old.force
     speed = old.speed - period * old.force
     deepest = jnp.where(depth > old.deepest, depth, old.deepest)

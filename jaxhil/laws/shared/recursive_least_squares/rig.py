@@ -48,14 +48,7 @@ class ContactIdentification:
         self.stiffness_variance, self.damping_variance = self._initial_covariance  # d1, d2
 
     def update(self, force: float, deflection: float, rate: float, weight: float) -> None:
-        """Update the estimate with one reading.
-
-        Args:
-            force: force reading [N].
-            deflection: signed penetration [m].
-            rate: rate of the penetration [m/s].
-            weight: weight of the reading, 0 to 1.
-        """
+        """Update with one force reading [N], signed penetration [m], its rate [m/s] and a weight, 0 to 1."""
         u = self.coupling
         d1 = self.stiffness_variance
         d2 = self.damping_variance
