@@ -325,6 +325,6 @@ def small_readings(draw):
 
 @settings(max_examples=60, deadline=None)
 @given(small_readings())
-def test_runtime_and_jax_commands_agree_on_thresholds(readings):
+def test_runtime_and_jax_commands_agree_for_readings_exactly_at_thresholds(readings):
     count = compare("response_error", readings)
     assert count.ticks == 64

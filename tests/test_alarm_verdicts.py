@@ -32,7 +32,7 @@ def rates(false, missed, held_out=1000):
         ((0, 0), (0, 0), "unknown", [], ["false", "missed"]),
     ],
 )
-def test_alarm_verdict_follows_from_interval_bounds(false, missed, verdict, bad, unknown):
+def test_alarm_verdict_follows_from_confidence_interval_of_rate(false, missed, verdict, bad, unknown):
     result = add_verdict(rates(false, missed), DEFAULT_ALLOWED_RATES, 2000)
     assert result["verdict"] == verdict
     assert [text.split()[0] for text in result["reasons"]] == bad
@@ -40,7 +40,7 @@ def test_alarm_verdict_follows_from_interval_bounds(false, missed, verdict, bad,
     assert result["false_alarms"]["allowed"] == 0.01 and result["missed_alarms"]["allowed"] == 0.02
 
 
-def test_alarm_verdict_uses_rates_allowed_by_caller():
+def test_alarm_verdict_uses_allowed_rates_given_by_caller():
     result = rates((30, 100), (0, 200))
     assert add_verdict(result, AllowedAlarmRates(0.5, 0.02), 400)["verdict"] == "good"
     assert add_verdict(result, AllowedAlarmRates(0.1, 0.02), 400)["verdict"] == "bad"
@@ -57,14 +57,14 @@ def test_alarm_verdict_uses_rates_allowed_by_caller():
         ((1, 50), "at this rate, no sweep would decide"),
     ],
 )
-def test_unknown_alarm_verdict_states_sufficient_sweep_size(missed, words):
+def test_unknown_alarm_verdict_states_number_of_scenarios_needed(missed, words):
     (text,) = add_verdict(rates((0, 500), missed), DEFAULT_ALLOWED_RATES, 2000)["unknown"]
     assert text.endswith(f"limit 0.02; {words}")
 
 
 @pytest.mark.parametrize("allowed", [0.001, 0.02, 0.3])
 @pytest.mark.parametrize(("failures", "number"), [(0, 0), (0, 30), (1, 200), (3, 60), (40, 100)])
-def test_number_to_decide_is_smallest_sufficient_number(failures, number, allowed):
+def test_deciding_scenarios_is_smallest_number_that_decides_alarm_verdict(failures, number, allowed):
     number_found = estimate_deciding_scenarios(failures, number, allowed)
     share = failures / max(number, 1)
     assert number_found is not None
@@ -77,7 +77,7 @@ def test_number_to_decide_is_smallest_sufficient_number(failures, number, allowe
     assert decided(number_found) and not all(decided(runs) for runs in fewer)
 
 
-def test_noticed_from_finds_smallest_error_detected_at_95_percent():
+def test_detectable_error_is_smallest_error_that_raises_alarm_in_95_percent():
     rng = np.random.default_rng(0)
     error = rng.normal(0.0, 0.01, 4000)
     result = find_detectable_error(error, np.abs(error) + rng.normal(0.0, 0.001, 4000) > 0.02)
@@ -94,7 +94,7 @@ def test_noticed_from_finds_smallest_error_detected_at_95_percent():
 
 
 @pytest.mark.parametrize(("contacts", "noticed"), [(0, True), (19, True), (200, False)])
-def test_noticed_from_returns_none_without_evidence(contacts, noticed):
+def test_detectable_error_is_none_without_enough_alarms(contacts, noticed):
     error = np.linspace(0.0, 0.05, contacts)
     result = find_detectable_error(error, np.full(contacts, noticed))
     assert result == {"error": None, "contacts": 0, "largest": 0.05 if contacts else None}

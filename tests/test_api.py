@@ -53,7 +53,7 @@ def command(request):
 # Public names.
 
 
-def test_jaxhil_offers_and_lists_public_names():
+def test_jaxhil_package_exports_and_lists_public_names():
     assert set(jaxhil.__all__) == {*OFFERED, "__version__"} <= set(dir(jaxhil))
     for name in OFFERED:
         assert getattr(jaxhil, name) is not None
@@ -72,7 +72,7 @@ def test_controller_import_needs_neither_jax_nor_numpy():
 # Loading.
 
 
-def test_load_overrides_equal_those_of_the_command(command):
+def test_load_overrides_equal_set_options_of_command_line(command):
     mechanism = jaxhil.load("varying", {"rig.force_sensor.delay": np.float32(0.0035), **TWO})
     assert mechanism.contact.stiffness == [124355.0, 90000.0] and mechanism.approach.contacts == 2
     assert mechanism.rig.force_sensor.delay == float(np.float32(0.0035))
@@ -230,14 +230,14 @@ def test_simulate_accepts_gains_as_dict_and_file(tmp_path):
         ("phase_lead", "sharp", "no setting's name (phase_lead has none)"),
     ],
 )
-def test_simulate_rejects_wrong_gains_and_names_expected_ones(
+def test_simulate_rejects_wrong_gain_names_and_lists_expected_names(
     compensator, gains, message, monkeypatch, tmp_path
 ):
     monkeypatch.chdir(tmp_path)
     assert message in refusal(jaxhil.simulate, "varying", compensator, gains)
 
 
-def test_simulate_rejects_unknown_setting_and_names_available_ones(monkeypatch):
+def test_simulate_rejects_unknown_setting_and_lists_available_settings(monkeypatch):
     settings = {"gentle": {"velocity_gain": 50.0}, "firm": {}}
     monkeypatch.setattr(type(COMPENSATORS["impulse_ledger"]), "settings", settings)
     message = refusal(jaxhil.simulate, "varying", "impulse_ledger", "gentl")
@@ -348,7 +348,7 @@ def test_jacobian_matches_finite_differences(law, of):
         )
 
 
-def test_jacobian_by_both_masses_matches_equivalent_mass():
+def test_jacobian_with_respect_to_both_masses_matches_equivalent_mass():
     masses = {"bodies": {"chaser_mass": 500.0, "target_mass": 1000.0}}
     together = jaxhil.load("varying", {**TWO, **masses})
     # As many keys as above: both share one program.

@@ -26,7 +26,7 @@ def tuned():
 
 @pytest.mark.slow
 @pytest.mark.users_options
-def test_interface_script_runs(tmp_path):
+def test_python_interface_script_of_readme_runs(tmp_path):
     """Run it in its own process, where JAX computes in float32 and must continue to."""
     shutil.copy(SCRIPT, tmp_path)
     check = "import jax; assert not jax.config.jax_enable_x64 and 'XLA_FLAGS' not in __import__('os').environ"
@@ -49,7 +49,7 @@ def test_interface_script_runs(tmp_path):
     assert written == {SCRIPT.name, "script.py", "run.csv", "run.png", "gains.json", "bundle"}
 
 
-def test_tuning_import_is_lazy():
+def test_tuning_import_loads_submodules_lazily():
     code = "import sys, tuning; assert 'sweep' in dir(tuning); tuning.sweep; assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 

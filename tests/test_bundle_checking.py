@@ -88,7 +88,7 @@ def test_bundle_check_accepts_exported_bundle(files, folder):
 
 
 @pytest.mark.parametrize("name", [*CODE, "c99/jaxhil_controller.c", "README.md", "ros2.yaml", "gains.mat"])
-def test_self_consistent_foreign_bundle_is_not_run(files, folder, tmp_path, name):
+def test_third_party_bundle_with_valid_checksums_is_not_run(files, folder, tmp_path, name):
     """Change one file so that it leaves a trace if it is run, and let the manifest fit all files."""
     trap = b"\nopen(%r, 'w')\n" % str(tmp_path / "ran").encode()
     signed_files = signed({**files, name: files[name] + trap}, document_of(files))
@@ -155,7 +155,7 @@ def test_bundle_check_rejects_gain_file_with_other_formatting(files, folder):
         assert reasons[0].startswith("gains.json: "), reasons
 
 
-def test_selftest_runs_the_checked_content_not_files_changed_later(files, folder, tmp_path):
+def test_self_test_runs_checked_content_even_if_files_change_afterwards(files, folder, tmp_path):
     checked = check_bundle(placed(folder, files))
     for name in ("selftest.py", "jaxhil_runtime.py"):
         (folder / name).write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
@@ -196,7 +196,9 @@ def test_manifest_paths_outside_bundle_are_rejected(files, folder, path):
 
 @pytest.mark.parametrize("name", ["gains.json", "manifest.json", "manifest.sig", "selftest.py", "c99"])
 @pytest.mark.parametrize("kind", ["pipe", "link", "link to a device", "loop", "folder", "socket", "vast"])
-def test_bundle_check_rejects_links_pipes_and_folders_without_waiting(files, folder, monkeypatch, name, kind):
+def test_bundle_check_rejects_links_pipes_and_folders_without_blocking(
+    files, folder, monkeypatch, name, kind
+):
     placed(folder, files)
     path = folder / name
     elsewhere = folder.parent / "elsewhere"

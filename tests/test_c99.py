@@ -71,7 +71,7 @@ def test_c99_faults_match_runtime(batch):
     assert made.fault_name(UNUSABLE) == "unusable" and made.fault_name(3) == made.fault_name(0) == ""
 
 
-def test_c99_statuses_match_runtime(batch):
+def test_c99_status_codes_match_runtime(batch):
     header = generate_c99(gain_document("none"))["jaxhil_controller.h"]
     (listed,) = re.findall(r"enum \{\n([^}]*JAXHIL_UNSTATED[^}]*)\}", header)
     numbers = {name: int(number) for name, number in re.findall(r"^    JAXHIL_(\w+) = (\d+)", listed, re.M)}
@@ -85,7 +85,7 @@ def test_c99_statuses_match_runtime(batch):
 
 
 @pytest.mark.parametrize("delay", [101_000.0 * PERIOD, 1e306])
-def test_c99_export_rejects_delay_that_runtime_rejects(delay):
+def test_c99_export_rejects_the_same_delays_as_python(delay):
     document = gain_document()
     document["gains"]["identification_delay"] |= {"value": delay, "upper": delay}
     with pytest.raises(GainFileError, match="delay"):
@@ -121,14 +121,14 @@ def test_c99_decimal_constants_are_compiled_to_the_same_bits(tmp_path):
 
 
 @given(value=st.floats(allow_nan=False))
-def test_decimal_writes_exact_floating_constant(value):
+def test_c99_decimal_literal_has_exact_double_value(value):
     text = format_double(value)
     assert math.isinf(value) or (re.fullmatch(r"-?\d+(\.\d+)?(e[-+]\d+)?", text) and set(text) & set(".e"))
     assert struct.pack("d", float(text.replace("INFINITY", "inf"))) == struct.pack("d", value)
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_c99_admits_the_same_gains_as_python(law, batch):
+def test_c99_accepts_the_same_gains_as_python(law, batch):
     """Check a loaded struct as a gain file is checked."""
     made = batch(law)
     sane = drawn_gains(law, np.random.default_rng(3), hostile=False)
@@ -147,7 +147,7 @@ def test_c99_admits_the_same_gains_as_python(law, batch):
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("delay", [1.01 * (LINES + 1), 1e6, 1e300, math.nan, math.inf])
-def test_c99_rejects_delay_longer_than_delay_line_until_next_begin(law, delay, batch):
+def test_c99_controller_commands_zero_force_if_delay_exceeds_delay_line(law, delay, batch):
     made = batch(law)
     sane = drawn_gains(law, np.random.default_rng(4), hostile=False, period=CONTROL_PERIODS[0])
     rows = drawn_rows("random", 1000, np.random.default_rng(5), PERIOD)
@@ -170,7 +170,7 @@ def test_c99_rejects_delay_longer_than_delay_line_until_next_begin(law, delay, b
         assert len(np.unique(results[commanded, 1])) == 1
 
 
-def test_c99_admits_the_same_limits_as_python(batch):
+def test_c99_accepts_the_same_limits_as_python(batch):
     made = batch("none")
     plain = check_gain_document(gain_document("none"))
     assert made.begin(packed("none", plain))
@@ -224,7 +224,7 @@ def compare(made: Batch, gain_file: GainFile, rows: np.ndarray) -> None:
     assert np.all(np.isfinite(results[:, :2]))
 
 
-def test_c99_retreat_across_the_whole_command_range_is_finite(batch):
+def test_c99_retreat_command_is_finite_for_infinite_limits(batch):
     gain_file = GainFile("none", {}, PERIOD, math.inf, complete_limits({"deceleration": 1.0}))
     rows = np.zeros((6, len(c99_cases.ROW)))
     rows[:2, 7] = 10.0, -10.0
@@ -268,13 +268,13 @@ def test_c99_impulse_ledger_contacts_equal_python_to_the_bit(batch):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_c99_commands_equal_python_where_comparisons_are_ties(law, batch):
+def test_c99_commands_equal_python_if_compared_values_are_equal(law, batch):
     rng = np.random.default_rng([10, LAWS.index(law)])
     for _ in range(25):
         compare(batch(law), *drawn_exactly(law, 300, rng))
 
 
-def test_c99_drawn_rows_reach_every_fault(batch):
+def test_c99_random_test_ticks_raise_every_fault(batch):
     """Reach every fault except that of compensators with a status, passed audits, and a changing identified
     stiffness.
     """
@@ -327,7 +327,7 @@ def limit_values(law, name):
 
 @settings(max_examples=150)
 @given(case=cases())
-def test_c99_commands_equal_python_on_hypothesis_rows(case, batch):
+def test_c99_commands_equal_python_on_hypothesis_ticks(case, batch):
     gain_file, rows = case
     compare(batch(gain_file.compensator), gain_file, rows)
 

@@ -215,14 +215,14 @@ def test_c99_user_registered_compensator_equals_python_to_the_bit(monkeypatch, t
             c99_cases.assert_same(made.run(rows, guarded), python(gain_file, rows), rows)
 
 
-def test_c99_user_registered_compensator_outside_subset_is_rejected(monkeypatch):
+def test_c99_user_registered_compensator_outside_c99_subset_is_rejected(monkeypatch):
     line = inspect.getsourcelines(ToyLawWithText)[1] + 4
     expected = rf"^c99: toy: \S*test_c99_sources\.py:{line}: found sum\(\.\.\.\), expected [^\n]*$"
     with pytest.raises(InputError, match=expected):
         generate_c99(toy_document(monkeypatch, ToyLawWithText))
 
 
-def test_c99_export_rejects_document_that_runtime_rejects():
+def test_c99_export_rejects_gain_document_that_runtime_rejects():
     document = gain_document()
     document["gains"]["forgetting"]["value"] = 0.99
     with pytest.raises(GainFileError, match="sha256"):

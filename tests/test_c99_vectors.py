@@ -107,6 +107,6 @@ def test_c99_test_program_detects_one_wrong_bit_of_a_command(column, replay):
         (lambda lines: [lines[0], *lines[2:]], "an unknown event, or a tick before a run"),
     ],
 )
-def test_c99_test_program_names_unreadable_vectors(change, message, replay):
+def test_c99_test_program_reports_unreadable_vector_file(change, message, replay):
     code, output = replay(change(vectors("contact")))
     assert code == 2 and message in output

@@ -85,7 +85,7 @@ def check(result, total=31.0):
 
 
 @where_kept
-def test_program_is_traced_once_and_gives_same_numbers(tmp_path):
+def test_cached_program_is_traced_once_and_gives_same_results(tmp_path):
     check(run(None))
     assert len(traced) == 1
     for _ in range(3):
@@ -94,7 +94,7 @@ def test_program_is_traced_once_and_gives_same_numbers(tmp_path):
 
 
 @where_kept
-def test_program_is_cached_if_its_code_came_from_compile_cache(tmp_path):
+def test_program_with_code_from_compile_cache_is_also_cached(tmp_path):
     """Cover a limit of jax: what it writes of such code fails when it is loaded."""
     for name in ("first", "second"):
         folder = tmp_path / name
@@ -117,7 +117,7 @@ def test_damaged_program_file_is_rebuilt(tmp_path, spoil):
 
 @where_kept
 @pytest.mark.parametrize("number", [10, pytest.param(1000, marks=pytest.mark.slow)])
-def test_program_file_with_flipped_bit_costs_only_tracing_time(tmp_path, number):
+def test_program_file_with_flipped_bit_is_retraced_with_same_result(tmp_path, number):
     run(tmp_path)
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()
@@ -195,7 +195,7 @@ def test_program_is_not_cached_if_jax_does_not_name_the_processor(tmp_path, monk
     assert len(traced) == 2 and not list(tmp_path.iterdir())
 
 
-def test_program_cache_in_unwritable_folder_costs_no_result(tmp_path):
+def test_program_with_unwritable_cache_folder_still_returns_its_result(tmp_path):
     check(run(tmp_path / "missing"))
 
 
@@ -227,12 +227,12 @@ def test_program_with_user_registered_law_in_arguments_is_not_cached(tmp_path, m
     assert (len(traced), len(list(tmp_path.iterdir()))) == ((2, 0) if isinstance(law, Mine) else (1, 1))
 
 
-def test_user_defined_named_tuple_is_foreign():
+def test_user_defined_named_tuple_counts_as_user_object_in_program_arguments():
     assert cached_programs.has_user_objects((1, Sums(1, (2,))))  # pyright: ignore[reportArgumentType]
     assert not cached_programs.has_user_objects((1, ("two", None, KelvinVoigt())))
 
 
-def test_external_calls_of_a_program_are_all_listed():
+def test_list_of_external_calls_of_a_program_is_complete():
     text = """%0 = stablehlo.custom_call @lapack_dpotrf_ffi(%1)
     %2 = stablehlo.custom_call @xla.sdy.Sharding(%0)
     %3 = stablehlo.custom_call @"my-own, one"(%2) %4 = stablehlo.custom_call @cu$other(%3)"""
@@ -248,7 +248,7 @@ def test_external_calls_of_a_program_are_all_listed():
     "error", [OSError(errno.ENOSPC, "full"), TypeError("cannot pickle"), KeyError("private")]
 )
 @pytest.mark.parametrize("step", ["remove_stale", "_serialise_program", "write_checksummed"])
-def test_program_that_cannot_be_cached_costs_no_result(tmp_path, monkeypatch, step, error):
+def test_program_that_cannot_be_cached_still_returns_its_result(tmp_path, monkeypatch, step, error):
     def fails(*arguments, **named):
         raise error
 
@@ -274,7 +274,7 @@ print(cached_programs.run_cached(solved, 1, np.diag([4.0, 0.5])))
 
 
 @where_kept
-def test_cached_program_solves_equations_in_process_that_traced_none(tmp_path):
+def test_cached_linear_solve_runs_in_process_that_traces_nothing(tmp_path):
     script = tmp_path / "solves.py"
     script.write_text(SOLVES)
     run = partial(subprocess.run, [sys.executable, str(script)], capture_output=True, text=True, check=True)

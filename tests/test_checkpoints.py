@@ -22,7 +22,7 @@ NUMBERS = [0.1, -0.0, 5e-324, math.inf, -math.inf, math.nan, 1.7976931348623157e
 POINT = Point("a", {"z": 1.5, "a": math.nan}, np.array([[1.0, np.nan], [-0.0, 3.0]]), None)
 
 
-def test_checkpoint_returns_every_bit():
+def test_checkpoint_values_are_read_back_to_the_bit():
     result = decode_value(encode_value(NUMBERS), list[float])
     assert [struct.pack("d", one) for one in result] == [struct.pack("d", one) for one in NUMBERS]
     point = decode_value(encode_value(POINT), Point)
@@ -36,12 +36,12 @@ def test_checkpoint_returns_every_bit():
 
 
 @pytest.mark.parametrize("thing", [print, object(), np.array([print]), {"a": lambda: 1}])
-def test_checkpoint_of_what_is_no_data_is_not_saved(thing):
+def test_checkpoint_of_value_that_is_not_data_raises_type_error(thing):
     with pytest.raises(TypeError):
         encode_value(thing)
 
 
-def test_checkpoint_is_read_only_for_the_same_computation(tmp_path, monkeypatch):
+def test_checkpoint_of_other_inputs_or_sources_is_ignored(tmp_path, monkeypatch):
     inputs = {"seed": 1, "limit": math.inf, "gains": POINT}
     Checkpoints(tmp_path).write("one", inputs, POINT)
     reader = Checkpoints(tmp_path, resume=True)
@@ -76,7 +76,7 @@ def test_checkpoint_with_a_flipped_bit_is_not_used(tmp_path):
         assert Checkpoints(tmp_path, resume=True).read("one", 1, Point) is None
 
 
-def test_checkpointed_steps_are_removed_once_the_whole_is_saved(tmp_path):
+def test_step_checkpoints_are_removed_after_final_checkpoint_is_saved(tmp_path):
     made = []
 
     def run(stop, resume=True):
@@ -101,7 +101,7 @@ def test_checkpointed_steps_are_removed_once_the_whole_is_saved(tmp_path):
     assert [path.name for path in folder.iterdir()] == ["notes.txt"]
 
 
-def test_checkpoint_that_cannot_be_saved_costs_nothing_else(tmp_path):
+def test_failed_checkpoint_write_does_not_stop_the_computation(tmp_path):
     (tmp_path / "taken").touch()
     for folder in (tmp_path / "taken", tmp_path / "link"):
         checkpoints = Checkpoints(folder)
@@ -116,7 +116,7 @@ def test_checkpoint_that_cannot_be_saved_costs_nothing_else(tmp_path):
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
-def test_checkpoint_names_that_look_alike_are_distinguished(tmp_path):
+def test_similar_checkpoint_names_are_stored_in_separate_files(tmp_path):
     written = Checkpoints(tmp_path)
     names = ["a b", "a-b", "../a", "A" * 300, "A" * 301, "ä", "ö"]
     for number, name in enumerate(names):

@@ -55,7 +55,7 @@ def test_simulate_command_reports_results_in_json(jaxhil):
     assert contact["approach_velocity"] == pytest.approx(0.005)
 
 
-def test_simulate_limit_decides_exit_code(jaxhil, tmp_path):
+def test_simulate_exit_code_depends_on_error_limit(jaxhil, tmp_path):
     assert jaxhil("simulate", "rig-300kg", "--limit", "10", "--log", tmp_path / "run.csv").code == 0
     assert (tmp_path / "run.csv").read_text().startswith("time,force_measured,force_command,")
     ran = jaxhil("simulate", "rig-300kg", "--limit", "0.1")
@@ -184,7 +184,7 @@ def test_tune_accepts_folder_of_mechanism_files(jaxhil, tmp_path):
 
 
 @pytest.mark.slow
-def test_tune_start_from_earlier_gains_never_ends_worse(jaxhil, tuned, tmp_path):
+def test_tune_from_earlier_gains_is_never_worse_than_those_gains(jaxhil, tuned, tmp_path):
     arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
     cold = jaxhil(*arguments, "--json").document["mechanisms"][0]
     assert cold["carried_over"] == []
@@ -297,7 +297,7 @@ def test_simulate_command_uses_gain_file(jaxhil, tuned):
     assert other["mechanism"] == "rod-100n-mm"
 
 
-def test_simulate_rejects_gain_file_that_does_not_fit(jaxhil, tuned):
+def test_simulate_rejects_gain_file_with_other_compensator_or_period(jaxhil, tuned):
     path = tuned / "gains.json"
     refused(jaxhil("simulate", "--gains", path, "--compensator", "none"), "--compensator", "phase_lead")
     slower = ["--set", "rig.control_period=0.002"]

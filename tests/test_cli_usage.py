@@ -31,7 +31,7 @@ def refused(ran, *words):
         assert word in ran.err
 
 
-def test_cli_exits_with_130_on_interrupt(jaxhil, monkeypatch):
+def test_cli_exits_with_code_130_on_interrupt(jaxhil, monkeypatch):
     def interrupted(arguments):
         raise KeyboardInterrupt
 
@@ -92,7 +92,7 @@ def test_cli_reports_internal_error_in_one_line(jaxhil, monkeypatch):
 
 
 @pytest.mark.parametrize("arguments", [["--no-such"], ["fly"], [], ["tune", "--starts", "x"], ["verify"]])
-def test_cli_exits_with_2_on_wrong_usage(jaxhil, arguments):
+def test_cli_exits_with_code_2_on_wrong_usage(jaxhil, arguments):
     ran = jaxhil(*arguments)
     assert ran.code == 2 and ran.out == "" and ran.err != ""
 
@@ -160,7 +160,7 @@ def test_init_command_writes_mechanism_file(jaxhil, monkeypatch, tmp_path, argum
 
 
 @pytest.mark.parametrize("taken", [Path.touch, Path.mkdir, lambda path: path.symlink_to("nowhere")])
-def test_init_command_overwrites_nothing(jaxhil, tmp_path, taken):
+def test_init_command_never_overwrites_a_file(jaxhil, tmp_path, taken):
     path = tmp_path / "rig.toml"
     taken(path)
     before = os.lstat(path)
@@ -168,7 +168,7 @@ def test_init_command_overwrites_nothing(jaxhil, tmp_path, taken):
     assert os.lstat(path) == before and list(tmp_path.iterdir()) == [path]
 
 
-def test_init_command_lists_names(jaxhil):
+def test_init_command_lists_names_of_builtin_mechanisms(jaxhil):
     names = [*builtin_names(), *suite_names(), *six_axis_names()]
     assert (
         jaxhil("init", "--list").out.split() == jaxhil("init", "--list", "--json").document["names"] == names
@@ -181,13 +181,13 @@ def test_cli_prints_version_and_shell_completion(jaxhil):
     assert "jaxhil" in jaxhil("--tyro-print-completion", "bash").out
 
 
-def test_plot_option_without_value_gets_default_name():
+def test_plot_option_without_value_uses_default_file_name():
     assert complete_bare_options(["simulate", "--plot", "a.png", "x"]) == ["simulate", "--plot", "a.png", "x"]
     assert complete_bare_options(["--plot", "--json"]) == ["--plot", DEFAULT_PLOT, "--json"]
     assert complete_bare_options(["x", "--plot"]) == ["x", "--plot", DEFAULT_PLOT]
 
 
-def test_study_options_without_value_get_default_number():
+def test_sweep_study_options_without_value_use_default_numbers():
     assert complete_bare_options(["--drivers", "64", "--rare", "0.02"]) == [
         "--drivers",
         "64",
@@ -222,7 +222,7 @@ def test_folder_name_is_a_single_safe_path_component(name):
     assert len(folder.encode()) <= 120 and not folder.startswith(".")
 
 
-def test_is_better_compares_failures_before_errors():
+def test_result_comparison_ranks_number_of_failures_before_error():
     def made(rms, failed):
         return ErrorMetrics(rms, rms, rms, rms, 0.0, 1.0, 0.0, failed)
 
@@ -242,7 +242,7 @@ def test_xla_flags_of_user_take_precedence(monkeypatch):
     assert jax_environment.build_xla_flags(user_flags).count("optimization_level") == 1
 
 
-def test_cache_folder_is_created_or_none_if_impossible(monkeypatch, tmp_path):
+def test_cache_folder_is_none_if_folder_cannot_be_created(monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "file" / "below"))
     assert jax_environment.cache_folder() is None

@@ -130,13 +130,13 @@ def test_clock_trips_on_consecutive_missed_ticks():
     assert faults(periods(5.0, 1.0), **BRIDGED) == [OK, MISSED_TICK, OK]
 
 
-def test_next_contact_resets_clock():
+def test_next_contact_resets_clock_check_of_controller():
     times = [*periods(0.5, 0.5), *periods(0.5, 0.5, start=-3.0)]
     events = [0.0] * 3 + [NEXT_CONTACT] + [0.0] * 2
     assert faults(times, events=events) == [OK, EARLY_TICK, EARLY_TICK] * 2
 
 
-def test_late_fraction_sets_threshold_of_late_and_early_ticks():
+def test_late_fraction_limit_sets_threshold_of_late_and_early_ticks():
     gaps = periods(1.1, 0.9, 1.3, 0.7)
     assert faults(gaps, late_fraction=0.05) == [OK, LATE_TICK, EARLY_TICK, LATE_TICK, EARLY_TICK]
     assert faults(gaps, late_fraction=0.25) == [OK, OK, OK, LATE_TICK, EARLY_TICK]

@@ -103,7 +103,7 @@ def test_bootstrap_resumes_after_lost_scheduler(jaxhil, tmp_path):
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 
-def test_cluster_worker_with_other_sources_is_rejected(tmp_path):
+def test_cluster_worker_with_different_source_code_is_rejected(tmp_path):
     write_gain_file(tmp_path / "gains.json", case())
     for package in ("jaxhil", "tuning"):
         shutil.copytree(ROOT / package, tmp_path / "other" / package)

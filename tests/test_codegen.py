@@ -400,7 +400,7 @@ def test_construct_outside_c99_subset_is_rejected_with_file_and_line(function, l
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_c99_list_that_is_replaced_under_another_name_is_rejected(method, line, name):
+def test_c99_access_to_replaced_list_through_old_alias_is_rejected(method, line, name):
     program = CProgram("t_")
     program.add(Aliasing.__init__, Aliasing)
     with pytest.raises(SubsetError) as error:
@@ -411,7 +411,7 @@ def test_c99_list_that_is_replaced_under_another_name_is_rejected(method, line, 
     )
 
 
-def test_c99_list_that_the_called_method_replaces_is_rejected():
+def test_c99_list_alias_is_rejected_if_called_method_replaces_the_list():
     program = CProgram("t_")
     program.add(Aliasing.__init__, Aliasing)
     with pytest.raises(SubsetError, match="found values, which replace_and_read replaces, expected a copy"):
@@ -419,7 +419,7 @@ def test_c99_list_that_the_called_method_replaces_is_rejected():
 
 
 @needs_compiler
-def test_c99_list_with_two_names_changes_in_place_as_in_python(tmp_path):
+def test_c99_list_with_two_names_is_modified_in_place_as_in_python(tmp_path):
     program = CProgram("t_")
     program.add(Aliasing.__init__, Aliasing)
     program.add(Aliasing.changed_in_place, Aliasing)
@@ -444,7 +444,7 @@ def test_c99_public_function_that_may_raise_is_rejected():
         program.output()
 
 
-def test_c99_divisors_that_cannot_be_zero_are_not_checked():
+def test_c99_code_omits_zero_check_for_nonzero_constant_divisors():
     def safe(a: float, b: float) -> float:
         if not b > 0.0:
             return a / 3.0

@@ -54,7 +54,7 @@ def test_common_program_includes_every_contact_law():
     assert set(groups[0][1].laws) == set(CONTACT_LAWS)
 
 
-def test_common_program_keeps_two_surfaces_and_other_orders_separate():
+def test_mechanisms_with_different_numbers_of_surfaces_or_orders_share_no_program():
     others = [
         mechanism({}),
         mechanism({"clearance": 0.02}),
@@ -91,7 +91,7 @@ def test_common_program_gives_the_same_results_as_separate_programs():
 
 
 @pytest.mark.parametrize("exact", [True, False])
-def test_common_program_with_cells_mixes_sensors_with_and_without_lag(exact):
+def test_common_program_serves_force_sensors_with_and_without_lag(exact):
     """Follow the exact motion, because it is requested or because one mechanism is stiff."""
     lagging = mechanism(
         {"law": "kelvin_voigt"}, SECOND_ORDER, period=1e-3, force_sensor={"time_constant": 2e-4}

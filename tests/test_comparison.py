@@ -118,7 +118,7 @@ def test_uncompensated_delay_error_matches_closed_form():
         pytest.param("suite-hertz", marks=pytest.mark.slow),
     ],
 )
-def test_damping_perturbations_span_a_third_of_the_speed(name):
+def test_damping_perturbations_reduce_rebound_speed_by_up_to_a_third(name):
     parsed = load(name).mechanism
     draws = draw(parsed, 24, 0)
     twin, twin_draws = perturb_damping(parsed, draws)
@@ -158,7 +158,7 @@ def test_comparison_intervals_have_stated_coverage():
     assert none.value == 0 and none.low == 0 and none.high == pytest.approx(1 - 0.025 ** (1 / 100))
 
 
-def test_winner_requires_separated_intervals():
+def test_best_compensator_is_marked_only_if_intervals_are_disjoint():
     figures = {
         "a": IntervalEstimate(0.1, 0.09, 0.11),
         "b": IntervalEstimate(0.2, 0.12, 0.3),
@@ -176,7 +176,7 @@ def test_winner_requires_separated_intervals():
     )
 
 
-def test_transparency_distance_is_measured_from_1():
+def test_transparency_metrics_are_ranked_by_distance_from_1():
     assert set(BEST_AT_ONE) == {"early", "late", "slope"}
     assert compute_distance_from_best("early", IntervalEstimate(0.7, 0.6, 0.8)) == pytest.approx(
         (0.3, 0.2, 0.4)

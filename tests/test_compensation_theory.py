@@ -260,7 +260,7 @@ def test_clamped_response_error_diverges_as_predicted(blind):
     assert np.all(np.abs(free - 1) < 0.1 * CLAMP_PHASES**2)
 
 
-def test_clamped_phase_lead_diverges_more():
+def test_clamped_phase_lead_diverges_more_than_unclamped_phase_lead():
     delay = CLAMP_PHASES / OMEGA
     gains = {"phase_lead": delay, "lead_filter": FINE / 2}
     free, clamped = clamped_and_not("phase_lead", PhaseLead(), 0, gains, force_sensor__delay=delay)

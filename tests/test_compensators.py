@@ -127,7 +127,7 @@ def test_every_compensator_exists_in_jax_and_runtime():
 
 @pytest.mark.parametrize("name", LAWS)
 @pytest.mark.parametrize("hostile", HOSTILE)
-def test_nominal_gains_lie_within_bounds_that_runtime_admits(name, hostile):
+def test_nominal_gains_lie_within_bounds_of_runtime(name, hostile):
     mechanism = load("rig-300kg", HOSTILE[hostile]).mechanism
     for gain in COMPENSATORS[name].gains:
         lower, nominal, upper = (bound(mechanism) for bound in (gain.lower, gain.nominal, gain.upper))
@@ -212,7 +212,7 @@ def test_compensator_lanes_are_independent_for_any_batch_shape(name):
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_compensator_output_type_follows_its_input_arrays(name):
+def test_compensator_output_is_float32_for_float32_inputs(name):
     lowered = jax.tree.map(
         lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf,
         (*readings((), GAP), some_gains(name)),
@@ -238,7 +238,7 @@ def test_compensator_is_mirror_symmetric_between_surfaces(name):
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_compensator_restart_clears_state(name):
+def test_compensator_state_is_cleared_when_a_run_starts(name):
     """Without a start of a run nothing changes; the next contact keeps only what was identified; a reset
     clears all.
     """

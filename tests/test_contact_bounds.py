@@ -33,7 +33,7 @@ def test_contact_bounds_are_twice_the_force_and_half_to_twice_the_duration(array
     assert not is_contact_out_of_bounds(array(1.0), array(1.0), array(1.0), array(1.0), PERIOD)
 
 
-def test_contact_bounds_ignore_unknown_values():
+def test_contact_bounds_ignore_unknown_peak_force_and_duration():
     assert not is_peak_force_excessive(math.nan, 1.0) and not is_peak_force_excessive(1.0, math.nan)
     assert not is_duration_out_of_bounds(math.nan, 1.0, PERIOD) and not is_duration_out_of_bounds(
         1.0, math.nan, PERIOD
@@ -42,14 +42,14 @@ def test_contact_bounds_ignore_unknown_values():
     assert not is_duration_out_of_bounds(0.1, math.inf, PERIOD)
 
 
-def test_duration_bound_of_short_contact_allows_whole_periods():
+def test_duration_bound_of_short_contact_allows_rounding_to_control_periods():
     # Sampling shows an ideal contact of 2.4 periods as one to five ticks.
     assert not is_duration_out_of_bounds(1 * PERIOD, 2.4 * PERIOD, PERIOD)
     assert not is_duration_out_of_bounds(6 * PERIOD, 2.4 * PERIOD, PERIOD)
     assert is_duration_out_of_bounds(7 * PERIOD, 2.4 * PERIOD, PERIOD)
 
 
-def test_undelayed_run_equals_ideal_contact():
+def test_undelayed_simulation_has_peak_force_and_duration_of_ideal_contact():
     # With an ideal simulator and no delay, the rest is of the order of (omega T)^2 and of one control period.
     rig = {"rig.simulator": {"model": "ideal"}, "rig.force_sensor.delay": 0.0, "contact.damping": [0.0]}
     mechanism = jaxhil.load("claw-350kg", {**rig, "uncertainty": None})
@@ -88,7 +88,7 @@ def test_verdict_reasons_name_status_or_error_first(slow_simulator):
     assert len(slow_simulator.reasons(limit=1e-6)) == 3
 
 
-def test_verify_checks_real_contact_of_closed_loop(slow_simulator):
+def test_verify_reports_excessive_peak_force_of_closed_loop(slow_simulator):
     gains, mechanism = slow_simulator.gains, slow_simulator.mechanism
     report = verify(check_document(build_document(LAW, gains, mechanism, "0" * 64, {}, {}, 0, {})), 1)
     (contact,) = report.closed_loop

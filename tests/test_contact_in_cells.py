@@ -103,7 +103,7 @@ RIGID = {"law": "piecewise_linear", "stiffness": [[8e4, 1e7, 7e4]], "depths": [1
         ({"law": "preloaded", "preload": 3.0, "friction": 2.0}, 20.0, 1e-4, True),
     ],
 )
-def test_slow_mechanisms_use_samples_without_cells(contact, frequency, lag, cells):
+def test_slow_mechanisms_need_no_subdivision_of_control_period(contact, frequency, lag, cells):
     sensor = {"time_constant": lag}
     raw = mechanism(contact, second_order(frequency), period=1e-3, force_sensor=sensor)
     _, sampled, exact = loops_of(raw)
@@ -147,7 +147,7 @@ def test_sampled_contact_of_slow_mechanism_agrees_with_exact_motion(contact, fre
 
 @pytest.mark.parametrize("fastest", [0.0, 0.1, 0.9, 5.0, MAX_POLE])
 @pytest.mark.parametrize("lag", [0.0, 1e-9, 0.01, 0.3, 5.0])
-def test_cells_are_at_most_one_radian_and_one_time_constant_long(fastest, lag):
+def test_subdivisions_of_control_period_are_at_most_one_radian_and_one_time_constant(fastest, lag):
     counts = count_cells(fastest, np.array([lag]))
     window = min(1.0, 40 * lag) if counts.plain else 1.0
     if counts.plain:
@@ -157,7 +157,7 @@ def test_cells_are_at_most_one_radian_and_one_time_constant_long(fastest, lag):
     assert counts.degree == (1 if fastest == 0 else 8 if fastest <= 0.12 else 16)
 
 
-def test_joined_cell_counts_cover_every_member():
+def test_merged_cell_counts_suffice_for_every_mechanism():
     whole, windowed, plain = CellCounts(0, 16, 16), CellCounts(2, 64, 8), CellCounts(4, 0, 8)
     assert merge_cell_counts([NO_CELLS, NO_CELLS]) == NO_CELLS
     assert merge_cell_counts([NO_CELLS, plain]) == plain
@@ -166,7 +166,7 @@ def test_joined_cell_counts_cover_every_member():
     assert merge_cell_counts([windowed, plain]) == CellCounts(4, 64, 8)
 
 
-def test_fastest_pole_is_found_for_every_order():
+def test_fastest_simulator_pole_is_correct_for_every_order():
     rng = np.random.default_rng(1)
     for order in range(1, 7):
         roots = -rng.uniform(1.0, 300.0, order)
@@ -176,7 +176,7 @@ def test_fastest_pole_is_found_for_every_order():
     np.testing.assert_allclose(fastest_pole(pair), 50.0, rtol=1e-12)
 
 
-def test_exact_loop_differs_from_sampled_loop_only_in_cells():
+def test_exact_loop_differs_from_sampled_loop_only_in_cell_counts():
     parsed = validated(mechanism({}, second_order(12.0), period=1e-3))
     scenarios = join([build_scenarios(parsed)])
     plain = build_loop(parsed, "none", scenarios)

@@ -33,7 +33,7 @@ def reference(name, **values):
     return run(contact(**values), mass, velocity)
 
 
-def test_hardening_undamped_matches_closed_form():
+def test_undamped_hardening_contact_matches_closed_form():
     """e = 1; k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 at the peak force; a soft spring stays linear."""
     unit = np.array([1e-5, 5e-5, 1e-4, 2e-4, 1e-3, 10.0])
     result = reference("hardening", reference_depth=unit)
@@ -62,7 +62,7 @@ def test_single_surface_equals_two_surfaces_infinitely_apart(name):
 
 
 @pytest.mark.parametrize("exponent, damping", [(1.5, 0.0), (2.2, 0.0), (1.0, 600.0)])
-def test_depth_damped_equals_hunt_crossley_for_equal_parameters(exponent, damping):
+def test_depth_damped_contact_equals_hunt_crossley_for_equal_parameters(exponent, damping):
     stiffness = 1e7 if exponent > 1 else STIFFNESS
     result = reference("depth_damped", stiffness=stiffness, exponent=exponent, damping=damping)
     parameters = MASS, stiffness, exponent, damping / (1.5 * 2e-4 * stiffness), VELOCITY
@@ -73,7 +73,7 @@ def test_depth_damped_equals_hunt_crossley_for_equal_parameters(exponent, dampin
         np.testing.assert_allclose(got, wanted, rtol=1e-8)
 
 
-def test_elastoplastic_closed_form_matches_integration():
+def test_elastoplastic_contact_closed_form_matches_integration():
     ratio = np.array([1.0, 1.1, 1.5, 2.0, 4.0, 25.0])
     result = reference("elastoplastic", unloading_ratio=ratio)
     np.testing.assert_allclose(result.restitution, ratio**-0.5, rtol=1e-15)
@@ -88,7 +88,7 @@ def test_elastoplastic_closed_form_matches_integration():
 PRELOADS = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 6.0], [10.0, 6.0], [3.0, 6.0], [200.0, 1.0]]).T
 
 
-def test_preloaded_closed_form_matches_integration():
+def test_preloaded_contact_closed_form_matches_integration():
     """Energy: M v^2/2 = k d^2/2 + (F_0 + F_r) d in, k d^2/2 + (F_0 - F_r) d out.
 
     If friction holds the mechanism back, some energy is left in the spring.
@@ -112,7 +112,7 @@ def test_preloaded_closed_form_matches_integration():
     assert np.all(stuck.restitution == 0) and np.all(np.isinf(stuck.duration))
 
 
-def test_elastoplastic_loads_unloads_reloads_and_resets():
+def test_elastoplastic_contact_loads_unloads_reloads_and_resets():
     law, parameters = CONTACT_LAWS["elastoplastic"], contact(unloading_ratio=2.0)
     state, forces = law.init(jnp.zeros(LANES)), []
     depths = np.array([1.0, 3.0, 2.0, 1.6, 1.0, 2.5, 4.0, 3.0, 0.0, 1.0])
@@ -122,7 +122,7 @@ def test_elastoplastic_loads_unloads_reloads_and_resets():
     np.testing.assert_allclose(forces, [1, 3, 1, 0.2, 0, 2, 4, 2, 0, 1], rtol=0, atol=1e-12)
 
 
-def test_integrated_reference_derivatives_match_finite_differences():
+def test_integrated_ideal_contact_derivatives_match_finite_differences():
     """Differentiate by stiffness, damping and velocity."""
     values = {"damping": np.linspace(50.0, 900.0, LANES)}
 
@@ -182,7 +182,7 @@ def limit(name):
 
 
 @pytest.mark.parametrize("name, order", list(zip(LAWS_ALONE, [2, 1, 1, 2, 1], strict=True)))
-def test_undelayed_contact_converges_to_reference(name, order):
+def test_undelayed_contact_converges_to_ideal_contact(name, order):
     """Compare the restitution with SciPy or the closed form, and with the law's own reference; W_out/W_in
     with e^2.
     """

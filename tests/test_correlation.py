@@ -73,7 +73,7 @@ def test_correlated_draws_keep_small_variance_of_a_combination():
     assert abs(np.std(combined) / np.sqrt(variance) - 1) < 4 / np.sqrt(2 * 4096)
 
 
-def test_draws_without_earlier_correlation_keep_their_bits():
+def test_correlation_changes_only_draws_of_the_correlated_key():
     apart, together = draw(mechanism(keys=None), 500, 3), draw(mechanism(), 500, 3)
     assert together.keys() == apart.keys()
     for key in set(apart) - {DAMPING}:
@@ -118,7 +118,7 @@ def test_correlation_leaves_quantiles_and_extremes_unchanged():
     assert all(np.all(np.isfinite(values)) for values in box.values())
 
 
-def test_correlation_matrix_holds_for_each_independent_list_entry():
+def test_correlation_matrix_applies_to_each_independent_list_entry():
     apart = {key: UNCERTAIN[key] | {"independent": True} for key in (STIFFNESS, DAMPING)}
     raw = to_plain_data(load("varying", {"contact.damping": [260.0, 390.0]}).mechanism)
     table = {"keys": [STIFFNESS, DELAY, DAMPING], "matrix": [[1.0], [0.6, 1.0], [0.5, -0.3, 1.0]]}
@@ -149,7 +149,7 @@ def test_correlation_matrix_holds_for_each_independent_list_entry():
         assert stats.kstest(column, stats.norm.cdf).pvalue > 0.01
 
 
-def test_correlated_groups_are_connected_components():
+def test_correlated_keys_are_grouped_by_connected_components():
     assert find_correlated_groups(mechanism()) == [(DELAY, STIFFNESS, DAMPING), (FREQUENCY,)]
     assert find_correlated_groups(mechanism(keys=None)) == []
 

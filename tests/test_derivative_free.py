@@ -26,7 +26,7 @@ def rippled(points):
 
 
 @pytest.mark.parametrize("gains", [2, 6, 12])
-def test_polish_follows_a_curved_valley(gains):
+def test_polishing_search_converges_along_a_curved_valley(gains):
     start = np.full(gains, 0.6)
     result = polish(rosenbrock, start, 1200 * gains, reach=0.05)
     assert result.loss < 1e-3 * rosenbrock(start)
@@ -35,13 +35,13 @@ def test_polish_follows_a_curved_valley(gains):
 
 
 @pytest.mark.parametrize("gains", [2, 6, 12])
-def test_polish_settles_at_a_kink(gains):
+def test_polishing_search_converges_at_a_kink(gains):
     start = np.full(gains, 0.52)
     result = polish(kinked, start, 400 * gains, reach=0.05)
     assert result.loss < 1e-3 * kinked(start)
 
 
-def test_polish_converges_faster_with_known_covariance():
+def test_polishing_search_converges_faster_with_known_covariance():
     generator = np.random.default_rng(0)
     turned, _ = np.linalg.qr(generator.standard_normal((10, 10)))
     hessian = (turned * np.geomspace(1, 1e6, 10)) @ turned.T
@@ -56,7 +56,7 @@ def test_polish_converges_faster_with_known_covariance():
     assert shaped.loss < 0.1 * blind.loss
 
 
-def test_polish_result_is_never_worse_than_its_start():
+def test_polishing_search_is_never_worse_than_its_starting_point():
     # Start at the minimum, with so wide a reach that no draw is better.
     start = np.array([0.3, 0.7])
     result = polish(kinked, start, 64, reach=0.4)
@@ -64,7 +64,7 @@ def test_polish_result_is_never_worse_than_its_start():
     np.testing.assert_array_equal(result.point, start)
 
 
-def test_polish_starts_are_independent_of_each_other():
+def test_polishing_searches_of_a_batch_are_independent():
     starts = np.random.default_rng(1).random((3, 4))
     together = polish(rosenbrock, starts, 320)
     for start, free, loss in zip(starts, together.point, together.loss, strict=True):
@@ -74,7 +74,7 @@ def test_polish_starts_are_independent_of_each_other():
     assert together.evaluations == 320
 
 
-def test_polish_is_reproducible_and_calls_have_one_shape():
+def test_polishing_search_is_reproducible_and_uses_constant_batch_shape():
     shapes = []
 
     def losses(points):
@@ -89,13 +89,13 @@ def test_polish_is_reproducible_and_calls_have_one_shape():
     assert first.evaluations == 192 and len(shapes) == 2 * 12
 
 
-def test_polish_finds_minimum_on_the_bound():
+def test_polishing_search_finds_minimum_on_the_bound():
     target = np.array([0.0, 0.4, 1.0])
     result = polish(lambda points: np.sum(np.abs(points - target), axis=-1), np.full(3, 0.5), 1500, reach=0.1)
     np.testing.assert_allclose(result.point, target, atol=1e-3)
 
 
-def test_polish_treats_nan_as_the_worst_loss():
+def test_polishing_search_treats_nan_as_the_worst_loss():
     def losses(points):
         return np.where(points[..., 0] > 0.55, np.nan, rosenbrock(points))
 
@@ -128,7 +128,7 @@ def test_global_search_finds_minimum_that_local_search_misses():
     assert result.loss == losses(result.point)
 
 
-def test_global_search_keeps_budget_and_one_call_shape():
+def test_global_search_keeps_evaluation_budget_and_constant_batch_shape():
     shapes = []
 
     def losses(points):

@@ -15,7 +15,7 @@ def by_lane(array):
     return np.moveaxis(np.asarray(array), -1, 0)
 
 
-def test_solve_matches_numpy_with_zero_pivots():
+def test_linear_solve_matches_numpy_for_matrices_with_zero_pivots():
     matrix = MATRIX.copy()
     matrix[0, 0], matrix[:2, :2, 3] = 0.0, [[0.0, 1.0], [1.0, 0.0]]
     result = by_lane(jax.jit(solve)(matrix, RIGHT))
@@ -24,7 +24,7 @@ def test_solve_matches_numpy_with_zero_pivots():
     assert np.max(np.abs(result - expected).max(axis=(1, 2)) / scale) < 1e-15
 
 
-def test_solve_derivative_includes_both_sides():
+def test_linear_solve_derivative_includes_matrix_and_right_hand_side():
     """A X' = B' - A' X."""
     slopes = jnp.asarray(SEEDED.normal(size=MATRIX.shape)), jnp.asarray(SEEDED.normal(size=RIGHT.shape))
     result, slope = jax.jit(lambda: jax.jvp(solve, (jnp.asarray(MATRIX), jnp.asarray(RIGHT)), slopes))()
@@ -32,7 +32,7 @@ def test_solve_derivative_includes_both_sides():
     np.testing.assert_allclose(both, slopes[1], atol=1e-11)
 
 
-def test_matrix_square_root_is_accurate_for_distant_eigenvalues():
+def test_matrix_square_root_is_accurate_for_widely_spread_eigenvalues():
     turns = np.linalg.qr(by_lane(MATRIX))[0]
     for ratio in (1.0, 1e-3, 1e-8):
         values = np.geomspace(1.0, ratio, 6) * 700.0

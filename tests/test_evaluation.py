@@ -51,7 +51,7 @@ def test_evaluation_of_a_lane_does_not_depend_on_its_batch():
     np.testing.assert_array_equal(part.metrics.status, whole.metrics.status[..., lanes])
 
 
-def test_evaluation_with_gains_per_lane_equals_common_gains():
+def test_evaluation_with_separate_gains_per_lane_equals_evaluation_with_common_gains():
     loop, gains, scenarios = setting(lanes=20)
     common = evaluate(loop, gains, scenarios)
     per_lane = evaluate(loop, {name: np.full(20, value) for name, value in gains.items()}, scenarios)
@@ -63,7 +63,7 @@ def test_evaluation_with_gains_per_lane_equals_common_gains():
 @pytest.mark.parametrize(
     "compensator", [pytest.param("phase_lead", marks=pytest.mark.slow), "response_error"]
 )
-def test_neutral_gains_equal_no_compensation(compensator):
+def test_neutral_gains_give_the_result_of_no_compensation(compensator):
     loop, gains, scenarios = setting(compensator)
     plain, _, _ = setting("none")
     neutral = evaluate(loop, neutralise_gains(compensator, gains), scenarios)
@@ -71,7 +71,7 @@ def test_neutral_gains_equal_no_compensation(compensator):
     np.testing.assert_allclose(neutral.error[none.wanted], none.error[none.wanted], rtol=1e-10, atol=1e-12)
 
 
-def test_evaluation_reuses_program_for_other_mechanism_seed_and_number():
+def test_evaluation_reuses_program_for_other_mechanism_seed_and_batch_size():
     loop, gains, scenarios = setting()
     evaluate(loop, gains, scenarios)
     programs = programs_of("run_tiles")
@@ -82,7 +82,7 @@ def test_evaluation_reuses_program_for_other_mechanism_seed_and_number():
     assert programs_of("run_tiles") == programs > 0
 
 
-def test_evaluation_compares_every_contact_with_its_own_reference():
+def test_evaluation_compares_every_contact_with_its_own_ideal_contact():
     loop, gains, scenarios = setting("none")
     outcome = evaluate(loop, gains, scenarios)
     damping_ratio = scenarios.contact.damping / (
@@ -122,7 +122,7 @@ def test_tiles_group_lanes_of_equal_delay_and_similar_duration():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["varying", "rattling"])
-def test_evaluation_of_a_lane_keeps_its_bits_in_any_batch(name):
+def test_evaluation_of_a_lane_is_bit_identical_in_any_batch(name):
     # With a lagging sensor, a tile without contact skips work.
     overrides = ("rig.force_sensor.time_constant=0.002",)
     loop, gains, scenarios = setting(lanes=600, name=name, overrides=overrides)
@@ -148,7 +148,7 @@ print(jax.device_count(), hashlib.sha256(content).hexdigest())
 
 
 @pytest.mark.slow
-def test_evaluation_of_a_lane_keeps_its_bits_on_any_number_of_cores():
+def test_evaluation_of_a_lane_is_bit_identical_on_any_number_of_cores():
     digests = {}
     for cores in 1, 2, 3:
         flags = "" if cores == 1 else f"{DEVICE_COUNT_FLAG}={cores}"

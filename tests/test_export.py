@@ -125,7 +125,7 @@ def test_export_is_reproducible_for_equal_gains_and_seed():
     assert {name for name in first if first[name] != other[name]} == {"vectors.csv", "manifest.json"}
 
 
-def test_with_limits_signs_limits_and_stores_alarm_rates():
+def test_replace_limits_updates_digest_and_stores_alarm_rates():
     made = document()
     changed = replace_limits(made, {"force_limit": 900.0, "velocity_limit": None}, {"limit": 0.01})
     assert changed["limits"] == {
@@ -157,7 +157,7 @@ def test_export_reports_limits_that_stop_the_nominal_run(jaxhil, gains, tmp_path
     assert (tmp_path / "bundle" / "manifest.json").exists()
 
 
-def test_export_takes_limits_from_named_sweep(jaxhil, gains, tmp_path):
+def test_export_takes_limits_from_the_specified_sweep(jaxhil, gains, tmp_path):
     store, folder = tmp_path / "store", tmp_path / "bundle"
     assert jaxhil("sweep", gains, "--scenarios", "40", "--limit", "5", "-o", store).code == 0
     replaced = ["--set", "command_lowest=-0.05", "--set", "force_range=none"]
@@ -218,7 +218,7 @@ def test_export_command_rejects_unreadable_gains(jaxhil, tmp_path):
     refused(jaxhil("export", tmp_path, "-o", tmp_path / "bundle"), "gains.json: schema: found nothing")
 
 
-def test_export_leaves_foreign_folder_untouched(jaxhil, gains, tmp_path):
+def test_export_leaves_third_party_folder_unchanged(jaxhil, gains, tmp_path):
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "thesis.txt").write_text("years of work")
@@ -363,7 +363,7 @@ def test_export_rejects_folder_with_bundle_of_another_mechanism(tmp_path):
         check_same_mechanism(folder, "another")
 
 
-def test_export_writers_write_the_files_of_their_format():
+def test_each_export_format_writes_its_own_files():
     made = document()
     for name, names in {
         "ros2": {"ros2.yaml"},

@@ -49,14 +49,14 @@ def undelayed(members, damped: bool) -> Any:
     return SimpleNamespace(**references)
 
 
-def test_family_files_load_as_the_family(tmp_path, members):
+def test_generated_family_of_mechanism_files_loads_unchanged(tmp_path, members):
     paths = write(tmp_path)
     assert [load(path).mechanism for path in paths] == members
     assert len({path.name for path in paths}) == len({m.name for m in members}) == NUMBER
     assert all(path.stem == mechanism.name for path, mechanism in zip(paths, members, strict=True))
 
 
-def test_family_files_are_reproducible_in_another_process(tmp_path):
+def test_generated_mechanism_files_are_reproducible_in_another_process(tmp_path):
     once = write(tmp_path / "once")
     command = [sys.executable, "-m", "tests.family", str(tmp_path / "again")]
     subprocess.run(command, check=True, cwd=Path(__file__).parent.parent, stdout=subprocess.DEVNULL)
@@ -65,12 +65,12 @@ def test_family_files_are_reproducible_in_another_process(tmp_path):
     assert texts(seed=1) != texts(seed=0)
 
 
-def test_family_of_fewer_members_is_a_prefix(members):
+def test_smaller_generated_family_is_prefix_of_larger_family(members):
     for number in (1, 3, 20):
         assert family(number) == members[:number]
 
 
-def test_family_values_lie_within_and_fill_their_ranges(members):
+def test_generated_mechanism_values_lie_within_and_fill_their_ranges(members):
     drawn = {
         "mass": [m.bodies.mass for m in members],
         "velocity": [m.approach.velocity for m in members],
@@ -92,7 +92,7 @@ def test_family_values_lie_within_and_fill_their_ranges(members):
     assert all(m.rig.control_period == 1e-3 for m in members)
 
 
-def test_family_has_every_contact_law_and_undamped_members(members):
+def test_generated_family_has_every_contact_law_and_undamped_members(members):
     assert {m.contact.law for m in members} == set(LAWS)
     number = [sum(g.tuned(m) for g in COMPENSATORS["response_error"].gains) for m in members]
     damped = [m.contact.damping[0] > 0 for m in members]
@@ -100,7 +100,7 @@ def test_family_has_every_contact_law_and_undamped_members(members):
     assert all(n == (5 if d else 4) for n, d in zip(number, damped, strict=True))
 
 
-def test_family_members_are_uncertain_in_stiffness_force_delay_and_phase(members):
+def test_generated_mechanisms_have_uncertain_stiffness_force_delay_and_phase(members):
     for mechanism in members:
         assert set(mechanism.uncertainty) == {
             "contact.stiffness", "rig.force_sensor.delay", "approach.phase"

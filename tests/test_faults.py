@@ -210,7 +210,7 @@ def _differing(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
     return [name for name in first.keys() | second.keys() if first.get(name) != second.get(name)]
 
 
-def test_sweep_recovers_from_failed_call_and_kill(runner, tmp_path):
+def test_sweep_recovers_from_failed_system_call_and_kill(runner, tmp_path):
     bench = Bench(runner, tmp_path, "sweep")
     bench.restore()
     calls = bench.undisturbed.calls
@@ -224,7 +224,7 @@ def test_sweep_recovers_from_failed_call_and_kill(runner, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("kill", [False, True], ids=["fails", "killed"])
 @pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_command_recovers_from_every_failed_call_and_kill(runner, tmp_path, name, kill):
+def test_every_command_recovers_from_failed_system_call_and_kill(runner, tmp_path, name, kill):
     bench = Bench(runner, tmp_path, name)
     for at in range(len(bench.undisturbed.calls)):
         bench.restore()

@@ -25,7 +25,7 @@ from jaxhil.files import (
 )
 
 
-def test_write_whole_replaces_file(tmp_path):
+def test_write_atomically_replaces_file(tmp_path):
     path = tmp_path / "file"
     for content in (b"old", bytearray(b"new"), memoryview(b"newer")):
         write_atomically(path, content)
@@ -33,7 +33,7 @@ def test_write_whole_replaces_file(tmp_path):
 
 
 @pytest.mark.parametrize("has_links", [True, False])
-def test_write_new_never_overwrites(tmp_path, monkeypatch, has_links):
+def test_write_new_never_overwrites_a_file(tmp_path, monkeypatch, has_links):
     def refuse(*_):
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
@@ -47,7 +47,7 @@ def test_write_new_never_overwrites(tmp_path, monkeypatch, has_links):
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_write_whole_keeps_old_file_after_failure(tmp_path, monkeypatch, step):
+def test_write_atomically_keeps_old_file_after_failure(tmp_path, monkeypatch, step):
     path = tmp_path / "file"
     write_atomically(path, b"old")
 
@@ -61,7 +61,7 @@ def test_write_whole_keeps_old_file_after_failure(tmp_path, monkeypatch, step):
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_writing_passes_other_errors_through(tmp_path):
+def test_report_write_errors_passes_other_errors_through(tmp_path):
     with pytest.raises(InputError, match=r"^something else$"), report_write_errors(tmp_path):
         raise InputError("something else")
 
@@ -108,7 +108,7 @@ def test_make_folder_rejects_links(tmp_path):
             make_folder(tmp_path / name)
 
 
-def test_follow_resolves_link_named_by_user(tmp_path):
+def test_output_path_given_as_link_is_written_through_the_link(tmp_path):
     _, target = not_plain(tmp_path)
     write_atomically(resolve_output_path(tmp_path / "link"), b"picture")
     assert (tmp_path / "link").is_symlink() and target.read_bytes() == b"picture"
@@ -117,7 +117,7 @@ def test_follow_resolves_link_named_by_user(tmp_path):
         write_atomically(resolve_output_path(tmp_path / "device"), b"picture")
 
 
-def test_read_sealed_returns_exact_content_or_none(tmp_path):
+def test_read_checksummed_returns_exact_content_or_none(tmp_path):
     path = tmp_path / "file"
     generator = np.random.default_rng(0)
     assert read_checksummed(path) is None
@@ -137,7 +137,7 @@ def test_read_sealed_returns_exact_content_or_none(tmp_path):
                 assert read_checksummed(path) is None
 
 
-def test_remove_stale_removes_only_files_of_killed_processes(tmp_path):
+def test_remove_stale_removes_only_temporary_files_of_killed_processes(tmp_path):
     killed = """
 import os, signal, sys
 from pathlib import Path

@@ -64,7 +64,7 @@ SIDES = pytest.mark.parametrize(("side", "gap"), [(1.0, 0.0), (1.0, 0.02), (-1.0
 @pytest.mark.parametrize("damping_ratio", [0.25, 0.5, 0.8])
 @pytest.mark.parametrize("dead_zone", [0.0, 2.0])
 @pytest.mark.parametrize("bias", [0.0, 0.1, -3.7])
-def test_force_stuck_is_not_raised_for_noiseless_sensor_without_force(
+def test_force_stuck_fault_is_not_raised_for_noiseless_sensor_without_force(
     damping_ratio, dead_zone, bias, side, gap
 ):
     """A damped contact ends by moving out several times `force_stuck_travel` without a force."""
@@ -74,7 +74,7 @@ def test_force_stuck_is_not_raised_for_noiseless_sensor_without_force(
 
 
 @SIDES
-def test_force_stuck_ignores_position_noise_without_force(side, gap):
+def test_force_stuck_fault_is_not_raised_by_position_noise_without_force(side, gap):
     """At a contact's end noise accumulates to far more than the travel, but the penetration does not
     increase.
     """
@@ -84,7 +84,7 @@ def test_force_stuck_ignores_position_noise_without_force(side, gap):
 
 @SIDES
 @pytest.mark.parametrize("bias", [0.0, -3.7])
-def test_force_stuck_is_raised_if_sensor_never_reads_force(bias, side, gap):
+def test_force_stuck_fault_is_raised_if_sensor_never_reads_force(bias, side, gap):
     """Disconnect the cable: no mechanism can be pressed in this far without a force."""
     position, force = contact(0.5, side, gap)
     depth = position if side > 0 else -gap - position
@@ -95,7 +95,7 @@ def test_force_stuck_is_raised_if_sensor_never_reads_force(bias, side, gap):
 
 @SIDES
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
-def test_force_stuck_is_raised_for_constant_force_while_mechanism_moves(share, side, gap):
+def test_force_stuck_fault_is_raised_for_constant_force_while_mechanism_moves(share, side, gap):
     position, force = contact(0.25, side, gap)
     begin = int(20 + share * (np.count_nonzero(force) - 10))
     read = force.copy()
@@ -110,7 +110,7 @@ def test_force_stuck_is_raised_for_constant_force_while_mechanism_moves(share, s
     )
 
 
-def test_force_stuck_is_raised_on_next_contact_if_stuck_at_zero():
+def test_force_stuck_fault_is_raised_on_next_contact_if_sensor_stays_at_zero():
     """The sensor fails at the end of a contact; this shows as soon as the next contact presses."""
     position, force = contact(0.5, 1.0, 0.0)
     released = len(force) - int(np.argmax(force[::-1] > 0))

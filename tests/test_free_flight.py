@@ -30,7 +30,7 @@ def case(law, mechanism="varying", overrides=()):
 @pytest.mark.parametrize(
     "law", [pytest.param(law, marks=() if law in EVERYDAY else pytest.mark.slow) for law in WAITING]
 )
-def test_skipped_approach_changes_no_metric(law):
+def test_skipping_the_approach_changes_no_metric(law):
     loop, gains, scenarios = case(law)
     assert loop.is_idle_in_flight
     result = run_rollout(loop, gains, scenarios)
@@ -52,7 +52,7 @@ def test_skipped_approach_changes_no_metric(law):
         ["rig.simulator.velocity_limit=0.5"],
     ],
 )
-def test_approach_with_noise_or_limits_is_not_skipped(overrides):
+def test_approach_with_noise_or_limits_is_simulated_and_not_skipped(overrides):
     loop, _, _ = case("none", overrides=overrides)
     assert not loop.is_idle_in_flight
 
@@ -66,7 +66,7 @@ class Early(NoCompensator):
         return signals.force_measured + jnp.maximum(signals.position_desired, 0), state
 
 
-def test_approach_is_not_skipped_for_compensator_active_before_contact():
+def test_skipped_approach_is_disabled_for_compensators_active_before_contact():
     """This includes a compensator built from one that waits for contact."""
     loop, _, _ = case("virtual_contact")
     assert not loop.is_idle_in_flight

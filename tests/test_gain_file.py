@@ -59,7 +59,7 @@ def test_gain_file_digest_ignores_date_and_timings():
     assert digest({**document, "seed": 8}) != document["sha256"]
 
 
-def test_gain_file_units_and_bounds_are_those_of_the_registry():
+def test_gain_file_units_and_bounds_equal_those_of_the_compensator():
     document, mechanism = make(), load("varying").mechanism
     for gain in COMPENSATORS["response_error"].gains:
         entry = document["gains"][gain.name]
@@ -70,13 +70,13 @@ def test_gain_file_units_and_bounds_are_those_of_the_registry():
         )
 
 
-def test_gain_file_contains_overrides():
+def test_gain_file_stores_overridden_mechanism_values():
     loaded = check_document(make(overrides=["contact.stiffness=5e4", "rig.force_sensor.range=900"]))
     assert loaded.mechanism.contact.stiffness == [5e4]
     assert loaded.mechanism.rig.force_sensor.range == 900.0
 
 
-def test_gain_file_is_sorted_ascii_json_with_digest(tmp_path):
+def test_gain_file_is_ascii_json_with_sorted_keys_and_digest(tmp_path):
     path = tmp_path / "gains.json"
     document = make()
     write_gain_file(path, {**document, "note": "Dämpfung", "sha256": "stale"})
@@ -88,7 +88,7 @@ def test_gain_file_is_sorted_ascii_json_with_digest(tmp_path):
     assert load_gain_file(path).document["note"] == "Dämpfung"
 
 
-def test_gain_file_survives_failed_write(tmp_path, monkeypatch):
+def test_gain_file_is_unchanged_after_failed_write(tmp_path, monkeypatch):
     path = tmp_path / "gains.json"
     write_gain_file(path, make())
     before = path.read_bytes()
@@ -111,7 +111,7 @@ def test_gain_file_write_rejects_missing_folder(tmp_path):
         write_gain_file(tmp_path / "nowhere" / "gains.json", make())
 
 
-def test_plain_replaces_non_finite_values_by_null():
+def test_json_data_has_null_for_non_finite_values():
     Pair = namedtuple("Pair", "error peak")
     value = {"a": np.array([1.0, np.nan]), "b": (np.inf, 2), "c": np.float32(0.5), "d": Pair(-math.inf, True)}
     assert to_json_data(value) == {
@@ -147,7 +147,7 @@ def test_build_document_rejects_missing_gain_and_unknown_compensator():
         build_document("pid", {}, mechanism, sha256, {}, {}, 0, {})
 
 
-def test_build_document_clips_rounding_beyond_bound():
+def test_build_document_clips_gain_beyond_bound_by_rounding():
     assert make(forgetting=1.0 + 2e-16 * 5)["gains"]["forgetting"]["value"] == 1.0
 
 
@@ -203,7 +203,7 @@ def test_gain_file_rejects_inconsistent_entry(path, value, message, tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff", b'{"schema": NaN}', b"[" * 100_000])
-def test_gain_file_rejects_other_content(content, tmp_path):
+def test_gain_file_reader_rejects_other_file_types(content, tmp_path):
     file = tmp_path / "gains.json"
     file.write_bytes(content)
     with pytest.raises(InputError) as caught:
@@ -240,7 +240,7 @@ def test_gain_file_of_retired_compensator_is_rejected_with_replacement(law, tmp_
     assert_refused_everywhere(file, {**document, "compensator": law}, text, jaxhil)
 
 
-def test_gain_file_rejects_edit_without_new_digest(tmp_path):
+def test_gain_file_edited_without_new_digest_is_rejected(tmp_path):
     file = tmp_path / "gains.json"
     write_gain_file(file, make())
     file.write_text(file.read_text().replace('"value": 0.98', '"value": 0.97'))
@@ -287,7 +287,7 @@ def test_gain_file_accepts_or_rejects_any_change_in_one_line(path, value):
         assert loaded.document is document
 
 
-def test_envelope_of_linear_contact_matches_closed_form():
+def test_force_envelope_of_linear_contact_matches_closed_form():
     mechanism = load("varying").mechanism
     draws = {
         "contact.stiffness": np.array([[1e5, 4e5, 5e4], [2e5, 8e5, 1e5]]),
@@ -312,13 +312,13 @@ def test_envelope_of_linear_contact_matches_closed_form():
         np.testing.assert_allclose([envelope[name]["low"], envelope[name]["high"]], [low, high], rtol=1e-12)
 
 
-def test_envelope_counts_only_simulated_contacts():
+def test_force_envelope_covers_only_simulated_contacts():
     mechanism = load("varying", ["approach.contacts=1"]).mechanism
     frequency = validity_envelope(mechanism, build_scenarios(mechanism))["contact_frequency"]
     np.testing.assert_allclose([frequency["low"], frequency["high"]], math.sqrt(124355 / 350) / (2 * math.pi))
 
 
-def test_envelope_of_hunt_crossley_uses_typical_stiffness():
+def test_force_envelope_of_hunt_crossley_contact_uses_typical_stiffness():
     overrides = ["contact.law=hunt_crossley", "contact.stiffness=[1e7]", "contact.damping=[0.1]"]
     mechanism = load("claw-350kg", [*overrides, "contact.exponent=1.3"]).mechanism
     envelope = validity_envelope(mechanism, build_scenarios(mechanism))
@@ -326,7 +326,7 @@ def test_envelope_of_hunt_crossley_uses_typical_stiffness():
     np.testing.assert_allclose(envelope["contact_frequency"]["low"], omega / (2 * math.pi), rtol=1e-12)
 
 
-def test_envelope_of_user_registered_contact_law():
+def test_force_envelope_of_user_registered_contact_law_matches_closed_form():
     """F = k d^2: M v^2/2 = k d^3/3, so F = k^(1/3) (3 M v^2/2)^(2/3); the law has no damping."""
     jaxhil.register(SquaredSpring())
     stiffness, velocity = np.array([[4e8, 1e9], [2e8, 5e8]]), np.array([0.004, 0.006])
@@ -342,7 +342,7 @@ def test_envelope_of_user_registered_contact_law():
 
 
 @pytest.mark.parametrize("velocity", [0.002, 0.005, 0.01, 0.05])
-def test_envelope_of_layers_matches_integration(velocity):
+def test_force_envelope_of_layered_contact_matches_integration(velocity):
     mechanism = load("layered", [f"approach.velocity={velocity}", "approach.contacts=1"]).mechanism
     slopes, depths = [8e4, 1.6e5, 3.2e5], [0.0002, 0.0004]
 

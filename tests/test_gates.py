@@ -66,7 +66,7 @@ def crossing(enters, leaves):
 
 
 @SIDES
-def test_gate_sum_is_time_in_contact_and_delay_is_one_period(gates):
+def test_contact_gate_sums_to_contact_time_and_lags_one_period(gates):
     enters, duration = (leaf.ravel() for leaf in np.meshgrid(PHASES, 7.3 + PHASES))
     leaves = enters + duration
     result = gates(crossing(enters, leaves))
@@ -76,7 +76,7 @@ def test_gate_sum_is_time_in_contact_and_delay_is_one_period(gates):
 
 
 @SIDES
-def test_gate_is_one_inside_zero_outside_and_triangular_between(gates):
+def test_contact_gate_is_1_in_contact_0_outside_and_triangular_between(gates):
     result = gates(crossing(PHASES, PHASES + 20))
     age = TICKS[1:, None] - PHASES
     # The integral of the triangle over the time since the onset, up to two periods.
@@ -90,7 +90,7 @@ def test_gate_is_one_inside_zero_outside_and_triangular_between(gates):
     assert np.all((result >= 0) & (result <= 1)) and np.any(result == 1) and np.any(result == 0)
 
 
-def test_gate_is_continuously_differentiable_in_crossing_time():
+def test_contact_gate_is_continuously_differentiable_in_crossing_time():
     def gates_of(enters):
         x = jnp.asarray(TICKS, float) - enters
         excess = jnp.where(x > 0, x, 0)
@@ -106,7 +106,7 @@ def test_gate_is_continuously_differentiable_in_crossing_time():
 
 
 @SIDES
-def test_gate_with_two_surfaces_opens_in_the_gap(gates):
+def test_contact_gate_is_reduced_while_reading_crosses_gap_between_surfaces(gates):
     """A reading that crosses the gap is free for the time in the gap; less if that is under two periods."""
     speed = np.array([0.5, 1.1, 2.9, 6.0, 30.0])
     down = 10.5 * speed - speed * TICKS[:, None]
@@ -125,7 +125,7 @@ READINGS = NORMAL | st.sampled_from([0.0, 1e-300, -1e-300, -CLEARANCE])
 
 
 @given(st.lists(READINGS, min_size=3, max_size=3), st.sampled_from([np.inf, 0.0, CLEARANCE]))
-def test_gate_agrees_between_jax_and_runtime_with_finite_derivatives(readings, clearance):
+def test_contact_gates_of_jax_and_runtime_agree_and_have_finite_derivatives(readings, clearance):
     x = np.array(readings)[:, None]
     np.testing.assert_allclose(on_jax(x, clearance), rig(x, clearance), rtol=0, atol=1e-12)
     # The slope of a change of a few denormals overflows.

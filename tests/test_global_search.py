@@ -18,7 +18,7 @@ def validation():
 
 
 @pytest.mark.slow
-def test_global_search_confirms_good_optimum_and_exposes_bad_one(validation):
+def test_global_search_confirms_good_optimum_and_detects_poor_optimum(validation):
     (result,) = find_gains(validation, SETTINGS)
     assert result.best is not None
     good = compare_with_global_search(validation, 0, result, SETTINGS, factor=20)

@@ -147,7 +147,7 @@ def disagreements(study):
     }
 
 
-def test_restitution_derivatives_are_finite_and_nonzero(study):
+def test_restitution_derivatives_by_gains_and_parameters_are_finite_and_nonzero(study):
     exact = study[-1]
     assert np.all(np.isfinite(exact))
     # Every parameter, including the threshold, changes the restitution of most scenarios.
@@ -255,7 +255,7 @@ def named_events(study, pairs, step):
 
 
 @pytest.mark.parametrize("step", STEPS)
-def test_derivative_disagreement_is_explained_by_discrete_event(study, disagreements, step):
+def test_derivative_differs_from_finite_difference_only_if_discrete_event_moves(study, disagreements, step):
     pairs = disagreements[step]
     # The larger step certainly crosses events: otherwise this test would check nothing.
     assert len(pairs) > 0 or step == STEPS[0]
@@ -271,7 +271,7 @@ def test_derivative_disagreement_is_explained_by_discrete_event(study, disagreem
         assert not unexplained
 
 
-def test_derivative_agreement_has_no_discrete_event(study, disagreements):
+def test_derivative_equals_finite_difference_if_no_discrete_event_moves(study, disagreements):
     """The events of the test above are not always present."""
     step = STEPS[0]
     parted = {(p, s) for p, s in disagreements[step]}

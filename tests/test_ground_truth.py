@@ -83,7 +83,7 @@ def kelvin_voigt():
 
 
 @pytest.mark.parametrize("name", LIMITS)
-def test_restitution_of_kelvin_voigt_contact_converges(kelvin_voigt, name):
+def test_restitution_of_kelvin_voigt_contact_converges_to_closed_form(kelvin_voigt, name):
     _, expected, order = LIMITS[name]
     error = kelvin_voigt[name][0] - expected
     assert order - 0.1 < fitted_order(error) < order + 0.4
@@ -109,7 +109,9 @@ def behind_simulator():
 @pytest.mark.parametrize(
     "hold, latency, periods", [("linear", 0, 0.0), ("linear", 1, 1.0), ("zoh", 0, -0.5), ("zoh", 1, 0.5)]
 )
-def test_restitution_behind_simulator_and_two_delays_converges(behind_simulator, hold, latency, periods):
+def test_restitution_with_simulator_and_two_delays_converges_to_continuous_solution(
+    behind_simulator, hold, latency, periods
+):
     rig = {"command_hold": hold, "command_latency": latency}
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, SECOND_ORDER, 0.0083, **rig))
     period, phase = grid(PERIODS, (np.arange(32) + 0.5) / 32)
@@ -206,7 +208,7 @@ def test_restitution_of_nonlinear_contact_converges_to_continuous_solution(nonli
 
 
 @pytest.mark.parametrize("name", [name for name in LIMITS if "delay" not in name or name == "undelayed"])
-def test_energy_balance_of_kelvin_voigt_contact_converges(kelvin_voigt, name):
+def test_work_of_kelvin_voigt_contact_converges_to_closed_form(kelvin_voigt, name):
     (_, ratio, _), _, order = LIMITS[name]
     restitution, work_in, work_out = kelvin_voigt[name]
     balance = work_out / work_in - restitution**2
@@ -218,7 +220,7 @@ def test_energy_balance_of_kelvin_voigt_contact_converges(kelvin_voigt, name):
 
 
 @pytest.mark.parametrize("name", NONLINEAR)
-def test_energy_balance_of_nonlinear_contact_converges(nonlinear, name):
+def test_work_of_nonlinear_contact_converges_to_continuous_solution(nonlinear, name):
     restitution, _, work_in, work_out = nonlinear[name]
     order = NONLINEAR[name][2]
     balance = work_out / work_in - restitution**2
@@ -235,7 +237,7 @@ def test_energy_balance_of_nonlinear_contact_converges(nonlinear, name):
 @pytest.mark.parametrize(
     "integrator, latency, periods", [("zoh", 0, 0.5), ("explicit_euler", 0, 1.0), ("zoh", 1, 1.5)]
 )
-def test_integrator_delay_matches_closed_form(integrator, latency, periods):
+def test_delay_caused_by_integrator_matches_closed_form(integrator, latency, periods):
     rig = {"integrator": integrator, "command_latency": latency}
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, IDEAL, 0.0, **rig))
     period, phase = grid(PERIODS, PHASES)
@@ -251,7 +253,7 @@ def test_integrator_delay_matches_closed_form(integrator, latency, periods):
 # Item 10.
 
 
-def test_stiffness_fit_noise_early_in_contact_matches_closed_form():
+def test_noise_of_early_stiffness_estimate_matches_closed_form():
     """Least squares of F on x with an intercept: sigma_k = sigma_F sqrt(12 T) / (v t^1.5).
 
     On increments, only the noise of the first and last force counts: sqrt(t / 6 T) times that.

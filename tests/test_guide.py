@@ -83,7 +83,7 @@ def test_guide_index_links_every_page_and_notebook():
     assert {*PAGES, *(ROOT / "notebooks").glob("*.ipynb")} - {GUIDE / "index.md"} <= linked
 
 
-def test_guide_has_the_sections_that_code_cites(model):
+def test_guide_has_every_section_that_the_code_cites(model):
     assert re.findall(r"^## (.*)$", model, re.M) == SECTIONS
     headings = {
         "model": len(SECTIONS),
@@ -99,7 +99,7 @@ def test_guide_has_the_sections_that_code_cites(model):
         assert all(1 <= int(item) <= last for item in re.findall(r"\d+", listed)), path
 
 
-def test_guide_describes_every_law_and_status(model):
+def test_guide_describes_every_compensator_and_contact_status(model):
     in_tables = set(re.findall(r"^\| `(\w+)` \|", section(model, 3) + section(model, 5), re.M))
     assert in_tables == {*COMPENSATORS, *CONTACT_LAWS}
     statuses = section(text_of("impulse_ledger.md"), 6)

@@ -219,7 +219,7 @@ def test_piecewise_linear_contact_agrees_with_integration(slopes, depths, ratio)
 
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(st.floats(1.0, 3.0), st.floats(-3, 0.8), st.floats(-3, 0))
-def test_hunt_crossley_contact_agrees_with_integration_at_random(exponent, onset, velocity):
+def test_random_hunt_crossley_contact_agrees_with_integration(exponent, onset, velocity):
     onset, velocity = 10**onset, 10**velocity
     expected = integrate_hunt_crossley(exponent, onset, 1e7, velocity)
     result = evaluate(ideal_hunt_crossley, MASS, 1e7, exponent, onset / (1.5 * velocity), velocity)
@@ -232,7 +232,7 @@ two_steps = st.lists(st.floats(0.05, 0.6), min_size=2, max_size=2)
 
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(three_slopes, two_steps, st.floats(-3, 0.3))
-def test_piecewise_linear_contact_agrees_with_integration_at_random(slopes, steps, ratio):
+def test_random_piecewise_linear_contact_agrees_with_integration(slopes, steps, ratio):
     slopes = STIFFNESS * 10 ** np.array(slopes)
     depths = VELOCITY * PERIOD * np.cumsum(steps)
     damping = damping_of(10**ratio)
@@ -243,7 +243,7 @@ def test_piecewise_linear_contact_agrees_with_integration_at_random(slopes, step
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(two_steps, st.floats(-9, 4))
-def test_piecewise_linear_contact_of_equal_slopes_is_kelvin_voigt(steps, ratio):
+def test_piecewise_linear_contact_with_equal_slopes_equals_kelvin_voigt(steps, ratio):
     damping = damping_of(10**ratio)
     depths = VELOCITY * PERIOD * np.cumsum(steps) / max(1.0, 10**ratio)
     whole = evaluate(ideal_kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, False)
@@ -252,7 +252,7 @@ def test_piecewise_linear_contact_of_equal_slopes_is_kelvin_voigt(steps, ratio):
 
 
 @pytest.mark.parametrize("ratio", [0.0, 1e-12, 1e-3, 0.5, 1 - 1e-9, 1.0, 1 + 1e-9, 7.0, 1e5])
-def test_piecewise_linear_contact_of_one_segment_is_kelvin_voigt(ratio):
+def test_piecewise_linear_contact_with_one_segment_equals_kelvin_voigt(ratio):
     damping = damping_of(ratio)
     whole = evaluate(ideal_kelvin_voigt, MASS, STIFFNESS, damping, VELOCITY, False)
     chained = evaluate(ideal_piecewise_linear, MASS, [STIFFNESS], [], damping, VELOCITY)
@@ -260,7 +260,7 @@ def test_piecewise_linear_contact_of_one_segment_is_kelvin_voigt(ratio):
 
 
 @pytest.mark.parametrize("depth", [0.999999999, 1 - 1e-15, 1.0, 1 + 1e-15, 1.000000001])
-def test_piecewise_linear_contact_may_just_reach_a_depth(depth):
+def test_piecewise_linear_contact_is_exact_if_peak_depth_equals_segment_limit(depth):
     depths = VELOCITY * PERIOD * np.array([0.5, depth])
     result = evaluate(ideal_piecewise_linear, MASS, [STIFFNESS] * 3, depths, 0.0, VELOCITY)
     assert_close(result, (1.0, VELOCITY * np.sqrt(MASS * STIFFNESS), np.pi * PERIOD), 1e-12)
@@ -307,7 +307,7 @@ DERIVATIVES = [
 
 
 @pytest.mark.parametrize(("function", "parameters"), DERIVATIVES)
-def test_ideal_contact_derivatives_agree_with_differences(function, parameters):
+def test_ideal_contact_derivatives_match_finite_differences(function, parameters):
     parameters = np.array(parameters)
     _, columns = function(parameters)
     for index, column in enumerate(np.asarray(columns)):
@@ -328,7 +328,7 @@ def test_ideal_contact_derivatives_agree_with_differences(function, parameters):
         (BUFFER, [2.0, 3.0, 9.0, 20.0, 0.1, 0.2, 0.0, 0.5], 6),
     ],
 )
-def test_ideal_contact_without_damping_has_derivative_by_damping(function, parameters, index):
+def test_undamped_ideal_contact_has_derivative_with_respect_to_damping(function, parameters, index):
     parameters = np.array(parameters)
     value, columns = function(parameters)
     np.testing.assert_allclose(value[0], 1.0, rtol=1e-14)
@@ -355,7 +355,7 @@ def test_ideal_contact_is_never_nan(function, damping):
     assert 0 <= value[0] <= 1 + 1e-14
 
 
-def test_ideal_contact_keeps_shape_and_single_precision_of_batches():
+def test_ideal_contact_preserves_batch_shape_and_single_precision():
     batch = jnp.linspace(0.0, 3.0, 6, dtype=jnp.float32).reshape(2, 3)
     one = jnp.ones_like(batch)
     segments, edges = jnp.stack([one, 3 * one, 5 * one]), jnp.stack([0.3 * one, 0.5 * one])

@@ -83,7 +83,7 @@ def test_integrated_contact_agrees_with_closed_forms(case):
 
 
 @pytest.mark.parametrize("case", [name for name in CASES if name != "piecewise_linear"])
-def test_error_falls_with_the_tolerance(case):
+def test_ideal_contact_integration_error_decreases_with_tolerance(case):
     """Expect errors to fall as E^(4/5).
 
     A step of order 5 whose error is E is as long as E^(1/5), so that the sum of the errors of all steps falls
@@ -98,7 +98,7 @@ def test_error_falls_with_the_tolerance(case):
     assert errors[-1] < 1e-9
 
 
-def test_sticking_bodies_never_separate():
+def test_ideal_contact_of_sticking_bodies_never_ends():
     result, _ = integrated("kelvin_voigt", {"damping": 3 * CRITICAL, "tension": True})
     assert np.all(np.isinf(result.duration))
     assert np.all(result.restitution < 1e-6)
@@ -114,7 +114,7 @@ def pulse(start, length, height):
     return push
 
 
-def test_pushed_contact_agrees_with_scipy():
+def test_ideal_contact_with_external_push_agrees_with_scipy():
     """Push at all times of a damped contact: before, at and after the turning point and the separation."""
     starts, length, height = np.linspace(0.0, 0.21, LANES), 0.02, 6.0
     damping = 0.05 * CRITICAL
@@ -154,7 +154,7 @@ def test_pushed_contact_agrees_with_scipy():
         np.testing.assert_allclose(result.velocity[:, lane], speed, rtol=0, atol=1e-6 * VELOCITY)
 
 
-def test_push_after_the_contact_adds_its_impulse():
+def test_external_push_after_the_contact_adds_its_impulse():
     push = pulse(0.25, 0.02, 6.0)
     result, alone = integrated("kelvin_voigt", {}, push=push, push_duration=0.27)
     impulse = 6.0 * 0.02 * 2 / np.pi
@@ -162,7 +162,7 @@ def test_push_after_the_contact_adds_its_impulse():
     np.testing.assert_allclose(result.duration, alone.duration, rtol=1e-9)
 
 
-def test_trajectory_of_linear_contact_is_the_closed_form():
+def test_trajectory_of_linear_contact_matches_closed_form():
     """Use x = v sin(omega t) / omega, then uniform motion; times in any order."""
     times = np.linspace(-0.1, 0.4, 97)[::-1].copy()
     times = times[:, None] * np.ones(LANES)
@@ -180,7 +180,7 @@ def test_trajectory_of_linear_contact_is_the_closed_form():
     "case, tolerance",
     [("kelvin_voigt", 1e-3), pytest.param("piecewise_linear", 1e-3, marks=pytest.mark.slow)],
 )
-def test_integrated_contact_has_the_derivatives_of_closed_forms(case, tolerance):
+def test_integrated_contact_derivatives_match_those_of_closed_forms(case, tolerance):
     """Allow for steps with a kink inside: their derivative is that of a slightly different force."""
     name, values = CASES[case]
     law, parameters = CONTACT_LAWS[name], contact(**values)
@@ -202,7 +202,7 @@ def test_integrated_contact_has_the_derivatives_of_closed_forms(case, tolerance)
     np.testing.assert_array_less(np.abs(result - expected) / np.stack(size)[..., None], tolerance)
 
 
-def test_integrated_contact_in_single_precision_and_under_vmap():
+def test_integrated_contact_works_in_single_precision_and_under_vmap():
     law, parameters = CONTACT_LAWS["kelvin_voigt"], contact(np.float32, **KELVIN_VOIGT)
     mass, velocity = (np.full(LANES, value, np.float32) for value in (MASS, VELOCITY))
 

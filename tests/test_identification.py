@@ -46,7 +46,7 @@ SIDES = pytest.mark.parametrize("identify", [on_jax, rig])
 
 @SIDES
 @pytest.mark.parametrize("forgetting", [0.9, 0.98, 1.0])
-def test_identification_equals_weighted_batch_least_squares(identify, forgetting):
+def test_recursive_identification_equals_weighted_batch_least_squares(identify, forgetting):
     rng = np.random.default_rng(0)
     # Large regressors come first: the bound on the covariance is never active.
     readings = rng.normal(size=(30, 3)) + np.array([[3.0, 6.0, 0.0], [-5.0, 5.0, 0.0]] + 28 * [[0.0] * 3])
@@ -57,7 +57,7 @@ def test_identification_equals_weighted_batch_least_squares(identify, forgetting
 
 
 @SIDES
-def test_identification_is_linear_in_small_weights(identify):
+def test_recursive_identification_is_linear_in_small_weights(identify):
     rng = np.random.default_rng(1)
     readings = rng.normal(size=(3, 3))
     weights = np.array([1.0, 0.5, 0.0])

@@ -74,7 +74,7 @@ DEFECTS = {"hold": "command hold", "sign": "sign of the force", "scale": "scale"
         *(pytest.param(*defect, marks=pytest.mark.slow) for defect in DEFECTS.items()),
     ],
 )
-def test_identify_names_defect_and_verdict_is_bad(wrong, worst):
+def test_identify_reports_defect_of_rig_with_bad_verdict(wrong, worst):
     campaign = campaigns.campaign("resonance" if wrong == "order" else "clean", 1, speeds=FEW)
     options = IdentificationOptions(law="kelvin_voigt", order=2 if wrong == "order" else None)
     runs = campaign.runs
@@ -97,7 +97,7 @@ def test_identify_reports_stiffening_contact_as_drift():
     assert next(line for line in result.lines if line.name.startswith("drift")).there
 
 
-def test_identify_separates_dead_zone_from_bias_and_names_confounded_pair():
+def test_identify_separates_dead_zone_from_bias_and_reports_confounded_pair():
     law = campaigns.KINDS["dead_zone"].contact["law"]
     options = IdentificationOptions(law=law, fixed={"rig.contact_plane": 0.0})
     result = identify_kind("dead_zone", options=options, speeds=FEW)
@@ -108,7 +108,7 @@ def test_identify_separates_dead_zone_from_bias_and_names_confounded_pair():
 
 
 @pytest.mark.parametrize("surface", [-2e-5, 2e-5])
-def test_identify_does_not_trust_an_assumed_surface_behind_a_dead_zone(surface):
+def test_identify_estimates_surface_position_if_force_sensor_has_dead_zone(surface):
     """A surface 14 um off gave a damping of 298 +- 0.4 N s/m for a true 348, with a good verdict."""
     campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
     moved = [
@@ -130,7 +130,7 @@ def test_identify_does_not_trust_an_assumed_surface_behind_a_dead_zone(surface):
     assert not result.good and any("--fix rig.contact_plane" in note for note in result.notes)
 
 
-def test_identify_finds_dead_zone_behind_a_surface_that_is_nearer_than_assumed():
+def test_identify_detects_dead_zone_if_surface_is_nearer_than_assumed():
     """The readings then lack no force: a fit without a dead zone erred by 0.018 in e - e*, verdict good."""
     campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
     moved = [
@@ -148,7 +148,7 @@ def test_identify_finds_dead_zone_behind_a_surface_that_is_nearer_than_assumed()
 
 
 @pytest.mark.parametrize("law", ["hunt_crossley", "piecewise_linear"])
-def test_identify_widens_the_dead_zone_by_the_surface_for_other_laws(law):
+def test_identify_widens_dead_zone_interval_by_surface_uncertainty(law):
     """Expect an interval of several newtons: 4 N of dead zone are as likely as a surface 33 um off."""
     campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
     dead = identify(campaign, options=IdentificationOptions(law=law))["rig.force_sensor.dead_zone"]
@@ -156,7 +156,7 @@ def test_identify_widens_the_dead_zone_by_the_surface_for_other_laws(law):
     assert str(dead.low) == "0.0"
 
 
-def test_surface_further_away_goes_with_a_smaller_dead_zone():
+def test_identified_dead_zone_decreases_if_assumed_surface_is_further_away():
     """The readings, stiffness (x - surface) - dead zone, determine only the sum of what both remove."""
     campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
     posterior = identify(campaign, options=IdentificationOptions(law="kelvin_voigt")).contact.posterior
@@ -181,7 +181,7 @@ def test_identify_uses_prior_for_missing_motion_or_contact():
     ((0.006, 0.012), 0, "rig.simulator (add a run of kind free) and contact.stiffness"),
     ((), 5.0, "contact.stiffness (add a run of kind contact or press)"),
 ))  # fmt: skip
-def test_identify_names_missing_runs_without_prior(speeds, seconds, says):
+def test_identify_without_prior_reports_missing_runs(speeds, seconds, says):
     result = identify(campaigns.campaign("clean", 2, speeds, seconds))
     assert result.mechanism is None and not result.good
     assert f"logs and prior do not determine {says}" in result.verdict
@@ -198,7 +198,7 @@ def test_identify_uses_prior_for_contact_below_noise():
     assert not any(estimate.key.startswith("contact") for estimate in result.estimates)
 
 
-def test_identify_keeps_fixed_values(clean):
+def test_identify_does_not_change_fixed_values(clean):
     fixed = {"rig.contact_plane": 0.0, "rig.position_sensor.delay": 0.001}
     result = identify_kind(
         "clean", speeds=FEW, seconds=30.0, options=IdentificationOptions(law="kelvin_voigt", fixed=fixed)
@@ -217,7 +217,7 @@ def test_identify_keeps_fixed_values(clean):
         )
 
 
-def test_identify_attributes_computing_delay_to_motion(clean):
+def test_identify_adds_computing_delay_to_motion_simulator_delay(clean):
     campaign = campaigns.campaign("clean", 0, speeds=FEW, seconds=30.0)
     late = replace(campaign, timing=replace(campaign.timing, computing_delay=2), integrator="explicit_euler")
     result = identify(late, options=IdentificationOptions(law="kelvin_voigt"))
@@ -231,7 +231,7 @@ def test_identify_attributes_computing_delay_to_motion(clean):
     )
 
 
-def test_identify_keeps_prior_only_for_unobservable_values(clean):
+def test_identify_takes_prior_values_only_for_unobservable_parameters(clean):
     sensors = {"rig.force_sensor.time_constant": 0.002, "rig.force_sensor.dead_zone": 3.0}
     prior = jaxhil.load("rig-300kg", {**sensors, "rig.force_sensor.range": 800.0})
     stated = {"rig.position_sensor.noise_std": Uncertainty(distribution="normal", std=1e-7)}
@@ -277,7 +277,7 @@ def test_identify_keeps_position_delay_if_force_delay_may_be_zero(monkeypatch):
 
 
 @pytest.mark.slow
-def test_identify_splits_delay_if_position_sensor_lags_more(monkeypatch):
+def test_identify_separates_delays_if_position_sensor_lags_more_than_force_sensor(monkeypatch):
     rig = campaign_kinds.rig(force_sensor__delay=0.0012, position_sensor__delay=0.003)
     monkeypatch.setitem(campaigns.KINDS, "slow", campaign_kinds.Kind(rig, campaign_kinds.voigt()))
     campaign = campaigns.campaign("slow", 0, speeds=FEW, seconds=30.0)
@@ -315,7 +315,7 @@ def test_identify_rejects_unknown_law_and_order(options, message):
         identify(campaigns.campaign("clean", 0, (), 5.0), options=IdentificationOptions(**options))
 
 
-def test_identify_holds_out_touches_of_every_speed():
+def test_validation_contacts_of_identify_cover_every_speed():
     runs = campaigns.campaign("clean", 0, seconds=0, rest=0).runs
     is_held_out = select_held_out_contacts(runs, 0.2)
     assert is_held_out.sum() == 3 and {

@@ -44,7 +44,7 @@ def written(result, folder):
 
 
 @pytest.mark.parametrize(("name", "seed"), (("plain", 0), ("hidden", 1)))
-def test_identify_never_drops_damping_while_delay_is_free(monkeypatch, tmp_path, name, seed):
+def test_identify_keeps_damping_in_the_model_while_delay_is_estimated(monkeypatch, tmp_path, name, seed):
     """With these seeds, held-out touches do not reveal the damping.
 
     The linear law was chosen, with a delay 2.1 ms too short, a standard deviation of 0.02 ms, and a good
@@ -80,7 +80,7 @@ def test_identify_widens_damping_and_delay_for_possible_lag(monkeypatch):
 
 
 @pytest.mark.parametrize(("name", "possible"), (("undamped", True), ("plain", False)))
-def test_identify_keeps_undamped_contact_in_the_draws(monkeypatch, name, possible):
+def test_identify_uncertainty_draws_include_undamped_contact(monkeypatch, name, possible):
     campaign = ambiguous.campaign(monkeypatch, name, 0, seconds=10.0)
     result = identify(
         campaign, ambiguous.prior(name), IdentificationOptions(law="kelvin_voigt", hold_out=0.0)
@@ -91,7 +91,7 @@ def test_identify_keeps_undamped_contact_in_the_draws(monkeypatch, name, possibl
     assert (result["contact.damping.0"].low == 0.0) is possible
 
 
-def test_delay_interval_includes_delay_of_undamped_contact():
+def test_identified_delay_interval_includes_delay_of_undamped_contact():
     """Draws of damping lie on one side of 0, those of the delay on one side of the true value."""
     rng = np.random.default_rng(0)
     damping = np.abs(rng.normal(0.0, 100.0, 4000))
@@ -167,7 +167,7 @@ def test_identify_accepts_log_of_one_contact(monkeypatch, noise):
     assert result.good == (noise == 0.0)
 
 
-def test_uncertainty_effect_matches_spring_to_first_order():
+def test_effect_of_stiffness_uncertainty_matches_first_order_theory():
     mechanism = ambiguous.truth("undamped")
     contact, frequency = _simulate_ideal_contact(
         mechanism, mechanism_models.make_regression_law(mechanism.contact), 0
@@ -182,7 +182,7 @@ def test_uncertainty_effect_matches_spring_to_first_order():
     )
 
 
-def test_uncertainty_effect_counts_only_identified_uncertainty():
+def test_uncertainty_effect_includes_only_uncertainty_from_identification():
     """Uncertainty of other origin describes how mechanisms vary."""
     assert compute_uncertainty_effect(load("rig-300kg").mechanism).parts == {}
     document = ambiguous.to_plain_data(ambiguous.truth("plain")) | {

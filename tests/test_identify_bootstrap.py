@@ -45,7 +45,7 @@ def fit():
 
 
 @pytest.mark.parametrize("times", (1.2, 3.0))
-def test_bootstrap_widens_draws_if_fits_scatter_more(fit, monkeypatch, times):
+def test_bootstrap_widens_parameter_draws_if_fits_scatter_more_than_predicted(fit, monkeypatch, times):
     original = fit.posterior.draws
     monkeypatch.setattr(
         "tuning.identification.bootstrap.fit_bootstrap_samples",
@@ -61,7 +61,7 @@ def test_bootstrap_widens_draws_if_fits_scatter_more(fit, monkeypatch, times):
 
 
 @pytest.mark.slow
-def test_bootstrap_widens_intervals_if_contacts_differ():
+def test_bootstrap_widens_intervals_if_contacts_differ_from_each_other():
     campaign = scattering(0, 0.02, (0.012, 0.006) * 4)
     stated, wide = of(campaign, 0), of(campaign, 20)
     assert any("intervals are the bootstrap's" in note for note in wide.notes)
@@ -95,7 +95,7 @@ def test_bootstrap_resumes_with_the_same_draws(fit, tmp_path, monkeypatch):
     np.testing.assert_array_equal(again.posterior.draws, whole.posterior.draws)
 
 
-def test_bootstrap_checkpoints_fit_only_the_same_problem(fit, tmp_path, monkeypatch):
+def test_bootstrap_checkpoints_of_another_problem_are_rejected(fit, tmp_path, monkeypatch):
     monkeypatch.setattr(bootstrap, "fit_resampled_contacts", lambda drawn, *_: np.zeros((len(drawn), 3)))
 
     def anew(other_fit, seed=0):
@@ -123,7 +123,7 @@ def test_bootstrap_checkpoints_fit_only_the_same_problem(fit, tmp_path, monkeypa
     assert anew(changed("law", shape={"exponent": 1.5})) == 4
 
 
-def test_bootstrap_rejects_too_few_contacts_and_repeats():
+def test_bootstrap_rejects_too_few_contacts_and_too_few_repeats():
     few = campaigns.campaign("clean", 0, speeds=(0.006, 0.012, 0.006), seconds=5.0)
     assert "no bootstrap: 3 contacts, 6 are needed" in of(few, 20).notes
     with pytest.raises(jaxhil.InputError, match="bootstrap: found 5, expected 0, or 20 or more"):

@@ -21,7 +21,7 @@ def worst(result):
     return result.worst.name if result.worst else None
 
 
-def test_check_accepts_logs_of_the_same_mechanism(clean):
+def test_mechanism_check_accepts_logs_of_the_same_mechanism(clean):
     result = check_against_mechanism(clean, campaign_rigs.mechanism("clean"))
     assert result.good and result.effect == 0.0 and result.estimates == ()
     names = [line.name for line in result.lines]
@@ -40,14 +40,14 @@ def test_check_accepts_logs_of_the_same_mechanism(clean):
         ({"rig__command_hold": "zoh"}, None),
     ],
 )
-def test_check_rejects_logs_of_another_mechanism(clean, changed, name):
+def test_mechanism_check_rejects_logs_of_another_mechanism(clean, changed, name):
     """The command hold belongs to the logs, not to the mechanism."""
     result = check_against_mechanism(clean, campaign_rigs.mechanism("clean", **changed))
     assert result.good == (name is None)
     assert name in [None, *(line.name for line in result.lines if line.there)]
 
 
-def test_check_names_the_file_and_time_of_a_touch_that_differs(clean):
+def test_mechanism_check_reports_file_and_time_of_deviating_contact(clean):
     runs = [replace(run, source=f"run_{index}.csv") for index, run in enumerate(clean.runs)]
     index = next(index for index, run in reversed(list(enumerate(runs))) if run.kind == "contact")
     runs[index] = replace(runs[index], force_measured=1.1 * runs[index].force_measured, begin=7.0)
@@ -56,7 +56,7 @@ def test_check_names_the_file_and_time_of_a_touch_that_differs(clean):
     assert line.there and line.where.startswith(f"run_{index}.csv from 7.")
 
 
-def test_check_detects_wrong_command_hold(clean):
+def test_mechanism_check_detects_wrong_command_hold(clean):
     wrong = replace(clean, timing=replace(clean.timing, command_hold="zoh"))
     assert "command hold" in [
         line.name
@@ -67,7 +67,7 @@ def test_check_detects_wrong_command_hold(clean):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in campaigns.KINDS if name != "drifting"])
-def test_check_accepts_logs_of_every_kind_of_rig(name):
+def test_mechanism_check_accepts_logs_of_every_kind_of_rig(name):
     if name in ("coloured", "jitter"):
         pytest.skip("the same rig as clean")
     good = [
@@ -78,12 +78,12 @@ def test_check_accepts_logs_of_every_kind_of_rig(name):
 
 
 @pytest.mark.slow
-def test_check_detects_drift():
+def test_mechanism_check_detects_drift():
     result = check_against_mechanism(campaigns.campaign("drifting", 1), campaign_rigs.mechanism("drifting"))
     assert not result.good and any(line.name.startswith("drift") and line.there for line in result.lines)
 
 
-def test_check_rejects_logs_without_motion_and_unsupported_contact_law(clean):
+def test_mechanism_check_rejects_logs_without_motion_and_unsupported_contact_law(clean):
     at_rest_only = replace(clean, runs=tuple(run for run in clean.runs if run.kind == "rest"))
     with pytest.raises(InputError, match="found neither free motion nor contact"):
         check_against_mechanism(at_rest_only, campaign_rigs.mechanism("clean"))

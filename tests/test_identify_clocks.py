@@ -78,7 +78,7 @@ def test_identify_rejects_unusable_logs_of_two_clocks():
         check_against_mechanism(together, jaxhil.load("rig-300kg"))
 
 
-def test_slope_and_its_standard_error_are_consistent():
+def test_standard_error_of_fitted_slope_matches_its_scatter():
     rng, position = np.random.default_rng(0), np.linspace(0.0, 1.0, 12)
     off = []
     for _ in range(2000):

@@ -75,7 +75,7 @@ def test_identify_command_writes_mechanism_file_from_logs(jaxhil, day, tmp_path)
     assert refused.code == 2 and "mechanism.toml: found a file that jaxhil did not write" in refused.err
 
 
-def test_identify_command_verdict_is_bad_for_wrong_mapping(jaxhil, day, tmp_path):
+def test_identify_command_verdict_is_bad_for_wrong_mapping_file(jaxhil, day, tmp_path):
     path = tmp_path / "map.toml"
     path.write_text(drafted(jaxhil, day).read_text().replace('"linear"', '"zoh"'))
     command = (

@@ -42,7 +42,7 @@ def problem(name, law, noise=0.5, speeds=campaigns.SPEEDS, seed=0, plane=None, t
     ("stiffnesses", kelvin_voigt(), 2e-4, [1.2e5, 2.4e5, 7e4, 650.0, 0.0]),
     ("hertz", HERTZ, 0.0, [6e6, 1.2e7, 0.0]),
 ))  # fmt: skip
-def test_contact_fit_is_exact_without_noise(name, law, plane, expected):
+def test_contact_parameter_fit_is_exact_without_noise(name, law, plane, expected):
     exact = problem(name, law, noise=0.0, speeds=(0.006, 0.012, 0.006))
     inner = exact.at(0.0037, plane)
     np.testing.assert_allclose(inner.coefficients, expected, rtol=1e-7, atol=1e-6)
@@ -61,7 +61,7 @@ def test_contact_fit_is_exact_with_force_sensor_lag():
     assert np.abs(lagging.force(0.0025, 0.0, inner.coefficients) - lagging.readings.force).max() < 0.06
 
 
-def test_lag_weights_are_exact_for_parabola():
+def test_lag_filter_weights_are_exact_for_quadratic_force():
     rate = 0.7
     pole, weights = compute_lag_weights(rate)
     t = np.linspace(0.0, 1.0, 200_001)
@@ -72,7 +72,7 @@ def test_lag_weights_are_exact_for_parabola():
     assert pole == pytest.approx(np.exp(-rate)) and sum(weights) == pytest.approx(1.0 - pole)
 
 
-def test_onset_weights_are_exact_for_contact_onset_within_a_period():
+def test_lag_filter_weights_are_exact_for_contact_onset_within_a_period():
     rate, left = 0.7, np.array([0.03, 0.4, 1.0])
     after, end = compute_onset_weights(rate, left)
     for share, begin_weight, end_weight in zip(left, after, end, strict=True):
@@ -82,7 +82,7 @@ def test_onset_weights_are_exact_for_contact_onset_within_a_period():
         assert begin_weight * 3.0 + end_weight * 5.0 == pytest.approx(exact, rel=1e-9)
 
 
-def test_contact_fit_with_white_noise_equals_filtered_path():
+def test_contact_fit_for_white_noise_equals_general_filtered_computation():
     plain = problem("stiffnesses", kelvin_voigt(), speeds=(0.006, 0.012, 0.003))
     filtered = ContactProblem(plain.motion, plain.readings, plain.law, None)
     filtered.is_unfiltered, filtered.needed_rows = False, np.arange(plain.readings.counts.size)
@@ -99,7 +99,7 @@ def test_matrix_exponential_matches_scipy():
     np.testing.assert_allclose(compute_matrix_exponential(matrix), expm(matrix), rtol=1e-11)
 
 
-def test_contact_posterior_covers_truth_and_apparent_damping_is_most_precise():
+def test_contact_posterior_covers_true_values_and_is_narrowest_for_apparent_damping():
     posterior = compute_posterior(problem("clean", kelvin_voigt(), seed=4))
     values = dict(zip(posterior.names, posterior.draws.T, strict=True))
     for name, truth in (("delay", 0.0037), ("plane", 0.0), ("stiffness.0", 1.2e5), ("damping", 650.0)):
@@ -112,7 +112,7 @@ def test_contact_posterior_covers_truth_and_apparent_damping_is_most_precise():
     assert np.corrcoef(values["delay"], values["damping"])[0, 1] > 0.5
 
 
-def test_contact_fit_of_press_in_chunks_is_exact():
+def test_contact_fit_of_press_run_in_chunks_is_exact():
     kind = campaigns.KINDS["clean"]
     silent = {
         sensor: {**kind.rig[sensor], "noise_std": 0.0} for sensor in ("force_sensor", "position_sensor")
@@ -128,7 +128,7 @@ def test_contact_fit_of_press_in_chunks_is_exact():
     np.testing.assert_allclose(inner.coefficients, [1.2e5, 650.0, 0.0], rtol=1e-5, atol=1e-3)
 
 
-def test_contact_fit_skips_rows_until_motion_forgets_a_gap():
+def test_contact_fit_skips_rows_after_gap_until_transient_has_decayed():
     """Lose 30 rows at the turning point of the touches: the commands there affect the later motion."""
     kind = campaigns.KINDS["clean"]
     silent = {"force_sensor": {**kind.rig["force_sensor"], "noise_std": 0.0}}
@@ -184,7 +184,7 @@ def test_contact_law_selection_finds_the_true_law(name, law):
         assert candidates[0].law.shape == {"exponent": 1.5}
 
 
-def test_contact_profile_cells_are_cut_at_contact_onsets():
+def test_contact_profile_grid_is_divided_at_contact_onsets():
     at = np.array([0.1, 0.15, 0.7])
     np.testing.assert_allclose(
         contact_profile.divide_into_cells(0.0, 1.0, at, 6), [0.0, 0.1, 0.15, 0.425, 0.7, 0.85, 1.0]
@@ -199,7 +199,7 @@ def test_contact_profile_cells_are_cut_at_contact_onsets():
     assert np.sum(inside[0] != inside[1]) == 1
 
 
-def test_quick_search_stays_within_longest_delay():
+def test_quick_delay_search_stays_within_longest_delay():
     """Beyond the longest delay, the grid about the delay had a single point."""
     clean = problem("clean", kelvin_voigt(), speeds=(0.006, 0.012))
     late = replace(clean.readings, force=np.roll(clean.readings.force, 40, axis=0))

@@ -47,7 +47,7 @@ def problem(law, time_constant=0.0, whitening=(1.0,), threshold=0.0, seconds=12.
     "lag, whitening", [(0.0, (1.0,)), (0.0015, (1.0,)), (0.0, COLOURED), (0.001, COLOURED)]
 )
 @pytest.mark.parametrize("threshold", [0.0, 0.5])
-def test_pseudo_rows_have_the_misfit_of_all_rows(law, lag, whitening, threshold):
+def test_pseudo_rows_of_long_press_have_the_misfit_of_all_rows(law, lag, whitening, threshold):
     full = problem(law, lag, whitening, threshold)
     few = summarise_deep_lanes(full, (NEAR[0] - lag, 0.0))
     assert few is not full
@@ -70,7 +70,7 @@ def test_pseudo_rows_have_the_misfit_of_all_rows(law, lag, whitening, threshold)
 @pytest.mark.parametrize(
     "law, plane", [(kelvin_voigt(), 9e-4), (KINKED.make(8e-4), 0.0)], ids=["shallow", "kinks in the force"]
 )
-def test_all_rows_are_used_where_pseudo_rows_are_not_accurate(law, plane):
+def test_long_press_uses_all_rows_if_pseudo_rows_are_inaccurate(law, plane):
     full = problem(law)
     few = summarise_deep_lanes(full, NEAR)
     exact, fit = full.at(0.0037, plane), few.at(0.0037, plane)
@@ -78,7 +78,7 @@ def test_all_rows_are_used_where_pseudo_rows_are_not_accurate(law, plane):
     assert fit.misfit == exact.misfit
 
 
-def test_touches_are_never_summarized():
+def test_short_contacts_are_never_replaced_by_pseudo_rows():
     full = problem(kelvin_voigt())
     deep = find_deep_lanes(full.motion, 0.0)
     assert deep.sum() >= 8 and not deep[-3:].any()
@@ -90,7 +90,7 @@ def test_touches_are_never_summarized():
 
 
 @pytest.mark.parametrize("whitening", [(1.0,), COLOURED])
-def test_filters_of_a_lane_do_not_depend_on_other_lanes(whitening):
+def test_noise_filter_of_a_run_does_not_depend_on_other_runs(whitening):
     full = problem(kelvin_voigt(), 0.0015, whitening, seconds=5.0)
     values = np.array([1.2e5, 650.0, 0.3])
     together = full.force(0.002, 0.0, values)

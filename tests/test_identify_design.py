@@ -23,7 +23,7 @@ from tuning.identification.records import CampaignTiming
 SLOPES = np.array([[0.0076, -0.089, -3.9, 30.4, -2.8e-7, -5.7e-5]])
 
 
-def test_best_powers_of_slope_lie_at_both_ends():
+def test_optimal_design_for_a_slope_uses_both_ends_of_the_range():
     """Elfving 1952: for y = a + b x on -1 <= x <= 1, b is best estimated with half the readings at either
     end.
     """
@@ -36,7 +36,7 @@ def test_best_powers_of_slope_lie_at_both_ends():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_best_powers_within_limits_match_general_solver(seed):
+def test_optimal_excitation_powers_match_general_solver(seed):
     random = np.random.default_rng(seed)
     rows = random.standard_normal((2, 7))
     use = random.uniform(0.1, 1.0, (2, 7))
@@ -54,7 +54,7 @@ def test_best_powers_within_limits_match_general_solver(seed):
     assert error(power) == pytest.approx(result.fun, rel=5e-3) and error(power) < error(start)
 
 
-def test_multisine_has_low_crest_factor_and_given_amplitudes():
+def test_multisine_has_low_crest_factor_and_specified_amplitudes():
     lines, rows = np.arange(1, 200, 2), 2000
     amplitude = np.random.default_rng(0).uniform(0.1, 1.0, len(lines))
     made = waveform.synthesise_multisine(
@@ -75,7 +75,7 @@ def planned():
     return design_excitation(mechanism, 0.002, lambda keys: SLOPES)
 
 
-def test_design_keeps_and_uses_the_limits(planned):
+def test_excitation_design_reaches_but_does_not_exceed_limits(planned):
     free, press = planned.free.position, planned.press.position
     assert np.abs(free).max() == pytest.approx(0.002, rel=1e-6) or np.abs(free).max() < 0.002
     speed, acceleration = np.diff(free) / 1e-3, np.diff(free, 2) / 1e-6
@@ -91,7 +91,7 @@ def test_design_keeps_and_uses_the_limits(planned):
     assert press[0] == press[-1] == pytest.approx(-0.001, abs=1e-6)
 
 
-def test_design_is_more_informative_than_flat_spectrum(planned):
+def test_excitation_design_is_more_informative_than_flat_spectrum(planned):
     assert planned.flat > 1.5
 
 
@@ -107,7 +107,7 @@ def spread(planned, repeats):
     return np.std(rows, axis=0, ddof=1) / planned.std[:3], np.mean(rows, axis=0)
 
 
-def test_design_predicts_standard_deviations_of_fit(planned):
+def test_excitation_design_predicts_standard_deviations_of_fit(planned):
     run = campaign_rigs.commanded("clean", "free", planned.free.position - 0.05, 0)
     fit = free_motion.fit_free_motion([run], CampaignTiming(1e-3, "linear", 0, "tick"), 2)
     assert fit is not None and fit.spectra[0].periods == MULTISINE_PERIODS - 1
@@ -117,7 +117,7 @@ def test_design_predicts_standard_deviations_of_fit(planned):
 
 
 @pytest.mark.slow
-def test_design_predicts_scatter_over_many_campaigns():
+def test_excitation_design_predicts_scatter_over_many_campaigns():
     mechanism = campaign_rigs.mechanism("clean")
     gains = choose_gains(mechanism, "response_error", None)[1]
     planned = design_excitation(
@@ -149,7 +149,7 @@ def test_design_predicts_scatter_over_many_campaigns():
 PLASTIC = "elastoplastic", 2.0, [0.0]
 
 
-def test_design_rejects_unsupported_mechanism():
+def test_excitation_design_rejects_unsupported_mechanism():
     for changed, reason in (
         (dict(zip(("contact__law", "contact__unloading_ratio", "contact__damping"), PLASTIC, strict=True)),
          r"contact\.law: found 'elastoplastic'"),

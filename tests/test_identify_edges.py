@@ -29,13 +29,13 @@ def checked(monkeypatch, lag):
 
 
 @pytest.mark.parametrize(("lag", "there"), [(0.0016, False), (0.0, True)])
-def test_check_detects_missing_force_lag_at_contact_edges(monkeypatch, lag, there):
+def test_force_lag_missing_from_model_is_detected_at_onset_and_end_of_contact(monkeypatch, lag, there):
     line = checked(monkeypatch, lag)
     assert line.there == there
     assert not there or line.counted_error > 0.01
 
 
-def test_at_rest_estimates_dead_zone_from_noise():
+def test_dead_zone_is_estimated_from_noise_at_rest():
     signal = np.random.default_rng(1).standard_normal(20_000)
     noise = estimate_noise(np.sign(signal) * np.maximum(np.abs(signal) - 0.7, 0.0))
     assert noise.silent and noise.dead_zone is not None
@@ -46,7 +46,7 @@ def test_at_rest_estimates_dead_zone_from_noise():
 
 
 @pytest.mark.parametrize("is_cut", [True, False])
-def test_identify_reports_cutting_dead_zone_as_defect(monkeypatch, tmp_path, is_cut):
+def test_identify_reports_dead_zone_without_subtraction_as_defect(monkeypatch, tmp_path, is_cut):
     campaign = ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0)
     runs = []
     for run in campaign.runs:
@@ -64,7 +64,7 @@ def test_identify_reports_cutting_dead_zone_as_defect(monkeypatch, tmp_path, is_
     assert not (is_cut and result.good)
 
 
-def test_motion_is_evaluated_at_the_time_of_the_force_readings():
+def test_contact_motion_is_evaluated_at_the_times_of_force_readings():
     campaign = campaigns.campaign("clean", 0, speeds=(0.006, 0.012), seconds=0, rest=0)
     model = MotionModel(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
     late = [replace(run, force_late=np.full(len(run.tick), 3e-4)) for run in campaign.runs]

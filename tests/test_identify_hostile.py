@@ -98,7 +98,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_identify_command_rejects_spoilt_logs_in_one_line(jaxhil, day, tmp_path, case):
+def test_identify_command_rejects_corrupted_logs_in_one_line(jaxhil, day, tmp_path, case):
     spoil, words = REFUSED[case]
     ran = identified(jaxhil, tmp_path, spoil(day))
     assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1 and "internal" not in ran.err
@@ -133,7 +133,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_identify_command_verdict_is_bad_for_spoilt_logs(jaxhil, day, tmp_path, case):
+def test_identify_command_verdict_is_bad_for_corrupted_logs(jaxhil, day, tmp_path, case):
     spoil, words = BAD[case]
     ran = identified(jaxhil, tmp_path, spoil(day))
     assert ran.code == 1 and ran.document["verdict"] == "bad"
@@ -142,7 +142,7 @@ def test_identify_command_verdict_is_bad_for_spoilt_logs(jaxhil, day, tmp_path, 
     assert words in ran.document["reason"] or words in failed
 
 
-def test_identify_command_verdict_is_bad_for_rest_alone_despite_prior(jaxhil, day, tmp_path):
+def test_identify_command_verdict_is_bad_for_log_at_rest_with_prior(jaxhil, day, tmp_path):
     ran = identified(jaxhil, tmp_path, only("rest")(day), MAPPING, *PRIOR)
     assert ran.code == 1 and "the file cannot be checked" in ran.document["reason"]
 
@@ -189,7 +189,7 @@ def test_identify_command_is_accurate_despite_gaps_and_noise(jaxhil, day, tmp_pa
         assert max(map(abs, off.values())) < 4.0
 
 
-def test_identify_command_file_with_good_verdict_predicts_the_rig(jaxhil, day, tmp_path):
+def test_identified_file_with_good_verdict_predicts_the_rig(jaxhil, day, tmp_path):
     """Commands interpolated over 4 rows lose fast content: another model of the same contacts may fit."""
     ran = identified(jaxhil, tmp_path, changed(day, COMMAND, joined(4)))
     noise_free = {"force_sensor__noise_std": 0.0, "position_sensor__noise_std": 0.0}

@@ -18,7 +18,7 @@ def pass_on(force, position, velocity, measured):
     return force
 
 
-def test_independent_rig_has_the_ideal_restitution_of_damped_springs():
+def test_independent_simulator_has_ideal_restitution_of_damped_springs():
     rig = Rig(mass=300.0, stiffness=1.1e5)
     assert ideal_restitution(rig, 0.005) == pytest.approx(1, abs=1e-6)
     critical = 2 * np.sqrt(rig.stiffness * rig.mass)
@@ -26,7 +26,7 @@ def test_independent_rig_has_the_ideal_restitution_of_damped_springs():
     assert ideal_restitution(damped, 0.005) == pytest.approx(0.858758, abs=1e-5)
 
 
-def test_independent_rig_without_delays_keeps_energy_for_half_a_period():
+def test_independent_simulator_without_delays_conserves_energy():
     # A moving average over an instant is a drive without lag.
     rig = Rig(period=0.0005, mass=300.0, stiffness=1.1e5, window=1e-9)
     real, *_ = touch(rig, np.array([-0.001]), np.array([0.005]), pass_on, 1200)[:, :, 0]
@@ -36,14 +36,14 @@ def test_independent_rig_without_delays_keeps_energy_for_half_a_period():
 
 
 @pytest.mark.parametrize(("phase", "expected"), [(0.1, 1.169561985550), (0.4, 1.827809059189)])
-def test_independent_rig_gains_energy_from_force_delay(phase, expected):
+def test_independent_simulator_gains_energy_from_force_delay(phase, expected):
     rig = Rig(period=0.00025, mass=300.0, stiffness=1.1e5, window=1e-9)
     delay = phase * np.sqrt(rig.mass / rig.stiffness)
     late = Rig(period=0.00025, mass=300.0, stiffness=1.1e5, window=1e-9, force_delay=delay)
     assert restitution(late, 0.005, pass_on) == pytest.approx(expected, rel=1e-3)
 
 
-def test_independent_rig_loses_work_of_friction():
+def test_independent_simulator_loses_energy_by_friction():
     rig = Rig(mass=300.0, stiffness=1.1e5, friction=2.0)
     omega, speed, offset = np.sqrt(rig.stiffness / rig.mass), 0.005, rig.friction / rig.stiffness
     depth = np.hypot(offset, speed / omega) - offset
@@ -51,7 +51,7 @@ def test_independent_rig_loses_work_of_friction():
     assert ideal_restitution(rig, speed) == pytest.approx(omega * (depth - offset) / speed, abs=1e-4)
 
 
-def test_independent_rig_with_stiff_structure_equals_rigid_rig():
+def test_independent_simulator_with_stiff_structure_equals_rigid_rig():
     rig = Rig(damping=400.0, drive_delay=0.002, force_delay=0.002)
     soft, stiff = replace(rig, mode=40.0), replace(rig, mode=400.0)
     assert ideal_restitution(stiff, 0.005) == pytest.approx(ideal_restitution(rig, 0.005), abs=1e-3)
@@ -68,7 +68,7 @@ def _second_order(frequency):
     ("window", "response"),
     [(0.0, _second_order), (0.04, lambda f: np.sinc(0.04 * f) * np.exp(-1j * np.pi * f * 0.04))],
 )
-def test_independent_drive_has_the_response_of_its_transfer_function(window, response):
+def test_independent_simulator_drive_has_response_of_its_transfer_function(window, response):
     rig = Rig(frequency=12.0, ratio=0.7, window=window, drive_delay=0.0043, position_delay=0.0006)
     time = np.arange(4000) * rig.period
     omega = 2 * np.pi * 7.0
@@ -77,7 +77,7 @@ def test_independent_drive_has_the_response_of_its_transfer_function(window, res
     assert position[2000:] == pytest.approx(np.imag(late)[2000:], abs=1e-3)
 
 
-def test_independent_errors_are_zero_only_for_the_true_file(tmp_path):
+def test_independent_study_errors_are_zero_only_for_true_mechanism_file(tmp_path):
     campaign = write_campaign("plain", 0, tmp_path)
     rig, file = campaign.rig, tmp_path / "truth.toml"
     text = mechanism_file(rig, campaign.speed, KINDS["plain"], np.ones(6))
@@ -89,14 +89,14 @@ def test_independent_errors_are_zero_only_for_the_true_file(tmp_path):
     assert max(abs(error), abs(difference)) > LIMIT
 
 
-def test_identify_explains_an_independent_campaign(tmp_path):
+def test_identify_verdict_is_good_for_campaign_of_independent_simulator(tmp_path):
     outcome = judge("plain", 1, tmp_path)
     assert (outcome.verdict, outcome.check, outcome.wrong, outcome.trouble) == ("good", "good", False, "")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_identify_gives_no_good_verdict_for_wrong_independent_file(kind, tmp_path):
+def test_identify_verdict_is_never_good_for_wrong_file_of_independent_campaign(kind, tmp_path):
     outcomes = []
     for seed in range(CAMPAIGNS):
         outcomes.append(judge(kind, seed, tmp_path / str(seed)))

@@ -64,7 +64,7 @@ def close(actual, expected, share=0.06):
     np.testing.assert_allclose((covariance - spread) / np.outer(std, std), 0.0, atol=share)
 
 
-def test_with_prior_equals_weighted_least_squares():
+def test_combination_of_logs_and_prior_equals_weighted_least_squares():
     mechanism, mean, spread = prior()
     result = conditioning.condition_on_prior(logs_say(KEYS), mechanism, 3.0)
     both = np.linalg.inv(np.linalg.inv(COVARIANCE) + np.linalg.inv(spread))
@@ -72,7 +72,7 @@ def test_with_prior_equals_weighted_least_squares():
     close(summary(result), (wanted, both))
 
 
-def test_with_prior_moves_values_known_only_from_the_prior():
+def test_combination_of_logs_and_prior_updates_values_known_only_from_prior():
     """Without free motion, the force delay is estimated for the given simulator, so it holds the sum of both
     lags.
     """
@@ -89,7 +89,7 @@ def test_with_prior_moves_values_known_only_from_the_prior():
     close(summary(draws), (wanted, both))
 
 
-def test_fixed_values_condition_draws_and_note_contradictions():
+def test_fixed_values_condition_parameter_draws_and_contradictions_are_reported():
     result, notes = conditioning.condition_on_fixed(logs_say(KEYS), {"contact.damping.0": 660.0})
     assert KEYS[3] not in result and notes == []
     regression = COVARIANCE[:3, 3] / COVARIANCE[3, 3]
@@ -99,7 +99,7 @@ def test_fixed_values_condition_draws_and_note_contradictions():
     assert notes == ["contact.damping.0: fixed at 0, but the logs give 650 +- 12"]
 
 
-def test_spread_out_assigns_list_values_entry_by_entry():
+def test_fixed_list_values_are_assigned_entry_by_entry():
     result = ["contact.stiffness.0", "contact.stiffness.1", "contact.damping.0"]
     assert conditioning.split_lists({"contact.stiffness": [1.0, 2.0]}, result) == {
         result[0]: 1.0,
@@ -116,7 +116,7 @@ def test_spread_out_assigns_list_values_entry_by_entry():
             conditioning.split_lists({key: value}, result)
 
 
-def test_with_prior_rejects_prior_without_uncertainty():
+def test_prior_without_uncertainty_is_rejected():
     with pytest.raises(
         InputError, match=r"prior: \[uncertainty\]: found no normal entry for a parameter that"
     ):

@@ -48,7 +48,7 @@ def test_motion_model_matches_exactly_sampled_simulator(name):
     ("linear", 0, 0, 0.0), ("zoh", 0, 0, -0.5), ("zoh", 1, 0, 0.5), ("linear", 1, 1, 2.0),
     ("linear", 0, -1, -1.0),
 ))  # fmt: skip
-def test_hold_response_is_a_delay_of_whole_and_half_periods(kind, latency, shift, periods):
+def test_command_hold_response_is_a_delay_of_whole_and_half_periods(kind, latency, shift, periods):
     frequency = np.array([0.1, 1.0, 10.0])
     response = hold.compute_hold_response(frequency, 0.002, kind, latency, shift)
     np.testing.assert_allclose(np.angle(response), -2.0 * np.pi * frequency * periods * 0.002, atol=1e-12)
@@ -56,7 +56,7 @@ def test_hold_response_is_a_delay_of_whole_and_half_periods(kind, latency, shift
 
 
 @pytest.mark.parametrize("model", (SECOND, THIRD), ids=("second", "third"))
-def test_motion_model_slopes_match_finite_differences(model):
+def test_motion_model_derivatives_match_finite_differences(model):
     s = 2j * np.pi * np.array([0.3, 3.0, 30.0])
     for i, slope in enumerate(model.slopes(s)):
         step = np.zeros(len(model.parameters))
@@ -75,7 +75,7 @@ def test_motion_model_bandwidth_matches_closed_form():
 
 
 @pytest.mark.parametrize("name", ("ideal", "first_order", "second_order", "third_order"))
-def test_choose_takes_the_smallest_sufficient_order(name):
+def test_motion_model_selection_takes_lowest_order_that_explains_the_data(name):
     numbers = {"ideal": [], "first_order": [np.log(0.022)], "second_order": [np.log(75.0), np.log(0.8)],
                "third_order": [np.log(0.008), np.log(110.0), np.log(0.5)]}[name]  # fmt: skip
     exact = lines_of(MotionModel(BY_NAME[name], np.array([*numbers, 0.0044])))
@@ -136,7 +136,7 @@ def test_local_polynomial_spectrum_estimates_response_from_chirp():
     assert np.exp(best.parameters[0]) / (2.0 * np.pi) == pytest.approx(12.0, rel=3e-3)
 
 
-def test_motion_fit_is_unbiased_with_lost_rows():
+def test_motion_model_fit_is_unbiased_if_log_rows_are_lost():
     campaign = campaigns.campaign("jitter", 2, speeds=(), rest=0)
     (run,) = campaign.runs
     assert 0.98 < run.valid.mean() < 1.0
@@ -146,7 +146,7 @@ def test_motion_fit_is_unbiased_with_lost_rows():
     assert result.noise_std == pytest.approx(5e-6, rel=0.02)
 
 
-def test_spectrum_detects_nonlinearity_at_unexcited_lines():
+def test_spectrum_detects_nonlinearity_at_unexcited_frequencies():
     campaign = campaigns.campaign("clean", 3, speeds=(), rest=0)
     (run,) = campaign.runs
     depth = run.position_measured - run.position_measured.mean()
@@ -158,7 +158,7 @@ def test_spectrum_detects_nonlinearity_at_unexcited_lines():
 
 
 @pytest.mark.parametrize("logarithms", [(4.3, -0.2), (4.3, 1.1), (156.8, 153.0)])
-def test_motion_model_limits_poles_beyond_all_lines(logarithms):
+def test_motion_model_limits_poles_above_all_measured_frequencies(logarithms):
     """A pole of 1e134 rad/s made the motion overflow; at the frequencies of the lines nothing changes."""
     structure = rational.STRUCTURES[2]
     asked = np.array([*logarithms, 0.001])

@@ -8,7 +8,7 @@ from tuning.identification.noise import detect_quantum, estimate_noise, fit_whit
 
 
 @pytest.mark.parametrize("quantum", (0.0, 0.5, 3.0, 8.0))
-def test_at_rest_noise_and_bias_lie_within_their_errors_for_any_quantum(quantum):
+def test_noise_and_bias_at_rest_lie_within_stated_errors_for_any_quantum(quantum):
     scores = []
     for seed in range(20):
         signal = 1.3 + 2.67 * np.random.default_rng(seed).standard_normal(3000)
@@ -21,14 +21,14 @@ def test_at_rest_noise_and_bias_lie_within_their_errors_for_any_quantum(quantum)
     assert np.all(rms < 1.6) and np.all(rms > 0.5)
 
 
-def test_at_rest_estimates_noise_smaller_than_the_quantum():
+def test_noise_smaller_than_the_quantum_is_estimated_at_rest():
     """Rounding alone would turn 0.3 of a quantum into 0.42."""
     readings = 0.5 * np.round((0.21 + 0.15 * np.random.default_rng(0).standard_normal(20_000)) / 0.5)
     result = estimate_noise(readings)
     assert result.std == pytest.approx(0.15, rel=0.03) and result.mean == pytest.approx(0.21, abs=0.01)
 
 
-def test_at_rest_whitens_coloured_noise():
+def test_coloured_noise_at_rest_is_whitened():
     rng, scores = np.random.default_rng(1), []
     for _ in range(20):
         drive = rng.standard_normal(6000) * np.sqrt(1.0 - 0.6**2)
@@ -40,7 +40,7 @@ def test_at_rest_whitens_coloured_noise():
     assert fit_whitening_filter(rng.standard_normal(5000)) == (1.0,)
 
 
-def test_steps_finds_quantum_on_both_sides_of_a_dead_zone():
+def test_quantum_is_detected_with_and_without_dead_zone():
     force = 0.5 * np.round(20.0 * np.random.default_rng(0).standard_normal(4000))
     dead = np.sign(force) * np.maximum(0.0, np.abs(force) - 3.7)
     assert detect_quantum(force) == pytest.approx(0.5) and detect_quantum(dead) == pytest.approx(0.5)
@@ -48,7 +48,7 @@ def test_steps_finds_quantum_on_both_sides_of_a_dead_zone():
     assert detect_quantum(np.zeros(100)) == 0.0
 
 
-def test_at_rest_gives_no_noise_for_mostly_zero_readings():
+def test_noise_at_rest_is_unknown_for_mostly_zero_readings():
     signal = 0.5 * np.random.default_rng(0).standard_normal(1000)
     dead = np.sign(signal) * np.maximum(0.0, np.abs(signal) - 4.0)
     result = estimate_noise(dead)

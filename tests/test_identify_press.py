@@ -32,18 +32,18 @@ def error(press, response):
     return np.sqrt(np.mean(np.abs(averaged) ** 2))
 
 
-def test_press_data_are_explained_by_first_order_lag_with_delay(press):
+def test_measured_press_data_are_explained_by_first_order_lag_with_delay(press):
     assert press.model.structure.name == "first_order"
     lag, delay = np.exp(press.model.parameters[0]), press.model.delay
     assert lag == pytest.approx(0.0222, abs=4e-4) and delay == pytest.approx(0.00445, abs=1e-4)
     assert error(press, press.model.response) < 0.012
 
 
-def test_press_data_error_of_published_model_without_delay_is_four_times_larger(press):
+def test_published_model_without_delay_has_four_times_the_error_on_press_data(press):
     fast, slow = PUBLISHED
     assert error(press, lambda s: 1.0 / ((1.0 + s / fast) * (1.0 + s / slow))) > 0.044
 
 
-def test_press_data_friction_is_detected(press):
+def test_friction_in_measured_press_data_is_detected(press):
     misfit = validation.check_motion_model(press, 3.0)[0]
     assert misfit.name == "motion model" and misfit.there and misfit.effect > 0.01

@@ -50,7 +50,7 @@ def fit(run, noise):
     ],
     ids=["multisine", "biased", "ten times the noise", "slow"],
 )
-def test_press_inside_contact_estimates_surface_from_bias_at_rest(run, noise, bias):
+def test_surface_is_estimated_from_press_run_in_contact_and_bias_at_rest(run, noise, bias):
     result = fit(replace(run, force_measured=run.force_measured + bias), rest(noise, bias)).posterior
     plane, stiffness = (result.names.index(name) for name in ("plane", "stiffness.0"))
     assert abs(result.mean[plane]) < 4.0 * np.std(result.draws[:, plane]) < 1e-4
@@ -58,13 +58,13 @@ def test_press_inside_contact_estimates_surface_from_bias_at_rest(run, noise, bi
     assert result.mean[stiffness] == pytest.approx(1.2e5, rel=0.01 * noise)
 
 
-def test_press_inside_contact_is_rejected_without_bias():
+def test_press_run_in_contact_is_rejected_without_bias_at_rest():
     for run in (multisine(), ramp(2e-4), multisine(noise=10.0)):
         with pytest.raises(InputError, match=r"^press.csv: force_measured: found a press that never leaves"):
             fit(run, None)
 
 
-def test_press_from_outside_estimates_its_own_bias():
+def test_press_run_that_starts_out_of_contact_estimates_bias():
     """A bias that changed since the run at rest has no effect."""
     run = ramp(-1e-3)
     run = replace(run, force_measured=run.force_measured + 5.0)
@@ -78,7 +78,7 @@ def bias_of(runs, noise=None, plane=None):
     return find_bias_prior(runs, MotionResponse(MODEL, runs, TIMING, 0.022), noise, plane)
 
 
-def test_press_needs_bias_only_for_unknown_surface():
+def test_press_run_requires_bias_only_if_surface_is_unknown():
     inside, outside = multisine(), ramp(-1e-3)
     mean, std = bias_of([inside], rest(bias=2.0))
     assert mean == pytest.approx(2.0, abs=4 * std) and std > 0.04

@@ -42,7 +42,7 @@ OTHERS = (pytest.param(*kind, marks=pytest.mark.slow) for kind in (("noisy", 60.
 
 
 @pytest.mark.parametrize("name, seconds", (("clean", 60.0), *OTHERS))
-def test_joint_fit_is_not_much_more_precise_than_stages(name, seconds):
+def test_joint_identification_is_hardly_more_precise_than_staged_identification(name, seconds):
     kind = campaigns.KINDS[name]
     campaign = campaigns.campaign(name, 0, speeds=(), seconds=seconds, rest=0)
     timing, noise = campaign.timing, kind.rig["force_sensor"]["noise_std"]

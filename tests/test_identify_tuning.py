@@ -59,7 +59,7 @@ def force_age(mechanism):
     ("stiffnesses", "response_error", False), ("lagging", "response_error", False),
     ("lagging", "response_error", True), ("clean", "impulse_ledger", False),
 ))  # fmt: skip
-def test_gains_tuned_on_identified_file_lose_little_on_true_rig(name, compensator, press):
+def test_gains_tuned_on_identified_file_have_little_additional_error_on_true_rig(name, compensator, press):
     truth = campaign_rigs.mechanism(name)
     result = identify(
         campaigns.campaign(name, 70_000, press=press), options=IdentificationOptions(law="kelvin_voigt")
@@ -95,7 +95,7 @@ LIMIT = 0.01  # error to which gains are tuned on the file
 HARDLY_TOLD = ("plain", "no delay", "undamped", "lost rows")  # kinds for which some files get a good verdict
 
 
-def test_gains_tuned_on_files_with_good_verdict_lose_little(monkeypatch):
+def test_gains_tuned_on_files_with_good_verdict_have_little_additional_error(monkeypatch):
     """The priors lack damping, lag, delay and dead zone; e* is that of the true mechanism.
 
     The quietest gains within the limit on the file are taken. On the true rig they may err by up to that

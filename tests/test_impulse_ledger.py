@@ -50,7 +50,7 @@ def test_impulse_ledger_does_not_mistake_damper_for_delay():
     assert abs(mean) < 5e-4 < 2 * np.sqrt(variance)
 
 
-def test_impulse_ledger_keeps_delay_for_zero_delay_spread():
+def test_impulse_ledger_does_not_change_delay_if_delay_spread_is_zero():
     model = fitted(1e-3, 0.0, 0.0)
     assert model.estimate_delay(0.0, 0.1) == (0.0, 0.0)
     model.conclude(0.0)

@@ -21,7 +21,7 @@ TICKS = 250_000
 
 
 @pytest.mark.parametrize("suite", ["noisy", "layered", "friction", "elastoplastic"])
-def test_impulse_ledger_agrees_with_jax_in_simulated_contacts(suite):
+def test_impulse_ledger_of_runtime_agrees_with_jax_in_simulated_contacts(suite):
     mechanism, sha256, _ = load(f"suite-{suite}")
     gains = literature_gains(mechanism, LAW)
     loaded = check_document(build_document(LAW, gains, mechanism, sha256, {}, {}, 0, {}))

@@ -38,13 +38,13 @@ def test_binomial_interval_matches_scipy():
 
 
 @pytest.mark.parametrize("interval", (binomial_interval, confidence_sequence))
-def test_interval_without_scenarios_is_zero_to_one(interval):
+def test_probability_interval_without_scenarios_is_zero_to_one(interval):
     none = interval(0, 0)
     assert np.isnan(none.value) and none.low == 0.0 and none.high == 1.0
 
 
 @pytest.mark.parametrize("number", (20, 200, 2000))
-def test_binomial_interval_covers_for_every_probability(number):
+def test_binomial_interval_has_stated_coverage_for_every_probability(number):
     failures = np.arange(number + 1)
     interval = binomial_interval(failures, number)
     for probability in np.linspace(0.0005, 0.9995, 97):
@@ -120,7 +120,7 @@ def ever_outside(interval, probability):
 
 
 @pytest.mark.parametrize("probability", PROBABILITIES)
-def test_confidence_sequence_covers_for_any_stopping_rule(probability, capsys):
+def test_confidence_sequence_has_stated_coverage_for_any_stopping_rule(probability, capsys):
     """Stopping at the worst of 150 looks keeps the coverage; with exact intervals it does not."""
     failures, number = walks(probability)
     missed = np.mean(ever_outside(of_each(confidence_sequence, failures, number), probability))
@@ -132,7 +132,7 @@ def test_confidence_sequence_covers_for_any_stopping_rule(probability, capsys):
 
 
 @pytest.mark.parametrize("probability, width", ((0.2, 0.1), (0.05, 0.03), (0.01, 0.01), (0.0, 0.01)))
-def test_confidence_sequence_covers_when_stopped_at_a_width(probability, width, capsys):
+def test_confidence_sequence_has_stated_coverage_if_stopped_at_a_width(probability, width, capsys):
     rng = np.random.default_rng(2)
     failures = np.cumsum(rng.binomial(100, probability, (1000, 150)), axis=1)
     number = np.broadcast_to(100 * np.arange(1, 151), failures.shape)
@@ -164,7 +164,7 @@ def test_confidence_sequence_covers_when_stopped_at_a_width(probability, width, 
     assert (running.number, running.low, running.high) == (number[stop][0], low[stop][0], high[stop][0])
 
 
-def test_updated_intersects_looks_and_restarts_on_contradiction():
+def test_sequential_interval_is_intersection_and_restarts_on_contradiction():
     failures, number = walks(0.3, repeats=1, looks=50)
     running = SequentialState()
     for added in np.diff(failures[0], prepend=0):
@@ -211,7 +211,7 @@ def replicated(name, probability, repeats, points=256, replicates=8):
 
 @pytest.mark.parametrize("name", REGIONS)
 @pytest.mark.parametrize("probability", (0.3, 0.001))
-def test_replicate_interval_covers_for_scrambled_sequences(name, probability):
+def test_replicate_interval_has_stated_coverage_for_scrambled_sequences(name, probability):
     failures, interval = replicated(name, probability, 60)
     assert covered(interval, probability) >= BAR
     if probability == 0.3:
@@ -223,7 +223,7 @@ def test_replicate_interval_covers_for_scrambled_sequences(name, probability):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", REGIONS)
 @pytest.mark.parametrize("probability", (0.3, 0.03, 0.001))
-def test_replicate_interval_covers_over_a_thousand_scrambled_sweeps(name, probability, capsys):
+def test_replicate_interval_has_stated_coverage_over_a_thousand_sweeps(name, probability, capsys):
     _, interval = replicated(name, probability, 1000)
     coverage, width = covered(interval, probability), np.mean(interval.width)
     with capsys.disabled():
@@ -232,7 +232,7 @@ def test_replicate_interval_covers_over_a_thousand_scrambled_sweeps(name, probab
 
 
 @pytest.mark.parametrize("probability", (*PROBABILITIES, 1e-4, 1e-5))
-def test_replicate_interval_covers_for_independent_points(probability, capsys):
+def test_replicate_interval_has_stated_coverage_for_independent_points(probability, capsys):
     """Use independent points, the least even ones."""
     failures = np.random.default_rng(4).binomial(1024, probability, (1000, 16))
     interval = replicate_interval(failures, 1024)
@@ -248,7 +248,7 @@ def test_replicate_interval_covers_for_independent_points(probability, capsys):
 
 
 @pytest.mark.parametrize("part", (0.0, 0.1, 0.3, 0.5, 0.8))
-def test_replicate_interval_covers_for_perfectly_even_points(part):
+def test_replicate_interval_has_stated_coverage_for_perfectly_even_points(part):
     """Each scrambling counts one of the integers around n p, often the same."""
     failures = 300 + (np.random.default_rng(5).random((2000, 8)) < part)
     assert covered(replicate_interval(failures, 1024), (300 + part) / 1024) >= BAR
@@ -265,7 +265,7 @@ def test_replicate_interval_of_equal_replicates_has_nonzero_width():
 
 @pytest.mark.parametrize("variation", (0.1, 0.3, 0.6))
 @pytest.mark.parametrize("replicates", (5, 10, 20))
-def test_lognormal_interval_covers_the_mean(variation, replicates):
+def test_lognormal_interval_has_stated_coverage_of_the_mean(variation, replicates):
     rng = np.random.default_rng(8)
     sigma = np.sqrt(np.log1p(variation**2))
     drawn = 1e-5 * np.exp(sigma * rng.standard_normal((4000, replicates)) - sigma**2 / 2)

@@ -19,7 +19,7 @@ def test_compiler_options_unknown_to_xla_are_omitted():
         jax.jit(lambda x: x + 1, compiler_options=unknown)(np.ones(3))
 
 
-def test_llvm_option_is_set_only_for_versions_that_know_it(monkeypatch):
+def test_llvm_option_is_set_only_for_jaxlib_versions_that_support_it(monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
     for version, expected in (("0.10.7", True), ("0.11.0", False), ("0.100.0", False)):
         monkeypatch.setattr(jax_environment, "version", lambda name, version=version: version)
@@ -30,7 +30,7 @@ AFFINITY = pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the 
 
 
 @AFFINITY
-def test_half_the_cores_are_released_after_use():
+def test_cpu_affinity_is_restored_after_use_of_half_the_cores():
     usable = os.sched_getaffinity(0)
     halves = []
     for half in (0, 1):

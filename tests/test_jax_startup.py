@@ -59,13 +59,13 @@ def refused(ran, *words):
         ({"JAX_ENABLE_X64": "perhaps"}, ["JAX_ENABLE_X64=perhaps"]),
     ],
 )
-def test_environment_variables_with_which_jax_does_not_start_are_refused(variables, words):
+def test_environment_variables_that_prevent_start_of_jax_are_refused(variables, words):
     ran = run("simulate", "rig-300kg", "--json", **variables)
     refused(ran, *words)
     assert ran.stdout == ""
 
 
-def test_flags_that_end_xla_raise_in_python():
+def test_xla_flags_that_abort_the_process_raise_python_error():
     script = "import jaxhil; jaxhil.simulate('rig-300kg')"
     variables = {**os.environ, "PYTHONPATH": ROOT, "XLA_FLAGS": "--xla_nonsense=1"}
     ran = subprocess.run(
@@ -75,14 +75,14 @@ def test_flags_that_end_xla_raise_in_python():
     assert "InputError: XLA_FLAGS: found '--xla_nonsense=1'" in ran.stderr
 
 
-def test_debugging_modes_and_displays_change_no_number(jaxhil, tmp_path):
+def test_jax_debugging_modes_change_no_result(jaxhil, tmp_path):
     ran = run("simulate", "rig-300kg", "--json", "--plot", str(tmp_path / "run.png"), **DEBUGGING)
     assert ran.returncode == 1, ran.stderr
     assert json.loads(ran.stdout) == jaxhil("simulate", "rig-300kg", "--json").document
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_flags_are_tried_by_another_process():
+def test_xla_flags_are_tested_in_a_separate_process():
     jax_startup.check_xla_flags("--xla_cpu_ftz=true")
     for flags, reason in (
         ("--xla_backend_optimization_level=high", "interpret value high"),
@@ -92,13 +92,13 @@ def test_flags_are_tried_by_another_process():
             jax_startup.check_xla_flags(flags)
 
 
-def test_flags_of_a_file_are_those_in_it(tmp_path):
+def test_xla_flags_are_read_from_flag_file(tmp_path):
     (tmp_path / "flags").write_text("--xla_cpu_ftz=true\n--xla_backend_optimization_level=3\n")
     flags = "--xla_cpu_ftz=true --xla_backend_optimization_level=3"
     assert jax_environment.build_xla_flags(str(tmp_path / "flags")) == jax_environment.build_xla_flags(flags)
 
 
-def test_fork_of_a_process_in_which_jax_runs_is_refused(monkeypatch):
+def test_fork_of_process_with_running_jax_is_refused(monkeypatch):
     monkeypatch.setattr(jax_startup, "_processes", set())
     jax_startup.check_not_forked()
     jax_startup.check_not_forked()
@@ -116,14 +116,14 @@ def test_full_standard_output_is_reported_in_one_line():
 
 
 @pytest.mark.parametrize("shell", ["2>&- <&-", "2> /dev/full", "2> >(true)"])
-def test_result_without_standard_error_is_the_same(jaxhil, tmp_path, shell):
+def test_command_result_is_unchanged_if_standard_error_is_closed(jaxhil, tmp_path, shell):
     arguments = "simulate", "rig-300kg", "--json", "--log", str(tmp_path / "log.csv")
     ran = run(*arguments, shell=shell)
     assert (ran.returncode, ran.stderr) == (1, "")
     assert json.loads(ran.stdout) == jaxhil(*arguments).document
 
 
-def test_reader_that_has_gone_away_is_no_error(tmp_path):
+def test_closed_output_pipe_is_no_error(tmp_path):
     ran = run(
         "simulate", "rig-300kg", "--log", str(tmp_path / "log.csv"), shell="| true; exit ${PIPESTATUS[0]}"
     )
@@ -132,7 +132,7 @@ def test_reader_that_has_gone_away_is_no_error(tmp_path):
     assert (ran.returncode, ran.stderr) == (0, "")
 
 
-def test_notes_that_nobody_reads_cost_no_result(monkeypatch, capsys):
+def test_command_result_is_printed_if_progress_notes_cannot_be_written(monkeypatch, capsys):
     read, write = os.pipe()
     os.close(read)
     with open(write, "w") as broken:

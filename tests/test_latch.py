@@ -28,7 +28,7 @@ def at(position, theta):
     return Pose(place(position, BATCH), exponential(place(theta, BATCH)))
 
 
-def test_latch_captures_deep_aligned_bodies_and_holds_them():
+def test_latch_captures_and_holds_bodies_if_deep_enough_and_aligned():
     """Check for no force before the capture, none at first, and a spring from there on."""
     one = latch(False)
     still = Twist(place([0, 0, 0], BATCH), place([0, 0, 0], BATCH))
@@ -48,7 +48,7 @@ def test_latch_captures_deep_aligned_bodies_and_holds_them():
 
 
 @pytest.mark.slow
-def test_latches_together_hold_as_much_as_each_alone():
+def test_wrench_of_several_latches_is_sum_of_separate_wrenches():
     """Capture at different depths, with different springs and with dampers."""
     one, share = latch(False, 0.01), jnp.array([[1.0], [2.0], [3.0]])
     points = place([[0.2, 0.2, 0.2], [-0.1, 0.0, 0.3], [0.0, 0.0, 0.0]], BATCH)

@@ -60,7 +60,7 @@ def scenario(delays):
 
 
 @pytest.mark.parametrize("delays", [[DELAY] * 6, UNEQUAL], ids=["equal", "unequal"])
-def test_latched_modes_grow_under_delay_as_characteristic_roots(delays):
+def test_latched_vibration_modes_grow_under_delay_as_characteristic_roots(delays):
     """Compare with the fastest growing root of det(s^2 M + K diag(exp(-s tau))) = 0.
 
     With equal delays it is that of the stiffest mode by Lambert's function. The integrator adds half a period
@@ -81,7 +81,7 @@ def test_latched_modes_grow_under_delay_as_characteristic_roots(delays):
     assert abs(result - root) < 1e-4 * abs(root), (result, root)
 
 
-def test_response_error_with_true_stiffness_removes_the_rig():
+def test_response_error_with_true_stiffness_cancels_rig_dynamics_of_latched_bodies():
     """Check that -K xi_a - K (xi_d - xi_a) = -K xi_d for any six axes; without it the same run diverges."""
     bodies, start = started()
     pose = Pose(vector(jnp.zeros((3, 1))), identity(jnp.zeros(1)))

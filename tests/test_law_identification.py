@@ -20,7 +20,7 @@ from jaxhil.rig.law_status import MAX_DOUBTFUL_SHARE
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suite", ["noisy", "hertz", "hardening", "layered", "fast"])
-def test_share_of_doubtful_ticks_separates_short_contacts(suite):
+def test_share_of_doubtful_ticks_distinguishes_too_short_contacts(suite):
     """Print the share of ticks in doubt, and check the gap that contains `MAX_DOUBTFUL_SHARE`.
 
     A contact is too short if the law says so on any tick.
@@ -47,7 +47,7 @@ def test_share_of_doubtful_ticks_separates_short_contacts(suite):
         assert most > MAX_DOUBTFUL_SHARE
 
 
-def test_contact_that_seems_to_add_energy_is_unexplained():
+def test_impulse_ledger_status_is_unexplained_if_contact_seems_to_add_energy():
     """The force is 1 ms older than specified; some errors are too small for the test of the energy alone."""
     nominal = load("suite-noisy").mechanism
     errors, statuses = [], []
@@ -84,7 +84,7 @@ WRONG = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", WRONG)
-def test_identified_contacts_hardly_ever_err(wrong):
+def test_contacts_with_status_identified_rarely_exceed_error_limit(wrong):
     """Expect few errors above 1.5 %, whatever is wrong; if nothing is wrong, 98 in 100 are identified."""
     (changes, known), contacts = WRONG[wrong], 100
     mechanism_known = load("suite-noisy", list(known)).mechanism
@@ -119,7 +119,7 @@ def restitution(mechanism: Mechanism) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lag", [0.0, 1e-3, 3e-3])
-def test_identified_contact_with_a_damper_behind_a_lag_does_not_err(lag):
+def test_contact_with_status_identified_is_accurate_for_damper_with_unmodelled_lag(lag):
     """Cover a damper whose loss is offset by the unmodelled lag, so that it reads like no damper."""
     contacts, mechanism_known = 60, load("suite-damped").mechanism
     errors, statuses = np.empty(contacts), []
@@ -138,7 +138,7 @@ def test_identified_contact_with_a_damper_behind_a_lag_does_not_err(lag):
 
 
 @pytest.mark.slow
-def test_slow_contacts_are_identified():
+def test_slow_contacts_get_status_identified_by_impulse_ledger():
     """Run contacts of 0.4 to 1.4 Hz."""
     changes = ("contact.stiffness=[8000.0]",)
     mechanism_known = load("suite-noisy", list(changes)).mechanism

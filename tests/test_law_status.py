@@ -91,7 +91,7 @@ def ran(name: str, limits: str) -> tuple[Controller, Ran]:
         for number, name in enumerate(KINDS)
     ],
 )
-def test_contact_status_is_the_status_of_most_ticks(name, limits):
+def test_status_of_contact_is_most_frequent_status_of_its_ticks(name, limits):
     """Expect it after the contact, on one tick, without a trip; with the energy audit and without."""
     law, result = ran(name, limits)
     record, wanted = law.last_contact, KINDS[name].status
@@ -108,7 +108,7 @@ def test_contact_status_is_the_status_of_most_ticks(name, limits):
 
 
 @pytest.mark.parametrize("nearer", [1e-3, 4e-3])
-def test_contact_before_specified_surface_is_audited(nearer):
+def test_contact_in_front_of_specified_surface_is_audited_by_watchdog(nearer):
     """Expect the audit to begin when the law acts."""
     changes = (f"rig.contact_plane={-nearer}",)
     mechanism, made = gain_file(Kind("noisy", changes, {}, "identified"), {"settling": 0.02})
@@ -140,7 +140,7 @@ def counting_in_c(tmp_path_factory):
     return ctypes.CDLL(str(c99_cases.compiled(folder, "counted.c", "counted.so", "-shared", "-fPIC")))
 
 
-def test_status_counts_in_c_agree_with_python(counting_in_c):
+def test_contact_status_counts_in_c_agree_with_python(counting_in_c):
     """Use contacts of 40 ticks in which one or two random statuses prevail."""
     rng = np.random.default_rng(0)
     numbers = [status.number for status in STATUSES if status.number != NOT_REACHED]
@@ -163,7 +163,7 @@ def test_status_counts_in_c_agree_with_python(counting_in_c):
     assert statuses == {*STATUS_NAMES.values()} - {"out_of_contact", "unstated"}
 
 
-def test_contact_kinds_cover_every_status_of_the_law():
+def test_sample_contacts_cover_every_status_of_impulse_ledger():
     records = [ran(name, "no energies") for name in KINDS]
     statuses = {name for _, contact in records for name in contact.said}
     never = {"unstated", "not_reached"}
@@ -173,7 +173,7 @@ def test_contact_kinds_cover_every_status_of_the_law():
     }
 
 
-def test_contact_without_measured_force_is_not_reached():
+def test_contact_without_measured_force_has_status_not_reached():
     """Let the model pass the surface and come back without a measured force, whatever the law does.
 
     The hardware never touches, a dead zone hides its contact, or the contact has a single reading.
@@ -199,7 +199,7 @@ def test_contact_without_measured_force_is_not_reached():
         assert law.seen == LAW_IN_DOUBT
 
 
-def test_contact_record_stays_until_next_contact_is_audited():
+def test_last_contact_record_remains_until_next_contact_is_audited():
     mechanism, made = gain_file(KINDS["8 Hz"], {})
     law = Controller(made)
     assert law.law_status == "out_of_contact" and law.last_contact == ContactRecord()
@@ -213,7 +213,7 @@ def test_contact_record_stays_until_next_contact_is_audited():
     assert law.last_contact[:2] == (2, "identified")
 
 
-def test_contact_under_way_is_evaluated_when_next_is_announced():
+def test_unfinished_contact_is_audited_when_next_contact_is_announced():
     for limits in LIMITS.values():
         mechanism, made = gain_file(KINDS["8 Hz"], {**limits, "settling": 5.0})
         law = Controller(made)
@@ -226,7 +226,7 @@ def test_contact_under_way_is_evaluated_when_next_is_announced():
         assert law.faults == 0 and law.seen == LAW_IN_DOUBT
 
 
-def test_restitution_trip_reports_status_of_the_law():
+def test_restitution_trip_reports_status_of_compensator():
     """Expect both faults on one tick; a fault that does not trip is no cause."""
     mechanism, made = gain_file(KINDS["8 Hz"], {**LIMITS["energies"], "restitution_margin": 1e-6})
     law = Controller(made)
@@ -237,7 +237,7 @@ def test_restitution_trip_reports_status_of_the_law():
 
 
 @pytest.mark.parametrize("name", [name for name in laws.built_in_compensators() if name != LAW])
-def test_laws_without_status_report_none(name):
+def test_compensators_without_status_report_none(name):
     mechanism = load("suite-noisy").mechanism
     law = controller(mechanism, name, literature_gains(mechanism, name), **LIMITS["energies"])
     result = run(mechanism, law)

@@ -56,7 +56,7 @@ def tilted(static, gains, arguments):
     return (gains - arguments) @ matrix.T
 
 
-def test_minimum_on_bounds_is_that_of_bounded_linear_least_squares():
+def test_minimum_on_bounds_equals_bounded_linear_least_squares_solution():
     bounds = GainBounds(*(np.full((4, 2), leaf) for leaf in (0.0, 1.0, 0.0)))
     targets = np.array([[2.0, -0.3], [0.5, 3.0], [-1.0, -2.0], [0.2, 0.6]])
     starts = np.array([[0.5, 0.5], [0.0, 0.0], [1.0, 1.0], [1.0, 0.0]])
@@ -68,7 +68,7 @@ def test_minimum_on_bounds_is_that_of_bounded_linear_least_squares():
         np.testing.assert_allclose(curvature, matrix.T @ matrix)
 
 
-def test_gain_without_influence_stays():
+def test_gain_without_influence_keeps_its_starting_value():
     def blind(static, gains, arguments):
         return gains[:, :1] - arguments
 
@@ -80,7 +80,7 @@ def test_gain_without_influence_stays():
     assert [SOLVER_STATUSES[i] for i in solution.status] == ["converged"]
 
 
-def test_least_squares_without_progress_has_converged():
+def test_least_squares_without_further_progress_reports_convergence():
     """Use a ripple finer than any step: the loss stops falling long before the residuals settle."""
 
     def rippled(static, gains, arguments):
@@ -94,13 +94,13 @@ def test_least_squares_without_progress_has_converged():
     assert solution.steps[0] < 20
 
 
-def test_least_squares_reports_too_few_steps_and_nonfinite_start():
+def test_least_squares_reports_step_limit_and_nonfinite_starting_point():
     solution = solved(blows_up, [[0.7, 0.2]] * 2, [[0.1, 0.01], [1.9, 5.0]], 2)
     assert [SOLVER_STATUSES[i] for i in solution.status] == ["step limit", "not finite"]
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_least_squares_derivative_is_that_of_the_residuals(number):
+def test_least_squares_gradient_equals_gradient_of_residuals(number):
     free = jnp.asarray(np.linspace(0.1, 0.9, 2 * number).reshape(number, 2))
     factors = jnp.asarray(np.linspace(2.0, 5.0, 2 * number).reshape(number, 2))
     tangent = jnp.asarray([1.0, -0.5])

@@ -47,7 +47,7 @@ def moves(speeds):
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.lists(st.floats(-0.08, 0.08), min_size=8, max_size=8))
-def test_velocity_and_acceleration_limits_hold_for_any_motion(speeds):
+def test_command_velocity_and_acceleration_limits_hold_for_any_motion(speeds):
     # The drives can reach the first speed.
     speeds[0] = np.clip(speeds[0], -VELOCITY_LIMIT, VELOCITY_LIMIT)
     commands = limited(moves(np.repeat(speeds, 12)), VELOCITY_LIMIT, ACCELERATION_LIMIT)
@@ -65,7 +65,7 @@ def gap(distance, speed=0.0):
 
 @pytest.mark.parametrize("speed", [0.0, 0.003, -0.004])
 @pytest.mark.parametrize("distance", [1e-7, 3.3e-6, 1e-4, 2.7e-3, -1e-3])
-def test_command_reaches_displaced_target(distance, speed):
+def test_limited_command_reaches_displaced_target(distance, speed):
     behind = gap(distance, speed)
     assert np.all(behind[:2] == 0) and abs(behind[-1]) < 1e-12
     # The gap closes all the way and is never overshot.
@@ -75,14 +75,14 @@ def test_command_reaches_displaced_target(distance, speed):
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.floats(1e-9, 1e-3), st.floats(-VELOCITY_LIMIT / 4, VELOCITY_LIMIT / 4))
-def test_command_does_not_overshoot_displaced_target(distance, speed):
+def test_limited_command_does_not_overshoot_displaced_target(distance, speed):
     behind = gap(distance, speed)
     assert behind.min() > -1e-15 and abs(behind[-1]) < 1e-15
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.integers(1, 30), st.floats(0, 1))
-def test_command_reaches_displaced_target_in_fewest_periods(count, spare):
+def test_limited_command_reaches_displaced_target_in_fewest_periods(count, spare):
     """Take steps of q, 2 q, ..., q, 2 count - 1 of them: no fewer steps go as far as count^2 q."""
     change = ACCELERATION_LIMIT * PERIOD**2
     distance = (count**2 - spare * (2 * count - 2 if count > 1 else 1)) * change
@@ -93,7 +93,7 @@ def test_command_reaches_displaced_target_in_fewest_periods(count, spare):
 
 
 @pytest.mark.parametrize("limit", [1.0, 0.1])
-def test_command_stops_in_the_minimum_time(limit):
+def test_limited_command_stops_in_the_minimum_time(limit):
     """Compare with a jump by x, which takes at least 2 sqrt(x/a).
 
     To 0.99 x it takes a tenth of sqrt(2 x/a) less; times are whole periods.
@@ -107,7 +107,7 @@ def test_command_stops_in_the_minimum_time(limit):
 
 @pytest.mark.parametrize(("dtype", "margin"), [("float64", 1.01), ("float32", 1.05)])
 @pytest.mark.parametrize("offset", [0, 1e-3, -0.1])
-def test_limits_that_do_not_bind_change_no_bit(offset, dtype, margin):
+def test_command_limits_that_are_not_reached_leave_commands_bit_identical(offset, dtype, margin):
     time = PERIOD * np.arange(400)
     smooth = offset + 0.01 * np.sin(2 * np.pi * 3 * time)
     steps = np.diff(smooth)
@@ -122,7 +122,7 @@ def test_limits_that_do_not_bind_change_no_bit(offset, dtype, margin):
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("origin", [0.0, 0.05])
-def test_limit_that_is_just_reached_does_not_bind(origin, dtype):
+def test_command_limit_that_is_just_reached_does_not_change_the_command(origin, dtype):
     """Move uniformly at the drives' largest speed, through 0 and far from it."""
     speed, period = np.array(VELOCITY_LIMIT, dtype), np.array(PERIOD, dtype)
     targets = np.full(400, origin - 0.004, dtype)
@@ -133,7 +133,7 @@ def test_limit_that_is_just_reached_does_not_bind(origin, dtype):
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.floats(1e-9, 1e-3), st.floats(-VELOCITY_LIMIT / 4, VELOCITY_LIMIT / 4), st.floats(-0.05, 0.05))
-def test_command_follows_reached_target_to_the_bit(distance, speed, origin):
+def test_limited_command_equals_target_to_the_bit_after_reaching_the_target(distance, speed, origin):
     targets = origin + moves(np.full(800, speed))
     targets[2:] += distance
     commands = limited(targets, VELOCITY_LIMIT, ACCELERATION_LIMIT)
@@ -141,7 +141,7 @@ def test_command_follows_reached_target_to_the_bit(distance, speed, origin):
 
 
 @pytest.mark.parametrize("limits", [(0.0053, np.inf), (np.inf, 0.06), (0.0053, 0.06)])
-def test_limits_hold_over_a_whole_contact(limits):
+def test_command_limits_hold_over_a_whole_contact(limits):
     """Use the ideal simulator without delay: its position is the command."""
     names = ("velocity_limit", "acceleration_limit")
     simulator = {"model": "ideal"} | {n: x for n, x in zip(names, limits, strict=True) if np.isfinite(x)}

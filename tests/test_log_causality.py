@@ -40,7 +40,7 @@ KINDS = ["noisy", *(pytest.param(one, marks=pytest.mark.slow) for one in campaig
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_noise_shows_the_tick_of_a_rows_readings(kind):
+def test_sensor_noise_reveals_the_tick_of_readings_in_a_log_row(kind):
     for ahead, row in ((-1, "after"), (0, "tick"), (1, "sent")):
         runs, timing = runs_of(kind, ahead)
         assert detect_reading_offset(runs) == ahead
@@ -55,7 +55,7 @@ def test_noise_shows_the_tick_of_a_rows_readings(kind):
         check_row_convention(runs, timing)
 
 
-def test_contact_shows_tick_of_readings_if_rig_is_driven_before_and_after():
+def test_tick_of_log_readings_is_estimated_if_rig_moves_before_and_after_contact():
     """Add a thousand rows on either side in which commands follow a path and forces are noise."""
     runs, _ = runs_of("noisy", -1)
     rng, path = np.random.default_rng(0), 1e-3 * np.cos(np.linspace(0.0, 3.0, 1000))
@@ -68,7 +68,7 @@ def test_contact_shows_tick_of_readings_if_rig_is_driven_before_and_after():
     assert detect_reading_offset(runs) == -1
 
 
-def test_explicit_integrator_answers_a_tick_late():
+def test_force_command_of_explicit_integrator_acts_one_tick_later():
     """Move by the velocity before the force: commands are those of a controller that takes a tick."""
     runs, timing = runs_of("noisy", -1)
     speeds = [np.diff(run.position_desired, append=np.nan) / 1e-3 for run in runs]
@@ -80,7 +80,7 @@ def test_explicit_integrator_answers_a_tick_late():
         check_row_convention(moved, replace(timing, row="sent"), result)
 
 
-def test_tick_of_readings_is_not_reported_without_noise_or_enough_runs():
+def test_tick_of_log_readings_is_not_reported_without_noise_or_enough_runs():
     (run, *others), timing = runs_of("clean")
     assert detect_reading_offset([run, *others]) == 0
     assert detect_reading_offset([run]) is None and detect_reading_offset([]) is None

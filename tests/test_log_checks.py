@@ -41,7 +41,7 @@ def model(integrator, row, sign=1):
 
 @pytest.mark.parametrize("integrator", ["semi_implicit_euler", "zoh", "explicit_euler"])
 @pytest.mark.parametrize("row", ["tick", "sent"])
-def test_rows_of_another_tick_are_detected_with_any_integrator(tmp_path, integrator, row):
+def test_log_readings_of_another_tick_are_detected_for_any_integrator(tmp_path, integrator, row):
     path = write_csv(tmp_path / "a.csv", model(integrator, row))
     assert read(path, timing={"row": row}).runs[0].kind == "contact"
     other = "tick" if row == "sent" else "sent"
@@ -51,7 +51,7 @@ def test_rows_of_another_tick_are_detected_with_any_integrator(tmp_path, integra
         assert read(path, timing={"row": "after"}).notes == ()
 
 
-def test_wrong_sign_or_mass_of_force_command_is_detected(tmp_path):
+def test_wrong_sign_or_mass_for_logged_force_command_is_detected(tmp_path):
     path = write_csv(tmp_path / "a.csv", model("zoh", "tick", sign=-1))
     assert "force_command: found forces that accelerate the approach" in message(path)
     assert read(path, force_command={"column": "Fc", "sign": -1}).notes == ()
@@ -82,12 +82,12 @@ def test_wrong_sign_or_mass_of_force_command_is_detected(tmp_path):
         ({"position_desired": "still"}, "m in every row, expected a motion"),
     ],
 )  # fmt: skip
-def test_wrong_units_signs_and_swapped_channels_are_detected(tmp_path, channels, reason):
+def test_wrong_units_wrong_signs_and_swapped_log_channels_are_detected(tmp_path, channels, reason):
     path = write_csv(tmp_path / "a.csv", LOG | {"still": np.zeros(1200)})
     assert reason in message(path, force_command=None, velocity_desired=None, **channels)
 
 
-def test_wrong_channels_of_a_free_run_are_detected(tmp_path):
+def test_wrong_log_channels_of_a_run_without_contact_are_detected(tmp_path):
     path = write_csv(tmp_path / "a.csv", sway() | {"slow": 1e-3 * sway()["xm"]})
     assert read(path, "free").notes == ()
     assert "ticks earlier than position_desired" in message(
@@ -102,7 +102,7 @@ def test_wrong_channels_of_a_free_run_are_detected(tmp_path):
     assert read(write_csv(tmp_path / "d.csv", sway(amplitude=0.0)), "rest").runs[0].kind == "rest"
 
 
-def test_held_readings_are_noted(tmp_path):
+def test_log_readings_that_repeat_for_several_rows_are_reported(tmp_path):
     log = sway() | {"xm": np.repeat(sway()["xm"][::4], 4)}
     (note,) = read(write_csv(tmp_path / "a.csv", log), "free").notes
     assert "repeated in 75 % of rows, as if each reading was held for 4 rows" in note
@@ -110,7 +110,7 @@ def test_held_readings_are_noted(tmp_path):
     assert read(write_csv(tmp_path / "b.csv", rounded), "free").notes == ()
 
 
-def test_press_requires_force_that_rises_with_depth_and_clipping_is_noted(tmp_path):
+def test_press_log_requires_force_that_rises_with_depth_and_clipping_is_reported(tmp_path):
     press = sway()
     press["F"] = STIFFNESS * np.maximum(press["xm"] + 5e-4, 0.0)
     path = write_csv(tmp_path / "a.csv", press)
@@ -123,7 +123,7 @@ def test_press_requires_force_that_rises_with_depth_and_clipping_is_noted(tmp_pa
 
 
 @pytest.mark.parametrize("every", [2, 5])
-def test_commands_and_forces_of_another_rate_are_detected(tmp_path, every):
+def test_log_commands_and_forces_sampled_at_another_rate_are_detected(tmp_path, every):
     def held(values):
         return np.repeat(values[::every], every)[: len(values)]
 
@@ -150,7 +150,7 @@ def far_side():
 
 
 @pytest.mark.parametrize("gone", [(), ("velocity_desired", "force_command")])
-def test_contacts_on_the_far_side_of_a_clearance_are_refused(tmp_path, gone):
+def test_log_contacts_on_the_far_side_of_a_clearance_are_refused(tmp_path, gone):
     """Cover forces that were taken for ones in a wrong unit, or ended in an internal error."""
     log, back = far_side()
     path = write_csv(tmp_path / "a.csv", log)
@@ -161,7 +161,7 @@ def test_contacts_on_the_far_side_of_a_clearance_are_refused(tmp_path, gone):
 
 
 @pytest.mark.parametrize("rows", range(150, 180))
-def test_log_may_end_soon_after_a_pulling_force(rows):
+def test_log_that_ends_soon_after_a_pulling_force_is_accepted(rows):
     """Cover a search for the speed after the pull that went beyond the last row."""
     pull = np.where((np.arange(rows) > 100) & (np.arange(rows) < 140), -1.0, 0.0)
     checks._check_one_side("a.csv", pull, np.linspace(0.0, 1e-3, rows), PERIOD, MASS)

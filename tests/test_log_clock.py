@@ -18,7 +18,7 @@ def stamps(rows=20_000, jitter=0.0, drift=0.0, lost=(), seed=0):
 
 @pytest.mark.parametrize("drift", [0.0, 1e-4, -1e-3])
 @pytest.mark.parametrize("jitter", [0.0, 5e-5, 1.5e-4])
-def test_every_row_gets_its_tick(jitter, drift):
+def test_every_log_row_is_assigned_its_tick(jitter, drift):
     lost = [5, 700, 701, 702, 703, *range(3000, 3060), 12_000, 12_002, 19_998]
     times, tick = stamps(jitter=jitter, drift=drift, lost=lost)
     result = assign_ticks(times, PERIOD, "a")
@@ -29,14 +29,14 @@ def test_every_row_gets_its_tick(jitter, drift):
     assert abs(result.clock.jitter - jitter) <= 0.03 * jitter + 1e-3 * PERIOD
 
 
-def test_rows_with_a_stamp_in_a_neighbouring_tick_stay_in_order():
+def test_log_rows_with_time_stamp_in_neighbouring_tick_keep_their_order():
     times, tick = stamps(jitter=0.0)
     times[100] += 0.55 * PERIOD
     times[5000] -= 0.6 * PERIOD
     np.testing.assert_array_equal(assign_ticks(times, PERIOD, "a").tick, tick)
 
 
-def test_few_rows_and_counted_rows_get_their_ticks():
+def test_short_logs_and_logs_without_time_stamps_are_assigned_ticks():
     for rows in (2, PHASE_CHUNK_ROWS - 1, PHASE_CHUNK_ROWS, PHASE_CHUNK_ROWS + 1, 2 * PHASE_CHUNK_ROWS + 1):
         times, tick = stamps(rows)
         np.testing.assert_array_equal(assign_ticks(times, PERIOD, "a").tick, tick)
@@ -44,7 +44,7 @@ def test_few_rows_and_counted_rows_get_their_ticks():
     assert result.tick.tolist() == [*range(7)] and result.clock.jitter == result.clock.lost == 0
 
 
-def test_unusable_stamps_are_refused():
+def test_unusable_time_stamps_are_refused():
     times, _ = stamps(3000)
     slower = np.concatenate([times[:1500], times[1500] + 2 * (times[1500:] - times[1500])])
     cases = [

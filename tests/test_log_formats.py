@@ -107,7 +107,7 @@ FORMATS = [
 
 @pytest.mark.filterwarnings("ignore")  # those of other libraries
 @pytest.mark.parametrize(("name", "write"), FORMATS)
-def test_log_formats_give_the_same_campaign(tmp_path, name, write):
+def test_all_log_formats_give_the_same_campaign(tmp_path, name, write):
     if write is mat_5:
         pytest.importorskip("pymatreader")
     path, columns = write(tmp_path / name)
@@ -123,7 +123,7 @@ def test_log_formats_give_the_same_campaign(tmp_path, name, write):
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("suffix", [".mat", ".h5", ".mcap", ".mf4", ".tdms"])
-def test_torn_log_or_missing_library_is_refused_in_one_line(tmp_path, suffix):
+def test_truncated_log_or_missing_library_is_refused_in_one_line(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"torn" * 100)
     with pytest.raises(InputError) as caught:
@@ -206,7 +206,7 @@ OWN_CLOCKS = [
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(("name", "write"), OWN_CLOCKS)
 @pytest.mark.parametrize("late", [0.005, -0.007])
-def test_channels_that_begin_apart_are_read_at_their_own_times(tmp_path, name, write, late):
+def test_log_channels_that_begin_at_different_times_are_aligned(tmp_path, name, write, late):
     """Expect the force of the command's tick, whatever row it is written in."""
     path, columns = write(tmp_path / name, LOG, late)
     result = read(path, **columns)
@@ -221,7 +221,7 @@ def test_channels_that_begin_apart_are_read_at_their_own_times(tmp_path, name, w
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_channels_of_other_rates_and_clocks_are_read_or_refused_in_one_line(tmp_path):
+def test_log_channels_with_other_rates_or_clocks_are_read_or_refused_in_one_line(tmp_path):
     path, columns = mdf_of_groups(tmp_path / "a.mf4", LOG, 0.005)
     with pytest.raises(InputError, match=r'timing.clock: found "index", expected "stamps", because '):
         read(path, **columns, timing={"clock": "index"})
@@ -249,7 +249,7 @@ def test_channels_of_other_rates_and_clocks_are_read_or_refused_in_one_line(tmp_
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_waveforms_without_start_time_beside_others_are_refused(tmp_path):
+def test_log_waveform_without_start_time_among_timed_waveforms_is_refused(tmp_path):
     nptdms = pytest.importorskip("nptdms")
     begin = {"wf_start_time": np.datetime64("2026-03-01T10:00:00", "us")}
     with nptdms.TdmsWriter(tmp_path / "a.tdms") as writer:

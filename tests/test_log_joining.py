@@ -45,7 +45,7 @@ def joined(sampled, stamps=None, ticks=None, jitter=0.0):
 
 @pytest.mark.parametrize("late", [5.0, -7.0, 0.0])
 @pytest.mark.parametrize("jitter", [0.0, 5e-5])
-def test_channel_that_begins_some_ticks_later_is_shifted_exactly(late, jitter):
+def test_log_channel_that_begins_some_ticks_later_is_shifted_exactly(late, jitter):
     sampled = PERIOD * (np.arange(ROWS - 40) + late)
     ticks, force, notes = joined(sampled, scattered(sampled, jitter, 2), jitter=jitter)
     np.testing.assert_array_equal(force, smooth(PERIOD * (late + np.arange(ROWS)))[(ticks - int(late))])
@@ -63,7 +63,7 @@ def test_channel_that_begins_some_ticks_later_is_shifted_exactly(late, jitter):
     seed=st.integers(0, 99),
 )
 @settings(deadline=None, max_examples=30)
-def test_joined_readings_are_those_of_the_rows_times(late, rate, jitter, lost, ends, seed):
+def test_readings_with_own_clock_are_interpolated_to_times_of_log_rows(late, rate, jitter, lost, ends, seed):
     random = np.random.default_rng(seed)
     count = int(ends / rate)
     sampled = (late + PERIOD * rate * np.arange(count))[random.uniform(size=count) >= lost]
@@ -77,7 +77,7 @@ def test_joined_readings_are_those_of_the_rows_times(late, rate, jitter, lost, e
     assert len(kept) > (0.9 if lost else 0.999) * np.count_nonzero(inside) - 2 and set(kept) <= set(ticks)
 
 
-def test_gap_in_a_channel_drops_its_rows():
+def test_gap_in_a_log_channel_drops_the_rows_within_the_gap():
     sampled = np.delete(PERIOD * np.arange(ROWS), slice(1000, 1200)) + 4e-4
     ticks, _, notes = joined(sampled)
     assert not np.any((ticks > 1000) & (ticks < 1200)) and "are interpolated" in notes[0]
@@ -105,7 +105,7 @@ def test_gap_in_a_channel_drops_its_rows():
         (None, "column 'F': found no stamps, expected stamps"),
     ],
 )
-def test_clocks_that_cannot_be_joined_are_refused_by_name(stamps, reason):
+def test_log_channel_with_incompatible_clock_is_refused_by_name(stamps, reason):
     rows = PERIOD * np.arange(ROWS)
     columns = {"position_desired": rows, "force_measured": rows}
     with pytest.raises(InputError) as caught:
@@ -114,7 +114,7 @@ def test_clocks_that_cannot_be_joined_are_refused_by_name(stamps, reason):
     assert str(caught.value).startswith("a: ") and reason in str(caught.value)
 
 
-def test_channels_that_hold_their_value_are_not_interpolated():
+def test_log_channel_that_holds_its_value_is_not_interpolated():
     rows = PERIOD * np.arange(ROWS)
     columns = {"position_desired": rows, "contact_index": np.repeat([0.0, 3.0], ROWS // 2)}
     columns["mode"] = np.array(["free"] * (ROWS // 2) + ["contact"] * (ROWS // 2), object)
@@ -138,7 +138,7 @@ TIMES = {
 
 
 @pytest.mark.parametrize("late", [0.005, -0.012])
-def test_channel_is_joined_by_stamps_named_in_the_mapping(tmp_path, late):
+def test_log_channel_is_aligned_by_time_stamps_named_in_mapping_file(tmp_path, late):
     h5py = pytest.importorskip("h5py")
     log, *groups = separate(late)
     with h5py.File(tmp_path / "a.h5", "w") as file:
@@ -157,12 +157,12 @@ def test_channel_is_joined_by_stamps_named_in_the_mapping(tmp_path, late):
         read(tmp_path / "a.h5", **TIMES, timing={"clock": "index"})
 
 
-def test_channel_stamps_require_stamps_of_the_rows():
+def test_time_stamps_of_a_log_channel_require_time_stamps_of_rows():
     with pytest.raises(InputError, match=r"channels.force_measured.time: found 'tF', expected none"):
         mapping(time={"rate": 1000.0}, force_measured={"column": "F", "time": "tF"})
 
 
-def test_text_channel_of_same_length_is_joined_by_its_own_stamps(tmp_path):
+def test_text_log_channel_of_same_length_is_aligned_by_own_time_stamps(tmp_path):
     log = touches(1)
     path = write_csv(tmp_path / "a.csv", log | {"tF": log["t"] + 0.003})
     (run,) = read(path, force_measured={"column": "F", "time": "tF"}).runs
@@ -171,7 +171,7 @@ def test_text_channel_of_same_length_is_joined_by_its_own_stamps(tmp_path):
 
 
 @pytest.mark.parametrize(("unit", "late"), [(1.0, 0.005), (1e3, 0.005), (1.0, 1e-4)])
-def test_group_stamps_that_differ_from_those_of_the_rows_are_refused(tmp_path, unit, late):
+def test_time_stamps_of_channel_group_that_differ_from_row_stamps_are_refused(tmp_path, unit, late):
     h5py, log = pytest.importorskip("h5py"), touches(1)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["x/time"], file["f/time"], file["f/count"] = log["t"], unit * (log["t"] + late), 2.0 * log["t"]
@@ -205,7 +205,7 @@ HOSTILE = st.one_of(
     rate=st.sampled_from([1e-9, 1e-4, 1e-3, 1.4e-3, 1e9]),
     whose=st.sampled_from(["position_desired", "force_measured"]),
 )
-def test_any_clock_is_joined_or_refused_in_one_line(place, value, count, rate, whose):
+def test_log_channel_with_any_clock_is_aligned_or_refused_in_one_line(place, value, count, rate, whose):
     rows = {"position_desired": PERIOD * np.arange(300), "force_measured": rate * np.arange(count)}
     if len(rows[whose]):
         rows[whose][place % len(rows[whose])] = value

@@ -48,7 +48,7 @@ def changed(path, value):
     return raw
 
 
-def test_mapping_number_is_sign_times_scaled_reading_and_offset_in_unit():
+def test_mapping_applies_scale_unit_offset_and_sign_to_logged_numbers():
     channels = parse_mapping(FULL, "map").channels
     assert get_si_conversion(channels.position_desired, "position_desired") == (-1e-3, -2e-3)
     assert get_si_conversion(channels.position_measured, "position_measured") == (1e-6, 0.0)
@@ -117,7 +117,7 @@ def test_unusable_mapping_is_refused(path, value, reason):
     assert str(caught.value).isprintable()
 
 
-def test_value_missing_from_mapping_and_prior_is_refused(tmp_path):
+def test_value_missing_from_both_mapping_and_prior_is_refused(tmp_path):
     log = tmp_path / "free_1.csv"
     log.touch()
     cases = [

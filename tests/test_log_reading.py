@@ -50,7 +50,7 @@ def test_log_is_read_as_it_was_written(tmp_path):
     assert set(one.contact_index) == set(two.contact_index) == {0}
 
 
-def test_text_dialects_and_parquet_are_read_alike(tmp_path):
+def test_text_log_dialects_and_parquet_give_the_same_campaign(tmp_path):
     plain = read(write_csv(tmp_path / "a.csv", LOG))
     same(plain, read(write_csv(tmp_path / "b.txt", LOG, delimiter="\t")))
     head = "Logger 3.1\nstarted 06/29/2022, 04:05\n"
@@ -90,7 +90,7 @@ def test_log_units_signs_and_offsets_are_applied(tmp_path):
     np.testing.assert_allclose(force, LOG["F"], rtol=1e-14, atol=1e-14)
 
 
-def test_log_runs_are_cut_by_begin_and_end_by_mode_and_by_index(tmp_path):
+def test_log_is_divided_into_runs_by_times_by_mode_column_or_by_index_column(tmp_path):
     path = write_csv(
         tmp_path / "a.csv", LOG | {"state": np.repeat([0, 7], 600), "touch": np.repeat([4, 2], 600)}
     )
@@ -108,7 +108,7 @@ def test_log_runs_are_cut_by_begin_and_end_by_mode_and_by_index(tmp_path):
         read(path, mode={"column": "state", "values": {"0": "contact"}})
 
 
-def test_contact_with_a_gap_stays_one_contact(tmp_path):
+def test_logged_contact_with_lost_rows_is_a_single_contact(tmp_path):
     log = touches(2)
     deep = int(np.argmax(log["F"][:600]))
     cut = {name: np.delete(one, slice(deep - 8, deep + 8)) for name, one in log.items()}
@@ -117,7 +117,7 @@ def test_contact_with_a_gap_stays_one_contact(tmp_path):
     assert runs[1].tick[0] - runs[0].tick[-1] == 17
 
 
-def test_simulated_run_is_read_as_it_was(tmp_path):
+def test_log_of_simulated_run_is_read_back_as_simulated(tmp_path):
     mechanism = load("varying").mechanism
     run = jaxhil.simulate(mechanism)
     run.to_csv(tmp_path / "run.csv")
@@ -156,7 +156,7 @@ def edit(path: Path, row: int, cell: int, text: str) -> Path:
         (0, 2, "xd", "column 'xd': found 2 columns, expected one"),
     ],
 )  # fmt: skip
-def test_unusable_cells_are_refused(tmp_path, row, cell, text, reason):
+def test_unusable_cells_of_log_files_are_refused(tmp_path, row, cell, text, reason):
     path = edit(write_csv(tmp_path / "a.csv", LOG), row, cell, text)
     with pytest.raises(InputError) as caught:
         read(path)
@@ -191,7 +191,7 @@ def test_unusable_log_files_are_refused(tmp_path):
         read_campaign([])
 
 
-def test_contact_requires_its_force_and_a_free_run_none(tmp_path):
+def test_logged_contact_requires_force_and_free_run_requires_no_force(tmp_path):
     path = write_csv(tmp_path / "a.csv", sway())
     (run,) = read(path, "free").runs
     assert run.force_measured is None and run.contact_index is None and run.kind == "free"

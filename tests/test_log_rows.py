@@ -25,7 +25,7 @@ def cut(lost, without=(), cuts=()):
 
 
 @pytest.mark.parametrize(("lost", "error"), [(1, 1e-17), (2, 1e-17), (3, 1e-8)])
-def test_lost_commands_are_restored_as_the_model_made_them(lost, error):
+def test_lost_commands_are_restored_by_the_numerical_model(lost, error):
     gone = np.arange(TOUCH, TOUCH + lost)
     (result,) = cut(gone)
     np.testing.assert_array_equal(result.tick, np.arange(1200))
@@ -37,7 +37,7 @@ def test_lost_commands_are_restored_as_the_model_made_them(lost, error):
     assert set(result.channels["contact_index"]) == {0, 1}
 
 
-def test_lost_commands_without_the_model_are_mostly_restored_by_a_cubic():
+def test_lost_commands_without_model_are_mostly_restored_by_cubic_interpolation():
     (result,) = cut([TOUCH, TOUCH + 1], without=["force_command"])
     assert np.max(np.abs(result.channels["position_desired"] - LOG["xd"])) < 1e-7
     (many,) = cut([TOUCH, TOUCH + 4, TOUCH + 6, TOUCH + 7, 1198], without=["velocity_desired"])
@@ -45,7 +45,7 @@ def test_lost_commands_without_the_model_are_mostly_restored_by_a_cubic():
     assert len(many.tick) == 1200
 
 
-def test_log_is_divided_at_longer_gaps_and_cuts():
+def test_log_is_divided_at_long_gaps_and_specified_times():
     first, second, third = cut(
         np.arange(300, 300 + MAX_RECONSTRUCTED_ROWS + 1), cuts=[700 - MAX_RECONSTRUCTED_ROWS - 1]
     )

@@ -81,11 +81,11 @@ NO_COMMAND = {"force_command": None}
         ({"vd": -1.0}, {}, "velocity_desired: found -1 times the rate"),
     ],
 )
-def test_channel_in_a_wrong_unit_is_refused_with_factor_and_unit(tmp_path, factors, said, reason):
+def test_log_channel_in_wrong_unit_is_refused_with_factor_and_unit(tmp_path, factors, said, reason):
     assert reason in refused(tmp_path, scaled(LOG, **factors), **said)
 
 
-def test_wrong_mass_of_a_few_percent_is_found(tmp_path):
+def test_mass_error_of_a_few_percent_is_detected_from_log(tmp_path):
     result = refused(tmp_path, scaled(LOG, Fc=1.03))
     assert "(nearest: 360.5 kg): force_command is 1.03 times" in result
     assert read(write_csv(tmp_path / "b.csv", scaled(LOG, Fc=1.005))).notes == ()
@@ -106,7 +106,7 @@ REAL = {
 
 @pytest.mark.parametrize("name", REAL)
 @pytest.mark.parametrize("without", [(), ("velocity_desired",)])
-def test_force_command_is_used_in_logs_of_real_loggers(tmp_path, name, without):
+def test_force_command_column_is_used_in_rounded_logs(tmp_path, name, without):
     log, gone = REAL[name](LOG), dict.fromkeys(without)
     result = read(write_csv(tmp_path / "a.csv", log), **gone)
     assert result.notes == () and all(run.force_command is not None for run in result.runs)
@@ -115,7 +115,7 @@ def test_force_command_is_used_in_logs_of_real_loggers(tmp_path, name, without):
     assert "accelerate the approach" in refused(tmp_path, scaled(log, Fc=-1.0), **gone)
 
 
-def test_uninformative_force_command_is_ignored_with_a_note(tmp_path):
+def test_uninformative_force_command_column_is_ignored_with_a_note(tmp_path):
     noise = LOG | {"Fc": 5.0 * np.random.default_rng(0).standard_normal(len(LOG["t"]))}
     result = read(write_csv(tmp_path / "a.csv", noise))
     (note,) = result.notes
@@ -127,7 +127,7 @@ def test_uninformative_force_command_is_ignored_with_a_note(tmp_path):
     assert "force in lbf" in refused(tmp_path, scaled(noise, F=1 / LBF))
 
 
-def test_velocity_that_does_not_match_is_ignored_with_a_note(tmp_path):
+def test_velocity_column_that_contradicts_position_is_ignored_with_a_note(tmp_path):
     noise = LOG | {"vd": 5e-3 * np.random.default_rng(0).standard_normal(len(LOG["t"]))}
     result = read(write_csv(tmp_path / "a.csv", noise))
     assert "velocity_desired: ignored, because it is not the rate of position_desired" in "\n".join(
@@ -136,14 +136,14 @@ def test_velocity_that_does_not_match_is_ignored_with_a_note(tmp_path):
     assert all(run.velocity_desired is None for run in result.runs)
 
 
-def test_undetermined_row_is_noted(tmp_path):
+def test_undetermined_tick_of_log_readings_is_reported(tmp_path):
     coarse = rounded(scatter(LOG, 2e-4, samples=True), xd=2e-6, vd=1e-4)
     assert "timing.row: not checked: force_command is too coarse" in "\n".join(
         read(write_csv(tmp_path / "a.csv", coarse)).notes
     )
 
 
-def test_compensator_damping_and_dead_zone_are_not_taken_for_a_wrong_unit(tmp_path):
+def test_compensator_damping_and_dead_zone_are_not_mistaken_for_wrong_unit(tmp_path):
     """Allow for the impulse that the compensator adds and the dead zone takes."""
     log = touches(1, speed=12e-3, noise=0.0)
     dead = log | {"F": np.sign(log["F"]) * np.maximum(np.abs(log["F"]) - 45.0, 0.0)}
@@ -163,7 +163,7 @@ def test_compensator_damping_and_dead_zone_are_not_taken_for_a_wrong_unit(tmp_pa
     lost=st.sampled_from([0.0, 0.01, 0.1]),
     seed=st.integers(0, 99),
 )
-def test_force_command_is_right_or_refused_in_any_log(factor, quantum, noise, lost, seed):
+def test_force_command_column_is_read_correctly_or_refused_in_any_log(factor, quantum, noise, lost, seed):
     log = {name: column[:500] for name, column in touches(1, noise=noise, seed=seed).items()}
     x = quantum * np.round(log["xd"] / quantum) if quantum else log["xd"]
     valid = np.random.default_rng(seed).uniform(size=len(x)) >= lost
@@ -183,7 +183,7 @@ def test_force_command_is_right_or_refused_in_any_log(factor, quantum, noise, lo
 
 
 @pytest.mark.parametrize("quantum", [0.0, 1e-9, 1e-7, 1e-6])
-def test_integrator_is_recognised_under_rounding(quantum):
+def test_integrator_is_identified_from_rounded_log(quantum):
     log = touches(1, noise=1.0)
     v = log["vd"][:500]
     ways = {"semi_implicit_euler": v[1:], "explicit_euler": v[:-1], "zoh": (v[1:] + v[:-1]) / 2}
@@ -193,7 +193,7 @@ def test_integrator_is_recognised_under_rounding(quantum):
         assert detect_integrator(coarse, v, PERIOD) == name
 
 
-def test_scale_and_its_error_cover_the_truth():
+def test_scale_fit_has_stated_standard_error():
     random, off = np.random.default_rng(0), []
     unit = np.sin(np.arange(400) / 20.0)
     for _ in range(300):
@@ -204,19 +204,19 @@ def test_scale_and_its_error_cover_the_truth():
     assert fit_scale(np.zeros(9), np.ones(9)) is None and fit_scale(np.ones(9), np.zeros(9)) is None
 
 
-def test_units_are_named_by_their_factors():
+def test_wrong_units_are_named_by_conversion_factor():
     assert ask_for_unit((0.225,), 0.02) == " (force in lbf, read as N?)"
     assert ask_for_unit((1.3,), 0.02) == ask_for_unit((-4.448,), 0.02) == ""
     assert ask_for_length_unit(1 / 25.4, 0.01) == " (in in, read as mm?)"
 
 
-def test_campaign_of_several_files_names_the_wrong_one(tmp_path):
+def test_campaign_of_several_log_files_reports_the_file_with_wrong_unit(tmp_path):
     good, bad = write_csv(tmp_path / "a.csv", LOG), write_csv(tmp_path / "b.csv", scaled(LOG, F=1 / LBF))
     with pytest.raises(InputError, match=r"b.csv: force_measured: found 0.2"):
         read_campaign([good, bad], mapping())
 
 
-def test_note_on_several_logs_is_given_once(tmp_path):
+def test_note_that_applies_to_several_logs_is_printed_once(tmp_path):
     log = LOG | {"vd": 0.0 * LOG["vd"]}  # loggers write a channel like this if it is not connected
     paths = [write_csv(tmp_path / f"{name}.csv", log) for name in "abc"]
     (note,) = read_campaign(paths, mapping()).notes

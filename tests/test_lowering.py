@@ -59,11 +59,11 @@ def jacobian(name, compensator):
     return calls(jax.jacfwd(errors), np.array([*gains.values()], float), scenarios)
 
 
-def test_batch_lowers_for_cuda_without_external_calls():
+def test_rollout_batch_lowers_for_cuda_without_external_calls():
     assert batch("varying", "none") == set()
 
 
-def test_tuning_lowers_for_cuda(monkeypatch):
+def test_tuning_program_lowers_for_cuda(monkeypatch):
     """Lower the whole solver; the card's own Cholesky decomposition computes its steps."""
     programs = []
     monkeypatch.setattr(cached_programs, "compile_cached", lambda *program, options: programs.append(program))
@@ -73,7 +73,7 @@ def test_tuning_lowers_for_cuda(monkeypatch):
     assert result == CHOLESKY
 
 
-def test_callback_into_python_is_detected():
+def test_python_callback_in_lowered_program_is_detected():
     like = jax.ShapeDtypeStruct((), float)
     with pytest.raises(ValueError, match="different from the lowering platform cuda"):
         calls(lambda x: jax.pure_callback(np.sin, like, x), 1.0)
@@ -82,20 +82,20 @@ def test_callback_into_python_is_detected():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "compensator"), ONE_AXIS)
-def test_every_law_and_its_derivatives_lower_for_cuda(name, compensator):
+def test_every_compensator_and_derivatives_lower_for_cuda(name, compensator):
     assert batch(name, compensator) == set()
     assert jacobian(name, compensator) == set()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compensator", SIX_AXIS_COMPENSATORS)
-def test_six_axes_and_their_derivatives_lower_for_cuda(compensator):
+def test_six_axis_rollout_and_derivatives_lower_for_cuda(compensator):
     """Solve six equations in six unknowns by the card's own routine."""
     assert batch("probe-drogue", compensator) <= LINEAR_EQUATIONS
     assert jacobian("probe-drogue", compensator) <= LINEAR_EQUATIONS
 
 
-def test_compiler_options_for_cpus_go_to_cpus_only(monkeypatch):
+def test_cpu_compiler_options_are_passed_only_to_cpu_compiler(monkeypatch):
     assert supported_options(ROLLOUT_OPTIONS) == ROLLOUT_OPTIONS
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert supported_options(ROLLOUT_OPTIONS) == {}
@@ -104,7 +104,7 @@ def test_compiler_options_for_cpus_go_to_cpus_only(monkeypatch):
 @pytest.mark.parametrize(
     ("plugin", "platforms", "given"), ((None, "", True), ("there", "", False), ("there", "cpu", True))
 )
-def test_less_optimisation_is_asked_of_the_cpu_compiler_only(monkeypatch, plugin, platforms, given):
+def test_reduced_optimisation_flag_is_set_only_if_jax_uses_cpus_alone(monkeypatch, plugin, platforms, given):
     """Cover a jax plugin, as a graphics card needs one, that jax is not told to leave out."""
     monkeypatch.setattr(jax_environment, "find_spec", {"jax_plugins": plugin}.get)
     monkeypatch.setenv("JAX_PLATFORMS", platforms)

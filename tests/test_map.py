@@ -54,7 +54,7 @@ def simulated_growth(run, period):
 @pytest.mark.slow
 @pytest.mark.parametrize("changes", RIGS.values(), ids=RIGS)
 @pytest.mark.parametrize("compensator", LINEAR_COMPENSATORS)
-def test_growth_on_the_map_is_that_of_a_long_simulated_contact(compensator, changes):
+def test_stability_map_growth_rate_equals_that_of_long_simulated_contact(compensator, changes):
     mechanism = jaxhil.load("varying", SOFT | changes)
     result = compute_growth(
         mechanism, compensator, literature_gains(mechanism, compensator), build_scenarios(mechanism)
@@ -65,7 +65,7 @@ def test_growth_on_the_map_is_that_of_a_long_simulated_contact(compensator, chan
 
 
 @pytest.mark.slow
-def test_map_derivatives_by_gains_are_finite_differences():
+def test_stability_map_derivatives_by_gains_match_finite_differences():
     mechanism = jaxhil.load("varying", {"uncertainty": {}})
     gains, scenarios = literature_gains(mechanism, "phase_lead"), build_scenarios(mechanism)
     slopes = compute_growth(mechanism, "phase_lead", gains, scenarios).by_gain
@@ -79,7 +79,7 @@ def test_map_derivatives_by_gains_are_finite_differences():
         assert slopes[name] == pytest.approx(difference, rel=1e-5)
 
 
-def test_growth_agrees_with_closed_forms():
+def test_stability_map_growth_rate_agrees_with_closed_forms():
     phases = np.array([0.02, 0.05, 0.2, 0.7])
     assert restitution_by_series(phases) == pytest.approx(
         [delayed_restitution(phase) for phase in phases], abs=1e-6
@@ -118,7 +118,7 @@ def ideal(tmp_path_factory):
     return tuning.map(mechanism, across, up, points=5, limit=0.2, folder=folder), folder
 
 
-def test_map_of_an_uncompensated_contact_is_that_of_theory(ideal):
+def test_stability_map_of_uncompensated_contact_agrees_with_theory(ideal):
     result, folder = ideal
     document = json.loads((folder / "map.json").read_text())
     assert (folder / "map.png").stat().st_size > 20_000 and document["sha256"] == result.document["sha256"]
@@ -138,7 +138,7 @@ def growing(found, restitution):
     return np.exp(roots.real * frequency * 0.001)
 
 
-def test_margins_end_at_the_stability_limit(ideal):
+def test_margins_of_stability_map_end_at_the_error_limit(ideal):
     result, _ = ideal
     nominal = result.document["nominal"]
     [stiffness, delay] = (nominal["margins"]["error"][axis] for axis in "xy")
@@ -150,7 +150,7 @@ def test_margins_end_at_the_stability_limit(ideal):
     assert math.sqrt(stiffness["high"] / 350.0) * 0.004 == pytest.approx(phase, rel=1e-2)
 
 
-def test_map_has_the_requested_axes(ideal):
+def test_stability_map_has_the_requested_axes(ideal):
     result, _ = ideal
     assert result.x[[0, -1]] == pytest.approx([5e4, 4e5]) and result.y[[0, -1]] == pytest.approx([5e-4, 8e-3])
     assert result.error.shape == (5, 5) and result.document["x"]["nominal"] == 124355.0
@@ -169,13 +169,13 @@ def test_map_has_the_requested_axes(ideal):
         (("contact.stiffness", "rig.simulator.time_constant"), "found no value"),
     ],
 )
-def test_map_refuses_unusable_arguments(jaxhil, tmp_path, axes, said):
+def test_stability_map_refuses_unusable_arguments(jaxhil, tmp_path, axes, said):
     ended = jaxhil("map", "varying", "--x", axes[0], "--y", axes[1], "-o", str(tmp_path))
     assert ended.code == 2 and said in ended.err and ended.out == ""
 
 
 @pytest.mark.slow
-def test_map_reaches_theoretical_limits_at_small_control_periods():
+def test_stability_map_reaches_theoretical_limits_at_small_control_periods():
     """Compare the contours of items 1 and 2 and the growth limit of item 5, each to 1e-3."""
     axes = "contact.stiffness=5e4:2e5", "rig.force_sensor.delay=0.0005:0.008"
     for period, allowed in ((4e-4, 1e-3), (1e-4, 1e-4)):
@@ -200,7 +200,7 @@ def test_map_reaches_theoretical_limits_at_small_control_periods():
 @pytest.mark.slow
 @pytest.mark.users_options
 @pytest.mark.parametrize("compensator", sorted(COMPENSATORS))
-def test_map_of_100_by_100_points_takes_at_most_20_s(compensator):
+def test_stability_map_of_100_by_100_points_takes_at_most_20_s(compensator):
     axes = "contact.stiffness", "rig.force_sensor.delay=0.001:0.008"
     took = spent = 0.0
     for _ in range(2):
@@ -214,7 +214,7 @@ def test_map_of_100_by_100_points_takes_at_most_20_s(compensator):
 
 @pytest.mark.slow
 @pytest.mark.users_options
-def test_map_on_a_cluster_is_the_same_to_the_bit(tmp_path):
+def test_stability_map_computed_on_a_cluster_is_bit_identical(tmp_path):
     asked = {"x": "rig.force_sensor.delay", "y": "contact.stiffness", "points": 60}
     here = tuning.map("varying", **asked)
     with started(tmp_path) as cluster:
@@ -223,7 +223,7 @@ def test_map_on_a_cluster_is_the_same_to_the_bit(tmp_path):
     assert there.document == here.document
 
 
-def test_interrupted_map_resumes(tmp_path, monkeypatch):
+def test_interrupted_stability_map_computation_resumes(tmp_path, monkeypatch):
     monkeypatch.setattr(grid, "MAX_TILE_RUNS", 128)
     asked = {"x": "rig.force_sensor.delay", "y": "contact.stiffness", "points": 8}
     whole = tuning.map("varying", **asked, folder=tmp_path / "whole")

@@ -48,7 +48,7 @@ MAY_BE_INFINITE = [
 ]
 
 
-def test_mechanism_table_is_read_value_by_value():
+def test_every_value_of_mechanism_table_is_read():
     mechanism = from_plain_data(FULL, "f")
     for path in leaves():
         if path != "uncertainty":
@@ -63,7 +63,7 @@ def test_mechanism_table_is_read_value_by_value():
     assert mechanism.uncertainty["rig.force_sensor.delay"].independent
 
 
-def test_mechanism_keys_have_their_defaults():
+def test_missing_mechanism_keys_get_documented_defaults():
     raw = {"schema": FULL["schema"], "name": "n", "bodies": {"equivalent_mass": 1}}
     raw |= {"approach": {"velocity": 1}, "contact": {"law": "linear", "stiffness": 5}}
     raw |= {"rig": {"control_period": 0.001, "simulator": {"model": "ideal"}}}
@@ -83,7 +83,7 @@ def test_mechanism_keys_have_their_defaults():
         assert getattr(rig.position_sensor, name) == 0.0
 
 
-def test_equivalent_mass_of_two_bodies():
+def test_equivalent_mass_is_computed_from_both_masses():
     assert Bodies(chaser_mass=300.0, target_mass=600.0).mass == 200.0
     assert Bodies(equivalent_mass=7.0).mass == 7.0
     with pytest.raises(ValueError, match="bodies"):
@@ -91,18 +91,18 @@ def test_equivalent_mass_of_two_bodies():
 
 
 @pytest.mark.parametrize("path", REQUIRED)
-def test_missing_key_is_named(path):
+def test_missing_mechanism_key_is_named_in_error(path):
     assert f": {path}: found nothing" in refusal(changed({path: ...}))
 
 
 @pytest.mark.parametrize("path", sorted(set(leaves()) - set(REQUIRED)))
-def test_other_keys_may_be_missing(path):
+def test_optional_mechanism_keys_may_be_missing(path):
     assert isinstance(from_plain_data(changed({path: ...}), "f"), Mechanism)
 
 
 @pytest.mark.parametrize("path", [*leaves(), *(table[:-1] for table in tables() if table)])
 @pytest.mark.parametrize("value", ["a\nb\x1b[31m", True, {"x": 1}, [[[1.0]]], b"raw", -1e308])
-def test_wrong_type_is_named(path, value):
+def test_wrong_type_of_mechanism_value_is_named_in_error(path, value):
     if (path == "contact.tension" and value is True) or path in ("name", "source"):
         value = 3
     if path == "rig.force_sensor.bias" and isinstance(value, float):
@@ -113,7 +113,7 @@ def test_wrong_type_is_named(path, value):
 
 @pytest.mark.parametrize("table", [*tables()])
 @pytest.mark.parametrize("key", ["unknown", "", "new\nline", "\x1b[31m" * 50, '"\\', "\ud800"])
-def test_unknown_key_is_named(table, key):
+def test_unknown_mechanism_key_is_named_in_error(table, key):
     raw = changed()
     node = raw
     for part in table.split(".")[:-1]:
@@ -123,7 +123,7 @@ def test_unknown_key_is_named(table, key):
     assert f": {table}" in message and "unknown key" in message
 
 
-def test_misspelt_key_gets_a_hint():
+def test_error_for_misspelt_mechanism_key_suggests_correct_key():
     message = refusal(changed({"contact.stiffness": ..., "contact.stifness": 1e5}))
     assert "contact.stifness: found an unknown key" in message
     assert "did you mean stiffness?" in message
@@ -131,7 +131,7 @@ def test_misspelt_key_gets_a_hint():
 
 @pytest.mark.parametrize("path", [*numeric_keys()])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 10**400, -(10**400)])
-def test_numbers_must_be_finite_unless_the_key_allows(path, value):
+def test_non_finite_mechanism_values_are_refused_unless_key_allows_infinity(path, value):
     listed = [value, 1.0, 1.0] if isinstance((OF_OTHERS | dict(flat(FULL))).get(path), list) else value
     base = changed()
     if path in ("bodies.chaser_mass", "bodies.target_mass"):
@@ -152,7 +152,7 @@ def flat(node, path=""):
 
 
 @pytest.mark.parametrize("path", sorted(set(numeric_keys()) & set(leaves())))
-def test_zero_and_negative_values_are_accepted_or_refused_by_key(path):
+def test_zero_and_negative_mechanism_values_are_refused_if_key_forbids_them(path):
     nominal = dict(flat(FULL))[path]
     signed = ("contact_plane", "force_sensor.bias")
     may_be_negative = path.removeprefix("rig.") in signed
@@ -190,7 +190,7 @@ def test_zero_and_negative_values_are_accepted_or_refused_by_key(path):
         ("schema", "jaxhil/mechanism/1", "jaxhil/mechanism/2"),
     ],
 )
-def test_edges_of_ranges_are_accepted_and_values_beyond_are_refused(path, inside, outside):
+def test_mechanism_values_at_range_limits_are_accepted_and_beyond_refused(path, inside, outside):
     assert isinstance(from_plain_data(changed({path: inside}), "f"), Mechanism)
     message = refusal(changed({path: outside}))
     assert f": {path}" in message and ", expected " in message
@@ -205,20 +205,20 @@ def test_edges_of_ranges_are_accepted_and_values_beyond_are_refused(path, inside
         ("bodies.equivalent_mass", 1e-100, 1e-320),
     ],
 )
-def test_edges_of_ranges_of_another_law_are_accepted_and_beyond_refused(path, inside, outside):
+def test_hunt_crossley_values_at_range_limits_are_accepted_and_beyond_refused(path, inside, outside):
     base = changed({"contact.law": "hunt_crossley"})
     assert value_at(from_plain_data(changed({path: inside}, base), "f"), path) in (inside, [inside])
     assert f": {path}" in refusal(changed({path: outside}, base))
 
 
-def test_contact_depths_must_increase():
+def test_contact_segment_depths_must_increase():
     assert from_plain_data(changed(LAYERED), "f").contact.depths == LAYERED["contact.depths"]
     for wrong in ([0.001, 0.001], [0.0, 0.001], [0.001, -0.1]):
         assert ": contact.depths[" in refusal(changed({**LAYERED, "contact.depths": wrong}))
 
 
 @pytest.mark.parametrize("value", [1e-320, -1e-320, 1e-101, 1.1e100, -1.7e308])
-def test_numbers_that_overflow_or_vanish_in_products_are_refused(value):
+def test_mechanism_values_that_overflow_or_underflow_in_products_are_refused(value):
     message = refusal(changed({"rig.force_sensor.bias": value}))
     assert f": found {value}, expected a finite number of N, of a magnitude from 1e-100 to 1e+100" in message
 
@@ -231,7 +231,7 @@ def test_numbers_that_overflow_or_vanish_in_products_are_refused(value):
     ),
     st.data(),
 )
-def test_any_value_at_any_key_is_accepted_or_refused_in_one_line(value, data):
+def test_any_value_of_any_mechanism_key_is_accepted_or_refused_in_one_line(value, data):
     path = data.draw(st.sampled_from([*leaves(), *(table[:-1] for table in tables() if table)]))
     raw = changed({path: value})
     try:
@@ -244,14 +244,14 @@ def test_any_value_at_any_key_is_accepted_or_refused_in_one_line(value, data):
 
 @settings(deadline=None)
 @given(st.text(), st.integers(3, 80))
-def test_shown_and_one_line_are_short_and_printable(text, limit):
+def test_formatted_values_in_messages_are_short_and_printable(text, limit):
     assert to_one_line(text).isprintable()
     assert to_one_line(text, limit).isprintable() and len(to_one_line(text, limit)) <= limit
     assert format_value(text).isprintable() and len(format_value(text)) <= 60
     assert format_value([text]).isprintable() and len(format_value([text])) <= 60
 
 
-def test_shown_handles_values_without_text():
+def test_message_format_handles_deeply_nested_lists_and_huge_numbers():
     nested = []
     for _ in range(100_000):
         nested = [nested]

@@ -31,7 +31,7 @@ from jaxhil.mechanism.toml_table import MAX_BYTES
 TEXT = builtin_path("claw-350kg").read_text()
 
 
-def test_builtin_mechanisms_are_the_documented_ones():
+def test_builtin_mechanisms_equal_documented_list():
     names = "claw-350kg layered rattling rig-300kg rod-100n-mm varying"
     assert builtin_names() == names.split()
     assert load() == load(DEFAULT_MECHANISM) == load("varying")
@@ -41,7 +41,7 @@ SUITES = "damped dead-zone depth-damped elastoplastic fast friction hardening he
 SUITES += " mixed noise-free noisy plane preload rattling repeated"
 
 
-def test_suites_are_the_documented_ones():
+def test_mechanism_suites_equal_documented_list():
     assert suite_names() == [f"suite-{name}" for name in SUITES.split()]
     for name in suite_names():
         mechanism, _, label = load(name)
@@ -60,7 +60,7 @@ def test_builtin_mechanism_has_name_digest_and_source(name):
     assert mechanism.rig.force_sensor.noise_std == 0.0
 
 
-def test_builtins_have_frequency_and_damping_ratio_of_their_comments():
+def test_builtin_mechanisms_have_frequency_and_damping_ratio_stated_in_comments():
     for name, frequency, ratio in (
         ("rig-300kg", 3.0, 0.0),
         ("claw-350kg", 3.0, 0.03),
@@ -74,7 +74,7 @@ def test_builtins_have_frequency_and_damping_ratio_of_their_comments():
         assert mechanism.contact.damping[0] == pytest.approx(damping, rel=2e-4)
 
 
-def test_mechanism_file_is_read_like_the_builtin(written):
+def test_copied_mechanism_file_is_read_like_the_builtin_mechanism(written):
     path = written(TEXT)
     loaded = load(path)
     assert loaded.mechanism == load(str(path)).mechanism == load("claw-350kg").mechanism
@@ -82,7 +82,7 @@ def test_mechanism_file_is_read_like_the_builtin(written):
     assert load(written("\ufeff" + TEXT.replace("\n", "\r\n"))).mechanism == loaded.mechanism
 
 
-def test_path_is_never_taken_for_a_builtin(tmp_path, monkeypatch):
+def test_mechanism_path_is_never_mistaken_for_builtin_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "no such file" in file_refusal(Path("varying"))
 
@@ -114,7 +114,7 @@ def test_unusable_mechanism_file_content_is_refused(written, content, reason):
     assert message.startswith(f"{path}: ") and reason in message
 
 
-def test_long_texts_and_lists_are_not_taken_for_long_keys(written):
+def test_long_texts_and_lists_in_mechanism_file_are_accepted(written):
     lists = ", ".join(["0.5 "] * 1000)
     text = TEXT.replace("[395.8]", f"[{lists}]") + "# " + "a.b" * 500
     text = text.replace('name = "claw-350kg"', f'name = "{"a." * 50}"')
@@ -138,7 +138,7 @@ def test_unreadable_mechanism_files_are_refused(tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root reads every file")
-def test_mechanism_file_without_permission_is_refused(written):
+def test_mechanism_file_without_read_permission_is_refused(written):
     path = written(TEXT)
     path.chmod(0)
     assert "Permission denied" in file_refusal(path)
@@ -146,7 +146,7 @@ def test_mechanism_file_without_permission_is_refused(written):
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cut=st.integers(0, len(TEXT) - 1))
-def test_truncated_mechanism_file_is_refused_or_complete(written, cut):
+def test_truncated_mechanism_file_is_refused_unless_still_complete(written, cut):
     """Cut the file anywhere: it is refused in one line, or the rest is a whole mechanism."""
     path = written(TEXT[:cut])
     try:
@@ -176,7 +176,7 @@ def test_mechanism_survives_round_trip_through_json(name):
     assert "null" not in text
 
 
-def test_from_builtins_refuses_what_is_no_table():
+def test_mechanism_data_that_are_not_a_table_are_refused():
     with pytest.raises(InputError, match=r"^a\\nfile: found \[1\], expected a table$"):
         from_plain_data([1], "a\nfile")  # pyright: ignore[reportArgumentType]
 
@@ -187,7 +187,7 @@ def test_mechanism_file_is_read_without_jax():
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
 
 
-def test_every_key_has_a_meaning_and_every_number_a_unit():
+def test_every_mechanism_key_has_a_description_and_every_number_a_unit():
     def keys(kind, path=""):
         fields = kind.type.fields if isinstance(kind, Metadata) else kind.fields
         for field in fields:

@@ -31,7 +31,7 @@ ELASTOPLASTIC = {
 
 
 @pytest.mark.parametrize("contact", [HARDENING, DEPTH_DAMPED, ELASTOPLASTIC], ids=lambda c: c["contact.law"])
-def test_contact_law_requires_its_key_and_checks_its_range(contact):
+def test_contact_law_requires_its_keys_and_checks_their_ranges(contact):
     name, key = contact["contact.law"], list(contact)[1]
     drawn = {"uncertainty": {key: {"distribution": "uniform", "factor": [1.0, 1.5]}}}
     mechanism = from_plain_data(changed({**contact, **drawn}), "f")
@@ -52,14 +52,14 @@ def test_contact_law_requires_its_key_and_checks_its_range(contact):
 
 
 @pytest.mark.parametrize("path", OF_OTHERS)
-def test_keys_of_other_laws_and_models_are_refused(path):
+def test_mechanism_keys_of_other_contact_laws_and_simulator_models_are_refused(path):
     message = refusal(changed({path: OF_OTHERS[path]}))
     assert f": {path}: found {OF_OTHERS[path]}, expected nothing (" in message
     uncertain = {path: {"distribution": "uniform", "factor": [0.5, 1.5]}}
     assert f': uncertainty."{path}": found ' in refusal(changed({"uncertainty": uncertain}))
 
 
-def test_unused_keys_of_a_law_may_be_at_their_default():
+def test_keys_that_contact_law_does_not_use_may_only_have_default_value():
     for law in (HARDENING, LAYERED):
         assert from_plain_data(changed({**law, "contact.exponent": 1.5, "contact.tension": False}), "f")
         for key, value, only in (
@@ -72,12 +72,12 @@ def test_unused_keys_of_a_law_may_be_at_their_default():
     assert '"contact.exponent": found a key only for law hunt' in refusal(changed({"uncertainty": drawn}))
 
 
-def test_preloaded_contact_has_no_damping():
+def test_preloaded_contact_law_refuses_damping():
     message = refusal(changed({"contact.law": "preloaded", "contact.damping": [3.0]}))
     assert ": contact.damping: found [3.0], expected 0 (law preloaded dissipates by friction)" in message
 
 
-def test_elastoplastic_contact_has_no_damping():
+def test_elastoplastic_contact_law_refuses_damping():
     message = refusal(changed({**ELASTOPLASTIC, "contact.damping": [0.0, 3.0]}))
     assert ": contact.damping: found [0.0, 3.0], expected 0 (law elastoplastic" in message
     drawn = {"contact.damping": {"distribution": "uniform", "low": 0.0, "high": 2.0}}
@@ -104,7 +104,7 @@ def test_elastoplastic_contact_has_no_damping():
         (IDEAL, "rig.command_hold"),
     ],
 )
-def test_keys_that_contradict_each_other_are_refused(changes, key):
+def test_mechanism_keys_that_contradict_each_other_are_refused(changes, key):
     assert f": {key}: found" in refusal(changed(changes))
 
 
@@ -121,7 +121,7 @@ def test_keys_that_contradict_each_other_are_refused(changes, key):
         {**IDEAL, "rig.command_hold": "linear"},
     ],
 )
-def test_mechanism_with_other_law_or_model_survives_round_trip(changes):
+def test_mechanism_of_every_law_and_model_survives_round_trip_through_json(changes):
     mechanism = from_plain_data(changed(changes), "f")
     assert from_plain_data(to_plain_data(mechanism), "f") == mechanism
 
@@ -144,7 +144,7 @@ def test_mechanism_with_other_law_or_model_survives_round_trip(changes):
         ),
     ],
 )
-def test_both_positions_start_inside_the_gap(changes, lag):
+def test_clearance_must_exceed_model_and_hardware_positions_at_start(changes, lag):
     # Free approach and phase, then latency, transport delay and lag of x_a.
     start = 0.005 * (0.02 + 0.001 + 0.001 + 0.004 + lag)
     changes = changes | {"rig.contact_plane": ...}
@@ -167,7 +167,7 @@ def test_velocity_limit_below_the_approach_speed_is_refused():
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_start_is_clear_of_the_contact_surface(side):
+def test_contact_plane_beyond_starting_position_is_refused(side):
     # Free approach and phase, then latency, transport delay and lag of x_a.
     plane = side * (0.02 - 0.99 * 0.005 * (0.026 + 2 * 0.8 / (2 * math.pi * 10.0)))
     changes = {"contact.clearance": 0.02}
@@ -196,7 +196,7 @@ def test_start_is_clear_of_the_contact_surface(side):
         ([1.0, 1.0], np.poly(-np.ones(20)).tolist(), None),
     ],
 )
-def test_transfer_function_is_accepted_or_refused_by_key(numerator, denominator, key):
+def test_unusable_transfer_function_is_refused_by_key(numerator, denominator, key):
     # A gap would have to be wider than the lag of some of these, so the contact is one-sided.
     changes = {**TRANSFER_FUNCTION, "contact.clearance": ...}
     changes |= {"rig.simulator.numerator": numerator, "rig.simulator.denominator": denominator}

@@ -75,13 +75,13 @@ def test_new_mechanism_file_has_every_key_at_its_default(written):
     assert load(written(live)).mechanism == load("rig-300kg").mechanism
 
 
-def test_new_mechanism_file_explains_itself():
+def test_new_mechanism_file_contains_description_of_every_key():
     text = format_mechanism_file(load("varying").mechanism)
     assert re.search(r"^velocity = 0\.005 +# speed of the first approach: a number > 0 m/s$", text, re.M)
     assert re.search(r"^#tension = false +# whether kelvin_voigt may pull: true or false$", text, re.M)
 
 
-def test_every_key_has_a_description():
+def test_mechanism_key_descriptions_state_unit_range_and_contact_laws():
     keys = {f"{table.path}.{key.name}": key for table in describe_tables() for key in table.keys}
     numbers = {path for path in keys if '"' not in path and keys[path].unit is not None}
     others = {"approach.contacts", "rig.command_latency", "correlation.matrix"}  # integer keys
@@ -106,13 +106,13 @@ class _Unitless(msgspec.Struct):
     ("kind", "reason"),
     [(_Silent, "drag: found no description"), (_Unitless, "drag: found no unit")],
 )
-def test_key_without_meaning_or_unit_is_refused(kind, reason):
+def test_mechanism_key_without_description_or_unit_raises_error(kind, reason):
     with pytest.raises(ValueError, match=reason):
         describe_tables(kind)
 
 
 @pytest.mark.parametrize("name", [*NAMES, *six_axis_names()])
-def test_schema_accepts_builtins(validator, name):
+def test_json_schema_accepts_builtin_mechanisms(validator, name):
     validator.validate(tomllib.loads(builtin_path(name).read_text(encoding="utf-8")))
 
 
@@ -128,7 +128,7 @@ def test_schema_accepts_builtins(validator, name):
         ("uncertainty", "contact.stiffness", {"distribution": "uniform", "factor": [0.5]}),
     ],
 )
-def test_schema_refuses_what_the_reader_refuses(validator, table, key, value):
+def test_json_schema_refuses_values_that_mechanism_reader_refuses(validator, table, key, value):
     document = to_plain_data(load("varying").mechanism)
     document[table][key] = value
     assert not validator.is_valid(document)
@@ -146,7 +146,7 @@ def test_schema_refuses_what_the_reader_refuses(validator, table, key, value):
         (("rig", "velocity_limit"), 1.0),
     ],
 )
-def test_schema_refuses_what_the_reader_of_six_axes_refuses(validator, path, value):
+def test_json_schema_refuses_values_that_six_axis_reader_refuses(validator, path, value):
     document = to_plain_data(load_any("probe-drogue").mechanism)
     assert validator.is_valid(document)
     *tables, key = path
@@ -154,7 +154,7 @@ def test_schema_refuses_what_the_reader_of_six_axes_refuses(validator, path, val
     assert not validator.is_valid(document)
 
 
-def test_schema_accepts_units_and_numbers_for_lists(validator):
+def test_json_schema_accepts_units_and_single_numbers_for_lists(validator):
     document = to_plain_data(load("varying").mechanism)
     document["contact"]["stiffness"] = 1e5
     validator.validate(document)

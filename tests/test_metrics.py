@@ -78,11 +78,11 @@ HUMP = 60 * np.sin(np.linspace(0, np.pi, 101))
         (np.tile([50, -50], 10), 9 * 100),
     ],
 )
-def test_excess_variation_of_known_sequences(commands, expected):
+def test_excess_variation_of_known_command_sequences_is_exact(commands, expected):
     assert recorded(commands) == pytest.approx(expected, abs=1e-11)
 
 
-def test_excess_variation_is_the_sum_by_hand():
+def test_excess_variation_equals_sum_computed_by_hand():
     commands = 60 * np.random.default_rng(0).normal(size=200)
     path = np.array([0, *commands, 0])
     assert recorded(commands) == pytest.approx(np.abs(np.diff(path)).sum() / 2 - np.ptp(path), rel=1e-13)
@@ -101,7 +101,7 @@ def test_excess_variation_counts_return_of_the_last_command_to_zero():
     assert float(excess(padded, touching)) == pytest.approx(0, abs=1e-11)
 
 
-def test_excess_variation_derivatives_are_those_of_the_sum():
+def test_excess_variation_derivatives_equal_those_of_explicit_sum():
     generator = np.random.default_rng(1)
     touching = (np.arange(400) >= BEFORE) & (np.arange(400) < BEFORE + len(HUMP))
     commands, way = np.zeros((2, 400))
@@ -117,7 +117,7 @@ def test_excess_variation_derivatives_are_those_of_the_sum():
     assert np.isfinite(slope(np.where(touching, 60.0, 0.0)))
 
 
-def test_contacts_without_identification_have_one_swing():
+def test_commands_of_compensators_without_identification_have_no_excess_variation():
     """Count the undershoot of a phase lead as part of its one swing."""
     for compensator, gains in (("none", {}), ("phase_lead", nominal_gains(PARSED, "phase_lead"))):
         recorded = first_contact(PARSED, spread(PARSED, 1), compensator, gains, chatter=True)

@@ -50,7 +50,7 @@ def fault(rates, name):
     return result
 
 
-def test_injected_delay_is_that_of_theory(rates):
+def test_injected_delay_that_reaches_error_limit_matches_theory(rates):
     """Use e = exp(pi omega tau/2) of a force delayed by tau; the error is LIMIT to BAND times LIMIT."""
     mechanism = load("claw-350kg", EXACT).mechanism
     omega = math.sqrt(mechanism.contact.stiffness[0] / mechanism.bodies.mass)
@@ -62,7 +62,7 @@ def test_injected_delay_is_that_of_theory(rates):
         assert one["size"] == pytest.approx(2 / (math.pi * omega) * math.log1p(one["error"]), rel=0.05)
 
 
-def test_fault_without_effect_is_not_counted(rates):
+def test_injected_fault_without_effect_is_not_counted(rates):
     # Without a compensator the position is not read, and there are no gains to remove.
     one = fault(rates, "position_delay")
     assert one["runs"] == 0 and not one["counted"] and one["size"] is None
@@ -74,13 +74,13 @@ def test_fault_without_effect_is_not_counted(rates):
     assert any("not counted" in text for text in describe_alarm_rates(rates))
 
 
-def test_watchdog_that_sees_every_error_misses_none(rates):
+def test_watchdog_that_detects_every_error_misses_no_injected_fault(rates):
     for name in ("force_delay", "simulator_delay"):
         assert fault(rates, name)["alarms"] == 0 and fault(rates, name)["high"] < 0.06
     assert rates["missed_alarms"]["runs"] == 0  # no draw is bad, so that nothing could be counted on draws
 
 
-def test_watchdog_without_a_margin_misses_every_fault():
+def test_watchdog_without_restitution_check_misses_every_injected_fault():
     blind = calibrated(restitution_margin=None)
     for name in ("force_delay", "simulator_delay"):
         one = fault(blind, name)
@@ -90,7 +90,7 @@ def test_watchdog_without_a_margin_misses_every_fault():
     assert any(text.startswith(start) for text in blind["reasons"])
 
 
-def test_gains_are_an_injected_fault_for_laws_that_work_without_them(rates):
+def test_neutral_gains_are_injected_as_fault_only_if_gains_have_an_effect(rates):
     result = calibrated("phase_lead")
     # Nothing is late here: the literature's lead is already 0, and there is nothing to remove.
     names = [kind.name for kind in INJECTED_FAULTS if kind.name != "gains"]
@@ -107,7 +107,7 @@ def test_gains_are_an_injected_fault_for_laws_that_work_without_them(rates):
         (0, 10, False, "unknown"),
     ],
 )
-def test_verdict_on_missed_alarms_follows_from_fault_runs(alarms, runs, counted, verdict):
+def test_verdict_on_missed_alarms_depends_on_runs_with_injected_faults(alarms, runs, counted, verdict):
     from tuning.statistics.intervals import binomial_interval
 
     def rate(alarms, runs):
@@ -134,13 +134,13 @@ def test_verdict_on_missed_alarms_follows_from_fault_runs(alarms, runs, counted,
     assert missed["verdict"] == "bad"
 
 
-def test_number_of_scenarios_follows_from_the_allowed_rate():
+def test_number_of_fault_scenarios_follows_from_allowed_missed_alarm_rate():
     assert count_fault_scenarios(0.02) == 2 * 183
     assert count_fault_scenarios(0.5) == 64 == count_fault_scenarios(1.0) and count_fault_scenarios(
         1e-6
     ) == MAX_FAULT_SCENARIOS == count_fault_scenarios(0.0)
 
 
-def test_good_sweep_has_a_positive_margin():
+def test_stated_error_margin_adds_watchdog_margin_and_offset():
     assert _error_margin(0.01, -0.004) == "+0.006 of the error"
     assert _error_margin(None, 0.1) == "none"

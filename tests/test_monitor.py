@@ -63,7 +63,7 @@ RARER = ("clean", "third_order", "resonance", "hertz", "layered")
 
 
 @pytest.mark.parametrize("name", (*EVERY, *(pytest.param(one, marks=pytest.mark.slow) for one in RARER)))
-def test_monitor_finds_no_deviation_without_noise(name):
+def test_monitor_reports_no_deviation_for_exact_file_without_noise(name):
     """Use a file whose laws, lags, latencies and holds are those of the independent rig."""
     kind = quiet(campaigns.KINDS[name])
     stated = {k: v for k, v in STATED.items() if k == "rig.force_sensor.delay"}
@@ -79,7 +79,7 @@ def test_monitor_finds_no_deviation_without_noise(name):
     assert np.all(np.abs(np.nan_to_num(value)) < bound)
 
 
-def test_monitor_of_a_matching_rig_scatters_as_predicted():
+def test_monitor_deviations_of_matching_rig_scatter_as_predicted():
     result = monitor_contacts(contacts(CLEAN, seed=3), file_of(CLEAN))
     assert result.state == "good" and result.alarm is None and result.changes == ()
     z = np.array([contact.z for contact in result.contacts])
@@ -101,7 +101,7 @@ DAILY = ("delay", "noise")
 @pytest.mark.parametrize(
     "what", [pytest.param(one, marks=() if one in DAILY else pytest.mark.slow) for one in CHANGES]
 )
-def test_monitor_finds_and_names_a_change(what):
+def test_monitor_detects_and_names_a_changed_parameter(what):
     other, name, value, within = CHANGES[what]
     before, after = contacts(CLEAN, seed=1, speeds=SPEEDS[:3]), contacts(other, seed=2, speeds=SPEEDS[:3])
     result = monitor_contacts(replace(before, runs=(*before.runs, *after.runs)), file_of(CLEAN))
@@ -115,7 +115,7 @@ def test_monitor_finds_and_names_a_change(what):
     assert f"since contact 4 of 6 (touch_0.csv): {result.changes[0].name}" in result.verdict
 
 
-def test_monitor_state_is_watch_if_the_file_covers_the_change():
+def test_monitor_state_is_watch_if_change_lies_within_stated_uncertainty():
     """Change a value within a wide range after contacts that showed where in the range the rig is."""
     wide = STATED | {"contact.stiffness": {"distribution": "uniform", "factor": [0.8, 1.2]}}
     before = contacts(CLEAN, seed=4, speeds=SPEEDS)
@@ -124,7 +124,7 @@ def test_monitor_state_is_watch_if_the_file_covers_the_change():
     assert result.state == "watch" and result.since == 6 and "covers it" in result.verdict
 
 
-def test_monitor_correlates_numbers_as_the_file_says():
+def test_monitor_uses_correlations_stated_in_mechanism_file():
     wide = STATED | {
         "contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0], "independent": True}
     }

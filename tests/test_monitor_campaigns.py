@@ -63,7 +63,7 @@ def test_monitor_raises_no_alarm_in_500_contacts_of_an_unchanged_rig(files):
 
 
 @pytest.mark.parametrize("number", (15, 60))
-def test_monitor_finds_drifts_early(files, number):
+def test_monitor_detects_drifts_early(files, number):
     """Let the stiffness grow by 15 %, or the force delay by 0.6 ms, over so many contacts."""
     result = {"stiffness [%]": [], "force delay [ms]": []}
     for seed, mechanism in enumerate(files):

@@ -17,7 +17,7 @@ CUSUM_LIMIT, AVERAGE_LIMIT = (
 )  # with 0.5 allowed and weight 0.2; together as rare as `ALARM_THRESHOLD`
 
 
-def test_change_point_agrees_with_calculation_by_hand():
+def test_monitor_change_point_equals_calculation_by_hand():
     z = np.array([[0.0, 1.0], [0.0, np.nan], [2.0, 1.0], [2.0, np.nan]])
     likelier, since = detect_changes(z)
     # (2 + 2)^2 / 2 and (1 + 1)^2 / 2: the unknown change point does not alter these.
@@ -52,7 +52,7 @@ def alarms(mean, lanes, contacts, rng):
     return first
 
 
-def test_first_alarm_is_that_of_the_charts():
+def test_first_monitor_alarm_equals_that_of_control_charts():
     """Compare the ratios that are counted here with those of `detect_changes`."""
     z = np.random.default_rng(2).standard_normal((40, 3)) + np.array([0.0, 1.5, -4.0])
     for figure in range(3):
@@ -70,7 +70,7 @@ class Silent:
 
 
 @pytest.mark.slow
-def test_charts_have_stated_false_alarm_rate_and_find_jumps_before_others():
+def test_control_charts_have_stated_false_alarm_rate_and_detect_as_fast_as_cusum():
     rng, contacts = np.random.default_rng(0), 4000
     first = alarms(lambda i: 0.0, 1500, contacts, rng)
     watched, raised = first.sum(axis=1), (first < contacts).sum(axis=1)

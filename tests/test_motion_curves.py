@@ -25,7 +25,7 @@ def pieces():
 
 
 @pytest.mark.slow
-def test_laws_side_by_side_move_as_each_alone(pieces):
+def test_nominal_motion_of_several_compensators_equals_separate_simulations(pieces):
     assert [list(piece.curves) for piece in pieces] == [["in space", *LAWS]] * 2
     for name in ("before", "literature", "tuned"):
         for piece, alone in zip(pieces, compute_nominal_motion(MECHANISM, {name: LAWS[name]}), strict=True):
@@ -37,7 +37,7 @@ def test_laws_side_by_side_move_as_each_alone(pieces):
     assert np.max(first["before"].force) != pytest.approx(np.max(first["literature"].force), rel=0.01)
 
 
-def test_first_ideal_contact_is_the_closed_form(pieces):
+def test_nominal_ideal_contact_motion_matches_closed_form(pieces):
     stiffness, mass = MECHANISM.contact.stiffness[0], MECHANISM.bodies.mass
     space, velocity = pieces[0].curves["in space"], MECHANISM.approach.velocity
     assert np.max(space.force) == pytest.approx(velocity * math.sqrt(stiffness * mass), rel=1e-3)

@@ -26,7 +26,7 @@ PHASES = (np.arange(8) + 0.5) / 8
 @pytest.mark.parametrize(
     ("frequency", "delay", "restitution"), list(itertools.product(FREQUENCIES, DELAYS, [0.1, 0.7, 1.0, 1.2]))
 )
-def test_placed_pole_is_a_root_of_the_characteristic_equation(frequency, delay, restitution):
+def test_pole_placed_by_lead_is_a_root_of_the_characteristic_equation(frequency, delay, restitution):
     gain, rate = pole_placement(frequency, delay, restitution)
     ratio = -log(restitution) / np.sqrt(pi**2 + log(restitution) ** 2)
     root = frequency * (-ratio + 1j * np.sqrt(1 - ratio**2))
@@ -40,14 +40,14 @@ def test_placed_pole_is_a_root_of_the_characteristic_equation(frequency, delay, 
 
 
 @pytest.mark.parametrize(("frequency", "delay"), list(itertools.product(FREQUENCIES, DELAYS)))
-def test_pole_placement_without_damping_is_the_closed_form(frequency, delay):
+def test_pole_placement_for_undamped_contact_matches_closed_form(frequency, delay):
     angle = frequency * delay
     expected = np.cos(angle), np.sin(angle) / frequency
     assert pole_placement(frequency, delay, 1.0) == pytest.approx(expected, rel=0, abs=1e-12)
 
 
 @pytest.mark.parametrize("bad", [(0.0, 0.01, 1.0), (1.0, np.inf, 1.0), (1.0, 0.01, 0.0), (1.0, 0.01, np.nan)])
-def test_pole_placement_refuses_what_has_no_pole(bad):
+def test_pole_placement_refuses_nonpositive_and_nonfinite_arguments(bad):
     with pytest.raises(InputError, match=r"^pole_placement: \w+: found .*, expected finite numbers > "):
         pole_placement(*bad)
 
@@ -61,13 +61,13 @@ def placed(phases):
     return {"force_gain": gain, "force_rate_gain": rate}, phase
 
 
-def test_loop_has_the_placed_pole():
+def test_simulated_loop_has_the_pole_placed_by_lead():
     gains, phase = placed([0.1, 0.3])
     result = without_period("multi_parameter_lead", 1.6, gains, force_sensor__delay=phase / OMEGA)
     np.testing.assert_allclose(np.exp(result), np.tile(DESIRED, 2), rtol=0, atol=1e-5)
 
 
-def test_contact_has_the_desired_restitution():
+def test_contact_under_placed_pole_has_the_desired_restitution():
     phases, periods = np.array([0.05, 0.1, 0.2, 0.4]), np.array([5e-4, 2.5e-4])
     gains, phase = placed(phases)
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, IDEAL, 0.0, period=periods[1]))
@@ -85,7 +85,7 @@ def test_contact_has_the_desired_restitution():
     assert np.all(error < 0.01 * (np.exp(pi * phases / 2) - 1)[:, None])
 
 
-def test_nominal_gains_are_within_bounds_for_long_delays_too():
+def test_nominal_multi_parameter_lead_gains_are_within_bounds_for_long_delays():
     delays = np.linspace(0.0, 0.5, 11)
     overrides = [[f"rig.force_sensor.delay={delay}"] for delay in delays]
     overrides += [["rig.command_hold=zoh", "rig.simulator.model=ideal", "rig.force_sensor.delay=0.0"]]
@@ -102,7 +102,7 @@ def test_nominal_gains_are_within_bounds_for_long_delays_too():
     assert len(signs) == 4
 
 
-def test_noise_amplification_of_multi_parameter_lead():
+def test_noise_amplification_of_multi_parameter_lead_matches_runtime():
     check_amplification(
         "multi_parameter_lead",
         [

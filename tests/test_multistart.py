@@ -38,7 +38,7 @@ def value(validation, index, start, objective=RMS_OBJECTIVE):
 
 
 @pytest.mark.slow
-def test_every_task_is_solved_under_its_own_objective(tasks, validation):
+def test_every_tuning_task_is_solved_with_its_own_objective(tasks, validation):
     """Compare the starts and ends of tasks together with those of each task alone."""
     several = [Objective(divergence_weight=weight) for weight in (1.0, 4.0, 16.0)]
     chosen = choose_starts(validation, 3, 0, several)
@@ -49,7 +49,7 @@ def test_every_task_is_solved_under_its_own_objective(tasks, validation):
         assert end.rms == pytest.approx(value(validation, i, end, objective), rel=1e-9)
 
 
-def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, validation):
+def test_starting_gains_are_literature_gains_and_best_points_of_a_scan(tasks, validation):
     chosen = choose_starts(validation, 4, seed=3)
     for index, (task, points) in enumerate(zip(tasks, chosen, strict=True)):
         assert validation.gains(index, points[0]) == pytest.approx(task.literature)
@@ -65,7 +65,7 @@ def test_starts_are_the_literature_and_the_best_of_a_scan(tasks, validation):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_scan_on_part_of_the_scenarios_chooses_as_if_on_all(seed, monkeypatch):
+def test_scan_with_part_of_scenarios_chooses_same_points_as_full_scan(seed, monkeypatch):
     runs = []
     work = SearchProgress()
     monkeypatch.setattr(work, "report_runs", runs.append)
@@ -79,7 +79,7 @@ def test_scan_on_part_of_the_scenarios_chooses_as_if_on_all(seed, monkeypatch):
 
 
 @pytest.mark.slow
-def test_best_start_is_polished(tasks, validation):
+def test_best_optimisation_result_is_refined_by_polishing_search(tasks, validation):
     """Stop the solver far too early, so that none is at its minimum; if all fail, none is polished."""
     early = solve_tasks(tasks, choose_starts(validation, 3, 0), 1)
     early[1] = [start._replace(rms=np.nan) for start in early[1]]
@@ -97,7 +97,7 @@ def test_best_start_is_polished(tasks, validation):
     assert polish_best_starts(validation, failed, 64, seed=0) == [None] * 3
 
 
-def test_batches_follow_until_starts_agree(tasks, validation, monkeypatch):
+def test_further_batches_of_starts_run_until_several_optima_agree(tasks, validation, monkeypatch):
     """Let one task's starts never agree, whatever they end at, and the others' at once."""
     asked = []
 
@@ -130,7 +130,7 @@ def test_batches_follow_until_starts_agree(tasks, validation, monkeypatch):
     assert result[1].evaluations == MAX_START_BATCHES * (FEW + 3 * 3) + 32
 
 
-def test_single_start_is_the_literature_and_is_polished(tasks, validation):
+def test_single_start_uses_literature_gains_and_polishing_search(tasks, validation):
     result = find_gains(validation, searched(1, 2, 32))
     for index, one in enumerate(result):
         (start,) = one.starts
@@ -139,7 +139,7 @@ def test_single_start_is_the_literature_and_is_polished(tasks, validation):
         assert one.best.rms == pytest.approx(value(validation, index, one.best), rel=1e-9)
 
 
-def test_other_work_is_done_while_the_solver_compiles(validation, monkeypatch):
+def test_callback_runs_once_while_the_solver_compiles(validation, monkeypatch):
     """Expect it once, before the first round."""
     done = []
     monkeypatch.setattr(multistart, "solve_tasks", lambda *_: done.append("round") or [[], [], []])
@@ -150,7 +150,7 @@ def test_other_work_is_done_while_the_solver_compiles(validation, monkeypatch):
 
 
 @pytest.mark.slow
-def test_best_start_is_the_best_by_the_objective_itself(tasks, validation):
+def test_best_start_is_selected_by_true_objective_instead_of_surrogate_norm(tasks, validation):
     """Let the solver lower a norm in place of the mean of the worst contacts; that mean counts."""
     objective = Objective("cvar")
     for index, one in enumerate(find_gains(validation, searched(3, 4, 16, objective))):
@@ -161,7 +161,7 @@ def test_best_start_is_the_best_by_the_objective_itself(tasks, validation):
         assert one.best.rms <= min(values)
 
 
-def test_failed_task_leaves_the_others_their_best_gains(tasks, validation):
+def test_failed_tuning_task_does_not_affect_best_gains_of_other_tasks(tasks, validation):
     broken = tasks[1].scenarios._replace(equivalent_mass=np.full(8, np.nan))
     sick = build_validation([tasks[0], dataclasses.replace(tasks[1], scenarios=broken), tasks[2]], 15, 0)
     result, healthy = (find_gains(one, searched(3, 2, 16)) for one in (sick, validation))
@@ -182,7 +182,7 @@ class Kinked:
         return {"x": float(coordinates[0]), "y": float(coordinates[1])}
 
 
-def test_stuck_start_is_searched_further_and_the_others_are_left():
+def test_only_stuck_optimisation_is_continued_by_polishing_search():
     corner, best = np.array([0.3, 0.3]), np.array([0.8, 0.8])
     starts = [
         StartResult("converged", 3, 1.0, [1.0], {"x": 0.8, "y": 0.8}, best),

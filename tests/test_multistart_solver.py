@@ -41,7 +41,7 @@ def validation(tasks):
     return build_validation(tasks, 15, 0)
 
 
-def test_every_start_is_accounted_for(solved):
+def test_every_optimisation_start_has_history_and_status(solved):
     for starts in solved:
         assert len(starts) == STARTS
         for start in starts:
@@ -59,14 +59,14 @@ def test_every_start_is_accounted_for(solved):
     assert any(start.status == GIVEN_UP for starts in solved for start in starts)
 
 
-def test_every_task_ends_as_it_does_alone(tasks, solved):
+def test_every_task_of_a_batch_reaches_same_optimum_as_alone(tasks, solved):
     for task, together in zip(tasks, solved, strict=True):
         (alone,) = solve_tasks([task], spread([task]), STEPS)
         best = min(start.rms for start in alone)
         assert min(start.rms for start in together) == pytest.approx(best, rel=1e-6)
 
 
-def test_failed_task_harms_no_other(tasks, solved):
+def test_failed_task_does_not_change_results_of_other_tasks(tasks, solved):
     broken = tasks[1].scenarios._replace(equivalent_mass=np.full(8, np.nan))
     sick = multistart_solver.dataclasses.replace(tasks[1], scenarios=broken)
     starts = solve_tasks([tasks[0], sick, tasks[2]], spread(tasks), STEPS)
@@ -75,7 +75,7 @@ def test_failed_task_harms_no_other(tasks, solved):
     assert all(start.rms == pytest.approx(3.0) or not np.isfinite(start.rms) for start in starts[1])
 
 
-def test_solver_lowers_the_requested_objective(tasks):
+def test_solver_reduces_the_requested_objective(tasks):
     """Weigh a squared divergence 16 times, so that less diverges; both objectives in one call."""
     objectives = [RMS_OBJECTIVE, Objective(divergence_weight=16.0)]
     plain, cautious = (
@@ -99,7 +99,7 @@ def test_global_search_uses_the_objective_of_the_solver(tasks, solved, validatio
         )
 
 
-def test_every_task_is_searched_under_its_own_objective(tasks, validation):
+def test_global_search_evaluates_every_task_with_its_own_objective(tasks, validation):
     """Compare the values, starts and ends of tasks together with those of each task alone."""
     several = [Objective(divergence_weight=4.0), Objective(noise_weight=0.01), Objective(noise_weight=0.1)]
     points = np.random.default_rng(0).random((2, 5, 2))
@@ -119,7 +119,7 @@ def restitution_errors_of(task, gains):
     return outcome.error[outcome.wanted]
 
 
-def test_long_tasks_are_spread_evenly_over_devices():
+def test_tasks_with_long_simulations_are_spread_evenly_over_devices():
     """Divide the slots of a call into one contiguous part for each of the two devices."""
     np.testing.assert_array_equal(multistart_solver.assign_to_devices(8), [0, 2, 4, 6, 1, 3, 5, 7])
     np.testing.assert_array_equal(multistart_solver.assign_to_devices(3), [0, 1, 2])

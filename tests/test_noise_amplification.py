@@ -34,7 +34,7 @@ def amplified(compensator, gains, period=1e-3):
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
-def test_noise_amplification_is_that_of_the_filter(compensator):
+def test_noise_amplification_equals_that_of_compensator_filter(compensator):
     for gains in GAINS:
         values = dict(zip(NAMES, gains, strict=True))
         ours, slopes = amplified(compensator, values)
@@ -48,7 +48,7 @@ def test_noise_amplification_is_that_of_the_filter(compensator):
             np.testing.assert_allclose(slopes[gain], (high - low) / (2 * step), rtol=1e-7)
 
 
-def test_no_compensation_and_no_lead_pass_the_noise_unchanged():
+def test_noise_amplification_is_1_without_compensation_or_lead():
     assert amplified("none", {})[0] == 1
     no_lead = {"phase_lead": 0, "lead_filter": 0.003}
     np.testing.assert_allclose(amplified("phase_lead", no_lead)[0], 1, rtol=1e-14)
@@ -81,7 +81,7 @@ def steady_contact(**values):
     return gains, command - np.polynomial.polynomial.polyval(time, line).T
 
 
-def test_noise_amplification_is_that_of_the_loop_in_steady_contact():
+def test_noise_amplification_matches_simulated_loop_in_steady_contact():
     gains, whole = steady_contact()
     _, lead = steady_contact(**LEAD_ALONE)
     expected = amplified("response_error", gains)[0]
@@ -93,7 +93,7 @@ def test_noise_amplification_is_that_of_the_loop_in_steady_contact():
     assert 0 < np.std(whole - lead) < 0.15 * np.std(lead)
 
 
-def test_noise_amplification_rises_early_in_contact_by_identification():
+def test_identification_increases_noise_amplification_early_in_contact():
     """Expect more for a larger initial covariance, and in the first tenth of a contact only.
 
     A force above the contact threshold is hardly ever noise.

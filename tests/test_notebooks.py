@@ -28,14 +28,14 @@ def path(request):
     return request.param
 
 
-def test_notebooks_exist():
+def test_expected_notebooks_exist():
     assert NOTEBOOKS
 
 
 # Ignore warnings of the notebook client's event loop and messaging.
 @pytest.mark.filterwarnings("default")
 @pytest.mark.slow
-def test_notebook_runs_every_cell(path, tmp_path, monkeypatch):
+def test_every_notebook_cell_runs_without_error(path, tmp_path, monkeypatch):
     copy = Path(shutil.copy(path, tmp_path))
     inherited = os.environ.get("PYTHONPATH")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *([inherited] if inherited else [])]))
@@ -71,7 +71,7 @@ def _printed(cell) -> tuple[list[str], list[float]]:
     return NUMBER.sub("#", text).split(), [float(number) for number in NUMBER.findall(text)]
 
 
-def test_committed_notebook_outputs_are_those_of_one_run(path):
+def test_committed_notebook_outputs_come_from_a_single_run(path):
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -89,7 +89,7 @@ def test_notebook_imports_only_the_public_interface(path):
     assert {module for module in later if module.startswith(("jaxhil.", "tuning."))} <= ALSO_PUBLIC
 
 
-def test_committed_notebook_is_small_and_names_no_machine(path):
+def test_committed_notebook_is_small_and_contains_no_machine_names(path):
     text = path.read_text(encoding="utf-8")
     assert len(text) < LARGEST
     notebook = nbformat.reads(text, as_version=4)

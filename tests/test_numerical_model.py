@@ -137,7 +137,7 @@ def at_the_same_time(series):
     return np.stack([series[250 * 2**lane, :, lane] for lane in range(3)], axis=-1)
 
 
-def test_free_top_follows_jacobis_solution_to_second_order(run):
+def test_free_top_converges_to_jacobis_solution_at_second_order(run):
     result = AXES.inv().apply(at_the_same_time(run["angular"][0]).T).T
     (one, two, three), (first, _, third) = MOMENTS, FREE
     second = third * np.sqrt(three * (one - three) / (two * (one - two)))
@@ -153,7 +153,7 @@ def test_free_top_follows_jacobis_solution_to_second_order(run):
     assert np.max(np.abs(energy / energy[0] - 1)) < 1e-6
 
 
-def test_axisymmetric_top_has_closed_form_attitude(run):
+def test_attitude_of_axisymmetric_top_matches_closed_form(run):
     """Expect it to turn about its spin momentum at |pi|/J_1, and about its own axis at (1 - J_3/J_1) w_3."""
     first = Rotation.from_quat(run["attitude"][0].T)
     time = 250 * PERIOD
@@ -224,7 +224,7 @@ def push_from_rest(pair, states, wrench, point, normal):
 
 
 @pytest.mark.slow
-def test_wrench_accelerates_the_relative_mass():
+def test_acceleration_under_contact_wrench_matches_relative_mass():
     """Start from rest, in a very short period; in half of the lanes, push along a normal."""
     pair, states = begin()
     states = States(*(state._replace(velocity=0 * state.velocity, spin=0 * state.spin) for state in states))

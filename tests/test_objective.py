@@ -102,7 +102,7 @@ def outcomes(batch):
     return [evaluate(loop, dict(zip(NAMES, gains, strict=True)), scenarios) for gains in GAINS]
 
 
-def test_residuals_are_those_of_an_evaluation(outcomes, known):
+def test_tuning_residuals_equal_errors_of_an_evaluation(outcomes, known):
     for gains, outcome, row in zip(GAINS, outcomes, known[0], strict=True):
         good, wanted = outcome.good, outcome.wanted
         assert (wanted & ~good).sum() == 3 and not good[:, SHORT].any()
@@ -124,7 +124,7 @@ def test_residuals_are_those_of_an_evaluation(outcomes, known):
 
 
 @pytest.mark.parametrize("name", OBJECTIVE_NAMES)
-def test_sum_of_squares_is_the_objective_or_just_above(outcomes, name):
+def test_residual_sum_of_squares_equals_or_slightly_exceeds_objective(outcomes, name):
     objective = of_name(name)
     for gains, outcome in zip(GAINS, outcomes, strict=True):
         terms = compute_contact_terms(outcome)
@@ -141,7 +141,7 @@ def test_sum_of_squares_is_the_objective_or_just_above(outcomes, name):
             assert value < ours < 1.5 * value
 
 
-def test_every_problem_has_its_own_weights(batch):
+def test_every_problem_of_a_batch_uses_its_own_objective_weights(batch):
     """Compare each with its residuals in a program where all have the same weights."""
     several = [STATED, replace(STATED, noise_weight=0.02, limit=0.7), Objective("rms", 5.0, 10.0, 0.1, 1.0)]
     together = run(batch, objective=several)[0]
@@ -149,7 +149,7 @@ def test_every_problem_has_its_own_weights(batch):
         np.testing.assert_allclose(together[i], run(batch, objective=objective)[0][i], rtol=1e-13)
 
 
-def test_objective_part_of_weight_0_is_ignored():
+def test_objective_terms_with_weight_zero_are_ignored():
     errors, excesses, swings, noise = [0.1, -0.2], [0.3, 0.4], [0.5, 0.6], 3.0
     terms = *map(padded, (errors, excesses, swings)), np.arange(SLOTS) < 2, np.asarray(noise)
     none = *[padded([])] * 3, np.asarray(0.0)
@@ -159,7 +159,7 @@ def test_objective_part_of_weight_0_is_ignored():
     np.testing.assert_array_equal(whole[: len(plain)], plain)
 
 
-def test_objective_weights_are_multiples_of_the_limit():
+def test_objective_weights_are_scaled_by_the_error_limit():
     """Check that a weight w of a metric X costs the error at most sqrt(J_0^2 - X_0^2) = w limit X_0."""
     errors, excesses, swings = np.array([0.01, -0.02]), np.array([0.3, 0.5]), np.array([0.7, 0.1])
     for limit in (0.003, 0.01, 0.2):
@@ -179,7 +179,7 @@ def test_objective_weights_are_multiples_of_the_limit():
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.004, 0.02, 1.0])
-def test_errors_within_the_tolerance_hardly_count(tolerance):
+def test_errors_within_tolerance_hardly_affect_objective(tolerance):
     errors, excesses = np.random.default_rng(3).normal(scale=0.01, size=45), np.full(45, 0.4)
     objective = Objective("rms", 2.0, 0.2, 0.1, tolerance=tolerance)
     size = evaluate_objective(Objective("rms", 2.0), errors)
@@ -194,7 +194,7 @@ def test_errors_within_the_tolerance_hardly_count(tolerance):
     assert RESIDUAL_SCALE**2 * np.sum(values * slopes) == pytest.approx(counted * grown, rel=1e-12)
 
 
-def test_tolerance_of_0_gives_the_same_objective_in_a_shared_program():
+def test_tolerance_of_zero_gives_the_same_objective_in_a_shared_program():
     terms = join_terms([Objective(tolerance=0.0)])
     assert terms == join_terms([Objective(command_weight=0.1, noise_weight=0.2, tolerance=0.5)])
     assert terms == ObjectiveTerms("rms", True, True, False, tolerance=True)
@@ -205,7 +205,7 @@ def test_tolerance_of_0_gives_the_same_objective_in_a_shared_program():
     assert not values[len(plain) :].any()
 
 
-def test_common_terms_are_those_that_any_objective_has():
+def test_common_objective_terms_are_union_of_terms_of_all_objectives():
     assert join_terms([Objective(), Objective(noise_weight=0.1)]) == ObjectiveTerms(
         "rms", False, True, False, False
     )
@@ -232,13 +232,13 @@ def against_differences(batch, jacobian):
     return jacobian_diagonal
 
 
-def test_objective_derivatives_are_central_differences(batch, known):
+def test_objective_derivatives_match_central_differences(batch, known):
     jacobian_diagonal = against_differences(batch, known[1])
     parts = *np.split(jacobian_diagonal[..., :-1], 3, axis=-1), jacobian_diagonal[..., -1:]
     assert all((np.abs(part).max(axis=2) > 0).all() for part in parts)
 
 
-def test_sensor_noise_is_the_same_for_all_gains(known):
+def test_sensor_noise_in_objective_is_the_same_for_all_gains(known):
     """Use the same noise at every call.
 
     If gains change a little, the residuals change a little: derivatives need that.
@@ -250,7 +250,7 @@ def test_sensor_noise_is_the_same_for_all_gains(known):
     against_differences(noisy, jacobian)
 
 
-def test_problems_of_one_program_do_not_mix(batch, known):
+def test_tuning_problems_in_one_program_do_not_affect_each_other(batch, known):
     value, jacobian = known
     for mine in range(len(GAINS)):
         others = np.arange(len(GAINS)) != mine
@@ -261,7 +261,7 @@ def test_problems_of_one_program_do_not_mix(batch, known):
     assert changed[1].any() and not changed[[0, 2]].any()
 
 
-def test_failed_contacts_count_and_have_no_derivative(batch, known):
+def test_failed_contacts_increase_objective_with_zero_derivative(batch, known):
     value, jacobian = known
     slots = np.reshape(value[:, :-1], (len(GAINS), 3, -1, SCENARIOS))
     slopes = np.reshape(jacobian[..., :-1], (*GAINS.shape, len(GAINS), 3, -1, SCENARIOS))
@@ -304,7 +304,7 @@ def sum_of_squares(*arguments):
 
 
 @pytest.mark.parametrize("number, tail", [(1, 1), (19, 1), (20, 1), (21, 2), (40, 2), (41, 3), (140, 7)])
-def test_cvar_is_the_mean_of_the_worst_twentieth(number, tail):
+def test_cvar_objective_is_mean_of_worst_5_percent(number, tail):
     errors = np.random.default_rng(number).permutation(np.arange(1, number + 1)) / number
     errors[::2] *= -1
     expected = np.mean(np.arange(number - tail + 1, number + 1)) / number
@@ -315,7 +315,7 @@ def test_cvar_is_the_mean_of_the_worst_twentieth(number, tail):
     assert expected <= bound
 
 
-def test_known_errors_have_known_metrics():
+def test_error_metrics_of_known_errors_are_exact():
     errors = np.array([0.03, -0.04, *[0.0] * 18])
     assert evaluate_objective(Objective("rms"), errors) == pytest.approx(0.05 / np.sqrt(20), rel=1e-14)
     assert (
@@ -340,7 +340,7 @@ def test_known_errors_have_known_metrics():
     assert alone(stated, errors, (), 0.5)[0][-1] == 0
 
 
-def test_high_norm_approximates_the_worst_error():
+def test_high_order_norm_approximates_the_worst_error():
     errors = np.random.default_rng(0).normal(size=96)
     norm = np.sum(np.abs(errors) ** NORM_POWERS["worst"]) ** (1 / NORM_POWERS["worst"])
     assert np.abs(errors).max() < norm < 1.3 * np.abs(errors).max()
@@ -352,7 +352,7 @@ def test_high_norm_approximates_the_worst_error():
 
 
 @pytest.mark.parametrize("name", OBJECTIVE_NAMES)
-def test_objective_derivatives_by_the_errors(name):
+def test_objective_derivatives_with_respect_to_errors_are_exact(name):
     objective, generator = Objective(name, 3.0, 0.2, 0.01, 0.03), np.random.default_rng(1)
     errors, excesses = generator.normal(size=45), np.maximum(0, generator.normal(size=45))
     terms = errors, excesses, 2.0, generator.uniform(0, 3, 45)

@@ -46,7 +46,7 @@ def play(mechanism: Any, **options: Any) -> ToyOptions:
     return asked
 
 
-def test_toy_option_is_stated_once():
+def test_option_defined_once_appears_in_command_function_and_range_check():
     assert tyro.cli(ToyOptions, args=["--toys", "3"]).toys == play("varying", toys=3).toys == 3
     assert inspect.signature(play).parameters["toys"].default == 2 == play("varying").toys
     assert "        toys: Toys to play with.\n" in str(play.__doc__)
@@ -72,6 +72,6 @@ def test_functions_and_commands_have_the_same_options_and_defaults(function):
     assert "OPTIONS" not in function.__doc__
 
 
-def test_unknown_option_is_refused():
+def test_unknown_option_of_function_is_refused():
     with pytest.raises(TypeError, match="unexpected keyword argument 'scenario'"):
         tuning.tune("varying", scenario=3)

@@ -79,7 +79,7 @@ def test_oracle_with_pure_force_delay_converges_at_second_order(phase, published
 
 
 @pytest.mark.parametrize("tension", [False, True])
-def test_oracle_agrees_with_damped_separation_without_delay(tension):
+def test_undelayed_oracle_agrees_with_closed_form_of_damped_separation(tension):
     omega, xi = 2 * pi * 3.0, 0.1
     root = sqrt(1 - xi**2)
     angle = pi if tension else atan2(2 * xi * root, 2 * xi**2 - 1)
@@ -100,7 +100,7 @@ def test_oracle_agrees_with_damped_separation_without_delay(tension):
     "integrator, periods", [("semi_implicit_euler", 0.0), ("zoh", 0.5), ("explicit_euler", 1.0)]
 )
 @pytest.mark.parametrize("latency", [0, 1])
-def test_oracle_delays_by_integrator_and_latency(integrator, periods, latency):
+def test_oracle_includes_delays_of_integrator_and_command_latency(integrator, periods, latency):
     T, omega = 5e-4, 2 * pi * 3.0
     rig = {"integrator": integrator, "command_latency": latency}
     value = simulate(mechanism(T, contact=linear(omega), **rig))[0]["restitution"]
@@ -110,7 +110,7 @@ def test_oracle_delays_by_integrator_and_latency(integrator, periods, latency):
 
 
 @pytest.mark.parametrize("latency", [0, 1])
-def test_zoh_hold_is_half_a_period_earlier_than_linear(latency):
+def test_zero_order_hold_delays_half_a_period_less_than_linear_hold(latency):
     T, omega = 5e-4, 2 * pi * 3.0
     simulator = {"model": "second_order", "natural_frequency": 20.0, "damping_ratio": 0.8}
     zoh = mechanism(
@@ -164,7 +164,7 @@ def test_oracle_work_equals_energy_change_without_delay(contact):
     ids=lambda simulator: simulator["model"],
 )
 @pytest.mark.parametrize("hold", ["linear", "zoh"])
-def test_oracle_starts_in_the_steady_state_of_the_held_history(simulator, hold):
+def test_oracle_starts_in_steady_state_of_uniform_approach(simulator, hold):
     law = {"law": "linear", "stiffness": [1e5]}
     rig = {"command_hold": hold, "command_latency": 1}
     simulator = {**simulator, "delay": 0.0013}
@@ -201,7 +201,7 @@ def test_oracle_starts_in_the_steady_state_of_the_held_history(simulator, hold):
     ],
     ids=["kelvin_voigt-linear-1", "hunt_crossley-zoh-0"],
 )
-def test_oracle_agrees_with_brute_force(contact, hold, latency):
+def test_oracle_agrees_with_brute_force_integration_of_hybrid_loop(contact, hold, latency):
     T = 2e-3
     case = mechanism(
         T,
@@ -225,7 +225,7 @@ def test_oracle_agrees_with_brute_force(contact, hold, latency):
     assert difference < 1e-10
 
 
-def test_oracle_sensor_order_and_noise_sequence():
+def test_oracle_applies_sensor_effects_in_documented_order():
     noise = np.random.default_rng(1).normal(0.0, 2.0, 4000)
     sensor = {"noise_std": 2.0, "bias": 1.5, "quantum": 0.5, "dead_zone": 3.0, "range": 25.0}
     case = mechanism(contact={"law": "linear", "stiffness": [1e5]}, sensor=sensor)
@@ -236,7 +236,7 @@ def test_oracle_sensor_order_and_noise_sequence():
     assert expected.max() == 25.0
 
 
-def test_oracle_reads_the_left_limit_of_an_ideal_zoh():
+def test_oracle_samples_position_before_step_of_ideal_zero_order_hold():
     case = mechanism(contact={"law": "linear", "stiffness": [1e5]}, command_hold="zoh")
     signals = simulate(case, record=True)[0]["signals"]
     # Over [t_{n-1}, t_n) the drives hold x_d(n): the tick reads k x_d(n), not k x_d(n + 1).
@@ -244,7 +244,7 @@ def test_oracle_reads_the_left_limit_of_an_ideal_zoh():
     assert np.allclose(signals["force_measured"], expected, rtol=0.0, atol=1e-12)
 
 
-def test_oracle_has_delayed_readings_and_peak_of_the_ideal_simulator():
+def test_oracle_readings_and_peak_force_of_ideal_simulator_are_exact():
     case = mechanism(
         contact={"law": "linear", "stiffness": [1e5]},
         force_delay=0.00237,
@@ -263,7 +263,7 @@ def test_oracle_has_delayed_readings_and_peak_of_the_ideal_simulator():
     assert result["peak_force"] == pytest.approx(1e5 * x.max(), rel=1e-13)
 
 
-def test_velocity_limit_acts_before_latency_and_delay():
+def test_oracle_applies_velocity_limit_before_latency_and_delay():
     case = mechanism(
         contact={"law": "linear", "stiffness": [1e5]},
         simulator={"model": "ideal", "delay": 0.002, "velocity_limit": 0.0051},
@@ -275,7 +275,7 @@ def test_velocity_limit_acts_before_latency_and_delay():
     assert np.abs(signals["v_desired"]).max() > 0.0055
 
 
-def test_rattling_contact_uses_successive_laws_on_both_sides():
+def test_oracle_uses_successive_stiffnesses_at_alternating_surfaces():
     law = {
         "law": "kelvin_voigt",
         "stiffness": [1e5, 2e5, 3e5],
@@ -297,7 +297,7 @@ def test_rattling_contact_uses_successive_laws_on_both_sides():
     assert [r["approach_velocity"] for r in results[1:]] == pytest.approx(speeds[:-1], rel=1e-12)
 
 
-def test_successive_fresh_runs_use_the_list_and_the_rebound_speed():
+def test_successive_oracle_runs_use_next_stiffness_and_previous_rebound_speed():
     law = {"law": "linear", "stiffness": [1e5, 2e5]}
     results = simulate(mechanism(contact=law, force_delay=0.003), contacts=3)
     for before, after in pairwise(results):
@@ -307,7 +307,7 @@ def test_successive_fresh_runs_use_the_list_and_the_rebound_speed():
     assert results[0]["restitution"] < results[1]["restitution"]
 
 
-def test_oracle_refuses_damped_ideal_zoh():
+def test_oracle_refuses_damped_contact_with_ideal_zero_order_hold():
     law = {"law": "kelvin_voigt", "stiffness": [1e5], "damping": [100.0]}
     with pytest.raises(ValueError, match="damped"):
         simulate(mechanism(contact=law, command_hold="zoh"))

@@ -34,14 +34,14 @@ TEXT = builtin_path("claw-350kg").read_text()
         ("uncertainty={}", "uncertainty", {}),
     ],
 )
-def test_override_sets_the_value(override, path, value):
+def test_override_replaces_the_value_of_a_key(override, path, value):
     node = to_plain_data(load("varying", [override]).mechanism)
     for part in path.split(".")[:-1]:
         node = node[part]
     assert node.get(path.split(".")[-1], math.inf) == value
 
 
-def test_override_reaches_quoted_keys_tables_and_nested_lists():
+def test_override_accepts_quoted_keys_tables_and_nested_list_entries():
     overrides = [
         "uncertainty={}",
         'rig.simulator={model="first_order", time_constant=0.01}',
@@ -58,13 +58,13 @@ def test_override_reaches_quoted_keys_tables_and_nested_lists():
     assert layered.contact.stiffness[1] == [60000.0, 120000.0, 1.0]
 
 
-def test_overrides_apply_in_order_and_leave_the_digest():
+def test_later_override_wins_and_file_digest_is_unchanged():
     loaded = load("varying", ["approach.velocity=1", "approach.velocity=2"])
     assert loaded.mechanism.approach.velocity == 2.0
     assert loaded.sha256 == load("varying").sha256
 
 
-def test_override_replaces_a_bare_number_in_the_file(written):
+def test_override_of_list_entry_accepts_single_number_in_file(written):
     path = written(TEXT.replace("[124355.0]", "124355"))
     assert load(path, ["contact.stiffness[0]=5"]).mechanism.contact.stiffness == [5.0]
 
@@ -88,7 +88,7 @@ def test_override_of_a_model_accepts_its_keys_and_no_others():
     assert ideal == load("varying", changes).mechanism == jaxhil.load("varying", changes)
 
 
-def test_unset_removes_keys_tables_and_uncertainty():
+def test_unset_option_removes_keys_tables_and_uncertainty():
     mechanism = load("varying", (), ["contact.damping", "rig.force_sensor", "approach.contacts"]).mechanism
     assert mechanism.contact.damping == [0.0] and mechanism.rig.force_sensor.delay == 0.0
     assert mechanism.approach.contacts == 1 and "rig.force_sensor.delay" not in mechanism.uncertainty
@@ -117,12 +117,12 @@ def test_unset_removes_keys_tables_and_uncertainty():
         ("a..b", "expected a dotted path"),
     ],
 )
-def test_unusable_unset_is_named(path, reason):
+def test_unusable_unset_option_is_named_in_error(path, reason):
     message = file_refusal("varying", (), [path])
     assert message.startswith("varying: --unset ") and reason in message
 
 
-def test_uncertain_key_requires_a_value():
+def test_uncertainty_of_key_without_value_is_refused():
     message = file_refusal(
         "varying", ["uncertainty.'rig.simulator.time_constant'={distribution='normal', std=1}"]
     )
@@ -160,18 +160,18 @@ def test_uncertain_key_requires_a_value():
         ("contact.law=piecewise_linear", "contact.depths: found no entries"),
     ],
 )
-def test_unusable_override_is_named(override, reason):
+def test_unusable_override_is_named_in_error(override, reason):
     message = file_refusal("varying", [override])
     assert message.startswith("varying: --set ") and reason in message
 
 
-def test_override_below_a_value_that_is_no_table_is_refused(written):
+def test_override_of_subkey_of_non_table_value_is_refused(written):
     path = written("rig = 5")
     message = file_refusal(path, ["rig.simulator.model=ideal"])
     assert "--set rig.simulator.model=ideal: rig: found 5, expected a table" in message
 
 
-def test_fault_of_the_file_is_not_attributed_to_an_override(written):
+def test_error_in_mechanism_file_is_not_attributed_to_an_override(written):
     path = written(TEXT.replace("velocity = 0.005", "velocity = -1"))
     assert file_refusal(path, ["name=x"]).startswith(f"{path}: approach.velocity: found -1")
     assert load(path, ["approach.velocity=1"]).mechanism.approach.velocity == 1.0
@@ -187,7 +187,7 @@ def test_any_override_is_applied_or_refused_in_one_line(text):
 
 
 @pytest.mark.parametrize("path", [*numeric_keys()])
-def test_every_numeric_key_can_be_overridden_or_says_why(path):
+def test_every_numeric_key_can_be_overridden_or_error_names_the_key(path):
     """Set PATH=1 for every key: the value is accepted, or the message is about that very path."""
     try:
         mechanism = load("varying", [f"{path}=1"]).mechanism

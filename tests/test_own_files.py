@@ -47,7 +47,7 @@ def test_results_do_not_replace_third_party_files(jaxhil, thesis, untouched):
     refused(jaxhil(*tune), "thesis/errors.png: found a file that jaxhil did not write")
 
 
-def test_overview_does_not_replace_a_third_party_picture(jaxhil, thesis):
+def test_overview_plot_does_not_replace_a_third_party_picture(jaxhil, thesis):
     (thesis / "overview.png").write_text("years")
     names = ("rig-300kg", "varying", "layered", "rattling", "claw-350kg")
     refused(jaxhil("tune", *names, "-o", thesis), "overview.png: found a file that jaxhil did not write")
@@ -103,7 +103,7 @@ RESULTS = {  # Mechanism "a b": the command that would replace files, the docume
 
 
 @pytest.mark.parametrize("kind", RESULTS)
-def test_results_of_another_mechanism_are_not_replaced(jaxhil, tmp_path, kind):
+def test_results_of_another_mechanism_are_not_overwritten(jaxhil, tmp_path, kind):
     (command, *options), document, content = RESULTS[kind]
     path = tmp_path / "out" / document
     path.parent.mkdir(parents=True)
@@ -115,7 +115,7 @@ def test_results_of_another_mechanism_are_not_replaced(jaxhil, tmp_path, kind):
     assert path.read_bytes() == before
 
 
-def test_identified_values_of_another_mechanism_are_not_replaced(jaxhil, tmp_path):
+def test_identified_file_of_another_mechanism_is_not_overwritten(jaxhil, tmp_path):
     content = {"estimates": [], "mechanism": {"name": "a b"}}
     (tmp_path / "identification.json").write_text(json.dumps(content))
     ran = jaxhil("identify", "none.csv", "--prior", "rig-300kg", "-o", tmp_path)
@@ -123,7 +123,7 @@ def test_identified_values_of_another_mechanism_are_not_replaced(jaxhil, tmp_pat
 
 
 @pytest.mark.parametrize("names", [("a b", "a_b"), ("Rig", "rig"), ("..", "..."), ("é", "e\u0301")])
-def test_mechanisms_of_one_call_share_no_folder(jaxhil, tmp_path, names):
+def test_mechanisms_tuned_in_one_call_have_separate_folders(jaxhil, tmp_path, names):
     files = [named(tmp_path / f"{path}.toml", name) for path, name in enumerate(names)]
     ran = jaxhil(*TUNE, *files, "-o", tmp_path / "out", "--json")
     assert ran.code == 2 and "1.toml: name: found" in ran.err
@@ -131,7 +131,7 @@ def test_mechanisms_of_one_call_share_no_folder(jaxhil, tmp_path, names):
     assert entry["mechanism"] == names[0]
 
 
-def test_gains_of_another_mechanism_of_same_name_are_replaced_with_warning(jaxhil, tmp_path):
+def test_gains_of_different_mechanism_with_same_name_are_replaced_with_warning(jaxhil, tmp_path):
     file = named(tmp_path / "rig.toml", "機構一")
     options = (file, *TUNE[1:], "-o", tmp_path / "out")
     assert "replaced" not in jaxhil(TUNE[0], *options).err
@@ -174,7 +174,7 @@ def test_input_from_a_pipe_or_device_is_refused(jaxhil, tmp_path, monkeypatch, c
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
-def test_picture_replaces_only_a_plain_file(jaxhil, tmp_path, kind):
+def test_plot_file_replaces_only_a_plain_file(jaxhil, tmp_path, kind):
     path = tmp_path / "plot.png"
     if kind == "pipe":
         os.mkfifo(path)
@@ -188,7 +188,7 @@ def test_picture_replaces_only_a_plain_file(jaxhil, tmp_path, kind):
     assert (os.lstat(path).st_ino, os.stat("/dev/full").st_ino) == before
 
 
-def test_named_link_stands_for_its_file(jaxhil, tmp_path):
+def test_output_path_that_is_a_link_writes_to_the_linked_file(jaxhil, tmp_path):
     (tmp_path / "there.png").write_bytes(b"an older picture")
     (tmp_path / "plot.png").symlink_to("there.png")
     ran = jaxhil("simulate", "rig-300kg", "--plot", tmp_path / "plot.png", "--json")

@@ -96,7 +96,7 @@ def test_pareto_point_is_dominated_if_another_is_better_and_none_worse():
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
-def test_noise_amplification_is_that_of_the_lead_filter(compensator):
+def test_pareto_noise_amplification_equals_that_of_lead_filter(compensator):
     mechanism = load("varying", ["rig.control_period=0.002"]).mechanism
     gains = {**literature_gains(mechanism, compensator), "phase_lead": 0.006, "lead_filter": 0.0017}
     impulse = np.zeros(3000)
@@ -110,7 +110,7 @@ def test_noise_amplification_is_that_of_the_lead_filter(compensator):
 NO_TRADE_OFF = ["none", "position_lead", "virtual_contact", "passivity", "impulse_ledger"]
 
 
-def test_only_amplifying_laws_have_a_trade_off():
+def test_only_compensators_that_amplify_noise_have_a_pareto_front():
     assert {name for name in COMPENSATORS if not has_noise_trade_off(name)} == set(NO_TRADE_OFF)
     assert compute_noise_amplification(load().mechanism, "none", {}) == 1
 
@@ -119,7 +119,7 @@ def test_only_amplifying_laws_have_a_trade_off():
 
 
 @pytest.mark.slow
-def test_metrics_of_every_pareto_point_are_those_of_an_evaluation(results, made):
+def test_metrics_of_every_pareto_point_equal_those_of_an_evaluation(results, made):
     for mechanism, result, front in zip(MECHANISMS, results, made[0], strict=True):
         seed = SETTINGS.seed + VALIDATION_SEED_OFFSET
         scenarios = build_scenarios(mechanism, draw(mechanism, SETTINGS.validation, seed), seed)
@@ -140,7 +140,7 @@ def test_metrics_of_every_pareto_point_are_those_of_an_evaluation(results, made)
 
 
 @pytest.mark.slow
-def test_no_pareto_point_is_better_under_another_points_weight(results, made):
+def test_each_pareto_point_is_best_for_its_own_noise_weight(results, made):
     """Compare on the training scenarios.
 
     No point beats another at its own weight, nor do the gains that were tuned before. So the heavier the
@@ -167,11 +167,11 @@ def test_no_pareto_point_is_better_under_another_points_weight(results, made):
 
 
 @pytest.mark.slow
-def test_weights_of_all_mechanisms_share_one_program(made):
+def test_pareto_searches_of_all_weights_and_mechanisms_share_one_program(made):
     assert made[1] == 1
 
 
-def test_pareto_points_start_at_the_results_of_their_neighbours():
+def test_pareto_search_starts_at_results_of_neighbouring_weights():
     result = [pareto_search._LadderCandidate({"gain": float(n)}, 0.1, 1.0) for n in (1, 2, 2, 4)]
     assert [[gains["gain"] for gains in own] for own in pareto_search._collect_neighbour_gains(result)] == [
         [1, 2],
@@ -181,7 +181,7 @@ def test_pareto_points_start_at_the_results_of_their_neighbours():
     ]
 
 
-def test_result_of_a_start_is_distinguished_from_its_noise():
+def test_pareto_point_error_excludes_the_weighted_noise_term():
     task = build_task(MECHANISMS[0], "phase_lead", 8, 0)
     excess = compute_noise_amplification(task.mechanism, "phase_lead", task.literature) - 1
     start = pareto_search.StartResult("converged", 1, math.hypot(0.02, 0.003 * excess), [], task.literature)
@@ -194,7 +194,7 @@ def test_result_of_a_start_is_distinguished_from_its_noise():
 
 
 @pytest.mark.slow
-def test_settings_other_than_the_weight_stay(results, monkeypatch):
+def test_pareto_search_keeps_all_objective_settings_except_noise_weight(results, monkeypatch):
     seen = []
 
     def solve(tasks, starts, steps, objectives, work):

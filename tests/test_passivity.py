@@ -47,7 +47,7 @@ def check(forces, velocities, period):
     return corrected
 
 
-def test_passivity_energy_of_random_readings_stays_positive():
+def test_passivity_observer_energy_stays_nonnegative_for_random_readings():
     rng = np.random.default_rng(3)
     corrected = 0
     for size in (1e-9, 1.0, 1e6):
@@ -63,18 +63,18 @@ ANY = st.floats(-1e120, 1e120) | st.sampled_from([0.0, -0.0, 5e-324, -5e-324, 1e
 
 
 @given(rows=st.lists(st.tuples(ANY, ANY), min_size=1, max_size=30))
-def test_passivity_energy_of_hostile_readings_stays_positive(rows):
+def test_passivity_observer_energy_stays_nonnegative_for_hostile_readings(rows):
     check(*zip(*rows, strict=True), 1e-3)
 
 
-def test_passivity_forgets_energy_that_overflows():
+def test_passivity_observer_resets_energy_that_overflows():
     law = ON_THE_RIG["passivity"]({}, 1e-3, math.inf)
     assert law.step(1e308, 0.0, 1e308, 0.0) == 1e308
     # No energy was taken, so none is returned.
     assert law.step(5.0, 0.0, -1.0, 0.0) == 0.0
 
 
-def test_virtual_damping_returns_the_energy_to_0():
+def test_virtual_damping_of_passivity_controller_returns_energy_to_zero():
     """Use alpha = -E/(T v^2) of the source, where E includes this tick's F."""
     law = ON_THE_RIG["passivity"]({}, 1e-3, math.inf)
     assert law.step(100.0, 0.0, 0.005, 0.0) == 100.0
@@ -85,14 +85,14 @@ def test_virtual_damping_returns_the_energy_to_0():
     assert law.step(50.0, 0.0, 0.0, 0.0) == 50.0
 
 
-def test_passivity_energy_is_reset_at_next_contact_but_not_between_surfaces():
+def test_passivity_energy_is_reset_at_next_contact_but_not_at_other_surface():
     energy, yes = jnp.asarray([1.0, 2.0]), jnp.asarray([True, False])
     assert LAW.restart({}, energy, yes, yes).tolist() == [0.0, 2.0]
     assert LAW.restart({}, energy, yes, ~yes).tolist() == [1.0, 2.0]
 
 
 @pytest.mark.parametrize("damping", [0.0, 300.0])
-def test_passivity_stops_a_contact_from_diverging(damping):
+def test_passivity_controller_limits_restitution_of_delayed_contact(damping):
     """Allow for what the observation of the energy at the ticks leaves: (T F_c)^2/(2 M) a tick."""
     parsed = validated(mechanism({"damping": [damping]}, IDEAL))
     delay = np.array([0.001, 0.004, 0.01, 0.02])

@@ -23,7 +23,7 @@ def largest(curve, times, anew):
     return peak.largest
 
 
-def test_peak_between_unequal_steps_is_that_of_a_parabola():
+def test_peak_between_unequally_spaced_samples_is_interpolated_by_parabola():
     """Expect a parabola's vertex; of a sine at most 2e-5 less, where the largest sample lacks 6e-4."""
     never = np.zeros_like(TIMES, bool)
     parabola, sine = np.maximum(2.0 - (TIMES - 1.01) ** 2, 0.0), np.maximum(np.sin(2 * TIMES), 0.0)

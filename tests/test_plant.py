@@ -35,7 +35,7 @@ LAGGED = 1e-7
 
 
 @pytest.mark.parametrize("name", AGAINST_THE_ORACLE)
-def test_plant_agrees_with_the_oracle_in_every_contact(name):
+def test_rig_plant_agrees_with_oracle_in_every_contact(name):
     case = CASES[name]
     mechanism = validated(case.mechanism)
     gains = nominal_gains(mechanism, case.compensator, **case.gains)
@@ -60,7 +60,7 @@ BUILT_IN = [
 
 
 @pytest.mark.parametrize("name", [*BUILT_IN, "limited", "suite-elastoplastic"])
-def test_plant_agrees_with_simulation_for_every_builtin(name):
+def test_rig_plant_agrees_with_jax_simulation_for_every_builtin_mechanism(name):
     overrides = ()
     if name == "suite-elastoplastic":
         assert load(name).mechanism.rig.force_sensor.delay == 0.008  # both delays are whole periods
@@ -120,7 +120,7 @@ def on_rig(simulator, **rig):
 
 @pytest.mark.parametrize("model", SIMULATORS)
 @pytest.mark.parametrize("latency", [0, 1])
-def test_plant_follows_uniform_motion_with_a_constant_lag(model, latency):
+def test_rig_plant_follows_uniform_motion_with_constant_lag(model, latency):
     simulator, lag = SIMULATORS[model]
     mechanism = on_rig(
         {**simulator, "delay": 0.0037}, command_latency=latency, position_sensor={"delay": 0.0009}
@@ -134,7 +134,7 @@ def test_plant_follows_uniform_motion_with_a_constant_lag(model, latency):
         plant.move(position + 0.001 * velocity)
 
 
-def test_plant_follows_a_staircase_in_its_steady_state():
+def test_rig_plant_follows_staircase_command_in_steady_state():
     mechanism = on_rig({**SIMULATORS["second order"][0], "delay": 0.0037}, command_hold="zoh")
     plant, velocity = RigHardware(mechanism), 0.005
     plant.begin(-1.0, velocity, -1.0, 0)
@@ -146,12 +146,12 @@ def test_plant_follows_a_staircase_in_its_steady_state():
 
 
 @pytest.mark.parametrize("delay, intervals, place", [(0.0, 0, 1.0), (0.003, 3, 1.0), (0.0032, 3, 0.8)])
-def test_plant_splits_delays_at_the_ticks(delay, intervals, place):
+def test_rig_plant_splits_delay_into_whole_and_fractional_ticks(delay, intervals, place):
     assert split_delay(delay, 0.001) == (intervals, pytest.approx(place, abs=1e-12))
     assert split_delay(0.1 + 0.2, 0.1)[0] == 3
 
 
-def test_plant_sensors_in_free_flight_have_stated_bias_and_noise():
+def test_rig_plant_sensors_in_free_flight_have_stated_bias_and_noise():
     sensor = {"noise_std": 0.5, "bias": 2.0}
     mechanism = on_rig({"model": "ideal"}, force_sensor=sensor, position_sensor={"noise_std": 1e-6})
     plant = RigHardware(mechanism, seed=3)
@@ -166,7 +166,7 @@ def test_plant_sensors_in_free_flight_have_stated_bias_and_noise():
 
 
 @pytest.mark.parametrize("name", ["rig-300kg", "rattling"])
-def test_noisy_contacts_are_as_good_on_average_as_without_noise(name):
+def test_mean_restitution_of_noisy_plant_contacts_equals_noiseless_restitution(name):
     mechanism = load(name, ("rig.force_sensor.noise_std=0.2", "approach.contacts=1")).mechanism
     quiet = load(name, ("approach.contacts=1",)).mechanism
     gains = literature_gains(mechanism, "phase_lead")
@@ -177,13 +177,13 @@ def test_noisy_contacts_are_as_good_on_average_as_without_noise(name):
     assert np.mean(result) == pytest.approx(expected.restitution, abs=4 * spread / 8**0.5 + 1e-3)
 
 
-def test_runtime_has_every_law_that_the_plant_runs():
+def test_runtime_has_every_compensator_used_with_rig_plant():
     assert {case.compensator for case in CASES.values()} <= set(COMPENSATORS)
 
 
 @pytest.mark.benchmark
 @pytest.mark.parametrize("name", [*builtin_names(), "lag"])
-def test_plant_tick_takes_little_time(name):
+def test_rig_plant_time_per_tick_is_within_limit(name):
     overrides = ("rig.force_sensor.time_constant=0.002",) if name == "lag" else ()
     mechanism = load("varying" if name == "lag" else name, overrides).mechanism
     plant, velocity = RigHardware(mechanism), mechanism.approach.velocity

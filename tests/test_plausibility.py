@@ -30,7 +30,7 @@ def behind(**simulator):
 
 
 @pytest.mark.parametrize("name", [*builtin_names(), *suite_names()])
-def test_builtin_mechanisms_give_no_warning(name):
+def test_builtin_mechanisms_give_no_plausibility_warning(name):
     mechanism = jaxhil.load(name)
     result = summarise_mechanism(mechanism)
     assert result.warnings == ()
@@ -40,7 +40,7 @@ def test_builtin_mechanisms_give_no_warning(name):
     check_run(mechanism, drawn=True)
 
 
-def test_summary_line_states_what_the_file_means():
+def test_mechanism_summary_states_frequency_peak_force_and_duration():
     assert summarise_mechanism(rig(rig__force_sensor__range=200.0)).line("mine") == (
         "mine: equivalent mass 300 kg; contact at 3 Hz, 1/333 of the control rate (1000 Hz) and 0.29 of the "
         "motion simulator's bandwidth (10.5 Hz); peak force 28.3 N (0.14 of the sensor's range (200 N)); "
@@ -59,7 +59,7 @@ def test_summary_line_states_what_the_file_means():
 # Figures.
 
 
-def test_summary_lists_different_contacts_once_in_order():
+def test_mechanism_summary_lists_different_contacts_once_in_order():
     result = summarise_mechanism(
         jaxhil.load("varying", {"contact.stiffness": [2e5, 1e5, 2e5, 3e5], "approach.contacts": 9})
     )
@@ -77,7 +77,7 @@ def power_law(stiffness, exponent):
     return stiffness * deepest**exponent, duration
 
 
-def test_summary_of_every_law_is_that_of_its_ideal_contact():
+def test_mechanism_summary_of_every_contact_law_matches_ideal_contact():
     jaxhil.register(SquaredSpring())
     spring = SPEED * math.sqrt(STIFFNESS * MASS), math.pi * math.sqrt(MASS / STIFFNESS)
     laws = {
@@ -105,7 +105,7 @@ def test_summary_of_every_law_is_that_of_its_ideal_contact():
         assert contact.frequency == pytest.approx(1 / (2 * duration), rel=1e-6), law
 
 
-def test_damped_spring_has_the_frequency_of_the_spring():
+def test_summary_frequency_of_damped_spring_equals_undamped_frequency():
     damped = {"contact.damping": [3 * math.sqrt(STIFFNESS * MASS)]}
     for tension in (False, True):
         [contact] = summarise_mechanism(rig(damped, contact__tension=tension)).contacts
@@ -114,7 +114,7 @@ def test_damped_spring_has_the_frequency_of_the_spring():
         assert math.isinf(contact.duration) == tension
 
 
-def test_duration_of_a_run_is_estimated():
+def test_estimated_number_of_ticks_of_a_run_is_close_to_simulation():
     run = jaxhil.simulate("varying", "phase_lead")
     assert run.meaning == summarise_mechanism(run.mechanism)
     assert run.meaning.duration == pytest.approx(run.time[-1], rel=0.25)
@@ -135,7 +135,7 @@ SIMULATORS = [
 
 
 @pytest.mark.parametrize("simulator", SIMULATORS, ids=lambda one: one["model"])
-def test_bandwidth_is_where_the_gain_has_fallen_by_3_db(simulator):
+def test_simulator_bandwidth_is_frequency_of_3_db_attenuation(simulator):
     if len(simulator.get("denominator", ())) > 20:
         simulator = simulator | {"numerator": [simulator["denominator"][-1]]}
     made = build_scenarios(behind(**simulator)).simulator
@@ -203,14 +203,14 @@ def test_ideal_simulator_has_no_bandwidth():
         ),
     ],
 )
-def test_implausible_values_give_a_warning(key, plausible, implausible, said):
+def test_implausible_mechanism_values_give_a_warning(key, plausible, implausible, said):
     others = {"rig.force_sensor.delay": 0.0} if key == "rig.simulator.delay" else {}
     assert summarise_mechanism(rig(others, **{key: plausible})).warnings == ()
     [warning] = summarise_mechanism(rig(others, **{key: implausible})).warnings
     assert said in warning and ", expected " in warning and warning.isprintable()
 
 
-def test_implausible_contact_is_named():
+def test_warning_names_the_implausible_contact():
     stiffness = {"contact.stiffness": [1e5, 1e9, 1.0], "approach.contacts": 3}
     fast, slow, late = summarise_mechanism(rig(stiffness)).warnings
     assert "291 Hz (contact 2), expected at most 100 Hz, 1/10 of the control rate" in fast
@@ -233,7 +233,7 @@ def refusal(mechanism, **options):
     return message
 
 
-def test_runs_of_too_many_ticks_are_refused():
+def test_mechanism_whose_run_needs_too_many_ticks_is_refused():
     message = (
         "found 1e-09 s, expected at most 1e+07 ticks a contact and 1e+09 a run: contact 1 takes about 0.195 s"
     )
@@ -248,7 +248,7 @@ def test_runs_of_too_many_ticks_are_refused():
     assert "contact 1 takes about 0.195 s, 1.9e+06 ticks" in refusal(rig(many))
 
 
-def test_flight_without_end_is_refused():
+def test_mechanism_with_endless_approach_is_refused():
     gap = {"contact.clearance": 40.0, "approach.contacts": 2}
     check_run(rig(gap))
     message = refusal(rig(gap, contact__clearance=100.0))
@@ -259,7 +259,7 @@ def test_flight_without_end_is_refused():
     check_run(rig(contact__clearance=1e30))
 
 
-def test_limit_on_ticks_covers_drawn_values():
+def test_limit_on_number_of_ticks_applies_to_uncertain_values():
     wide = {"distribution": "loguniform", "factor": [1e-6, 1.0]}
     uncertain = rig({"uncertainty": {"rig.control_period": wide}})
     check_run(uncertain)
@@ -283,7 +283,7 @@ def test_limit_on_ticks_covers_drawn_values():
     ],
     ids=str,
 )
-def test_simulators_too_fast_for_the_control_period_are_refused(simulator):
+def test_motion_simulator_too_fast_for_control_period_is_refused(simulator):
     message = refusal(behind(**simulator))
     assert (
         ": rig.simulator: found a pole of " in message and "expected at most 64 / control_period" in message
@@ -291,7 +291,7 @@ def test_simulators_too_fast_for_the_control_period_are_refused(simulator):
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.6, np.pi / 2])
-def test_accepted_poles_are_propagated_exactly(angle):
+def test_fastest_accepted_simulator_poles_are_propagated_exactly(angle):
     """Use two poles of the magnitude 64 / T, at some angle to the negative axis."""
     damping = 2 * MAX_POLE * math.cos(angle)
     matrix = np.array([[0.0, MAX_POLE], [-MAX_POLE, -damping]])
@@ -301,13 +301,13 @@ def test_accepted_poles_are_propagated_exactly(angle):
     np.testing.assert_allclose(result, expm(whole)[:3], rtol=0, atol=2e-9)
 
 
-def test_limit_on_poles_covers_drawn_values():
+def test_limit_on_simulator_poles_applies_to_uncertain_values():
     drawn = {"rig.simulator.natural_frequency": {"distribution": "uniform", "factor": [1.0, 1e3]}}
     check_run(rig(uncertainty=drawn))
     assert "rig.simulator: found a pole of " in refusal(rig(uncertainty=drawn), drawn=True)
 
 
-def test_limit_on_velocity_covers_drawn_values():
+def test_velocity_limit_check_applies_to_uncertain_values():
     normal = {"approach.velocity": {"distribution": "normal", "std": 1e-4}}
     narrow = rig({"uncertainty": normal}, rig__simulator__velocity_limit=1.1 * SPEED)
     check_run(narrow)
@@ -316,7 +316,7 @@ def test_limit_on_velocity_covers_drawn_values():
     check_run(rig({"uncertainty": normal}, rig__simulator__velocity_limit=2 * SPEED), drawn=True)
 
 
-def test_every_function_refuses_runs_without_end():
+def test_every_public_function_refuses_mechanism_with_endless_run():
     endless = rig(rig__control_period=1e-9)
     for function in (jaxhil.simulate, tuning.tune, tuning.compare):
         with pytest.raises(jaxhil.InputError, match="at most 1e\\+07 ticks a contact"):
@@ -325,7 +325,7 @@ def test_every_function_refuses_runs_without_end():
         jaxhil.jacobian(endless, by="approach.velocity")
 
 
-def test_tune_prints_the_mechanism_summary_on_request(capsys):
+def test_tune_prints_mechanism_summary_on_request(capsys):
     sensor = rig(rig__force_sensor__range=10.0)
     for progress in (False, True):
         with pytest.raises(jaxhil.InputError, match="objective"):
@@ -340,7 +340,7 @@ def test_tune_prints_the_mechanism_summary_on_request(capsys):
 # The commands.
 
 
-def test_simulate_begins_with_the_summary_line(jaxhil):
+def test_simulate_output_begins_with_mechanism_summary_line(jaxhil):
     ran = jaxhil("simulate", "rig-300kg", "--set", "rig.force_sensor.range=10")
     assert ran.out.startswith("rig-300kg: equivalent mass 300 kg; contact at 3 Hz, ")
     assert ran.err == (
@@ -362,7 +362,7 @@ def test_simulate_begins_with_the_summary_line(jaxhil):
 
 
 @pytest.mark.parametrize("command", ["simulate", "tune", "compare"])
-def test_commands_refuse_runs_without_end_in_one_line(jaxhil, command, tmp_path, monkeypatch):
+def test_every_command_refuses_mechanism_with_endless_run_in_one_line(jaxhil, command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ran = jaxhil(command, "rig-300kg", "--set", "rig.control_period=1e-9")
     assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1
@@ -370,14 +370,14 @@ def test_commands_refuse_runs_without_end_in_one_line(jaxhil, command, tmp_path,
 
 
 @pytest.mark.parametrize("command", ["simulate", "tune", "compare"])
-def test_commands_unset_keys(jaxhil, command):
+def test_unset_option_of_commands_removes_keys(jaxhil, command):
     ran = jaxhil(command, "rig-300kg", "--set", "name=x", "--unset", "approach.velocity", "--unset", "rig")
     assert ran.code == 2 and ran.err.startswith(
         "jaxhil: rig-300kg: --set name=x --unset approach.velocity rig: approach.velocity: found nothing"
     )
 
 
-def test_timeout_states_its_limit(jaxhil):
+def test_timeout_message_states_the_time_limit(jaxhil):
     ran = jaxhil("simulate", "rig-300kg", "--set", "rig.force_sensor.range=1e-6", "--json")
     assert ran.document["status"] == "timeout"
     assert ran.document["reason"] == "a contact was not over within 10 s, the limit of a contact"

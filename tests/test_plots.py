@@ -82,7 +82,7 @@ def test_error_plot_has_units_and_a_legend():
     assert labels(right)[-1] == "within 0.01"
 
 
-def test_exceedance_is_the_share_of_larger_errors():
+def test_exceedance_curve_is_share_of_errors_above_each_value():
     made = result()
     left = errors_plot(made, 0.01).axes[0]
     line = next(line for line in left.lines if line.get_label() == "tuned")
@@ -93,7 +93,7 @@ def test_exceedance_is_the_share_of_larger_errors():
         assert share[place] == pytest.approx(np.mean(errors >= size[place]))
 
 
-def test_contact_frequency_is_that_of_the_linear_contact():
+def test_plotted_contact_frequency_equals_that_of_linear_contact():
     made = result()
     right = errors_plot(made, 0.01).axes[1]
     points = np.asarray(right.lines[0].get_xdata())
@@ -111,7 +111,7 @@ def test_error_plot_accepts_any_limit_and_no_errors_at_all(limit, tmp_path):
     save_figure(errors_plot(made, limit), tmp_path / "nothing.png")
 
 
-def test_best_start_stands_out_in_the_plot():
+def test_best_optimisation_start_is_highlighted_in_the_plot():
     (axes,) = loss_plot(result()).axes
     assert "log" == axes.get_yscale() and "step" in axes.get_xlabel() and "rms" in axes.get_ylabel()
     assert set(labels(axes)) == {"start at the literature's gains", "best start", "other starts"}
@@ -131,7 +131,7 @@ def front(places=((0.01, 3.0), (0.01, 3.0), (0.02, 2.0), (0.03, 2.5), (0.04, 1.1
     return made, ParetoFront(points, point(0.1, 4.0, False), point(0.012, 3.5, False))
 
 
-def test_front_plot_has_units_numbers_and_the_literature():
+def test_pareto_plot_has_units_point_numbers_and_literature_gains():
     made, drawn = front()
     (axes,) = front_plot(drawn, made, 0.015).axes
     assert (
@@ -151,7 +151,7 @@ def test_front_plot_has_units_numbers_and_the_literature():
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.01, math.inf])
-def test_front_plot_accepts_any_front(limit, tmp_path):
+def test_pareto_plot_accepts_any_number_of_points(limit, tmp_path):
     for number, places in enumerate(
         [((0.5, 1.0),) * 2, ((0.0, 1.0), (2.0, 0.9)), ((1e-3, 40.0), (1.0, 1.0))]
     ):
@@ -177,7 +177,7 @@ def test_measured_signals_are_plotted_on_request():
     assert len(measured(plot_contacts(pieces(1), "title", sensors="tuned"))) == 1
 
 
-def test_name_in_a_plot_is_text_and_no_formula(tmp_path):
+def test_mechanism_name_in_plot_is_not_rendered_as_formula(tmp_path):
     save_figure(plot_contacts(pieces(1), r"$\frac{1$ [bold]"), tmp_path / "plot.png")
 
 
@@ -195,7 +195,7 @@ def test_plot_colours_and_line_styles_differ():
 
 
 @pytest.mark.parametrize("name", ["rig-300kg", "claw-350kg", "layered"])
-def test_reference_motion_is_the_ideal_contact(name):
+def test_plotted_reference_motion_equals_ideal_contact(name):
     mechanism = load(name).mechanism
     scenarios = build_scenarios(mechanism, {"approach.phase": np.full(1, 0.5)})
     velocity = 0.007
@@ -220,7 +220,7 @@ DRAWING = [
 
 
 @pytest.mark.parametrize("path", DRAWING, ids=lambda path: "/".join(path.parts[-2:]))
-def test_plots_have_one_palette_and_units(path):
+def test_all_plots_use_the_same_colours_and_have_units(path):
     """Expect colours of `plot_contacts` or greys; axes have a unit, unless they count."""
     counted = ("", "solver step", "contact")
     for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -150,14 +150,14 @@ def runs(draw):
 
 
 @given(run=runs())
-def test_position_command_is_no_further_from_the_drives_than_limits_allow(run):
+def test_position_command_distance_from_drive_position_is_within_limits(run):
     gain_file, rows = run
     Reference(gain_file).follow(rows, in_both(gain_file, rows))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
-def test_position_command_stays_near_the_drives_for_a_million_ticks(law):
+def test_position_command_stays_near_drive_position_for_a_million_ticks(law):
     rng = np.random.default_rng([12, LAWS.index(law)])
     made = c99_cases.loaded(law)
     for n in range(1000):
@@ -178,7 +178,7 @@ def plain(law: str = "none", **limits: float) -> GainFile:
 @pytest.mark.parametrize("before", [[], [{"desired": -0.02, "measured": -0.02, "x": -0.02}] * 3])
 @pytest.mark.parametrize("model", [5e-3, 0.02, 1e300, -0.5])
 @pytest.mark.parametrize("drives", [-5e-3, -5e-4, 0.02, 5e-4])
-def test_first_position_command_against_the_drives_does_not_jump(drives, model, before):
+def test_first_position_command_does_not_jump_for_model_of_wrong_sign(drives, model, before):
     """Give the model the wrong sign: it trips at once, or moves there within the velocity limit."""
     wrong = {"desired": model, "measured": drives, "x": model}
     sent = in_both(plain(), rows_of(*before, {**wrong, "event": NEXT_CONTACT}, *[wrong] * 400))[len(before) :]
@@ -195,7 +195,7 @@ def test_first_position_command_against_the_drives_does_not_jump(drives, model, 
 
 @pytest.mark.parametrize("bad", ["desired", "velocity"])
 @pytest.mark.parametrize("drives", [0.02, -0.02, 5e-4, -40.0])
-def test_nonfinite_model_position_at_first_leaves_the_drives_where_they_are(bad, drives):
+def test_nonfinite_first_model_position_holds_the_drive_position(bad, drives):
     rows = rows_of(*[{"measured": drives, "x": 0.0, bad: math.nan}] * 3)
     results = in_both(plain(), rows)
     assert int(results[0, RESULT.index("cause")]) == MODEL_NOT_FINITE
@@ -203,7 +203,7 @@ def test_nonfinite_model_position_at_first_leaves_the_drives_where_they_are(bad,
 
 
 @pytest.mark.parametrize(("drives", "way", "rest"), [(0.02, -1.0, -5e-4), (-0.046, 1.0, -0.0295)])
-def test_retreat_from_outside_the_stroke_returns_without_a_jump(drives, way, rest):
+def test_retreat_from_position_outside_the_stroke_has_no_jump(drives, way, rest):
     """Begin beyond either end, and beyond either surface of a gap of 30 mm."""
     gain_file = plain()._replace(clearance=0.03)
     results = in_both(gain_file, rows_of(*[{"measured": drives, "x": math.nan}] * 4000))
@@ -213,7 +213,7 @@ def test_retreat_from_outside_the_stroke_returns_without_a_jump(drives, way, res
     assert np.all(np.abs(np.diff(commands)) <= LIMITED["retreat_velocity"] * PERIOD * (1 + 1e-9))
 
 
-def test_drives_moved_elsewhere_begin_the_next_run_there():
+def test_next_run_begins_at_current_drive_position():
     """Announce the run.
 
     Before its first reading the model says where it begins, but only out of contact.
@@ -227,7 +227,7 @@ def test_drives_moved_elsewhere_begin_the_next_run_there():
         assert controller.position_command(model, 0.0, 0.0) == pytest.approx(expected, rel=1e-12)
 
 
-def test_first_position_reading_is_not_bridged():
+def test_nonfinite_first_position_reading_trips_immediately():
     """Expect this whatever may be bridged later: there is no good reading to continue with."""
     rows = rows_of({"measured": math.nan, "desired": -5e-3, "x": -5e-3}, {"measured": -0.02})
     results = in_both(plain(), rows)
@@ -251,7 +251,7 @@ def test_command_before_the_first_reading_is_never_in_contact(model, expected):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_drives_that_follow_late_begin_without_a_bump(law):
+def test_run_with_delayed_drives_starts_without_a_jump(law):
     """Expect the law's own first command, without a fault, within `start_distance` and out of contact."""
     start = {"desired": -4e-4, "velocity": 5e-3, "measured": -5e-4, "x": -3.95e-4, "v": 5e-3}
     gain_file = plain(law, start_distance=5e-4)
@@ -266,7 +266,7 @@ def test_drives_that_follow_late_begin_without_a_bump(law):
     assert in_both(gain_file, pressed)[0, POSITION] == pytest.approx(-1e-4 + STEP, rel=1e-12)
 
 
-def test_run_that_begins_off_the_drives_catches_up_within_velocity_limit():
+def test_run_that_starts_away_from_drive_position_catches_up_within_velocity_limit():
     model = {"desired": -0.01, "measured": -0.011, "x": -0.01}
     rows = rows_of(*[{**model, "measured": -0.011 + 1e-7 * n} for n in range(60)])
     results = in_both(plain(), rows)
@@ -275,7 +275,7 @@ def test_run_that_begins_off_the_drives_catches_up_within_velocity_limit():
     assert np.all(commands[50:] == -0.01) and not results[-1, TRIPPED]
 
 
-def test_command_after_reset_continues_from_the_last_one():
+def test_command_after_reset_continues_from_last_command():
     """Begin the run at the drives' reading if they have been moved meanwhile."""
     here, there = {"desired": -0.01, "measured": -0.01, "x": -0.01}, {"measured": -0.03, "desired": -0.03}
     moved = {**there, "x": -0.03}
@@ -286,7 +286,7 @@ def test_command_after_reset_continues_from_the_last_one():
 
 
 @pytest.mark.parametrize("error", [ValueError, RuntimeError, ZeroDivisionError])
-def test_exception_in_the_law_leaves_the_drives_where_they_are(error, monkeypatch):
+def test_exception_in_compensator_holds_the_drive_position(error, monkeypatch):
     def fail(*_):
         raise error("gone wrong")
 

@@ -60,7 +60,7 @@ def restitutions():
     return result.reshape(3, len(PERIODS), -1).mean(axis=-1)
 
 
-def test_exact_inverse_leaves_an_error_of_first_order_in_the_period():
+def test_exact_inverse_position_lead_leaves_error_of_first_order_in_control_period():
     error, without, _ = restitutions() - 1
     # Behind the simulator alone the contact diverges, whatever the period.
     assert np.all(without > 0.5)
@@ -70,7 +70,7 @@ def test_exact_inverse_leaves_an_error_of_first_order_in_the_period():
     assert abs(2 * error[-1] - error[-2]) < 2e-5
 
 
-def test_position_lead_leaves_the_force_delay():
+def test_position_lead_does_not_compensate_force_delay():
     result = restitutions()[2]
     expected = delayed_restitution(OMEGA * DELAY)
     assert expected > 1.15
@@ -90,7 +90,7 @@ def test_simulator_follows_the_model_under_position_lead():
     assert apart[0] < 0.01 and apart[1] == pytest.approx(apart[0] / 2, rel=0.1)
 
 
-def test_position_lead_derivatives_by_its_gains():
+def test_position_lead_derivatives_by_gains_match_finite_differences():
     law = COMPENSATORS["position_lead"]
     gains = {"position_lead": jnp.asarray(0.02), "acceleration_lead": jnp.asarray(2e-4)}
 
@@ -136,7 +136,7 @@ def loaded_gains(simulator=SECOND_ORDER, **keys):
 LIMITED = {**SECOND_ORDER, "velocity_limit": 0.008, "acceleration_limit": 0.5}
 
 
-def test_sent_command_is_recorded_before_the_simulators_limits():
+def test_recorded_position_command_is_the_value_before_simulator_limits():
     loaded = loaded_gains(LIMITED)
     batch = nominal_and_draws(loaded.mechanism, 1, 0)
     _, (lane,) = record_lanes(loaded, batch)
@@ -151,7 +151,7 @@ def test_sent_command_is_recorded_before_the_simulators_limits():
     assert np.max(np.abs(np.asarray(lane.sent)[:-1] - x)[same_run]) > 0.02 * VELOCITY
 
 
-def test_verification_detects_a_wrong_position_command(monkeypatch):
+def test_verification_detects_wrong_position_command_of_runtime(monkeypatch):
     loaded = loaded_gains()
     good = verify(loaded, scenarios=1)
     assert good.verdict, good.reasons
@@ -171,7 +171,7 @@ def test_verification_detects_a_wrong_position_command(monkeypatch):
     assert "position command found" in reason
 
 
-def test_stroke_and_velocity_limits_apply_to_the_sent_command():
+def test_stroke_and_velocity_limits_apply_to_command_with_position_lead():
     loaded = loaded_gains()
     result = calibrate(loaded, scenarios=8, limit=1.0)
     [chunk] = record_selection(loaded, ScenarioSelection("random", 0, 8))

@@ -20,7 +20,7 @@ def test_probe_push_is_a_half_sine():
 
 
 @pytest.mark.parametrize("lag", [1e-3, 0.01, 0.1])
-def test_probe_push_behind_a_lag_is_its_convolution_with_the_lag(lag):
+def test_lagged_reading_of_probe_push_equals_convolution_with_sensor_lag(lag):
     for time in TIMES:
         expected, _ = quad(
             lambda s, time=time: float(PUSH.force(jnp.array(s))) * np.exp(-(time - s) / lag) / lag,
@@ -73,7 +73,7 @@ def test_early_probe_push_takes_energy_and_late_push_gives_energy():
     assert early < plain - 1e-3 and late > plain + 1e-3
 
 
-def test_trajectory_error_is_the_root_mean_square_off_the_table():
+def test_trajectory_error_is_rms_deviation_from_reference_trajectory():
     # Ideal linear contact without delay: x_d is the sine itself, and the table lies 1 mm deeper.
     parsed = validated(mechanism({}, IDEAL, 0.0))
     shape = build_scenarios(parsed).phase.shape

@@ -20,7 +20,7 @@ def lines(capsys):
     return capsys.readouterr().err.splitlines()
 
 
-def test_progress_line_has_work_done_rate_and_remaining_time(clock, capsys):
+def test_progress_line_states_completed_work_rate_and_remaining_time(clock, capsys):
     with terminal.show_progress(64, "mechanisms") as bar:
         bar.tell("first", 0)
         clock[0] += 60
@@ -36,7 +36,7 @@ def test_progress_line_has_work_done_rate_and_remaining_time(clock, capsys):
     assert third == "32 of 64 mechanisms, 16 mechanisms/min, 0:02:00 left, second"
 
 
-def test_progress_rate_excludes_work_done_before(clock, capsys):
+def test_progress_rate_excludes_work_done_before_resuming(clock, capsys):
     with terminal.show_progress(40, "results") as bar:
         bar.tell("as kept", 20, 20)
         clock[0] += 100
@@ -44,14 +44,14 @@ def test_progress_rate_excludes_work_done_before(clock, capsys):
     assert lines(capsys)[1] == "30 of 40 results, 6 results/min, 0:01:40 left, more"
 
 
-def test_progress_of_a_single_item_is_a_share(clock, capsys):
+def test_progress_of_a_single_item_is_shown_as_percentage(clock, capsys):
     with terminal.show_progress(1, "fronts") as bar:
         clock[0] += 36
         bar.tell("searching", 0.25)
     assert lines(capsys) == ["25 %, 41.7 %/min, 0:01:48 left, searching"]
 
 
-def test_progress_counts_stages_as_they_begin(clock, capsys):
+def test_progress_counts_each_stage_when_the_stage_begins(clock, capsys):
     with terminal.show_stages(3) as stages:
         for text in ("one", "two", "three"):
             stages.begin(text)
@@ -83,7 +83,7 @@ def test_progress_is_printed_with_elapsed_time_after_silence(monkeypatch, capsys
     assert all(re.match(r"1 of 10 scenarios, .* left, compiling", line) for line in result)
 
 
-def test_progress_shows_elapsed_time_before_anything_is_known(clock, capsys):
+def test_progress_shows_elapsed_time_before_first_work_is_reported(clock, capsys):
     with terminal.show_progress(100, "runs") as bar:
         clock[0] += 21
         bar.remind()

@@ -18,7 +18,7 @@ from tuning.statistics.quantiles import (
 
 @pytest.mark.parametrize("number", (1, 20, 300, 5000))
 @pytest.mark.parametrize("order", (0.05, 0.5, 0.95, 0.999))
-def test_quantile_ranks_leave_out_at_most_the_stated_probability(number, order):
+def test_quantile_interval_ranks_have_stated_coverage(number, order):
     """Use P(X_(low) <= quantile <= X_(high)) = P(low <= B < high) of a binomial B, exactly."""
     low, high = compute_order_ranks(number, order)
     law = stats.binom(number, order)
@@ -30,7 +30,7 @@ def test_quantile_ranks_leave_out_at_most_the_stated_probability(number, order):
     assert wider[0] <= low and wider[1] >= high
 
 
-def test_quantile_ranks_of_sequences_hold_at_all_numbers_at_once():
+def test_sequential_quantile_ranks_have_coverage_at_all_sample_sizes_together():
     rng = np.random.default_rng(0)
     numbers = np.arange(50, 5001, 50)
     for order in (0.5, 0.95):
@@ -42,7 +42,7 @@ def test_quantile_ranks_of_sequences_hold_at_all_numbers_at_once():
 
 
 @pytest.mark.parametrize("order", (0.5, 0.95, 0.99))
-def test_quantile_intervals_of_repeated_sweeps_cover(order, capsys):
+def test_quantile_intervals_have_stated_coverage_over_repeated_sweeps(order, capsys):
     """Draw half-normal |error| of known quantile; use the values, and the bins of two halves."""
     truth = stats.halfnorm.ppf(order)
     rng = np.random.default_rng(1)
@@ -69,7 +69,7 @@ def test_quantile_intervals_of_repeated_sweeps_cover(order, capsys):
 
 @pytest.mark.parametrize("order", (0.5, 0.99))
 @pytest.mark.parametrize("sampling", ("independent", "sobol"))
-def test_quantile_intervals_of_replicates_cover(order, sampling, capsys):
+def test_quantile_intervals_of_replicates_have_stated_coverage(order, sampling, capsys):
     """Draw |u_1 + u_2 - 1| for 16 replicates of 64 points.
 
     It is triangular on 0..1, with the quantile 1 - sqrt(1 - q).
@@ -108,7 +108,7 @@ def test_quantile_of_replicates_without_results_has_no_bound():
         replicate_quantile(np.stack([count_in_bins([1.0]), count_in_bins([1.0, 2.0])]), 0.5)
 
 
-def test_quantile_intervals_cover_ties():
+def test_quantile_intervals_have_stated_coverage_for_tied_values():
     """Draw from three values only: the quantile is one of them, and both ends may be."""
     rng = np.random.default_rng(2)
     inside = []
@@ -118,7 +118,7 @@ def test_quantile_intervals_cover_ties():
     assert np.mean(inside) >= 0.95
 
 
-def test_quantile_bins_merge_and_hold_every_error():
+def test_merged_quantile_bins_contain_every_error():
     assert BIN_EDGES[0] == 1e-9 and BIN_EDGES[-1] >= 1e3 and BIN_COUNT == len(BIN_EDGES) + 1 < 3000
     assert np.max(BIN_EDGES[1:] / BIN_EDGES[:-1]) <= 1 + BIN_RESOLUTION + 1e-12
     rng = np.random.default_rng(3)
@@ -145,11 +145,11 @@ def test_failed_runs_count_as_the_largest_errors():
 
 
 @pytest.mark.parametrize("interval", (quantile([], 0.5), binned_quantile(count_in_bins([]), 0.5)))
-def test_quantile_without_values_is_unknown(interval):
+def test_quantile_of_no_values_is_unknown(interval):
     assert np.isnan(interval.value) and interval.low == 0.0 and np.isinf(interval.high)
 
 
-def test_few_values_do_not_bound_a_far_quantile():
+def test_extreme_quantile_of_few_values_has_no_upper_bound():
     values = np.arange(1.0, 11.0)
     assert np.isinf(quantile(values, 0.99).high) and quantile(values, 0.01).low == 0.0
     # 100 n q is a whole number: the rank is not rounded up.
@@ -159,6 +159,6 @@ def test_few_values_do_not_bound_a_far_quantile():
 @pytest.mark.parametrize(
     "number, order, level", ((-1, 0.5, 0.9), (5, 0.0, 0.9), (5, 1.0, 0.9), (5, 0.5, 1.0))
 )
-def test_quantile_refuses_impossible_orders(number, order, level):
+def test_quantile_function_refuses_impossible_orders(number, order, level):
     with pytest.raises(ValueError, match="number, order, level: found"):
         compute_order_ranks(number, order, level)

@@ -74,7 +74,7 @@ def most_accurate(result):
     return min(result.starts, key=lambda start: start.rms)
 
 
-def test_quiet_gains_are_within_the_limit_on_fresh_scenarios(quiet):
+def test_quiet_gains_meet_error_limit_on_fresh_scenarios(quiet):
     result = quiet[0][0]
     accurate = most_accurate(result)
     assert result.quiet and accurate.rms < compute_training_tolerance(LIMIT, SETTINGS.scenarios or 0)
@@ -82,7 +82,7 @@ def test_quiet_gains_are_within_the_limit_on_fresh_scenarios(quiet):
     assert noise_of(result, result.gains) < 0.8 * noise_of(result, accurate.gains)
 
 
-def test_gains_of_least_error_stay_if_none_are_within_the_limit(quiet, validation):
+def test_most_accurate_gains_are_kept_if_no_gains_meet_error_limit(quiet, validation):
     result = quiet[0][1]
     accurate = most_accurate(result)
     assert not result.quiet and accurate.rms > compute_training_tolerance(LIMIT, SETTINGS.scenarios or 0)
@@ -97,11 +97,11 @@ def validation():
     return build_validation(tasks, SETTINGS.validation, SETTINGS.seed)
 
 
-def test_quiet_and_accurate_searches_share_one_program(quiet):
+def test_searches_for_quiet_gains_and_accurate_gains_share_one_program(quiet):
     assert quiet[1] == 1
 
 
-def test_no_gains_of_a_grid_are_quieter_within_the_tolerance(quiet, validation):
+def test_no_gains_on_a_grid_have_less_noise_within_the_error_tolerance(quiet, validation):
     """Measure the loudness of every pair of the two gains, with the weights of this task."""
     result = quiet[0][0]
     accurate = most_accurate(result).gains
@@ -119,7 +119,7 @@ def test_no_gains_of_a_grid_are_quieter_within_the_tolerance(quiet, validation):
     assert loudness[-2] <= 1.03 * loudness[:-2][errors[:-2] <= tolerance].min()
 
 
-def test_metrics_without_noise_are_those_of_the_mechanism_without_noise(quiet):
+def test_noise_free_metrics_equal_those_of_mechanism_without_noise(quiet):
     for rig, result in zip(RIGS, quiet[0], strict=True):
         silent = noisy(*rig[:-1], 0.0)
         seed = SETTINGS.seed + VALIDATION_SEED_OFFSET
@@ -131,7 +131,7 @@ def test_metrics_without_noise_are_those_of_the_mechanism_without_noise(quiet):
         assert result.without_noise.rms != result.figures["tuned"].rms
 
 
-def test_mechanisms_without_noise_are_tuned_as_if_quiet_was_not_requested():
+def test_quiet_option_has_no_effect_for_mechanisms_without_noise():
     silent = load("varying").mechanism
     assert not is_quiet_search_needed(build_task(silent, LAW, 4, 0), SETTINGS)
     assert not is_quiet_search_needed(build_task(MECHANISMS[0], "position_lead", 4, 0), SETTINGS)
@@ -139,7 +139,7 @@ def test_mechanisms_without_noise_are_tuned_as_if_quiet_was_not_requested():
 
 
 @pytest.mark.slow
-def test_cached_quiet_gains_are_the_same(quiet, tmp_path):
+def test_quiet_gains_from_cached_program_are_identical(quiet, tmp_path):
     made = tuned(SETTINGS, pieces=Checkpoints(tmp_path))
     again = tuned(SETTINGS, pieces=Checkpoints(tmp_path, resume=True))
     for one, other, reference in zip(made, again, quiet[0], strict=True):
@@ -200,7 +200,7 @@ def result_of(rms=0.005, silent=0.004, failed=0, unlike=0.0, peaks=(1.0, 1.2), g
         ({"unlike": 0.02}, False, "Bad: too many real contacts are unlike the ideal one; the tuned rms"),
     ],
 )
-def test_verdict_names_the_metrics_it_used(changes, good, words):
+def test_tuning_verdict_names_the_metrics_used(changes, good, words):
     result = result_of(**changes)
     line = tune_verdict.describe_verdict(result, 0.01)
     assert tune_verdict.is_good(result, 0.01) is good
@@ -240,7 +240,7 @@ def test_tune_of_a_noisy_mechanism_records_its_noise_free_error_and_warnings():
 
 
 @pytest.mark.parametrize("name", ["suite-noisy", "petals"])
-def test_scenarios_without_noise_differ_in_their_noise_alone(name):
+def test_noise_free_scenarios_differ_from_noisy_scenarios_only_in_noise(name):
     sensor = {} if name != "petals" else {"rig.force_sensor.noise_std": {"force": 0.5, "torque": 0.05}}
     mechanism = load_any(name, {**sensor, "rig.force_sensor.delay": 0.003}).mechanism
     scenarios = choose_rig_model(mechanism).scenarios(mechanism)

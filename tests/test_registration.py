@@ -77,7 +77,7 @@ def test_incomplete_contact_law_is_refused(registered):
     assert "contact.law: found 'none', expected one of linear, " in refusal(laws.find_contact_law, "none")
 
 
-def test_contact_laws_must_describe_a_shared_key_alike():
+def test_contact_laws_with_shared_key_must_describe_the_key_identically():
     for law in laws.CONTACT_LAWS.values():
         assert all(laws.CONTACT_KEYS[key.name] == key for key in law.keys or ())
 
@@ -133,7 +133,7 @@ def test_unusable_law_is_not_registered(registered):
     jaxhil.register(ScaledLead())
 
 
-def test_redefined_law_is_the_one_that_runs():
+def test_redefined_compensator_replaces_the_earlier_definition():
     """Check that no compiled program of the first law serves the second."""
 
     def defined(share):

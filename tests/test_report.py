@@ -84,7 +84,7 @@ def put(tmp_path):
     return write
 
 
-def test_names_in_the_report_stay_text(put):
+def test_mechanism_names_in_report_are_escaped(put):
     places = [
         put(identified(), folder="a"),
         put(mapped(), "map.json", "b"),
@@ -100,7 +100,7 @@ def test_names_in_the_report_stay_text(put):
     assert "script-src 'sha256-" in page and "default-src 'none'" in page
 
 
-def test_report_verdict_is_that_of_the_requirements(put):
+def test_report_verdict_follows_from_all_requirements(put):
     made = tuning.report(put(identified(effect=0.02, verdict="bad")))
     assert made.verdict == "bad" and "Bad: not every requirement is met." in made.html.decode()
     [one] = made.requirements
@@ -124,7 +124,7 @@ def test_report_verdict_is_that_of_the_requirements(put):
         ({"schema": "jaxhil/gains/1"}, "sha256: found nothing"),
     ],
 )
-def test_third_party_results_are_refused_in_one_line(jaxhil, put, tmp_path, document, said):
+def test_report_refuses_third_party_results_in_one_line(jaxhil, put, tmp_path, document, said):
     ended = jaxhil("report", put(document), "-o", tmp_path / "page.html")
     assert ended.code == 2 and said in ended.err and ended.err.count("\n") == 1
     assert not (tmp_path / "page.html").exists()
@@ -168,7 +168,7 @@ def whole(results, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_report_holds_all_that_is_known(whole):
+def test_report_contains_all_results_in_the_folder(whole):
     text = whole.read_text(encoding="utf-8")
     for folder in ("requirements", "assumptions", "gains", "runs", "errors", "drivers", "watchdog", "map",
                   "reproduction", "sign-off"):  # fmt: skip
@@ -229,7 +229,7 @@ def test_report_page_is_accessible(whole, browser):
 
 
 @pytest.mark.slow
-def test_report_on_paper_cuts_no_picture(whole, browser):
+def test_printed_report_cuts_no_picture(whole, browser):
     """Expect everything that stands on a page to fit on it, and nothing to be broken between two."""
     browser.open(whole, 1440)
     pages, faults = browser.printed(*A4)

@@ -99,7 +99,7 @@ def interrupted_and_resumed(jaxhil, files, folder, stop, after):
 
 
 @pytest.mark.slow
-def test_resumed_run_ends_as_without_interruption(jaxhil, files, whole, tmp_path):
+def test_resumed_run_gives_result_of_uninterrupted_run(jaxhil, files, whole, tmp_path):
     expected, every = whole
     # Rounds of the search, the search, and one result each.
     assert every >= 2 + FILES
@@ -136,7 +136,7 @@ def test_checkpoints_of_other_files_and_options_are_not_used(jaxhil, files, tmp_
 
 
 @pytest.mark.parametrize("number", [1, pytest.param(FILES, marks=pytest.mark.slow)])
-def test_checkpointed_result_is_the_result(tmp_path, number):
+def test_result_read_from_checkpoint_is_bit_identical(tmp_path, number):
     """Compare all of it to the bit, including what pictures are made of."""
     mechanisms = [load("rig-300kg", [f"name=m{i}"]).mechanism for i in range(number)]
     made = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Checkpoints(tmp_path)))
@@ -163,7 +163,7 @@ def assert_same(one, other):
 
 
 @pytest.mark.slow
-def test_front_is_checkpointed_too(jaxhil, tmp_path):
+def test_pareto_front_is_checkpointed(jaxhil, tmp_path):
     arguments = ["tune", "rig-300kg", "-o", tmp_path, *TINY, "--pareto", "2"]
     with pytest.MonkeyPatch.context() as patched:
         Writes(patched, stop=8)
@@ -183,7 +183,7 @@ class Scene(NamedTuple):
     mechanism: Mechanism
 
 
-def test_comparison_resumes_with_missing_results(tmp_path, monkeypatch):
+def test_resumed_comparison_computes_only_missing_results(tmp_path, monkeypatch):
     """Make up the metrics; group, save and read them as usual."""
     names = ["rig-300kg", "suite-noisy", "varying"]
     mechanisms = [load(name).mechanism for name in names]

@@ -48,7 +48,7 @@ def case(compensator, overrides=()):
 
 @pytest.mark.parametrize("compensator", ["none", "phase_lead", "response_error"])
 @pytest.mark.parametrize("threads", [1, 2])
-def test_contacts_agree_with_the_jax_loop(baseline, compensator, threads):
+def test_cpp_baseline_contacts_agree_with_jax_simulation(baseline, compensator, threads):
     loop, gains, scenario, rig = case(compensator)
     expected = jax.jit(rollout, static_argnums=0)(loop, gains, scenario)
     found = baseline.run(loop, rig, gains, scenario, int(np.max(expected.ticks)), threads)
@@ -65,7 +65,7 @@ def test_contacts_agree_with_the_jax_loop(baseline, compensator, threads):
         )
 
 
-def test_bare_ticks_make_the_first_contact(baseline):
+def test_cpp_baseline_run_ticks_gives_same_first_contact_as_run(baseline):
     loop, gains, scenario, rig = case("response_error")
     contacts = baseline.run(loop, rig, gains, scenario, 3000)
     bare = baseline.run_ticks(loop, rig, gains, scenario, 3000)
@@ -75,7 +75,7 @@ def test_bare_ticks_make_the_first_contact(baseline):
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the report is that of g++ on Linux")
-def test_every_law_of_it_does_several_lanes_at_a_time():
+def test_cpp_baseline_is_vectorised_for_every_compensator():
     """The loop over the lanes of a tick, three instances: the compiler's own report."""
     source = SOURCE.read_text().splitlines()
     (line,) = (n for n, text in enumerate(source, 1) if "const double x = b.position[l], v" in text)
@@ -89,13 +89,13 @@ def test_every_law_of_it_does_several_lanes_at_a_time():
     assert len(loops) == len(KINDS)
 
 
-def test_what_is_out_of_scope_is_refused(baseline):
+def test_cpp_baseline_refuses_zero_order_hold(baseline):
     loop, gains, scenario, rig = case("none", ["rig.command_hold=zoh"])
     with pytest.raises(ValueError, match="linear hold"):
         baseline.run(loop, rig, gains, scenario, 10)
 
 
-def test_a_delay_beyond_the_delay_lines_is_refused(baseline):
+def test_cpp_baseline_refuses_delay_longer_than_its_delay_lines(baseline):
     loop, gains, scenario, rig = case("response_error")
     gains["identification_delay"] = np.asarray(loop.ring * scenario.control_period)
     with pytest.raises(ValueError, match=f"delays: found {loop.ring} periods"):

@@ -55,7 +55,7 @@ WIDE = {
 
 
 @pytest.mark.parametrize("law", COMPENSATORS)
-def test_time_of_a_tick(law, tmp_path):
+def test_c_controller_time_per_tick_is_within_limit(law, tmp_path):
     document, count = gain_document(law), ROWS
     document["limits"] = {name: {"value": value, "unit": LIMITS[name].unit} for name, value in WIDE.items()}
     folder = c99_cases.write_sources(tmp_path, sign(document))

@@ -39,7 +39,7 @@ def swept(folder, manifest, computer=run_chunks):
 
 
 @pytest.mark.parametrize("workers", [2, 4, 8])
-def test_workers_beside_one_process_on_the_same_cores(workers, tmp_path, capsys):
+def test_cluster_sweep_is_at_least_half_as_fast_as_local_sweep(workers, tmp_path, capsys):
     manifest = build_manifest(check_document(default_gains()), ManifestOptions(PARTS * CHUNK, chunk=CHUNK))
     here, there = [], []
     with started(tmp_path) as cluster:
@@ -63,7 +63,7 @@ def test_workers_beside_one_process_on_the_same_cores(workers, tmp_path, capsys)
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="times of other processes are Linux's")
-def test_the_scheduler_carries_a_thousand_workers(tmp_path, capsys):
+def test_scheduler_serves_a_thousand_workers_without_becoming_the_bottleneck(tmp_path, capsys):
     """Pieces that take no time: what each costs the scheduler and the command, in seconds of processor."""
     distributed = pytest.importorskip("distributed")
     with started(tmp_path) as cluster:

@@ -51,7 +51,7 @@ def figures(response):
     return 1e3 * (lag(response) - lag(exact)), 100.0 * (width / TRUE.bandwidth() - 1.0)
 
 
-def test_methods(tmp_path, capsys):
+def test_identify_is_more_accurate_than_other_identification_methods(tmp_path, capsys):
     run = campaigns.campaign("clean", 0, speeds=(), rest=0).runs[0]
     timing = campaigns.campaign("clean", 0, speeds=(), seconds=0, rest=0).timing
     period, rows = timing.control_period, []

@@ -42,7 +42,7 @@ def general(campaign, model):
     return optimize.least_squares(residuals, start, x_scale="jac", bounds=(least, most)).x[:4] * UNITS
 
 
-def test_time_of_a_day(capsys):
+def test_identify_processes_logs_of_one_day_within_time_limit(capsys):
     campaign = campaigns.campaign("clean", 0)
     options = IdentificationOptions(law="kelvin_voigt")
     identify(campaign, options=options)
@@ -68,7 +68,7 @@ def test_time_of_a_day(capsys):
     assert max(took, every) < BAR
 
 
-def test_time_of_a_long_press(capsys):
+def test_identify_processes_a_long_press_run_within_time_limit(capsys):
     """Identify a rig whose force sensor lags from touches and a press of 40 s, 43,000 readings in contact."""
     kind, campaign = campaigns.KINDS["lagging"], campaigns.campaign("lagging", 0)
     press = campaigns._press_run(kind, np.random.default_rng(0), seconds=40.0)

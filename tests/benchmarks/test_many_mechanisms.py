@@ -28,7 +28,7 @@ def computing_seconds():
     return (time.process_time() - time.thread_time()) / count_usable_cores()
 
 
-def test_many_in_one_command_beside_as_many_commands(tmp_path, capsys):
+def test_tuning_many_mechanisms_in_one_command_is_faster_than_separate_commands(tmp_path, capsys):
     content = builtin_path("varying").read_text()
     for i, mass in enumerate(MASSES):
         other = re.sub(r"(?m)^equivalent_mass = \S+", f"equivalent_mass = {mass:.1f}", content)
@@ -55,7 +55,7 @@ def test_many_in_one_command_beside_as_many_commands(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
-def test_many_in_one_call_beside_as_many_calls(compensator, capsys):
+def test_tuning_many_mechanisms_in_one_call_is_faster_than_separate_calls(compensator, capsys):
     every = [
         jaxhil.load("varying", {"bodies.equivalent_mass": float(mass), "name": f"mass {i}"})
         for i, mass in enumerate(MASSES)

@@ -25,7 +25,7 @@ TAILS = {"impulse_ledger": 500.0}  # on 999 of 1000 in contact
 
 @pytest.mark.parametrize("guarded", [False, True], ids=["bare", "guarded"])
 @pytest.mark.parametrize("law", COMPENSATORS)
-def test_time_of_a_tick(law, guarded, capsys):
+def test_python_controller_time_per_tick_is_within_limit(law, guarded, capsys):
     document, count = gain_document(law), TICKS // 10 if law in TAILS else TICKS
     if guarded:
         document["limits"] = {

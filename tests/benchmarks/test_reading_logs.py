@@ -66,7 +66,7 @@ def run(code: str, *arguments: object) -> tuple[int, float, float, float]:
 
 @pytest.mark.parametrize("rows", SECONDS)
 @pytest.mark.parametrize("kind", ["free", "contact"])
-def test_rows_a_second(kind, rows, tmp_path, capsys):
+def test_log_reading_time_and_memory_are_within_limits(kind, rows, tmp_path, capsys):
     path = tmp_path / "log.csv"
     write(path, rows, kind)
     _, bare, bare_processor, bare_memory = run(BARE, path)

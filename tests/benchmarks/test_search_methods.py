@@ -3,7 +3,7 @@
 Every method tunes the same mechanisms of the family from the same starts; what counts is how often a start
 ends within 1 % of the best that any of them finds, and after how many rollouts and how long. Compilation is
 outside of all times. Run with `pytest -m benchmark -s tests/benchmarks/test_search_methods.py`, for a few
-mechanisms with `-k "03 or 48 or bar"`.
+mechanisms with `-k "03 or 48 or fewer"`.
 """
 
 import os
@@ -45,7 +45,7 @@ def compared() -> dict[str, Results]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_methods_on(name, cases, compared, capsys):
+def test_optimisers_are_compared_on_mechanism(name, cases, compared, capsys):
     case = cases[name]
     starts = case.starts(STARTS, SEED)
     case.warm_up()
@@ -65,7 +65,7 @@ def test_methods_on(name, cases, compared, capsys):
         )
 
 
-def test_bar(compared, capsys):
+def test_tuning_needs_fewer_rollouts_than_other_optimisers(compared, capsys):
     if not compared:
         pytest.skip("no mechanism has been compared")
     middle = medians(list(compared.values()))
@@ -83,7 +83,7 @@ def test_bar(compared, capsys):
     assert seconds <= COST
 
 
-def test_every_program_has_the_loss_of_tuning(cases):
+def test_compared_optimisers_minimise_the_loss_of_tuning(cases):
     # One of each program is enough.
     for case in {(case.loop, case.names): case for case in cases.values()}.values():
         points = case.starts(5, 1)
@@ -105,7 +105,7 @@ def bowl(points):
 
 
 @pytest.mark.parametrize("method", OTHERS)
-def test_every_method_finds_the_bottom_of_a_bowl_and_goes_on_from_its_start(method):
+def test_every_optimiser_minimises_a_quadratic_from_its_starting_point(method):
     start = np.full(4, 0.31)
     trace = record(OTHERS[method], bowl, start, 0, 0.5)
     assert trace.loss[0] <= bowl(start) + (0.35 if method == "Nelder-Mead" else 0)
@@ -116,7 +116,7 @@ def test_every_method_finds_the_bottom_of_a_bowl_and_goes_on_from_its_start(meth
     assert trace.seconds[-2] < 0.5 and trace.seconds[-1] > 0.4
 
 
-def test_a_recorder_counts_and_ends():
+def test_recorder_counts_rollouts_and_stops_optimiser_at_time_limit():
     recorder = Recorder(bowl, 1e3)
     recorder(np.full((3, 2), 0.5))
     recorder(np.array([[0.3, 0.3]]))
@@ -128,7 +128,7 @@ def test_a_recorder_counts_and_ends():
         Recorder(bowl, 0.0)(np.full((1, 2), 0.5))
 
 
-def test_expected_cost_is_the_median_over_the_share():
+def test_expected_cost_is_median_cost_divided_by_success_rate():
     def trace(*losses):
         calls = np.arange(1, 1 + len(losses))
         return Trace(10.0 * calls, 0.5 * calls, np.array(losses))

@@ -38,7 +38,7 @@ def seconds(kind, folder):
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def test_second_tune_gains_from_cached_programs(tmp_path, capsys):
+def test_second_tune_is_faster_with_cached_programs(tmp_path, capsys):
     kinds = ("ours", "jax")
     first = [seconds(kind, tmp_path) for kind in kinds]
     ours, jax_alone = np.array([[seconds(kind, tmp_path) for kind in kinds] for _ in range(PAIRS)]).T

@@ -37,7 +37,7 @@ def seconds_of(name, folder):
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
-def test_first_simulate(name, tmp_path, capsys):
+def test_first_six_axis_simulate_command_is_within_time_limit(name, tmp_path, capsys):
     cold, warm = (seconds_of(name, tmp_path) for _ in range(2))
     with capsys.disabled():
         print(f"\n{name}: first simulate {cold:.1f} s, then {warm:.1f} s of the processor")
@@ -56,7 +56,7 @@ def nothing_kept():
 
 
 @pytest.mark.usefixtures("nothing_kept")
-def test_twelve_candidates_compile(capsys):
+def test_six_axis_program_of_twelve_contact_candidates_compiles_within_time_limit(capsys):
     """Twelve candidates of two kinds, the second time with derivatives by six leads."""
     mechanism = load_any("petals", []).mechanism
     scenario = build_scenarios(mechanism)

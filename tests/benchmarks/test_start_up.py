@@ -50,7 +50,7 @@ def run(arguments, folder, programs):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_that_ran_before_begins_soon(name, tmp_path, capsys):
+def test_repeated_command_finishes_within_time_limit(name, tmp_path, capsys):
     arguments, most = COMMANDS[name]
     first, *others = (run(arguments, tmp_path, tmp_path / "programs") for _ in range(1 + REPEATS))
     took, said = min(others)
@@ -80,7 +80,7 @@ def nothing_kept():
 
 
 @pytest.mark.parametrize("compensator", [name for name, law in COMPENSATORS.items() if law.gains])
-def test_the_rollouts_of_a_law_compile_soon_with_derivatives(compensator, nothing_kept, capsys):
+def test_rollouts_with_derivatives_compile_within_time_limit(compensator, nothing_kept, capsys):
     """A tile's restitutions and their derivatives by all gains, as the solver asks for them."""
     loop, gains, scenarios = case(compensator, LANES_PER_TILE)
     rig = jax.jit(build_rig_constants, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
@@ -102,7 +102,7 @@ def test_the_rollouts_of_a_law_compile_soon_with_derivatives(compensator, nothin
 
 
 @pytest.mark.parametrize("compensator", [name for name, law in COMPENSATORS.items() if law.gains])
-def test_a_law_with_derivatives_compiles_soon(compensator, tmp_path, capsys):
+def test_programs_of_tuning_compile_within_time_limit(compensator, tmp_path, capsys):
     """One solver step is enough for all of a tuning's programs."""
     few = "--starts", "1", "--steps", "1", "--validation", "15", "--compensator", compensator
     took, said = run(("tune", "varying", *few), tmp_path, tmp_path / "programs")

@@ -49,7 +49,7 @@ def default_gains():
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_sweep_beside_the_compiled_baseline(precision, tmp_path, capsys):
+def test_sweep_speed_is_compared_with_cpp_baseline(precision, tmp_path, capsys):
     baselines = [compile_baseline(skips=skips) for skips in (False, True)]
     if None in baselines:
         pytest.skip("no C++ compiler")
@@ -100,7 +100,7 @@ def test_sweep_beside_the_compiled_baseline(precision, tmp_path, capsys):
     assert rate >= 0.8 * compiled[0]
 
 
-def test_memory_does_not_grow_with_the_number_of_scenarios(tmp_path, capsys):
+def test_sweep_memory_does_not_grow_with_number_of_scenarios(tmp_path, capsys):
     write_gain_file(tmp_path / "gains.json", default_gains())
     peaks = {}
     for number in FEW, MANY:

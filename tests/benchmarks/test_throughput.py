@@ -89,7 +89,7 @@ def timed(function):
 
 @pytest.mark.parametrize("names", [("varying",), ONE_SIDED], ids=["varying", "several"])
 @pytest.mark.parametrize("compensator", ["none", "response_error"])
-def test_rollout_beside_the_compiled_baseline(compensator, names, capsys):
+def test_rollout_speed_is_compared_with_cpp_baseline(compensator, names, capsys):
     flying, skipping = ([compile_baseline(width, skips) for width in WIDTHS] for skips in (False, True))
     if None in flying:
         pytest.skip("no C++ compiler")
@@ -148,7 +148,7 @@ def jacobian(lanes, options):
     return timed(partial(program, values))
 
 
-def test_jacobian_with_and_without_its_options_and_tiles(capsys):
+def test_jacobian_time_is_compared_for_compiler_options_and_tile_sizes(capsys):
     """Time a lane, in the tiles of tuning and twice as many lanes at once."""
     tuned = best(
         jacobian(LANES_PER_TILE, supported_options(TICK_OPTIONS)),
@@ -169,7 +169,7 @@ def test_jacobian_with_and_without_its_options_and_tiles(capsys):
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
-def test_gradient_costs_little_more_than_its_rollouts(compensator, capsys):
+def test_gradient_takes_little_longer_than_rollouts_alone(compensator, capsys):
     loop, gains, scenarios = case(compensator, 256)
     rig = jax.jit(build_rig_constants, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
     names = tuple(gains)
