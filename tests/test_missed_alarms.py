@@ -141,6 +141,6 @@ def test_number_of_fault_scenarios_follows_from_allowed_missed_alarm_rate():
     ) == MAX_FAULT_SCENARIOS == count_fault_scenarios(0.0)
 
 
-def test_stated_error_margin_adds_watchdog_margin_and_offset():
+def test_reported_error_margin_is_limit_minus_largest_error():
     assert _error_margin(0.01, -0.004) == "+0.006 of the error"
     assert _error_margin(None, 0.1) == "none"

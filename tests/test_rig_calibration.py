@@ -88,7 +88,7 @@ def watch(limits, signals, rules, lane):
 
 
 @pytest.mark.parametrize("sided", [pytest.param(1, marks=pytest.mark.slow), 2])
-def test_calibration_audit_is_the_watchdogs_to_the_bit(sided):
+def test_calibration_audit_equals_watchdog_audit_to_the_bit(sided):
     rules, _ = build_audit_rules({1: ONE_SIDED, 2: NOISY_GAP}[sided])
     chunk, slots = recorded(sided), 8
     audited = audit_contacts(chunk.signals, rules, slots)
@@ -121,7 +121,7 @@ def test_calibration_audit_is_the_watchdogs_to_the_bit(sided):
     assert contacts == np.sum(np.isfinite(audited.restitution)) >= 2 * LANES
 
 
-def test_calibration_audits_the_restitution_that_the_loop_reports():
+def test_calibration_audit_restitution_equals_simulated_restitution():
     rules, distance = build_audit_rules(ONE_SIDED)
     chunk = recorded(1)
     judged = evaluate_runs(chunk, rules, distance)
@@ -132,7 +132,7 @@ def test_calibration_audits_the_restitution_that_the_loop_reports():
     assert np.max(judged.audited.imbalance[ended]) < 1e-11
 
 
-def test_audit_of_a_law_with_status_begins_when_the_law_acts():
+def test_audit_of_impulse_ledger_begins_when_the_compensator_acts():
     """Place the surface 1 mm nearer than specified: neither position ever passes the specified one."""
     nearer = gains(uncertainty={}, compensator="impulse_ledger", contact_plane=-1e-3)
     assert build_audit_rules(nearer)[0].has_status and not build_audit_rules(ONE_SIDED)[0].has_status
@@ -142,7 +142,7 @@ def test_audit_of_a_law_with_status_begins_when_the_law_acts():
     np.testing.assert_allclose(audited.restitution, chunk.contacts.restitution[:2], atol=1e-6)
 
 
-def test_calibration_sets_every_limit_and_the_file_loads(calibrated):
+def test_calibration_sets_every_limit_and_the_gain_file_loads(calibrated):
     limits = calibrated[0].limits
     assert list(limits) == list(LIMITS)
     # The distance from which a rig approaches a surface is not limited.
@@ -161,7 +161,7 @@ def test_calibration_sets_every_limit_and_the_file_loads(calibrated):
     assert 0 < limits["measured_highest"] < 0.01
 
 
-def test_long_approach_is_no_fault(calibrated):
+def test_long_approach_under_calibrated_limits_raises_no_fault(calibrated):
     controller = limited_controller(ONE_SIDED, build_limits_section(calibrated[0].limits))
     velocity, period = ONE_SIDED.mechanism.approach.velocity, ONE_SIDED.mechanism.rig.control_period
     for tick in range(5000):
@@ -171,7 +171,7 @@ def test_long_approach_is_no_fault(calibrated):
         assert controller.faults == 0
 
 
-def test_contacts_without_force_end_though_the_law_output_hardly_decays(calibrated):
+def test_contacts_end_without_force_even_if_compensator_output_decays_slowly(calibrated):
     """Alternate contact and flight, with less flight than the output is given to die out."""
     limits = {name: value for name, value in calibrated[0].limits.items() if value is not None}
 
@@ -187,7 +187,7 @@ def test_contacts_without_force_end_though_the_law_output_hardly_decays(calibrat
     assert CONTACT_TOO_LONG in faults(1e-3) and CONTACT_TOO_LONG not in faults(1e-9)
 
 
-def test_rig_specific_limits_are_preserved_and_count():
+def test_rig_specific_limits_are_preserved_and_counted_as_false_alarms():
     small = {"force_limit": 1e-3, "command_lowest": -0.05}
     result = calibrate(ONE_SIDED, scenarios=64, limit=LIMIT, replaced=small)
     assert {name: result.limits[name] for name in small} == small
@@ -196,7 +196,7 @@ def test_rig_specific_limits_are_preserved_and_count():
     assert rate["alarms"] == rate["runs"] > 0
 
 
-def test_controller_stops_bad_runs_and_no_good_run(calibrated):
+def test_calibrated_controller_stops_every_bad_run_and_no_good_run(calibrated):
     (limits, rates), chunk = calibrated
     rules, distance = build_audit_rules(ONE_SIDED)
     judged = evaluate_runs(chunk, rules, distance)
@@ -218,14 +218,14 @@ def test_controller_stops_bad_runs_and_no_good_run(calibrated):
     assert rates["missed_alarms"]["runs"] > 10 and 0 < rates["missed_alarms"]["high"] < 0.3
 
 
-def test_specified_damping_requires_no_identified_damping(calibrated):
+def test_watchdog_with_specified_damping_does_not_use_identified_damping(calibrated):
     rates = calibrated[0].rates
     assert rates["terms"] == ["1", "p", "pp", "ppp"]
     assert rates["expectation_largest"] < 2e-3 and rates["restitution_margin"] == 0.75 * LIMIT
     assert rates["widened_from"] is None and rates["noticed_from"]["error"] < LIMIT
 
 
-def test_unspecified_damping_is_not_distinguished_from_delay():
+def test_watchdog_without_specified_damping_cannot_distinguish_damping_from_delay():
     """Expect a margin that is widened until good runs pass, at a stated price."""
     loaded = gains(uncertainty={**UNCERTAIN, **DAMPING})
     rates = calibrate(loaded, scenarios=8 * LANES, limit=LIMIT, lanes=LANES).rates
@@ -245,14 +245,14 @@ def test_unspecified_damping_is_not_distinguished_from_delay():
     assert rates["widened_from"] is None and rates["reasons"][0].startswith("false alarms: ")
 
 
-def test_undamped_contact_is_expected_to_return_all_energy():
+def test_expected_restitution_of_undamped_contact_is_1():
     rng = np.random.default_rng(0)
     features = ContactFeatures(*rng.uniform(1.0, 2.0, (3, 100)))
     fitted = fit_expectation(features, np.ones(100), np.arange(100), 350.0, 1e-4)
     assert fitted.coefficients == {**dict.fromkeys(POLYNOMIAL_TERMS, 0.0), "1": pytest.approx(1.0)}
 
 
-def test_calibration_finds_a_known_polynomial():
+def test_calibration_recovers_a_known_restitution_polynomial():
     rng = np.random.default_rng(1)
     features = ContactFeatures(
         1e5 * rng.uniform(0.5, 2, 400), 300 * rng.uniform(0.5, 2, 400), rng.uniform(4e-3, 6e-3, 400)
@@ -268,7 +268,7 @@ def test_calibration_finds_a_known_polynomial():
     assert np.sum(inside) > 300 and np.max(np.abs(again - expected[inside])) < 1e-9
 
 
-def test_calibration_runs_a_store_again(tmp_path):
+def test_calibration_repeats_the_runs_of_a_stored_sweep(tmp_path):
     document = case(2, "response_error")
     manifest = sweep_manifest(document, scenarios=LANES, limit=LIMIT)
     store = open_store(tmp_path / "store", manifest, resume=False)
@@ -292,7 +292,7 @@ def test_calibration_runs_a_store_again(tmp_path):
 
 
 @pytest.mark.slow
-def test_calibration_misses_none_of_a_hundred_thousand_scenarios():
+def test_calibrated_watchdog_misses_no_bad_run_in_a_hundred_thousand_scenarios():
     """Use the built-in claw and gains near the literature's, so that many runs are good and many are not."""
     parsed = load("claw-350kg").mechanism
     law = literature_gains(parsed, "response_error")
@@ -327,7 +327,7 @@ def signals(**columns):
     return RecordedSignals(**every, live=live, begins=begins)
 
 
-def test_extent_of_a_run_has_its_largest_and_smallest_values():
+def test_run_extremes_are_largest_and_smallest_signal_values():
     made = signals(
         force=[0.0, 0.5, 0.5, 0.5, 7.0, -9.0],
         measured=[-4.0, -3.0, 1.0, 3.0, 3.0, 4.0],
@@ -358,7 +358,7 @@ def test_extent_of_a_run_has_its_largest_and_smallest_values():
 
 
 @pytest.mark.parametrize(("force", "travel"), [(0.0, 1.5 + 0.5), (5.0, 1.5 + 0.5 + 0.5 + 0.3 + 0.5)])
-def test_extent_counts_missing_force_only_on_the_way_into_a_contact(force, travel):
+def test_travel_without_force_is_counted_only_while_penetration_increases(force, travel):
     """Count as the runtime's guard does: a damped mechanism leaves the contact without a force."""
     flat = dict.fromkeys(("position", "velocity", "command", "sent"), [0.0] * 6)
     made = signals(force=[force] * 6, measured=[-1.0, 0.5, 1.0, 0.5, 0.2, 0.7], **flat)
@@ -366,7 +366,7 @@ def test_extent_counts_missing_force_only_on_the_way_into_a_contact(force, trave
     assert float(result.force_stuck[0]) == pytest.approx(travel)
 
 
-def test_margins_are_set_by_good_runs_alone(calibrated):
+def test_calibrated_limits_depend_only_on_good_runs(calibrated):
     _, chunk = calibrated
     rules, distance = build_audit_rules(ONE_SIDED)
     judged = evaluate_runs(chunk, rules, distance)
@@ -376,6 +376,6 @@ def test_margins_are_set_by_good_runs_alone(calibrated):
 
 
 @pytest.mark.parametrize("keywords", [{"scenarios": 1}, {"limit": 0.0}, {"limit": math.nan}])
-def test_calibration_refuses_impossible_choices(keywords):
+def test_calibration_refuses_impossible_arguments(keywords):
     with pytest.raises(InputError, match=r"found .*, expected"):
         calibrate(ONE_SIDED, **keywords)

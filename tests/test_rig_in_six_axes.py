@@ -155,7 +155,7 @@ def energy_error(seen, lane, mass, speed):
     ("integrator", "hold", "latency"),
     [("semi_implicit_euler", "linear", 0), ("zoh", "zoh", 1), ("explicit_euler", "linear", 1)],
 )
-def test_central_contact_is_that_of_one_axis(integrator, hold, latency):
+def test_six_axis_rig_central_contact_equals_one_axis_contact(integrator, hold, latency):
     changes = {"rig.integrator": integrator, "rig.command_hold": hold, "rig.command_latency": latency}
     expected = package.simulate(package.load("claw-350kg", changes), "none").contacts[0].restitution
     result = simulated(integrator, hold, latency, 16)
@@ -163,7 +163,7 @@ def test_central_contact_is_that_of_one_axis(integrator, hold, latency):
     np.testing.assert_allclose(energy_error(result, CENTRAL, 350, 0.005), expected**2 - 1, rtol=1e-9)
 
 
-def test_contact_off_the_line_is_that_of_the_effective_mass(seen):
+def test_six_axis_rig_off_centre_contact_follows_effective_mass(seen):
     """Compare to first order in the rotation during the contact: ten times slower, ten times nearer."""
     mass = effective_mass()
     assert mass < 300
@@ -173,7 +173,7 @@ def test_contact_off_the_line_is_that_of_the_effective_mass(seen):
     np.testing.assert_allclose(faults[0] / faults[1], 10, rtol=0.1)
 
 
-def test_momentum_is_constant_on_the_rig(seen):
+def test_six_axis_rig_conserves_momentum(seen):
     for lane in range(LANES):
         exchanged = np.sum(np.abs(seen["force"][lane])) * PERIOD
         for key in ("linear", "angular"):
@@ -182,7 +182,7 @@ def test_momentum_is_constant_on_the_rig(seen):
     assert np.max(np.abs(seen["force"][OBLIQUE, :, 0])) > 1
 
 
-def test_six_axis_contact_is_invariant_to_rotation_and_boost_of_the_world(seen):
+def test_six_axis_rig_is_invariant_to_rotation_and_boost_of_the_world(seen):
     for key in ("force", "moment"):
         one, other = seen[key][OBLIQUE], seen[key][ELSEWHERE]
         np.testing.assert_allclose(one, other, atol=1e-9 * np.max(np.abs(one)))

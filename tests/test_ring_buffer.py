@@ -33,7 +33,7 @@ def test_ring_buffer_returns_default_for_unknown_samples(newest, ticks, last):
     np.testing.assert_array_equal(read, np.where(is_known, samples, otherwise))
 
 
-def test_ring_buffer_written_in_turn_or_at_once_is_the_same():
+def test_ring_buffer_is_the_same_if_samples_are_written_singly_or_together():
     generator = np.random.default_rng(1)
     rings = {name: jnp.asarray(generator.normal(size=(SAMPLES, LANES))) for name in "abc"}
     values = {name: jnp.asarray(generator.normal(size=LANES)) for name in "abc"}
@@ -42,7 +42,7 @@ def test_ring_buffer_written_in_turn_or_at_once_is_the_same():
         jax.tree.map(np.testing.assert_array_equal, write_samples(rings, tick, values), one_by_one)
 
 
-def test_ring_buffer_tie_changes_no_value_and_no_derivative():
+def test_ring_buffer_data_dependency_changes_no_value_and_no_derivative():
     value, read = jnp.array([1.0, 2.0, 3.0]), jnp.array([4.0, -0.0, jnp.inf])
     np.testing.assert_array_equal(depend_on(value, read), value)
     tangents = jnp.ones(3), 5 * jnp.ones(3)

@@ -86,7 +86,7 @@ def test_rollout_motion_agrees_with_oracle_in_every_contact(name):
         )
 
 
-def test_shortfall_is_zero_once_the_drives_have_caught_up():
+def test_position_shortfall_is_zero_after_drives_have_caught_up():
     rattling, always = (
         [result["position_shortfall"] for result in cases.loop_contacts(name)]
         for name in ("rattling, faster than the drives at first", "velocity limit")
@@ -103,7 +103,7 @@ def test_rollout_peak_force_agrees_with_oracle(name):
 
 
 @every_case
-def test_rollout_work_agrees_with_oracle(name):
+def test_rollout_mechanical_work_agrees_with_oracle(name):
     for result, expected in both(name):
         accuracy = expected["work_in"] * WORK_ACCURACY.get(name, 3e-5)
         if CASES[name].mechanism["rig"]["simulator"]["model"] == "ideal" and name not in WORK_ACCURACY:
@@ -115,13 +115,13 @@ def test_rollout_work_agrees_with_oracle(name):
 @pytest.mark.parametrize(
     "name", [one for one in slow_if_seldom if "clearance" not in CASES[one.values[0]].mechanism["contact"]]
 )
-def test_rollout_first_contact_ends_at_the_oracles_tick(name):
+def test_rollout_first_contact_ends_at_same_tick_as_oracle(name):
     ticks, length = cases.loop_contacts(name)[0]["ticks"], segment_length(cases.batches()[name].loop)
     assert 0 < ticks - cases.oracle_contacts(name)[0]["end_tick"] <= length
 
 
 @pytest.mark.slow
-def test_rollout_with_sensor_lag_agrees_at_every_control_period():
+def test_rollout_with_sensor_lag_agrees_with_oracle_at_every_control_period():
     """Use contact at 5 Hz, elastic and heavily damped, with the compensation that a lag upsets most."""
     periods = (0.25e-3, 1e-3, 2e-3, 4e-3)
     lagged = {
@@ -173,7 +173,7 @@ def test_rollout_agrees_with_oracle_at_every_tick_of_the_first_contact(recorded,
         np.testing.assert_allclose(result[:count, lane], expected[key][:count], rtol=0, atol=1e-11 * scale)
 
 
-def test_recorded_run_agrees_with_its_metrics(recorded):
+def test_recorded_rollout_signals_agree_with_metrics(recorded):
     batch, metrics, ticks = recorded
     rolled = batch.run()
     # The recording ends before the later contacts do.
@@ -260,7 +260,7 @@ def test_rollout_reports_a_status_for_every_lane(mixed):
 
 
 @pytest.mark.parametrize("name", ["varying", "rattling"])
-def test_position_reading_that_nobody_uses_changes_no_bit(name):
+def test_unused_position_reading_does_not_change_rollout(name):
     drawn = load(name).mechanism
     scenario = build_scenarios(drawn, draw(drawn, 5, 1))
     loop = build_loop(drawn, "none", scenario)
@@ -274,7 +274,7 @@ def test_position_reading_that_nobody_uses_changes_no_bit(name):
     jax.tree.map(np.testing.assert_array_equal, metrics, run(True, scenario))
 
 
-def test_padding_lanes_are_inert(mixed):
+def test_padding_lanes_do_not_affect_other_lanes(mixed):
     batch, run, metrics = mixed
     lane = batch.names.index("padding")
     for name, values in metrics._asdict().items():
@@ -293,7 +293,7 @@ def test_padding_lanes_are_inert(mixed):
         np.testing.assert_array_equal(np.asarray(result)[:, 0], expected[:, 0])
 
 
-def test_rollout_of_another_mechanism_uses_the_same_program(mixed):
+def test_rollouts_of_similar_mechanisms_share_a_compiled_program(mixed):
     batch, run, _ = mixed
     other = validated(
         mechanism(
@@ -351,7 +351,7 @@ def noise():
     return tuple(np.stack(values) for values in zip(*drawn, strict=True))
 
 
-def test_noise_belongs_to_the_lane_not_to_the_batch(noisy_run):
+def test_sensor_noise_of_a_lane_does_not_depend_on_batch(noisy_run):
     together = noisy_run
     assert len(set(together.restitution[0])) == 6 and np.all(together.status[0] == OK)
     shifted = jax.tree.map(np.asarray, run_rollout(*noisy_batch(6, first=3)))
@@ -378,7 +378,7 @@ def test_sensor_noise_is_white(noise):
     assert abs(np.mean(noise[0] * noise[1]) / 2e-6) < 4 / np.sqrt(count)
 
 
-def test_noise_of_a_contact_does_not_depend_on_the_length_of_the_last(noise):
+def test_sensor_noise_of_a_contact_does_not_depend_on_previous_contact_duration(noise):
     loop, gains, scenario = noisy_batch(6)
     begins = []
     for softer in (1.0, 0.5):

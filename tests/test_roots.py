@@ -24,7 +24,7 @@ def root_of(height):
 
 
 @pytest.mark.parametrize("height", [0.9, 0.3, 0.1])
-def test_roots_of_powers_are_the_closed_form(height):
+def test_bracketed_roots_of_powers_match_closed_form(height):
     """Cover a contact whose force ends at a power of the depth: its root is next to the surface."""
     result, slope = jax.jvp(root_of, (jnp.asarray(height),), (jnp.ones(()),))
     np.testing.assert_allclose(result, height ** (1 / POWERS), rtol=0, atol=ARGUMENT_TOLERANCE)

@@ -53,7 +53,7 @@ def results():
     return [np.asarray(part) for part in everything(jnp.asarray(THETA), jnp.asarray(RATE))]
 
 
-def test_exponential_and_rotation_agree_with_scipy(results):
+def test_rotation_exponential_map_agrees_with_scipy(results):
     turns = Rotation.from_rotvec(THETA.T)
     sign = np.sign(np.sum(np.roll(turns.as_quat(), 1, axis=1).T * results[0], axis=0))
     np.testing.assert_allclose(results[0], sign * np.roll(turns.as_quat(), 1, axis=1).T, atol=4e-16)
@@ -64,7 +64,7 @@ def test_exponential_and_rotation_agree_with_scipy(results):
     np.testing.assert_allclose(results[8], RATE, rtol=1e-12, atol=1e-13)
 
 
-def test_logarithm_inverts_the_exponential(results):
+def test_rotation_logarithm_inverts_the_exponential_map(results):
     np.testing.assert_allclose(results[2][:, :-1], THETA[:, :-1], rtol=1e-14, atol=5e-16)
     np.testing.assert_allclose(results[7][:, :-1], THETA[:, :-1], rtol=1e-14, atol=5e-16)
     # Half a turn in either direction is the same rotation.
@@ -72,7 +72,7 @@ def test_logarithm_inverts_the_exponential(results):
     np.testing.assert_allclose(np.abs(results[2][:, -1] @ AXES[:, -1]), np.pi, rtol=1e-15)
 
 
-def test_left_jacobian_is_the_mean_rotation(results):
+def test_left_jacobian_equals_mean_of_intermediate_rotations(results):
     """Compare with the mean of exp(s theta) over s in [0, 1], the upper right block of an exponential."""
     for column in range(THETA.shape[1]):
         x, y, z = THETA[:, column]

@@ -40,7 +40,7 @@ def test_controller_returns_same_floats_for_numpy_scalars_and_integers():
     assert all(type(value) is float for value in scalars)
 
 
-def test_controller_reset_forgets_and_next_contact_keeps_identification():
+def test_reset_clears_identification_and_next_contact_keeps_identification():
     ticks = readings(300)
     controller = Controller.from_dict(gain_document())
     run(controller, ticks)
@@ -83,7 +83,7 @@ def test_controller_trips_on_nonfinite_input_until_reset(name, position, value):
     assert controller.step(*readings, 0.004) == healthy
 
 
-def test_controller_trips_on_input_that_is_no_number():
+def test_controller_trips_on_input_that_is_not_a_number():
     controller = Controller.from_dict(gain_document())
     assert controller.step(None, 0.0, 0.0, 0.0) == 0.0  # type: ignore[arg-type]
     assert controller.status == "tripped: force_not_finite (force_measured is null)"
@@ -95,7 +95,7 @@ def test_controller_trips_on_force_that_overflows():
     assert controller.status == "tripped: command_not_finite"
 
 
-def test_controller_trips_on_nonfinite_position_command_and_holds():
+def test_controller_trips_and_holds_position_on_nonfinite_position_command():
     controller = Controller.from_dict(gain_document())
     assert controller.position_command(-0.02, 0.005, 0.0) == -0.02
     assert controller.position_command(math.nan, 0.005, 0.0) == -0.02
@@ -117,7 +117,7 @@ def test_controller_counts_missed_ticks():
     assert controller.missed_ticks == 0
 
 
-def test_controllers_share_no_state():
+def test_several_controllers_share_no_state():
     ticks = readings(200)
     alone = run(Controller.from_dict(gain_document()), ticks)
     first, second = Controller.from_dict(gain_document()), Controller.from_dict(gain_document())

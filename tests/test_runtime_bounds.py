@@ -28,15 +28,15 @@ def beyond(mechanism: Mechanism) -> list[tuple]:
 
 
 @pytest.mark.parametrize("mechanism", [*builtin_names(), *suite_names()])
-def test_bounds_admit_gains_of_every_mechanism(mechanism):
+def test_runtime_bounds_accept_nominal_gains_of_every_builtin_mechanism(mechanism):
     assert beyond(load(mechanism).mechanism) == []
 
 
-def test_bounds_admit_gains_of_the_family():
+def test_runtime_bounds_accept_nominal_gains_of_generated_mechanisms():
     assert [beyond(mechanism) for mechanism in family()] == [[]] * len(family())
 
 
-def test_bounds_admit_settings():
+def test_runtime_bounds_accept_gains_of_every_compensator_setting():
     for name, law in COMPENSATORS.items():
         for values in law.settings.values():
             assert all(ON_THE_RIG[name].gains[gain].admits(value) for gain, value in values.items())
@@ -57,7 +57,9 @@ def log(low: float, high: float) -> st.SearchStrategy[float]:
     log(1e-3, 1.0),
     st.sampled_from(["linear", "zoh"]),
 )
-def test_bounds_admit_gains_of_any_sane_rig(period, mass, frequency, speed, delay, lag, share, hold):
+def test_runtime_bounds_accept_nominal_gains_of_any_realistic_rig(
+    period, mass, frequency, speed, delay, lag, share, hold
+):
     omega = 2.0 * math.pi * frequency
     left = 0.99 * FORCES[1] - mass * omega * speed
     if left < 0.0:
@@ -88,7 +90,7 @@ def test_bounds_admit_gains_of_any_sane_rig(period, mass, frequency, speed, dela
     assert beyond(from_plain_data(raw, "rig")) == []
 
 
-def test_bounds_are_finite_and_every_limit_has_one_by_default():
+def test_runtime_bounds_are_finite_and_every_limit_has_a_default():
     for law in ON_THE_RIG.values():
         for gain in law.gains.values():
             assert math.isfinite(gain.lowest) and math.isfinite(gain.highest) and gain.lowest < gain.highest

@@ -68,7 +68,7 @@ def test_gain_file_with_any_field_mutated_is_refused(place, value, remove):
 
 @given(value=JSON_VALUES, path=st.sampled_from([p for n, p in SIGNED if n == "response_error"]))
 @settings(max_examples=300, deadline=None)
-def test_gain_file_mutated_and_signed_anew_loads_or_is_refused_in_one_line(path, value):
+def test_mutated_gain_file_with_valid_digest_loads_or_is_refused_in_one_line(path, value):
     document = gain_document()
     at(document, path[:-1])[path[-1]] = value
     try:
@@ -153,11 +153,11 @@ def change(*path_and_value: Any) -> dict[str, Any]:
         (("mechanism", "contact", "clearance", -1.0), ["mechanism.contact.clearance", "-1.0"]),
     ],
 )
-def test_gain_file_that_does_not_fit_is_refused_by_key(edit, words):
+def test_inconsistent_gain_file_is_refused_with_name_of_key(edit, words):
     refused(change(*edit), *words)
 
 
-def test_gain_file_with_delay_of_too_many_periods_is_refused():
+def test_gain_file_with_delay_longer_than_delay_line_is_refused():
     document = gain_document(control_period=1e-5)
     document["gains"]["identification_delay"] |= {"value": 1.5, "upper": 1.5}
     refused(sign(document), "gains", "periods, expected 0 to 100000")
@@ -174,7 +174,7 @@ def test_gain_file_schema_and_digest_are_checked_first():
     refused({**document, "seed": {1, 2}}, "JSON")
 
 
-def test_gain_file_nesting_is_limited():
+def test_deeply_nested_gain_file_is_refused():
     deep: Any = 0
     for _ in range(3000):
         deep = [deep]
@@ -220,6 +220,6 @@ def test_unreadable_gain_file_paths_are_refused(tmp_path):
         assert str(caught.value).isprintable()
 
 
-def test_gain_file_accepts_whole_numbers():
+def test_gain_file_accepts_integers_for_gains():
     document = change("gains", "initial_stiffness", "value", 90000)
     assert Controller.from_dict(document).identified == (90000.0, 50.0)

@@ -57,7 +57,7 @@ BAD_READINGS = {
 
 
 @pytest.mark.parametrize("fault", BAD_READINGS)
-def test_bad_readings_are_bridged_then_trip(fault):
+def test_nonfinite_readings_are_bridged_for_a_few_ticks_before_trip(fault):
     controller = limited()
     controller.step(3.0, 1e-4, 5e-3, 1e-4)
     force, measured = BAD_READINGS[fault]
@@ -73,7 +73,7 @@ def test_bad_readings_are_bridged_then_trip(fault):
     assert controller.seen == controller.cause == fault
 
 
-def test_good_reading_ends_the_bridging():
+def test_finite_reading_ends_bridging_of_nonfinite_readings():
     controller = limited()
     for n in range(30):
         position = -1e-4 + 5e-6 * n
@@ -83,7 +83,7 @@ def test_good_reading_ends_the_bridging():
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_force_that_is_constant_in_contact_is_stuck(side):
+def test_constant_force_in_contact_raises_force_stuck_fault(side):
     controller = limited()
     document = gain_document("none")
     assert "clearance" not in document["mechanism"]["contact"]
@@ -101,7 +101,7 @@ def test_force_that_is_constant_in_contact_is_stuck(side):
         assert first is None
 
 
-def test_position_that_is_constant_while_the_model_moves_is_stuck():
+def test_constant_position_while_model_moves_raises_position_stuck_fault():
     controller = limited()
     fly(controller, 30)
     for n in range(30, 60):
@@ -112,7 +112,7 @@ def test_position_that_is_constant_while_the_model_moves_is_stuck():
     assert n in (30 + 20, 30 + 21)
 
 
-def test_force_out_of_contact_is_flagged_once_contact_has_settled():
+def test_force_out_of_contact_raises_fault_after_settling_time():
     controller = limited()
     for n in range(40):
         controller.step(6.0, -0.02 + 5e-6 * n, 5e-3, -0.02 + 5e-6 * n, n * PERIOD)
@@ -127,7 +127,7 @@ def test_force_out_of_contact_is_flagged_once_contact_has_settled():
         assert controller.faults == 0
 
 
-def test_late_and_missed_ticks_and_stopped_clock_are_detected():
+def test_late_ticks_missed_ticks_and_stopped_clock_are_detected():
     controller = limited()
     seen = []
     for time in (0.0, 1e-3, 2.3e-3, 3.3e-3, 5.3e-3, 9.3e-3):
@@ -169,7 +169,7 @@ def test_unusable_tare_trips(readings):
     assert controller.step(5.0, 0.0, 0.0, 0.0) == 0.0
 
 
-def test_force_limit_trips_and_the_force_fades():
+def test_force_command_fades_after_force_limit_trip():
     controller = limited()
     for n in range(10):
         assert controller.step(100.0 * (n + 1), 1e-4 * n, 0.0, 1e-4 * n) == 100.0 * (n + 1)
@@ -179,7 +179,7 @@ def test_force_limit_trips_and_the_force_fades():
     assert forces == [*(1000.0 - 100.0 * (n + 1) for n in range(10)), 0.0, 0.0]
 
 
-def test_force_slew_is_limited_and_trips_if_it_persists():
+def test_force_slew_rate_is_limited_and_persistent_excess_trips():
     controller = limited()
     assert [controller.step(250.0, 1e-4 * n, 0.0, 1e-4 * n) for n in range(3)] == [100.0, 200.0, 250.0]
     assert controller.seen == FORCE_SLEW and not controller.tripped
@@ -189,7 +189,7 @@ def test_force_slew_is_limited_and_trips_if_it_persists():
     assert forces == [100.0, 200.0, 300.0, 400.0, 300.0, 200.0]
 
 
-def test_stroke_limit_trips_and_the_command_stops_inside():
+def test_command_stops_inside_stroke_after_stroke_limit_trip():
     controller = limited()
     sent = []
     for n in range(30):
@@ -202,7 +202,7 @@ def test_stroke_limit_trips_and_the_command_stops_inside():
 
 
 @pytest.mark.parametrize("start", [1e-3, -1e-5, -0.01])
-def test_command_after_a_trip_brakes_and_rests_out_of_contact(start):
+def test_position_command_after_trip_brakes_and_rests_out_of_contact(start):
     controller = limited()
     sent, resting = [], False
     for n in range(3000):
@@ -224,7 +224,7 @@ def test_command_after_a_trip_brakes_and_rests_out_of_contact(start):
     assert start < -5e-4 or sent[-1] > -5e-4 - length
 
 
-def test_velocity_is_limited_and_trips_if_excess_persists():
+def test_command_velocity_is_limited_and_persistent_excess_trips():
     controller = limited()
     controller.step(0.0, -0.02, 0.0, -0.02)
     assert controller.position_command(-0.02, 0.0, 0.0) == -0.02
@@ -235,7 +235,7 @@ def test_velocity_is_limited_and_trips_if_excess_persists():
     assert controller.cause == VELOCITY_LIMIT
 
 
-def test_reset_after_a_trip_makes_no_bump():
+def test_reset_after_trip_causes_no_jump_of_position_command():
     controller = limited()
     fly(controller, 20)
     controller.emergency_stop(True)
@@ -261,7 +261,7 @@ def test_reset_after_a_trip_makes_no_bump():
     assert controller.cause == VELOCITY_LIMIT
 
 
-def test_next_contact_begins_at_the_model_but_not_after_a_trip():
+def test_next_contact_starts_at_model_position_except_after_trip():
     controller = limited()
     fly(controller, 20)
     controller.next_contact()
@@ -273,7 +273,7 @@ def test_next_contact_begins_at_the_model_but_not_after_a_trip():
     assert abs(controller.position_command(-0.01, 5e-3, 0.0) + 0.03) < 1e-4
 
 
-def test_gain_file_without_limits_gives_the_law_within_outermost_limits():
+def test_controller_without_limits_applies_compensator_within_default_bounds():
     for values in (None, {}, dict.fromkeys(LIMITED)):
         document = gain_document("none")
         if values is not None:
@@ -298,7 +298,7 @@ def test_gain_file_without_limits_gives_the_law_within_outermost_limits():
         ((0.0, 0.0, 0.0, 0.0), (0.011, 0.0, 0.0), VELOCITY_LIMIT),
     ],
 )
-def test_gain_file_without_limits_trips_beyond_outermost_limits(reading, moved, cause):
+def test_controller_without_limits_trips_beyond_default_bounds(reading, moved, cause):
     controller = Controller.from_dict(gain_document("phase_lead"))
     controller.step(0.0, 0.0, 0.0, 0.0)
     assert controller.position_command(0.0, 0.0, 0.0) == 0.0
@@ -332,7 +332,7 @@ def test_gain_file_without_limits_trips_beyond_outermost_limits(reading, moved, 
         ),
     ],
 )
-def test_limits_that_do_not_fit_are_refused(limits, words):
+def test_inconsistent_controller_limits_are_refused(limits, words):
     document: dict[str, Any] = gain_document("none")
     document["limits"] = limits
     try:

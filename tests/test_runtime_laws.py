@@ -127,7 +127,7 @@ def test_no_compensation_returns_the_measured_force():
     assert controller.identified == (0.0, 0.0)
 
 
-def test_phase_lead_is_the_tustin_transfer_function():
+def test_phase_lead_frequency_response_matches_tustin_transfer_function():
     """Compare the steady response to a sine with the discrete transfer function's gain and phase."""
     lead, lag, period, omega = 0.008, 0.001, 0.001, 40.0
     controller = Controller.from_dict(gain_document("phase_lead", phase_lead=lead, lead_filter=lag))
@@ -157,13 +157,13 @@ def test_response_error_agrees_with_matrix_equations(delay, clearance):
 
 
 @pytest.mark.parametrize("name", sorted(set(GAINS) - {"position_lead"}))
-def test_law_that_leads_the_force_commands_the_position_itself(name):
+def test_force_compensators_command_the_model_position_unchanged(name):
     controller = Controller.from_dict(gain_document(name))
     controller.step(0.0, 0.25, 3.0, 0.25)
     assert controller.position_command(0.25, 3.0, -7.0) == 0.25
 
 
-def test_response_term_acts_while_the_aligned_position_is_in_contact():
+def test_response_error_term_acts_only_while_aligned_position_is_in_contact():
     controller = Controller.from_dict(gain_document(identification_delay=0.0, initial_stiffness=1e5))
     # Without force nothing is identified: only the side of the surface counts, and the time spent there.
     for measured, stiffness in [(-1e-4, 0.0), (1e-4, 9e4), (-1e-9, 0.0), (0.0, 0.0), (1e-9, 9e4)]:
@@ -173,7 +173,7 @@ def test_response_term_acts_while_the_aligned_position_is_in_contact():
         assert forces == pytest.approx(expected, rel=1e-12)
 
 
-def test_response_term_fades_by_where_the_surface_was_left():
+def test_response_error_term_fades_with_time_since_surface_was_left():
     document = gain_document(identification_delay=0.0, initial_stiffness=1e5, response_error_damping=0.0)
     for left in (0.0, 0.25, 0.5, 1.0):  # share of the period after the last tick in contact
         controller = Controller.from_dict(document)
@@ -183,13 +183,13 @@ def test_response_term_fades_by_where_the_surface_was_left():
         assert forces[3:] == pytest.approx([9e4 * 1e-5 * gate for gate in expected], rel=1e-12)
 
 
-def test_lead_filter_passes_a_constant_and_leads_a_ramp():
+def test_lead_filter_passes_constant_unchanged_and_leads_ramp_by_lead_time():
     constant, ramp = LeadFilter(0.02, 0.003, 0.001), LeadFilter(0.02, 0.003, 0.001)
     settled = [(constant.step(7.0), ramp.step(n * 0.001)) for n in range(200)][-1]
     assert settled == pytest.approx((7.0, 0.199 + 0.02), rel=1e-12)
 
 
-def test_velocity_filter_starts_in_uniform_motion():
+def test_velocity_filter_has_no_transient_in_uniform_motion():
     velocity = VelocityFilter(0.004, 0.001)
     velocity.start(-2.0, 0.5)
     assert [velocity.step(-2.0 + 0.0005 * n) for n in range(50)] == pytest.approx([0.5] * 50, rel=1e-11)
@@ -197,7 +197,7 @@ def test_velocity_filter_starts_in_uniform_motion():
 
 @given(periods=st.floats(0.0, 40.0))
 @settings(max_examples=50, deadline=None)
-def test_delay_line_interpolates_its_samples(periods):
+def test_delay_line_interpolates_between_samples(periods):
     period, speed = 0.002, 0.3
     samples = [1.0 + math.sin(0.7 * n) for n in range(60)]
     line = DelayLine(periods * period, period)
@@ -209,7 +209,7 @@ def test_delay_line_interpolates_its_samples(periods):
     np.testing.assert_allclose(delayed, expected, atol=1e-8)
 
 
-def test_delay_line_keeps_whole_delays_whole():
+def test_delay_line_of_whole_periods_does_not_interpolate():
     # Values like 0.003/0.001 round either way.
     for whole in range(40):
         line = DelayLine(whole * 0.001, 0.001)
@@ -225,7 +225,7 @@ def test_delay_line_refuses_excessive_delay():
 
 @given(seed=st.integers(0, 2**32 - 1), forgetting=st.floats(0.9, 1.0))
 @settings(max_examples=30, deadline=None)
-def test_identification_is_weighted_recursive_least_squares(seed, forgetting):
+def test_runtime_identification_equals_weighted_recursive_least_squares(seed, forgetting):
     """Include the bound on its covariance."""
     rng = np.random.default_rng(seed)
     identification = ContactIdentification(2.0, -1.0, 5.0, 0.5, forgetting)
@@ -244,7 +244,7 @@ def test_identification_is_weighted_recursive_least_squares(seed, forgetting):
     np.testing.assert_allclose(covariance_of(identification), expected, rtol=0, atol=1e-9 * scale)
 
 
-def test_identification_covariance_does_not_wind_up():
+def test_runtime_identification_covariance_stays_bounded():
     """Hold the contact still, which shows no damping, and at no depth, which shows no stiffness."""
     for deflection, rate in ((2e-4, 0.0), (0.0, 1e-3), (0.0, 0.0)):
         identification = ContactIdentification(1e5, 100.0, 1e12, 1e6, 0.8)
@@ -255,7 +255,7 @@ def test_identification_covariance_does_not_wind_up():
         assert max(kk / 1e12, bb / 1e6) == 1.0
 
 
-def test_identification_finds_stiffness_and_damping():
+def test_runtime_identification_converges_to_true_stiffness_and_damping():
     identification = ContactIdentification(0.0, 0.0, 1e16, 1e14, 1.0)
     for n in range(100):
         p, v = 1e-4 * math.sin(0.03 * n), 2e-3 * math.cos(0.03 * n)

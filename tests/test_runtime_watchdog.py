@@ -90,7 +90,7 @@ def test_watchdog_stops_divergence_once_the_contact_has_ended():
     assert n - left in (4, 5, 6)
 
 
-def test_watchdog_margin_decides():
+def test_watchdog_trips_only_if_error_exceeds_margin():
     for late in (1, 2, 3):
         error = restitution_of(late) - 1.0
         assert error > 0.01
@@ -112,7 +112,7 @@ def test_watchdog_audits_every_contact_between_two_surfaces():
     assert min(positions) > -2e-3
 
 
-def test_watchdog_audits_contact_under_way_when_the_next_is_announced():
+def test_watchdog_audits_unfinished_contact_when_next_contact_is_announced():
     controller = watched(settling=5.0)
     bounce(controller, late=3, ticks=300)
     assert not controller.tripped
@@ -135,7 +135,7 @@ def test_watchdog_detects_a_model_that_does_not_integrate_its_force():
     assert controller.cause == ENERGY_BALANCE
 
 
-def test_watchdog_trips_on_a_contact_that_does_not_end():
+def test_watchdog_trips_on_contact_that_exceeds_maximum_duration():
     controller = watched(longest_contact=0.05)
     n, positions, _ = bounce(controller)
     assert controller.cause == CONTACT_TOO_LONG
@@ -143,7 +143,7 @@ def test_watchdog_trips_on_a_contact_that_does_not_end():
     assert n - first == 50
 
 
-def test_expected_restitution_follows_the_stiffness_of_the_contact():
+def test_expected_restitution_depends_on_identified_stiffness():
     # e* = 1 - 0.1 (sqrt(k0/k) - 1): a contact of another stiffness has another expected restitution.
     controller = watched(
         reference_stiffness=4 * STIFFNESS,
@@ -157,7 +157,7 @@ def test_expected_restitution_follows_the_stiffness_of_the_contact():
     assert controller._watchdog.expected == pytest.approx(0.95 - 0.1 * (2 - 1), abs=2e-3)
 
 
-def test_expectation_is_its_polynomial_within_its_ranges():
+def test_expected_restitution_is_polynomial_with_inputs_limited_to_stated_ranges():
     terms = ("1", "p", "pp", "ppp", "w", "ww", "pw", "z", "zz", "pz", "wz")
     limits = {f"expected_{term}": 0.01 * (n + 1) for n, term in enumerate(terms)}
     limits |= {"reference_stiffness": 9e4, "reference_velocity": 4e-3}
@@ -176,7 +176,7 @@ def test_expectation_is_its_polynomial_within_its_ranges():
         assert Expectation(limits).restitution(stiffness, -1e9, 1.0, 300.0) == pytest.approx(end, rel=1e-12)
 
 
-def test_contact_does_not_end_while_it_is_touched():
+def test_watchdog_contact_does_not_end_while_bodies_touch():
     """Allow no settling time: the contact does not end where the force crosses 0 on the way back either."""
     controller = watched(settling=0.0, energy_balance=1e9, restitution_margin=1e9)
     position, velocity, audited = -1e-4, SPEED, []

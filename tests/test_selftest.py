@@ -42,7 +42,7 @@ def in_a_bare_process(folder, *arguments, cwd="/", python=("-I", "-S")):
     return ran.returncode, ran.stdout, ran.stderr
 
 
-def test_selftest_passes_where_nothing_is_installed(folder):
+def test_self_test_passes_in_python_without_installed_packages(folder):
     code, out, err = in_a_bare_process(folder)
     assert (code, err) == (0, "")
     assert out.splitlines()[-1] == "PASSED" and "FAIL" not in out
@@ -52,7 +52,7 @@ def test_selftest_passes_where_nothing_is_installed(folder):
     assert not (folder / "__pycache__").exists()
 
 
-def test_selftest_uses_nothing_that_a_rig_lacks(folder):
+def test_self_test_uses_only_the_standard_library(folder):
     program = (
         "import runpy, sys\ntry: runpy.run_path(sys.argv.pop(1), run_name='__main__')\n"
         "except SystemExit as stop: assert not stop.code, stop.code\n"
@@ -72,7 +72,7 @@ def mutated(source, content):
     return content[:index] + new.encode() + content[index + 1 :], content.count(b"\n", 0, index) + 1
 
 
-def test_selftest_names_file_and_line_of_any_changed_character(files, folder):
+def test_self_test_names_file_and_line_of_any_changed_character(files, folder):
     source = random.Random(5)
     names = [name for name, content in files.items() if is_text(content) and name != "selftest.py"]
     assert {"gains.json", "vectors.csv", "jaxhil_runtime.py", "manifest.json", "README.md"} <= {*names}
@@ -95,7 +95,7 @@ def test_selftest_names_file_and_line_of_any_changed_character(files, folder):
     assert run_selftest(folder)[0]
 
 
-def test_selftest_manifest_names_its_own_line(files, folder):
+def test_self_test_names_the_changed_line_of_the_manifest(files, folder):
     lines = files["manifest.json"].split(b"\n")
     for number in range(1, len(lines) - 4):
         changed = [*lines]
@@ -105,7 +105,7 @@ def test_selftest_manifest_names_its_own_line(files, folder):
         assert not good and f"FAIL  manifest.json: line {number + 1}: differs" in out, out
 
 
-def test_selftest_never_passes_a_change_of_itself(files, folder):
+def test_self_test_never_passes_if_its_own_code_was_changed(files, folder):
     source = random.Random(6)
     content = files["selftest.py"]
     program = content.index(b"def main")
@@ -119,7 +119,7 @@ def test_selftest_never_passes_a_change_of_itself(files, folder):
         assert code != 0 and "selftest.py" in out + err, (changed, out, err)
 
 
-def test_selftest_detects_damage_at_the_weak_points_of_its_guard(files, folder):
+def test_self_test_detects_damage_of_its_own_integrity_check(files, folder):
     content = files["selftest.py"].decode()
     for old, new in [
         ('if __name__ == "__main__":', 'if __name__ == "__main_":'),
@@ -138,7 +138,7 @@ def test_selftest_detects_damage_at_the_weak_points_of_its_guard(files, folder):
         assert code != 0 and "FAIL  selftest.py" in out + err, (old, out, err)
 
 
-def test_selftest_counts_every_digit_of_every_gain(files, folder):
+def test_self_test_detects_a_change_of_any_digit_of_any_gain(files, folder):
     document = json.loads(files["gains.json"])
     text = files["gains.json"].decode()
     values = {f"gains.{name}.value": one["value"] for name, one in document["gains"].items()}
@@ -159,7 +159,7 @@ def test_selftest_counts_every_digit_of_every_gain(files, folder):
             assert f"line {text.count(chr(10), 0, at) + 1}: differs" in out
 
 
-def test_selftest_names_a_changed_command_and_the_controllers_command(files, folder):
+def test_self_test_names_recorded_and_computed_command_if_different(files, folder):
     lines = files["vectors.csv"].decode().split("\n")
     force = selftest.VECTOR_COLUMNS.split(",").index("force_command")
     number = next(n for n, line in enumerate(lines[1:], start=1) if float(line.split(",")[force]) > 1)
@@ -176,7 +176,7 @@ def test_selftest_names_a_changed_command_and_the_controllers_command(files, fol
     assert f"line {number + 1}, run 0: force_command: found {expected}, expected {stated}" in out
 
 
-def test_selftest_replays_vectors_even_if_every_file_fits_the_manifest(files, folder):
+def test_self_test_replays_vectors_even_if_all_checksums_match(files, folder):
     """Cover what a wrong port of the controller would look like."""
     document = json.loads(files["gains.json"])
     runtime = files["jaxhil_runtime.py"]
@@ -193,7 +193,7 @@ def test_selftest_replays_vectors_even_if_every_file_fits_the_manifest(files, fo
 
 
 @pytest.mark.parametrize("share, good", [(1e-12, True), (3e-11, False)])
-def test_selftest_compares_simulated_forces_to_a_fraction_of_their_range(files, folder, share, good):
+def test_self_test_tolerance_of_simulated_forces_is_a_fraction_of_force_range(files, folder, share, good):
     document = json.loads(files["gains.json"])
     rows = [line.split(",") for line in files["vectors.csv"].decode().split("\n")[1:-1]]
     forces = [float(row[-1]) for row in rows if row[-1] != "nan"]
@@ -208,7 +208,7 @@ def test_selftest_compares_simulated_forces_to_a_fraction_of_their_range(files, 
     assert good or f"FAIL  vectors.csv: line {tick + 2}: run 0: force" in out
 
 
-def test_selftest_compares_numbers_bit_by_bit():
+def test_self_test_compares_controller_commands_to_the_bit():
     assert selftest.are_same_bits(float("nan"), -float("nan"))
     assert not selftest.are_same_bits(0.0, -0.0)
     assert not selftest.are_same_bits(0.1 + 0.2, 0.3)
@@ -221,7 +221,7 @@ def test_selftest_compares_numbers_bit_by_bit():
 @pytest.mark.parametrize(
     "garbage", [b"", b"\x00\xff\xfe" * 999, b"[" * 100_000, b"{}", b"raise SystemExit(0)\n", None, "folder"]
 )
-def test_selftest_reports_garbage_in_one_line_a_check(folder, name, garbage):
+def test_self_test_reports_unreadable_files_in_one_line_per_check(folder, name, garbage):
     (folder / name).unlink()
     if garbage == "folder":
         (folder / name).mkdir()
@@ -232,7 +232,7 @@ def test_selftest_reports_garbage_in_one_line_a_check(folder, name, garbage):
     assert all(re.match("self-test of|ok    |FAIL  |FAILED", line) for line in out.splitlines()), out
 
 
-def test_selftest_reports_garbage_that_the_manifest_fits(files, folder):
+def test_self_test_reports_unreadable_files_with_matching_checksums(files, folder):
     document = json.loads(files["gains.json"])
     for name, text, reason in [
         ("jaxhil_runtime.py", "raise SystemExit(0)", "cannot be executed: SystemExit"),
@@ -250,7 +250,7 @@ def test_selftest_reports_garbage_that_the_manifest_fits(files, folder):
         assert not good and f"FAIL  {name}: " in out and reason in out, out
 
 
-def test_selftest_names_surplus_and_missing_files(files, folder):
+def test_self_test_names_surplus_and_missing_files(files, folder):
     (folder / "other").mkdir()
     (folder / "other" / "notes.txt").write_text("mine")
     (folder / "__pycache__").mkdir()
@@ -263,19 +263,19 @@ def test_selftest_names_surplus_and_missing_files(files, folder):
     assert "FAIL  summary.html: cannot be read: No such file or directory" in out
 
 
-def test_selftest_reports_other_line_endings(files, folder):
+def test_self_test_reports_changed_line_endings(files, folder):
     (folder / "gains.csv").write_bytes(files["gains.csv"].replace(b"\n", b"\r\n"))
     good, out = run_selftest(folder)
     assert not good and "FAIL  gains.csv: its line endings differ from what was exported" in out
 
 
-def test_selftest_refuses_unknown_arguments(folder):
+def test_self_test_refuses_unknown_arguments(folder):
     code, out, err = in_a_bare_process(folder, "--fast")
     assert (code, out, err) == (1, "", "usage: python selftest.py [--c]\n")
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-def test_selftest_compiles_and_runs_the_c_controller(files, folder, monkeypatch):
+def test_self_test_compiles_and_runs_the_c_controller(files, folder, monkeypatch):
     good, out = run_selftest(folder, "--c")
     assert good and re.search(rf"ok    c99: vectors.csv: {TICKS + 60} ticks, the same bit for bit", out), out
     document = json.loads(files["gains.json"])

@@ -13,7 +13,7 @@ def quadratic():
     return np.array([[300.0, 300.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 
-def test_gains_may_move_as_far_as_the_loss_allows():
+def test_gain_tolerance_is_change_that_raises_loss_by_stated_amount():
     jacobian, loss = np.array([[50.0, 0.0], [0.0, 20.0]]), 0.5
     result = compute_gain_tolerance(jacobian, loss)
     # d^2 J^2 / 2 = rise * loss, in a box of one.
@@ -22,7 +22,7 @@ def test_gains_may_move_as_far_as_the_loss_allows():
     np.testing.assert_allclose(result.together, result.alone, rtol=1e-12)
 
 
-def test_gains_that_compensate_each_other_are_free_together():
+def test_gains_that_compensate_each_other_have_large_joint_tolerance():
     result = compute_gain_tolerance(quadratic(), 0.5)
     assert result.alone[0] == pytest.approx(result.alone[1], rel=1e-4)
     assert result.alone[0] < 1e-3
@@ -30,7 +30,7 @@ def test_gains_that_compensate_each_other_are_free_together():
     assert result.together[2] == result.alone[2] == 1
 
 
-def test_loss_rises_as_stated_at_the_tolerance_of_gains():
+def test_loss_at_gain_tolerance_is_higher_by_the_stated_amount():
     generator = np.random.default_rng(7)
     jacobian, residuals = 40 * generator.standard_normal((9, 4)), generator.standard_normal(9)
     # At the optimum of a linear least-squares problem, the residuals are orthogonal to J.
@@ -48,6 +48,6 @@ def test_loss_rises_as_stated_at_the_tolerance_of_gains():
             assert moved == pytest.approx((1 + LOSS_RISE) * loss, rel=LOSS_RISE * STIFF_ENOUGH**2)
 
 
-def test_fewer_residuals_than_gains_leave_the_rest_free():
+def test_gains_not_determined_by_residuals_have_tolerance_of_the_whole_range():
     result = compute_gain_tolerance(np.array([[3.0, 0.0, 4.0]]), 0.5)
     assert result.together[1] == pytest.approx(1)

@@ -26,7 +26,7 @@ def test_random_generator_agrees_with_published_vectors(key, counter, result):
     assert tuple(int(word) for word in ours(*map(jnp.uint32, (*key, *counter)))) == result
 
 
-def test_random_bits_are_those_of_jax():
+def test_random_generator_gives_the_same_bits_as_jax():
     words = np.random.default_rng(0).integers(0, 1 << 32, (4, 8), dtype=np.uint32)
     result = np.stack(ours(*map(jnp.asarray, words)))
     theirs = np.stack([threefry_2x32(*(jnp.asarray(w) for w in np.split(lane, 2))) for lane in words.T])
@@ -34,7 +34,7 @@ def test_random_bits_are_those_of_jax():
 
 
 @pytest.mark.parametrize("dtype, largest", [("float32", 5.3), ("float64", 6.4)])
-def test_noise_samples_are_normal(dtype, largest):
+def test_sensor_noise_samples_are_normally_distributed(dtype, largest):
     keys = np.stack([np.full(100, 7), np.arange(100)]).astype(np.uint32)
     count = np.broadcast_to(np.arange(5000, dtype=np.int32)[:, None], (5000, 100))
     contact = np.zeros(100, np.int32)

@@ -89,21 +89,21 @@ def shortfalls_found(request, batch):
     return result
 
 
-def test_limit_that_does_not_bind_gives_no_shortfall_to_the_bit(shortfalls_found):
+def test_position_shortfall_is_exactly_zero_if_no_limit_is_reached(shortfalls_found):
     assert {name for name, shortfalls in shortfalls_found.items() if np.all(shortfalls > 0)} == set(BINDING)
     for name in set(shortfalls_found) - set(BINDING):
         np.testing.assert_array_equal(shortfalls_found[name], 0, err_msg=name)
 
 
 @pytest.mark.parametrize("name", BINDING)
-def test_shortfall_agrees_with_oracle(shortfalls_found, name):
+def test_position_shortfall_agrees_with_oracle(shortfalls_found, name):
     expected = oracle_shortfalls(name)
     assert min(expected) > 1e-6
     accuracy = 1e-10 if shortfalls_found[name].dtype == "float64" else 1e-3
     np.testing.assert_allclose(shortfalls_found[name], expected, rtol=accuracy)
 
 
-def test_run_ends_with_a_rebound_that_the_drives_cannot_follow():
+def test_run_ends_if_drives_cannot_follow_the_rebound():
     simulator = SECOND_ORDER | {"velocity_limit": 1.1 * VELOCITY}
     case = Case(mechanism({"damping": [300.0]}, simulator, LATE, contacts=3))
     metrics = cases.build_batch({"": case}).run()
@@ -111,7 +111,7 @@ def test_run_ends_with_a_rebound_that_the_drives_cannot_follow():
     assert metrics.status[:3, 0].tolist() == [OK, NOT_REACHED, NOT_REACHED]
 
 
-def test_shortfall_broadcasts_over_trailing_axes(batch):
+def test_position_shortfall_broadcasts_over_trailing_axes(batch):
     def fold(leaf):
         wide = np.concatenate([leaf, np.asarray(leaf)[..., :2]], axis=-1)
         return wide.reshape(*leaf.shape[:-1], 2, 4)
@@ -121,7 +121,7 @@ def test_shortfall_broadcasts_over_trailing_axes(batch):
     np.testing.assert_allclose(result[:, :6], batch.run().position_shortfall[:2], rtol=1e-12)
 
 
-def test_shortfall_of_a_leading_law_is_that_of_its_command():
+def test_position_shortfall_with_position_lead_refers_to_sent_command():
     lead = 0.008
     laned = {times: limited(times * VELOCITY, 300.0) for times in (1.05, 20.0)}
     leading = cases.build_batch(laned)
@@ -135,7 +135,7 @@ def test_shortfall_of_a_leading_law_is_that_of_its_command():
             assert metrics.position_shortfall[number, lane] == pytest.approx(shortfall, rel=1e-9, abs=0)
 
 
-def test_loop_without_limits_keeps_no_shortfall_state(batch):
+def test_loop_without_motion_limits_has_no_shortfall_state(batch):
     free = cases.build_batch({"": CONTACTS["none"]})
     assert batch.loop.has_limits and not free.loop.has_limits
     for one in (batch, free):

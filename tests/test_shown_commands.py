@@ -27,7 +27,7 @@ ORDER = ("first_ten_minutes", "tuning", "sweeps", "to_the_rig")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
-def test_shown_numbers_stand_below_the_command_that_prints_them(page):
+def test_numbers_in_guide_stand_below_the_command_that_prints_them(page):
     """Look for the command, or the script, between a block of numbers and the heading above it."""
     text = page.read_text(encoding="utf-8")
     for block in BLOCK.finditer(text):
@@ -45,7 +45,7 @@ def shown(page):
 
 
 @pytest.mark.slow
-def test_shown_commands_print_what_is_shown(tmp_path):
+def test_commands_in_guide_print_the_output_shown(tmp_path):
     """Compare words and lines; print the numbers that differ, which depend on a solver."""
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": path, "COLUMNS": "110"}
@@ -72,7 +72,7 @@ def test_shown_commands_print_what_is_shown(tmp_path):
 
 
 @pytest.mark.slow
-def test_logs_commands_print_what_is_shown(tmp_path):
+def test_commands_of_guide_page_on_logs_print_the_output_shown(tmp_path):
     """Run the first day of the page on logs, with the rig that the page names."""
     (tmp_path / "day1").mkdir()
     write(tmp_path / "day1", campaigns.campaign("clean", 0))

@@ -150,19 +150,19 @@ def check(count: int, seed: int, path: Path, laws: Collection[str]) -> dict[str,
     return counts
 
 
-def test_signed_mutations_are_refused_or_stay_within_the_codes_bounds(tmp_path):
+def test_mutated_gain_files_with_valid_digest_are_refused_or_stay_within_bounds(tmp_path):
     counts = check(500, 0, tmp_path / "gains.json", COMPILED)
     assert counts["loaded"] > 50 and counts["refused"] > 200, counts
 
 
 @pytest.mark.slow
-def test_signed_mutations_a_hundred_thousand_are_refused_or_within_bounds(tmp_path):
+def test_hundred_thousand_mutated_gain_files_are_refused_or_stay_within_bounds(tmp_path):
     counts = check(100_000, 1, tmp_path / "gains.json", {*COMPENSATORS})
     print(counts)
     assert counts["loaded"] > 10_000 and counts["refused"] > 40_000
 
 
-def test_thousand_flipped_bits_load_no_other_content(tmp_path):
+def test_gain_file_with_any_of_1000_flipped_bits_loads_no_other_content(tmp_path):
     path = tmp_path / "gains.json"
     document = gain_document()
     document["limits"] = {name: {"value": one, "unit": LIMITS[name].unit} for name, one in LIMITED.items()}

@@ -52,7 +52,7 @@ def folder(key, tmp_path):
     return placed(tmp_path / "bundle", {**files, "manifest.sig": signature})
 
 
-def test_signature_is_that_of_rfc_8032(tmp_path):
+def test_bundle_signature_matches_example_of_rfc_8032(tmp_path):
     """Use section 7.1, test 2."""
     secret = "4ccd089b28ff96da9db6c346ec114e0f5b8a319f35aba624da8cf6ed4fb8a6fb"
     signature = (
@@ -64,7 +64,7 @@ def test_signature_is_that_of_rfc_8032(tmp_path):
     assert load_signer(tmp_path / "key.pem")(b"\x72").hex() == signature
 
 
-def test_verify_without_key_claims_no_proof(folder):
+def test_verify_without_key_does_not_claim_proof_of_origin(folder):
     checked = check_bundle(folder)
     assert checked.reasons == [] and checked.signature.startswith("present, but not checked")
     good, out = run_selftest(folder)
@@ -75,7 +75,7 @@ def test_verify_without_key_claims_no_proof(folder):
     assert good and "note  manifest.json: is not signed" in out
 
 
-def test_verify_refuses_another_key_or_another_manifest(key, folder, tmp_path):
+def test_verify_refuses_signature_of_another_key_or_manifest(key, folder, tmp_path):
     by_key = load_verifier(key[1])
     assert check_bundle(folder, by_key).signature == "valid for the given key"
     (tmp_path / "other.pem").write_bytes(as_public(Ed25519PrivateKey.generate()))
@@ -91,7 +91,7 @@ def test_verify_refuses_another_key_or_another_manifest(key, folder, tmp_path):
 
 
 @pytest.mark.parametrize("flips", [60, pytest.param(1000, marks=pytest.mark.slow)])
-def test_verify_detects_any_flipped_bit_of_signature_or_signed_content(key, folder, flips):
+def test_verify_detects_flipped_bits_in_signature_and_signed_content(key, folder, flips):
     source, by_key = random.Random(flips), load_verifier(key[1])
     for turn in range(flips):
         path = folder / ("manifest.sig", "manifest.json")[turn % 2]
@@ -104,14 +104,14 @@ def test_verify_detects_any_flipped_bit_of_signature_or_signed_content(key, fold
 
 
 @pytest.mark.parametrize("size", [0, 63, 64, 65])
-def test_invalid_signature_proves_nothing(key, folder, size):
+def test_verify_with_key_refuses_invalid_signature(key, folder, size):
     (folder / "manifest.sig").write_bytes(bytes(size))
     assert check_bundle(folder, load_verifier(key[1])).reasons[0].startswith("manifest.sig: found ")
     assert (check_bundle(folder).reasons == []) is run_selftest(folder)[0] is (size <= 64)
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl")
-def test_openssl_makes_the_keys_and_verifies_the_signature(tmp_path):
+def test_openssl_creates_keys_and_verifies_bundle_signature(tmp_path):
     """Run the commands of the guide."""
     for command in (
         "openssl genpkey -algorithm ed25519 -out key.pem",
@@ -127,7 +127,7 @@ def test_openssl_makes_the_keys_and_verifies_the_signature(tmp_path):
     assert subprocess.run(proof.split(), cwd=tmp_path, capture_output=True).returncode != 0
 
 
-def test_unusable_keys_are_refused_in_one_line(key, folder, tmp_path, jaxhil):
+def test_unusable_signing_keys_are_refused_in_one_line(key, folder, tmp_path, jaxhil):
     pair = Ed25519PrivateKey.generate()
     other = generate_private_key(65537, 2048)
     copy = tmp_path / "kept.pem"

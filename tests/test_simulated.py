@@ -21,7 +21,7 @@ class LargeLaw(NoCompensator):
     is_large: ClassVar[bool] = True
 
 
-def test_runs_of_a_large_law_are_compiled_apart(monkeypatch):
+def test_large_compensators_are_compiled_outside_of_loops(monkeypatch):
     monkeypatch.setattr(
         "jaxhil.simulation.one_axis.COMPENSATORS", {"none": NoCompensator(), "large": LargeLaw()}
     )

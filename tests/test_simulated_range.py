@@ -33,7 +33,7 @@ def compare(form: Form, seed: int, lanes: int, longest: int) -> list[tuple[dict[
 
 
 @pytest.mark.parametrize("number", [33, pytest.param(38, marks=pytest.mark.slow)])
-def test_contacts_of_drawn_mechanisms_agree_with_oracle(number):
+def test_contacts_of_random_mechanisms_agree_with_oracle(number):
     compared = compare(Form(number), seed=number, lanes=3, longest=16)
     assert len(compared) >= 2
     for mechanism, difference in compared:
@@ -41,7 +41,7 @@ def test_contacts_of_drawn_mechanisms_agree_with_oracle(number):
 
 
 @pytest.mark.slow
-def test_contacts_over_the_whole_range_agree_with_oracle():
+def test_contacts_of_300_random_mechanisms_agree_with_oracle():
     """Draw 300 mechanisms that end well and that the oracle vouches for."""
     compared = []
     for number in range(FORMS):

@@ -31,7 +31,7 @@ def loaded(folder):
     return namespace
 
 
-def test_single_file_holds_one_law_and_only_what_it_needs(exported):
+def test_single_file_runtime_contains_one_compensator_and_only_required_code(exported):
     compensator, folder = exported
     head = (folder / "jaxhil_runtime.py").read_text().partition("# ---- ")[0]
     assert "and no other package" in head
@@ -46,14 +46,14 @@ def test_single_file_holds_one_law_and_only_what_it_needs(exported):
     assert (ran.returncode, ran.stdout.split(), ran.stderr) == (0, [compensator], "")
 
 
-def test_single_file_has_no_surplus_or_missing_name(exported):
+def test_single_file_runtime_has_no_unused_or_missing_name(exported):
     _, folder = exported
     command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F,E9", str(folder)]
     ran = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stdout
 
 
-def test_single_file_commands_are_the_packages_to_the_bit(exported):
+def test_single_file_runtime_commands_equal_those_of_package_to_the_bit(exported):
     compensator, folder = exported
     document = gain_document(compensator)
     ours, other = Controller.from_dict(document), loaded(folder)["Controller"].from_dict(document)
@@ -72,7 +72,7 @@ def test_single_file_commands_are_the_packages_to_the_bit(exported):
     assert other.identified == ours.identified
 
 
-def test_single_file_keeps_comments_and_labels_each_part(exported):
+def test_single_file_runtime_keeps_comments_and_labels_each_module(exported):
     _, folder = exported
     text = (folder / "jaxhil_runtime.py").read_text()
     assert "# ---- jaxhil.rig.controller ---" in text
@@ -125,7 +125,7 @@ def run_source(text):
     return namespace
 
 
-def test_single_file_holds_what_a_law_imports_and_no_other_law(package):
+def test_single_file_runtime_contains_imports_of_its_compensator_alone(package):
     made = package(
         shared="import math as m\nSHARED = 4 * m.floor(1.5)  # a comment stays\n",
         second="from .registry import register\nfrom .shared import SHARED\n\n@register('second')\n"
@@ -153,7 +153,7 @@ def test_single_file_holds_what_a_law_imports_and_no_other_law(package):
         ("for register in (): pass\n", "register: found in .*registry and in .*controller"),
     ],
 )
-def test_single_file_refuses_what_it_cannot_hold(package, controller, reason):
+def test_single_file_export_refuses_unsupported_code(package, controller, reason):
     made = package()
     folder = Path(made.__file__).parent
     (folder / "circle.py").write_text(f"from {made.__name__}.controller import B\n")
@@ -163,6 +163,6 @@ def test_single_file_refuses_what_it_cannot_hold(package, controller, reason):
         build_runtime_source("first", made)
 
 
-def test_single_file_of_unknown_compensator_is_a_key_error():
+def test_single_file_export_of_unknown_compensator_raises_key_error():
     with pytest.raises(KeyError):
         build_runtime_source("no such law")

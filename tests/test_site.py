@@ -50,7 +50,7 @@ def reference():
 @pytest.mark.parametrize(
     ("page", "kind"), [("mechanism_file", Mechanism), ("mechanism_file_six_axes", SixAxisMechanism)]
 )
-def test_site_has_every_key_of_the_mechanism_file(reference, page, kind):
+def test_documentation_site_has_every_key_of_the_mechanism_file(reference, page, kind):
     text = reference[f"reference/{page}.md"]
     for table in describe_tables(kind):
         part = text[text.index(f"## `[{table.path}]`") :] if table.path else text
@@ -61,14 +61,14 @@ def test_site_has_every_key_of_the_mechanism_file(reference, page, kind):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_site_has_every_option(jaxhil, reference, command):
+def test_documentation_site_has_every_command_option(jaxhil, reference, command):
     text = reference["reference/commands.md"]
     [part] = re.findall(rf"^## jaxhil {command}$(.*?)(?=^## |\Z)", text, re.M | re.S)
     options = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", jaxhil(command, "--help").out.split("options")[1]))
     assert options - {"-h", "--help"} <= set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", part))
 
 
-def test_options_named_in_the_guide_exist(reference):
+def test_command_options_named_in_the_guide_exist(reference):
     parts = dict(
         re.findall(r"^## jaxhil (\w+)$(.*?)(?=^## |\Z)", reference["reference/commands.md"], re.M | re.S)
     )
@@ -87,7 +87,7 @@ def test_options_named_in_the_guide_exist(reference):
     assert seen > 50
 
 
-def test_site_build_fails_for_undocumented_options_and_gains(reference, monkeypatch):
+def test_documentation_build_fails_for_undocumented_options_and_gains(reference, monkeypatch):
     """Use an option without help, and a gain without unit."""
     module = sys.modules["reference"]
 
@@ -104,7 +104,7 @@ def test_site_build_fails_for_undocumented_options_and_gains(reference, monkeypa
         module._row_of_gain(gain._replace(unit=""), jaxhil.load("varying"))
 
 
-def test_site_has_every_gain(reference):
+def test_documentation_site_has_every_gain(reference):
     text = reference["reference/gains.md"]
     for name, law in COMPENSATORS.items():
         [part] = re.findall(rf"^### {name}$(.*?)(?=^### |\Z)", text, re.M | re.S)
@@ -112,7 +112,7 @@ def test_site_has_every_gain(reference):
         assert listed == [(one.name, one.unit) for one in law.gains]
 
 
-def test_site_messages_are_those_that_users_see(jaxhil, reference):
+def test_error_messages_on_documentation_site_equal_real_messages(jaxhil, reference):
     """Find a refusal on the page, with `…` where something is filled in."""
     lines = re.findall(r"^(.*….*)$", reference["reference/messages.md"], re.M)
     patterns = [re.compile(".*".join(map(re.escape, line.split("…"))) + "$") for line in lines]
@@ -125,7 +125,7 @@ def test_site_messages_are_those_that_users_see(jaxhil, reference):
         assert any(pattern.match(message) for pattern in patterns), message
 
 
-def test_site_navigation_has_every_page_and_notebook():
+def test_documentation_navigation_has_every_page_and_notebook():
     """Build strictly: `mkdocs build` fails for a file that the navigation lacks."""
 
     def leaves(entry):
@@ -143,7 +143,7 @@ def test_site_navigation_has_every_page_and_notebook():
     assert there == {path for path in listed if (folder / path).exists()}
 
 
-def test_site_versions_agree():
+def test_package_versions_on_documentation_site_agree():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
@@ -185,7 +185,7 @@ class Page(HTMLParser):
 
 
 @pytest.mark.slow
-def test_site_links_all_lead_somewhere(site):
+def test_documentation_site_has_no_broken_links(site):
     pages = {path: Page(path) for path in sorted(site.rglob("*.html"))}
     assert len(pages) > 20
     for path, page in pages.items():
@@ -200,7 +200,7 @@ def test_site_links_all_lead_somewhere(site):
 
 
 @pytest.mark.slow
-def test_browser_finds_faults_of_a_page(browser, tmp_path):
+def test_browser_check_detects_errors_of_a_page(browser, tmp_path):
     path = tmp_path / "bad.html"
     path.write_text(BAD)
     opened = browser.open(path, 375)
@@ -216,7 +216,7 @@ def test_browser_finds_faults_of_a_page(browser, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", WIDTHS)
-def test_site_pages_open_offline(site, browser, width):
+def test_documentation_pages_open_offline(site, browser, width):
     """Expect no error, external request, missing picture, excess width or overlapping text."""
     for path in sorted(site.rglob("*.html")):
         name = str(path.relative_to(site))
@@ -226,7 +226,7 @@ def test_site_pages_open_offline(site, browser, width):
 
 
 @pytest.mark.slow
-def test_site_on_paper_cuts_nothing(site, browser):
+def test_printed_documentation_pages_cut_no_content(site, browser):
     for path in sorted(site.rglob("*.html")):
         browser.open(path, max(WIDTHS))
         pages, faults = browser.printed(*A4)
@@ -234,7 +234,7 @@ def test_site_on_paper_cuts_nothing(site, browser):
 
 
 @pytest.mark.slow
-def test_site_pages_are_accessible(site, browser):
+def test_documentation_pages_are_accessible(site, browser):
     """Expect no serious finding of axe-core; check one notebook, as they are alike and long."""
     package = pytest.importorskip("axe_core_python")
     axe = (Path(package.__file__).parent / "axe.min.js").read_text(encoding="utf-8")
@@ -249,7 +249,7 @@ def test_site_pages_are_accessible(site, browser):
 
 
 @pytest.mark.slow
-def test_site_search_finds_a_key_offline(site, browser):
+def test_documentation_search_returns_a_mechanism_key_offline(site, browser):
     browser.open(site / "index.html", 1440)
     result = """new Promise(done => {
       const field = document.querySelector("[data-md-component=search-query]");

@@ -63,7 +63,7 @@ def poses(monkeypatch):
     return of
 
 
-def test_compensator_reads_the_delayed_pose(poses):
+def test_six_axis_compensator_reads_pose_delayed_by_sensor(poses):
     """Both sensors have the same delay: the pose of the hardware when the force is sampled."""
     measured, hardware = poses({"rig.position_sensor.delay": 0.0037, "rig.force_sensor.delay": 0.0037})
     np.testing.assert_allclose(measured, hardware, atol=1e-12)
@@ -72,7 +72,7 @@ def test_compensator_reads_the_delayed_pose(poses):
     np.testing.assert_allclose((later - measured)[100], 0.0037 * speed, rtol=1e-3, atol=1e-9)
 
 
-def test_measured_pose_has_noise_and_quantum(poses):
+def test_measured_six_axis_pose_has_noise_and_quantisation(poses):
     exact, _ = poses({})
     noisy, _ = poses({"rig.position_sensor.noise_std": NOISE})
     error = noisy - exact
@@ -87,7 +87,7 @@ def test_measured_pose_has_noise_and_quantum(poses):
     np.testing.assert_allclose(rounded, steps * np.round(exact / steps), atol=1e-12)
 
 
-def test_lag_lead_moves_the_command_along_its_motion():
+def test_six_axis_lag_lead_shifts_pose_command_along_its_motion():
     """Lead one coordinate by the lag of its axis: the hardware is where the model is when it is sampled."""
     mechanism = load_any("petals", FREE).mechanism
     gains = {**literature_gains(mechanism, "phase_lead"), "lead_filter": 1e-3}
@@ -99,7 +99,7 @@ def test_lag_lead_moves_the_command_along_its_motion():
     np.testing.assert_allclose(np.delete(led, 1, axis=1), np.delete(late, 1, axis=1), atol=1e-15)
 
 
-def test_constants_are_those_of_the_docked_bodies():
+def test_six_axis_controller_constants_match_masses_of_docked_bodies():
     """Compare with M^-1 = D diag(m, J)^-1 D' of both bodies by hand, and A with its inverse."""
     mechanism = load_any("probe-drogue").mechanism
     with jax_context():
@@ -124,7 +124,7 @@ def test_constants_are_those_of_the_docked_bodies():
     np.testing.assert_allclose(constants.tool_correction[..., 0], correction, rtol=1e-9, atol=1e-12)
 
 
-def test_rig_without_a_tool_needs_no_correction():
+def test_six_axis_tool_correction_is_identity_without_tool():
     mechanism = load_any("petals").mechanism
     with jax_context():
         scenario = build_scenarios(mechanism)

@@ -77,7 +77,7 @@ def evaluated():
     return jax.tree.map(np.asarray, jax.jit(evaluate, static_argnums=0)(loop, {}, given))
 
 
-def test_central_episode_is_that_of_one_axis(evaluated):
+def test_central_six_axis_episode_equals_one_axis_contact(evaluated):
     expected = package.simulate("claw-350kg", "none").contacts[0]
     result = evaluated.metrics
 
@@ -98,7 +98,7 @@ def test_central_episode_is_that_of_one_axis(evaluated):
     np.testing.assert_allclose(of("normal"), [0, 0, 1], atol=1e-12)
 
 
-def test_oblique_episode_has_all_three_error_parts(evaluated):
+def test_oblique_six_axis_episode_has_normal_tangential_and_rotational_errors(evaluated):
     result = evaluated.metrics
 
     def of(name):
@@ -111,7 +111,7 @@ def test_oblique_episode_has_all_three_error_parts(evaluated):
     assert 100 < of("effective_mass") < 300
 
 
-def test_episode_does_not_depend_on_the_start_of_its_run(evaluated):
+def test_six_axis_episode_does_not_depend_on_start_time_of_run(evaluated):
     """Expect the same metrics, whichever ticks the check for the end falls on."""
     for name, figure in evaluated.metrics._asdict().items():
         one, other = (figure[..., 0, lane] for lane in (ASIDE, EARLIER))
@@ -152,7 +152,7 @@ def last_touches(touches):
 
 
 @pytest.mark.parametrize("lane", [CENTRAL, ASIDE, AGAIN])
-def test_episode_ends_at_the_first_common_quiet(evaluated, ticks, lane):
+def test_six_axis_episode_ends_60_ms_after_last_touch_of_rig_and_ideal_contact(evaluated, ticks, lane):
     """Find the end tick by tick: nothing has touched for 60 ms, on the hardware and in the ideal contact."""
     rig, energy, ideal, expected = (part[:, lane] for part in ticks)
     since = [np.arange(TICKS) - last_touches(touches) for touches in (rig, ideal)]
@@ -172,7 +172,7 @@ def test_episode_ends_at_the_first_common_quiet(evaluated, ticks, lane):
         assert onsets == [1, 2]
 
 
-def test_biased_episode_ends_after_the_longest_wait_for_the_wrench(evaluated, ticks):
+def test_six_axis_episode_with_sensor_bias_ends_after_longest_wait(evaluated, ticks):
     """A biased wrench never decays: the numerical model moves before and after the contact."""
     rig, energy, *_ = (part[:, BIASED] for part in ticks)
     over = np.flatnonzero(rig)[-1] + round((QUIET + 0.1) / PERIOD) + 2
@@ -180,7 +180,7 @@ def test_biased_episode_ends_after_the_longest_wait_for_the_wrench(evaluated, ti
     np.testing.assert_allclose(evaluated.metrics.energy_change[0, BIASED], change, rtol=1e-10)
 
 
-def test_contact_that_hardly_changes_the_motion_does_not_end_an_episode(evaluated):
+def test_six_axis_episode_does_not_end_after_contact_of_little_energy(evaluated):
     """Judge it at the end of the run, with energies over 5 % of that of the approach."""
     result = evaluated.metrics
     assert STATUS_NAMES[result.status[0, GRAZING]] == "timeout"
@@ -199,7 +199,7 @@ def test_contact_that_hardly_changes_the_motion_does_not_end_an_episode(evaluate
     np.testing.assert_allclose((change - expected) / first_touch, result.energy_error[0, CENTRAL], rtol=0.1)
 
 
-def test_episode_without_contact_is_a_miss(evaluated):
+def test_six_axis_episode_without_contact_has_status_miss(evaluated):
     result = evaluated.metrics
     assert STATUS_NAMES[result.status[0, AWAY]] == "miss"
     assert np.isnan(result.energy_error[0, AWAY]) and result.touches[0, AWAY] == 0

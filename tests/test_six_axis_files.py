@@ -45,7 +45,7 @@ def test_six_axis_builtins_are_read_and_state_their_sources(name):
     assert any_from_plain_data(json.loads(text), name) == mechanism
 
 
-def test_six_values_may_be_given_as_one_or_two():
+def test_six_axis_values_may_be_given_as_one_or_two_numbers():
     simulator = load_any("probe-drogue").mechanism.rig.simulator
     assert simulator.damping_ratio == [0.8] * 6
     assert simulator.natural_frequency == [14.0] * 3 + [11.0] * 3
@@ -109,7 +109,7 @@ def test_six_values_may_be_given_as_one_or_two():
          "a z component as far as 0.1, expected draws below 0 m/s"),
     ],
 )  # fmt: skip
-def test_unusable_six_axis_values_are_named(override, reason):
+def test_unusable_six_axis_values_are_named_in_error(override, reason):
     assert reason in refusal(override)
 
 
@@ -147,11 +147,11 @@ LEGS = "hydraulic-hexapod"
         ("claw-two-arms", {"rig.simulator.space": "tasks"}, "expected one of stewart, task, two_robots"),
     ],
 )  # fmt: skip
-def test_unusable_latches_and_simulators_are_named(name, changes, reason):
+def test_unusable_six_axis_latches_and_simulators_are_named_in_error(name, changes, reason):
     assert reason in refusal(changes, name=name)
 
 
-def test_shapes_that_cannot_touch_are_refused():
+def test_six_axis_contact_shapes_that_cannot_touch_are_refused():
     capsule = {"shape": "capsule", "from": [0, 0, 0], "to": [0, 0, 1], "radius": 0.1}
     raw = copy.deepcopy(RAW["probe-drogue"])
     raw["contact"]["tip"]["chaser"] = capsule
@@ -164,7 +164,7 @@ def test_shapes_that_cannot_touch_are_refused():
     assert any_from_plain_data(raw, "f")
 
 
-def test_start_replaces_the_approach():
+def test_six_axis_start_table_and_approach_table_are_mutually_exclusive():
     start = {"start.target": BODY, "start.chaser": {**BODY, "position": [0, 0, 3]}}
     with pytest.raises(InputError, match=r"start: found \[approach\] as well, expected either \[start\] or"):
         load_any("probe-drogue", start)
@@ -178,7 +178,7 @@ def test_start_replaces_the_approach():
         load_any("probe-drogue", {**start, "approach": None})
 
 
-def test_start_shown_in_the_guide_is_read():
+def test_six_axis_start_table_in_the_guide_is_read():
     text = (Path(__file__).parents[1] / "notebooks" / "guide" / "six_axes.md").read_text(encoding="utf-8")
     shown = re.search(r"^```toml\n(\[start\].*?)^```", text, re.M | re.S)
     assert shown is not None
@@ -187,7 +187,7 @@ def test_start_shown_in_the_guide_is_read():
     assert start.duration == 1.2 and start.chaser.position == [0.06, -0.05, 2.21]
 
 
-def test_six_axis_values_can_all_be_uncertain_including_lists_and_inertias():
+def test_all_six_axis_values_including_lists_and_inertias_may_be_uncertain():
     entry = {"distribution": "uniform", "factor": [0.9, 1.1]}
     mechanism = load_any("petals").mechanism
     uncertain = {
@@ -210,7 +210,7 @@ def test_six_axis_values_can_all_be_uncertain_including_lists_and_inertias():
     assert 0.008 < np.std(drawn["rig.force_sensor.crosstalk"]) < 0.012
 
 
-def test_commands_of_one_axis_refuse_six_axis_files():
+def test_one_axis_commands_refuse_six_axis_mechanism_files():
     with pytest.raises(
         InputError, match=r"^petals: schema: found jaxhil/mechanism/2, six axes, expected jaxhil"
     ):
@@ -237,7 +237,7 @@ PLACES = [(name, path) for name, raw in RAW.items() for path in places(raw)]
 
 @settings(deadline=None, max_examples=40)
 @given(place=st.sampled_from(PLACES), junk=JUNK, sibling=st.sampled_from(PLACES))
-def test_any_six_axis_table_is_read_or_refused_in_one_line(place, junk, sibling):
+def test_any_six_axis_mechanism_table_is_read_or_refused_in_one_line(place, junk, sibling):
     """Replace one value by another one of any kind, or by one from another place in the files."""
     name, path = place
     for value in (junk, at(RAW[sibling[0]], sibling[1])):

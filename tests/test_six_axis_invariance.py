@@ -72,7 +72,7 @@ def close(found, expected, before):
             np.testing.assert_allclose(a, b, atol=1e-9 * max(changed, 0.01), rtol=0)
 
 
-def test_contact_is_invariant_to_frames_and_names_of_the_bodies():
+def test_six_axis_contact_is_invariant_to_frames_and_exchange_of_bodies():
     pair, points = bodies(), place([[0.0], [0.0], [0.0]], BATCH)
     before = start(pair)
     drogue = Drogue(0.75 * ONE, 0.04 * ONE, 0 * ONE)

@@ -55,7 +55,7 @@ def check_good(metrics):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BARS)
-def test_ledger_leaves_a_small_share_of_the_errors_of_a_lead(name):
+def test_six_axis_impulse_ledger_has_much_smaller_errors_than_lead(name):
     """Compare with the best of several leads as long as the whole loop, on the same draws."""
     mechanism = with_ranges(name)
     [ledger] = evaluated(mechanism, LAW)
@@ -70,14 +70,14 @@ def test_ledger_leaves_a_small_share_of_the_errors_of_a_lead(name):
 
 
 @pytest.mark.slow
-def test_ledger_tolerates_noise_of_the_pose():
+def test_six_axis_impulse_ledger_is_accurate_with_pose_noise():
     [metrics] = evaluated(with_ranges("probe-drogue", POSE_NOISE), LAW)
     check_good(metrics)
     assert rms(metrics["energy_error"]) < 0.05 and rms(metrics["twist_error"]) < 0.012
 
 
 @pytest.mark.slow
-def test_ledger_tolerates_wrong_numbers():
+def test_six_axis_impulse_ledger_is_accurate_with_wrong_rig_parameters():
     """Cover a bias of 5 N, a tool 2 % too light, and a force delay 1 ms longer than assumed."""
     mechanism = with_ranges("probe-drogue")
     delay = mechanism.rig.force_sensor.delay
@@ -101,7 +101,7 @@ def test_ledger_tolerates_wrong_numbers():
 
 
 @pytest.mark.slow
-def test_ledger_commands_nothing_without_contact():
+def test_six_axis_impulse_ledger_commands_zero_wrench_without_contact():
     """Approach from afar, with noise, a tool and gravity."""
     mechanism = with_ranges("probe-drogue", POSE_NOISE)
     with jax_context():
@@ -120,7 +120,7 @@ def test_ledger_commands_nothing_without_contact():
     assert np.all(depths < 0)
 
 
-def test_gains_of_the_ledger_follow_from_the_file():
+def test_six_axis_impulse_ledger_gains_follow_from_mechanism_file():
     mechanism = load_any(
         "probe-drogue", {"rig.force_sensor.noise_std": {"force": 0.5, "torque": 0.05}}
     ).mechanism

@@ -33,7 +33,7 @@ ENDS = [
 
 
 @pytest.mark.parametrize("tethers", [0, 1, 3])
-def test_twists_agree_with_mujoco(tethers):
+def test_six_axis_twists_agree_with_mujoco(tethers):
     duration = DURATION if tethers else 5.0
     result, expected = ours(tethers, duration), mujocos(tethers, duration)
     assert (expected[5] < 0.03) == (tethers > 0)  # the chaser's velocity along z, 0.05 m/s without tethers

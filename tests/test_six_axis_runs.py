@@ -22,7 +22,7 @@ APART = {"approach": None, "uncertainty": {}, "start.duration": 0.05}
 APART |= {"start.target": {**STILL, "position": [0, 0, 0]}, "start.chaser": {**STILL, "position": [0, 0, 3]}}
 
 
-def test_patterns_are_rotated_copies():
+def test_six_axis_contact_patterns_are_rotated_copies():
     mechanism = load_any("petals", APART).mechanism
     scenario = build_scenarios(mechanism)
     edges, rings = jax.tree.map(np.asarray, scenario.groups)
@@ -37,7 +37,7 @@ def test_patterns_are_rotated_copies():
     np.testing.assert_allclose(rings.candidates.shape.normal.z, np.ones((6, 1)))
 
 
-def test_draws_of_six_axes_are_lanes():
+def test_six_axis_parameter_draws_are_stored_as_lanes():
     """Draw lists, matrices and numbers of tables, different in each lane; the rest is nominal."""
     factor = {"distribution": "uniform", "factor": [0.9, 1.1]}
     uncertain = {
@@ -54,7 +54,7 @@ def test_draws_of_six_axes_are_lanes():
     assert np.all(scenario.bodies.chaser.mass == 420.0) and scenario.sensor.errors.bias.shape == (6, 5)
 
 
-def test_latches_and_robots_are_built_as_specified():
+def test_six_axis_latches_and_robots_are_built_as_specified():
     hooks = {"latch.hooks.chaser": [0.6, 0.1, 0.02], "latch.hooks.pattern": {"count": 3, "phase": 0.5}}
     hooks |= {
         "latch.nose": {"chaser": [0, 0, 0], "latched": True, "stiffness_matrix": np.diag([6.0] * 6).tolist()}
@@ -114,7 +114,7 @@ def central(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in builtin_names() if name != "rattling"])
-def test_central_contact_is_that_of_one_axis(name):
+def test_simulated_six_axis_central_contact_equals_one_axis_contact(name):
     one, raw = central(name)
     quiet = {"approach.contacts": 1, "rig.force_sensor.noise_std": 0.0, "rig.contact_plane": 0.0}
     expected = package.simulate(package.load(name, quiet), "none").contacts[0]
@@ -127,7 +127,7 @@ def test_central_contact_is_that_of_one_axis(name):
 
 
 @pytest.mark.slow
-def test_starts_that_cannot_be_run_are_refused():
+def test_unusable_six_axis_starting_states_are_refused():
     above = APART | {"start.chaser.position": [0, 0, 6.3]}
     legs = {"rig.simulator.base": [[0, 0, 0]] * 6}
     for name, changes, reason in (
@@ -165,7 +165,7 @@ def test_starts_that_cannot_be_run_are_refused():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", six_axis_names())
-def test_simulate_runs_a_six_axis_builtin(jaxhil, tmp_path, name):
+def test_simulate_command_runs_a_six_axis_builtin_mechanism(jaxhil, tmp_path, name):
     picture, log = tmp_path / "run.png", tmp_path / "run.csv"
     ran = jaxhil("simulate", name, "--json", "--plot", picture, "--log", log)
     assert ran.code == 1 and ran.err.startswith("wrote "), ran.err
@@ -238,7 +238,7 @@ def check_table(ticks, mechanism, final):
 
 
 @pytest.mark.slow
-def test_simulate_runs_a_flight_without_contact(jaxhil, tmp_path):
+def test_simulate_command_runs_a_six_axis_flight_without_contact(jaxhil, tmp_path):
     """Start from states of both bodies; the chaser turns about a principal axis."""
     state = "{{position=[0,0,{}], attitude=[1,0,0,0], velocity=[0,0,0], angular_velocity=[0,{},0]}}"
     start = f"start={{duration=0.2, target={state.format(0, 0)}, chaser={state.format(3, 0.5)}}}"
@@ -265,7 +265,7 @@ def test_simulate_runs_a_flight_without_contact(jaxhil, tmp_path):
 
 
 @pytest.mark.slow
-def test_friction_that_is_too_stiff_is_named():
+def test_too_stiff_six_axis_friction_is_named_in_error():
     """Cover an ideal contact that would need steps of 1e-9 s."""
     stiff = {"contact.tip.friction.coefficient": 10.0, "contact.tip.friction.slip": 1e-9, "uncertainty": {}}
     with pytest.raises(InputError, match=r"^probe-drogue: contact\.tip\.friction\.slip: found 1e-09 m/s"):
@@ -273,7 +273,7 @@ def test_friction_that_is_too_stiff_is_named():
 
 
 @pytest.mark.slow
-def test_shapes_that_pass_through_each_other_are_reported():
+def test_simulate_reports_shapes_that_pass_through_each_other():
     soft = {"contact.tip.stiffness": 3e4, "approach.velocity": [0, 0, -0.5], "uncertainty": {}}
     run = package.simulate(package.load("probe-drogue", soft))
     assert run.episodes[0].penetration > 0.9 and "times the size of the shapes" in run.meaning.warnings[-1]
@@ -282,7 +282,7 @@ def test_shapes_that_pass_through_each_other_are_reported():
 
 
 @pytest.mark.slow
-def test_run_ends_at_the_tick_at_which_a_leg_is_too_long():
+def test_hexapod_run_ends_at_the_tick_at_which_a_leg_exceeds_its_length():
     free = {**APART, "start.duration": 0.2, "start.chaser.position": [0.0, 0.0, 6.3]}
     free |= {"start.chaser.velocity": [0.0, 0.0, 0.5], "contact": {}, "rig.simulator.stroke": [1.6, 2.17]}
     mechanism = load_any("hydraulic-hexapod", free).mechanism
@@ -297,7 +297,7 @@ def test_run_ends_at_the_tick_at_which_a_leg_is_too_long():
 
 
 @pytest.mark.slow
-def test_bodies_at_rest_do_not_diverge():
+def test_six_axis_bodies_at_rest_with_noise_are_not_reported_as_divergent():
     """Move them by noise alone, by more than the energy of the start, which is zero."""
     rest = {"attitude": [1, 0, 0, 0], "velocity": [0, 0, 0], "angular_velocity": [0, 0, 0]}
     bodies = {"target": {"position": [0, 0, 0], **rest}, "chaser": {"position": [0, 0, 3], **rest}}
@@ -328,7 +328,7 @@ def test_unsupported_six_axis_options_are_refused_in_one_line(jaxhil, tmp_path):
         assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1 and reason in ran.err
 
 
-def test_init_copies_a_six_axis_builtin_under_a_name(jaxhil, tmp_path):
+def test_init_command_copies_a_six_axis_builtin_with_new_name(jaxhil, tmp_path):
     path = tmp_path / "mine.toml"
     assert jaxhil("init", "petals", "-o", path).code == 0
     mine, builtin = load_any(path).mechanism, load_any("petals").mechanism

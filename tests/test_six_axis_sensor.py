@@ -66,7 +66,7 @@ def close(found, expected, **tolerances):
 
 
 @pytest.mark.slow
-def test_tool_wrench_is_that_of_its_particles():
+def test_tool_wrench_equals_sum_over_its_particles():
     """Let the motion carry each particle, which pushes with its weight less its inertia."""
 
     def places(time):
@@ -87,7 +87,7 @@ def test_tool_wrench_is_that_of_its_particles():
 
 
 @pytest.mark.slow
-def test_controller_with_correct_tool_parameters_finds_the_contact():
+def test_correct_tool_parameters_recover_contact_wrench_from_sensor():
     pose, twist, acceleration = moving()
     load = tool_load(tool(), pose, twist, acceleration, triple(GRAVITY))
     reading = read_moving(wrench(), load, pose)
@@ -102,7 +102,7 @@ def test_controller_with_correct_tool_parameters_finds_the_contact():
     close(read_fixed(wrench(), pose), list(-at_chaser.ravel()), rtol=1e-12)
 
 
-def test_wrong_tool_parameters_leave_part_of_gravity():
+def test_wrong_tool_parameters_leave_residual_gravity_wrench():
     """Expect a share of the weight for the mass, and the weight times the angle for the attitude."""
     still = Twist(triple([0.0] * 3), triple([0.0] * 3))
     level = Pose(triple([0.1, 0.0, 0.2]), exponential(triple([0.0, 0.0, 0.0])))
@@ -120,7 +120,7 @@ def test_wrong_tool_parameters_leave_part_of_gravity():
 
 
 @pytest.mark.slow
-def test_sensor_sample_is_mixed_then_biased_then_rounded():
+def test_six_axis_sensor_applies_crosstalk_then_bias_then_quantisation():
     mixing = np.eye(6)
     mixing[0, 2], mixing[4, 1] = 0.01, -0.02
     zero = np.zeros(6)

@@ -38,7 +38,7 @@ def here(gains):
     return tuning.sweep(gains, **ASKED, folder=gains.parent / "store")
 
 
-def test_six_axis_scenario_repeats_to_the_bit(here, jaxhil, tmp_path):
+def test_six_axis_scenario_replays_to_the_bit(here, jaxhil, tmp_path):
     ran = jaxhil("replay", here.folder, 7, "--json", "--plot", tmp_path / "7.png")
     assert ran.code == 0, ran.err
     document, row = json.loads(ran.out), read_row(read_store(here.folder), 7)
@@ -59,7 +59,7 @@ def test_six_axis_scenario_repeats_to_the_bit(here, jaxhil, tmp_path):
     assert not touching[-1]
 
 
-def test_six_axis_cluster_gives_the_same_rows_though_a_worker_is_killed(here, gains, tmp_path, monkeypatch):
+def test_six_axis_cluster_sweep_is_unchanged_if_a_worker_is_killed(here, gains, tmp_path, monkeypatch):
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker()
         killed_meanwhile(monkeypatch, ClusterWorkers, cluster, first, "run")
@@ -70,7 +70,7 @@ def test_six_axis_cluster_gives_the_same_rows_though_a_worker_is_killed(here, ga
         assert there.document[name] == here.document[name]
 
 
-def test_six_axis_cluster_gives_the_same_gains_though_a_worker_is_killed(tmp_path, monkeypatch):
+def test_six_axis_cluster_tuning_is_unchanged_if_a_worker_is_killed(tmp_path, monkeypatch):
     monkeypatch.setattr(tune_all, "MAX_GROUP_SIZE", 1)
     mechanisms = [package.load(NAME, {"target.mass": mass, "name": f"{mass}"}) for mass in (1e3, 2e3, 3e3)]
     few = {"scenarios": 4, "starts": 1, "steps": 1, "validation": 15}

@@ -18,11 +18,11 @@ from tuning.api.tune_options import TuneOptions
 SMALL = {"scenarios": 8, "starts": 2, "steps": 4, "validation": 15}
 
 
-def test_six_axis_laws_are_known_to_the_public_interface():
+def test_public_interface_lists_six_axis_compensators():
     assert tuple(SIX_AXIS_COMPENSATORS) == arguments.SIX_AXIS_COMPENSATOR_NAMES
 
 
-def test_every_channel_has_its_own_lead():
+def test_six_axis_lead_per_axis_applies_separate_lead_to_each_channel():
     mechanism = load_any("petals").mechanism
     law = SIX_AXIS_COMPENSATORS["phase_lead_per_axis"]
     gains = literature_gains(mechanism, law.name)
@@ -32,7 +32,7 @@ def test_every_channel_has_its_own_lead():
     assert leads == [0.0037] * 3 + [0.02] + [0.0037] * 2
 
 
-def test_public_interface_accepts_six_axes():
+def test_public_functions_accept_six_axis_mechanisms():
     mechanism = package.load("petals", {"target.mass": 2000.0})
     assert (
         mechanism.target.mass == 2000.0 and mechanism == load_any("petals", {"target.mass": 2000.0}).mechanism
@@ -72,7 +72,7 @@ def test_unsupported_six_axis_features_are_refused_in_one_line(jaxhil, tmp_path)
     assert not path.exists()
 
 
-def test_lead_for_each_axis_is_tuned_like_any_law():
+def test_six_axis_lead_per_axis_is_tuned_like_any_compensator():
     options = TuneOptions(compensator="phase_lead_per_axis", scenarios=4)
     assert (
         options.settings().objective
@@ -107,7 +107,7 @@ def test_six_axis_tuning_lowers_both_errors(tuned):
 
 
 @pytest.mark.slow
-def test_equal_leads_of_all_axes_are_one_lead():
+def test_equal_leads_per_axis_give_the_result_of_a_common_lead():
     lead, filter_ = 0.02, 0.001
     each = {f"phase_lead_{axis}": lead for axis in ("x", "y", "z", "rx", "ry", "rz")}
     [one], [six] = (
@@ -119,7 +119,7 @@ def test_equal_leads_of_all_axes_are_one_lead():
 
 
 @pytest.mark.slow
-def test_gains_of_six_axes_are_refused_by_a_controller_of_one(tuned, jaxhil, tmp_path):
+def test_six_axis_gain_file_is_refused_by_one_axis_controller(tuned, jaxhil, tmp_path):
     from jaxhil.rig import Controller, GainFileError
 
     _, path = tuned
@@ -131,7 +131,7 @@ def test_gains_of_six_axes_are_refused_by_a_controller_of_one(tuned, jaxhil, tmp
 
 
 @pytest.mark.slow
-def test_six_axis_sweep_and_report(tuned, jaxhil, tmp_path):
+def test_six_axis_sweep_and_report_run_end_to_end(tuned, jaxhil, tmp_path):
     _, path = tuned
     store, page = tmp_path / "store", tmp_path / "page.html"
     ran = jaxhil("sweep", path, "--scenarios", 64, "--chunk", 32, "--limit", 0.3, "-o", store, "--json")

@@ -11,7 +11,7 @@ def warnings_of(name, changes):
 
 
 @pytest.mark.parametrize("name", six_axis_names())
-def test_six_axis_builtins_are_plausible(name):
+def test_six_axis_builtin_mechanisms_give_no_plausibility_warning(name):
     assert warnings_of(name, {}) == ()
 
 
@@ -39,6 +39,6 @@ def test_six_axis_builtins_are_plausible(name):
         ({"rig.force_sensor.tool.com": [10.0, 20.0, 150.0]}, "tool.com: found 152 m, expected at most 2 m"),
     ],
 )
-def test_values_far_from_any_docking_are_reported(changes, reason):
+def test_six_axis_values_far_from_any_docking_are_reported(changes, reason):
     warnings = warnings_of("probe-drogue", changes)
     assert any(reason in warning for warning in warnings), warnings

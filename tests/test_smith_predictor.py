@@ -28,7 +28,7 @@ def expected_decay(share, lag, delay):
     return decay(characteristic_root(equation))
 
 
-def test_smith_predictor_restitution_is_that_of_the_guide():
+def test_smith_predictor_restitution_equals_value_in_the_guide():
     lag, delay = LAGS[0]
     assert np.exp(expected_decay(1.0, lag, delay)) == pytest.approx(1.014, abs=5e-4)
 
@@ -40,7 +40,7 @@ def test_smith_predictor_restitution_is_that_of_the_guide():
 
 
 @pytest.mark.parametrize("name", SMITH)
-def test_smith_predictor_loop_grows_as_its_root(name):
+def test_smith_predictor_loop_growth_matches_characteristic_root(name):
     lag, delay = LAGS.T
     gains = {"phase_lead": delay, "simulator_lag": lag}
     result = without_period(name, 2.5, gains, simulator__delay=lag, force_sensor__delay=delay)
@@ -51,7 +51,7 @@ def test_smith_predictor_loop_grows_as_its_root(name):
 
 
 @pytest.mark.parametrize("name", SMITH)
-def test_smith_predictor_restitution_of_a_single_contact_is_near_its_root(name):
+def test_smith_predictor_restitution_is_near_prediction_of_characteristic_root(name):
     period, phase = grid([5e-4, 2.5e-4], (np.arange(8) + 0.5) / 8)
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, IDEAL, 0.0, period=2.5e-4))
     lag, delay = LAGS[0]
@@ -66,7 +66,7 @@ def test_smith_predictor_restitution_of_a_single_contact_is_near_its_root(name):
 
 
 @pytest.mark.parametrize("name", SMITH)
-def test_noise_amplification_of_smith_predictor(name):
+def test_noise_amplification_of_smith_predictor_matches_runtime(name):
     check_amplification(
         name,
         [
@@ -78,7 +78,7 @@ def test_noise_amplification_of_smith_predictor(name):
 
 
 @pytest.mark.parametrize("name", SMITH)
-def test_smith_predictor_without_lag_is_phase_lead(name):
+def test_smith_predictor_without_lag_equals_phase_lead(name):
     made = load("rig-300kg").mechanism
     gains = {"phase_lead": 0.008, "lead_filter": 0.001}
     amplified = pareto_amplification(made, name, gains | {"simulator_lag": 0.0})

@@ -44,7 +44,7 @@ def test_sobol_indices_agree_with_closed_forms(case):
         assert np.all((interval.low <= truth) & (truth <= interval.high)) and np.all(interval.width < 0.1)
 
 
-def test_sobol_estimates_are_those_of_scipy():
+def test_sobol_estimates_equal_those_of_scipy():
     values = ishigami(saltelli_design(3, 512, seed=1))
     a, b, mixed = values[None, :512], values[None, 512:1024], values[1024:].reshape(3, 1, 512)
     expected = stats.sobol_indices(func={"f_A": a, "f_B": b, "f_AB": mixed}, n=512)
@@ -55,7 +55,7 @@ def test_sobol_estimates_are_those_of_scipy():
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("number", (64, 256))
-def test_sobol_intervals_of_repeats_cover(case, number, capsys):
+def test_sobol_index_intervals_have_stated_coverage(case, number, capsys):
     _, first_order, total = CASES[case]
     inside, widths = [], []
     for seed in range(60):
@@ -71,7 +71,7 @@ def test_sobol_intervals_of_repeats_cover(case, number, capsys):
     assert np.mean(inside) >= 0.935
 
 
-def test_sobol_input_may_have_several_columns():
+def test_sobol_input_may_consist_of_several_columns():
     columns = (1, 3, 1)
     points = saltelli_design(columns, 2048, seed=2)
     assert points.shape == (count_evaluations(columns, 2048), 5) == (2048 * 5, 5)
@@ -82,7 +82,7 @@ def test_sobol_input_may_have_several_columns():
     np.testing.assert_allclose(indices.first_order.value, variances / np.sum(variances), atol=3e-3)
 
 
-def test_saltelli_design_is_two_sets_and_their_mixtures():
+def test_saltelli_design_consists_of_two_sample_sets_and_their_mixtures():
     points = saltelli_design(3, 64, seed=3).reshape(5, 64, 3)
     a, b, mixed = points[0], points[1], points[2:]
     assert np.all((points >= 0) & (points < 1))
@@ -97,7 +97,7 @@ def test_saltelli_design_is_two_sets_and_their_mixtures():
     assert not np.array_equal(saltelli_design(3, 64, seed=4), points.reshape(-1, 3))
 
 
-def test_sobol_results_are_capped_on_request():
+def test_sobol_study_caps_results_on_request():
     points = saltelli_design(2, 256, seed=5)
     values = points @ [1.0, 3.0]
     cut = sobol_indices(np.minimum(values, 3.5), 2, 256)

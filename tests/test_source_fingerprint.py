@@ -49,7 +49,7 @@ def test_fingerprint_covers_user_registered_law_and_its_fields(tmp_path, monkeyp
     assert len(set(digests)) == 5
 
 
-def test_fingerprint_versions_are_those_that_run():
+def test_fingerprint_versions_equal_imported_versions():
     assert (
         dependency_versions()["jax"] == jax.__version__
         and dependency_versions()["numpy"] == numpy.__version__

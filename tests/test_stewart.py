@@ -86,7 +86,7 @@ def moved(kinematics, axes, amplitude):
     return lax.scan(body, hardware, jnp.arange(TICKS, dtype=jnp.int32))[1]
 
 
-def test_hexapod_of_equal_legs_is_task_space_for_small_strokes():
+def test_hexapod_with_equal_legs_equals_task_space_simulator_for_small_strokes():
     """Expect a difference of second order in the stroke."""
     both = [
         [np.asarray(jax.jit(moved, static_argnums=(1, 2))(one, 12.0, size)) for size in (1e-2, 1e-3)]
@@ -97,7 +97,7 @@ def test_hexapod_of_equal_legs_is_task_space_for_small_strokes():
     np.testing.assert_allclose(large / small, 100, rtol=0.2)
 
 
-def test_two_equal_robots_are_one():
+def test_two_equal_robots_move_like_a_single_robot():
     share = lanes([0.2, 0.3, 0.0, 0.7, 1.0, 0.5], BATCH)
     one, two = (jax.jit(moved, static_argnums=(1, 2)) for _ in range(2))
     expected = np.asarray(one(TaskSpace(), 12.0, 0.01))

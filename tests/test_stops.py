@@ -85,7 +85,7 @@ FAULT_OF = {
 
 
 @pytest.mark.parametrize("limit", FAULT_OF)
-def test_guard_that_stops_a_run_is_named_with_value_and_limit(loaded, recorded, limit):
+def test_fault_that_stops_a_run_is_reported_with_value_and_limit(loaded, recorded, limit):
     most = reaches(recorded[1])[limit]
     start = {"start_distance": 1e-3}
     assert stop_of(loaded, recorded[1], **start, **{limit: 1.001 * most})[1] is None
@@ -101,7 +101,7 @@ def test_guard_that_stops_a_run_is_named_with_value_and_limit(loaded, recorded, 
     assert f"--set {limit}=" in describe_limit_changes(passing)
 
 
-def test_first_command_far_from_the_drives_is_named_with_the_distance(loaded, recorded):
+def test_first_command_far_from_drive_position_is_reported_with_distance(loaded, recorded):
     speed = 1.001 * reaches(recorded[1])["velocity_limit"]
     gain_file, stop = stop_of(loaded, recorded[1], velocity_limit=speed)
     assert (stop.fault, stop.limit, stop.tick) == ("velocity_limit", "start_distance", 0)
@@ -112,7 +112,7 @@ def test_first_command_far_from_the_drives_is_named_with_the_distance(loaded, re
     assert stop_of(loaded, recorded[1], velocity_limit=speed, **passing)[1] is None
 
 
-def test_stuck_sensors_are_named_with_the_travel(loaded, recorded):
+def test_stuck_sensors_are_reported_with_distance_travelled(loaded, recorded):
     lane = recorded[1]
     measured, force = np.array(lane.signals.position_measured), np.array(lane.signals.force_measured)
     inside = np.flatnonzero(measured > 0)[:40]
@@ -127,7 +127,7 @@ def test_stuck_sensors_are_named_with_the_travel(loaded, recorded):
     assert travel < stop.found < 2 * travel
 
 
-def test_watchdog_names_restitution_expectation_and_contact(loaded, recorded):
+def test_watchdog_stop_reports_restitution_expected_value_and_contact(loaded, recorded):
     metrics, lane = recorded
     restitution = metrics.restitution[:, 0]
     for margin, expected in ((0.05, 1.0), (0.02, 0.9)):
@@ -154,13 +154,13 @@ def test_last_contact_of_a_run_is_audited(loaded, recorded):
     assert stop.found == pytest.approx(abs(metrics.restitution[0, 0] - 1.0), abs=1e-4)
 
 
-def test_contact_that_lasts_too_long_is_named(loaded, recorded):
+def test_contact_that_lasts_too_long_is_reported(loaded, recorded):
     gain_file, stop = stop_of(loaded, recorded[1], **AUDIT, longest_contact=0.05)
     assert (stop.fault, stop.by, stop.contact) == ("contact_too_long", "watchdog", 1)
     assert list(find_passing_limits(gain_file, recorded[1])) == ["longest_contact"]
 
 
-def test_verify_names_the_cause_that_stopped_the_closed_loop(loaded):
+def test_verify_reports_the_fault_that_stopped_the_closed_loop(loaded):
     limits = {**AUDIT, "restitution_margin": 0.05}
     report = verify(check_document(limited(loaded, **limits)), scenarios=1)
     assert not report.verdict and report.stop.fault == "restitution" and report.stop.contact == 1
@@ -170,7 +170,7 @@ def test_verify_names_the_cause_that_stopped_the_closed_loop(loaded):
     assert verify(loaded, scenarios=1).stop is None
 
 
-def test_bundle_reports_that_its_limits_stop_the_run_it_was_made_from(loaded):
+def test_bundle_reports_limits_that_stop_its_own_nominal_run(loaded):
     limits = {**AUDIT, "restitution_margin": 0.05}
     bundle = build_bundle(loaded.document, ["csv"], limits)
     assert bundle.stop.fault == "restitution" and bundle.stop.limit == "restitution_margin"
@@ -178,7 +178,7 @@ def test_bundle_reports_that_its_limits_stop_the_run_it_was_made_from(loaded):
     assert again.stop is None and again.passing is None and again.ended[0] is None
 
 
-def test_export_names_the_limit_and_the_value_to_set(loaded, tmp_path):
+def test_export_reports_the_limit_that_stopped_a_run_and_a_sufficient_value(loaded, tmp_path):
     path = tmp_path / "gains.json"
     result = export(_saved(path, loaded), tmp_path / "bundle", limits={"force_limit": 5.0})
     assert result.verdict == "bad" and result.document["stop"]["limit"] == "force_limit"

@@ -41,7 +41,7 @@ def repeated(name, probability, repeats):
 # The run to 1e-6 passes 1e-4.
 @pytest.mark.parametrize("probability", (pytest.param(1e-4, marks=pytest.mark.slow), 1e-6))
 @pytest.mark.parametrize("name", LIMIT_STATES)
-def test_subset_interval_contains_the_probability(name, probability, capsys):
+def test_subset_simulation_interval_contains_the_probability(name, probability, capsys):
     results = repeated(name, probability, 20)
     inside = sum(result.low <= probability <= result.high for result in results)
     with capsys.disabled():
@@ -61,7 +61,7 @@ def test_subset_interval_contains_the_probability(name, probability, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("probability", (1e-4, 1e-6))
 @pytest.mark.parametrize("name", LIMIT_STATES)
-def test_subset_intervals_of_repeats_contain_the_probability(name, probability, capsys):
+def test_repeated_subset_simulation_intervals_contain_the_probability(name, probability, capsys):
     results = repeated(name, probability, 300)
     inside = np.mean([result.low <= probability <= result.high for result in results])
     bias = np.mean([result.probability for result in results]) / probability - 1
@@ -71,7 +71,7 @@ def test_subset_intervals_of_repeats_contain_the_probability(name, probability, 
     assert abs(bias) < 0.1
 
 
-def test_subset_coefficients_of_variation_are_those_observed():
+def test_subset_simulation_coefficient_of_variation_matches_repeats():
     """Compare over repeats: the replicates' spread is right, the formula is too small."""
     results = repeated("plane of 5", 1e-4, 40)
     seen = np.std([result.estimates for result in results]) / 1e-4
@@ -83,7 +83,7 @@ def test_subset_coefficients_of_variation_are_those_observed():
     assert combined == pytest.approx(of_formula / np.sqrt(10), rel=0.1)
 
 
-def test_subset_levels_are_those_in_closed_form():
+def test_subset_simulation_levels_match_closed_form():
     limit = float(stats.norm.isf(1e-4))
     result = subset_simulation(LIMIT_STATES["plane of 5"][1], 5, limit, seed=3, samples=4000)
     assert result.thresholds.shape[1] == 10
@@ -95,7 +95,7 @@ def test_subset_levels_are_those_in_closed_form():
     assert np.all((levels == 4) | (levels == 5))
 
 
-def test_subset_batches_have_one_size_and_are_all_counted():
+def test_subset_simulation_batches_have_constant_size_and_are_all_counted():
     sizes = []
 
     def performance(u):
@@ -116,7 +116,7 @@ def test_subset_simulation_with_the_same_seed_gives_the_same_result():
     assert first.probability != other.probability
 
 
-def test_subset_worst_scenarios_are_distinct_and_replay():
+def test_subset_simulation_worst_scenarios_are_distinct_and_reproducible():
     performance = LIMIT_STATES["sphere of 3"][1]
     result = subset_simulation(performance, 3, 15.0, seed=4)
     assert result.worst_points.shape == (10, 3)
@@ -126,7 +126,7 @@ def test_subset_worst_scenarios_are_distinct_and_replay():
 
 
 @pytest.mark.parametrize("broken", (np.nan, np.inf, -np.inf))
-def test_subset_counts_nonfinite_performance_as_failed(broken):
+def test_subset_simulation_counts_nonfinite_performance_as_failure(broken):
     """Use a run that diverges beyond 3.5 standard deviations, long before the limit 1e9."""
 
     def performance(u):
@@ -142,7 +142,7 @@ def test_subset_counts_nonfinite_performance_as_failed(broken):
 
 
 @pytest.mark.parametrize("quantum", (0.25, 1.0))
-def test_subset_climbs_a_stepped_performance(quantum):
+def test_subset_simulation_works_for_stepwise_performance_function(quantum):
     """Use whole steps: many scenarios are equal, often more than a tenth of them at once."""
 
     def performance(u):
@@ -154,7 +154,7 @@ def test_subset_climbs_a_stepped_performance(quantum):
 
 
 @pytest.mark.parametrize("probability", (0.0, 0.02, 0.05, 0.3, 1.0))
-def test_subset_of_frequent_failures_has_the_exact_interval(probability):
+def test_subset_simulation_of_frequent_failures_uses_binomial_interval(probability):
     """Use two values of performance: passed or failed, and nothing between."""
     limit = stats.norm.isf(probability)
     inside = 0
@@ -168,7 +168,7 @@ def test_subset_of_frequent_failures_has_the_exact_interval(probability):
     assert inside >= 36
 
 
-def test_subset_does_not_call_a_failure_beyond_a_plateau_safe():
+def test_subset_simulation_upper_bound_covers_failures_beyond_a_plateau():
     """Use a failure without a slope towards it: the performance rises to a plateau, and fails beyond."""
 
     def performance(u):
@@ -179,13 +179,13 @@ def test_subset_does_not_call_a_failure_beyond_a_plateau_safe():
     assert stats.norm.sf(5.5) < stats.norm.sf(2.0) * 0.9 < result.high < 1.2 * stats.norm.sf(2.0)
 
 
-def test_subset_number_of_levels_is_limited():
+def test_subset_simulation_limits_the_number_of_levels():
     result = subset_simulation(lambda u: u[:, 0], 1, 4.75, seed=7, levels=3)
     assert len(result.thresholds) == 3 and result.evaluations == 10_000 + 2 * 9_000
     assert result.low == 0.0 and 1e-6 < result.high < 0.02
 
 
-def test_subset_uniform_numbers_stay_within_their_range():
+def test_subset_simulation_uniform_numbers_stay_within_unit_interval():
     uniform = convert_to_uniform(np.array([-40.0, -1.0, 0.0, 1.0, 40.0]))
     assert np.all((uniform > 0) & (uniform < 1)) and np.all(np.diff(uniform) > 0)
     np.testing.assert_allclose(uniform[1:4], stats.norm.cdf([-1.0, 0.0, 1.0]), rtol=1e-14)
@@ -203,7 +203,7 @@ def test_subset_uniform_numbers_stay_within_their_range():
         {"levels": 0},
     ),
 )
-def test_subset_refuses_impossible_settings(wrong):
+def test_subset_simulation_refuses_impossible_settings(wrong):
     settings = {"inputs": 2, "limit": 3.0, "seed": 0} | wrong
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))}: found"):
         subset_simulation(lambda u: u[:, 0], **settings)

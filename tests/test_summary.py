@@ -85,13 +85,13 @@ def page(made):
     return Page(summary_html(made))
 
 
-def test_summary_has_a_row_with_unit_for_every_gain(made, page):
+def test_bundle_summary_has_a_row_with_unit_for_every_gain(made, page):
     rows = {row[0]: row for row in page.rows if row}
     for name, one in made["gains"].items():
         assert float(rows[name][1]) == pytest.approx(one["value"], rel=1e-5) and rows[name][2] == one["unit"]
 
 
-def test_summary_has_every_limit_or_states_its_absence(made, page):
+def test_bundle_summary_lists_every_limit_or_states_that_no_limit_is_set(made, page):
     rows = {row[0]: row for row in page.rows if row}
     text = " ".join(page.texts)
     unset = re.search(r"the widest limit holds: ([^.]*)\.", text)[1].split(", ")
@@ -105,7 +105,7 @@ def test_summary_has_every_limit_or_states_its_absence(made, page):
     assert {"force_limit", "restitution_margin"} <= {*rows} | {*unset}
 
 
-def test_summary_states_purpose_quality_and_confidence(made, page):
+def test_bundle_summary_states_purpose_quality_and_confidence(made, page):
     text = " ".join(page.texts)
     for part in (
         *(
@@ -126,14 +126,14 @@ def test_summary_states_purpose_quality_and_confidence(made, page):
     assert rows["tuned"][1:] == ["0.005", "1.25", "1.5", "0.375", "1.75", "3"]
 
 
-def test_summary_is_self_contained_and_reproducible(made, page):
+def test_bundle_summary_is_self_contained_and_reproducible(made, page):
     assert len(page.references) == 1 and page.references[0].startswith("data:image/png;base64,")
     assert summary_html(made) == summary_html(made)
     content = summary_html(made).decode()
     assert "http" not in content and "@page { size: A4" in content
 
 
-def test_summary_has_one_picture(made, page, tmp_path):
+def test_bundle_summary_has_a_single_picture(made, page, tmp_path):
     content = base64.b64decode(page.references[0].partition(",")[2])
     assert content == summary_png(made)
     (tmp_path / "picture.png").write_bytes(content)
@@ -147,27 +147,27 @@ def test_summary_has_one_picture(made, page, tmp_path):
     assert all(np.all(edge == 1.0) for edge in edges)
 
 
-def test_summary_picture_ignores_the_callers_matplotlib_settings(made):
+def test_bundle_summary_picture_ignores_user_matplotlib_settings(made):
     with matplotlib.rc_context({"figure.constrained_layout.use": True, "font.size": 20}):
         inside = summary_png(made)
     assert inside == summary_png(made)
 
 
-def test_summary_rows_fit_on_one_sheet(page):
+def test_bundle_summary_fits_on_a_single_printed_page(page):
     # A4 less margins is 275 mm: 3.7 mm a row in the longer column, 110 mm for heading, picture and figures.
     limits = [row for row in page.rows if len(row) == 3]
     gains = [row for row in page.rows if len(row) == 4]
     assert 3.7 * max(len(limits), len(gains)) + 110 + 20 < 275
 
 
-def test_summary_shows_a_name_as_text_and_no_markup(made):
+def test_mechanism_name_in_bundle_summary_is_escaped(made):
     hostile = {**made, "mechanism": {**made["mechanism"], "name": "<script>alert('$x_1')</script>\n&"}}
     content = summary_html(hostile)
     assert b"<script" not in content and b"&lt;script&gt;" in content
     Page(content)
 
 
-def test_summary_does_not_invent_unknown_values():
+def test_bundle_summary_marks_unknown_values_as_unknown():
     bare = document("rattling", "none")
     text = " ".join(Page(summary_html(bare)).texts)
     assert "None: the force command is the measured force." in text

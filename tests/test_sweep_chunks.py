@@ -37,12 +37,12 @@ def test_sweep_rows_do_not_depend_on_the_chunks(sweep):
     assert np.ptp(whole["error_1"]) > 1e-3
 
 
-def test_sweep_chunks_come_one_by_one_in_the_requested_order(sweep):
+def test_sweep_chunks_are_computed_in_the_requested_order(sweep):
     assert [part for part, _ in run_chunks(sweep, [3, 0])] == [3, 0]
     assert list(run_chunks(sweep, [])) == []
 
 
-def test_sweep_program_serves_whatever_can_be_drawn():
+def test_sweep_delay_line_is_long_enough_for_every_drawn_delay():
     uncertain = {
         "rig.force_sensor.delay": {"distribution": "normal", "std": 0.05},
         "rig.control_period": {"distribution": "uniform", "low": 0.001, "high": 0.002},
@@ -52,7 +52,7 @@ def test_sweep_program_serves_whatever_can_be_drawn():
     assert few.loop.ring == 512
 
 
-def test_sweep_in_float32_is_near_float64():
+def test_sweep_results_in_float32_are_close_to_float64():
     sweep = build_sweep(manifest(precision="float32"))
     single, double = run_chunk(sweep, 0, 32), run_chunk(sweep, 0, 32, "float64")
     assert single["error_1"].dtype == np.float32 and double["error_1"].dtype == np.float64
@@ -61,7 +61,7 @@ def test_sweep_in_float32_is_near_float64():
     assert 0 < np.max(difference) < 1e-4
 
 
-def test_failed_runs_are_rows():
+def test_failed_runs_are_stored_as_sweep_rows():
     # A sensor that reads next to nothing: the bodies are never stopped.
     uncertain = {"rig.force_sensor.range": {"distribution": "loguniform", "low": 1e-7, "high": 1e3}}
     sweep = build_sweep(manifest(case(force_sensor={"range": 1.0}, uncertainty=uncertain)))
@@ -72,7 +72,7 @@ def test_failed_runs_are_rows():
 
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
-def test_simulator_slower_than_the_model_is_saturated(tmp_path, precision):
+def test_run_counts_as_saturated_if_simulator_cannot_follow_the_model(tmp_path, precision):
     """Omit damping and compensation: the force only pushes back, so the model is fastest in flight."""
     uncertain = {"rig.simulator.velocity_limit": {"distribution": "loguniform", "low": 0.0055, "high": 0.024}}
     label = manifest(case(uncertainty=uncertain, velocity_limit=0.01), 32, precision=precision)

@@ -43,7 +43,7 @@ def whole(tmp_path_factory):
     return rows_of(tmp_path_factory.mktemp("whole") / "store")
 
 
-def test_sweep_without_a_scheduler_is_one_line_and_leaves_nothing(tmp_path):
+def test_sweep_without_scheduler_fails_in_one_line_and_writes_no_files(tmp_path):
     pytest.importorskip("distributed")
     write_gain_file(tmp_path / "gains.json", case())
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
@@ -55,7 +55,7 @@ def test_sweep_without_a_scheduler_is_one_line_and_leaves_nothing(tmp_path):
     ("says", "reason"),
     ((b"", "nothing that answers within"), (b"HTTP/1.1 400 Bad", "another program answers")),
 )
-def test_sweep_on_a_port_without_an_answering_scheduler_is_one_line(monkeypatch, says, reason):
+def test_sweep_with_unresponsive_scheduler_fails_in_one_line(monkeypatch, says, reason):
     pytest.importorskip("distributed")
     monkeypatch.setattr("tuning.caches.cluster.SCHEDULER_TIMEOUT", 0.5)
     waited = Event()
@@ -75,14 +75,14 @@ def test_sweep_on_a_port_without_an_answering_scheduler_is_one_line(monkeypatch,
         answered.result()
 
 
-def test_worker_imports_no_jax_before_its_flags_are_set():
+def test_cluster_worker_sets_xla_flags_before_jax_import():
     code = "import sys, tuning.caches.worker as w; assert 'jax' not in sys.modules; w.dask_setup(None);"
     code += "import os; assert '--xla_backend_optimization_level=1' in os.environ['XLA_FLAGS']"
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     subprocess.run([sys.executable, "-c", code], check=True, env={**environment, "PYTHONPATH": str(ROOT)})
 
 
-def test_worker_of_other_flags_says_how_to_start_it(monkeypatch):
+def test_cluster_worker_with_other_xla_flags_reports_correct_start_command(monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("tuning.sweeps.manifest.active_xla_flags", lambda: "--others")
         asked = encode_manifest(manifest(case()))
@@ -91,7 +91,7 @@ def test_worker_of_other_flags_says_how_to_start_it(monkeypatch):
 
 
 @pytest.mark.slow
-def test_plain_workers_give_the_same_rows_though_one_is_killed(whole, tmp_path):
+def test_cluster_sweep_rows_are_unchanged_if_a_worker_is_killed(whole, tmp_path):
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker("--nthreads", "2")
 
@@ -105,7 +105,7 @@ def test_plain_workers_give_the_same_rows_though_one_is_killed(whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_worker_on_which_jax_runs_already_is_refused_or_preloaded(whole, tmp_path):
+def test_cluster_worker_with_running_jax_is_refused_or_preloaded(whole, tmp_path):
     (tmp_path / "early.py").write_text("def dask_setup(worker):\n    import jax\n    jax.devices()\n")
     with started(tmp_path) as cluster:
         wrong = cluster.worker("--preload", str(tmp_path / "early.py"))
@@ -118,7 +118,7 @@ def test_worker_on_which_jax_runs_already_is_refused_or_preloaded(whole, tmp_pat
 
 
 @pytest.mark.slow
-def test_chunk_that_kills_its_workers_is_computed_locally(tmp_path):
+def test_sweep_chunk_that_kills_its_workers_is_computed_locally(tmp_path):
     """Let every worker die of its first chunk, and start anew."""
     few = manifest(case(), scenarios=64, limit=1.5)
     code = "import os, signal, tuning.caches.worker as w\n"
@@ -131,7 +131,7 @@ def test_chunk_that_kills_its_workers_is_computed_locally(tmp_path):
 
 
 @pytest.mark.slow
-def test_workers_that_join_later_get_chunks_too(tmp_path, monkeypatch):
+def test_cluster_workers_that_join_later_also_receive_chunks(tmp_path, monkeypatch):
     monkeypatch.setattr("tuning.caches.cluster.WORKER_COUNT_INTERVAL", 0.5)
     with started(tmp_path) as cluster:
         cluster.worker()
@@ -157,7 +157,7 @@ def test_sweep_without_workers_is_computed_locally(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_scheduler_that_dies_is_one_line_and_finished_chunks_stay(whole, tmp_path):
+def test_killed_scheduler_is_reported_in_one_line_and_finished_chunks_are_kept(whole, tmp_path):
     with started(tmp_path) as cluster:
         cluster.worker()
 
@@ -172,7 +172,7 @@ def test_scheduler_that_dies_is_one_line_and_finished_chunks_stay(whole, tmp_pat
 
 
 @pytest.mark.slow
-def test_sweep_on_a_cluster_stops_at_the_same_look(tmp_path):
+def test_sweep_on_a_cluster_stops_after_the_same_number_of_scenarios(tmp_path):
     until = manifest(case(), scenarios=300, limit=1.5, until_width=0.25)
     here, tally = rows_of(tmp_path / "here", label=until)
     with started(tmp_path) as cluster:
@@ -182,7 +182,7 @@ def test_sweep_on_a_cluster_stops_at_the_same_look(tmp_path):
 
 
 @pytest.mark.slow
-def test_studies_are_the_same_though_a_worker_is_killed(tmp_path, monkeypatch):
+def test_sweep_studies_are_unchanged_if_a_worker_is_killed(tmp_path, monkeypatch):
     monkeypatch.setattr("tuning.sweeps.point_batches.MIN_POINTS_PER_BATCH", 16)
     gains, folder = tmp_path / "gains.json", tmp_path / "store"
     write_gain_file(gains, case(force_sensor=NOISY))

@@ -78,7 +78,7 @@ def test_error_of_largest_magnitude_decides_the_outcome():
     np.testing.assert_array_equal(result["index"], [7, 8, 9])
 
 
-def test_failed_run_is_a_row_with_a_cause():
+def test_failed_run_is_stored_as_row_with_cause_of_failure():
     errors = [[NAN, 0.5, 0.0, 0.0], [0.0, 0.0, NAN, 0.0]]
     status = [[NON_FINITE, DIVERGED, OK, OK], [NOT_REACHED, NOT_REACHED, TIMEOUT, NOT_REACHED]]
     result = rows(errors, status)
@@ -95,12 +95,12 @@ def test_failed_run_is_a_row_with_a_cause():
     np.testing.assert_array_equal(np.isnan(result["peak_force_2"]), [True, True, False, True])
 
 
-def test_force_beyond_the_sensors_range_is_saturation():
+def test_force_beyond_the_sensor_range_counts_as_saturation():
     assert outcomes(rows([[0.0], [0.0]], [[OK], [OK]], 10.0, 9.0)) == ["saturated"]
     assert outcomes(rows([[0.0], [0.0]], [[OK], [OK]], 10.0, 11.0)) == ["good"]
 
 
-def test_binding_limit_of_the_motion_simulator_is_saturation():
+def test_reached_limit_of_the_motion_simulator_counts_as_saturation():
     errors, status = [[0.0, 0.5, 0.0], [0.0, 0.0, NAN]], [[OK] * 3, [OK, OK, TIMEOUT]]
     result = rows(errors, status, shortfall=1e-9)
     # It ranks above an error and below a contact that does not end; it is known for that one, too.
@@ -122,14 +122,14 @@ def test_binding_limit_of_the_motion_simulator_is_saturation():
         ((10.0, np.inf), "good"),  # bodies that stick have no duration to compare with
     ],
 )
-def test_real_contact_unlike_the_ideal_one_is_a_failure(ideal, outcome):
+def test_contact_that_differs_too_much_from_ideal_contact_counts_as_failure(ideal, outcome):
     result = rows([[0.0], [0.0]], [[OK], [OK]], ideal=ideal)
     assert outcomes(result) == [outcome] and result["failed"][0] == (outcome != "good")
     np.testing.assert_array_equal(result["reference_peak_force_2"], ideal[0])
     np.testing.assert_array_equal(result["reference_duration_1"], ideal[1])
 
 
-def test_unlike_contact_ranks_above_an_error_and_below_saturation():
+def test_contact_unlike_ideal_contact_ranks_between_error_and_saturation():
     errors, status = [[0.5, 0.5], [0.0, 0.0]], [[OK, OK], [OK, OK]]
     assert outcomes(rows(errors, status, ideal=(1.0, 1.0))) == ["unlike the ideal contact"] * 2
     assert outcomes(rows(errors, status, 10.0, 9.0, ideal=(1.0, 1.0))) == ["saturated"] * 2
@@ -137,7 +137,7 @@ def test_unlike_contact_ranks_above_an_error_and_below_saturation():
     assert outcomes(unended) == ["timeout"]
 
 
-def test_outcomes_of_a_store_without_ideal_contacts_follow_from_errors_alone():
+def test_outcomes_without_ideal_contact_columns_depend_only_on_errors():
     result = rows([[0.0], [0.0]], [[OK], [OK]], ideal=(1.0, 1.0))
     old = {name: values for name, values in result.items() if not name.startswith("reference_")}
     judged = classify_outcomes(
@@ -146,13 +146,13 @@ def test_outcomes_of_a_store_without_ideal_contacts_follow_from_errors_alone():
     assert outcomes(result) == ["unlike the ideal contact"] and outcomes(judged) == ["good"]
 
 
-def test_energies_are_kinetic_energies_of_the_numerical_model():
+def test_energy_columns_are_kinetic_energies_of_the_numerical_model():
     result = rows([[0.1], [0.0]], [[OK], [OK]])
     np.testing.assert_allclose(result["energy_in_1"], 350 / 2 * 2**2, rtol=1e-15)
     np.testing.assert_allclose(result["energy_out_1"], 350 / 2 * 2**2 * (0.9 + 0.1) ** 2, rtol=1e-15)
 
 
-def test_columns_and_rows_have_the_same_names():
+def test_sweep_column_names_equal_names_in_rows():
     result = rows([[0.0], [0.0]], [[OK], [OK]])
     parsed = check_document(case(2, uncertainty={})).mechanism
     assert [column.name for column in list_sweep_columns(parsed, False)] == list(result)
@@ -173,7 +173,7 @@ def test_sweep_columns_have_units(path, unit):
     assert find_key_unit(load("varying").mechanism, path) == unit
 
 
-def test_every_contact_has_its_own_columns():
+def test_every_contact_of_a_sweep_has_separate_columns():
     names = [column.name for column in list_sweep_columns(load("varying").mechanism, True)]
     assert {"contact.stiffness_3", "approach.phase_3", "error_3", "work_in_3", "status_3"} <= set(names)
     assert len(names) == len(set(names)) and "error_4" not in names

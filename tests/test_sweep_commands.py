@@ -53,7 +53,7 @@ def document(ran):
     return json.loads(ran[1], parse_constant=pytest.fail)
 
 
-def test_sweep_prints_its_findings_as_json(jaxhil, gains, store):
+def test_sweep_command_prints_results_as_json(jaxhil, gains, store):
     ran = jaxhil("sweep", gains, *TINY, "-o", store, "--limit", "1.5", "--resume", "--json")
     result = document(ran)
     assert ran[0] == 1 and result["verdict"] == "bad"
@@ -74,7 +74,7 @@ def test_sweep_verdict_depends_on_the_acceptable_probability(jaxhil, gains, stor
     assert jaxhil(*again, "--acceptable", high - 1e-6)[0] == 1
 
 
-def test_sweep_without_failures_is_good(jaxhil, gains, tmp_path):
+def test_sweep_verdict_is_good_without_failures(jaxhil, gains, tmp_path):
     """Expect the store beside the gain file unless a folder is named."""
     shutil.copy(gains, tmp_path / "best.json")
     code, out, _ = jaxhil("sweep", tmp_path / "best.json", *TINY, "--limit", "inf")
@@ -84,7 +84,7 @@ def test_sweep_without_failures_is_good(jaxhil, gains, tmp_path):
     assert "case, compensation: none, 100 scenarios (random, float64)\n" in out
 
 
-def test_sobol_sweep_leaves_its_last_scenarios_out_of_replicates(jaxhil, gains, tmp_path):
+def test_sobol_sweep_excludes_last_incomplete_block_from_replicates(jaxhil, gains, tmp_path):
     sobol = ["sweep", gains, *TINY, "--sampling", "sobol", "--limit", "1.5", "-o", tmp_path / "new"]
     ran = jaxhil(*sobol, "--json")
     result = document(ran)
@@ -102,7 +102,7 @@ def test_sweep_compares_float32_with_float64(jaxhil, gains, tmp_path):
     assert compared["scenarios"] == 64 and 0 < compared["largest_difference"] < 1e-4
 
 
-def test_sweep_stops_at_a_width(jaxhil, gains, tmp_path):
+def test_sweep_stops_at_the_requested_interval_width(jaxhil, gains, tmp_path):
     wide = ["sweep", gains, "--scenarios", "1000", "--chunk", "64", "--limit", "1.5", "-o", tmp_path / "n"]
     wide += ["--until-width", "0.3"]
     ran = jaxhil(*wide, "--json")
@@ -171,7 +171,7 @@ def test_sweep_verdict_is_saved_as_it_was_printed(jaxhil, own):
     assert jaxhil("replay", folder, 5)[0] == 0
 
 
-def test_sweep_studies_are_run_once(jaxhil, own, quick, monkeypatch):
+def test_finished_sweep_studies_are_not_repeated(jaxhil, own, quick, monkeypatch):
     folder, again = own
     first = jaxhil(*again, *STUDIES, "--json")
     assert (folder / "verdict.json").read_text() == first[1] and "as kept" not in first[2]
@@ -185,7 +185,7 @@ def test_sweep_studies_are_run_once(jaxhil, own, quick, monkeypatch):
         jaxhil(*again, "--drivers", "32")
 
 
-def test_new_sweep_runs_its_studies(jaxhil, gains, own, quick, tmp_path):
+def test_new_sweep_does_not_reuse_studies_of_old_sweep(jaxhil, gains, own, quick, tmp_path):
     folder, again = own
     jaxhil(*again, *STUDIES)
     new = [*("sweep", gains, *TINY, "-o", tmp_path / "other", "--limit", "1.5"), *STUDIES]
@@ -238,7 +238,7 @@ def unwritable(ran, name):
     return json.loads(out)
 
 
-def test_study_that_cannot_be_written_costs_no_verdict(jaxhil, own, quick):
+def test_sweep_verdict_is_printed_if_study_cannot_be_written(jaxhil, own, quick):
     folder, again = own
     (folder / "studies").touch()
     result = unwritable(jaxhil(*again, *STUDIES, "--json"), KEPT[0])
@@ -252,7 +252,7 @@ def test_study_that_cannot_be_written_costs_no_verdict(jaxhil, own, quick):
     assert document(jaxhil(*again, *STUDIES, "--json")) == result
 
 
-def test_full_disk_costs_no_verdict(jaxhil, own, quick):
+def test_sweep_verdict_is_printed_if_disk_is_full(jaxhil, own, quick):
     folder, again = own
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -270,7 +270,7 @@ def test_full_disk_costs_no_verdict(jaxhil, own, quick):
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-def test_replay_is_the_same_to_the_bit(jaxhil, store, tmp_path):
+def test_replay_command_reproduces_row_to_the_bit(jaxhil, store, tmp_path):
     ran = jaxhil("replay", store, 77, "--json", "--plot", tmp_path / "plots" / "77.png")
     result = document(ran)
     assert ran[0] == 0 and result["verdict"] == "good" and result["different"] == []
@@ -280,7 +280,7 @@ def test_replay_is_the_same_to_the_bit(jaxhil, store, tmp_path):
     assert code == 0 and "to the bit" in out
 
 
-def test_replay_detects_changes(jaxhil, gains, tmp_path):
+def test_replay_command_detects_changed_rows(jaxhil, gains, tmp_path):
     folder = tmp_path / "store"
     jaxhil("sweep", gains, *TINY, "-o", folder)
     opened = read_store(folder)

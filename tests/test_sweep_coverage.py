@@ -58,7 +58,7 @@ def check(found: list[ProbabilityEstimate], truth: float, name: str, capsys) -> 
 
 @pytest.mark.parametrize("truth", TRUTHS)
 @pytest.mark.parametrize("sampling", ["random", "sobol"])
-def test_intervals_of_repeated_sweeps_cover_the_truth(truth, sampling, capsys):
+def test_failure_intervals_of_repeated_sweeps_cover_true_probability(truth, sampling, capsys):
     replicates = 16 if sampling == "sobol" else 1
     result = [
         estimate_failure_probability(add_to_tally(build_empty_tally(replicates, NUMBER), rows))
@@ -71,7 +71,7 @@ def test_intervals_of_repeated_sweeps_cover_the_truth(truth, sampling, capsys):
 
 
 @pytest.mark.parametrize("truth", TRUTHS)
-def test_intervals_of_sweeps_stopped_at_a_width_cover_the_truth(truth, capsys):
+def test_failure_intervals_of_sweeps_stopped_at_a_width_cover_true_probability(truth, capsys):
     result = []
     for rows in repeated(truth, "random"):
         tally = build_empty_tally(1, NUMBER, looked_at=True)

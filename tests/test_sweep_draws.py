@@ -24,7 +24,7 @@ def leaves(found, part=slice(None)):
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 @given(first=st.integers(0, 2990), number=st.integers(0, 1500))
 @settings(max_examples=25)
-def test_drawn_chunk_is_a_part_of_the_whole(sampling, first, number):
+def test_draws_of_a_chunk_equal_the_same_rows_of_the_whole_sweep(sampling, first, number):
     number = min(number, 3000 - first)
     result = leaves(draw_scenarios(MECHANISM, sampling, 3, first, number))
     expected = leaves(WHOLE[sampling], slice(first, first + number))
@@ -38,12 +38,12 @@ def test_draws_of_different_seeds_differ(sampling):
         assert not np.any(values[:100] == other[path])
 
 
-def test_noise_keys_are_the_seed_and_the_index():
+def test_sensor_noise_keys_consist_of_seed_and_scenario_index():
     _, scenarios = draw_scenarios(MECHANISM, "sobol", 9, 70_000, 3)
     np.testing.assert_array_equal(scenarios.key, [[9, 9, 9], [70_000, 70_001, 70_002]])
 
 
-def test_replicates_are_sobol_sequences_and_no_two_are_the_same():
+def test_sweep_replicates_are_distinct_sobol_sequences():
     points = draw_sobol_points(5, 1, 0, 64 * SOBOL_REPLICATES)
     replicates = points.reshape(64, SOBOL_REPLICATES, 5)
     for replicate in range(SOBOL_REPLICATES):
@@ -54,7 +54,7 @@ def test_replicates_are_sobol_sequences_and_no_two_are_the_same():
     assert np.all((points > 0) & (points < 1))
 
 
-def test_means_of_replicates_scatter_less_than_random_ones():
+def test_sobol_replicate_means_scatter_less_than_random_means():
     points = draw_sobol_points(3, 2, 0, 256 * SOBOL_REPLICATES).reshape(256, SOBOL_REPLICATES, 3)
     deviation = np.std(np.mean(np.prod(points, axis=2), axis=0), ddof=1)
     assert deviation < 0.2 * np.std(np.prod(points, axis=2)) / np.sqrt(256)

@@ -37,14 +37,14 @@ def refusal(content):
     return message
 
 
-def test_manifest_survives_a_round_trip():
+def test_sweep_manifest_survives_a_round_trip():
     assert decode_manifest(encode_manifest(GOOD), "f") == GOOD
     endless = manifest(limit=0)
     assert decode_manifest(encode_manifest(endless), "f") == endless and endless.error_limit == 0
     assert GOOD.error_limit == float("inf")
 
 
-def test_manifest_has_a_width_if_there_is_one():
+def test_sweep_manifest_contains_interval_width_only_if_specified():
     # Without it a manifest is as it was before widths existed.
     assert b"until_width" not in encode_manifest(GOOD) and "until_width" not in DOCUMENT
     wide = manifest(until_width=0.1)
@@ -55,13 +55,13 @@ def test_manifest_has_a_width_if_there_is_one():
 
 
 @given(st.binary(max_size=200))
-def test_manifest_of_arbitrary_bytes_is_refused(content):
+def test_sweep_manifest_of_arbitrary_bytes_is_refused(content):
     refusal(content)
 
 
 @given(st.sampled_from(sorted(DOCUMENT)), JSON, st.booleans())
 @settings(max_examples=200)
-def test_manifest_with_another_value_is_refused_or_taken_as_signed(key, value, signed):
+def test_sweep_manifest_with_changed_value_and_valid_digest_is_read_or_refused(key, value, signed):
     changed = {**DOCUMENT, key: value}
     if signed:
         changed["sha256"] = digest(changed)
@@ -75,14 +75,14 @@ def test_manifest_with_another_value_is_refused_or_taken_as_signed(key, value, s
         assert signed or key in ("created", "sha256") or DOCUMENT[key] == value
 
 
-def test_manifest_with_missing_or_unknown_keys_names_them():
+def test_missing_and_unknown_keys_of_sweep_manifest_are_named_in_error():
     assert "seed" in refusal(json.dumps({k: v for k, v in DOCUMENT.items() if k != "seed"}).encode())
     assert "speed" in refusal(json.dumps({**DOCUMENT, "speed": 1}).encode())
     assert "jaxhil/sweep/2" in refusal(b"[]")
     assert "NaN" in refusal(encode_manifest(GOOD).replace(b'"seed": 0', b'"seed": NaN'))
 
 
-def test_manifest_parts_cover_all_scenarios():
+def test_sweep_chunks_cover_all_scenarios():
     assert GOOD.parts == 4
     assert [GOOD.chunk_range(part) for part in range(4)] == [(0, 32), (32, 32), (64, 32), (96, 4)]
 
@@ -91,19 +91,19 @@ def test_manifest_parts_cover_all_scenarios():
     ("key", "value"),
     [("seed", 1), ("scenarios", 96), ("sampling", "sobol"), ("precision", "float32"), ("limit", 0.1)],
 )
-def test_manifest_comparison_names_what_differs(key, value):
+def test_sweep_manifest_comparison_names_every_difference(key, value):
     (difference,) = list_input_differences(
         manifest(scenarios=112), manifest(**{"scenarios": 112, key: value})
     )
     assert difference.startswith(f"{key}: found ")
 
 
-def test_manifest_of_an_earlier_schema_says_what_to_do():
+def test_sweep_manifest_of_earlier_schema_is_refused_with_advice():
     old = json.dumps({**DOCUMENT, "schema": "jaxhil/sweep/1"}).encode()
     assert "expected jaxhil/sweep/2: sweep again into a new folder, or use the version" in refusal(old)
 
 
-def test_manifest_with_flipped_bit_is_refused_or_differs_in_date_alone():
+def test_sweep_manifest_with_flipped_bit_is_refused_unless_only_date_changes():
     content = encode_manifest(GOOD)
     for bit in np.random.default_rng(0).integers(0, 8 * len(content), 1000):
         harmed = bytearray(content)
@@ -116,7 +116,7 @@ def test_manifest_with_flipped_bit_is_refused_or_differs_in_date_alone():
             assert msgspec.structs.replace(result, created=GOOD.created) == GOOD
 
 
-def test_manifest_differs_for_other_gains_and_other_code():
+def test_sweep_manifest_depends_on_gains_and_source_code():
     (difference,) = list_input_differences(GOOD, manifest(case(compensator="phase_lead")))
     assert difference.startswith("gains_sha256: ")
     newer = msgspec.structs.replace(GOOD, versions={**GOOD.versions, "jax": "9.9"}, sources_sha256="0" * 64)
@@ -131,13 +131,13 @@ def test_manifest_differs_for_other_gains_and_other_code():
     )
 
 
-def test_manifest_covers_only_flags_that_may_change_a_result():
+def test_sweep_manifest_contains_only_xla_flags_that_may_change_results():
     ours = rounding_flags("--xla_force_host_platform_device_count=8 --b=1 --a=2")
     assert ours == rounding_flags("--a=2 --b=1") == "--a=2 --b=1"
     assert rounding_flags("--xla_force_host_platform_device_count=1 --b=1") != rounding_flags("--b=1")
 
 
-def test_every_sobol_replicate_has_a_scenario():
+def test_sobol_sweep_with_fewer_scenarios_than_replicates_is_refused():
     assert manifest(sampling="sobol", scenarios=16, chunk=5).replicates == 16
     with pytest.raises(InputError, match="--scenarios: found 15, expected 16 or more"):
         manifest(sampling="sobol", scenarios=15)

@@ -81,7 +81,7 @@ def flat(found):
     "cuts",
     [[(n, n + 1) for n in range(NUMBER)], [(0, 1), (1, 1), (1, 37), (37, NUMBER)], [(60, NUMBER), (0, 60)]],
 )
-def test_sweep_plots_are_the_same_for_any_division(swept, few_points, cuts):
+def test_sweep_plots_do_not_depend_on_division_into_chunks(swept, few_points, cuts):
     made, mechanism, rows = swept
     plan = plan_statistics(made, mechanism, rows)
     whole = accumulated(plan, rows, [(0, NUMBER)])
@@ -96,7 +96,7 @@ def test_stiffness_and_force_delay_are_plotted_first(usual):
     assert all(one.low < np.median(one.values(rows)) < one.high for one in plan.per_contact)
 
 
-def test_inputs_with_strongest_rank_correlation_are_plotted_otherwise(lost):
+def test_plotted_inputs_are_those_with_strongest_rank_correlation(lost):
     made, mechanism, rows = lost
     assert plan_statistics(made, mechanism, rows).per_scenario[1].columns == ("rig.force_sensor.range",)
     # The plan gets other sensitivities of the error than the real ones.
@@ -105,7 +105,7 @@ def test_inputs_with_strongest_rank_correlation_are_plotted_otherwise(lost):
     assert plan_statistics(made, mechanism, made_up).per_scenario[1].columns == ("approach.phase_2",)
 
 
-def test_cell_counts_are_a_histogram_of_the_whole(usual):
+def test_accumulated_cell_counts_equal_histogram_of_all_rows(usual):
     made, mechanism, rows = usual
     plan = plan_statistics(made, mechanism, rows)
     sizes = accumulated(plan, rows, [(0, NUMBER)]).sizes
@@ -120,7 +120,7 @@ def test_cell_counts_are_a_histogram_of_the_whole(usual):
     assert inner.sum() == sizes.sum() == 2 * NUMBER and np.count_nonzero(inner) > 50
 
 
-def test_plotted_quantile_is_that_of_the_values():
+def test_plotted_quantile_equals_quantile_of_all_values():
     values = np.abs(np.random.default_rng(0).standard_normal(3000)) * 10.0 ** np.linspace(-4, 0, 3000)
     counts = np.bincount(np.searchsorted(BIN_EDGES, values, side="right"), minlength=len(BIN_EDGES) + 1)
     for order in (0.5, 0.95, 0.99):
@@ -135,7 +135,7 @@ def test_plotted_quantile_is_that_of_the_values():
     )
 
 
-def test_contact_without_end_counts_as_infinite_and_later_ones_are_left_out(lost):
+def test_contact_without_end_has_infinite_error_and_later_contacts_are_ignored(lost):
     made, mechanism, rows = lost
     plan = plan_statistics(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])
@@ -148,7 +148,7 @@ def test_contact_without_end_counts_as_infinite_and_later_ones_are_left_out(lost
     np.testing.assert_array_equal(np.isinf(result.points.size), bad)
 
 
-def test_failures_are_counted_up_to_each_look(swept):
+def test_convergence_plot_counts_failures_up_to_each_look(swept):
     made, mechanism, rows = swept
     plan = plan_statistics(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])
@@ -161,7 +161,7 @@ def test_failures_are_counted_up_to_each_look(swept):
         np.testing.assert_array_equal(each, direct)
 
 
-def test_plotted_points_are_the_first_and_the_first_failures(usual, few_points):
+def test_plotted_points_are_the_first_scenarios_and_the_first_failures(usual, few_points):
     made, mechanism, rows = usual
     result = accumulated(plan_statistics(made, mechanism, rows), rows, [(0, NUMBER)])
     failed = np.flatnonzero(rows["failed"])[:20]
@@ -196,7 +196,7 @@ def test_convergence_plot_ends_at_the_verdict(swept):
 
 
 @pytest.mark.parametrize("acceptable", [None, 0.5])
-def test_convergence_plot_shows_its_end_if_nothing_failed(usual, acceptable):
+def test_convergence_plot_shows_final_upper_bound_without_failures(usual, acceptable):
     made, mechanism, rows = usual
     rows = {**rows, "failed": np.zeros(NUMBER, bool)}
     plan = plan_statistics(made, mechanism, rows)
@@ -209,7 +209,7 @@ def test_convergence_plot_shows_its_end_if_nothing_failed(usual, acceptable):
     assert f"95 % at a number fixed beforehand, last 0 to {last:.3g}" in labels
 
 
-def test_sweep_plots_ignore_the_callers_settings(usual, tmp_path):
+def test_sweep_plots_ignore_user_matplotlib_settings(usual, tmp_path):
     made, mechanism, rows = usual
     plan = plan_statistics(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])
@@ -244,7 +244,7 @@ SELDOM = [("phases", 0.0), ("phases", 1e-9), ("phases", 1e9), ("lost", 0.2), ("l
         for limit in (0.2, 0.0, None, 1e-9, 1e9)
     ],
 )
-def test_every_axis_is_labelled_with_its_unit(request, name, limit):
+def test_every_axis_of_sweep_plots_is_labelled_with_unit(request, name, limit):
     made, mechanism, rows = request.getfixturevalue(name)
     made = msgspec.structs.replace(made, limit=limit)
     plan = plan_statistics(made, mechanism, rows)
@@ -263,7 +263,7 @@ def test_every_axis_is_labelled_with_its_unit(request, name, limit):
 
 
 @pytest.mark.parametrize("limit", [0.2, None, 1e-9, 1e9])
-def test_colour_scale_is_labelled_at_both_ends(usual, limit):
+def test_colour_scale_of_sweep_plot_is_labelled_at_both_ends(usual, limit):
     made, mechanism, rows = usual
     made = msgspec.structs.replace(made, limit=limit)
     plan = plan_statistics(made, mechanism, rows)
@@ -276,7 +276,7 @@ def test_colour_scale_is_labelled_at_both_ends(usual, limit):
     assert labels == pytest.approx(ticks, rel=0.05)
 
 
-def test_legend_counts_failures_by_kind(lost, few_points):
+def test_sweep_plot_legend_counts_failures_by_kind(lost, few_points):
     made, mechanism, rows = lost
     plan = plan_statistics(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])
@@ -289,7 +289,7 @@ def test_legend_counts_failures_by_kind(lost, few_points):
     assert f"{UNENDED} ({endless} of the first {failed} of {of})" in labels
 
 
-def test_sweep_command_writes_plots_and_resumes_over_them(tmp_path, capsys):
+def test_sweep_command_writes_plots_and_replaces_plots_on_resume(tmp_path, capsys):
     gains, store = tmp_path / "gains.json", tmp_path / "store"
     write_gain_file(gains, case())
     command = ["sweep", str(gains), "--scenarios", "70", "--chunk", "64", "-o", str(store), "--json"]

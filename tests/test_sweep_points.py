@@ -22,7 +22,7 @@ def asked():
     return sweep, inputs, noise, run_points(sweep, inputs, noise)
 
 
-def test_finished_study_points_are_not_run_again(asked, tmp_path, monkeypatch):
+def test_finished_study_points_are_not_simulated_again(asked, tmp_path, monkeypatch):
     monkeypatch.setattr(point_batches, "MIN_POINTS_PER_BATCH", 8)
     *what, rows = asked
     ran, result = [], []
@@ -45,7 +45,7 @@ def test_finished_study_points_are_not_run_again(asked, tmp_path, monkeypatch):
     assert again.checkpoints.other == []
 
 
-def test_study_points_of_other_noise_are_run_anew(asked, tmp_path):
+def test_study_points_with_other_noise_are_simulated_again(asked, tmp_path):
     sweep, inputs, noise, rows = asked
     running = LOCAL_RUN._replace(checkpoints=Checkpoints(tmp_path / "kept", resume=True))
     run_points(sweep, inputs, noise, running)
@@ -53,7 +53,7 @@ def test_study_points_of_other_noise_are_run_anew(asked, tmp_path):
     assert np.any(other["worst_error"] != rows["worst_error"])
 
 
-def test_equal_study_points_are_run_once(asked):
+def test_equal_study_points_are_simulated_only_once(asked):
     sweep, inputs, noise, rows = asked
     ran = []
     twice = run_points(

@@ -60,7 +60,7 @@ def whole(tmp_path_factory):
     return store, all_rows(store), sweep, tally
 
 
-def test_tally_is_that_of_the_rows(whole):
+def test_sweep_tally_equals_tally_of_stored_rows(whole):
     _, rows, _, tally = whole
     assert tally.scenarios == 300 and tally.failed == np.sum(rows["failed"])
     assert 0 < tally.failed < 300
@@ -69,7 +69,7 @@ def test_tally_is_that_of_the_rows(whole):
     np.testing.assert_array_equal([index for _, _, index in tally.worst], worst)
 
 
-def test_missing_or_damaged_parts_are_made_again(whole, tmp_path):
+def test_missing_or_damaged_sweep_chunks_are_computed_again(whole, tmp_path):
     _, rows, _, tally = whole
     store, _, _ = Log().sweep(tmp_path / "store")
     store.chunk_path(0).unlink()
@@ -100,7 +100,7 @@ def test_interrupted_sweep_keeps_written_rows(whole, tmp_path):
     assert list_different_columns(all_rows(store), rows) == [] and again == tally
 
 
-def test_killed_and_resumed_sweep_is_the_same(whole, tmp_path):
+def test_killed_and_resumed_sweep_gives_the_same_store(whole, tmp_path):
     _, rows, _, _ = whole
     write_gain_file(tmp_path / "gains.json", case())
     folder = tmp_path / "store"
@@ -121,7 +121,7 @@ def test_killed_and_resumed_sweep_is_the_same(whole, tmp_path):
     assert list_different_columns(all_rows(store), rows) == []
 
 
-def test_any_row_replays_to_the_bit(whole):
+def test_any_sweep_row_replays_to_the_bit(whole):
     store, rows, _, _ = whole
     for index in np.random.default_rng(0).integers(0, 300, 6):
         result = replay_scenario(read_store(store.folder), int(index))
@@ -129,7 +129,7 @@ def test_any_row_replays_to_the_bit(whole):
         np.testing.assert_array_equal(result.again["error_1"], rows["error_1"][index])
 
 
-def test_replay_detects_a_changed_row(whole, tmp_path):
+def test_replay_detects_a_changed_sweep_row(whole, tmp_path):
     store = read_store(shutil.copytree(whole[0].folder, tmp_path / "store"))
     changed = dict(read_chunk(store, 0))
     changed["peak_force_1"] = changed["peak_force_1"].copy()
@@ -139,7 +139,7 @@ def test_replay_detects_a_changed_row(whole, tmp_path):
     assert replay_scenario(store, 6).different_columns == []
 
 
-def test_replayed_motion_is_that_of_the_scenario(whole):
+def test_replayed_motion_equals_simulation_of_the_scenario(whole):
     _, rows, sweep, _ = whole
     (piece,) = compute_motion(sweep, 17)
     curve = piece.curves["rig"]
@@ -147,7 +147,7 @@ def test_replayed_motion_is_that_of_the_scenario(whole):
     np.testing.assert_allclose(rebound / curve.velocity, rows["restitution_1"][17], rtol=1e-9)
 
 
-def test_precisions_are_compared_on_the_same_scenarios(whole):
+def test_float32_and_float64_are_compared_on_the_same_scenarios(whole):
     _, rows, sweep, _ = whole
     result = compare_precisions(sweep, 64)
     assert result.scenarios == 32 and result.failed_float64 == np.sum(rows["failed"][:32])
@@ -170,7 +170,7 @@ def parts_of(store):
     return sorted(path.name for path in store.folder.glob("parts/part-*"))
 
 
-def test_sweep_stops_at_the_first_look_that_is_narrow_enough(whole, stopped):
+def test_sweep_stops_at_first_look_with_narrow_enough_interval(whole, stopped):
     _, rows, _, _ = whole
     store, parts, tally = stopped
     failed, running = rows["failed"], SequentialState()
@@ -193,7 +193,7 @@ def test_sweep_stops_at_the_first_look_that_is_narrow_enough(whole, stopped):
         replay_scenario(store, 299)
 
 
-def test_stopped_sweep_is_not_continued(stopped):
+def test_sweep_that_reached_its_interval_width_is_not_continued(stopped):
     store, parts, tally = stopped
     log = Log()
     _, _, again = log.sweep(store.folder, label=UNTIL)
@@ -203,7 +203,7 @@ def test_stopped_sweep_is_not_continued(stopped):
         Log().sweep(store.folder, label=manifest(case(), scenarios=300, limit=1.5, until_width=0.1))
 
 
-def test_sweep_with_parts_in_any_order_stops_at_the_same_look(stopped, tmp_path):
+def test_sweep_stops_at_the_same_look_for_any_order_of_chunks(stopped, tmp_path):
     _, parts, tally = stopped
 
     def shuffled(sweep, missing):

@@ -69,7 +69,7 @@ def refused(*words):
     return pytest.raises(InputError, match=".*".join(words))
 
 
-def test_store_is_read_as_it_was_written(store):
+def test_sweep_store_is_read_as_written(store):
     for part in range(MANIFEST.parts):
         result = read_chunk(store, part)
         assert result is not None and list(result) == [column.name for column in MANIFEST.columns]
@@ -77,7 +77,7 @@ def test_store_is_read_as_it_was_written(store):
     assert list_different_columns(read_row(store, 99), {k: v[3:4] for k, v in made_up(3).items()}) == []
 
 
-def test_store_is_a_parquet_dataset_with_names_units_and_nulls(store):
+def test_sweep_store_is_a_parquet_dataset_with_names_units_and_nulls(store):
     from pyarrow import parquet
 
     table = parquet.read_table(store.folder / "parts")
@@ -90,7 +90,7 @@ def test_store_is_a_parquet_dataset_with_names_units_and_nulls(store):
 
 
 @pytest.mark.parametrize("harm", ["cut", "flipped", "empty", "gone", "other sweep", "other part"])
-def test_store_ignores_a_damaged_or_third_party_part(store, tmp_path, harm):
+def test_sweep_store_ignores_a_damaged_or_third_party_chunk_file(store, tmp_path, harm):
     path = store.chunk_path(1)
     content = bytearray(path.read_bytes())
     if harm == "cut":
@@ -114,7 +114,7 @@ def test_store_ignores_a_damaged_or_third_party_part(store, tmp_path, harm):
         read_row(store, 40)
 
 
-def test_store_detects_any_flipped_bit_of_a_part():
+def test_sweep_store_detects_any_flipped_bit_of_a_chunk_file():
     content = encode_chunk(MANIFEST, made_up(0))
     assert decode_chunk(MANIFEST, 0, content) is not None
     for bit in np.random.default_rng(0).integers(0, 8 * len(content), 1000):
@@ -123,7 +123,7 @@ def test_store_detects_any_flipped_bit_of_a_part():
         assert decode_chunk(MANIFEST, 0, bytes(harmed)) is None
 
 
-def test_store_ignores_a_part_rewritten_by_another_program(store):
+def test_sweep_store_ignores_a_chunk_file_rewritten_by_another_program(store):
     from pyarrow import parquet
 
     path = store.chunk_path(0)
@@ -135,7 +135,7 @@ def test_store_ignores_a_part_rewritten_by_another_program(store):
 
 
 @pytest.mark.parametrize("column", ["outcome", "failed", "worst_error", "error_2", "status_1"])
-def test_store_outcomes_follow_from_errors(store, column):
+def test_sweep_store_outcomes_follow_from_errors(store, column):
     good = {"status": 1, "error": 0.25, "position_shortfall": 0.0, "peak_force": 1.0, "duration": 1.0}
     good |= {f"reference_{name}": good[name] for name in ("peak_force", "duration")}
     rows = made_up(0)
@@ -158,12 +158,12 @@ def test_store_outcomes_follow_from_errors(store, column):
     assert read_chunk(store, 0) is None
 
 
-def test_store_refuses_an_index_beyond_the_end(store):
+def test_sweep_store_refuses_an_index_beyond_the_end(store):
     with refused("index: found 100, expected 0 to 99"):
         read_row(store, 100)
 
 
-def test_store_refuses_a_folder_that_is_not_empty(store, tmp_path):
+def test_sweep_store_refuses_a_folder_that_is_not_empty(store, tmp_path):
     with refused("--resume"):
         open_store(store.folder, MANIFEST, resume=False)
     (tmp_path / "thesis").mkdir()
@@ -173,12 +173,12 @@ def test_store_refuses_a_folder_that_is_not_empty(store, tmp_path):
             open_store(tmp_path / "thesis", MANIFEST, resume)
 
 
-def test_store_refuses_other_inputs_by_name(store):
+def test_sweep_store_of_other_inputs_is_refused_with_names_of_differences(store):
     with refused("other inputs", "seed: found 0, requested 7"):
         open_store(store.folder, manifest(case(2), seed=7), resume=True)
 
 
-def test_store_refuses_a_missing_column_by_name(tmp_path):
+def test_sweep_store_with_missing_column_is_refused_with_column_name(tmp_path):
     columns = [column for column in MANIFEST.columns if not column.name.startswith("position_shortfall")]
     assert len(columns) == len(MANIFEST.columns) - 2
     old = msgspec.structs.replace(MANIFEST, columns=columns)
@@ -193,7 +193,7 @@ def test_store_refuses_a_missing_column_by_name(tmp_path):
     ] and not list_process_differences(MANIFEST)
 
 
-def test_store_removes_unfinished_files_on_resuming(store):
+def test_resumed_sweep_removes_unfinished_files_of_the_store(store):
     (store.folder / "studies").mkdir()
     left = [store.folder / folder / UNFINISHED for folder in ("", "parts", "studies")]
     remaining = ["verdict.json", "studies/drivers-2.json", ".thesis.docx.tmp", "parts/.thesis.docx.1.tmp"]
@@ -204,7 +204,7 @@ def test_store_removes_unfinished_files_on_resuming(store):
     assert [path.exists() for path in (*left, *remaining)] == [False] * 3 + [True] * 4
 
 
-def test_new_store_takes_over_no_study_and_no_verdict(store):
+def test_new_sweep_store_refuses_folder_with_old_studies_or_verdict(store):
     (store.folder / "manifest.json").unlink()
     for part in range(MANIFEST.parts):
         store.chunk_path(part).unlink()
@@ -222,7 +222,7 @@ def test_new_store_takes_over_no_study_and_no_verdict(store):
     open_store(store.folder, MANIFEST, resume=False)
 
 
-def test_store_on_a_full_disk_is_one_line_and_keeps_its_parts(store):
+def test_full_disk_is_reported_in_one_line_and_sweep_store_keeps_its_chunks(store):
     before = store.chunk_path(0).read_bytes()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
@@ -235,20 +235,20 @@ def test_store_on_a_full_disk_is_one_line_and_keeps_its_parts(store):
     assert len(os.listdir(store.folder / "parts")) == MANIFEST.parts
 
 
-def test_store_folder_that_cannot_be_made_is_one_line(tmp_path):
+def test_sweep_store_folder_that_cannot_be_created_is_reported_in_one_line(tmp_path):
     (tmp_path / "file").touch()
     with refused("file/store: cannot be written: "):
         open_store(tmp_path / "file" / "store", MANIFEST, resume=False)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
-def test_store_in_a_read_only_folder_is_one_line(store):
+def test_sweep_store_in_read_only_folder_is_reported_in_one_line(store):
     (store.folder / "parts").chmod(0o500)
     with refused("part-000000.parquet: cannot be written: Permission denied"):
         write_chunk(store, 0, made_up(0))
 
 
-def test_store_is_continued_by_the_code_that_made_it(tmp_path):
+def test_sweep_store_is_resumed_only_by_the_same_source_code(tmp_path):
     old = msgspec.structs.replace(MANIFEST, sources_sha256="0" * 64)
     old = msgspec.structs.replace(old, sha256=digest(msgspec.to_builtins(old)))
     folder = open_store(tmp_path / "store", old, resume=False).folder
@@ -257,7 +257,7 @@ def test_store_is_continued_by_the_code_that_made_it(tmp_path):
         open_store(folder, MANIFEST, resume=True)
 
 
-def test_store_touches_no_file_of_the_user(tmp_path):
+def test_sweep_store_changes_no_file_of_the_user(tmp_path):
     thesis = tmp_path / "thesis"
     thesis.mkdir()
     for name in (".thesis.docx.tmp", ".thesis.docx.1.tmp", "thesis.docx", ".lock"):
@@ -272,7 +272,7 @@ def test_store_touches_no_file_of_the_user(tmp_path):
 
 @pytest.mark.parametrize("name", [".lock", "manifest.json", "parts", "verdict.json", "studies"])
 @pytest.mark.parametrize("kind", ["link", "pipe", "folder link"])
-def test_store_follows_no_link_and_waits_for_no_pipe(store, tmp_path, name, kind):
+def test_sweep_store_follows_no_link_and_does_not_block_on_pipe(store, tmp_path, name, kind):
     folder = store.folder / name
     if folder.is_dir():
         folder.rename(tmp_path / "away")
@@ -295,7 +295,7 @@ def test_store_follows_no_link_and_waits_for_no_pipe(store, tmp_path, name, kind
 
 
 @pytest.mark.parametrize("kind", ["link", "pipe"])
-def test_store_part_is_a_plain_file(store, tmp_path, kind):
+def test_sweep_store_chunk_must_be_a_plain_file(store, tmp_path, kind):
     path = store.chunk_path(2)
     path.rename(tmp_path / "part")
     if kind == "pipe":
@@ -309,7 +309,7 @@ def test_store_part_is_a_plain_file(store, tmp_path, kind):
     assert sorted(os.listdir(path.parent)) == ["part-000000.parquet", path.name]
 
 
-def test_store_is_written_by_one_sweep_at_a_time(tmp_path):
+def test_sweep_store_is_locked_against_a_second_sweep(tmp_path):
     with lock_store(tmp_path), refused("another sweep"), lock_store(tmp_path):
         pass
     with lock_store(tmp_path):

@@ -91,25 +91,25 @@ def unwritten(*words):
 
 
 @given(drivers())
-def test_sobol_study_is_read_as_it_was_written(found):
+def test_sobol_study_file_is_read_as_written(found):
     request = IndicesRequest(128)
     assert same(decode_study(MANIFEST, request, encode_study(MANIFEST, request, found)), found)
 
 
 @given(RARE)
-def test_rare_event_study_is_read_as_it_was_written(found):
+def test_rare_event_study_file_is_read_as_written(found):
     request = RareFailureRequest(1.5, replicates=REPLICATES)
     assert same(decode_study(MANIFEST, request, encode_study(MANIFEST, request, found)), found)
 
 
 @given(st.sampled_from(REQUESTS), st.binary(max_size=300))
-def test_study_of_arbitrary_bytes_is_ignored(request, content):
+def test_study_file_of_arbitrary_bytes_is_ignored(request, content):
     assert decode_study(MANIFEST, request, content) is None
 
 
 @given(st.sampled_from(STUDIES), st.data())
 @settings(max_examples=400)
-def test_study_with_any_flipped_bit_is_ignored(study, data):
+def test_study_file_with_any_flipped_bit_is_ignored(study, data):
     request, result = study
     content = bytearray(encode_study(MANIFEST, request, result))
     content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
@@ -126,7 +126,7 @@ JSON = st.recursive(
 
 @given(st.sampled_from(STUDIES), st.data())
 @settings(max_examples=300)
-def test_signed_study_is_read_as_it_says_or_not_at_all(study, data):
+def test_changed_study_file_with_valid_digest_is_read_as_written_or_ignored(study, data):
     """Include other types or shapes, which are no result and must not crash."""
     request, result = study
     document = json.loads(encode_study(MANIFEST, request, result))
@@ -140,7 +140,7 @@ def test_signed_study_is_read_as_it_says_or_not_at_all(study, data):
         assert {**again, "sha256": document["sha256"]} == document
 
 
-def test_study_that_json_cannot_express_is_not_written(store):
+def test_study_result_that_json_cannot_express_is_not_written(store):
     # Where no nan can be, it has no symbol.
     with unwritten("drivers-2.json: ", "JSON"):
         write_study(store, IndicesRequest(2), SOME_DRIVERS._replace(cap=math.nan))
@@ -149,7 +149,7 @@ def test_study_that_json_cannot_express_is_not_written(store):
     assert not (store.folder / "studies").exists()
 
 
-def test_stored_study_is_what_a_new_run_gives(store, sweep):
+def test_stored_study_equals_result_of_a_new_run(store, sweep):
     first, again = (compute_error_indices(sweep, 8) for _ in range(2))
     write_study(store, IndicesRequest(8), first)
     assert same(read_study(store, IndicesRequest(8)), again)
@@ -165,7 +165,7 @@ def test_stored_study_is_what_a_new_run_gives(store, sweep):
     assert study_path(store, RareFailureRequest(2.0, 20, 2)).read_bytes() == content
 
 
-def test_study_without_variance_and_failures_is_stored(tmp_path):
+def test_study_result_without_variance_or_failures_is_stored(tmp_path):
     still = build_sweep(manifest(case(uncertainty={}), limit=1.5))
     store = open_store(tmp_path / "store", still.manifest, resume=False)
     nothing = estimate_rare_failure(still, 1e9, samples=20, replicates=2)
@@ -177,7 +177,7 @@ def test_study_without_variance_and_failures_is_stored(tmp_path):
     assert same(read_study(store, IndicesRequest(2)), constant)
 
 
-def test_study_is_read_only_for_the_same_arguments_and_sweep(store):
+def test_stored_study_of_other_arguments_or_another_sweep_is_not_used(store):
     write_study(store, IndicesRequest(128), SOME_DRIVERS)
     write_study(store, RareFailureRequest(1.5, replicates=2), SOME_RARE)
     assert (
@@ -203,7 +203,7 @@ def test_study_is_read_only_for_the_same_arguments_and_sweep(store):
 
 
 @pytest.mark.parametrize("other", [manifest(limit=1.5, seed=1), manifest(limit=1.6)])
-def test_study_of_another_sweep_is_ignored(store, other):
+def test_study_file_of_another_sweep_is_ignored(store, other):
     write_study(SweepStore(store.folder, other), IndicesRequest(128), SOME_DRIVERS)
     write_study(SweepStore(store.folder, other), RareFailureRequest(1.5, replicates=2), SOME_RARE)
     assert (
@@ -212,7 +212,7 @@ def test_study_of_another_sweep_is_ignored(store, other):
     )
 
 
-def test_study_states_its_subject(store):
+def test_study_file_states_type_and_settings_of_the_study(store):
     write_study(store, RareFailureRequest(1.5, replicates=2), SOME_RARE)
     result = json.loads(study_path(store, RareFailureRequest(1.5, 1000, 2)).read_bytes())
     del result["result"]
@@ -224,7 +224,7 @@ def test_study_states_its_subject(store):
 
 
 @pytest.mark.parametrize("harm", ["cut", "empty", "folder", "large"])
-def test_damaged_study_is_ignored(store, harm):
+def test_damaged_study_file_is_ignored(store, harm):
     write_study(store, IndicesRequest(128), SOME_DRIVERS)
     path = study_path(store, IndicesRequest(128))
     content = path.read_bytes()
@@ -242,7 +242,7 @@ def test_damaged_study_is_ignored(store, harm):
             write_study(store, IndicesRequest(128), SOME_DRIVERS)
 
 
-def test_study_on_a_full_disk_is_one_line_and_keeps_what_is_there(store):
+def test_full_disk_is_reported_in_one_line_and_old_study_file_is_kept(store):
     write_study(store, IndicesRequest(128), SOME_DRIVERS)
     write_verdict(store, {"verdict": "good"})
     before = study_path(store, IndicesRequest(128)).read_bytes()
@@ -261,7 +261,7 @@ def test_study_on_a_full_disk_is_one_line_and_keeps_what_is_there(store):
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
-def test_study_in_a_read_only_folder_is_one_line(store):
+def test_study_file_in_read_only_folder_is_reported_in_one_line(store):
     (store.folder / "studies").mkdir(mode=0o500)
     with unwritten("drivers-128.json: ", "Permission denied"):
         write_study(store, IndicesRequest(128), SOME_DRIVERS)

@@ -40,7 +40,7 @@ def whole():
     return sweep, {name: np.concatenate([half[name] for half in halves]) for name in halves[0]}
 
 
-def test_input_without_effect_has_no_sensitivity(whole):
+def test_input_without_effect_has_zero_sensitivity_index(whole):
     sweep, _ = whole
     ran = []
     result = compute_error_indices(sweep, 128, PointRunSettings(ran.append))
@@ -55,7 +55,7 @@ def test_input_without_effect_has_no_sensitivity(whole):
     assert first.first_order_low <= first.first_order <= first.first_order_high
 
 
-def test_variance_of_a_single_input_is_all_its_own():
+def test_single_uncertain_input_has_sensitivity_index_1():
     # One input beside the phase: the law of total variance by brute force, with the phase's mean in cells.
     sweep = sweep_of(case(uncertainty={"contact.stiffness": UNCERTAIN["contact.stiffness"]}))
     result = {one.input: one for one in compute_error_indices(sweep, 256).inputs}
@@ -69,7 +69,7 @@ def test_variance_of_a_single_input_is_all_its_own():
     assert phase.total_low < 1 - share < phase.total_high
 
 
-def test_correlated_inputs_count_as_one():
+def test_correlated_inputs_have_a_joint_sensitivity_index():
     table = {"keys": ["rig.force_sensor.delay", "approach.velocity"], "matrix": [[1.0], [0.9, 1.0]]}
     apart = sweep_of(case(uncertainty=UNCERTAIN | IDLE))
     together = sweep_of(case(uncertainty=UNCERTAIN | IDLE, correlation=table))
@@ -88,7 +88,7 @@ def test_correlated_inputs_count_as_one():
     assert alone.total_low < joint.total < alone.total_high
 
 
-def test_noise_is_an_input_of_the_study():
+def test_sensor_noise_is_an_input_of_the_sensitivity_study():
     document = case(force_sensor=NOISY, uncertainty={"bodies.equivalent_mass": TIGHT})
     result = compute_error_indices(sweep_of(document), 64)
     shares = {one.input: one for one in result.inputs}
@@ -107,7 +107,7 @@ def test_noise_is_an_input_of_the_study():
 TIGHT = {"distribution": "uniform", "factor": [0.99999, 1.00001]}
 
 
-def test_errors_beyond_the_cap_count_as_the_cap(whole):
+def test_sensitivity_study_replaces_errors_above_the_cap_by_the_cap(whole):
     _, rows = whole
     limit = float(np.quantile(np.abs(rows["worst_error"]), 0.5)) / 10
     limited = sweep_of(case(uncertainty=UNCERTAIN | IDLE), limit=limit)
@@ -117,7 +117,7 @@ def test_errors_beyond_the_cap_count_as_the_cap(whole):
 
 
 @pytest.mark.parametrize("share", [0.2, 0.05])
-def test_rare_failures_are_as_frequent_as_in_the_sweep(whole, share):
+def test_rare_failure_probability_agrees_with_sweep(whole, share):
     sweep, rows = whole
     limit = float(np.quantile(np.abs(rows["worst_error"]), 1 - share))
     rows = {**rows, "outcome": (np.abs(rows["worst_error"]) > limit).astype(np.int8)}
@@ -131,20 +131,20 @@ def test_rare_failures_are_as_frequent_as_in_the_sweep(whole, share):
     assert is_spread_beyond_formula(result._replace(coefficient_of_variation=0.9))
 
 
-def test_rare_failures_are_reproducible(whole):
+def test_rare_failure_estimate_is_reproducible(whole):
     sweep, rows = whole
     limit = float(np.quantile(np.abs(rows["worst_error"]), 0.97))
     first, again = (estimate_rare_failure(sweep, limit, samples=50, replicates=2) for _ in range(2))
     np.testing.assert_array_equal(first.estimates, again.estimates)
 
 
-def test_other_failures_fail_at_any_limit():
+def test_saturated_runs_count_as_failures_for_any_error_limit():
     # A force sensor that reads only a little of the force.
     sweep = sweep_of(case(force_sensor={"range": 1e-3}), chunk=64)
     assert estimate_rare_failure(sweep, 1e9, samples=20, replicates=2).probability == 1
 
 
-def test_study_points_run_alike_in_any_chunk(whole):
+def test_study_point_results_do_not_depend_on_the_chunk(whole):
     sweep, _ = whole
     points = np.random.default_rng(1).random((40, 4))
     one = run_points(sweep, points, np.arange(40))

@@ -41,7 +41,7 @@ def piece(rows, part):
     return {name: values[part] for name, values in rows.items()}
 
 
-def test_tally_is_the_same_for_parts_in_any_order():
+def test_sweep_tally_does_not_depend_on_order_of_chunks():
     rows = made_up(1000)
     cuts = np.split(np.arange(1000), [10, 500, 501])
     whole = add_to_tally(build_empty_tally(16), rows)
@@ -54,7 +54,7 @@ def test_tally_is_the_same_for_parts_in_any_order():
     assert sum(k for _, k in whole.replicates) == whole.failed
 
 
-def test_tally_lists_the_worst_first():
+def test_sweep_tally_lists_the_worst_scenarios_first():
     rows = made_up(1000)
     tally = add_to_tally(build_empty_tally(1), rows)
     assert len(tally.worst) == MAX_WORST_SCENARIOS
@@ -66,14 +66,14 @@ def test_tally_lists_the_worst_first():
     np.testing.assert_array_equal([error for _, error, _ in tally.worst], largest)
 
 
-def test_tally_interval_without_failures_is_the_closed_form():
+def test_sweep_tally_interval_without_failures_matches_closed_form():
     rows = made_up(500, share=0.0)
     result = estimate_failure_probability(add_to_tally(build_empty_tally(1), rows))
     assert SCENARIO_OUTCOMES[0] == GOOD and result.value == 0 and result.low == 0
     assert result.high == pytest.approx(1 - 0.025 ** (1 / 500), rel=1e-12)
 
 
-def test_tally_interval_of_replicates_is_students():
+def test_sweep_tally_interval_of_replicates_is_students_t_interval():
     rows = made_up(16 * 64)
     result = estimate_failure_probability(add_to_tally(build_empty_tally(16), rows))
     means = rows["failed"].reshape(64, 16).mean(axis=0)
@@ -82,7 +82,7 @@ def test_tally_interval_of_replicates_is_students():
     assert (result.low, result.high) == pytest.approx((result.value - half, result.value + half))
 
 
-def test_tally_remainder_is_in_no_replicate():
+def test_incomplete_last_block_of_sweep_tally_is_in_no_replicate():
     rows = made_up(16 * 64 + 5)
     tally = add_to_tally(build_empty_tally(16, 16 * 64 + 5), rows)
     assert tally.scenarios == 16 * 64 + 5 and tally.left_out == 5
@@ -96,7 +96,7 @@ def test_tally_remainder_is_in_no_replicate():
     )
 
 
-def test_tally_has_no_interval_for_replicates_of_unequal_size():
+def test_sweep_tally_has_no_interval_for_replicates_of_unequal_size():
     tally = add_to_tally(build_empty_tally(16, 1600), made_up(100))
     result = estimate_failure_probability(tally)
     assert (result.low, result.high) == (0, 1) and 0 < result.value < 1 and "yet" in result.method
@@ -104,7 +104,7 @@ def test_tally_has_no_interval_for_replicates_of_unequal_size():
     assert estimate_failure_probability(add_to_tally(build_empty_tally(16, 10), made_up(10))).high == 1
 
 
-def test_tally_looks_are_the_confidence_sequences():
+def test_sweep_tally_interval_of_repeated_looks_is_confidence_sequence():
     rows = made_up(1000)
     tally, running = build_empty_tally(1, 10**6, looked_at=True), SequentialState()
     for part in np.split(np.arange(1000), 10):
@@ -125,7 +125,7 @@ def test_tally_looks_are_the_confidence_sequences():
 
 
 @pytest.mark.parametrize("replicates", [1, 16])
-def test_tally_quantiles_are_those_of_the_errors(replicates):
+def test_sweep_tally_quantiles_equal_quantiles_of_errors(replicates):
     rows = made_up(1600, share=0.01)
     sizes = compute_error_sizes(rows)
     assert np.array_equal(np.isinf(sizes), rows["outcome"] > SCENARIO_OUTCOMES.index(SATURATED)) and np.any(

@@ -12,7 +12,7 @@ FIGURES = [12.34, 20.15, 200.2, 0.1041, 0.5123, 0.9252, 1.443, 4.125]
 
 
 @pytest.mark.parametrize("width", [30, 60, 80, 110, 300])
-def test_table_loses_no_digit(monkeypatch, capsys, width):
+def test_terminal_table_shows_every_digit(monkeypatch, capsys, width):
     monkeypatch.setattr(terminal, "DEFAULT_WIDTH", width)
     heads = ["law", *(f"figure {number} %" for number in range(len(FIGURES)))]
     terminal.emit(
@@ -23,7 +23,7 @@ def test_table_loses_no_digit(monkeypatch, capsys, width):
     assert line.split() == [LAW, *(f"{figure:.4g}" for figure in FIGURES)]
 
 
-def test_table_folds_long_texts_between_words(monkeypatch, capsys):
+def test_terminal_table_wraps_long_texts_between_words(monkeypatch, capsys):
     monkeypatch.setattr(terminal, "DEFAULT_WIDTH", 60)
     text = "force delay, noise of the force sensor and dead zone, equivalent mass, roughly the surface"
     terminal.emit(
@@ -34,7 +34,7 @@ def test_table_folds_long_texts_between_words(monkeypatch, capsys):
     assert set(" ".join(lines).split()) >= {LAW, *text.split(), "1.25"}
 
 
-def test_json_writes_numpy_numbers_as_numbers_and_nonfinite_as_null():
+def test_json_output_has_numbers_for_numpy_scalars_and_null_for_nonfinite_values():
     said = {
         "yes": np.bool_(True),
         "three": np.int64(3),

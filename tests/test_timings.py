@@ -29,7 +29,7 @@ def test_timings_record_events_of_jax(capsys):
 
 
 @pytest.mark.parametrize("arguments", [(), ("--json",)])
-def test_timings_do_not_change_what_a_command_prints(jaxhil, arguments):
+def test_timings_option_does_not_change_command_output(jaxhil, arguments):
     plain, ran = jaxhil("mechanisms", *arguments), jaxhil("mechanisms", "--timings", *arguments)
     assert ran.code == plain.code == 0 and ran.out == plain.out
     assert plain.err == "" and ran.err.startswith("took: ") and "s in all" in ran.err

@@ -48,7 +48,7 @@ MET = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHAPES)
-def test_distance_has_unit_slope_along_its_normal(name):
+def test_signed_distance_has_unit_slope_along_its_normal(name):
     """Expect the gradient to be the normal, of length 1, and a step along it to end on the surface."""
     shape = SHAPES[name]
 
@@ -77,7 +77,7 @@ def test_distance_has_unit_slope_along_its_normal(name):
 
 
 @pytest.mark.slow
-def test_singular_points_have_no_nan():
+def test_signed_distance_at_singular_points_is_not_nan():
     """Cover the axis, a centre, a segment and the faces of a box."""
     singular = {
         "ball": (0.1, 0.2, 0.3), "cavity": (0.1, 0.2, 0.3), "drogue": (0, 0, -0.1), "rim": (0.5, 0, 0.1),
@@ -119,7 +119,7 @@ CANDIDATES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CANDIDATES)
-def test_depth_changes_at_its_rate_and_slip_is_tangential(name):
+def test_penetration_rate_is_derivative_of_depth_and_slip_is_tangential(name):
     candidates = CANDIDATES[name]
     pose, twist = pose_and_twist()
     touch = candidates.touch(pose)
@@ -130,7 +130,7 @@ def test_depth_changes_at_its_rate_and_slip_is_tangential(name):
 
 
 @pytest.mark.slow
-def test_mirrored_pair_is_the_same_touch():
+def test_contact_of_exchanged_shapes_is_the_same():
     """Swap the shape of a sphere and a ball: the force acts on the shape."""
     pose, _ = pose_and_twist()
     one = CANDIDATES["ball on sphere"].touch(pose)

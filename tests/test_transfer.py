@@ -52,7 +52,7 @@ def anywhere(mechanism, compensator, seed=0):
 # Distance
 
 
-def test_distance_is_zero_to_itself_and_symmetric():
+def test_mechanism_distance_is_symmetric_and_zero_for_identical_mechanisms():
     mechanisms = [load(name).mechanism for name in builtin_names()]
     for a in mechanisms:
         assert compute_mechanism_distance(a, a) == 0
@@ -82,11 +82,11 @@ def test_distance_is_zero_to_itself_and_symmetric():
         ("name='other'", 0.0),
     ],
 )
-def test_distance_weighs_each_trait_by_its_effect_on_the_restitution(override, expected):
+def test_mechanism_distance_weighs_each_property_by_effect_on_restitution(override, expected):
     assert compute_mechanism_distance(claw(), claw(override)) == pytest.approx(expected, rel=2e-4, abs=1e-12)
 
 
-def test_traits_do_not_depend_on_the_form_of_the_simulator():
+def test_mechanism_properties_do_not_depend_on_form_of_simulator_model():
     second = compute_traits(claw("rig.simulator.natural_frequency=10.0", "rig.simulator.damping_ratio=0.7"))
     omega = 2 * math.pi * 10
     written = behind(
@@ -98,14 +98,14 @@ def test_traits_do_not_depend_on_the_form_of_the_simulator():
     assert compute_traits(behind("'ideal'")).simulator_delay == 0.004
 
 
-def test_damping_of_every_law_is_that_of_its_restitution():
+def test_equivalent_damping_of_every_contact_law_matches_its_restitution():
     """Use Hunt and Crossley's e = 1 - chi v."""
     hertz = compute_traits(claw("contact.law='hunt_crossley'", "contact.damping=[4.0]"))
     assert math.exp(-math.pi * hertz.damping_ratio) == pytest.approx(1 - 4.0 * 0.005, rel=1e-3)
     assert compute_traits(claw()).damping_ratio == pytest.approx(0.03, rel=1e-3)
 
 
-def test_nearest_mechanism_is_the_least_distant_and_the_first_of_equals():
+def test_nearest_mechanism_has_least_distance_and_is_first_among_equals():
     stiff, soft = claw("contact.stiffness=[3e5]"), claw("contact.stiffness=[6e4]")
     sources = [
         EarlierGains(stiff, {}, "stiff"),
@@ -128,14 +128,14 @@ def test_transferred_gains_on_the_same_mechanism_are_unchanged(compensator, name
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
-def test_transferred_literature_gains_are_the_literatures(compensator):
+def test_transferred_literature_gains_equal_literature_gains_of_target(compensator):
     source, target = claw(), load("varying", ["rig.control_period=0.002"]).mechanism
     transferred = transfer_gains(compensator, literature_gains(source, compensator), source, target)
     for name, value in literature_gains(target, compensator).items():
         assert transferred[name] == pytest.approx(value, rel=1e-12)
 
 
-def test_transferred_gains_move_with_the_literature_and_the_range():
+def test_transferred_gains_keep_relative_position_to_literature_and_range():
     source = claw()
     target = claw("contact.stiffness=[497420.0]", "rig.force_sensor.delay=0.01", "rig.control_period=0.002")
     gains = {**literature_gains(source, "response_error"), "initial_stiffness": 1e5, "lead_filter": 1.5e-3}
@@ -177,7 +177,7 @@ def solved(task, validation):
     return starts
 
 
-def test_prior_starts_replace_the_last_starts(task, validation):
+def test_starting_gains_from_user_replace_the_last_random_starts(task, validation):
     gains = {"phase_lead": 0.011, "lead_filter": 0.0007}
     (usual,) = choose_starts(validation, 3, 0)
     (points,) = choose_starts(validation, 3, 0, first=[[gains]])
@@ -190,14 +190,14 @@ def test_prior_starts_replace_the_last_starts(task, validation):
 
 
 @pytest.mark.parametrize("starts", [1, 2])
-def test_literature_gains_stay_beside_prior_starts(task, validation, starts):
+def test_literature_gains_are_kept_beside_starting_gains_from_user(task, validation, starts):
     given = [{"phase_lead": 0.011, "lead_filter": 0.0007}, {"phase_lead": 0.002, "lead_filter": 0.0005}]
     (points,) = choose_starts(validation, starts, 0, first=[given])
     for gains, point in zip([task.literature, *given], points, strict=True):
         assert validation.gains(0, point) == pytest.approx(gains, rel=1e-12)
 
 
-def test_prior_start_never_ends_worse_than_it_was(task, validation, solved):
+def test_tuning_from_user_gains_never_ends_worse_than_those_gains(task, validation, solved):
     """Use tuned gains that lie at a bound."""
     best = min(solved, key=lambda start: start.rms)
     upper = COMPENSATORS["phase_lead"].gains[0].upper(task.mechanism)
@@ -231,12 +231,12 @@ def in_blocks(monkeypatch):
     return call
 
 
-def test_later_blocks_start_at_the_results_of_earlier_ones(in_blocks):
+def test_later_tuning_blocks_start_at_results_of_similar_earlier_mechanisms(in_blocks):
     assert in_blocks(starts=3) == [[], [], ["3e5"]]
     assert in_blocks(starts=2) == [[], [], ["3e5"]]
 
 
-def test_prior_starts_come_before_transferred_ones_and_literature_stays(in_blocks):
+def test_starting_gains_from_user_precede_transferred_gains_and_literature_stays(in_blocks):
     file = EarlierGains(claw("contact.stiffness=[1.1e5]"), {}, "file")
     assert in_blocks(3, [file]) == [["file"], ["file"], ["file", "3e5"]]
     assert in_blocks(2, [file]) == in_blocks(1, [file]) == [["file"]] * 3

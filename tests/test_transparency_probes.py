@@ -41,7 +41,7 @@ def kind(scenarios, number):
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., number::LANES_PER_SCENARIO], scenarios)
 
 
-def test_pushed_contact_has_the_restitution_of_the_pushed_ideal_contact():
+def test_contact_with_probe_push_has_restitution_of_pushed_ideal_contact():
     """Compare with SciPy, event by event, under the very push that the scenario's hardware gets."""
     probed = build_probed_scenarios(DAMPED, draw(DAMPED, 3, 0))
     for number, known in ((1, probed.early), (2, probed.late)):
@@ -66,7 +66,7 @@ def test_pushed_contact_has_the_restitution_of_the_pushed_ideal_contact():
             assert abs(known[lane] - probed.plain[lane]) > 0.01
 
 
-def test_probed_copies_have_no_error_on_an_ideal_rig():
+def test_probed_scenario_copies_have_zero_error_on_an_ideal_rig():
     spread = {"contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
     made = validated({**mechanism({}, IDEAL, 0.0, period=5e-5), "uncertainty": spread})
     probed = build_probed_scenarios(made, draw(made, 16, 0))
@@ -78,7 +78,7 @@ def test_probed_copies_have_no_error_on_an_ideal_rig():
     assert [one.value for one in figures.values()] == pytest.approx([1] * 4, abs=2e-3)
 
 
-def test_first_lanes_hold_some_copies_of_each_kind():
+def test_first_lanes_contain_every_kind_of_probed_copy():
     assert list(mask_probes(8)) == [False, True, True, True] * 2
     probed = build_probed_scenarios(DAMPED, draw(DAMPED, 5, 1)).scenarios
     damping = np.asarray(probed.contact.damping)[0]
@@ -90,7 +90,7 @@ def test_first_lanes_hold_some_copies_of_each_kind():
     np.testing.assert_array_equal(pushed, np.arange(20) % LANES_PER_SCENARIO % 3 > 0)
 
 
-def test_only_anticipating_laws_are_probed_unless_requested():
+def test_only_anticipating_compensators_are_probed_by_default():
     weighed = [name for name in COMPENSATORS if choose_default_weights(name)]
     assert (
         weighed
@@ -135,7 +135,7 @@ def test_solver_and_search_minimise_the_stated_objective(task):
         assert start.rms >= value * (1 - 1e-9)
 
 
-def test_scenarios_of_a_common_form_cannot_be_probed():
+def test_scenarios_of_a_common_program_cannot_be_probed():
     with pytest.raises(ValueError):
         build_task(DAMPED, "phase_lead", 4, 0, common=object(), probed=True)  # pyright: ignore
 
@@ -164,7 +164,7 @@ def test_scenarios_without_transparency_weight_are_not_probed():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", [PEAK_CRITERION, TRANSPARENCY_CRITERION])
-def test_error_is_traded_against_peak_or_transparency(result, axis):
+def test_objective_weights_trade_error_against_peak_force_or_transparency(result, axis):
     ((_, front),) = compute_fronts([result], 2, axis=axis)
     assert front.axis == axis and front.points[0].weight == 0 < front.points[1].weight
     for point in (*front.points, front.tuned):

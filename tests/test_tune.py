@@ -43,7 +43,7 @@ def test_tuned_gains_beat_the_literature_on_fresh_scenarios(result):
     assert tuned.max >= tuned.p99 >= tuned.rms
 
 
-def test_every_start_has_a_status_and_a_falling_history(result):
+def test_every_tuning_start_has_a_status_and_a_decreasing_loss_history(result):
     assert (
         0 < len(result.starts) <= MAX_START_BATCHES * SMALL.starts and len(result.starts) % SMALL.starts == 0
     )
@@ -55,7 +55,7 @@ def test_every_start_has_a_status_and_a_falling_history(result):
 
 
 @pytest.mark.slow
-def test_gains_tuned_with_noise_are_better_with_noise(result):
+def test_gains_tuned_with_noise_are_better_on_noisy_scenarios(result):
     """Use three times the published noise, on scenarios that neither of the two has seen."""
     noisy = load("varying", ["rig.force_sensor.noise_std=8"]).mechanism
     task = build_task(noisy, "phase_lead", SMALL.scenarios, SMALL.seed)
@@ -81,13 +81,13 @@ def test_gains_tuned_with_noise_are_better_with_noise(result):
         ),
     ],
 )
-def test_noisy_mechanisms_get_more_scenarios(override, number):
+def test_noisy_mechanisms_are_tuned_on_more_scenarios(override, number):
     mechanism = load("claw-350kg", [override]).mechanism
     assert len(build_task(mechanism, "none", None, 0).scenarios.velocity) == number
     assert len(build_task(mechanism, "none", 5, 0).scenarios.velocity) == 5
 
 
-def test_gains_lie_within_their_bounds(result):
+def test_tuned_gains_lie_within_their_bounds(result):
     for gain in COMPENSATORS["phase_lead"].gains:
         assert gain.lower(result.mechanism) <= result.gains[gain.name] <= gain.upper(result.mechanism)
 
@@ -103,7 +103,7 @@ def test_compensator_without_gains_is_only_evaluated():
     assert result.figures["before"] == result.figures["tuned"]
 
 
-def test_setting_is_evaluated_without_tuning(monkeypatch):
+def test_compensator_setting_is_evaluated_without_tuning(monkeypatch):
     law = COMPENSATORS["phase_lead"]
     monkeypatch.setattr(type(law), "settings", {"mild": {"phase_lead": 0.0015}})
     result = tune(
@@ -115,7 +115,7 @@ def test_setting_is_evaluated_without_tuning(monkeypatch):
 
 
 @pytest.mark.slow
-def test_before_is_no_compensation_for_any_law(monkeypatch):
+def test_outcome_before_tuning_is_uncompensated_for_every_compensator(monkeypatch):
     monkeypatch.setattr(type(COMPENSATORS["impulse_ledger"]), "settings", {"mild": {}})
     mechanism, quiet = load().mechanism, dataclasses.replace(SMALL, setting="mild")
     without = tune(mechanism, "none", SMALL).outcomes["tuned"]
@@ -126,7 +126,7 @@ def test_before_is_no_compensation_for_any_law(monkeypatch):
     assert np.sqrt(np.nanmean(before.error**2)) > 0.1
 
 
-def test_starts_begin_with_the_literature_and_stay_inside():
+def test_tuning_starts_begin_with_literature_gains_and_stay_within_bounds():
     task = build_task(load().mechanism, "response_error", 8, 0)
     names = list_tuned_gains([task])
     bounds = build_gain_bounds(task, names)

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.users_options
 FEW: dict[str, Any] = {"scenarios": 4, "starts": 1, "steps": 2, "validation": 15}
 
 
-def test_tuning_without_a_scheduler_is_one_line():
+def test_tuning_without_scheduler_fails_in_one_line():
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
         tuning.tune("varying", scheduler="nowhere://x", **FEW)

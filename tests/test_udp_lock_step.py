@@ -34,7 +34,7 @@ def varying():
 
 
 @pytest.mark.parametrize("name", ["varying", "layered", "rattling"])
-def test_first_contacts_are_those_of_the_closed_loop(name):
+def test_udp_lock_step_contacts_equal_those_of_closed_loop(name):
     mechanism = load(name).mechanism
     gains = literature_gains(mechanism, "response_error")
     contacts, _ = closed_loop(mechanism, "response_error", gains)
@@ -68,7 +68,7 @@ class Unreliable:
 
 
 @pytest.mark.parametrize("drops, ticks", [(0.01, 0), (0.05, 0), (0.0, 2), (0.01, 2)])
-def test_lost_and_late_packets_are_made_up_for(varying, drops, ticks):
+def test_udp_rig_compensates_for_lost_and_late_packets(varying, drops, ticks):
     mechanism, gains = varying
     law = controller(mechanism, "response_error", gains)
     whole, _, _ = packets(mechanism, controller(mechanism, "response_error", gains), 2500)
@@ -83,7 +83,7 @@ def test_lost_and_late_packets_are_made_up_for(varying, drops, ticks):
     assert rig.commanded.not_finite == rig.commanded.beyond_limits == 0
 
 
-def test_contacts_unidentified_by_the_law_are_counted():
+def test_contacts_without_status_identified_are_counted_over_udp():
     """Send contacts that are too short: an answer reports each once, and the process their number."""
     mechanism = load("suite-fast", ["contact.stiffness=[884316.0]"]).mechanism
     gains = literature_gains(mechanism, "impulse_ledger")
@@ -97,7 +97,7 @@ def test_contacts_unidentified_by_the_law_are_counted():
     )
 
 
-def test_missing_tick_is_interpolated_linearly(varying):
+def test_readings_of_a_missing_tick_are_interpolated_linearly(varying):
     mechanism, _ = varying
     whole, gappy = prepared(mechanism), prepared(mechanism)
     for tick, force in enumerate((0.0, 10.0, 20.0, 30.0, 40.0)):
@@ -108,7 +108,7 @@ def test_missing_tick_is_interpolated_linearly(varying):
     assert gappy.interpolated == 2 and gappy.stale == 0
 
 
-def test_long_gap_is_left_to_the_controller(varying):
+def test_readings_of_a_long_gap_are_not_interpolated(varying):
     mechanism, _ = varying
     task = prepared(mechanism, missed_in_a_row=20.0)
     first = task.answer(a_reading(0, force=7.0))
@@ -123,7 +123,7 @@ def test_long_gap_is_left_to_the_controller(varying):
     assert math.isfinite(tripped.position_command) and math.isfinite(tripped.command_rate)
 
 
-def test_stale_packets_are_dropped_and_counted(varying):
+def test_outdated_packets_are_dropped_and_counted(varying):
     task = prepared(varying[0])
     assert task.answer(a_reading(3)) is not None
     assert task.answer(a_reading(2)) is None  # overtaken
@@ -163,7 +163,7 @@ def test_any_packets_of_a_rig_are_answered_with_finite_commands(varying, reading
 
 
 @pytest.mark.parametrize("resets", [False, True])
-def test_trip_over_a_stall_of_the_machine_is_reset_and_reported(varying, resets):
+def test_trip_caused_by_a_stall_of_the_computer_is_reset_and_reported(varying, resets):
     mechanism, gains = varying
     law = controller(mechanism, "response_error", gains, missed_in_a_row=3.0)
     count = 0
@@ -186,7 +186,7 @@ def test_trip_over_a_stall_of_the_machine_is_reset_and_reported(varying, resets)
     assert all(abs(contact.restitution - 0.94) < 0.05 for contact in rig.contacts if contact.status == "ok")
 
 
-def test_trip_that_no_stall_explains_is_not_reset(varying):
+def test_trip_not_caused_by_a_stall_of_the_computer_is_not_reset(varying):
     mechanism, gains = varying
     law = controller(mechanism, "response_error", gains, force_limit=20.0, missed_in_a_row=1e9)
     count = 0
@@ -226,7 +226,7 @@ def test_failed_sensor_trips_and_the_rig_is_safe(varying):
     assert np.max(np.abs(steps)) <= 0.1 * mechanism.rig.control_period * (1 + 1e-9)
 
 
-def test_tare_comes_before_the_first_run():
+def test_udp_rig_tares_force_sensor_before_the_first_run():
     mechanism = load("rig-300kg", ("rig.force_sensor.bias=3.0",)).mechanism
     law = controller(mechanism, "none", {}, tare_ticks=50.0, bias_limit=5.0)
     rig, _, answers = packets(mechanism, law, 600)

@@ -71,7 +71,7 @@ def test_injected_network_faults_have_the_stated_rates():
     assert np.mean(held_back) == pytest.approx(0.004, rel=0.05)
 
 
-def test_missed_tick_is_attributed_to_its_cause():
+def test_missed_tick_is_attributed_to_network_or_computer():
     received = np.array([1, 0, 0, 0, 0, 1, 0, 0, 0], bool)
     overspent = np.array([1, 0, 0, 1, 0, 0, 0, 0, 0], bool)
     round_trip = np.array([1, 5, 0, 9, 9, 1, 3, 0, 6], float)
@@ -91,12 +91,12 @@ def test_missed_tick_is_attributed_to_its_cause():
     assert list(find_miss_causes(received, overspent, round_trip, held_back, lost, 1.0)) == expected
 
 
-def test_quantiles_of_no_values_are_nan():
+def test_latency_quantiles_of_no_values_are_nan():
     assert all(math.isnan(value) for value in compute_quantiles(np.zeros(0)))
     assert compute_quantiles(np.arange(1001.0)) == (500.0, 999.0, 1000.0)
 
 
-def test_ticks_that_took_too_long_are_replayed(varying):
+def test_overrunning_ticks_are_repeated_to_identify_the_cause(varying):
     mechanism, _ = varying
     record = TickRecord(4)
     for tick, cpu in enumerate((10, 2_000_000_000, 30, 40)):
@@ -111,7 +111,7 @@ def test_ticks_that_took_too_long_are_replayed(varying):
     assert replay_slow_ticks(lambda: pytest.fail("nothing to go through"), record, 1e10) == {}
 
 
-def test_ideal_restitutions_are_those_of_the_mechanisms_lists():
+def test_ideal_restitutions_use_entries_of_mechanism_lists_in_turn():
     def over(number, speed):
         return RigContact(number, speed, 0.9, 1.0, 0.1, "ok", 3)
 
@@ -126,7 +126,7 @@ def test_ideal_restitutions_are_those_of_the_mechanisms_lists():
     assert ideal_restitutions(mechanism, []) == []
 
 
-def test_contacts_without_commands_because_of_the_machine_are_not_evaluated(varying):
+def test_contacts_without_commands_due_to_a_stall_are_not_evaluated(varying):
     causes = np.full(100, NOT_MISSED)
     causes[20:40], causes[60] = CAUSE_MACHINE, CAUSE_CONTROLLER
     figures, times = None, None
@@ -150,7 +150,7 @@ class Sleepy(EmptyTask):
             time.sleep(self.held)
 
 
-def test_rig_that_was_held_up_continues_from_there():
+def test_udp_rig_schedule_is_shifted_after_a_stall():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
         nobody.bind(("127.0.0.1", 0))
         timing = PacketTimes(100)

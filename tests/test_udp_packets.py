@@ -36,7 +36,7 @@ WORD = st.integers(0, 2**32 - 1)
         ReadingPacket, st.sampled_from([PREPARE, TICK, STOP, RESET]), WORD, WORD, WORD, FINITE, *[ANY] * 4
     )
 )
-def test_readings_survive_encoding(reading):
+def test_reading_packets_survive_encoding_and_decoding(reading):
     assert same(decode_reading(encode_reading(reading, 7), 7), reading)
 
 
@@ -48,7 +48,7 @@ printable = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size
         AnswerPacket, st.integers(0, FLAGS), *[WORD] * 3, *[ANY] * 5, st.integers(0, 2**64 - 1), printable
     )
 )
-def test_answers_survive_encoding(answer):
+def test_answer_packets_survive_encoding_and_decoding(answer):
     assert same(decode_answer(encode_answer(answer, 7), 7), answer)
 
 
@@ -77,7 +77,7 @@ def mutated(packet):
 
 
 @given(mutated(READING))
-def test_any_bytes_are_refused_or_a_reading(packet):
+def test_arbitrary_bytes_are_refused_or_decoded_as_reading_packet(packet):
     try:
         reading = decode_reading(packet, SESSION)
     except PacketError:
@@ -87,7 +87,7 @@ def test_any_bytes_are_refused_or_a_reading(packet):
 
 
 @given(mutated(ANSWER))
-def test_any_bytes_are_refused_or_an_answer(packet):
+def test_arbitrary_bytes_are_refused_or_decoded_as_answer_packet(packet):
     try:
         answer = decode_answer(packet, SESSION)
     except PacketError:
@@ -104,7 +104,7 @@ def test_packets_of_another_session_are_refused():
                 decode(packet, other)
 
 
-def test_session_number_goes_to_the_asker_and_is_unique_to_every_address():
+def test_session_number_is_sent_to_requesting_address_and_differs_by_address():
     sessions, rig, number = SessionNumbers(), ("127.0.0.1", 4000), 2**63 + 5
     answer = sessions.answer(encode_session_request(number), rig)
     assert answer is not None and len(answer) == len(encode_session_request(number))
@@ -117,7 +117,7 @@ def test_session_number_goes_to_the_asker_and_is_unique_to_every_address():
 
 
 @given(st.one_of(st.binary(max_size=40), mutated(encode_session_request(3)), mutated(READING)))
-def test_session_is_opened_by_a_question_alone(packet):
+def test_session_is_opened_only_by_a_session_request(packet):
     answer = SessionNumbers().answer(packet, ("127.0.0.1", 4000))
     assert (answer is not None) == (len(packet) == 24 and packet[:5] == encode_session_request(3)[:5])
 
@@ -127,7 +127,7 @@ def newer(sequence: SequenceFilter, *numbers: int) -> list[bool]:
 
 
 @pytest.mark.parametrize("start", [0, 2**31 - 5, 2**32 - 5, 12345])
-def test_packet_numbers_order_packets_across_their_wrap_around(start):
+def test_packet_sequence_numbers_order_packets_across_wrap_around(start):
     sequence = SequenceFilter(start - 1)
     assert newer(sequence, start, start + 1, start + 4) == [True] * 3
     assert newer(sequence, start + 4, start + 3, start, start - 1) == [False] * 4
@@ -138,7 +138,7 @@ def test_packet_numbers_order_packets_across_their_wrap_around(start):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))
-def test_single_packet_of_any_number_makes_at_most_a_window_of_others_old(newest, wild):
+def test_packet_with_any_sequence_number_outdates_at_most_one_window_of_packets(newest, wild):
     sequence = SequenceFilter(newest)
     sequence.is_newer(wild)
     following = newer(sequence, *range(newest + 1, newest + MAX_SEQUENCE_STEP + 3))
@@ -148,7 +148,7 @@ def test_single_packet_of_any_number_makes_at_most_a_window_of_others_old(newest
     assert first in (0, (wild - newest) & 0xFFFFFFFF)
 
 
-def test_first_packet_after_many_lost_ones_is_lost_too():
+def test_first_packet_after_a_long_loss_is_also_dropped():
     for gap in (MAX_SEQUENCE_STEP + 1, 10**6, 2**31 - 10):
         sequence = SequenceFilter(5)
         assert newer(sequence, 5 + gap, 6 + gap, 7 + gap) == [False, True, True]

@@ -33,7 +33,7 @@ def gain_file(folder, compensator="response_error", limits=None, **values):
     return path
 
 
-def test_bundle_with_another_controller_is_not_rehearsed(jaxhil, tmp_path):
+def test_rig_command_refuses_bundle_with_modified_controller(jaxhil, tmp_path):
     """Run what this version exports, or nothing."""
     made = build_bundle(document(), [])
     trap = b"open(%r, 'w')\n" % str(tmp_path / "ran")
@@ -51,14 +51,14 @@ def test_bundle_with_another_controller_is_not_rehearsed(jaxhil, tmp_path):
     assert not (tmp_path / "ran").exists()
 
 
-def test_controller_process_without_a_gain_file_is_refused(capfd):
+def test_controller_process_without_gain_file_exits_with_error(capfd):
     assert udp_controller.main(["--gains", "nowhere.json"]) == 2
     error = capfd.readouterr().err
     assert "nowhere.json" in error and error.count("\n") == 1
 
 
 @pytest.mark.slow
-def test_rig_reports_a_short_run(jaxhil, tmp_path):
+def test_rig_command_reports_results_of_a_short_run(jaxhil, tmp_path):
     path = gain_file(tmp_path)
     # One contact of this gain file's takes most of a second.
     ran = jaxhil("rig", path, "--duration", 2, "--limit", "inf", "--json", "--plot", tmp_path / "rig.png")
@@ -79,7 +79,7 @@ def test_rig_reports_a_short_run(jaxhil, tmp_path):
     assert ran.code == (0 if result["verdict"] == "good" else 1)
 
 
-def test_rig_under_injected_faults_ends_safely(jaxhil, tmp_path):
+def test_rig_command_with_injected_faults_ends_safely(jaxhil, tmp_path):
     limits = {"command_lowest": -0.01, "command_highest": 0.01, "velocity_limit": 0.05, "deceleration": 1.0}
     limits |= {"held_readings": 3.0, "missed_in_a_row": 5.0, "retreat_velocity": 0.01}
     limits |= {"limited_in_a_row": 5.0, "force_limit": 200.0}
@@ -94,7 +94,7 @@ def test_rig_under_injected_faults_ends_safely(jaxhil, tmp_path):
     assert result["commanded"]["not_finite"] == result["commanded"]["beyond_limits"] == 0
 
 
-def test_rig_that_trips_without_injection_is_bad(jaxhil, tmp_path):
+def test_rig_verdict_is_bad_if_controller_trips_without_injected_fault(jaxhil, tmp_path):
     limits = {"force_limit": 5.0, "retreat_velocity": 0.01, "deceleration": 1.0}
     path = gain_file(tmp_path, limits=limits)
     ran = jaxhil("rig", path.parent, "--duration", 2, "--limit", "inf")
@@ -102,7 +102,7 @@ def test_rig_that_trips_without_injection_is_bad(jaxhil, tmp_path):
     assert "tripped: force_limit" in ran.out and "though no faults were injected" in ran.out
 
 
-def test_interrupted_rig_reports_what_it_measured(tmp_path):
+def test_interrupted_rig_command_reports_measurements_so_far(tmp_path):
     path = gain_file(tmp_path)
     # A shell's background jobs ignore interrupts, and hand that on.
     heeding = (
@@ -141,7 +141,7 @@ def test_interrupted_rig_reports_what_it_measured(tmp_path):
         (("BROKEN",), "sha256"),
     ],
 )
-def test_rig_refuses_unusable_input(jaxhil, tmp_path, options, words):
+def test_rig_command_refuses_unusable_input(jaxhil, tmp_path, options, words):
     good = gain_file(tmp_path)
     broken = tmp_path / "broken.json"
     broken.write_text(good.read_text().replace("0.005", "0.006"))
@@ -151,7 +151,7 @@ def test_rig_refuses_unusable_input(jaxhil, tmp_path, options, words):
     assert ran.err.strip().count("\n") == 0
 
 
-def test_priority_that_cannot_be_set_is_reported(jaxhil, tmp_path, monkeypatch):
+def test_process_priority_that_cannot_be_set_is_reported(jaxhil, tmp_path, monkeypatch):
     def refuse(*arguments):
         raise PermissionError(1, "Operation not permitted")
 
@@ -163,12 +163,12 @@ def test_priority_that_cannot_be_set_is_reported(jaxhil, tmp_path, monkeypatch):
     )
 
 
-def test_rig_help_has_an_example(jaxhil):
+def test_rig_command_help_has_an_example(jaxhil):
     ran = jaxhil("rig", "--help")
     assert ran.code == 0 and "Example: jaxhil rig" in ran.out
 
 
-def test_rig_loop_runs_without_jax():
+def test_rig_loop_runs_without_importing_jax():
     program = (
         "import sys, tuning.cli.commands.rig as command, tuning.rig.session, tuning.rig.session_report\n"
         "assert 'jax' not in sys.modules"
@@ -177,7 +177,7 @@ def test_rig_loop_runs_without_jax():
 
 
 @pytest.mark.benchmark
-def test_rig_runs_ten_minutes_at_1_khz(jaxhil, tmp_path):
+def test_rig_loop_runs_ten_minutes_at_1_khz(jaxhil, tmp_path):
     mechanism, sha256, _ = load("varying")
     gains = literature_gains(mechanism, "response_error")
     path = tmp_path / "gains.json"

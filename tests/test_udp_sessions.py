@@ -110,7 +110,7 @@ def flood(*senders):
     yield once
 
 
-def test_controller_process_answers_its_rig_and_nobody_else(process):
+def test_controller_process_answers_only_the_rig_of_its_session(process):
     served = process()
     rig, stranger, guesser = served.rig(), served.rig(), served.rig()
     rig.send(b"no packet at all")
@@ -135,7 +135,7 @@ def test_controller_process_answers_its_rig_and_nobody_else(process):
     assert all(value > 0 for value in ticks["wall"] + ticks["cpu"])
 
 
-def test_packet_from_the_rigs_address_without_session_number_is_ignored(process):
+def test_packet_from_rig_address_without_session_number_is_ignored(process):
     """Send what somebody can send who forges the rig's address but does not receive there."""
     served = process()
     rig = served.rig()
@@ -150,7 +150,7 @@ def test_packet_from_the_rigs_address_without_session_number_is_ignored(process)
     assert code == 0 and result["ignored"] == 2 and result["stale"] == 0
 
 
-def test_packet_with_wild_number_does_not_block_the_controller(process):
+def test_packet_with_arbitrary_sequence_number_does_not_block_the_controller(process):
     served = process()
     rig = served.rig()
     rig.prepare()
@@ -183,7 +183,7 @@ def test_replayed_packet_is_dropped(process):
     assert code == 1 and result["ended"] == "silent" and result["stale"] > 10
 
 
-def test_packets_of_strangers_do_not_keep_a_session_alive(process):
+def test_packets_from_other_addresses_do_not_keep_a_session_open(process):
     served = process("--silence", str(SILENCE))
     rig, stranger = served.rig(), served.rig()
     rig.prepare()
@@ -197,7 +197,7 @@ def test_packets_of_strangers_do_not_keep_a_session_alive(process):
 
 
 @pytest.mark.parametrize("opened", [False, True])
-def test_controller_process_without_session_ends_whoever_asks_for_one(process, opened):
+def test_controller_process_without_session_ends_despite_session_requests(process, opened):
     served = process("--wait", "0.3")
     rig = served.rig()
     begun = time.monotonic()
@@ -208,7 +208,7 @@ def test_controller_process_without_session_ends_whoever_asks_for_one(process, o
     assert code == 1 and result["ended"] == "silent"
 
 
-def test_silent_rig_ends_an_empty_loop(process):
+def test_controller_loop_ends_if_rig_sends_no_packet(process):
     served = process("--empty", "--silence", "0.1")
     rig = served.rig()
     rig.open()
@@ -230,7 +230,7 @@ def test_restarted_rig_does_not_continue_the_old_session(process):
     assert code == 1 and result["ended"] == "silent" and result["ignored"] == 2
 
 
-def test_lost_question_or_answer_is_asked_for_again(process):
+def test_lost_session_request_or_answer_is_sent_again(process):
     served = process()
     rig = served.rig()
     rig.send(encode_session_request(1)[:-1])

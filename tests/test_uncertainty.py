@@ -71,7 +71,7 @@ def test_draws_have_the_stated_distribution(draws, path, entry, expected):
         assert draws is draw or result.statistic < 1e-3
 
 
-def test_phases_are_uniform_and_every_contact_has_its_own():
+def test_contact_phases_are_uniform_and_independent_for_every_contact():
     phases = draw(from_plain_data(BASE, "f"), 4096, 0)
     assert list(phases) == [PHASE_KEY]
     assert phases[PHASE_KEY].shape == (4096, 3)
@@ -81,7 +81,7 @@ def test_phases_are_uniform_and_every_contact_has_its_own():
 
 
 @pytest.mark.parametrize("draws", [draw, draw_quasi_random])
-def test_lists_scale_as_one_or_entry_by_entry(draws):
+def test_uncertain_list_entries_scale_jointly_or_independently(draws):
     entry = {"distribution": "loguniform", "factor": [0.3, 3.0]}
     joint = draws(mechanism_with("contact.stiffness", entry), 4096, 1)["contact.stiffness"]
     assert joint.shape == (4096, 3)
@@ -94,7 +94,7 @@ def test_lists_scale_as_one_or_entry_by_entry(draws):
         assert stats.kstest(factors, stats.loguniform(0.3, 3.0).cdf).pvalue > 0.01
 
 
-def test_values_in_the_unit_of_a_list_belong_to_its_first_entry():
+def test_absolute_uncertainty_of_a_list_applies_to_its_first_entry():
     absolute = {"distribution": "uniform", "low": 2.0, "high": 4.0}
     values = draw(mechanism_with("contact.damping", absolute), 1000, 1)["contact.damping"]
     assert np.all((values[:, 0] >= 2.0) & (values[:, 0] <= 4.0))
@@ -111,7 +111,7 @@ def test_values_in_the_unit_of_a_list_belong_to_its_first_entry():
     assert np.all((values >= 2.0) & (values <= 4.0)) and np.all(values[:, 0] == values[:, 1])
 
 
-def test_nested_lists_keep_their_shape():
+def test_draws_of_nested_lists_keep_their_shape():
     mechanism = load("layered").mechanism
     values = draw(mechanism, 5, 0)["contact.stiffness"]
     nominal = np.array(mechanism.contact.stiffness)
@@ -130,7 +130,7 @@ def test_nested_lists_keep_their_shape():
     st.integers(0, 30),
     st.sampled_from(["varying", "layered"]),
 )
-def test_draw_depends_on_its_own_number_alone(seed, first, number, name):
+def test_draw_depends_only_on_seed_and_scenario_index(seed, first, number, name):
     mechanism = load(name).mechanism
     several = draw(mechanism, number, seed, first)
     for path, values in several.items():
@@ -139,7 +139,7 @@ def test_draw_depends_on_its_own_number_alone(seed, first, number, name):
             np.testing.assert_array_equal(values[i], draw(mechanism, 1, seed, first + i)[path][0])
 
 
-def test_draws_cross_blocks_and_differ():
+def test_draws_are_distinct_and_do_not_depend_on_block_boundaries():
     mechanism = load().mechanism
     whole = draw(mechanism, 5000, 7)
     for path, values in draw(mechanism, 3000, 7, first=1500).items():
@@ -148,7 +148,7 @@ def test_draws_cross_blocks_and_differ():
         assert not np.any(values == draw(mechanism, 3000, 8, first=1500)[path])
 
 
-def test_key_is_drawn_alike_whatever_else_is_uncertain():
+def test_draws_of_a_key_do_not_depend_on_other_uncertain_keys():
     mechanism = load().mechanism
     more = ["uncertainty.'rig.simulator.delay'={distribution='uniform', factor=[0.5, 1]}"]
     other = draw(load("varying", [*more, "approach.contacts=5"]).mechanism, 10, 0)
@@ -166,7 +166,7 @@ def test_recorded_draws_are_reproduced():
     )
 
 
-def test_quasi_random_points_depend_on_the_seed_and_fill_evenly():
+def test_quasi_random_points_depend_on_seed_and_fill_the_unit_cube_evenly():
     mechanism = load().mechanism
     points = draw_quasi_random(mechanism, 100, 5)
     for path, values in draw_quasi_random(mechanism, 70, 5).items():
@@ -180,7 +180,7 @@ def test_quasi_random_points_depend_on_the_seed_and_fill_evenly():
         assert sorted(np.floor(64 * column)) == list(range(64))
 
 
-def test_draw_accepts_no_scenarios_and_refuses_negative_arguments():
+def test_draw_accepts_zero_scenarios_and_refuses_negative_arguments():
     mechanism = load().mechanism
     for values in (draw(mechanism, 0, 0), draw_quasi_random(mechanism, 0, 0)):
         assert {path: entry.shape for path, entry in values.items()} == {
@@ -200,7 +200,7 @@ def test_draw_accepts_no_scenarios_and_refuses_negative_arguments():
 @pytest.mark.parametrize("path", sorted(set(numeric_keys()) - POLYNOMIALS))
 @settings(deadline=None, max_examples=30)
 @given(nominal=st.just(0.0) | st.floats(1e-9, 1e4), std=st.floats(*MAGNITUDE_LIMITS))
-def test_normal_draws_are_allowed_values(path, nominal, std):
+def test_normal_draws_are_truncated_to_allowed_values(path, nominal, std):
     allowed = numeric_keys()[path]
     lowest = BASE["approach"]["velocity"] if path.endswith("velocity_limit") else allowed.low + 1e-9
     nominal = float(np.clip(nominal, lowest, min(allowed.high, 1e4)))
@@ -270,12 +270,12 @@ def test_normal_draws_are_allowed_values(path, nominal, std):
         ("rig.force_sensor.bias", {"distribution": "loguniform", "low": -1, "high": 1}, "found -1"),
     ],
 )
-def test_unusable_uncertainty_is_refused(path, entry, reason):
+def test_unusable_uncertainty_table_is_refused(path, entry, reason):
     message = refusal(path, entry)
     assert "uncertainty." in message and reason in message
 
 
-def test_rules_hold_over_the_whole_uncertain_range():
+def test_mechanism_rules_are_checked_over_the_whole_uncertain_range():
     third = {"model": "third_order", "coefficients": [0.1, 0.1, 0.005]}
     path, wide = "rig.simulator.coefficients", {"distribution": "uniform", "factor": [0.4, 1.5]}
     narrow = wide | {"factor": [0.6, 1.5]}
@@ -309,21 +309,21 @@ def test_rules_hold_over_the_whole_uncertain_range():
     assert np.all(draw(independent, 9, 0)["contact.damping"] >= 1.0)
 
 
-def test_negative_nominal_value_keeps_its_sign():
+def test_draws_of_a_negative_nominal_value_keep_the_sign():
     entry = {"distribution": "loguniform", "factor": [0.5, 2.0]}
     bias = "rig.force_sensor.bias"
     values = draw(mechanism_with(bias, entry, rig__force_sensor={"bias": -3.0}), 2000, 0)[bias]
     assert stats.kstest(-values, stats.loguniform(1.5, 6.0).cdf).pvalue > 0.01
 
 
-def test_extreme_ranges_are_drawn_without_overflow():
+def test_draws_from_extreme_ranges_do_not_overflow():
     wide = {"distribution": "loguniform", "low": MAGNITUDE_LIMITS[0], "high": MAGNITUDE_LIMITS[1]}
     values = np.log10(draw(mechanism_with(FREQUENCY, wide), 4096, 0)[FREQUENCY])
     assert stats.kstest(values, stats.uniform(-100, 200).cdf).pvalue > 0.01
 
 
 @pytest.mark.parametrize("name", builtin_names())
-def test_draws_of_builtins_are_valid_mechanisms(name):
+def test_draws_of_builtin_mechanisms_are_valid_mechanisms(name):
     mechanism = load(name).mechanism
     draws = draw(mechanism, 20, 0)
     assert set(draws) == {*mechanism.uncertainty, PHASE_KEY}
@@ -339,7 +339,7 @@ def test_draws_of_builtins_are_valid_mechanisms(name):
 
 
 @pytest.mark.parametrize("name", builtin_names())
-def test_every_draw_lies_between_the_extremes(name):
+def test_every_draw_lies_between_the_reported_extremes(name):
     parsed = load(name).mechanism
     ends = draw_extremes(parsed)
     for path, values in draw(parsed, 2000, 5).items():
@@ -348,7 +348,7 @@ def test_every_draw_lies_between_the_extremes(name):
         assert np.all(np.ptp(ends[path], axis=0) <= 4 * np.ptp(values, axis=0))
 
 
-def test_quasi_random_draws_are_points_of_the_box():
+def test_quasi_random_draws_are_transformed_points_of_the_unit_cube():
     parsed = from_plain_data(BASE, "f")
     points = np.full((2, sum(count_dimensions(parsed).values())), 0.25)
     np.testing.assert_array_equal(draw_at_points(parsed, points)[PHASE_KEY], np.full((2, 3), 0.25))

@@ -36,7 +36,7 @@ def run(made: Mechanism, seed: int = 0):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_hardware_that_never_touches_is_not_reached(noise):
+def test_contact_that_hardware_never_touches_has_status_not_reached(noise):
     result = run(rig(1.2 * DEEPEST, noise_std=noise))
     assert result.status == "not reached"
     for contact in result.contacts:
@@ -45,7 +45,7 @@ def test_hardware_that_never_touches_is_not_reached(noise):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_model_turned_back_by_a_bias_alone_is_not_reached(noise):
+def test_contact_has_status_not_reached_if_only_sensor_bias_reverses_model(noise):
     """Use a bias of 70 N or 40 N, and expect no contact.
 
     The first turns the model back 0.09 mm before the surface, the second 0.2 mm behind it.
@@ -55,7 +55,7 @@ def test_model_turned_back_by_a_bias_alone_is_not_reached(noise):
         assert result.status == "not reached" and math.isnan(result.contacts[0].restitution)
 
 
-def test_dead_zone_that_hides_the_whole_contact_leaves_it_unreached():
+def test_contact_hidden_by_dead_zone_has_status_not_reached():
     largest = STIFFNESS * 0.5 * DEEPEST
     hidden = run(rig(0.5 * DEEPEST, dead_zone=1.01 * largest))
     assert hidden.contacts[0].status == "not reached"
@@ -63,20 +63,20 @@ def test_dead_zone_that_hides_the_whole_contact_leaves_it_unreached():
     assert almost.contacts[0].status == "ok"
 
 
-def test_single_reading_is_a_contact():
+def test_single_force_reading_counts_as_contact():
     result = run(rig(0.99996 * DEEPEST))
     assert result.contacts[0].status == "ok" and 0 < result.contacts[0].duration < 2e-3
     assert np.count_nonzero(result.force_measured[result.contact == 0]) == 1
 
 
-def test_hardware_that_touches_late_is_waited_for():
+def test_run_waits_for_delayed_contact_of_hardware():
     """Turn the model back by the virtual spring after 85 ms; the hardware touches after 91 ms."""
     result = run(rig(0.3 * DEEPEST, {"model": "ideal", "delay": 0.075}))
     assert result.contacts[0].status == "ok" and result.contacts[0].peak_force > 0
 
 
 @pytest.mark.slow
-def test_impulse_ledger_makes_no_contact_of_its_own():
+def test_impulse_ledger_does_not_act_without_hardware_contact():
     """Place the surface where the run does not reach it."""
     made = jaxhil.load("suite-noisy", {"rig.contact_plane": 0.1})
     result = jaxhil.simulate(made, "impulse_ledger")

@@ -49,11 +49,11 @@ def runs_of(vectors):
     return runs
 
 
-def test_vector_columns_are_those_that_the_self_test_reads():
+def test_vector_file_columns_equal_columns_read_by_self_test():
     assert ",".join(VectorRow._fields) == selftest.VECTOR_COLUMNS
 
 
-def test_recorded_vectors_are_the_simulations_and_agree(loaded, vectors):
+def test_recorded_vectors_contain_simulation_and_agree_with_runtime(loaded, vectors):
     assert vectors.reasons == [] and vectors.ended == [None] * 3
     _, lanes = record_lanes(loaded, nominal_and_draws(remove_fixed_uncertainty(loaded.mechanism), 3, 3))
     runs = runs_of(vectors)
@@ -70,7 +70,7 @@ def test_recorded_vectors_are_the_simulations_and_agree(loaded, vectors):
         assert len(begins) == loaded.mechanism.approach.contacts == 3
 
 
-def test_vector_model_moves_as_in_the_simulation(vectors):
+def test_model_motion_in_vectors_equals_simulation(vectors):
     """Compare position and velocity after a tick with those of the next tick, but for rounding."""
     for rows in list(runs_of(vectors).values())[:3]:
         for row, following in itertools.pairwise(rows):
@@ -80,7 +80,7 @@ def test_vector_model_moves_as_in_the_simulation(vectors):
         assert [row.time for row in rows] == [tick * 0.001 for tick in range(len(rows))]
 
 
-def test_vector_draws_differ_and_depend_on_the_seed(loaded, vectors):
+def test_scenarios_of_vectors_differ_and_depend_on_the_seed(loaded, vectors):
     runs = runs_of(vectors)
     first = [rows[60].force_measured for rows in list(runs.values())[:3]]
     assert len({*first}) == 3
@@ -90,7 +90,7 @@ def test_vector_draws_differ_and_depend_on_the_seed(loaded, vectors):
     assert format_csv(other.rows) != format_csv(vectors.rows)
 
 
-def test_hostile_vectors_hold_every_kind_of_damage(vectors):
+def test_hostile_vectors_contain_every_kind_of_bad_reading(vectors):
     rows = [row for row in vectors.rows if row.run > 2]
     inputs = [value for row in rows for value in row[2:10] if value is not None]
     assert any(math.isnan(value) for value in inputs) and {math.inf, -math.inf} <= {*inputs}
@@ -106,7 +106,7 @@ def test_hostile_vectors_hold_every_kind_of_damage(vectors):
     assert all(math.isnan(row.force_simulated) for row in rows)
 
 
-def test_every_vector_row_is_replayed_to_the_bit_by_a_fresh_controller(loaded, vectors):
+def test_new_controller_replays_every_vector_row_to_the_bit(loaded, vectors):
     gain_file = check_gain_document(loaded.document)
     controller = None
     for row in vectors.rows:
@@ -119,7 +119,7 @@ def test_every_vector_row_is_replayed_to_the_bit_by_a_fresh_controller(loaded, v
         assert (force, position, controller.faults) == (row.force_command, row.position_command, row.faults)
 
 
-def test_vector_text_gives_back_the_same_bits(vectors):
+def test_vector_values_survive_conversion_to_text_to_the_bit(vectors):
     rows = list(csv.reader(io.StringIO(format_csv(vectors.rows))))[1:]
     for row, fields in zip(vectors.rows, rows, strict=True):
         for value, field in zip(row, fields, strict=True):
@@ -131,7 +131,7 @@ def test_vector_text_gives_back_the_same_bits(vectors):
                 assert field == "nan"
 
 
-def test_vectors_are_not_compared_where_a_guard_acts(loaded):
+def test_vector_comparison_with_simulation_ends_when_a_limit_acts(loaded):
     tight = check_document(replace_limits(loaded.document, {"force_limit": 20.0}))
     result = make_vectors(tight, seed=3, draws=2)
     assert result.reasons == []
@@ -142,7 +142,7 @@ def test_vectors_are_not_compared_where_a_guard_acts(loaded):
     assert not any(math.isnan(row.force_simulated) for row in result.rows[:end])
 
 
-def test_trip_between_two_contacts_ends_the_comparison(loaded):
+def test_trip_between_two_contacts_ends_vector_comparison(loaded):
     """Let the audit, which waits for the force to die out, come with the next contact."""
     limits = {"equivalent_mass": 300.0, "settling": 10.0, "restitution_margin": 1e-9}
     result = make_vectors(check_document(replace_limits(loaded.document, limits)), seed=3, draws=1)
@@ -154,7 +154,7 @@ def test_trip_between_two_contacts_ends_the_comparison(loaded):
         assert [math.isnan(row.force_simulated) for row in rows[begins - 1 : begins + 1]] == [False, True]
 
 
-def test_runtime_that_differs_from_the_vectors_is_reported(loaded, monkeypatch):
+def test_runtime_command_that_differs_from_vectors_is_reported(loaded, monkeypatch):
     class Wrong(ON_THE_RIG[loaded.compensator]):
         def step(self, *readings):
             return super().step(*readings) * (1 + 1e-9)
@@ -165,7 +165,7 @@ def test_runtime_that_differs_from_the_vectors_is_reported(loaded, monkeypatch):
     assert "expected 1e-11" in result.reasons[1] and result.reasons[1].startswith("draw 1, ")
 
 
-def test_vectors_of_a_noisy_biased_rig_agree():
+def test_vectors_of_a_noisy_biased_rig_agree_with_runtime():
     """Leave out the first tick: the loop takes its force as none, whatever the sensor reads."""
     rough = ("rig.force_sensor.noise_std=0.5", "rig.force_sensor.bias=0.3", "rig.command_latency=1")
     result = make_vectors(check_document(document("claw-350kg", "phase_lead", rough)), seed=0, draws=1)
@@ -175,7 +175,7 @@ def test_vectors_of_a_noisy_biased_rig_agree():
     assert not math.isnan(result.rows[1].force_simulated)
 
 
-def test_vector_draws_change_nothing_that_the_gain_file_states(loaded):
+def test_vector_scenarios_do_not_vary_values_fixed_by_the_gain_file(loaded):
     uncertain = remove_fixed_uncertainty(loaded.mechanism).uncertainty
     assert "rig.control_period" not in uncertain and "contact.clearance" not in uncertain
     assert uncertain.keys() <= loaded.mechanism.uncertainty.keys()

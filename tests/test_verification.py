@@ -56,7 +56,7 @@ def varying():
 @pytest.mark.parametrize(
     "case", [pytest.param(case, marks=pytest.mark.slow if case == "rattling" else ()) for case in CASES]
 )
-def test_verification_passes_what_agrees(case):
+def test_verification_passes_agreeing_controllers(case):
     loaded = loaded_gains(*CASES[case])
     messages = []
     report = verify(loaded, scenarios=4, seed=1, progress=messages.append)
@@ -74,7 +74,7 @@ def test_verification_passes_what_agrees(case):
     assert msgspec.convert(msgspec.json.decode(msgspec.json.encode(report)), type(report)) == report
 
 
-def test_verification_record_is_the_rollout(varying):
+def test_verification_record_equals_rollout(varying):
     batch = nominal_and_draws(varying.mechanism, 4, seed=1)
     metrics, lanes = record_lanes(varying, batch)
     assert np.all(metrics.status[:3] == OK)
@@ -172,7 +172,7 @@ def gain_file(varying):
     return file._replace(gains=gains)
 
 
-def test_verification_counts_ticks_near_a_threshold(gain_file):
+def test_verification_reports_number_of_ticks_near_a_threshold(gain_file):
     measured = np.arange(-20, 20) * 5e-6
     measured[20] = 3e-18  # instead of 0: in contact, but by less than rounding
     force = np.where(measured > 0, 1e5 * measured, 0.0)
@@ -188,7 +188,7 @@ def test_verification_counts_ticks_near_a_threshold(gain_file):
     assert np.nonzero(find_threshold_ticks(lane.signals, two_sided))[0].tolist() == [3, 4, 22, 30]
 
 
-def test_verification_ends_the_comparison_at_a_different_decision(gain_file):
+def test_verification_comparison_ends_at_first_different_threshold_decision(gain_file):
     measured = np.arange(-20, 20) * 5e-6
     measured[20:23] = -3e-18, 3e-18, 6e-18  # standstill at the surface: rounding decides
     force = np.where(np.arange(40) > 17, 50.0, 0.0)
@@ -201,7 +201,7 @@ def test_verification_ends_the_comparison_at_a_different_decision(gain_file):
     assert parted.difference <= 1e-13
 
 
-def test_verification_ignores_a_tick_beside_the_surface(gain_file):
+def test_verification_ignores_onset_that_differs_by_rounding(gain_file):
     """Let a contact begin just before a tick or after it: it begins at the same time."""
     measured = np.arange(-20, 20) * 5e-6
     measured[20] = 3e-18
@@ -214,7 +214,7 @@ def test_verification_ignores_a_tick_beside_the_surface(gain_file):
     assert seen.difference <= 1e-11 and seen.near_difference <= 1e-11
 
 
-def test_verification_does_not_excuse_a_difference_away_from_thresholds(gain_file):
+def test_verification_reports_differences_away_from_thresholds(gain_file):
     measured = np.arange(-20, 20) * 5e-6
     measured[20] = 3e-18
     lane = lane_of(measured, np.where(np.arange(40) > 17, 50.0, 0.0), gain_file)
@@ -225,7 +225,7 @@ def test_verification_does_not_excuse_a_difference_away_from_thresholds(gain_fil
     assert seen.difference == pytest.approx(1e-9, rel=1e-3) and seen.worst_tick >= 19
 
 
-def test_verification_of_a_command_that_is_always_zero_requires_equality():
+def test_verification_of_zero_commands_requires_exact_equality():
     ticks = np.zeros(5)
     signals = Signals(ticks, ticks, ticks, ticks, np.arange(5, dtype=np.int32))
     gain_file = GainFile("none", {}, 0.001, np.inf)

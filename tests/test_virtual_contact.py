@@ -20,7 +20,7 @@ from jaxhil.mechanism.file import load
     frequency=st.floats(0.1, 1e3),
     angle=st.floats(0.0, 0.01) | st.floats(0.0, 1.0) | st.floats(0.0, 50.0),
 )
-def test_virtual_contact_has_an_imaginary_root_at_the_limit(mass, frequency, angle):
+def test_virtual_contact_has_an_imaginary_root_at_the_stability_limit(mass, frequency, angle):
     stiffness, delay = mass * frequency**2, angle / frequency
     damping, critical = damping_at_the_limit(stiffness, frequency, delay)
     root = 1j * critical
@@ -31,7 +31,7 @@ def test_virtual_contact_has_an_imaginary_root_at_the_limit(mass, frequency, ang
     assert np.all(np.cos(below * delay) > (below / frequency) ** 2)
 
 
-def test_nominal_damping_is_the_limit_for_the_total_delay():
+def test_nominal_virtual_damping_is_stability_limit_for_total_delay():
     """Include the force measurement, and the motion simulator as it follows a uniform motion."""
     overrides = ["rig.force_sensor.delay=0.003", "rig.force_sensor.time_constant=0.002"]
     simulator = 'rig.simulator={model="first_order", time_constant=0.01, delay=0.004}'
@@ -43,7 +43,7 @@ def test_nominal_damping_is_the_limit_for_the_total_delay():
     assert gains["virtual_stiffness"] == 0.0
 
 
-def test_simulated_loop_is_marginal_at_the_limit():
+def test_simulated_virtual_contact_is_marginal_at_the_stability_limit():
     """Compare the growth per half-cycle, pi Re s/Im s of the characteristic root, with 0 at the limit.
 
     Semi-implicit Euler has the velocity half a period late: what is of first order in T is extrapolated.

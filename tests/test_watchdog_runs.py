@@ -41,7 +41,7 @@ def coarse(contact: dict[str, Any], **parts: Any) -> LoadedGains:
     return gains(parsed, nominal_gains(parsed, "response_error"))
 
 
-def test_watchdog_in_c_misses_nothing_and_stops_no_good_run(tmp_path):
+def test_c_watchdog_misses_no_bad_run_and_stops_no_good_run(tmp_path):
     loaded = coarse({}, contacts=2)
     one, _ = export(loaded, 0.05, tmp_path, scenarios=256, lanes=128)
     (count,) = counted(loaded, [one], 384, lanes=128, in_python=12)
@@ -50,7 +50,7 @@ def test_watchdog_in_c_misses_nothing_and_stops_no_good_run(tmp_path):
 
 
 @pytest.mark.slow
-def test_watchdog_between_two_surfaces_with_noise_does_as_calibrated(tmp_path):
+def test_watchdog_for_noisy_contacts_at_two_surfaces_performs_as_calibrated(tmp_path):
     """Let noise go on to change the model's velocity in flight.
 
     Where the change exceeds what the limit leaves room for, the margin is widened until good runs pass; here
@@ -72,7 +72,7 @@ def test_watchdog_between_two_surfaces_with_noise_does_as_calibrated(tmp_path):
     assert not narrow.missed and not wide.missed
 
 
-def test_run_that_is_not_stopped_in_time_is_counted(tmp_path):
+def test_bad_run_that_is_not_stopped_in_time_is_counted_as_missed(tmp_path):
     """Set the largest margin on the restitution, which misses every bad run, and 0, which stops every run."""
     loaded = coarse({}, contacts=2)
     one, _ = export(loaded, 0.02, tmp_path, scenarios=256, lanes=128)

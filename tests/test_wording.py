@@ -20,7 +20,7 @@ def docstrings(path: Path):
 
 
 @pytest.mark.parametrize("package", ["jaxhil", "tuning"])
-def test_docstrings_begin_with_a_verb_or_a_noun(package):
+def test_docstrings_do_not_begin_with_discouraged_words(package):
     wrong = [
         f"{path.relative_to(ROOT)}:{line}: {text.splitlines()[0]}"
         for path in sorted((ROOT / package).rglob("*.py"))
@@ -49,7 +49,7 @@ def bound_names(path: Path):
 
 
 @pytest.mark.parametrize("package", ["jaxhil", "tuning"])
-def test_functions_bind_no_empty_names(package):
+def test_variables_have_no_meaningless_names(package):
     wrong = [
         f"{path.relative_to(ROOT)}:{line}: {name}"
         for path in sorted((ROOT / package).rglob("*.py"))
@@ -69,7 +69,7 @@ def concept(path: Path) -> str:
     return relative
 
 
-def test_class_names_are_unique_except_within_a_concept():
+def test_class_names_are_unique_except_for_variants_of_a_concept():
     concepts = {}
     for package in ("jaxhil", "tuning"):
         for path in sorted((ROOT / package).rglob("*.py")):

@@ -49,7 +49,7 @@ writer_test = settings(max_examples=25)
 
 @writer_test
 @given(documents)
-def test_ros2_parameters_are_read_back(made):
+def test_ros2_parameter_file_is_read_back_to_the_bit(made):
     text = ros2_files(made)["ros2.yaml"].decode("ascii")
     tree = YAML(typ="safe", pure=True).load(text)
     assert list(tree) == ["/jaxhil_controller"] and list(tree["/jaxhil_controller"]) == ["ros__parameters"]
@@ -65,7 +65,7 @@ def test_ros2_parameters_are_read_back(made):
 
 @writer_test
 @given(documents)
-def test_ros2_numbers_are_doubles_and_texts_are_texts(made):
+def test_ros2_parameter_numbers_are_doubles_and_texts_are_strings(made):
     """Follow ROS 2's parser by the letter: a decimal point or .inf makes a double, quotes make a string."""
     sections = []
     for line in ros2_files(made)["ros2.yaml"].decode().splitlines()[3:]:
@@ -78,7 +78,7 @@ def test_ros2_numbers_are_doubles_and_texts_are_texts(made):
         assert re.fullmatch(expected, value), line
 
 
-def test_texts_that_look_like_numbers_stay_texts():
+def test_ros2_texts_that_look_like_numbers_stay_strings():
     made = gain_document("none")
     made["mechanism"]["name"] = "1e3"
     made["sha256"] = "1234e5"
@@ -92,7 +92,7 @@ def test_texts_that_look_like_numbers_stay_texts():
 
 @writer_test
 @given(documents)
-def test_matlab_struct_is_read_back(made):
+def test_matlab_struct_is_read_back_to_the_bit(made):
     files = matlab_files(made)
     assert files == matlab_files(made)
     result = loadmat(io.BytesIO(files["gains.mat"]), simplify_cells=True)["jaxhil"]
@@ -153,7 +153,7 @@ def test_matlab_struct_follows_the_description_of_the_format():
 
 @writer_test
 @given(documents)
-def test_csv_table_is_read_back(made):
+def test_csv_gain_table_is_read_back_to_the_bit(made):
     rows = list(csv.DictReader(io.StringIO(csv_files(made)["gains.csv"].decode("ascii"))))
     result = {row["name"]: row for row in rows}
     assert len(result) == len(rows)
@@ -169,7 +169,7 @@ def test_csv_table_is_read_back(made):
 
 
 @pytest.mark.parametrize("compensator", sorted(COMPENSATORS))
-def test_every_compensator_is_written(compensator):
+def test_gains_of_every_compensator_are_written_in_every_format(compensator):
     made = gain_document(compensator)
     text = ros2_files(made)["ros2.yaml"]
     result = YAML(typ="safe", pure=True).load(text)["/jaxhil_controller"]["ros__parameters"]
@@ -179,14 +179,14 @@ def test_every_compensator_is_written(compensator):
     assert {name: mat["gains"][name]["value"] for name in values} == values
 
 
-def test_missing_limit_is_written_as_the_runtimes_default():
+def test_missing_limit_is_written_as_default_of_runtime():
     made = document([1.0] * 12, [None] * len(LIMITS))
     assert {name: one.value for name, one in limit_entries(made).items()} == {
         name: one.default for name, one in LIMITS.items()
     }
 
 
-def test_name_too_long_for_matlab_is_refused():
+def test_gain_name_too_long_for_matlab_is_refused():
     made = json.loads(json.dumps(gain_document("phase_lead")))
     made["gains"]["g" * 64] = made["gains"].pop("phase_lead")
     with pytest.raises(InputError, match="found 64 characters, expected at most 63"):
