@@ -1,4 +1,4 @@
-"""Campaigns whose touches hardly tell damping from the age of the force, and how far off e and e - e* are."""
+"""Campaigns whose contacts hardly distinguish damping from force delay, and their errors in e and e - e*."""
 
 import campaign_kinds
 import campaigns
@@ -10,7 +10,7 @@ from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
 
-SOFT = campaign_kinds.voigt((124355.0,), (264.0,))  # damping over stiffness: 2.1 ms
+SOFT = campaign_kinds.voigt((124355.0,), (264.0,))  # ratio of damping to stiffness: 2.1 ms
 RIG = campaign_kinds.rig
 KINDS = {
     "plain": campaign_kinds.Kind(RIG(), SOFT),
@@ -26,15 +26,15 @@ TOLD = ("natural_frequency", "damping_ratio", "delay")
 
 
 def campaign(monkeypatch, name, seed, **changes):
-    """Return a campaign of one of these kinds."""
     monkeypatch.setitem(campaigns.KINDS, name, KINDS[name])
     return campaigns.campaign(name, seed, **changes)
 
 
 def prior(name):
-    """Return what is known beforehand: stiffness, a rough motion simulator, the position sensor's delay.
+    """Return a prior with stiffness, a rough motion simulator and the delay of the position sensor.
 
-    It has no damping, and no delay, lag or dead zone of the force sensor."""
+    The force sensor has no damping, delay, lag or dead zone in the prior.
+    """
     sensor = {"delay": KINDS[name].rig["position_sensor"].get("delay", 0.0)}
     simulator = {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.8, "delay": 0.004}
     return from_plain_data({
@@ -46,7 +46,7 @@ def prior(name):
 
 
 def truth(name):
-    """Return the rig as a mechanism file has it, without noise and dead zone."""
+    """Return the mechanism file of the true rig, without noise and dead zone."""
     kind = KINDS[name]
     raw = to_plain_data(prior(name))
     raw["contact"] = {**kind.contact}
@@ -56,9 +56,11 @@ def truth(name):
 
 
 def numbers(mechanism, position_delay):
-    """Return the rig's numbers that decide e and e*, by key, as if the position sensor had that delay [s].
+    """Return the rig's parameters that determine e and e*, by key, for a position sensor with this delay [s].
 
-    Delays d less of the motion and of the force, and d more of the position sensor, are the same rig."""
+    A rig whose motion and force delays are smaller by d, and whose position sensor delay is larger by d,
+    gives the same readings.
+    """
     rig = mechanism.rig
     values = {f"rig.simulator.{key}": getattr(rig.simulator, key) for key in TOLD}
     values |= {
@@ -71,9 +73,10 @@ def numbers(mechanism, position_delay):
 
 
 def off(name, written, compensator, gains):
-    """Return by how much e and e - e* of each mechanism are off those of the truth, (mechanisms, 2).
+    """Return the errors of e and e - e* of each mechanism relative to the truth, (mechanisms, 2).
 
-    All run under the same gains in the loop of `jaxhil`; e is the mean over phases of the contact."""
+    All mechanisms run with the same gains in the simulation of `jaxhil`; e is the mean over contact phases.
+    """
     true = truth(name)
     voigt = [index for index, one in enumerate(written) if one.contact.law == true.contact.law]
     table = np.empty((len(written) + 1, 2))
@@ -87,7 +90,7 @@ def off(name, written, compensator, gains):
 
 
 def _errors(template, mechanisms, compensator, gains):
-    """Return e and e - e* of mechanisms with the template's contact law, (mechanisms, 2)."""
+    """Return e and e - e* of mechanisms that have the template's contact law, (mechanisms, 2)."""
     every = [numbers(one, template.rig.position_sensor.delay) for one in mechanisms]
     if len(mechanisms) > 1:
         for values, one in zip(every, mechanisms, strict=True):

@@ -1,6 +1,6 @@
-"""The hand-written C++ baseline (baseline.cpp): built on the spot, loaded with ctypes, fed by `jaxhil`.
+"""Hand-written C++ baseline (baseline.cpp), compiled on demand and called through ctypes.
 
-Scope: see the top of baseline.cpp. Doubles throughout, whatever the dtype of the arrays given.
+The supported options are listed in baseline.cpp. All computations use doubles, for any dtype of the input.
 """
 
 import ctypes
@@ -22,7 +22,7 @@ from jaxhil.simulation.watch import build_end_conditions
 SOURCE = Path(__file__).with_name("baseline.cpp")
 FLAGS = ("-O3", "-march=native", "-std=c++17", "-pthread")
 KINDS = {"none": 0, "phase_lead": 1, "response_error": 2}
-# The order of baseline.cpp's `Gain`; a compensator that lacks one does not read it.
+# Same order as `Gain` in baseline.cpp; compensators do not read gains that they do not have.
 GAINS = tuple(gain.name for gain in ResponseError.gains)
 RESULTS = ("restitution", "approach_velocity", "peak_force", "peak_command", "duration")
 
@@ -42,7 +42,7 @@ class _Problem(ctypes.Structure):
 
 
 class Baseline(NamedTuple):
-    """The compiled baseline; lanes per block as compiled."""
+    """Compiled C++ baseline."""
 
     library: ctypes.CDLL
     block_lanes: int
@@ -56,12 +56,13 @@ class Baseline(NamedTuple):
         horizon_ticks: int,
         threads: int = 2,
     ) -> dict[str, Any]:
-        """All contacts of every lane, and on to `horizon_ticks`: every lane runs that many ticks.
+        """Simulate `horizon_ticks` ticks with all contacts of every lane.
 
-        `scenario` is the one `rig` was built from, its batch one axis of lanes; `gains` are scalars or
-        (lanes,). Returns arrays (slots, lanes) named as in `jaxhil.simulation.metrics.Metrics`: restitution,
-        approach_velocity, peak_force, peak_command, duration, status (`NOT_REACHED` where the horizon
-        came first) and ticks; and "seconds" spent inside C++. Raises ValueError out of scope.
+        `scenario` is the scenario from which `rig` was built, with one batch axis of lanes; `gains` are
+        scalars or (lanes,). Returns arrays (slots, lanes) named as in `jaxhil.simulation.metrics.Metrics`:
+        restitution, approach_velocity, peak_force, peak_command, duration, status (`NOT_REACHED` if the
+        horizon ends before the contact) and ticks; and "seconds" spent in C++. Raises ValueError for
+        unsupported options.
         """
         return self._call(self.library.run_contacts, loop, rig, gains, scenario, horizon_ticks, threads)
 
@@ -74,9 +75,9 @@ class Baseline(NamedTuple):
         ticks: int,
         threads: int = 2,
     ) -> dict[str, Any]:
-        """`ticks` ticks of every lane's first contact and the flight after it: the bare loop.
+        """Simulate `ticks` ticks of every lane's first contact and of the flight after this contact.
 
-        Like `run`, but no contact is turned over; slot 0 describes the first one if it is over by then.
+        Returns the arrays of `run`; only slot 0 is used.
         """
         return self._call(self.library.run_ticks, loop, rig, gains, scenario, ticks, threads)
 
@@ -96,10 +97,10 @@ class Baseline(NamedTuple):
 
 
 def compile_baseline(block_lanes: int | None = None, skips: bool = True) -> Baseline | None:
-    """Build and load baseline.cpp; None where there is no g++.
+    """Compile and load baseline.cpp; return None without g++.
 
-    `block_lanes` overrides the lanes per block; unless it `skips` them, approaches are flown. Raises
-    `subprocess.CalledProcessError` when it does not compile.
+    `block_lanes` overrides the number of lanes per block. Approaches are simulated unless `skips` is set.
+    Raises `subprocess.CalledProcessError` if the compiler fails.
     """
     compiler = shutil.which("g++")
     if compiler is None:
@@ -109,7 +110,7 @@ def compile_baseline(block_lanes: int | None = None, skips: bool = True) -> Base
         path = Path(folder) / "baseline.so"
         command = [compiler, *FLAGS, *defined, "-shared", "-fPIC", str(SOURCE), "-o", str(path)]
         subprocess.run(command, check=True)
-        # The loaded library stays mapped after its file is gone.
+        # The loaded library remains usable after its file is deleted.
         library = ctypes.CDLL(str(path))
     for function in (library.run_ticks, library.run_contacts):
         function.argtypes = [ctypes.POINTER(_Problem), ctypes.c_int64]
@@ -144,7 +145,7 @@ def _check_scope(loop: Loop, rig: RigConstants, scenario: Scenario) -> None:
 
 
 def _check_reach(loop: Loop, inputs: dict[str, np.ndarray]) -> None:
-    """The C++ reads its delay lines unchecked."""
+    """Raise ValueError if a delay exceeds the delay lines: the C++ code does not check its indices."""
     intervals = [np.max(inputs[name]) for name in _COUNTS if name.endswith("_intervals")]
     if loop.compensator.name == "response_error":
         delay = inputs["gains"][GAINS.index("identification_delay")]
@@ -154,14 +155,14 @@ def _check_reach(loop: Loop, inputs: dict[str, np.ndarray]) -> None:
 
 
 def _inputs(rig, gains, scenario, lanes) -> dict[str, np.ndarray]:
-    """Every input array of the C++ problem, by name; doubles and 32-bit integers, lanes last."""
+    """Return every input array of the C++ code by name: doubles and 32-bit integers, lanes last."""
 
     def spread(array, dtype):
         array = np.asarray(array, dtype)
         return np.ascontiguousarray(np.broadcast_to(array, (*array.shape[:-1], lanes)))
 
     plant, rules = rig.propagation, build_end_conditions(scenario)
-    # Gains that the compensator lacks are multiplied, if at all, into nothing that is kept; 1 is harmless.
+    # Gains that the compensator lacks have no effect on the result, so any finite value will do.
     table = [np.broadcast_to(np.asarray(gains.get(name, 1.0), float), (lanes,)) for name in GAINS]
     numbers = {
         "period": scenario.control_period,

@@ -1,8 +1,9 @@
-"""Other identifications of a motion simulator, in an environment that has them: a line of JSON.
+"""Other identification methods for the motion simulator, run in an environment of their own.
 
-`python identify_others.py DATA.npz`: command and reading [m], period [s], the averaged response (frequency
-[Hz], complex), and frequencies `at` [Hz]. Each method gives its response at those, its delay where it has
-one, and its time. Discrete models have a delay of whole periods, as they count them: the best of several.
+`python identify_others.py DATA.npz` prints a line of JSON. DATA has command and reading [m], period [s], the
+averaged response (frequency [Hz], complex), and frequencies `at` [Hz]. Each method returns its response at
+these frequencies, its delay if the model has a delay parameter, and its computing time. Discrete models have
+a delay of whole periods; the delay with the best prediction is used.
 """
 
 import contextlib
@@ -15,19 +16,19 @@ import warnings
 import numpy as np
 
 DELAYS = range(2, 7)
-BLOCKS, THINNED = 10, 10  # of the subspace method: rows of the Hankel matrices, rows from one to the next
-ROWS = {"OE": 2_000, "ARX": 20_000}  # what each can do within a minute
+BLOCKS, THINNED = 10, 10  # rows of the Hankel matrices of N4SID; rows from one sample to the next
+ROWS = {"OE": 2_000, "ARX": 20_000}  # rows that each method processes within a minute
 
 
 def parametric(data, method):
-    """ARX or output error of second order with the delay [periods] under which it predicts best."""
+    """Fit a second-order ARX or output-error model; take the delay [periods] with the best prediction."""
     from sippy_unipi import system_identification
 
     u, y = data["command"][None, : ROWS[method]], data["reading"][None, : ROWS[method]]
     tried = []
     for delay in DELAYS:
         orders = {"ARX_orders": [2, 2, delay]} if method == "ARX" else {"OE_orders": [2, 2, delay]}
-        # Numbers of order 1, as its solver wants them.
+        # The solver requires numbers of order 1.
         model = system_identification(1e3 * y, 1e3 * u, method, tsample=1.0, max_iterations=100, **orders)
         left = np.ravel(model.Yid)[50:] - 1e3 * y[0, 50:]
         tried.append((float(left @ left), delay, model.G))
@@ -37,7 +38,10 @@ def parametric(data, method):
 
 
 def subspace(data):
-    """N4SID, the delay among its states, of every tenth row: at 1 kHz its states are nearly alike."""
+    """Fit a N4SID model with the delay among its states.
+
+    Only every tenth row is used: at 1 kHz the states are almost equal.
+    """
     import pandas
     from nfoursid.nfoursid import NFourSID
 
@@ -54,7 +58,7 @@ def subspace(data):
 
 
 def vectors(data):
-    """Vector fitting of the averaged response: a sum of poles, the delay among them."""
+    """Fit a sum of poles, which also represents the delay, to the averaged response (vector fitting)."""
     import skrf
     from skrf.vectorFitting import VectorFitting
 
@@ -77,7 +81,7 @@ def main():
     warnings.simplefilter("ignore")
     for name, method in methods.items():
         begin = time.process_time()
-        # They print as they go.
+        # The packages print progress messages.
         with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
             response, delay = method()
         took = time.process_time() - begin

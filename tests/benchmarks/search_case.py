@@ -1,8 +1,8 @@
-"""What every method of the comparison is given: a mechanism to tune and one compiled loss, whoever calls it.
+"""Tuning problem for the comparison of optimisers: a mechanism and its compiled loss.
 
-A point is a vector of unit coordinates, each gain's place in its range on its own scale; its loss is half the
-sum of squares of `tuning.gains.objective.residuals` over all scenarios. The scenarios, not the points, are
-dealt out to the devices: one point alone keeps all of them busy, and so does a generation of any size.
+A point is a vector of unit coordinates of the gains. Its loss is half the sum of squares of
+`tuning.gains.objective.compute_residuals` over all scenarios. The scenarios are divided among the devices, so
+that a single point also uses all devices.
 """
 
 import math
@@ -35,15 +35,14 @@ from tuning.optimisation.unit_box import GainBounds, to_coordinates, to_gains
 
 COMPENSATOR = "response_error"
 SCENARIOS = 128
-SEED = 0  # of the scenarios
-CAPACITY = 256  # points of one call of the program
-SIDE_BY_SIDE = 128  # lanes that a device computes at once where there are many points
+SEED = 0  # seed of the scenarios
+CAPACITY = 256  # points per call of the program
+SIDE_BY_SIDE = 128  # lanes that a device computes in parallel if there are many points
 
 
 @dataclass(frozen=True)
 class Case:
-    """A task, the loop it shares with its like, names and bounds of the gains tuned for it; on the devices
-    its rig, dealt out to them, with the gains that stay as they are, and the bounds once more."""
+    """Tuning problem with loop, gain names and bounds; `problem` and `placed_bounds` are on the devices."""
 
     task: TuneTask
     loop: Loop
@@ -57,41 +56,42 @@ class Case:
         return self.task.mechanism.name
 
     def losses(self, points: Float[np.ndarray, "points gains"]) -> Float[np.ndarray, "points"]:
-        """Loss of every point."""
+        """Return the loss of every point."""
         number = len(points)
         if number > CAPACITY:
             rest = self.losses(points[CAPACITY:])
             return np.concatenate([self.losses(points[:CAPACITY]), rest])
-        # One point alone gets a program of its own, in which nothing is computed beside it.
+        # A single point has its own program, without padding.
         together = 1 if number == 1 else max(1, SIDE_BY_SIDE * _devices() // SCENARIOS)
         capacity = 1 if number == 1 else CAPACITY
         padded = np.concatenate([points, np.broadcast_to(points[-1:], (capacity - number, len(self.names)))])
         static = self.loop, self.names, together
         parts = _losses(static, padded, np.array(number, np.int32), self.problem, self.placed_bounds)
-        # Every device had as many contacts: the mean over all is the mean of theirs.
+        # Every device has the same number of contacts, so the mean over the devices is the mean over all
+        # contacts.
         return np.mean(np.asarray(parts), axis=0)[:number]
 
     def warm_up(self) -> None:
-        """Compile what `losses` runs for one point and for several."""
+        """Compile the programs that `losses` runs for one point and for several points."""
         for number in (1, 2):
             self.losses(np.full((number, len(self.names)), 0.5))
 
     def starts(self, number: int, seed: int) -> Float[np.ndarray, "starts gains"]:
-        """Where tuning would start from: the literature's gains, then points around them and anywhere."""
+        """Return starting points: the literature's gains, points around these gains, and random points."""
         first = np.array([self.task.literature[name] for name in self.names])
         return spread_points(self.shares_of(first), number, seed)
 
     def gains_of(self, coordinates: Float[np.ndarray, "*points gains"]) -> Float[np.ndarray, "*points gains"]:
-        """Gains in their own units."""
+        """Return the gains in their own units."""
         return to_gains(coordinates, self.bounds)
 
     def shares_of(self, gains: Float[np.ndarray, "*points gains"]) -> Float[np.ndarray, "*points gains"]:
-        """Inverse of `gains_of`, inside the box."""
+        """Return the unit coordinates of gains (inverse of `gains_of`)."""
         return to_coordinates(gains, self.bounds)
 
 
 def build_cases(mechanisms: Sequence[Mechanism]) -> list[Case]:
-    """The cases of the mechanisms; like ones that tune the same gains share their programs."""
+    """Return the tuning problems of the mechanisms; similar mechanisms share their programs."""
     tasks = [build_task(mechanism, COMPENSATOR, SCENARIOS, SEED) for mechanism in mechanisms]
     cases: dict[int, Case] = {}
     for group in group_by_program([task.loop for task in tasks], [task.scenarios for task in tasks]):
@@ -102,12 +102,12 @@ def build_cases(mechanisms: Sequence[Mechanism]) -> list[Case]:
 
 
 def several(tree: Any, number: int) -> Any:
-    """A leading axis of so many of the same, as NumPy arrays."""
+    """Repeat all arrays along a new leading axis; return NumPy arrays."""
     return jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (number, *leaf.shape)), tree)
 
 
 def over_scenarios(function: Callable[..., Array], problem: SolverProblem, *arguments: Any) -> Array:
-    """`function(problem, *arguments)` on every device with its share of the scenarios; (devices, ...)."""
+    """Apply `function(problem, *arguments)` to the scenarios of every device; return (devices, ...)."""
     everywhere = PartitionSpec()
     lanes_last = SolverProblem(
         jax.tree.map(_lanes_last, problem.rig),
@@ -143,7 +143,7 @@ def _build_constants(loop: Loop, scenarios: Scenario) -> RigConstants:
 
 
 def _dealt(scenarios: Scenario) -> Scenario:
-    """Scenarios ordered so that every device has its share of long ones."""
+    """Sort the scenarios so that every device gets as many long scenarios as the others."""
     order = np.argsort(ONE_AXIS.expected_duration(scenarios), kind="stable")
     order = np.concatenate([order[device :: _devices()] for device in range(_devices())])
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., order], scenarios)
@@ -151,7 +151,7 @@ def _dealt(scenarios: Scenario) -> Scenario:
 
 @partial(jax.jit, static_argnums=0)
 def _losses(static, points, number, problem, bounds) -> Float[Array, "devices points"]:
-    """The mean over the scenarios of each device, for the first `number` of the points."""
+    """Return the mean loss over the scenarios of each device for the first `number` points."""
     loop, names, together = static
 
     def one_device(problem, points, number, bounds):

@@ -1,8 +1,8 @@
-"""The methods that users would pick, each until its time is up, and the record of what they find when.
+"""Optimisers that users would choose, run until a time limit, and a record of their best loss over time.
 
-Each is called with the loss of many points, a start (in the unit box, as all points) and a seed, and goes on
-for ever: the record ends it. Where a method is done before, it begins again. Settings are those of its
-authors or its package, but where a comment says otherwise; the start is one of the first points of all.
+Each optimiser is called with the loss of many points, a starting point in the unit box, and a seed. It
+restarts if it converges before the time limit. Settings are those of its authors or package unless a comment
+says otherwise.
 """
 
 import time
@@ -19,16 +19,17 @@ Method = Callable[[Losses, Float[np.ndarray, "gains"], int], None]
 
 PARTICLES, ITERATIONS = 15, 13  # as published for real-time hybrid simulation
 INERTIA, PULL = 0.729844, 1.496180  # constriction: Clerc and Kennedy (2002)
-SPREAD = 0.3  # first standard deviation of CMA-ES, as a share of the box
-EDGE = 0.25  # of the first simplex of Nelder-Mead; SciPy's 0.05 of the coordinate is 0 for a gain that is 0
-POPULATION = 2  # of differential evolution, for each gain; of SciPy's 15 a start sees few generations
+SPREAD = 0.3  # first standard deviation of CMA-ES relative to the box
+EDGE = 0.25  # edge of the first simplex of Nelder-Mead; SciPy's default is 0 for a gain of 0
+POPULATION = 2  # per gain; with SciPy's default of 15 only a few generations fit into the time limit
 NEVER = 1 << 40  # evaluations
 
 
 class Trace(NamedTuple):
-    """After each call of the loss: rollouts so far, seconds so far, best loss so far.
+    """Number of rollouts, seconds and best loss after each call of the loss.
 
-    A rollout is one point on all scenarios; residuals with their Jacobian over P gains are 1 + P of them.
+    A rollout is one point simulated on all scenarios; residuals with their Jacobian over P gains count as 1 +
+    P rollouts.
     """
 
     rollouts: Float[np.ndarray, "calls"]
@@ -37,14 +38,11 @@ class Trace(NamedTuple):
 
 
 class TimeIsUp(Exception):
-    """Ends a method."""
+    """Exception that stops an optimiser at its time limit."""
 
 
 class Recorder:
-    """The loss with a clock: counts what it is called for, and raises `TimeIsUp` at a call after its time.
-
-    A call begun in time counts, however long it takes.
-    """
+    """Loss function that counts rollouts and raises `TimeIsUp` when called after the time limit."""
 
     def __init__(self, losses: Losses, seconds: float):
         self.losses, self.seconds = losses, seconds
@@ -70,7 +68,7 @@ class Recorder:
 def record(
     method: Method, losses: Losses, start: Float[np.ndarray, "gains"], seed: int, seconds: float
 ) -> Trace:
-    """What a method finds from a start in so many seconds."""
+    """Run an optimiser from a starting point for the given seconds; return its trace."""
     recorder = Recorder(losses, seconds)
     try:
         method(recorder, start, seed)
@@ -80,10 +78,10 @@ def record(
 
 
 def particle_swarm(losses: Losses, start: Float[np.ndarray, "gains"], seed: int) -> None:
-    """Global-best particle swarm, the start one of the first swarm; further swarms at random.
+    """Global-best particle swarm with the starting point in the first swarm; restarts are random.
 
-    A particle that leaves the box stops at its wall.
-    Source: Clerc, "Standard particle swarm optimisation" (2012); Clerc and Kennedy (2002) for the constants.
+    A particle that leaves the box stops at the bound. Source: Clerc, "Standard particle swarm optimisation"
+    (2012); constants from Clerc and Kennedy (2002).
     """
     generator = np.random.default_rng(seed)
     while True:
@@ -105,8 +103,10 @@ def particle_swarm(losses: Losses, start: Float[np.ndarray, "gains"], seed: int)
 
 
 def cma_es(losses: Losses, start: Float[np.ndarray, "gains"], seed: int) -> None:
-    """CMA-ES of the package `cma`, a generation in one call; begun again at random with twice the population
-    (Auger and Hansen, "A restart CMA evolution strategy with increasing population size", 2005)."""
+    """CMA-ES of the package `cma`, one generation per call; restarts are random with twice the population.
+
+    Source: Auger and Hansen, "A restart CMA evolution strategy with increasing population size" (2005).
+    """
     generator = np.random.default_rng(seed)
     options = {"bounds": [0, 1], "verbose": -9, "maxfevals": NEVER}
     population = None
@@ -114,7 +114,7 @@ def cma_es(losses: Losses, start: Float[np.ndarray, "gains"], seed: int) -> None
         options |= {"seed": int(generator.integers(1, 1 << 31))}
         options |= {"popsize": population} if population else {}
         strategy = cma.CMAEvolutionStrategy(start, SPREAD, options)
-        # The first distribution is drawn around the start and need not hold it.
+        # The first distribution is drawn around the starting point and need not contain this point.
         strategy.inject([start])
         while not strategy.stop():
             points = strategy.ask()
@@ -124,7 +124,7 @@ def cma_es(losses: Losses, start: Float[np.ndarray, "gains"], seed: int) -> None
 
 
 def nelder_mead(losses: Losses, start: Float[np.ndarray, "gains"], seed: int) -> None:
-    """SciPy's Nelder-Mead, one point at a time; begun again with a fresh simplex where it ended."""
+    """SciPy's Nelder-Mead method, one point at a time; restarts use a new simplex at the last result."""
     best = start
     bounds = [(0.0, 1.0)] * len(start)
     while True:
@@ -140,7 +140,7 @@ def nelder_mead(losses: Losses, start: Float[np.ndarray, "gains"], seed: int) ->
 
 
 def differential_evolution(losses: Losses, start: Float[np.ndarray, "gains"], seed: int) -> None:
-    """SciPy's differential evolution, a generation in one call, the start one of the first population."""
+    """SciPy's differential evolution, one generation per call; the first population has the start."""
     generator = np.random.default_rng(seed)
     while True:
         optimize.differential_evolution(

@@ -1,7 +1,7 @@
-"""Ours in the comparison: the one place to change where tuning finds its gains in another way.
+"""Optimiser of jaxhil in the comparison; to be adapted if tuning changes its search.
 
-`ours` takes all starts at once, as tuning does, and says of each what it had found after how many rollouts
-and seconds; `warm_up` compiles what it will run. Nothing else of this file is used elsewhere.
+`ours` takes all starting points at once, as tuning does, and returns a trace for each; `warm_up` compiles the
+programs.
 """
 
 import time
@@ -27,19 +27,19 @@ from tuning.optimisation.derivative_free import polish, select_distant_points
 from tuning.optimisation.levenberg_marquardt import solve_least_squares
 from tuning.optimisation.solution import SolverResult
 
-SCANNED, DESCENTS, GO_ON = 64, 6, 3  # points looked at, those descended from, those that go on; of a batch
-STEPS = 25  # of Levenberg-Marquardt
+SCANNED, DESCENTS, GO_ON = 64, 6, 3  # per batch: points scanned, descents started, descents continued
+STEPS = 25  # steps of Levenberg-Marquardt
 POLISH = 320  # evaluations
-LONGEST = 32  # steps that the program is made for
+LONGEST = 32  # largest number of steps of the compiled program
 
 
 def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = False) -> list[Trace]:
-    """What tuning does, from every start (in the unit box) on its own: look around, descend by
-    Levenberg-Marquardt in two rounds, again where the descents disagree; polish without derivatives.
+    """Run the search of tuning separately from every starting point in the unit box.
 
-    A trace has an entry for every step of a start's descents and for the stages before and after. Its seconds
-    are those of the batch over the number of starts; the steps of a round, which is one program, count as
-    equally long.
+    The search scans points, descends by Levenberg-Marquardt in two rounds, repeats if the descents disagree,
+    and ends with a derivative-free polishing search. A trace has an entry for every step of the descents and
+    for the stages before and after. Its seconds are those of the batch divided by the number of starting
+    points; the steps of a round, which is one program, count as equally long.
     """
     number, gains = starts.shape
     stages = _Stages(number, time.perf_counter())
@@ -92,7 +92,7 @@ def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = 
 
 
 class _Ends(NamedTuple):
-    """Where the descents of a start ended."""
+    """Results of the descents from one starting point."""
 
     loss: np.ndarray
     coordinates: np.ndarray
@@ -100,13 +100,13 @@ class _Ends(NamedTuple):
 
 
 def _agree(losses: np.ndarray) -> bool:
-    # AGREED is of the rms error, the root of the loss.
+    # The tolerance applies to the rms error, which is the square root of the loss.
     ranked = np.sort(losses)
     return bool(ranked[MIN_AGREEING_STARTS - 1] <= (1 + AGREEMENT_TOLERANCE) ** 2 * ranked[0])
 
 
 def warm_up(case: Case, starts: Float[np.ndarray, "starts gains"]) -> None:
-    """Compile what `ours` runs for as many starts."""
+    """Compile the programs that `ours` runs for this number of starting points."""
     ours(case, starts, warming=True)
     for size in _sizes(len(starts)):
         for descents in (DESCENTS, GO_ON):
@@ -114,12 +114,12 @@ def warm_up(case: Case, starts: Float[np.ndarray, "starts gains"]) -> None:
 
 
 def _sizes(number: int) -> list[int]:
-    """Numbers that programs are compiled for, so that few starts do not take the time of all."""
+    """Return the batch sizes for which programs are compiled; small batches then take less time."""
     return [max(1, number >> halvings) for halvings in range(3)]
 
 
 def _descend(case: Case, coordinates, steps, most) -> SolverResult:
-    """From some coordinates, of `most` at any time, in the smallest program that takes so many."""
+    """Run the descents in the smallest program that fits; `most` is the largest batch size."""
     size = min(one for one in _sizes(most) if one >= len(coordinates))
     padded = np.concatenate([coordinates, np.repeat(coordinates[:1], size - len(coordinates), axis=0)])
     problems, bounds = several((case.problem, case.bounds), size)
@@ -131,14 +131,14 @@ def _descend(case: Case, coordinates, steps, most) -> SolverResult:
 
 
 class _Stages:
-    """Of every start rollouts, seconds and best loss after each stage."""
+    """Rollouts, seconds and best loss of every starting point after each stage."""
 
     def __init__(self, number: int, begin: float):
         self.number, self.begin = number, begin
         self.rollouts, self.seconds, self.best = [np.zeros(number)], [0.0], [np.full(number, np.inf)]
 
     def add(self, which, rollouts, best) -> None:
-        """Of some of the starts."""
+        """Add a stage of the selected starting points."""
         spent, reached = self.rollouts[-1].copy(), self.best[-1].copy()
         spent[which] += rollouts
         reached[which] = np.minimum(reached[which], best)
@@ -147,7 +147,7 @@ class _Stages:
         self.seconds.append((time.perf_counter() - self.begin) / self.number)
 
     def add_steps(self, which, rollouts: int, found: SolverResult) -> None:
-        """Descents of some of the starts, as many of each: an entry for every step."""
+        """Add an entry for every step of the descents from the selected starting points."""
         begin = self.seconds[-1]
         end = (time.perf_counter() - self.begin) / self.number
         steps = np.asarray(found.steps).reshape(len(which), -1)

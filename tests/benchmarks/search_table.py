@@ -1,8 +1,8 @@
-"""What the traces of several methods say: how often, after how many rollouts and how long a method succeeds.
+"""Success rate and cost of several optimisers, computed from their traces.
 
-A start succeeds when it comes within `CLOSE` of the best loss that any method reaches from any start of the
-mechanism. With the share p of starts that do, and the median cost c at which they first did, a user who
-starts anew until it succeeds expects to pay c/p.
+A start succeeds if it comes within `CLOSE` of the best loss that any method reaches from any start of the
+mechanism. If a share p of the starts succeeds at a median cost c, a user who restarts until success expects
+to pay c/p.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,9 +15,12 @@ CLOSE = 0.01
 
 
 class Success(NamedTuple):
-    """Share of starts that succeed; rollouts and seconds to be expected until one does, inf if none did; over
-    the starts, the best and the median loss at the end, as a multiple of the best of all; rollouts and
-    seconds spent on a start."""
+    """Success rate and cost of an optimiser on one mechanism.
+
+    `share` of starts that succeed; expected `rollouts` and `seconds` until the first success, inf without
+    success; `best` and `median` final loss over the starts as a multiple of the best loss of all methods;
+    `rollouts_done` and `seconds_done` per start.
+    """
 
     share: float
     rollouts: float
@@ -32,18 +35,18 @@ Results = Mapping[str, Success]
 
 
 def judge(traces: Mapping[str, Sequence[Trace]]) -> tuple[float, dict[str, Success]]:
-    """The best loss of all, and the success of every method on one mechanism."""
+    """Return the best loss of all methods, and the success of every method on one mechanism."""
     best = min(float(np.min(trace.loss)) for several in traces.values() for trace in several)
     return best, {name: _success(several, best) for name, several in traces.items()}
 
 
 def medians(results: Sequence[Results]) -> dict[str, Success]:
-    """Over mechanisms, of every method."""
+    """Return the median over mechanisms for every method."""
     return {name: Success(*np.median([one[name] for one in results], axis=0).tolist()) for name in results[0]}
 
 
 def ratios(ours: Success, others: Sequence[Success]) -> tuple[float, float]:
-    """Expected rollouts and seconds of ours over the best of the others; inf where ours never succeeds."""
+    """Return expected rollouts and seconds of `ours` divided by those of the best other method."""
 
     def ratio(field: str) -> float:
         own, best = getattr(ours, field), min(getattr(other, field) for other in others)
@@ -53,7 +56,7 @@ def ratios(ours: Success, others: Sequence[Success]) -> tuple[float, float]:
 
 
 def table(results: Results) -> str:
-    """One line per method: `Success`, with the losses as what they exceed the best by."""
+    """Return a table with one line per method; losses are stated as excess over the best loss."""
     lines = [
         f"{'':24}{'starts that':>12}  {'to be expected':>19}  {'loss above best':>17}"
         f"  {'spent on a start':>19}",
@@ -71,7 +74,7 @@ def table(results: Results) -> str:
 
 def _success(traces: Sequence[Trace], best: float) -> Success:
     ends = np.array([trace.loss[-1] for trace in traces]) / best
-    # Losses fall: the first entry that is close enough.
+    # Losses decrease, so this is the first entry that is close enough.
     first = [int(np.argmax(trace.loss <= (1 + CLOSE) * best)) for trace in traces]
     there = [(trace, i) for trace, i, end in zip(traces, first, ends, strict=True) if end <= 1 + CLOSE]
     share = len(there) / len(traces)

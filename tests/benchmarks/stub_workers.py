@@ -1,4 +1,4 @@
-"""Many workers of a dask.distributed cluster in one process: what they ask of the scheduler, on one machine.
+"""Many workers of a dask.distributed cluster in one process, to measure the load of the scheduler.
 
 `python stub_workers.py ADDRESS NUMBER`
 """
@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import dask
 from distributed import Worker
 
-# What a worker looks after by itself, fifty times a second, takes all the time of a process of a thousand.
+# The periodic self-monitoring of a thousand workers would take all the time of their process.
 QUIET = {
     "distributed.admin.tick.interval": "1h",
     "distributed.admin.system-monitor.interval": "1h",
@@ -18,11 +18,11 @@ QUIET = {
     "temporary-directory": ".",
 }
 AT_A_TIME = 50  # that join
-THREADS = 4  # of all workers together
+THREADS = 4  # threads of all workers together
 
 
 async def main(address: str, number: int) -> None:
-    """Join, and work until the scheduler ends."""
+    """Connect to the scheduler and work until the scheduler ends."""
     pool = ThreadPoolExecutor(THREADS)
     workers = [Worker(address, nthreads=1, memory_limit=0, executor=pool) for _ in range(number)]
     for begin in range(0, number, AT_A_TIME):

@@ -1,4 +1,4 @@
-"""The C++ baseline against the JAX loop: the same contacts to rounding, so that their speeds compare."""
+"""Comparison of the C++ baseline with the JAX simulation: equal contacts, so that speeds are comparable."""
 
 import os
 import subprocess
@@ -19,7 +19,7 @@ from jaxhil.simulation.scenario import build_scenarios
 
 pytestmark = pytest.mark.benchmark
 
-LANES = 61  # no whole number of blocks, whatever the block
+LANES = 61  # not a multiple of any block size
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_cpp_baseline_contacts_agree_with_jax_simulation(baseline, compensator, 
     expected = jax.jit(rollout, static_argnums=0)(loop, gains, scenario)
     found = baseline.run(loop, rig, gains, scenario, int(np.max(expected.ticks)), threads)
     np.testing.assert_array_equal(found["status"], expected.status)
-    # A contact that sticks until its time-out ends in rounding: its numbers are not worth comparing.
+    # A contact that sticks until its timeout is dominated by rounding, so its numbers are not compared.
     ended = np.asarray(expected.status) == OK
     assert np.mean(ended[: scenario.contacts[0]]) > 0.85
     for name in RESULTS:
@@ -76,7 +76,7 @@ def test_cpp_baseline_run_ticks_gives_same_first_contact_as_run(baseline):
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the report is that of g++ on Linux")
 def test_cpp_baseline_is_vectorised_for_every_compensator():
-    """The loop over the lanes of a tick, three instances: the compiler's own report."""
+    """Read the compiler's report on the three instances of the loop over the lanes of a tick."""
     source = SOURCE.read_text().splitlines()
     (line,) = (n for n, text in enumerate(source, 1) if "const double x = b.position[l], v" in text)
     report = subprocess.run(

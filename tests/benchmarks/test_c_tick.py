@@ -1,7 +1,7 @@
-"""Time of a tick of the controller in C beside a loop that only reads what a tick reads.
+"""Time per tick of the C controller compared with a loop that only reads the inputs.
 
-Every guard and the watchdog are on. The shortest of many repetitions counts: the machine is shared. Run with
-`pytest -m benchmark -s tests/benchmarks/test_c_tick.py`.
+Every guard and the watchdog are active. The shortest of many repetitions counts, because the machine is
+shared. Run with `pytest -m benchmark -s tests/benchmarks/test_c_tick.py`.
 """
 
 import shutil
@@ -21,11 +21,11 @@ pytestmark = [
     pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine"),
 ]
 BAR = 100.0  # ns
-BARS = {"impulse_ledger": 5000.0}  # it updates 18 parameters and their covariance
+BARS = {"impulse_ledger": 5000.0}  # updates 18 parameters and their covariance
 ROWS = 200_000
 REPEATS = 40
-# Contacts of 0.2 s, of up to 84 N, and 0.3 s between them: time enough for every law's force to die out, so
-# that the watchdog audits each contact on its own. Phase, rate [rad/s], amplitude [m].
+# Contacts of 0.2 s and up to 84 N, 0.3 s apart: every compensator's force decays in between, so that the
+# watchdog audits each contact separately. Phase, rate [rad/s], amplitude [m].
 CONTACTS = (0.0, 12.0, 1e-3)
 WIDE = {
     "force_range": 1e5,
@@ -49,7 +49,7 @@ WIDE = {
     "equivalent_mass": 350.0,
     "restitution_margin": 1e12,
     "energy_balance": 1e12,
-    "longest_contact": 1e4,  # the motion does not heed the law
+    "longest_contact": 1e4,  # the motion does not depend on the compensator
     "alignment": 0.008,
 }
 

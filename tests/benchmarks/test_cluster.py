@@ -1,5 +1,4 @@
-"""What a cluster costs: two to eight workers beside one process on the same cores, and the scheduler under a
-thousand of them.
+"""Speed of a cluster of two to eight workers compared with one process, and load of the scheduler.
 
 Run with `pytest -m benchmark -s tests/benchmarks/test_cluster.py`.
 """
@@ -30,7 +29,7 @@ STUBS = Path(__file__).with_name("stub_workers.py")
 
 
 def swept(folder, manifest, computer=run_chunks):
-    """Seconds of a sweep, and its rows."""
+    """Return the duration [s] of a sweep and its rows."""
     store = open_store(folder, manifest, resume=False)
     begin = time.perf_counter()
     run_sweep(store, lambda *_: None, lambda *_: None, computer)
@@ -45,7 +44,7 @@ def test_cluster_sweep_is_at_least_half_as_fast_as_local_sweep(workers, tmp_path
     with started(tmp_path) as cluster:
         for _ in range(workers):
             cluster.worker("--nthreads", "1")
-        # The first time everyone reads the program.
+        # In the first repetition every worker reads the program.
         for turn in range(1 + REPEATS):
             own, rows = swept(tmp_path / f"here {turn}", manifest)
             other, found = swept(tmp_path / f"there {turn}", manifest, on_cluster(cluster.address))
@@ -64,7 +63,7 @@ def test_cluster_sweep_is_at_least_half_as_fast_as_local_sweep(workers, tmp_path
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="times of other processes are Linux's")
 def test_scheduler_serves_a_thousand_workers_without_becoming_the_bottleneck(tmp_path, capsys):
-    """Pieces that take no time: what each costs the scheduler and the command, in seconds of processor."""
+    """Measure the CPU time of scheduler and command per empty task."""
     distributed = pytest.importorskip("distributed")
     with started(tmp_path) as cluster:
         command = [sys.executable, str(STUBS), cluster.address, str(THOUSAND)]
@@ -91,6 +90,6 @@ def test_scheduler_serves_a_thousand_workers_without_becoming_the_bottleneck(tmp
 
 
 def spent(process):
-    """Seconds of processor of a process until now."""
+    """Return the CPU time [s] that a process has used."""
     fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -1,8 +1,8 @@
-"""The motion simulator by `jaxhil identify` and by other identifications, on the same clean free motion.
+"""Identification of the motion simulator by `jaxhil identify` and by other methods on the same free motion.
 
-The others are in an environment of their own, since they want other versions of what we use: make one,
-install `sippy-unipi`, `nfoursid` and `scikit-rf` in it, and name its interpreter in JAXHIL_OTHERS; else they
-are left out. Run with `pytest -m benchmark -s tests/benchmarks/test_identify_others.py`.
+The other methods need other package versions: install `sippy-unipi`, `nfoursid` and `scikit-rf` in an
+environment and name its interpreter in JAXHIL_OTHERS; otherwise they are skipped. Run with `pytest -m
+benchmark -s tests/benchmarks/test_identify_others.py`.
 """
 
 import json
@@ -23,12 +23,12 @@ from tuning.identification.rational import STRUCTURES, MotionModel
 pytestmark = pytest.mark.benchmark
 SCRIPT = Path(__file__).with_name("identify_others.py")
 TRUE = MotionModel(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
-CONTACT = 3.0  # Hz, at which the lag counts
+CONTACT = 3.0  # Hz, frequency at which the lag is compared
 AT = np.concatenate([[CONTACT], np.linspace(5.0, 20.0, 301)])
 
 
 def by_hand(spectrum):
-    """What one would write oneself: least squares on the response, no hold, no weights."""
+    """Fit the response by unweighted least squares without a model of the command hold."""
 
     def left(parameters):
         model = MotionModel(STRUCTURES[2], np.array([*parameters[:2], 1e-3 * parameters[2]]))
@@ -40,7 +40,7 @@ def by_hand(spectrum):
 
 
 def figures(response):
-    """Errors of the lag at the contacts' frequency [ms] and of the bandwidth [%]."""
+    """Return the errors of the lag at the contact frequency [ms] and of the bandwidth [%]."""
 
     def lag(values):
         return -np.angle(values[0]) / (2.0 * np.pi * CONTACT)
@@ -77,7 +77,7 @@ def test_identify_is_more_accurate_than_other_identification_methods(tmp_path, c
         )
         for name, one in json.loads(ran.stdout.splitlines()[-1]).items():
             values = np.array(one["response"]) @ [1.0, 1j]
-            # From commands to readings: what the hold makes of the commands is in it.
+            # The response from commands to readings includes the command hold.
             held = hold_response(AT, period, "linear", 0)
             rows.append((name, values / held, one["delay"], one["seconds"]))
     headings = "lag at 3 Hz [ms]", "bandwidth [%]", "delay [ms]", "time [s]"

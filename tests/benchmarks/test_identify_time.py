@@ -1,8 +1,7 @@
-"""Time of `jaxhil identify` of a day's logs in memory, beside a general optimizer on the touches alone.
+"""Time of `jaxhil identify` for logs in memory, compared with a general optimiser.
 
-60 s of free motion at 1 kHz and 15 touches. The other one is what one would write oneself: SciPy's least
-squares with differences, over the same exact motion, from a start some per cent off, without intervals and
-without a check of anything. Times are those of the processor. Run with
+The logs have 60 s of free motion at 1 kHz and 15 contacts. The general optimiser is SciPy's least squares
+with finite differences on the same exact motion, without intervals and checks. Times are CPU times. Run with
 `pytest -m benchmark -s tests/benchmarks/test_identify_time.py`.
 """
 
@@ -26,7 +25,7 @@ UNITS = np.array([1e-3, 1e-6, 1e5, 100.0])
 
 
 def general(campaign, model):
-    """The four numbers and the bias by a general optimizer."""
+    """Fit the four parameters and the bias by a general optimiser."""
     runs = [run for run in campaign.runs if run.kind == "contact"]
     motion, readings = MotionResponse(model, runs, campaign.timing, 0.022), ForceReadings.of(runs, 0.5)
 
@@ -69,7 +68,7 @@ def test_identify_processes_logs_of_one_day_within_time_limit(capsys):
 
 
 def test_identify_processes_a_long_press_run_within_time_limit(capsys):
-    """Identify a rig whose force sensor lags from touches and a press of 40 s, 43,000 readings in contact."""
+    """Include a lagging force sensor and a press run of 40 s with 43,000 readings in contact."""
     kind, campaign = campaigns.KINDS["lagging"], campaigns.campaign("lagging", 0)
     press = campaigns._press_run(kind, np.random.default_rng(0), seconds=40.0)
     begin = time.process_time()

@@ -1,4 +1,4 @@
-"""Many mechanisms tuned in one call, beside as many calls once programs are compiled.
+"""Time to tune many mechanisms in one call, compared with separate calls that use compiled programs.
 
 Run with `pytest -m benchmark -s tests/benchmarks/test_many_mechanisms.py`.
 """
@@ -18,13 +18,13 @@ from jaxhil.simulation.jax_environment import count_usable_cores
 pytestmark = pytest.mark.benchmark
 NUMBER, SINGLE = 64, 6
 MASSES = np.geomspace(150.0, 600.0, NUMBER)
-# Of as many single ones: of commands the whole, of calls in a process that computes already all but the runs,
-# which are as many however they are called: three tenths of a single call's time or more, on all cores.
+# Largest allowed time relative to separate commands or calls. For calls, the simulations themselves, at least
+# three tenths of a single call's time, are subtracted.
 SHARE = 0.25
 
 
 def computing_seconds():
-    """Processor time of all threads but this one, over the cores [s]."""
+    """Return the CPU time of all other threads divided by the number of cores [s]."""
     return (time.process_time() - time.thread_time()) / count_usable_cores()
 
 
@@ -62,12 +62,12 @@ def test_tuning_many_mechanisms_in_one_call_is_faster_than_separate_calls(compen
     ]
 
     def seconds(some):
-        """Of a call, and those in which all cores would do what its other threads computed."""
+        """Return the duration [s] of a call, and the CPU time of its other threads per core."""
         begin, computed = time.perf_counter(), computing_seconds()
         tuning.tune(some, compensator)
         return np.array([time.perf_counter() - begin, computing_seconds() - computed])
 
-    # Programs of one mechanism, and of as many as are tuned together.
+    # Compile the programs of one mechanism, and of as many as are tuned together.
     seconds(every[0])
     seconds(every[: NUMBER // 2])
     singles = every[:: NUMBER // SINGLE][:SINGLE]

@@ -1,7 +1,7 @@
-"""Time of a tick of the rig's controller in Python beside an empty loop, bare and with all its guards.
+"""Time per tick of the Python controller compared with an empty loop, with and without guards.
 
-A tick is `step` with its time and `position_command`; the watchdog watches. Times are those of the
-processor, as the machine is shared. Run with `pytest -m benchmark -s tests/benchmarks/test_python_tick.py`.
+A tick is `step` with its time, followed by `position_command`; the watchdog is active. Times are CPU times.
+Run with `pytest -m benchmark -s tests/benchmarks/test_python_tick.py`.
 """
 
 import time
@@ -20,7 +20,7 @@ TICKS = 200_000
 BAR = 10.0  # us
 # The impulse ledger updates 17 parameters and their covariance on every tick in contact.
 BARS = {"impulse_ledger": 250.0}
-TAILS = {"impulse_ledger": 500.0}  # on 999 of 1000 in contact
+TAILS = {"impulse_ledger": 500.0}  # limit for 99.9 % of the ticks in contact
 
 
 @pytest.mark.parametrize("guarded", [False, True], ids=["bare", "guarded"])

@@ -1,4 +1,4 @@
-"""Time and memory of reading a log beside a bare pyarrow, on files of a million and of ten million rows.
+"""Time and memory of reading a log of 1e6 and 1e7 rows, compared with pyarrow alone.
 
 Run with `pytest -m benchmark -s tests/benchmarks/test_reading_logs.py`; the larger files take 1 GB.
 """
@@ -16,7 +16,7 @@ PERIOD = 1e-3
 BLOCK = 60_000  # rows
 MILLION = 1_000_000
 SECONDS = {MILLION: 2.0, 10 * MILLION: 20.0}
-LARGEST = 2.0  # GiB, of the whole process
+LARGEST = 2.0  # GiB, memory of the whole process
 
 READ = """
 import resource, sys, time
@@ -39,7 +39,7 @@ SAID = "print(rows, end[0] - begin[0], end[1] - begin[1], resource.getrusage(res
 
 
 def write(path: Path, rows: int, kind: str) -> None:
-    """A block of a rig's rows over and over, with stamps that go on."""
+    """Write a block of a rig's rows repeatedly, with increasing time stamps."""
     columns = touches(BLOCK // 600) if kind == "contact" else sway(BLOCK)
     names = [name for name in CHANNELS.values() if name != "t"]
     rows_of = zip(*(columns.get(name, columns["xm"]).tolist() for name in names), strict=True)
@@ -52,7 +52,7 @@ def write(path: Path, rows: int, kind: str) -> None:
 
 
 def run(code: str, *arguments: object) -> tuple[int, float, float, float]:
-    """Rows, seconds, seconds of the processor, and GiB at most, of a process of its own."""
+    """Return rows, seconds, CPU seconds and largest memory [GiB] of reading in a separate process."""
     ran = subprocess.run(
         [sys.executable, "-c", code + SAID, *map(str, arguments)],
         check=True,
@@ -79,5 +79,5 @@ def test_log_reading_time_and_memory_are_within_limits(kind, rows, tmp_path, cap
         )
     path.unlink()
     assert found >= 0.99 * rows and memory <= LARGEST
-    # One thread reads: that is the time it takes on a machine that does nothing else.
+    # A single thread reads, so its CPU time is the duration on an idle machine.
     assert processor <= SECONDS[rows]

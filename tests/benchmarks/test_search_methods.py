@@ -22,19 +22,19 @@ from tuning.gains.objective import RESIDUAL_SCALE, RMS_OBJECTIVE, compute_residu
 
 pytestmark = pytest.mark.benchmark
 
-# Contact from 1.4 to 6.2 Hz, every law, simulators fast and slow, one undamped (19).
+# Contact frequencies from 1.4 to 6.2 Hz, every contact law, fast and slow simulators, one undamped (19).
 MEMBERS = 3, 8, 9, 18, 19, 20, 37, 48
 STARTS = 8
-SEED = 0  # of the starts
-BUDGET = 1.0  # time of a start of the others, over ours
-SHARE, COST = 0.9, 0.5  # the bar: starts that succeed; rollouts and seconds over the best of the others
+SEED = 0  # seed of the starts
+BUDGET = 1.0  # time limit of other optimisers relative to that of tuning
+SHARE, COST = 0.9, 0.5  # limits: share of successful starts; rollouts and seconds relative to the best other
 
 NAMES = [mechanism.name for i, mechanism in enumerate(family()) if i in MEMBERS]
 
 
 @pytest.fixture(scope="module")
 def cases() -> dict[str, Case]:
-    # All of them whatever runs, so that a mechanism's program does not depend on which others are compared.
+    # Build all cases, so that a mechanism's program does not depend on the selection.
     every = family()
     return {case.name: case for case in build_cases([every[i] for i in MEMBERS])}
 
@@ -53,7 +53,7 @@ def test_optimisers_are_compared_on_mechanism(name, cases, compared, capsys):
     traces = {"ours": ours(case, starts)} | {method: [] for method in OTHERS}
     seconds = BUDGET * traces["ours"][0].seconds[-1]
     for seed, start in enumerate(starts):
-        # In turn: what else the machine does meets all of them.
+        # Run the optimisers alternately, so that other load on the machine affects all of them.
         for method, function in OTHERS.items():
             traces[method].append(record(function, case.losses, start, seed, seconds))
     best, compared[name] = judge(traces)
@@ -84,7 +84,6 @@ def test_tuning_needs_fewer_rollouts_than_other_optimisers(compared, capsys):
 
 
 def test_compared_optimisers_minimise_the_loss_of_tuning(cases):
-    # One of each program is enough.
     for case in {(case.loop, case.names): case for case in cases.values()}.values():
         points = case.starts(5, 1)
         together = case.losses(points)
@@ -99,7 +98,7 @@ def test_compared_optimisers_minimise_the_loss_of_tuning(cases):
 
 
 def bowl(points):
-    """1 at its lowest, a share of 0.3 of every gain's range."""
+    """Return a quadratic with minimum 1 at a coordinate of 0.3 for every gain."""
     assert (points >= 0).all() and (points <= 1).all()
     return 1 + np.sum((points - 0.3) ** 2, axis=-1)
 
@@ -140,7 +139,7 @@ def test_expected_cost_is_median_cost_divided_by_success_rate():
         }
     )
     assert best == 2
-    # Within 1 % after 20 rollouts, after 10; two never.
+    # Two starts come within 1 % of the best, after 20 and after 10 rollouts.
     assert found["ours"].share == 0.5
     assert found["ours"].rollouts == 30 and found["ours"].seconds == 1.5
     assert found["theirs"].share == 0 and found["theirs"].rollouts == np.inf

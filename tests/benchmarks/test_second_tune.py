@@ -1,6 +1,6 @@
-"""Processor time of a second `jaxhil tune`: with the cached programs, and with JAX's persistent cache alone.
+"""CPU time of a second `jaxhil tune` with cached programs, and with JAX's persistent cache alone.
 
-Each run is a process of its own; the first one of either kind fills its cache and is not counted. Run with
+Each run is a separate process; the first run with either cache fills the cache and is not counted. Run with
 `pytest -m benchmark -s tests/benchmarks/test_second_tune.py`.
 """
 
@@ -28,7 +28,7 @@ sys.exit(main(["tune", "rig-300kg", "-o", sys.argv[2]]) == 2)
 
 
 def seconds(kind, folder):
-    """Return the processor time of one run."""
+    """Return the CPU time of one run."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     command = [sys.executable, "-c", TUNE, kind, str(folder / "out")]
     subprocess.run(

@@ -1,9 +1,8 @@
-"""Throughput of the six-axis loop beside C++ and MuJoCo, one core each, all in this one process, in turn; the
-best counts.
+"""Speed of the six-axis simulation on one core, compared with C++ and MuJoCo.
 
-The C++ (six_axes.cpp) has the same physics, to rounding. MuJoCo steps the same two bodies by Euler's method,
-with friction between a sphere on one and a wall on the other: one candidate, as here. It has no rig. The time
-of its step is that of bodies pressed together and that of bodies apart, weighed by how long they touch here.
+The best of several repetitions counts. The C++ code (six_axes.cpp) has the same physics, to rounding. MuJoCo
+simulates the same two bodies without the rig, by Euler's method, with friction between a sphere and a wall.
+Its time per step is the average of steps with and without contact, weighted by the time in contact.
 """
 
 import ctypes
@@ -27,9 +26,9 @@ from jaxhil.sixdof.shapes import Drogue
 
 pytestmark = pytest.mark.benchmark
 TILES, REPEATS = 8, 25
-LANES = TILES * TILE_SIZE  # lanes of a tile run side by side, tiles one after the other, as all batches do
-TICKS = 384  # until the last of these lanes' episodes is over
-CPP, MUJOCO = 0.3, 30.0  # of their speeds
+LANES = TILES * TILE_SIZE  # lanes of a tile run in parallel, tiles one after the other
+TICKS = 384  # all contact episodes have ended by then
+CPP, MUJOCO = 0.3, 30.0  # required speed relative to C++ and to MuJoCo
 FLAGS = ("-O3", "-march=native", "-std=c++17", "-fno-math-errno", "-Wno-psabi", "-shared", "-fPIC")
 NUMBERS = (
     "period", "bodies", "states", "transition", "rows", "axes", "samples", "command", "intervals", "contact",
@@ -44,7 +43,7 @@ class Problem(ctypes.Structure):
 
 
 def prepared():
-    """Loop and scenarios of probe-drogue, drawn, with an ideal sensor under a drogue without a rim."""
+    """Return loop and random scenarios of probe-drogue, with an ideal sensor and a drogue without a rim."""
     mechanism = load_any("probe-drogue", ["rig.force_sensor.noise_std=0.0"]).mechanism
     scenario = build_scenarios(mechanism, draw(mechanism, LANES, 1))
     (group,) = scenario.groups
@@ -60,7 +59,7 @@ def prepared():
 
 
 def inputs(loop, rig, run):
-    """What six_axes.cpp reads, by name."""
+    """Return the inputs of six_axes.cpp by name."""
 
     def flat(*trees):
         return np.stack([np.broadcast_to(leaf, (LANES,)) for leaf in jax.tree.leaves(trees)])
@@ -99,7 +98,7 @@ def compiled(folder):
 
 @partial(jax.jit, static_argnums=0, compiler_options=supported_options(SIX_AXIS_OPTIONS))
 def ticks(loop, rig, run):
-    """States after all ticks."""
+    """Return the states after all ticks."""
 
     def one_tile(start):
         rig, run = start
@@ -109,7 +108,7 @@ def ticks(loop, rig, run):
 
 
 def tiled(tree):
-    """(..., lanes) as (tiles, ..., lanes of a tile); numbers repeated."""
+    """Reshape (..., lanes) to (tiles, ..., lanes of a tile); repeat scalars."""
 
     def fold(leaf):
         spread = jnp.broadcast_to(leaf, (*leaf.shape[:-1], LANES)).reshape(*leaf.shape[:-1], TILES, TILE_SIZE)
@@ -120,7 +119,7 @@ def tiled(tree):
 
 @partial(jax.jit, static_argnums=0)
 def touching(loop, rig, run):
-    """Share of all ticks of all lanes at which the bodies touch."""
+    """Return the share of all ticks of all lanes at which the bodies touch."""
 
     def body(run, _):
         run, seen = tick(loop, rig, run)
@@ -145,7 +144,7 @@ def test_six_axis_simulation_speed_is_compared_with_cpp_and_mujoco(tmp_path, cap
     found = np.stack(jax.tree.leaves(ticks(loop, *tiles))).reshape(len(first), LANES)
     library.run_ticks(ctypes.byref(problem), TICKS)
     np.testing.assert_allclose(found, arrays["states"], atol=1e-9 * np.max(np.abs(found - first)))
-    assert np.median(np.abs(found - first)[16]) > 0.003  # most chasers were turned back or aside
+    assert np.median(np.abs(found - first)[16]) > 0.003  # most chasers have changed their direction
 
     ours, cpp = [], []
     for _ in range(REPEATS):
@@ -168,7 +167,7 @@ def test_six_axis_simulation_speed_is_compared_with_cpp_and_mujoco(tmp_path, cap
 
 
 def mujoco_speed(mujoco, share):
-    """Steps/s of two free bodies with a pair of shapes that touch a share of the time."""
+    """Return the steps per second of two free bodies that touch during the given share of the time."""
     mechanism = load_any("probe-drogue", []).mechanism
     shapes = ('<geom type="box" size="1 1 0.1"/>', '<geom type="sphere" size="0.02" pos="0 0 -1"/>')
     bodies = ""
@@ -185,7 +184,7 @@ def mujoco_speed(mujoco, share):
 
 
 def step_time(mujoco, model, push, steps=10_000):
-    """Seconds of a step with the bodies pressed together [N]."""
+    """Return the time of a step [s] for bodies that are pressed together by the given force [N]."""
     data, seen = mujoco.MjData(model), []
     data.xfrc_applied[1:, 2] = push, -push
     for _ in range(REPEATS):

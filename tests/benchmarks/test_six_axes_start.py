@@ -1,7 +1,6 @@
-"""How soon a first result in six axes is there: the first `jaxhil simulate`, and programs of many candidates.
+"""CPU time until the first six-axis result: the first `jaxhil simulate`, and programs of many candidates.
 
-Processor seconds, so that what else runs on the machine does not count. Run with
-`pytest -m benchmark -s tests/benchmarks/test_six_axes_start.py`.
+Run with `pytest -m benchmark -s tests/benchmarks/test_six_axes_start.py`.
 """
 
 import os
@@ -27,7 +26,7 @@ BUILT_IN = ("probe-drogue", "petals", "ring-capture", "claw-two-arms", "hydrauli
 
 
 def seconds_of(name, folder):
-    """Processor seconds of one command."""
+    """Return the CPU time [s] of one command."""
     ours = {key: value for key, value in os.environ.items() if key not in ("XLA_FLAGS", "NPROC")}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     command = [sys.executable, "-m", "tuning", "simulate", name]
@@ -46,7 +45,7 @@ def test_first_six_axis_simulate_command_is_within_time_limit(name, tmp_path, ca
 
 @pytest.fixture
 def nothing_kept():
-    """Programs are compiled, whatever was before."""
+    """Disable the compile cache."""
     folder = jax.config.jax_compilation_cache_dir
     for now in (None, folder):
         jax.config.update("jax_compilation_cache_dir", now)
@@ -57,7 +56,7 @@ def nothing_kept():
 
 @pytest.mark.usefixtures("nothing_kept")
 def test_six_axis_program_of_twelve_contact_candidates_compiles_within_time_limit(capsys):
-    """Twelve candidates of two kinds, the second time with derivatives by six leads."""
+    """Use candidates of two kinds, first without, then with derivatives by six leads."""
     mechanism = load_any("petals", []).mechanism
     scenario = build_scenarios(mechanism)
     assert sum(group.parameters.damping.shape[0] for group in scenario.groups) == 12

@@ -1,7 +1,7 @@
-"""How long commands take that find their programs compiled, and how long compiling takes without any kept.
+"""Time of commands with cached programs, and compile time without a cache.
 
-Each is a process of its own, as users start it, and tells with `--timings` where the time went. Run with
-`pytest -m benchmark -s tests/benchmarks/test_start_up.py` on a quiet machine.
+Each command is a separate process and reports with `--timings` how its time is spent. Run with `pytest -m
+benchmark -s tests/benchmarks/test_start_up.py` on an idle machine.
 """
 
 import os
@@ -26,17 +26,17 @@ from tuning.gains.multistart_solver import LANES_PER_TILE
 
 pytestmark = pytest.mark.benchmark
 REPEATS = 4
-# Of a session's environment: flags of tests, and that modules are to be compiled anew by every process.
+# Variables of the test session that are removed: XLA flags, and the request to recompile every module.
 NOT_A_USERS = "XLA_FLAGS", "NPROC", "PYTHONDONTWRITEBYTECODE"
 COMMANDS = {"tune": (("tune", "varying"), 5.0), "simulate": (("simulate", "varying"), 1.2)}
-COMPILING = 15.0  # s, on two cores: of a law with derivatives, and of all programs of its tuning
-# Of laws of thousands of equations, which miss the latter: no more than was reached.
+COMPILING = 15.0  # s, on two cores: limit for rollouts with derivatives, and for all programs of tuning
+# Compensators of thousands of equations exceed the limit; these are their measured times.
 REACHED = {"impulse_ledger": 40.0}
-KEEPING = "jax_enable_compilation_cache"  # whether compiled programs are kept
+KEEPING = "jax_enable_compilation_cache"
 
 
 def run(arguments, folder, programs):
-    """Seconds of a command, and what it says of them."""
+    """Return the duration [s] of a command and its reported timings."""
     ours = {name: value for name, value in os.environ.items() if name not in NOT_A_USERS}
     begin = time.perf_counter()
     done = subprocess.run(
@@ -60,7 +60,7 @@ def test_repeated_command_finishes_within_time_limit(name, tmp_path, capsys):
 
 
 def compiling(traced, values):
-    """Seconds that the compiler takes for a new program that only calls the one that is `traced` once."""
+    """Return the compile time [s] of a new program that calls the function `traced` once."""
     program = jax.jit(lambda values: traced(values), compiler_options=supported_options(TICK_OPTIONS))
     lowered = program.lower(values)
     begin = time.perf_counter()
@@ -70,7 +70,7 @@ def compiling(traced, values):
 
 @pytest.fixture
 def nothing_kept():
-    """No compiled programs are kept meanwhile."""
+    """Disable the compile cache."""
     before = jax.config.values[KEEPING]
     jax.config.update(KEEPING, False)
     reset_cache()
@@ -81,7 +81,7 @@ def nothing_kept():
 
 @pytest.mark.parametrize("compensator", [name for name, law in COMPENSATORS.items() if law.gains])
 def test_rollouts_with_derivatives_compile_within_time_limit(compensator, nothing_kept, capsys):
-    """A tile's restitutions and their derivatives by all gains, as the solver asks for them."""
+    """Compile the restitutions of a tile and their derivatives by all gains, as the solver does."""
     loop, gains, scenarios = case(compensator, LANES_PER_TILE)
     rig = jax.jit(build_rig_constants, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
 
@@ -103,7 +103,7 @@ def test_rollouts_with_derivatives_compile_within_time_limit(compensator, nothin
 
 @pytest.mark.parametrize("compensator", [name for name, law in COMPENSATORS.items() if law.gains])
 def test_programs_of_tuning_compile_within_time_limit(compensator, tmp_path, capsys):
-    """One solver step is enough for all of a tuning's programs."""
+    """A single solver step compiles all programs of tuning."""
     few = "--starts", "1", "--steps", "1", "--validation", "15", "--compensator", compensator
     took, said = run(("tune", "varying", *few), tmp_path, tmp_path / "programs")
     parts = {part: float(seconds) for part, seconds in re.findall(r"(\w+) ([\d.]+) s", said)}

@@ -1,4 +1,4 @@
-"""Sweeps end to end beside the C++ baseline: sampling, metrics and writing included; and their memory.
+"""Speed of complete sweeps, including sampling and files, compared with the C++ baseline; memory use.
 
 Run with `pytest -m benchmark -s tests/benchmarks/test_sweep.py`.
 """
@@ -29,9 +29,9 @@ pytestmark = pytest.mark.benchmark
 REPEATS = 5
 PARTS = 6
 BASELINE_LANES = 8192
-FEW, MANY = 100_000, 10_000_000  # scenarios, for the same memory
+FEW, MANY = 100_000, 10_000_000  # numbers of scenarios whose memory is compared
 
-# The peak of a process of its own: `ru_maxrss` would begin with that of the process that started it.
+# Peak memory of the sweep's own process: `ru_maxrss` includes the process that started it.
 MEASURED = """
 import json, sys
 from tuning.__main__ import main

@@ -1,7 +1,7 @@
-"""Throughput of the loop beside the C++ baseline, and cost of its gradient.
+"""Speed of the simulation compared with the C++ baseline, and cost of its gradient.
 
-Everything that is compared runs in this one process, in turn, and the best of many repetitions counts: the
-machine is shared. Run with `pytest -m benchmark -s tests/benchmarks`.
+All programs run alternately in one process, and the best of many repetitions counts. Run with `pytest -m
+benchmark -s tests/benchmarks`.
 """
 
 import time
@@ -28,17 +28,16 @@ from tuning.batches import join_batches
 from tuning.gains.multistart_solver import LANES_PER_TILE
 
 pytestmark = pytest.mark.benchmark
-LANES = 16_384  # of a sweep's part
+LANES = 16_384  # lanes of one chunk of a sweep
 REPEATS = 12
-WIDTHS = 8, 16  # lanes a block of the C++ loop; which is faster depends on law and processor
+WIDTHS = 8, 16  # lanes per block of the C++ loop; the faster choice depends on compensator and processor
 INFORMATION = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
 PROCESSOR = next((row.split(":")[1].strip() for row in INFORMATION.splitlines() if "model name" in row), "?")
 INTEL = "GenuineIntel" in INFORMATION
-# Bars beside the C++ loop at its best width, at 16 lanes a block, and of scenarios to the fixed horizon. An
-# Intel Xeon (model 207) made 0.38 to 0.46 and 0.46 to 0.52 of the C++ loop's lane-steps/s.
+# Required speed relative to the C++ loop at its best width, at 16 lanes per block, and for a fixed horizon.
 LANE_STEPS = {"none": 0.33, "response_error": 0.4} if INTEL else {"none": 0.5, "response_error": 0.5}
 LANE_STEPS_16 = {"none": 0.33, "response_error": 0.43} if INTEL else {"none": 0.65, "response_error": 0.65}
-JACOBIAN = 0.85  # of the time without options
+JACOBIAN = 0.85  # largest time relative to that without compiler options
 SCENARIOS = {"none": 0.4, "response_error": 0.45} if INTEL else {"none": 1.0, "response_error": 0.95}
 
 
@@ -47,7 +46,7 @@ ONE_SIDED = ("rig-300kg", "rod-100n-mm", "claw-350kg", "varying")
 
 
 def case(compensator, lanes, names=("varying",)):
-    """Mechanisms, drawn, in one batch, at the literature's gains for the last of them."""
+    """Return a batch of random scenarios, and the literature's gains for the last mechanism."""
     batches = []
     for name in names:
         mechanism = load(name).mechanism
@@ -60,7 +59,7 @@ def case(compensator, lanes, names=("varying",)):
 
 @partial(jax.jit, static_argnums=0)
 def ticks_run(loop, common, per_lane, scenarios):
-    """Ticks that each tile of `shard`'s ran, (devices, tiles): as many as its slowest lane takes."""
+    """Return the ticks that each tile of `shard` runs, (devices, tiles): those of its slowest lane."""
 
     def of_tile(arguments):
         gains, scenario = arguments
@@ -70,7 +69,7 @@ def ticks_run(loop, common, per_lane, scenarios):
 
 
 def best(*calls, repeats=REPEATS):
-    """Shortest time of each call, the calls taking turns."""
+    """Return the shortest time of each function; the functions are called alternately."""
     times = [[] for _ in calls]
     for _ in range(repeats):
         for call, seen in zip(calls, times, strict=True):
@@ -98,10 +97,10 @@ def test_rollout_speed_is_compared_with_cpp_baseline(compensator, names, capsys)
     rig = jax.jit(build_rig_constants, static_argnums=0)(loop, on_device)
 
     def horizon(baseline):
-        """The last tick at which a lane ends."""
+        """Return the last tick at which a lane ends."""
         return int(baseline.run(loop, rig, gains, on_device, 4000)["ticks"].max())
 
-    # C++ too finds its numbers in place.
+    # The inputs of the C++ code are also prepared before the measurement.
     arguments = evaluation.place_on_devices(*ONE_AXIS.shard(scenarios, gains))
     tiles = ticks_run(loop, *arguments)
     lane_steps = int(np.sum(tiles)) * arguments[-1].velocity.shape[-1]
@@ -134,7 +133,7 @@ def test_rollout_speed_is_compared_with_cpp_baseline(compensator, names, capsys)
 
 
 def jacobian(lanes, options):
-    """Timed Jacobian of the restitutions of so many lanes by all gains of response_error."""
+    """Measure the Jacobian of the restitutions by all gains of response_error for this number of lanes."""
     loop, gains, scenarios = case("response_error", lanes)
     rig = jax.jit(build_rig_constants, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
 
@@ -149,7 +148,7 @@ def jacobian(lanes, options):
 
 
 def test_jacobian_time_is_compared_for_compiler_options_and_tile_sizes(capsys):
-    """Time a lane, in the tiles of tuning and twice as many lanes at once."""
+    """Use the tile size of tuning and twice that size."""
     tuned = best(
         jacobian(LANES_PER_TILE, supported_options(TICK_OPTIONS)),
         jacobian(2 * LANES_PER_TILE, supported_options(TICK_OPTIONS)),

@@ -1,4 +1,4 @@
-"""Rollout in tiles and vectors of other widths beside those in use: the same bits, and how fast.
+"""Speed of rollouts for other tile sizes and vector widths, with bit-identical results.
 
 Run with `pytest -m benchmark -s tests/benchmarks/test_tiles.py`.
 """
