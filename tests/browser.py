@@ -1,4 +1,4 @@
-"""A headless Chromium that tests open pages in, spoken to over a pipe by the DevTools protocol."""
+"""Headless Chromium in which tests open pages, controlled through the DevTools protocol over a pipe."""
 
 import base64
 import fcntl
@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-SECONDS = 60.0  # until an answer has to be there
-SETTLED = 200  # milliseconds that scripts of a page get after it has loaded
-# The browser's own descriptors are 3 and 4.
+SECONDS = 60.0  # timeout of an answer
+SETTLED = 200  # milliseconds that the scripts of a page may run after loading
+# The browser uses descriptors 3 and 4.
 START = """import os, sys
 for number, end in ((3, 1), (4, 2)):
     os.dup2(int(sys.argv[end]), number)
@@ -25,8 +25,8 @@ FLAGS = (
     "--disable-background-networking", "--no-first-run", "--remote-debugging-pipe",
 )  # fmt: skip
 
-# What is wrong with the layout of a page: texts that lie on one another, what sticks out, pictures that are
-# not there. Rectangles of text are cut where a box around them scrolls.
+# Layout errors of a page: overlapping texts, elements that exceed their container, missing pictures.
+# Rectangles of text are limited to the visible part of boxes that scroll.
 LAYOUT = """(() => {
   const faults = [], wide = document.documentElement.clientWidth, boxes = [];
   if (document.documentElement.scrollWidth > wide + 1)
@@ -65,8 +65,8 @@ LAYOUT = """(() => {
   return { faults, texts: boxes.length };
 })()"""
 
-# What is cut on sheets of paper that wide and high: what sticks out, boxes that would scroll, and pictures
-# and rows of tables that do not fit on one sheet or may be broken between two.
+# Elements cut by sheets of the given size: elements that exceed the sheet, boxes that would scroll, and
+# pictures and table rows that do not fit on a sheet or may be split between two.
 PAPER = """(wide, high) => {
   const faults = [];
   for (const one of document.body.querySelectorAll("*")) {
@@ -89,21 +89,21 @@ PAPER = """(wide, high) => {
 
 
 class Opened(NamedTuple):
-    """What a page did when it was opened."""
+    """Errors and requests of a page that was opened."""
 
-    errors: list[str]  # of its scripts, and on the console
-    elsewhere: list[str]  # addresses asked for that are neither files nor data
-    missing: list[str]  # addresses that could not be had
+    errors: list[str]  # errors of scripts, and on the console
+    elsewhere: list[str]  # requested addresses that are neither files nor data
+    missing: list[str]  # requested addresses that could not be loaded
 
 
 class Browser:
-    """One window; close it when done."""
+    """Browser with a single window, which must be closed after use."""
 
     def __init__(self, folder: Path) -> None:
-        """`folder` is for the browser's own files."""
+        """Start the browser; `folder` holds its temporary files."""
         assert CHROMIUM is not None
         ends = (*os.pipe(), *os.pipe())
-        # Above 4, so that neither is overwritten on the way.
+        # Above 4, so that neither is overwritten before use.
         reads, writes = (fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in (ends[0], ends[3]))
         self._out, self._in = os.fdopen(ends[1], "wb"), os.fdopen(ends[2], "rb", 0)
         flags = (*FLAGS, f"--user-data-dir={folder}")
@@ -124,7 +124,7 @@ class Browser:
         self._call("Page.setLifecycleEventsEnabled", enabled=True)
 
     def open(self, path: Path, width: int) -> Opened:
-        """Load a file in a window so many pixels wide."""
+        """Load a file in a window of the given width in pixels."""
         size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
         self._call("Emulation.setDeviceMetricsOverride", **size)
         self._events.clear()
@@ -135,13 +135,13 @@ class Browser:
         return _opened(self._events)
 
     def evaluate(self, script: str) -> Any:
-        """The value of an expression in the page, waited for if it is a promise."""
+        """Return the value of an expression in the page; wait for the result of a promise."""
         told = self._call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in told, told
         return told["result"].get("value")
 
     def click(self, selector: str) -> None:
-        """Press the mouse in the middle of the first element, scrolled into view."""
+        """Scroll the first matching element into view and click its centre."""
         x, y = self.evaluate(
             f"""(() => {{ const one = document.querySelector({json.dumps(selector)});
             one.scrollIntoView({{ block: "center", behavior: "instant" }});
@@ -153,7 +153,7 @@ class Browser:
         self.evaluate(f"new Promise(done => setTimeout(done, {SETTLED}))")
 
     def printed(self, width: int, height: int) -> tuple[int, list[str]]:
-        """How many sheets the page is printed on, and what is cut on sheets with so many pixels for it."""
+        """Return the number of printed sheets, and the elements cut by sheets of the given size in pixels."""
         self._call("Emulation.setEmulatedMedia", media="print")
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self._call("Emulation.setDeviceMetricsOverride", **size)
@@ -184,7 +184,7 @@ class Browser:
             self._read(lambda told: "method" in told and wanted(told))
 
     def _read(self, wanted) -> dict[str, Any]:
-        """The first message that is wanted; events on the way are kept."""
+        """Return the first message that satisfies the condition; store the events received before."""
         end = time.monotonic() + SECONDS
         while time.monotonic() < end:
             message, found, rest = self._rest.partition(b"\0")

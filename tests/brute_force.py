@@ -1,7 +1,7 @@
-"""The whole hybrid loop by SciPy's `solve_ivp`, step by step: slow, and without any of the oracle's ideas.
+"""Integration of the whole hybrid loop by SciPy's `solve_ivp`: slow, and independent of the oracle.
 
 Method of steps: the simulator's differential equation is restarted at every break of its delayed command and
-at every event of the contact, and the sensor's lag is integrated over what came out.
+at every event of the contact. The sensor's lag is integrated over the resulting force.
 """
 
 from math import exp, pi
@@ -10,11 +10,11 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 OPTIONS = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-16}
-BEFORE = -300  # ticks: a start forgotten long before t = 0
+BEFORE = -300  # ticks: start so early that the initial transient has decayed at t = 0
 
 
 def brute_force(case, compensator, ticks, mass, velocity):
-    """v_d [m/s] at every tick of a second-order case."""
+    """Return v_d [m/s] at every tick for a second-order motion simulator."""
     T = case["rig"]["control_period"]
     x, v = -velocity * (0.02 + T / 3), velocity
     commands = {m: x + velocity * m * T for m in range(-2000, 1)}
@@ -35,7 +35,7 @@ def brute_force(case, compensator, ticks, mass, velocity):
 
 
 class _Contact:
-    """Force of Kelvin-Voigt or Hertzian contact, and where its formula changes."""
+    """Force of Kelvin-Voigt or Hertzian contact, and the depths at which its formula changes."""
 
     def __init__(self, contact):
         self.is_hertzian = contact["law"] == "hunt_crossley"
@@ -60,7 +60,7 @@ class _Contact:
 
 
 class _Simulator:
-    """Position and velocity of a second-order simulator behind its transport delay."""
+    """Position and velocity of a second-order simulator with transport delay."""
 
     def __init__(self, rig, commands, velocity):
         simulator = rig["simulator"]
@@ -102,14 +102,14 @@ class _Simulator:
 
 
 class _Lag:
-    """What a first-order sensor makes of the force, some time later."""
+    """Force after the delay and first-order lag of the sensor."""
 
     def __init__(self, sensor, contact, simulator):
         self.delay, self.time_constant = sensor["delay"], sensor["time_constant"]
         self.contact, self.simulator = contact, simulator
 
     def over(self, a, b, value):
-        """The sensor's output at b [s], from `value` at a."""
+        """Return the sensor's output at time b [s] for output `value` at time a [s]."""
         lag = self.time_constant
         for start, end, solution in self.simulator.dense[-60:]:
             low, high = max(start + self.delay, a), min(end + self.delay, b)

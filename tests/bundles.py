@@ -1,4 +1,4 @@
-"""A small bundle, for the tests of all that is done with one."""
+"""Small bundle for the tests that read or modify bundles."""
 
 import contextlib
 import functools
@@ -12,7 +12,7 @@ from tuning.bundle.bundle import build_bundle
 from tuning.bundle.manifest import manifest_text
 from tuning.gain_file import build_document
 
-TICKS = 240  # of the small bundle: the nominal run
+TICKS = 240  # ticks of the nominal run in the small bundle
 LIMITS = {"force_limit": 900.0, "held_readings": 3.0, "velocity_limit": None}
 
 
@@ -22,7 +22,7 @@ def document(
     overrides: tuple[str, ...] = (),
     **changes: Any,
 ) -> dict[str, Any]:
-    """A gain document of a built-in mechanism, at the literature's gains."""
+    """Return the gain document of a built-in mechanism with the literature's gains."""
     mechanism, sha256, _ = load(mechanism_name, overrides)
     gains = {gain.name: gain.nominal(mechanism) for gain in COMPENSATORS[compensator].gains}
     return build_document(compensator, {**gains, **changes}, mechanism, sha256, {}, {}, 0, {})
@@ -30,7 +30,7 @@ def document(
 
 @functools.cache
 def small_files() -> dict[str, bytes]:
-    """The files of a bundle with few vectors: the nominal run's beginning, and the last hostile one."""
+    """Return the files of a bundle with few vectors: the start of the nominal run and a hostile run."""
     made = build_bundle(document(), ["ros2", "matlab", "csv", "c99"], LIMITS)
     lines = made.files["vectors.csv"].splitlines(keepends=True)
     last = lines[-1].partition(b",")[0] + b","
@@ -39,13 +39,13 @@ def small_files() -> dict[str, bytes]:
 
 
 def signed(files: dict[str, bytes], gain_document: dict[str, Any]) -> dict[str, bytes]:
-    """The files with a manifest that fits them."""
+    """Return the files with a manifest that matches their content."""
     rest = {name: content for name, content in files.items() if name != selftest.MANIFEST_FILE}
     return {**rest, selftest.MANIFEST_FILE: manifest_text(rest, gain_document)}
 
 
 def run_selftest(folder, *arguments: str) -> tuple[bool, str]:
-    """Whether the self-test of the bundle passes, and what it prints; run in this process."""
+    """Run the self-test of the bundle in this process; return whether it passes, and its output."""
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
         good = selftest.main(arguments, str(folder))

@@ -1,6 +1,6 @@
-"""The controller in C beside the one in Python: compiled, loaded, and both run on the same rows.
+"""Controller in C and controller in Python on the same rows.
 
-A row is what happens in one tick (see `c99_driver.c`), a result what either side makes of it.
+A row holds the inputs of one tick (see `c99_driver.c`), a result the outputs of either controller.
 """
 
 import ctypes
@@ -39,8 +39,8 @@ STATUS_NUMBERS = {status.name: status.number for status in STATUSES}
 TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY = map(float, range(8))
 EVENTS = (TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY)
 PERIOD = 0.001
-CAPACITY = 64  # periods of delay, of those drawn
-LINES = DelayLine.LONGEST  # periods of delay that the compiled laws hold
+CAPACITY = 64  # periods of delay, for random gains
+LINES = DelayLine.LONGEST  # periods of delay that the compiled compensators support
 SANITIZED = ("-fsanitize=undefined,address,float-cast-overflow", "-fno-sanitize-recover=all", "-g")
 SANE_LIMITS = {
     "force_range": 2000.0,
@@ -99,7 +99,7 @@ HOSTILE = np.array(
 
 
 class Batch:
-    """The compiled controller of one law, which runs rows."""
+    """Compiled controller with one compensator, which processes rows."""
 
     def __init__(self, library: Path, law: str) -> None:
         self._library = ctypes.CDLL(str(library))
@@ -108,7 +108,7 @@ class Batch:
         self.law = law
 
     def exported(self) -> np.ndarray:
-        """The gains and limits compiled in."""
+        """Return the controller with gains and limits compiled in."""
         parameters = np.empty(2 + len(COMPENSATORS[self.law].gains) + len(LIMITS))
         self._library.driver_exported.restype = ctypes.c_size_t
         assert self._library.driver_exported(_pointer(parameters)) == parameters.size
@@ -134,7 +134,7 @@ class Batch:
 
 @functools.cache
 def loaded(law: str) -> Batch:
-    """The law, compiled for any delay that the runtime admits and loaded: once for all modules."""
+    """Compile the compensator for the longest delay of the runtime and load it, once for all modules."""
     folder = write_sources(Path(_BUILT.name) / law, long_document(law))
     return Batch(compiled(folder, "c99_driver.c", "driver.so", "-O2", "-shared", "-fPIC"), law)
 
@@ -148,12 +148,12 @@ def _pointer(values: np.ndarray):
 
 
 def write_sources(folder: Path, document: Mapping[str, Any]) -> Path:
-    """The controller's files and the driver in `folder`."""
+    """Write the controller's files and the driver to `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     texts = generate_c99(document)
     for name, text in texts.items():
         (folder / name).write_text(text)
-    # Where a division or a square root may fail, the law's step has an error flag.
+    # If a division or a square root may fail, the compensator's step has an error flag.
     fails = re.search(
         r"^static double jaxhil_law_step\([^)]*bool \*error\)", texts["jaxhil_controller.c"], re.M
     )
@@ -162,7 +162,7 @@ def write_sources(folder: Path, document: Mapping[str, Any]) -> Path:
 
 
 def compiled(folder: Path, source: str, output: str, *options: str) -> Path:
-    """`source` in `folder`, compiled as the contract says."""
+    """Compile `source` in `folder` with the flags that the interface requires."""
     command = [str(COMPILER), *COMPILER_FLAGS, *options, source, "-o", output, "-lm"]
     ran = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
@@ -171,7 +171,7 @@ def compiled(folder: Path, source: str, output: str, *options: str) -> Path:
 
 
 def long_document(law: str) -> dict[str, Any]:
-    """A document of `law` whose delays are as long as any that the runtime admits."""
+    """Return a gain document whose delays have the maximum length of the runtime."""
     period = CONTROL_PERIODS[0]
     document = gain_document(law, control_period=period)
     document["limits"] = {}
@@ -185,20 +185,20 @@ def long_document(law: str) -> dict[str, Any]:
 
 @functools.cache
 def delays(law: str) -> frozenset[str]:
-    """The gains and limits that a line of the controller in C delays by."""
+    """Return the names of gains and limits that are delays of delay lines in the C controller."""
     header = generate_c99(gain_document(law))["jaxhil_controller.h"]
     return frozenset(name.lower() for name in re.findall(r"#define JAXHIL_(\w+)_SAMPLES", header))
 
 
 def packed(law: str, gain_file: GainFile) -> np.ndarray:
-    """The gains and limits as the structs in C hold them."""
+    """Return gains and limits as C structs."""
     gains = [gain_file.gains[name] for name in COMPENSATORS[law].gains]
     limits = [gain_file.limits[name] for name in LIMITS]
     return np.array([gain_file.control_period, gain_file.clearance, *gains, *limits])
 
 
 def drawn_gains(law: str, rng: np.random.Generator, hostile: bool, period: float | None = None) -> GainFile:
-    """Admissible gains: about the nominal ones, or from the whole range that is admitted."""
+    """Draw admissible gains, near the nominal gains or from the whole range."""
     gains = {}
     period = period or PERIOD * float(rng.choice([0.25, 1.0, 1.7]))
     for name, specification in COMPENSATORS[law].gains.items():
@@ -206,19 +206,19 @@ def drawn_gains(law: str, rng: np.random.Generator, hostile: bool, period: float
         if hostile and rng.random() < 0.5:
             value = float(rng.choice(HOSTILE)) if rng.random() < 0.5 else float(10 ** rng.uniform(-320, 300))
         if name == "sensor_lag" and rng.random() < 0.5:
-            value = 0.0  # none is told
+            value = 0.0  # not specified
         if name in delays(law):
             value = float(rng.choice([0.0, 1.0, 7.0, rng.uniform(0, CAPACITY)])) * period
-        # What is not a number goes to an end.
+        # Replace NaN by a bound.
         gains[name] = max(min(specification.highest, value), specification.lowest)
     clearance = float(rng.choice([math.inf, 0.0, 1e-4, 0.02]))
     return GainFile(law, gains, period, clearance, drawn_limits(law, rng, hostile, period))
 
 
 def drawn_limits(law: str, rng: np.random.Generator, hostile: bool, period: float) -> Mapping[str, float]:
-    """Limits that bind now and then on drawn rows, some of them left out; hostile, of any size."""
+    """Draw limits that are sometimes reached, some of them missing; if `hostile`, of any size."""
     limits = {}
-    only_audited = rng.random() < 0.4  # so that contacts come to their end
+    only_audited = rng.random() < 0.4  # so that contacts end
     for name, specification in LIMITS.items():
         if (only_audited and name not in AUDIT) or (rng.random() < 0.3 and name != "equivalent_mass"):
             continue
@@ -239,7 +239,7 @@ def drawn_limits(law: str, rng: np.random.Generator, hostile: bool, period: floa
 def contact_rows(
     count: int, rng: np.random.Generator, period: float, phase: float, rate: float, amplitude: float
 ) -> np.ndarray:
-    """Ticks of one contact after another: a motion of this phase, rate [rad/s] and amplitude [m], noise."""
+    """Return ticks of successive noisy contacts of this phase, rate [rad/s] and amplitude [m]."""
     time = period * np.arange(count)
 
     def motion(late: float) -> np.ndarray:
@@ -256,7 +256,7 @@ def contact_rows(
 
 
 def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -> np.ndarray:
-    """Ticks of a `contact`, of `random` size, or `hostile`; now and then a reset or the next contact."""
+    """Draw ticks of a `contact`, or of `random` or `hostile` values, with some resets and next contacts."""
     phase, rate, amplitude = rng.uniform(0, 2 * np.pi), rng.uniform(10, 60), 10 ** rng.uniform(-5, -3)
     rows = contact_rows(count, rng, period, phase, rate, amplitude)
     time = rows[:, 5].copy()
@@ -272,23 +272,25 @@ def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -
         taken[:, 5] = False
         rows[:, 1:] = np.where(taken, rng.choice(HOSTILE, (count, 9)), rows[:, 1:])
     rows[:, 0] = rng.choice(EVENTS, count, p=[0.87, 0.03, 0.02, 0.002, 0.01, 0.038, 0.02, 0.01])
-    if rng.random() < 0.5:  # a rig that begins with a tare, and whose force sensor then resolves little
+    if rng.random() < 0.5:  # a rig that starts with a tare and whose force sensor has a coarse resolution
         rows[:6, 0] = TARE
         rows[:, 1] = np.where(np.abs(rows[:, 1]) < 1e6, 50.0 * np.round(rows[:, 1] / 50.0), rows[:, 1])
         rows[:6, 1] = 3.0 * rng.standard_normal(6)
-    if rng.random() < 0.3:  # a position sensor that hangs
+    if rng.random() < 0.3:  # a position sensor whose reading is stuck
         begin = int(rng.integers(count))
         rows[begin : begin + count // 5, 4] = rows[begin, 4]
     return rows
 
 
 def drawn_exactly(law: str, count: int, rng: np.random.Generator) -> tuple[GainFile, np.ndarray]:
-    """Gains, limits and rows of few small numbers, so that much is equal which is compared; positions are
-    whole numbers of what 1 m/s takes in a period."""
+    """Draw gains, limits and rows from few values, so that many comparisons are ties.
+
+    Positions are multiples of the distance that 1 m/s covers in a period.
+    """
     period = 2.0**-10
     per_period = {"N/s": 1 / period, "m": period, "m/s^2": 1 / period, "s": period}
     limits = {}
-    only_expected = rng.random() < 0.5  # so that contacts come to the expected restitution
+    only_expected = rng.random() < 0.5  # so that contacts have the expected restitution
     for name, specification in LIMITS.items():
         guards = name not in AUDIT or name in ("energy_balance", "restitution_margin", "longest_contact")
         if (only_expected and guards) or (rng.random() < 0.4 and name != "equivalent_mass"):
@@ -315,7 +317,7 @@ def drawn_exactly(law: str, count: int, rng: np.random.Generator) -> tuple[GainF
     gain_file = gain_file._replace(gains=whole)
     rows = np.zeros((count, len(ROW)))
     rows[:, 1:] = rng.integers(-3, 4, (count, 9))
-    if rng.random() < 0.7:  # walks, which stay on one side for a while
+    if rng.random() < 0.7:  # random walks, which stay on the same side of zero for some time
         rows[:, 1:] = np.clip(np.cumsum(rng.integers(-1, 2, (count, 9)), axis=0), -4, 4)
         rows[:, 4] = np.where(rng.random(count) < 0.5, rows[:, 2], rows[:, 4])
     rows[:, [2, 4, 7]] *= period
@@ -323,14 +325,14 @@ def drawn_exactly(law: str, count: int, rng: np.random.Generator) -> tuple[GainF
     rows[:, 5] = period * np.cumsum(gaps)
     rows[:, 6] = 1.0
     rows[:, 0] = rng.choice(EVENTS, count, p=[0.77, 0.08, 0.02, 0.005, 0.045, 0.05, 0.02, 0.01])
-    if only_expected:  # no stop of the clock or of the rig either
+    if only_expected:  # without a stopped clock or emergency stop
         rows[:, 0] = np.where(rows[:, 0] == NEXT_CONTACT, NEXT_CONTACT, TICK)
         rows[:, 6] = 0.0
     return gain_file, rows
 
 
 def law_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
-    """What the Python runtime's law makes of the rows, without the controller's guards."""
+    """Return the force commands of the Python compensator, without the controller's guards."""
     law = COMPENSATORS[gain_file.compensator](gain_file.gains, gain_file.control_period, gain_file.clearance)
     results = np.zeros((len(rows), len(RESULT)))
     for row, result in zip(rows.tolist(), results, strict=True):
@@ -347,7 +349,7 @@ def law_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
 
 
 def controller_in_python(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
-    """What the Python runtime's controller makes of the rows."""
+    """Return the outputs of the Python controller for the rows."""
     controller = Controller(gain_file)
     watchdog = controller._watchdog
     results = np.zeros((len(rows), len(RESULT)))
@@ -385,12 +387,12 @@ def _event(controller: Controller, row: list[float]) -> float:
 
 
 def same_bits(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Where two arrays of doubles are the same bits, or both not a number."""
+    """Return where two arrays of doubles have equal bits or are both NaN."""
     return (found.view(np.uint64) == expected.view(np.uint64)) | (np.isnan(found) & np.isnan(expected))
 
 
 def assert_same(found: np.ndarray, expected: np.ndarray, rows: np.ndarray) -> None:
-    """Raises AssertionError with the first tick and column in which C and Python differ."""
+    """Raise AssertionError with the first tick and column in which C and Python differ."""
     same = same_bits(found, expected)
     if not same.all():
         tick, column = (int(index) for index in np.argwhere(~same)[0])

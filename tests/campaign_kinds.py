@@ -1,4 +1,4 @@
-"""The kinds of rigs that campaigns with known truth are of, and how each is logged."""
+"""Kinds of rigs for simulated campaigns with known true parameters, and their log settings."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,16 +8,16 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Kind:
-    """A rig and how it is logged."""
+    """Rig and the settings of its log."""
 
     rig: dict[str, Any]
     contact: dict[str, Any]
-    colour: float = 0.0  # pole of the noise
-    jitter: float = 0.0  # s, of the stamps
-    lost: float = 0.0  # share of rows
-    block: int = 0  # rows lost at once in the middle of the free motion
+    colour: float = 0.0  # pole of the noise filter
+    jitter: float = 0.0  # s, jitter of the time stamps
+    lost: float = 0.0  # share of rows lost
+    block: int = 0  # consecutive rows lost in the middle of the free motion
     amplitude: float = 0.0008  # m, rms of the multisine
-    drift: float = 0.0  # share by which stiffness grows over the touches
+    drift: float = 0.0  # relative increase of the stiffness over all contacts
     mass: float = 350.0
 
 
@@ -47,7 +47,7 @@ def voigt(stiffness=(1.2e5,), damping=(650.0,)):
 
 
 THIRD = {"model": "third_order", "coefficients": [0.018, 1.6e-4, 7e-7], "delay": 0.0031}
-# Two pairs of poles, one of them a structural resonance with its antiresonance.
+# Two pole pairs; the second is a structural resonance with an antiresonance.
 RESONANT = {
     "model": "transfer_function",
     "numerator": [1.0 / 235.0**2, 2 * 0.02 / 235.0, 1.0],

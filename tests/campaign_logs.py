@@ -1,4 +1,4 @@
-"""Campaigns with known truth as a rig's log files, in units of rigs, and what their columns mean."""
+"""Log files of simulated campaigns with known true parameters, and the mapping of their columns."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ equivalent_mass = 350.0
 
 
 def columns(run, jitter=0.0, random=None):
-    """Columns of a run's file by name, without the rows that were lost."""
+    """Return the columns of a run's log file by name, without lost rows."""
     late = 0.0
     if random is not None:
         late = np.clip(jitter * random.standard_normal(len(run.tick)), -4.5e-4, 4.5e-4)
@@ -37,13 +37,12 @@ def columns(run, jitter=0.0, random=None):
 
 
 def write_columns(path, table):
-    """One log file."""
     rows = np.stack(list(table.values()), axis=1)
     np.savetxt(path, rows, "%.15g", ",", header=",".join(table), comments="")
 
 
 def write(folder, campaign, jitter=0.0):
-    """A file for every run."""
+    """Write a log file for every run."""
     random = np.random.default_rng(0)
     for number, run in enumerate(campaign.runs):
         write_columns(folder / f"{run.kind}_{number:02}.csv", columns(run, jitter, random))

@@ -1,4 +1,4 @@
-"""The rigs of campaigns with known truth: as mechanism files, and under commands of one's own."""
+"""Rigs of simulated campaigns: as mechanism files, and under specified commands."""
 
 import campaigns
 import numpy as np
@@ -8,7 +8,7 @@ from jaxhil.mechanism.file import from_plain_data
 
 
 def mechanism(name, **changed):
-    """The rig of a kind of campaign as a mechanism file has it; keys `changed` by "section__key"."""
+    """Return the mechanism file of a kind of rig with replaced values; keys are "section__key"."""
     kind = campaigns.KINDS[name]
     rig = {key: {**value} if isinstance(value, dict) else value for key, value in kind.rig.items()}
     tables = {"contact": {**kind.contact}, **{one: rig[one] for one in rig if isinstance(rig[one], dict)}}
@@ -23,7 +23,7 @@ def mechanism(name, **changed):
 
 
 def commanded(name, what, command, seed, noise=True):
-    """A run, "free" or "press", of that kind of rig under a command [m]; contact may begin and end in it."""
+    """Return a "free" or "press" run of this kind of rig under a command [m], which may start in contact."""
     kind, rng = campaigns.KINDS[name], np.random.default_rng(seed)
     rig, T, sensor = kind.rig, kind.rig["control_period"], kind.rig["force_sensor"]
     plant, law = campaigns.Plant(rig), Law(kind.contact, rig.get("contact_plane", 0.0))

@@ -1,8 +1,8 @@
-"""Campaigns with known truth: 60 s of multisine and 15 touches, of the oracle's physics, not of the JAX loop.
+"""Simulated campaigns with known true parameters: 60 s of multisine and 15 contacts, without JAX.
 
-All touches advance together, one lane each. The motion simulator's output is exact at any time (matrix
-exponentials of the oracle's state space); contact force is the oracle's law, evaluated when the sensor sees
-it; a lagging sensor integrates it by quadrature. `test_campaigns.py` holds lanes against `oracle.simulate`.
+All contacts are simulated together, one lane each. The motion simulator's output is exact at any time (matrix
+exponentials of the oracle's state space). The contact force is the oracle's law at the sampling time of the
+sensor; a sensor lag is integrated by quadrature. `test_campaigns.py` compares lanes with `oracle.simulate`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NODES, WEIGHTS = (NODES + 1.0) / 2.0, WEIGHTS / 2.0
 
 
 def multisine(period=0.001, length=5.0, highest=45.0, rms=0.0008, seed=0):
-    """One period [m]: odd lines to `highest` [Hz], every fourth odd one left out, random phases."""
+    """Return one period [m] of odd harmonics up to `highest` [Hz], every fourth omitted, random phases."""
     rows = round(length / period)
     odd = np.arange(1, int(highest * length) + 1, 2)
     lines = odd[(np.arange(len(odd)) + 1) % 4 != 0]
@@ -36,7 +36,7 @@ def multisine(period=0.001, length=5.0, highest=45.0, rms=0.0008, seed=0):
 
 
 class Plant:
-    """The motion simulator in discrete time: rows for any place within a period."""
+    """Motion simulator in discrete time, with output rows for any time within a period."""
 
     def __init__(self, rig):
         self.T, self.hold = rig["control_period"], rig.get("command_hold", "linear")
@@ -45,7 +45,7 @@ class Plant:
         self.state, self.start, self.end = self.after(1.0)
 
     def after(self, part):
-        """State after a part of a period from state, input at its start and at its end."""
+        """Return the state after part of a period from the state and the inputs at both ends of this part."""
         n = len(self.B)
         system = np.zeros((n + 2, n + 2))
         system[:n, :n], system[:n, n], system[n, n + 1] = self.A * self.T, self.B * self.T, 1.0
@@ -53,18 +53,18 @@ class Plant:
         return full[:, :n], full[:, n] - full[:, n + 1], full[:, n + 1]
 
     def rows(self, part):
-        """Position and velocity there, as rows for (state, input at start, input at end)."""
+        """Return output rows of position and velocity for (state, input at start, input at end)."""
         state, start, end = self.after(part)
         position = np.array([*(self.C @ state), self.C @ start, self.C @ end])
         rate = self.C @ self.A
         velocity = np.array([*(rate @ state), rate @ start, rate @ end])
-        through = self.C @ self.B  # 0 unless G has a relative degree of 1
+        through = self.C @ self.B
         velocity[-2] += through * (1.0 - part)
         velocity[-1] += through * part
         return position, velocity
 
     def uniform(self, position, velocity):
-        """State of a uniform motion: input `position` now, which grows by `velocity` a period."""
+        """Return the state in uniform motion: input `position` now, with `velocity` per period."""
         closed = np.eye(len(self.B)) - self.state
         both = self.start + self.end
         ahead = both if self.hold == "zoh" else self.end
@@ -73,7 +73,7 @@ class Plant:
 
 
 def free(kind, seed, seconds=60.0):
-    """Command and actual position [m] as the position sensor sees it, of the multisine from rest."""
+    """Return command and position reading [m] of the multisine, starting from rest."""
     rig, rng = kind.rig, np.random.default_rng(seed)
     T = rig["control_period"]
     one = multisine(T, rms=kind.amplitude, seed=int(rng.integers(1 << 30)))
@@ -86,10 +86,10 @@ def _total_delay(rig):
 
 
 def _position(plant, command, lag):
-    """Response at the ticks less `lag` ticks; the command stood still before."""
+    """Return the response at the ticks minus `lag` ticks; the command was constant before the start."""
     history = int(np.ceil(lag)) + plant.latency + 3
     c = np.concatenate([np.full(history, command[0]), command])
-    # Input at the ends of interval `latency` of `c` and those after it.
+    # Inputs at the ends of interval `latency` of `c` and of the following intervals.
     end = c[1 : len(c) - plant.latency]
     start = end if plant.hold == "zoh" else c[: len(c) - 1 - plant.latency]
     poles, vectors = np.linalg.eig(plant.state)
@@ -107,10 +107,11 @@ def _position(plant, command, lag):
 
 
 def touches(kind, speeds, indices, phases, rng, seconds=0.42, lead=0.05, damping=0.35, noise=True):
-    """Per-tick signals of touches, each (ticks, lanes).
+    """Return the signals of contacts at every tick, each (ticks, lanes).
 
-    The compensation under which they run is a filtered force plus what damps the numerical model's motion in
-    contact: whatever keeps the rebound small enough; the estimates never see it."""
+    The compensation during the contacts is a filtered force with additional damping of the numerical model,
+    which limits the rebound. The estimators do not use it.
+    """
     rig, T, mass = kind.rig, kind.rig["control_period"], kind.mass
     plant, law = Plant(rig), Law(kind.contact, rig.get("contact_plane", 0.0))
     sensor, lanes = rig["force_sensor"], len(speeds)
@@ -127,7 +128,7 @@ def touches(kind, speeds, indices, phases, rng, seconds=0.42, lead=0.05, damping
     first = plant.latency + 2
 
     def ends(k):
-        """The input at both ends of interval k (of the rows of `c`)."""
+        """Return the input at both ends of interval k of the rows of `c`."""
         end = c[k + 1 - plant.latency]
         return (end if plant.hold == "zoh" else c[k - plant.latency]), end
 
@@ -202,7 +203,7 @@ def touches(kind, speeds, indices, phases, rng, seconds=0.42, lead=0.05, damping
 
 
 def sense(force, sensor):
-    """Bias, quantum, dead zone, range, in that order (noise is in `force`)."""
+    """Apply bias, quantisation, dead zone and range, in this order; noise is already in `force`."""
     force = _rounded(force + sensor.get("bias", 0.0), sensor.get("quantum", 0.0))
     force = np.sign(force) * np.maximum(0.0, np.abs(force) - sensor.get("dead_zone", 0.0))
     limit = sensor.get("range", np.inf)
@@ -214,7 +215,7 @@ def _rounded(value, quantum):
 
 
 def _coloured(rng, shape, std, pole):
-    """Noise of that standard deviation along axis 0, white or of one pole."""
+    """Return noise of this standard deviation along axis 0: white, or filtered by one pole."""
     white = rng.standard_normal(shape)
     if pole == 0.0:
         return std * white
@@ -224,7 +225,7 @@ def _coloured(rng, shape, std, pole):
 
 
 def campaign(name, seed, speeds=SPEEDS, seconds=60.0, rest=5.0, press=False) -> Campaign:
-    """A day on a rig of that kind: rest, free motion, touches, where asked a press."""
+    """Return a campaign of this kind: rest, free motion, contacts, and a press run if requested."""
     kind = KINDS[name]
     rng = np.random.default_rng([seed, len(name)])
     runs = []
@@ -256,7 +257,7 @@ def _rest_run(kind, rng, seconds):
 def _free_run(kind, rng, seconds):
     command, actual = free(kind, int(rng.integers(1 << 30)), seconds)
     rig = kind.rig
-    offset = -0.05  # clear of the mechanism
+    offset = -0.05  # m, out of contact
     force = _coloured(rng, len(command), rig["force_sensor"]["noise_std"], kind.colour)
     force = sense(force, rig["force_sensor"])
     run = _run(kind, "free", command + offset, _measured(kind, rng, actual + offset), force)
@@ -293,7 +294,7 @@ def _press_run(kind, rng, seconds=30.0, depth=0.0008, rms=5e-5):
     sensor = rig["force_sensor"]
     actual = _position(plant, command, _total_delay(rig) / T)
     lag = (rig["simulator"].get("delay", 0.0) + sensor.get("delay", 0.0)) / T
-    # Dense enough for its own velocity: the press never leaves the contact.
+    # The time step limits the press velocity, so that the press never leaves the contact.
     near = 1e-3
     law = Law(kind.contact, rig.get("contact_plane", 0.0))
 
@@ -307,7 +308,7 @@ def _press_run(kind, rng, seconds=30.0, depth=0.0008, rms=5e-5):
 
 
 def _lagged(force_at, lag, time_constant):
-    """A force at the ticks, less `lag` of them, through a sensor's first-order lag [ticks]."""
+    """Return the force after the sensor's first-order lag [ticks], at the ticks minus `lag` ticks."""
     if time_constant == 0.0:
         return force_at(lag)
     drive = sum(
@@ -331,7 +332,7 @@ def _run(kind, what, command, measured, force):
 
 
 def _lose(kind, run, rng):
-    """Rows lost here and there, and a block of them; a touch keeps its rebuilt command, as readers do."""
+    """Remove single rows and a block of rows; contacts keep their restored command, as in log readers."""
     rows = len(run.tick)
     valid = rng.uniform(size=rows) >= kind.lost
     valid[:3] = True

@@ -1,9 +1,8 @@
-"""A registry of mechanisms and gains that covers every branch of the loop, and what runs them.
+"""Registry of mechanisms and gains that cover every branch of the simulation loop, and functions to run them.
 
-Cases whose compiled loop has the same form share one program, as lanes of one batch (`batches`): so each case
-also tests that optional parts of the loop are inert where a lane's numbers say so, and that lanes do not
-touch one another. `oracle_contacts` runs the same case through the independent oracle, with the rig's own
-(plain Python) compensator.
+Cases whose compiled loop has the same form share one program, as lanes of one batch (`batches`). So each case
+also tests that unused optional parts of the loop have no effect, and that lanes are independent.
+`oracle_contacts` runs the same case in the independent oracle with the Python compensator of the rig.
 """
 
 import functools
@@ -36,7 +35,7 @@ from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 
 class Case(NamedTuple):
-    """A mechanism (as a parsed file), a compensator, gains that differ from their nominal values."""
+    """Mechanism (parsed file), compensator, and gains that differ from their nominal values."""
 
     mechanism: dict[str, Any]
     compensator: str = "none"
@@ -44,7 +43,7 @@ class Case(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Cases in one program: their names in the order of the lanes, loop, gains and scenarios."""
+    """Cases that share one program: names in the order of the lanes, loop, gains and scenarios."""
 
     names: tuple[str, ...]
     loop: Loop
@@ -52,17 +51,17 @@ class Batch(NamedTuple):
     scenario: Scenario
 
     def run(self) -> Metrics:
-        """Metrics (slots, lanes) as NumPy arrays."""
+        """Return the metrics (slots, lanes) as NumPy arrays."""
         return jax.tree.map(np.asarray, run_rollout(self.loop, self.gains, self.scenario))
 
 
 def build_batch(cases: Mapping[str, Case]) -> Batch:
-    """One batch of cases whose loops have the same form."""
+    """Return one batch of cases whose loops have the same form."""
     compensator = next(iter(cases.values())).compensator
     mechanisms = {name: validated(case.mechanism) for name, case in cases.items()}
     scenario = join(build_scenarios(m) for m in mechanisms.values())
     gains = [nominal_gains(m, compensator, **cases[name].gains) for name, m in mechanisms.items()]
-    # The delay line of the controller has to hold what any lane's gains look back.
+    # The delay line of the controller must cover the delays of every lane.
     longest = max(mechanisms.values(), key=force_delay)
     return Batch(
         tuple(cases),
@@ -73,7 +72,7 @@ def build_batch(cases: Mapping[str, Case]) -> Batch:
 
 
 def form(case: Case) -> tuple[Any, ...]:
-    """What the form of a compiled loop depends on: cases of one form can be lanes of one batch."""
+    """Return the properties that determine the compiled loop; cases with equal form may share a batch."""
     parsed = validated(case.mechanism)
     contact, rig = parsed.contact, parsed.rig
     simulator = rig.simulator.model, len(rig.simulator.denominator or ())
@@ -87,11 +86,11 @@ def form(case: Case) -> tuple[Any, ...]:
 
 @functools.cache
 def batches() -> dict[str, Batch]:
-    """The batch in which each case of the registry runs, by the case's name."""
+    """Return the batch of each case of the registry, by name of the case."""
     groups: dict[Any, dict[str, Case]] = {}
     for name, case in CASES.items():
         groups.setdefault(form(case), {})[name] = case
-    # All as wide as the widest: what is computed before the loop is then compiled but once.
+    # All batches have the same number of lanes, so that the computations before the loop are compiled once.
     width = max(len(group) for group in groups.values())
     for group in groups.values():
         first = next(iter(group.values()))
@@ -106,7 +105,7 @@ def _metrics(names: tuple[str, ...]) -> Metrics:
 
 
 def loop_contacts(name: str) -> list[dict[str, float]]:
-    """What the loop says of each contact of a case of the registry, by the fields of `Metrics`."""
+    """Return the simulated metrics of each contact of a case, by field of `Metrics`."""
     names = batches()[name].names
     metrics, lane = _metrics(names), names.index(name)
     contacts = CASES[name].mechanism["approach"]["contacts"]
@@ -115,12 +114,12 @@ def loop_contacts(name: str) -> list[dict[str, float]]:
 
 @functools.cache
 def oracle_contacts(name: str) -> list[dict[str, Any]]:
-    """What the oracle says of each contact of a case of the registry."""
+    """Return the oracle's results for each contact of a case."""
     return run_oracle(CASES[name])
 
 
 def run_oracle(case: Case, **options: Any) -> list[dict[str, Any]]:
-    """The oracle's contacts of a case, under the rig's own compensator."""
+    """Return the oracle's contacts of a case under the compensator of the rig."""
     parsed = validated(case.mechanism)
     gains = nominal_gains(parsed, case.compensator, **case.gains)
     compensator = RIG_COMPENSATORS[case.compensator](
@@ -150,7 +149,7 @@ TRANSFER = {"model": "transfer_function", "numerator": [0.004, 1.0], "denominato
 RATTLING = {"model": "second_order", "natural_frequency": 25.0, "damping_ratio": 0.8, "delay": 0.0021}
 LATE_EULER = {"command_latency": 1, "integrator": "explicit_euler"}
 ALL_ZOH = {"command_hold": "zoh", "integrator": "zoh"}
-# The paper's compensation with only its phase lead left.
+# Response-error compensation reduced to its phase lead.
 LEAD_ALONE = {"response_error": 0.0, "response_error_damping": 0.0}
 LAGGED = {"force_sensor": {"time_constant": 0.0023}}
 
@@ -185,7 +184,7 @@ CASES: dict[str, Case] = {
     "ideal with zoh hold": Case(
         mechanism({"stiffness": [STIFFNESS, 3e5]}, IDEAL, contacts=2, command_hold="zoh", command_latency=1)
     ),
-    # The other laws, under the paper's compensation too.
+    # Other contact laws, with response-error compensation too.
     "hertz": Case(mechanism(HERTZ, FIRST_ORDER, contacts=2, **ALL_ZOH), "response_error"),
     "hunt-crossley": Case(
         mechanism({**HERTZ, "damping": [20.0]}, FIRST_ORDER, **ALL_ZOH),
@@ -218,7 +217,7 @@ CASES: dict[str, Case] = {
     ),
     "preloaded": Case(mechanism(PRELOADED, contacts=2), "phase_lead"),
     "more friction than preload": Case(mechanism({**PRELOADED, "preload": 1.0}), "phase_lead"),
-    # The paper's compensation, with the sensors' faults and the simulator's limit.
+    # Response-error compensation with sensor errors and the simulator's limits.
     "response error": Case(mechanism(LIST, contacts=3), "response_error"),
     "response error, gains off nominal": Case(
         mechanism({"damping": [300.0]}, contacts=2),

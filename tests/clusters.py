@@ -1,4 +1,4 @@
-"""A dask.distributed cluster on this machine, as a user starts it: a scheduler and plain workers."""
+"""Local dask.distributed cluster: a scheduler and workers started as by a user."""
 
 import json
 import os
@@ -18,7 +18,7 @@ ROOT = Path(__file__).parent.parent
 
 
 class Cluster:
-    """A scheduler and plain workers, each a process of its own, as a user starts them."""
+    """Scheduler and workers, each a separate process."""
 
     def __init__(self, folder):
         self.file, self.processes = folder / "scheduler.json", []
@@ -28,7 +28,7 @@ class Cluster:
         self.address = json.loads(self.file.read_text())["address"]
 
     def _start(self, kind, *arguments, **environment):
-        """With nothing in the environment but where the packages are."""
+        """Start a process with an environment that contains only the package path."""
         ours = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "NPROC")}
         path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
         command = [sys.executable, "-m", "dask", kind, "--scheduler-file", str(self.file), "--no-dashboard"]
@@ -48,13 +48,13 @@ class Cluster:
         return self._start("worker", *arguments, **environment)
 
     def kill(self, process):
-        """The worker and the process that watches over it."""
+        """Kill the worker and its supervising process."""
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
 
 
 def killed_meanwhile(monkeypatch, holder, cluster, worker, name="on_workers"):
-    """The `worker` is killed once the first piece that the holder's function hands to workers is done."""
+    """Kill `worker` as soon as the first work unit that the wrapped function sends to workers is finished."""
     handed = getattr(holder, name)
 
     def killing(*asked):
@@ -79,7 +79,7 @@ def started(folder):
 
 
 def on_cluster(address):
-    """Parts of a sweep computed by the workers of the scheduler at this address."""
+    """Compute chunks of a sweep on the workers of the scheduler at this address."""
 
     def run(sweep, parts):
         with connect_workers(address) as workers:
@@ -89,7 +89,7 @@ def on_cluster(address):
 
 
 def awaited(seconds):
-    """A piece that takes so long: from when to when."""
+    """Work unit of the given duration; returns its start and end time."""
     begun = time.time()
     time.sleep(seconds)
     return begun, time.time()

@@ -1,10 +1,9 @@
-"""How the tests' programs are compiled: quickly, but where a module is about the programs that users run.
+"""Compiler options of the tests: fast compilation, except in modules that test the programs of users.
 
-A test's program runs once or twice: most of its time is the compiler's. With less optimisation that is half,
-for the same numbers but for their last bits, which are held to the same tolerances. Modules marked
-`users_options`, and the studies and benchmarks that are no part of the everyday suite, have the options of
-`jaxhil.simulation.jax_environment`: where the last bits are what is tested, and where jax is held against the
-rig's own controller.
+A test's program runs once or twice, so most of its time is compilation. Reduced optimisation halves this time
+and changes only the last bits of results, which must satisfy the same tolerances. Modules marked
+`users_options`, slow tests and benchmarks use the options of `jaxhil.simulation.jax_environment`: they test
+the last bits, or compare jax with the rig's controller.
 """
 
 from pathlib import Path
@@ -13,7 +12,7 @@ import jax
 
 from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, supported_options
 
-# Of one program, given to `jax.jit`: more than can be switched for all that a module compiles.
+# Options passed to `jax.jit` for a single program; most cannot be set for a whole module.
 QUICK = supported_options(SINGLE_RUN_OPTIONS)
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
@@ -23,7 +22,7 @@ _made: list[str] = []
 
 
 def compile_quickly(quick: bool) -> None:
-    """Whether what is compiled from here on is; no program made otherwise is used again."""
+    """Enable or disable fast compilation from now on; programs compiled before are not reused."""
     global _quick
     if quick != _quick:
         jax.clear_caches()
@@ -32,7 +31,7 @@ def compile_quickly(quick: bool) -> None:
 
 
 def is_quick() -> bool:
-    """Whether programs compiled now are compiled quickly."""
+    """Return whether programs are compiled with reduced optimisation."""
     return _quick
 
 
@@ -45,12 +44,12 @@ jax.monitoring.register_event_duration_secs_listener(_note)
 
 
 def programs_of(function: str) -> int:
-    """How many programs of a jitted function were made in this process, compiled or from the cache."""
+    """Return how many programs of a jitted function this process has compiled or read from the cache."""
     return sum(name in (function, f"jit({function})") for name in _made)
 
 
 def forget_oldest(folder: Path, most: int) -> None:
-    """Leave of the kept programs those used last, in all so many bytes."""
+    """Delete the least recently used cached programs until the given size in bytes is reached."""
     files = [(file.stat(), file) for file in folder.glob("*") if file.is_file()]
     files.sort(key=lambda entry: max(entry[0].st_atime, entry[0].st_mtime), reverse=True)
     total = 0

@@ -1,5 +1,7 @@
-"""What every test runs under: float64, strict promotion, two host devices, checked shapes, quick compilation.
-The command line, as tests call it."""
+"""Environment of every test: float64, strict dtype promotion, two host devices, shape checks.
+
+The fixture `jaxhil` calls the command line.
+"""
 
 import json
 import os
@@ -14,7 +16,7 @@ from jaxhil.simulation.jax_environment import (
     prepare_jax,
 )
 
-# Two devices wherever the tests run, and otherwise what users have.
+# Two devices on every machine; otherwise the settings of users.
 os.environ["XLA_FLAGS"] = build_xla_flags(
     os.environ.get("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
 )
@@ -26,7 +28,7 @@ import jaxtyping
 import pytest
 from compiling import compile_quickly, forget_oldest
 
-# Compiled programs are kept: for the next run, for other workers, for kernels and commands that tests start.
+# Compiled programs are cached for the next run, other workers, notebook kernels and child processes.
 FOLDER = "tests"
 if (_cache := cache_folder()) is not None and _cache.name != FOLDER:
     os.environ[CACHE_VARIABLE] = str(_cache / FOLDER)
@@ -35,10 +37,10 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Shapes are checked in the modules that compute with arrays; every day, in their own tests alone: checked
-# programs take a quarter longer to trace.
+# Shapes are checked in modules that compute with arrays, but every day only in their own tests: tracing with
+# checks takes a quarter longer.
 PACKAGES = ("compensators", "contact", "simulation", "sixdof")
-# What a caller gives them, these check themselves.
+# These functions check the caller's arguments themselves.
 FRONT_DOOR = ("gain_choice", "gain_file", "jacobian", "registration", "run")
 CHECKED = [
     f"{package}.{path.stem}"
@@ -47,14 +49,14 @@ CHECKED = [
     if path.stem not in FRONT_DOOR
 ]
 OWN_TESTS = {"test_compensators", "test_contacts", *(f"test_{name.split('.')[1]}" for name in CHECKED)}
-OWN_TESTS -= {"test_rollout"}  # the longest; others run the same modules
+OWN_TESTS -= {"test_rollout"}  # the longest; other tests check the shapes of the same modules
 jaxtyping.install_import_hook([f"jaxhil.{name}" for name in CHECKED], "beartype.beartype")
 
-# A shared machine has no deadlines to keep, and a test that fails must fail again.
+# Time limits are useless on a shared machine, and a failing test must fail again.
 hypothesis.settings.register_profile("jaxhil", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("jaxhil")
 
-KEPT = 1_000_000_000  # bytes of programs
+KEPT = 1_000_000_000  # bytes of cached programs
 LONG = ("test_notebooks", "test_rollout")
 
 
@@ -64,7 +66,7 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(items):
-    """The longest first, so that workers end together; then modules of a kind, which share programs."""
+    """Order the tests: longest modules first, so that workers end together; then similar modules."""
     items.sort(
         key=lambda item: (item.path.stem not in LONG, item.get_closest_marker("users_options") is None)
     )
@@ -72,7 +74,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="module", autouse=True)
 def _laws_of_the_package_alone():
-    """What a module registers is gone when it is done."""
+    """Remove user-registered laws at the end of each module."""
     import jaxhil.rig
     from jaxhil.contact.laws import CONTACT_LAWS
     from jaxhil.laws.compensators import COMPENSATORS
@@ -87,7 +89,7 @@ def _laws_of_the_package_alone():
 
 @pytest.fixture(scope="session", autouse=True)
 def _traced():
-    """What is tested is traced, its shapes checked, and not run as a process before compiled it."""
+    """Trace programs with shape checks instead of loading programs cached by an earlier process."""
     from jaxhil.simulation import cached_programs
 
     cached_programs.load_or_compile = lambda identity, build, arguments, folder: build()
@@ -107,7 +109,7 @@ def _compiled(request):
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    """Chromium without a screen; skips where there is none."""
+    """Return headless Chromium; skip the test if Chromium is not installed."""
     from browser import CHROMIUM, Browser
 
     if CHROMIUM is None:
@@ -118,7 +120,7 @@ def browser(tmp_path_factory):
 
 
 class Ran(NamedTuple):
-    """Exit code, standard output, standard error."""
+    """Exit code, standard output and standard error of a command."""
 
     code: int
     out: str
@@ -131,7 +133,7 @@ class Ran(NamedTuple):
 
 @pytest.fixture
 def jaxhil(capsys):
-    """`jaxhil ARGUMENTS` in this process."""
+    """Return a function that runs `jaxhil ARGUMENTS` in this process."""
     # After the import hook.
     from tuning.__main__ import main
 
@@ -148,7 +150,7 @@ def jaxhil(capsys):
 
 @pytest.fixture
 def written(tmp_path):
-    """Writes bytes or text to a mechanism file and returns its path."""
+    """Return a function that writes bytes or text to a mechanism file and returns the path."""
 
     def write(content):
         path = tmp_path / "rig.toml"

@@ -1,6 +1,6 @@
-"""The limit T -> 0 by other means: closed forms, ordinary and delay differential equations with SciPy.
+"""Limit T -> 0 by independent methods: closed forms, and ordinary and delay differential equations in SciPy.
 
-Positions, delays and time in SI units; `law(d, d')` is a contact force [N] at penetration d > 0 [m].
+Positions, delays and time are in SI units; `law(d, d')` is the contact force [N] at penetration d > 0 [m].
 """
 
 import math
@@ -15,7 +15,7 @@ TIGHT = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-15}
 
 
 def delayed_restitution(phase: float) -> float:
-    """e of x'' = -omega^2 x(t - tau), phase = omega tau, by its series (model.md section 6, item 1)."""
+    """Return e of x'' = -omega^2 x(t - tau), phase = omega tau, by its series (model.md 6, item 1)."""
 
     def series(time, derivative):
         terms = range(min(40, int(time / phase) + 1))
@@ -31,22 +31,22 @@ def delayed_restitution(phase: float) -> float:
 
 
 def separates_at_no_force(ratio: float) -> float:
-    """e of Kelvin-Voigt contact that ends at F = 0, xi < 1 (item 3)."""
+    """Return e of Kelvin-Voigt contact that ends at F = 0, xi < 1 (model.md section 6, item 3)."""
     root = math.sqrt(1 - ratio**2)
     return math.exp(-ratio / root * math.atan2(2 * ratio * root, 2 * ratio**2 - 1))
 
 
 def separates_at_surface(ratio: float) -> float:
-    """e of Kelvin-Voigt contact that ends at d = 0, xi < 1 (item 3)."""
+    """Return e of Kelvin-Voigt contact that ends at d = 0, xi < 1 (model.md section 6, item 3)."""
     return math.exp(-math.pi * ratio / math.sqrt(1 - ratio**2))
 
 
 def contact(
     mass: float, velocity: float, law: Callable[[float, float], float], depths: tuple[float, ...] = ()
 ) -> tuple[float, float]:
-    """(restitution, peak force [N]) of M d'' = -max(0, law) until the force or the penetration ends.
+    """Return (restitution, peak force [N]) of M d'' = -max(0, law) until force or penetration is zero.
 
-    `depths`: where the law's formula changes; the integration is cut there.
+    The integration is divided at `depths`, where the formula of the law changes.
     """
 
     def crossing(level):
@@ -76,7 +76,7 @@ def contact(
         state, time = found.y[:, -1], found.t[-1]
         if found.t_events[0].size or found.t_events[1].size:
             return abs(state[1]) / velocity, peak
-        # Step off the event, or it would be met again.
+        # Step off the event; otherwise it is detected again.
         time += 1e-9
         state = state + 1e-9 * np.array([state[1], -law(*state) / mass])
 
@@ -88,7 +88,7 @@ def delayed_contact(
     simulator: tuple[float, float, float],
     force_delay: float,
 ) -> float:
-    """Restitution of linear contact behind a second-order motion simulator, by the method of steps.
+    """Return the restitution of linear contact with a second-order motion simulator, by the method of steps.
 
     M x'' = -k max(0, x_a(t - tau_f)), x_a = G x(t - tau_p); `simulator`: angular frequency [rad/s], damping
     ratio, tau_p. The approach is uniform, and both delays are positive.
@@ -100,7 +100,7 @@ def delayed_contact(
 
     def past(time, component):
         if time <= 0 or not pieces:
-            # x = v t, and x_a follows it in its steady state.
+            # x = v t, and x_a is in steady state.
             return velocity * (time - (lag if component == 2 else 0.0))
         index = min(int(time / step), len(pieces) - 1)
         return pieces[index][1](time)[component]

@@ -1,7 +1,8 @@
-"""Mechanisms drawn over the whole legal range, as parsed files, and what the oracle says of them.
+"""Random mechanisms over the whole allowed range, and their results in the oracle.
 
-What shapes a compiled program goes by the number of the form: contact law, motion simulator, hold, latency,
-integrator, the speed of its poles and of the sensor's lag. Mechanisms of one form are lanes of one batch.
+The properties that determine a compiled program depend on the index of the form: contact law, motion
+simulator, hold, latency, integrator, speed of the poles and of the sensor's lag. Mechanisms of one form are
+lanes of one batch.
 """
 
 import math
@@ -13,20 +14,20 @@ from oracle import simulate
 LAWS = ("linear", "kelvin_voigt", "hunt_crossley", "piecewise_linear", "hardening", "depth_damped")
 LAWS += ("elastoplastic", "preloaded")
 MODELS = ("ideal", "first_order", "second_order", "third_order", "transfer_function")
-POLES = ((0.02, 1.0), (1.0, 8.0), (8.0, 63.0))  # of the fastest pole [rad per control period]
-LAGS = ((), (0.3, 20.0), (1e-7, 0.3))  # of the force sensor's lag [control periods]
+POLES = ((0.02, 1.0), (1.0, 8.0), (8.0, 63.0))  # rad per control period, range of the fastest pole
+LAGS = ((), (0.3, 20.0), (1e-7, 0.3))  # control periods, range of the force sensor's lag
 INTEGRATORS = ("semi_implicit_euler", "zoh", "explicit_euler")
 PERIODS, MASSES, STIFFNESSES = (1e-4, 2e-2), (0.1, 1e6), (1.0, 1e9)
-FREQUENCIES = 5e-3, 2.0  # of the contact [rad per control period]
+FREQUENCIES = 5e-3, 2.0  # rad per control period, range of the contact frequency
 LONGEST_DELAY = 0.1  # s
-NUDGE = 1e-12  # relative, of an input: what moves a figure by more than the bar is not compared
+NUDGE = 1e-12  # relative change of an input, to exclude ill-conditioned cases
 BAR = 1e-6
 
 FIGURES = ("restitution", "peak_force", "duration", "work_in", "work_out")
 
 
 class Form:
-    """What mechanisms that share a program have in common."""
+    """Common properties of mechanisms that share a program."""
 
     def __init__(self, number: int) -> None:
         self.law, self.model = LAWS[number % 8], MODELS[number % 5]
@@ -34,11 +35,11 @@ class Form:
         self.latency, self.integrator = number // 4 % 2, INTEGRATORS[number % 3]
         self.two_sided, self.tension = number % 7 == 3, number % 16 == 1
         self.hold = "zoh" if number % 4 < 2 else "linear"
-        # A damper sees no velocity of an ideal simulator whose command is held.
+        # The velocity of an ideal simulator is zero while the command is held, so a damper has no effect.
         self.damped = self.model != "ideal" or self.hold == "linear"
 
     def draw(self, rng: np.random.Generator, longest: int) -> dict[str, Any]:
-        """A mechanism of this form whose contact takes about `longest` ticks at most."""
+        """Draw a mechanism of this form whose contact takes at most about `longest` ticks."""
 
         def spread(low: float, high: float) -> float:
             return float(low * (high / low) ** rng.random())
@@ -135,7 +136,7 @@ class Form:
 
     @staticmethod
     def _delay(rng, spread, period, frequency) -> float:
-        """None, whole periods, any, or a tiny one; as a rule not much of a contact."""
+        """Draw a delay: none, whole periods, arbitrary or tiny; usually short compared with the contact."""
         longest = min(LONGEST_DELAY, 0.5 / frequency)
         choice = rng.integers(5)
         if choice == 0:
@@ -146,8 +147,11 @@ class Form:
 
 
 def oracle_figures(parsed: dict[str, Any]) -> dict[str, float] | None:
-    """What the oracle says of the first contact; None if it is not over, or if its own figures move by more
-    than the bar when an input moves by `NUDGE`."""
+    """Return the oracle's metrics of the first contact.
+
+    Returns None if the contact does not end, or if a change of an input by `NUDGE` changes a metric by more
+    than the tolerance.
+    """
     found = simulate(parsed)[0]
     if found["status"] != "over":
         return None
@@ -164,7 +168,7 @@ def oracle_figures(parsed: dict[str, Any]) -> dict[str, float] | None:
 
 
 def differences(found: dict[str, Any], expected: dict[str, Any]) -> dict[str, float]:
-    """By how much figures differ, relative to their scale."""
+    """Return the differences of metrics relative to their scale."""
     scales = {
         "restitution": max(1.0, expected["restitution"]),
         "peak_force": expected["peak_force"],

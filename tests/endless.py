@@ -1,7 +1,7 @@
-"""A contact that never ends: what the loop does to a spring and damper for as long as one likes.
+"""Contact that never ends: growth or decay of the oscillation of the loop.
 
-With both surfaces at x = 0 and tension allowed the contact never lets go, and its oscillation grows or decays
-as the dominant root of the loop's characteristic equation says.
+With both surfaces at x = 0 and tension allowed, the contact is never released. Its oscillation grows or
+decays as the dominant root of the characteristic equation of the loop.
 """
 
 import math
@@ -29,7 +29,7 @@ CHUNK = 256  # ticks
 def persistent(
     parsed: Mechanism, compensator: str, seconds: float, gains: Mapping[str, Any], **leaves: Any
 ) -> Tick:
-    """Record of an endless contact; `leaves` as for `spread`."""
+    """Return the record of an endless contact; `leaves` as for `spread`."""
     lanes = next(iter(leaves.values())).shape[-1]
     scenario = spread(parsed, lanes, clearance=np.zeros(lanes), **leaves)
     loop = build_loop(parsed, compensator, scenario)
@@ -50,7 +50,7 @@ def _begin(loop, gains, scenario):
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def _go_on(loop, gains, rig, run):
-    """One chunk: longer ones take the more time a tick, the more they record."""
+    """Simulate one chunk; longer chunks take more time per tick."""
 
     def body(run, _):
         return run_segment(loop, rig, gains, run, record=True)
@@ -66,9 +66,9 @@ def without_period(
     periods: tuple[float, float] = (5e-4, 2.5e-4),
     **leaves: Any,
 ) -> np.ndarray:
-    """Growth in the limit T -> 0 of a loop whose error is of first order in T, from two periods.
+    """Extrapolate the growth to T -> 0 from two periods, for a loop whose error is of first order in T.
 
-    The second is half the first, `lead_filter` half the period, the simulator ideal.
+    The second period is half the first; `lead_filter` is half the period, and the simulator is ideal.
     """
     lanes = next(iter(leaves.values())).shape[-1]
     period = np.repeat(periods, lanes)
@@ -80,7 +80,7 @@ def without_period(
 
 
 def growth(ticks: Tick) -> np.ndarray:
-    """Logarithm of the ratio of successive extrema of x_d, from the later half of a record."""
+    """Return the logarithm of the ratio of successive extrema of x_d in the second half of a record."""
     rates = []
     for x in np.abs(ticks.signals.position_desired).T:
         top = np.flatnonzero((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:])) + 1
@@ -92,12 +92,12 @@ def growth(ticks: Tick) -> np.ndarray:
 
 
 def spring(simulator: Mapping[str, Any] = IDEAL, period: float = 5e-4) -> Mechanism:
-    """An undamped contact of 3 Hz that never ends, behind a simulator, without delays."""
+    """Return an endless undamped contact of 3 Hz with a motion simulator without delays."""
     return validated(mechanism({"stiffness": [STIFFNESS], "tension": True}, simulator, 0.0, period=period))
 
 
 def characteristic_root(equation: Callable[[complex], complex], start: complex = 1j * OMEGA) -> complex:
-    """The root [1/s] of a loop's characteristic equation next to `start_rollout`, by the secant method."""
+    """Return the root [1/s] of the characteristic equation near `start_rollout`, by the secant method."""
     before, root = start * (1 + 1e-3), start
     value_before = equation(before)
     for _ in range(50):
@@ -109,5 +109,5 @@ def characteristic_root(equation: Callable[[complex], complex], start: complex =
 
 
 def decay(root: complex) -> float:
-    """Logarithm of the ratio of successive extrema of an oscillation of this root."""
+    """Return the logarithm of the ratio of successive extrema of an oscillation with this root."""
     return pi * root.real / abs(root.imag)

@@ -1,13 +1,12 @@
-"""A generated family of mechanisms, spread over the range that rigs and docking mechanisms are met in.
+"""Generated mechanisms that cover the range of rigs and docking mechanisms in practice.
 
-Each member is the text of a mechanism file, made of one point of a scrambled Sobol sequence: contact law,
+Each member is the text of a mechanism file, made from one point of a scrambled Sobol sequence: contact law,
 contact frequency (log-uniform), damping ratio (0 for an eighth of them), delays, motion simulator, mass and
 approach speed. A shorter family is the beginning of a longer one. `python -m tests.family FOLDER` writes it.
-
-The contact frequency f [Hz] is that of the undamped contact, which lasts 1/(2 f) whatever its law: for a
-linear one sqrt(k/M)/(2 pi). The damping ratio xi is that of a linear contact of that frequency,
-b = 2 xi M (2 pi f); for Hunt-Crossley chi = pi xi / v, which loses as much energy to first order in xi (e is
-exp(-pi xi) there, 1 - chi v here).
+The contact frequency f [Hz] is that of the undamped contact, which lasts 1/(2 f) for every contact law; for a
+linear contact f = sqrt(k/M)/(2 pi). The damping ratio xi is that of a linear contact of this frequency, b = 2
+xi M (2 pi f). For Hunt-Crossley, chi = pi xi / v, which has the same loss to first order in xi (e is exp(-pi
+xi) for the linear contact, 1 - chi v here).
 """
 
 import argparse
@@ -29,10 +28,13 @@ UNDAMPED = 1 / 8  # share of members with damping ratio 0
 
 
 class Ranges(NamedTuple):
-    """Low and high end of what is drawn, all uniform but the frequency: contact frequency [Hz], damping ratio
-    [1], mass [kg], approach speed [m/s]; force delay [s]; the motion simulator's natural frequency [Hz],
-    damping ratio [1] and transport delay [s]; of layered contact the ratio of the slopes and the depth of
-    the first layer as a share of the depth v/sqrt(k_1/M) that it alone would be pressed to."""
+    """Lower and upper limits of the generated values, uniform except for the log-uniform frequency.
+
+    Contact frequency [Hz], damping ratio [1], mass [kg], approach speed [m/s]; force delay [s]; natural
+    frequency [Hz], damping ratio [1] and transport delay [s] of the motion simulator. For layered contact:
+    ratio of the slopes, and depth of the first layer relative to the depth v/sqrt(k_1/M) that the first layer
+    alone would reach.
+    """
 
     frequency: tuple[float, float] = 1.0, 8.0
     damping_ratio: tuple[float, float] = 0.0, 0.1
@@ -82,8 +84,8 @@ delay = {force_delay:.6g}
 
 
 def texts(number: int = NUMBER, seed: int = 0) -> dict[str, str]:
-    """Mechanism files by the mechanisms' names, such as ``03-hunt_crossley-1.7Hz``."""
-    # One column for each range, one for the law.
+    """Return mechanism files by the mechanisms' names, such as ``03-hunt_crossley-1.7Hz``."""
+    # One column for each range, and one for the contact law.
     sequence = qmc.Sobol(len(RANGES) + 1, rng=np.random.default_rng(seed))
     shares = sequence.random(1 << max(number - 1, 0).bit_length())[:number]
     made = [_member(index, row) for index, row in enumerate(shares)]
@@ -91,12 +93,12 @@ def texts(number: int = NUMBER, seed: int = 0) -> dict[str, str]:
 
 
 def family(number: int = NUMBER, seed: int = 0) -> list[Mechanism]:
-    """The mechanisms of `texts`, in their order."""
+    """Return the mechanisms of `texts` in the same order."""
     return [from_plain_data(tomllib.loads(text), name) for name, text in texts(number, seed).items()]
 
 
 def write(folder: str | Path, number: int = NUMBER, seed: int = 0) -> list[Path]:
-    """Write ``NAME.toml`` of every member into `folder`, made if need be."""
+    """Write ``NAME.toml`` of every member to `folder`; create the folder if necessary."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
@@ -129,9 +131,12 @@ def _kelvin_voigt(frequency: float, damping_ratio: float, drawn: dict[str, float
 
 
 def _piecewise_linear(frequency: float, damping_ratio: float, drawn: dict[str, float]) -> dict[str, str]:
-    """Two layers. The undamped contact passes the first in asin(s)/omega_1 and turns round
-    atan(sqrt(r) sqrt(1 - s^2)/s)/(sqrt(r) omega_1) later: s the share of `layer`, r the slopes' ratio,
-    omega_1^2 = k_1/M."""
+    """Return the parameters of a contact with two layers.
+
+    The undamped contact passes the first layer in asin(s)/omega_1 and turns round atan(sqrt(r) sqrt(1 -
+    s^2)/s)/(sqrt(r) omega_1) later, where s is the value of `layer`, r the ratio of the slopes, and omega_1^2
+    = k_1/M.
+    """
     mass, velocity, ratio, share = (drawn[key] for key in ("mass", "velocity", "slope_ratio", "layer"))
     root = math.sqrt(ratio)
     quarter = math.asin(share) + math.atan2(root * math.sqrt(1 - share**2), share) / root
@@ -145,8 +150,11 @@ def _piecewise_linear(frequency: float, damping_ratio: float, drawn: dict[str, f
 
 
 def _hunt_crossley(frequency: float, damping_ratio: float, drawn: dict[str, float]) -> dict[str, str]:
-    """The undamped contact with F = k d^n reaches the depth D, k D^(n+1) = (n + 1) M v^2 / 2, and lasts
-    2 D/v sqrt(pi) gamma(1 + 1/(n+1)) / gamma(1/2 + 1/(n+1)) (Hertz, n = 1.5: 2.94 D/v)."""
+    """Return the parameters of a Hunt-Crossley contact.
+
+    The undamped contact with F = k d^n reaches the depth D with k D^(n+1) = (n + 1) M v^2 / 2, and lasts 2
+    D/v sqrt(pi) gamma(1 + 1/(n+1)) / gamma(1/2 + 1/(n+1)) (Hertz, n = 1.5: 2.94 D/v).
+    """
     mass, velocity, order = drawn["mass"], drawn["velocity"], EXPONENT + 1
     shape = 2 * math.sqrt(math.pi) * math.gamma(1 + 1 / order) / math.gamma(0.5 + 1 / order)
     depth = velocity / (2 * frequency * shape)

@@ -1,8 +1,8 @@
-"""Ticks of a rig with faults injected, and the faults that each tick must raise: no more, no less.
+"""Ticks of a rig with injected faults, and the exact set of faults that each tick must raise.
 
-The motion is scripted: in and out of contact, measured position and force late, a noisy force sensor. Now
-and then something goes wrong for a while, and twenty ticks later the rig resets. What a tick must raise is
-worked out from what was injected, without the controller. `rows` have the layout of `c99_cases.ROW`.
+The motion is scripted: in and out of contact, measured position and force delayed, force sensor noisy. Each
+injected fault lasts for some ticks, and twenty ticks later the rig resets. The expected faults are derived
+from the injection, without the controller. `rows` have the layout of `c99_cases.ROW`.
 """
 
 import math
@@ -34,7 +34,7 @@ from jaxhil.rig.faults import (
 from jaxhil.rig.limits import LIMITS
 
 PERIOD = 1e-3
-CYCLE = 800  # ticks, of which the contact takes a quarter
+CYCLE = 800  # ticks; a quarter of each cycle is in contact
 HELD, MISSED, CUT = 3, 4, 3
 LIMITED: dict[str, float] = {
     "force_range": 1e4,
@@ -61,9 +61,9 @@ LIMITED: dict[str, float] = {
 }
 FORCE, DESIRED, VELOCITY, MEASURED, TIME, MODEL = 1, 2, 3, 4, 5, 7
 BETWEEN, UNTIL_RESET = 60, 20
-BEFORE = 60  # ticks of a contact's approach that a law needs to know the noise
+BEFORE = 60  # ticks of approach that a compensator needs to estimate the noise
 NOT_FINITE = (math.nan, math.inf, -math.inf)
-# Leads short enough that what is injected, and nothing else, takes a command to its limits.
+# The leads are so short that only injected faults take a command to its limits.
 GENTLE = {
     "multi_parameter_lead": {"force_rate_gain": 0.008},
     "position_lead": {"position_lead": 1e-3, "acceleration_lead": 1e-5},
@@ -71,11 +71,12 @@ GENTLE = {
 
 
 class FaultRun(NamedTuple):
-    """Ticks and what they must raise, (ticks,); `tripped` says on which ticks the latch must hold.
+    """Ticks and their expected faults, (ticks,).
 
-    `catching_up` are ticks after a reset on which the command, which had been led elsewhere, comes back
-    within the velocity limit, and says so; `entered` those of a contact in which, or shortly before which, a
-    reset fell, and a while after: a law with a status does not know such a contact, and may say so.
+    `tripped` marks ticks on which the controller must be tripped. `catching_up` marks ticks after a reset on
+    which the command returns within the velocity limit and may flag this. `entered` marks ticks of a contact
+    with a reset during or shortly before the contact, and the ticks after it: a compensator with a status may
+    report that it does not know this contact.
     """
 
     rows: np.ndarray
@@ -85,13 +86,13 @@ class FaultRun(NamedTuple):
     entered: np.ndarray
 
     def wrong(self, faults: np.ndarray, tripped: np.ndarray) -> np.ndarray:
-        """The ticks on which a controller raised, or held, something else."""
+        """Return the ticks whose raised faults or trip state differ from the expectation."""
         excused = np.where(self.catching_up, VELOCITY_LIMIT, 0) | np.where(self.entered, LAW_IN_DOUBT, 0)
         return np.nonzero(((faults ^ self.faults) & ~excused != 0) | (tripped != self.tripped))[0]
 
 
 def document(law: str) -> dict[str, Any]:
-    """A gain document of the law with the limits of these runs."""
+    """Return a gain document of the compensator with the limits of these runs."""
     made = gain_document(law, **GENTLE.get(law, {}))
     made["limits"] = {
         name: {"value": float(value), "unit": LIMITS[name].unit} for name, value in LIMITED.items()
@@ -100,14 +101,14 @@ def document(law: str) -> dict[str, Any]:
 
 
 def fault_run(ticks: int, seed: int, law: str) -> FaultRun:
-    """`ticks` ticks with a fault every `BETWEEN` of them; those of the force command for `none` alone."""
+    """Return `ticks` ticks with a fault every `BETWEEN` ticks; force command faults only for `none`."""
     rng = np.random.default_rng(seed)
     rows = _healthy(ticks, rng)
     faults = np.zeros(ticks, np.int64)
     tripped = np.zeros(ticks, bool)
     run = FaultRun(rows, faults, tripped, np.zeros(ticks, bool), np.zeros(ticks, bool))
     in_contact = _IN_CONTACT + (_OF_COMMAND if law == "none" else ())
-    # The first tick after a reset has no past: nothing is injected before all is settled.
+    # The first tick after a reset has no history, so nothing is injected before the transient has decayed.
     for begin in range(BETWEEN, ticks - BETWEEN, BETWEEN):
         window = rows[begin - 25 : begin + 25, MEASURED]
         special = ()
@@ -156,7 +157,7 @@ def _pick(rng: np.random.Generator, values: tuple[float, ...]) -> float:
 
 def _bad_reading(column: int, fault: int, values: tuple[float, ...]):
     def inject(run: FaultRun, begin: int, rng: np.random.Generator) -> int | None:
-        """Of several in a row each is flagged; one more than may be bridged trips."""
+        """Flag each of several consecutive bad readings; the first beyond the allowed number trips."""
         length = int(rng.integers(1, HELD + 6))
         run.rows[begin : begin + length, column] = [_pick(rng, values) for _ in range(length)]
         run.faults[begin : begin + min(length, HELD + 1)] |= fault
@@ -175,7 +176,7 @@ def _bad_model(column: int):
 
 
 def _late(run: FaultRun, begin: int, rng: np.random.Generator) -> None:
-    """The clock goes on as before: the next tick comes early after this one."""
+    """Delay one tick; the clock continues as before, so the next tick is early."""
     run.rows[begin, TIME] += PERIOD * rng.uniform(0.26, 0.49)
     run.faults[begin] |= LATE_TICK
     run.faults[begin + 1] |= EARLY_TICK
@@ -188,7 +189,7 @@ def _early(run: FaultRun, begin: int, rng: np.random.Generator) -> None:
 
 
 def _rate(run: FaultRun, begin: int, rng: np.random.Generator) -> int:
-    """Ticks a little too fast or too slow, none of which is early or late by itself."""
+    """Inject ticks at a slightly wrong rate; no single tick is early or late."""
     wrong = _pick(rng, (-0.24, -0.21, -0.16, 0.16, 0.21, 0.24))
     end = begin + UNTIL_RESET
     run.rows[begin:end, TIME] += PERIOD * wrong * np.arange(1, UNTIL_RESET + 1)
@@ -216,7 +217,7 @@ def _clock(run: FaultRun, begin: int, rng: np.random.Generator) -> int:
 
 def _stuck(column: int, moving: int, limit: str, fault: int):
     def inject(run: FaultRun, begin: int, rng: np.random.Generator) -> int | None:
-        """One reading stays as it was, until what moves meanwhile has gone too far for that."""
+        """Hold one reading constant until the other signals have moved too far."""
         travel = 0.0
         for tick in range(begin, begin + UNTIL_RESET):
             run.rows[tick, column] = run.rows[begin - 1, column]
@@ -243,7 +244,7 @@ def _stroke(run: FaultRun, begin: int, rng: np.random.Generator) -> int:
 
 
 def _fast_position(run: FaultRun, begin: int, rng: np.random.Generator) -> int | None:
-    """A jump of a few millimetres, there and back, is cut to one a tick; the model itself adds 12 um."""
+    """Inject a jump of a few millimetres and back, limited per tick; the model itself moves 12 um."""
     cuts = int(rng.integers(1, CUT + 2))
     length = 8
     run.rows[begin : begin + length, MODEL] += _pick(rng, (-1.0, 1.0)) * (cuts + 0.5) * 1e-3
@@ -261,7 +262,7 @@ def _strong_force(run: FaultRun, begin: int, rng: np.random.Generator) -> int:
 
 
 def _fast_force(run: FaultRun, begin: int, rng: np.random.Generator) -> int | None:
-    """A jump of some thousand newtons, there and back, is cut to a thousand a tick; contact adds 50."""
+    """Inject a jump of some thousand newtons and back, limited to 1000 N per tick; contact adds 50 N."""
     cuts = int(rng.integers(1, CUT + 2))
     length = 8
     run.rows[begin : begin + length, FORCE] += _pick(rng, (-1.0, 1.0)) * (cuts + 0.5) * 1000.0

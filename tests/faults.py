@@ -1,7 +1,7 @@
-"""Commands during which a call of the system fails once, or at which they are killed (`faults.c`).
+"""Commands during which one system call fails, or at which the process is killed (`faults.c`).
 
-A process with all imports done forks for every command: jax is started by the fork. Run as a program, this
-file is that process.
+A process that has finished all imports forks for every command; jax is started by the child. This file is
+also the program of the parent process.
 """
 
 import ctypes
@@ -16,17 +16,17 @@ from typing import Any, NamedTuple
 
 HERE = Path(__file__).parent
 COMPILER = shutil.which("cc")
-LONGEST = 120.0  # s that a command may take
+LONGEST = 120.0  # s, timeout of a command
 HANGS = "hangs"
 
 
 class Ran(NamedTuple):
-    """What a command did."""
+    """Result of a command."""
 
     code: int | str  # exit code, the negative of a signal, or `HANGS`
     out: str
     err: str
-    calls: list[str]  # of the system that concerned the folders
+    calls: list[str]  # system calls on the folders
 
     @property
     def document(self) -> Any:
@@ -34,7 +34,7 @@ class Ran(NamedTuple):
 
 
 class Runner:
-    """Runs commands with a folder for kept programs, and one for its own files."""
+    """Process that runs commands, with a folder for cached programs and one for its own files."""
 
     def __init__(self, cache: Path, scratch: Path) -> None:
         self.cache, self.scratch = cache, scratch
@@ -58,7 +58,7 @@ class Runner:
         )
 
     def run(self, *arguments: Any, folders: tuple[Path, ...] = (), at: int = -1, kill: bool = False) -> Ran:
-        """Run `jaxhil ARGUMENTS`; call number `at` that concerns the folders fails, or is the last."""
+        """Run `jaxhil ARGUMENTS`; system call number `at` on the folders fails, or is the last one."""
         assert self._process.stdin and self._process.stdout
         job = {
             "arguments": [str(argument) for argument in arguments],
@@ -79,17 +79,17 @@ class Runner:
 
 
 def without_times(value: Any) -> Any:
-    """A document without what is another number every time."""
+    """Return a document without timings and dates."""
     if isinstance(value, dict):
         times = {"timings", "created", "scenarios_per_second"}
-        # A verdict's digest is one of its times, too.
+        # A verdict's digest depends on its times, too.
         times |= {"sha256"} if "sweep_sha256" in value else set()
         return {key: without_times(one) for key, one in value.items() if key not in times}
     return [without_times(one) for one in value] if isinstance(value, list) else value
 
 
 def serve() -> None:
-    """Read jobs from standard input, and write how each ended."""
+    """Read jobs from standard input, and write the result of each job."""
     from jaxhil.simulation.jax_environment import prepare_jax
 
     prepare_jax()

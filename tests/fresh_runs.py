@@ -1,10 +1,10 @@
-"""Fresh scenarios through the controller in C with every guard on and its limits as exported.
+"""New scenarios run through the C controller with every guard active and its limits as exported.
 
-Scenarios of a seed that calibration does not know are recorded and put through the compiled controller, tick
-by tick with its clock. A run is bad if some contact's restitution error exceeds the limit, or a contact does
-not end: it is missed unless the controller has tripped before the tick on which the next contact begins
-(after the last one: once the next run is announced). It is good if no error exceeds half the limit: a false
-alarm if any fault is raised at all, whether it trips or not, but for a law's word that it is in doubt.
+Scenarios of a seed that calibration does not use are recorded and passed to the compiled controller tick by
+tick with its clock. A run is bad if the restitution error of a contact exceeds the limit, or if a contact
+does not end. A bad run is missed unless the controller trips before the tick on which the next contact begins
+(for the last contact: before the next run is announced). A run is good if no error exceeds half the limit. A
+good run is a false alarm if any fault is raised, except a compensator's status of doubt.
 """
 
 from collections import Counter
@@ -38,12 +38,12 @@ from tuning.statistics.intervals import binomial_interval
 from tuning.watchdog.calibration import DEFAULT_DRAWS, calibrate
 from tuning.watchdog.recording import RecordedRuns, ScenarioSelection, record_selection
 
-FRESH = 20_000  # seed; limits are calibrated on draws of seed 0
+FRESH = 20_000  # seed of new scenarios; limits are calibrated on draws of seed 0
 SEEN, CAUSE, TRIPPED = (RESULT.index(name) for name in ("seen", "cause", "tripped"))
 
 
 class Exported(NamedTuple):
-    """A controller with the limits for a restitution error, in C and as its gain file says."""
+    """Controller with the limits for a restitution error: compiled C code and gain file."""
 
     name: str
     limit: float
@@ -53,8 +53,11 @@ class Exported(NamedTuple):
 
 
 class Record(NamedTuple):
-    """A lane: what the controller is given, row by row; restitution errors of its contacts, NaN for one
-    that did not end; the row on which each begins."""
+    """Controller inputs of one lane and the errors of its contacts.
+
+    `rows` are the inputs row by row. Restitution errors are NaN for a contact that did not end; begins are
+    the rows on which contacts begin.
+    """
 
     rows: np.ndarray
     error: np.ndarray
@@ -62,8 +65,11 @@ class Record(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What the controller made of a lane: the row on which it tripped, or None; the first row with a fault;
-    the bits that tripped it, and all that were raised."""
+    """Trip and faults of the controller in one lane.
+
+    Row on which the controller tripped, or None; first row with a fault; bits of the faults that tripped, and
+    of all raised faults.
+    """
 
     row: int | None
     faulty: int | None
@@ -75,9 +81,9 @@ WATCHDOG = RESTITUTION | ENERGY_BALANCE | CONTACT_TOO_LONG
 
 
 class Counts:
-    """Runs of either kind, and what was found wrong: (lane, row, names of faults).
+    """Numbers of good and bad runs, and the wrong decisions: (lane, row, names of faults).
 
-    `guarded` of the bad runs were stopped by another guard, before the watchdog had anything to say.
+    `guarded` bad runs were stopped by another guard before the watchdog.
     """
 
     def __init__(self) -> None:
@@ -140,7 +146,7 @@ def gains(parsed: Mechanism, values: dict[str, float], compensator: str = "respo
 def export(
     loaded: LoadedGains, limit: float, folder: Path, scenarios: int = DEFAULT_DRAWS, lanes: int = 1024
 ) -> tuple[Exported, dict[str, Any]]:
-    """The gains with limits calibrated on so many draws, compiled; the rates that calibration states."""
+    """Return the compiled gains with limits calibrated on `scenarios` draws, and the stated alarm rates."""
     limits, rates = calibrate(loaded, scenarios=scenarios, limit=limit, lanes=lanes)
     document = {**loaded.document, "limits": build_limits_section(limits)}
     document["sha256"] = digest(document)
@@ -154,7 +160,7 @@ def export(
 
 
 def records(chunk: RecordedRuns, parsed: Mechanism):
-    """Every lane of a chunk, as `Record`."""
+    """Yield a `Record` for every lane of a chunk."""
     signals, period = chunk.signals, parsed.rig.control_period
     lengths = signals.live.sum(axis=0)
     assert all(signals.live[:length, lane].all() for lane, length in enumerate(lengths))
@@ -173,7 +179,7 @@ def records(chunk: RecordedRuns, parsed: Mechanism):
         rows = np.empty((length + 1, len(ROW)))
         for place, column in enumerate(columns):
             rows[:-1, place] = column[:length, lane]
-        # A further run is announced, which audits the last contact, and begins as the first did.
+        # A further run is announced, which audits the last contact, and begins as the first run did.
         rows[-1] = rows[0]
         rows[-1, 5] = length * period
         rows[0, 0] = 0.0
@@ -182,8 +188,11 @@ def records(chunk: RecordedRuns, parsed: Mechanism):
 
 
 def _contact_rows(rows: np.ndarray, clearance: float, plane: float) -> np.ndarray:
-    """The rows on which contacts begin: the first beyond a surface, by the model's or the measured position,
-    in each run, and the first beyond the other surface. The hardware's surfaces lie `plane` deeper."""
+    """Return the rows on which contacts begin.
+
+    In each run, a contact begins on the first row beyond a surface, by the model's or the measured position,
+    and then on the first row beyond the other surface. The hardware's surfaces lie `plane` deeper.
+    """
     position, measured = rows[:-1, 2], rows[:-1, 4]
     near = (position > min(plane, 0.0)) | (measured > plane)
     far = (position < -clearance) | (measured < plane - clearance)
@@ -194,7 +203,7 @@ def _contact_rows(rows: np.ndarray, clearance: float, plane: float) -> np.ndarra
 
 
 def verdict_of(results: np.ndarray) -> Verdict:
-    """From a lane's results, of either controller."""
+    """Return the verdict of either controller from the results of a lane."""
     tripped, faulty = (np.flatnonzero(results[:, column]) for column in (TRIPPED, SEEN))
     return Verdict(
         int(tripped[0]) if len(tripped) else None,
@@ -206,13 +215,13 @@ def verdict_of(results: np.ndarray) -> Verdict:
 def counted(
     loaded: LoadedGains, exported: list[Exported], number: int, lanes: int, in_python: int
 ) -> list[Counts]:
-    """So many fresh scenarios through each of the controllers, a few of them through Python's as well."""
+    """Count the decisions of each controller on new scenarios; check some lanes in Python."""
     counts = [Counts() for _ in exported]
     for chunk in record_selection(loaded, ScenarioSelection("random", FRESH, number), lanes):
         assert np.all(np.isfinite(chunk.contacts.error) == (chunk.contacts.status == OK))
         for lane, record in enumerate(records(chunk, loaded.mechanism)):
             for one, count in zip(exported, counts, strict=True):
-                # A fresh controller, as the rig's program begins.
+                # Each lane uses a new controller, as if the rig's program had just started.
                 assert one.batch.begin(one.parameters)
                 results = one.batch.run(record.rows, guarded=True)
                 count.add(record, verdict_of(results), one.limit)

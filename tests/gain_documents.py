@@ -1,4 +1,4 @@
-"""Valid gain documents, for the tests of everything that reads or writes gain files."""
+"""Valid gain documents for tests that read or write gain files."""
 
 import copy
 from typing import Any
@@ -42,7 +42,7 @@ _LEAD = {
 
 
 def _entries(compensator: str) -> dict[str, dict[str, Any]]:
-    """Gains at the literature's values, and where that is 0 well within their bounds."""
+    """Return gains at the literature's values, or well within their bounds if that value is 0."""
     mechanism = from_plain_data(copy.deepcopy(MECHANISM), "documents")
     entries = {}
     for gain in COMPENSATORS[compensator].gains:
@@ -57,7 +57,7 @@ GAINS: dict[str, dict[str, dict[str, Any]]] = {
     "phase_lead": _LEAD,
     "impulse_ledger": {
         **_entries("impulse_ledger"),
-        # Off the ticks, where it may be differentiated.
+        # Between ticks, where the derivative exists.
         "identification_delay": {"value": 0.0083, "unit": "s", "lower": 0.0, "upper": 0.05},
         "velocity_gain": {"value": 10.0, "unit": "1/s", "lower": 1.0, "upper": 1e3},
         "correction_limit": {"value": 0.9, "unit": "1", "lower": 0.01, "upper": 20.0},
@@ -83,7 +83,7 @@ GAINS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 def sign(document: dict[str, Any]) -> dict[str, Any]:
-    """The document with the digest of its content written into it."""
+    """Write the digest of the document's content into the document."""
     document["sha256"] = digest(document)
     return document
 
@@ -95,7 +95,7 @@ def gain_document(
     clearance: float | None = None,
     **values: float,
 ) -> dict[str, Any]:
-    """A valid gain document; `values` replaces gain values, within the bounds of `GAINS`."""
+    """Return a valid gain document; `values` replaces gain values, within the bounds of `GAINS`."""
     gains = copy.deepcopy(GAINS[compensator])
     for name, value in values.items():
         gains[name]["value"] = value

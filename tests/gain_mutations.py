@@ -1,4 +1,4 @@
-"""Gain files damaged in any way and signed anew, so that nothing but what they say speaks against them."""
+"""Corrupted gain files with a valid digest, so that only their content can reveal the corruption."""
 
 import copy
 import json
@@ -28,7 +28,7 @@ PERIODS = (1e-3, 1e-3, 2.5e-4, 1e-5, 0.1)
 
 
 def numbers_changed(rng: random.Random) -> dict[str, Any]:
-    """A document that is wrong, if at all, in the values of its numbers: a file's own bounds follow them."""
+    """Draw a document with changed numbers; bounds in the file are adapted to the changed values."""
     document = _whole(rng)
     for _ in range(rng.randrange(1, 4)):
         kind = rng.choice(("gain", "gain", "gain", "limit", "limit", "period", "clearance"))
@@ -51,12 +51,12 @@ def numbers_changed(rng: random.Random) -> dict[str, Any]:
 
 
 def anything_changed(rng: random.Random) -> dict[str, Any]:
-    """A document some of whose entries are something else, gone, called otherwise, or new."""
+    """Draw a document with entries replaced, removed, renamed or added."""
     document = numbers_changed(rng) if rng.random() < 0.3 else _whole(rng)
     for _ in range(rng.randrange(1, 4)):
         places = list(_places(document))
         holder, key = rng.choice(places)
-        # Half of the time where a number is, of which a controller makes something.
+        # In half of the cases, change a number that the controller uses.
         if rng.random() < 0.5:
             holder, key = rng.choice([(h, k) for h, k in places if isinstance(h[k], (int, float))] or places)
         change = rng.randrange(6)
@@ -74,7 +74,7 @@ def anything_changed(rng: random.Random) -> dict[str, Any]:
 
 
 def text_of(document: dict[str, Any], rng: random.Random) -> str:
-    """As a file, signed if JSON can express it; now and then with a key twice, or nested too deeply."""
+    """Return the text of the file, signed if JSON allows; sometimes with a duplicate key or deep nesting."""
     try:
         document["sha256"] = digest(document)
     except (ValueError, TypeError, RecursionError):
@@ -90,7 +90,7 @@ def text_of(document: dict[str, Any], rng: random.Random) -> str:
 
 
 def wild(rng: random.Random, usual: float, lowest: float, highest: float) -> float:
-    """A number of any size; about the usual one, or about the ends of what is admitted."""
+    """Draw a number of any size, near the usual value, or near the ends of the admitted range."""
     kind = rng.randrange(5)
     if kind == 0:
         return rng.choice(EXTREMES)
@@ -108,7 +108,7 @@ _BASES: dict[tuple, str] = {}
 
 
 def _whole(rng: random.Random) -> dict[str, Any]:
-    """A good document, of any law."""
+    """Draw a valid document of any compensator."""
     law, period = rng.choice(sorted(GAINS)), rng.choice(PERIODS)
     clearance = rng.choice((None, None, 0.0, 0.002))
     kind = law, period, clearance

@@ -1,4 +1,4 @@
-"""A controller with every limit set, for the tests of the runtime's guards."""
+"""Controller with every limit set, for tests of the runtime's guards."""
 
 from gain_documents import gain_document, sign
 
