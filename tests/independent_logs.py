@@ -1,7 +1,7 @@
-"""Afternoons of rig logs, as a test engineer would record them by the user guide alone.
+"""Log files of a rig as a test engineer would record them, following only the user guide.
 
-`write_campaign` draws a rig, runs it and writes its logs, their mapping and a prior. The same seed draws the
-same rig for every kind, but for what the kind is about.
+`write_campaign` draws a rig, simulates it and writes logs, mapping file and prior. The same seed draws the
+same rig for every kind, except for the property that defines the kind.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from pyarrow import csv, parquet
 from scipy.signal import lfilter
 
 RATES = (1000, 500, 2000)  # Hz
-DECIMALS = (3, 2, 1)  # of forces in N; positions have six more of m
+DECIMALS = (3, 2, 1)  # decimals of forces in N; positions in m have six more
 REST, FREE, PRESS = 5.0, 60.0, 40.0  # s
 CLEARANCE = 0.03  # m between the surface and the middle of the free motion
 STROKE = 1.5e-3  # m, peak of the free motion
@@ -25,19 +25,19 @@ JITTER = 50e-6  # s, standard deviation of stamps
 
 @dataclass(frozen=True)
 class Kind:
-    """Change of the rig, or of how it is logged, that makes a kind of campaign."""
+    """Kind of campaign: a change of the rig or of its log settings."""
 
     rig: Callable[[np.random.Generator, Rig], dict[str, Any]] = lambda rng, rig: {}
     unknown: tuple[str, ...] = ()  # keys that the prior lacks
-    defect: tuple[str, ...] = ()  # words one of which a message must have; empty for a clean kind
+    defect: tuple[str, ...] = ()  # a message must contain one of these words; empty for a kind without defect
     sweep: bool = False  # the free motion is a swept sine in place of a multisine
     colour: float = 0.0  # N, standard deviation of low-frequency noise of the force
-    walk: float = 0.0  # N/sqrt(s), random walk of the force's bias
-    lost: float = 0.0  # share of rows lost; stamps jitter, too
-    force_clock: bool = False  # the force has stamps of its own and begins later
-    # its readings are brought to these stamps by straight lines before they are logged
+    walk: float = 0.0  # N/sqrt(s), random walk of the force bias
+    lost: float = 0.0  # share of rows lost; time stamps jitter, too
+    force_clock: bool = False  # the force has its own time stamps and begins later
+    # linear interpolation of force readings to these time stamps before logging
     resampled: bool = False
-    late: int = 0  # rows by which the measured position begins later, with its stamps; logs in Parquet
+    late: int = 0  # rows by which the measured position begins later; logs are Parquet with time stamps
 
 
 def _lag(rng, rig):
@@ -90,12 +90,12 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Campaign:
-    """Campaign on disk, with the rig behind it."""
+    """Campaign on disk, and the true rig."""
 
     kind: str
     seed: int
     rig: Rig
-    speed: float  # m/s, of the slowest touches
+    speed: float  # m/s, speed of the slowest contacts
     logs: list[Path]
     mapping: Path
     prior: Path
@@ -107,7 +107,7 @@ class Campaign:
 
 
 def draw_rig(rng):
-    """Draw a rig of the published orders of magnitude, without lag, dead zone or defect."""
+    """Draw a rig with values of published orders of magnitude, without lag, dead zone or defect."""
     mass, omega = rng.uniform(200, 500), 2 * np.pi * rng.uniform(1.5, 4.0)
     return Rig(
         period=1 / rng.choice(RATES),
@@ -132,13 +132,13 @@ class Noise:
         self.bias = rng.uniform(-0.4, 0.4)
 
     def draw(self, ticks, runs=1):
-        """Return fresh noise of force and position, a row per tick and a column per run."""
+        """Return new noise of force and position, one row per tick and one column per run."""
         rng, kind, shape = self.rng, self.kind, (ticks, runs)
         force = self.bias + rng.normal(0, self.force_noise, shape)
         if kind.walk:
             force += kind.walk * np.sqrt(self.period) * np.cumsum(rng.normal(size=shape), axis=0)
         if kind.colour:
-            # First-order low-pass noise to 30 Hz.
+            # First-order low-pass noise up to 30 Hz.
             keep = np.exp(-2 * np.pi * 30.0 * self.period)
             noise = np.asarray(lfilter([1], [1, -keep], rng.normal(size=(ticks + 2000, runs)), axis=0))
             force += kind.colour * np.sqrt(1 - keep**2) * noise[2000:]
@@ -146,7 +146,7 @@ class Noise:
 
 
 def free_motion(rng, kind, period):
-    """Return the commands of a free motion around 0 that comes and goes within a second."""
+    """Return the commands of a free motion around 0 that starts and ends smoothly within a second."""
     time = np.arange(round(FREE / period)) * period
     if kind.sweep:
         low, high = 0.2, 30.0
@@ -174,7 +174,7 @@ def _ends(time, duration, rise):
 
 
 def press_motion(rng, rig):
-    """Return commands from 1 mm before the surface to a force of about 50 N with a multisine on top."""
+    """Return commands from 1 mm before the surface to a force of about 50 N, plus a multisine."""
     time = np.arange(round(PRESS / rig.period)) * rig.period
     depth = 50.0 / rig.stiffness
     motion = multisine(rng, time, 20.0)
@@ -184,7 +184,7 @@ def press_motion(rng, rig):
 
 
 def _lead(rig, rng, lanes):
-    """Return the campaign's controller: a phase lead that makes up for a part of the force delay."""
+    """Return the campaign's compensator: a phase lead for part of the force delay."""
     lead, pole = rig.force_delay * rng.uniform(0.3, 1.0), 2 * rig.period
     state = np.zeros(lanes)
 
@@ -224,7 +224,7 @@ def write_campaign(kind_name, seed, folder):
         reading, velocity = rig.read_force(force + noise), np.gradient(commands, rig.period)
         log(name, reading, np.zeros(len(commands)), commands, velocity, position + position_noise, logger)
 
-    aside = replace(rig, mode=0.0)  # clear of the mechanism, its structure moves with the drive
+    aside = replace(rig, mode=0.0)  # out of contact the structure moves with the drive
     open_loop("rest", np.full(round(REST / rig.period), -CLEARANCE), aside)
     open_loop("free", free_motion(rng, kind, rig.period) - CLEARANCE, aside)
     speeds = speed * np.repeat([1.0, 2.0, 4.0], 5)
@@ -255,13 +255,13 @@ class Form:
 
     def __init__(self, rng, kind):
         self.kind = kind
-        self.small = bool(rng.integers(2))  # mm, kN and ms in place of SI units
+        self.small = bool(rng.integers(2))  # mm, kN and ms instead of SI units
         self.decimals = int(rng.choice(DECIMALS))
-        self.sent = bool(rng.integers(2))  # a row has the next tick's command
+        self.sent = bool(rng.integers(2))  # a row contains the next tick's command
         velocity, command = rng.random() < 0.3, rng.random() < 0.7
         self.columns = ["x_cmd", "x", "F", *["F_cmd"] * command, *["v_cmd"] * velocity]
-        self.sign = int(rng.choice([-1, 1]))  # of logged forces
-        self.offset = float(rng.choice([0.0, 0.25]))  # m, of logged positions
+        self.sign = int(rng.choice([-1, 1]))  # sign of logged forces
+        self.offset = float(rng.choice([0.0, 0.25]))  # m, offset of logged positions
         rng.random()
 
     def write(self, path, rng, period, columns):
@@ -329,7 +329,7 @@ class Form:
 
 
 def mechanism_file(rig, speed, kind, factors):
-    """Return a mechanism file, the rig's values times `factors`, that lacks the kind's unknown keys."""
+    """Return a mechanism file with the rig's values times `factors`, without the kind's unknown keys."""
     frequency, ratio = (4.0 / rig.window / np.pi, 0.9) if rig.window else (rig.frequency, rig.ratio)
     values = {
         "bodies.equivalent_mass": rig.mass,

@@ -14,7 +14,7 @@ from scipy.signal import cont2discrete, lfilter
 POINTS = 40  # fine points per control period
 LOGGER = 15  # fine points by which a force logger with its own clock samples before the tick
 WARM_UP = 0.6  # s of uniform motion before the first tick; the slowest drive settles to 1e-9 in it
-LONGEST = 1.5  # s; a contact that lasts longer than that never ends
+LONGEST = 1.5  # s; longer contacts count as never ending
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Rig:
     filter_order: int = 0  # Butterworth filter of the force; order 1 is a lag
     cutoff: float = 100.0
     dead_zone: float = 0.0
-    cut: bool = False  # if true, a force beyond the dead zone is read in full
+    cut: bool = False  # if true, the dead zone is not subtracted from forces beyond it
     position_delay: float = 0.0
     integrator: str = "semi_implicit_euler"  # or zoh
 
@@ -49,7 +49,7 @@ class Rig:
         return np.where((depth > 0) & (force > 0), force, 0.0)
 
     def push(self, position, velocity):
-        """Return the same force of one position and velocity, in plain floats."""
+        """Return the contact force for one position and velocity, as a float."""
         depth = position - self.plane
         if depth <= 0:
             return 0.0
@@ -57,7 +57,7 @@ class Rig:
         return max(0.0, self.stiffness * depth + self.damping * velocity + friction)
 
     def read_force(self, force):
-        """Return the force reading behind the dead zone."""
+        """Return the force reading after the dead zone."""
         beyond = np.abs(force) > self.dead_zone
         return np.where(beyond, force if self.cut else force - np.sign(force) * self.dead_zone, 0.0)
 
@@ -69,7 +69,7 @@ class Rig:
 
 
 class Filter:
-    """Linear filter, exact for inputs that are straight between points; it keeps its state."""
+    """Linear filter with state, exact for inputs that are piecewise linear between points."""
 
     def __init__(self, numerator, denominator, step, lanes):
         discrete: Any = cont2discrete((numerator, denominator), step, method="foh")
@@ -84,7 +84,7 @@ class Filter:
 
 
 class Delay:
-    """Delay line; delays between two points are interpolated by a straight line."""
+    """Delay line with linear interpolation between points."""
 
     def __init__(self, delay, step, lanes):
         whole, self.fraction = divmod(delay / step, 1)
@@ -98,7 +98,7 @@ class Delay:
 
 
 class Plant:
-    """Motion simulator, mechanism and sensors between two ticks, for several touches (lanes) at once."""
+    """Motion simulator, mechanism and sensors between two ticks, for several contacts (lanes) at once."""
 
     def __init__(self, rig, start):
         self.rig, self.start, self.step = rig, start, rig.period / POINTS
@@ -120,9 +120,9 @@ class Plant:
         self.structure = [(0.0, 0.0)] * lanes
 
     def __call__(self, commands):
-        """Advance over the ticks of `commands` (rows); return force, its reading and the position reading.
+        """Advance over the ticks of `commands` (rows); return force, force reading and position reading.
 
-        The arrays that are returned have a row per fine point; the last row is the last tick.
+        The returned arrays have one row per fine point; the last row is the last tick.
         """
         targets = np.concatenate([self.command[None], commands - self.start])
         self.command = targets[-1]
@@ -154,7 +154,7 @@ class Plant:
             for point, (x, v) in enumerate(
                 zip(position[:, lane].tolist(), velocity[:, lane].tolist(), strict=True)
             ):
-                # The midpoint rule.
+                # Midpoint rule.
                 acceleration = structure_acceleration(rig, offset, rate, x - step * v, v, start)
                 half, half_rate = offset + step / 2 * rate, rate + step / 2 * acceleration
                 acceleration = structure_acceleration(rig, half, half_rate, x - step / 2 * v, v, start)
@@ -165,14 +165,14 @@ class Plant:
 
 
 def structure_acceleration(rig, offset, rate, x, v, start):
-    """Return the acceleration of the structure's end, which touches, behind a drive at `x` with speed `v`."""
+    """Return the acceleration of the structure's contact end for drive position `x` and speed `v`."""
     omega = 2 * np.pi * rig.mode
     spring = 2 * rig.mode_ratio * omega * (v - rate) + omega**2 * (x - offset)
     return spring - rig.push(start + offset, rate) / rig.mode_mass
 
 
 def drive(rig, commands):
-    """Return force, force logger and position without noise under open-loop `commands`, a row per tick."""
+    """Return force, logged force and position without noise under open-loop `commands`, one row per tick."""
     plant = Plant(rig, commands[:1])
     readings = [np.array([[0.0, 0.0, commands[0]]])]
     for begin in range(1, len(commands), 4000):
@@ -183,12 +183,12 @@ def drive(rig, commands):
 
 
 def touch(rig, start, speed, controller, ticks, disturb=lambda tick, force, position: (force, position)):
-    """Simulate touches (lanes) from `start` at `speed` and return their ticks.
+    """Simulate contacts (lanes) from `start` at `speed` and return their ticks.
 
     `controller` maps force, desired position and velocity, and measured position to the force command;
-    `disturb` adds noise to the readings of a tick. The result has a row per tick and the columns largest real
-    force since the last tick, force reading, force command, desired position, desired velocity, position
-    reading, force logger without noise; each has an entry per lane.
+    `disturb` adds noise to the readings of a tick. The result has one row per tick and the columns largest
+    real force since the last tick, force reading, force command, desired position, desired velocity, position
+    reading, logged force without noise; each with one entry per lane.
     """
     plant = Plant(rig, start - speed * WARM_UP)
     approach = np.arange(round(WARM_UP / rig.period), 0, -1) - 1
@@ -208,8 +208,8 @@ def touch(rig, start, speed, controller, ticks, disturb=lambda tick, force, posi
 def restitution(rig, speed, law):
     """Return the restitution of the rig's first contact under a compensator's `step`, without noise.
 
-    The contact is over as the guide says: no real force for longer than the sensor remembers, and a command
-    below 1e-6 of its peak or 0.1 s more.
+    As stated in the guide, the contact ends after no real force for longer than the sensor's memory, and a
+    command below 1e-6 of its peak or a further 0.1 s.
     """
     start = min(rig.plane, 0.0) - speed * (0.02 + rig.period / 3)
 
@@ -225,7 +225,7 @@ def restitution(rig, speed, law):
     ]
     peak = np.maximum.accumulate(np.abs(command))
     last = np.flatnonzero(real > 0)
-    # The last touch before the body has gone for good.
+    # Last contact before the final release of the body.
     for index, end in enumerate(last):
         quiet_until = last[index + 1] if index + 1 < len(last) else ticks
         over = np.arange(end + 1 + int(memory / rig.period), quiet_until)
@@ -237,7 +237,7 @@ def restitution(rig, speed, law):
 
 
 def ideal_restitution(rig, speed):
-    """Return the restitution of the same contact without delays, behind a drive that follows at once."""
+    """Return the restitution of the same contact without delays and with an ideal drive."""
     rig = replace(rig, plane=0.0)
 
     def rates(_, state):

@@ -26,23 +26,23 @@ VERDICTS = {0: "good", 1: "bad", 2: "refused"}
 
 @dataclass
 class Outcome:
-    """Verdict on a campaign beside the truth."""
+    """Result of identification for one campaign, and the true values."""
 
     kind: str
     seed: int
     verdict: str  # good, bad or refused
     message: str
     check: str  # verdict of `--check`; empty where no file was written
-    restitution: float  # e of the true rig; e and e - e* are those of the file's gains
+    restitution: float  # e of the true rig; all e and e - e* are for the file's gains
     error: float  # e of the file less e of the true rig
     difference: float  # e - e* of the file less that of the true rig
     named: bool  # the message names the defect or, for a clean kind, a check
     trouble: str  # an internal error
-    seconds: float  # of identify
+    seconds: float  # duration of identify
 
     @property
     def wrong(self):
-        """Return whether the file misses the rig by more than the limit."""
+        """Return whether an error of the file exceeds the limit."""
         return not (abs(self.error) <= LIMIT and abs(self.difference) <= LIMIT)
 
 
@@ -60,7 +60,7 @@ def run_command(*arguments):
 
 
 def errors_of(file, campaign):
-    """Return the true e, and by how much the file's e and e - e* are off it, at the literature's gains."""
+    """Return the true e, and the errors of e and e - e* of the file, at the literature's gains."""
     import jaxhil
     from jaxhil.rig import COMPENSATORS
 
@@ -95,7 +95,7 @@ def judge(kind, seed, folder):
             if c["there"] and max(c["effect"] or 0, c["effect_on_error"] or 0) > LIMIT / 2
         ]
         text = " ".join([message, *(f"{c['name']} {c['finding']}" for c in large), *document["notes"]])
-        if verdict == "good":  # it takes longer than the rest
+        if verdict == "good":  # this check takes longer than the rest
             e, error, difference = errors_of(result / "mechanism.toml", campaign)
         arguments = [
             "identify",
@@ -121,7 +121,7 @@ def judge(kind, seed, folder):
 
 
 def summary(kind, outcomes):
-    """Return a line on all outcomes of a kind."""
+    """Return a line about all outcomes of a kind."""
     verdicts = Counter(outcome.verdict for outcome in outcomes)
     good = [outcome for outcome in outcomes if outcome.verdict == "good"]
     wrong = sum(outcome.wrong for outcome in good)
@@ -137,7 +137,7 @@ def summary(kind, outcomes):
 
 
 def main(folder, first, count, *kinds):
-    """Run the study, all kinds of a seed before the next; append outcomes to `outcomes.jsonl`."""
+    """Run all kinds for each seed in turn; append outcomes to `outcomes.jsonl`."""
     outcomes = {kind: [] for kind in kinds or KINDS}
     for seed in range(int(first), int(first) + int(count)):
         for kind in outcomes:

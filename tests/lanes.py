@@ -1,6 +1,6 @@
-"""Mechanisms, gains and scenarios for tests: many lanes, each with numbers of its own, in one program.
+"""Mechanisms, gains and scenarios for tests: many lanes with separate values in one program.
 
-Arrays are NumPy's: each that JAX makes of them is a small program to compile.
+Arrays are NumPy arrays: each JAX array operation would be a small program to compile.
 """
 
 import copy
@@ -23,7 +23,7 @@ from jaxhil.simulation.rollout import begin_next_contacts, rollout, run_segment,
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from jaxhil.simulation.tick import Tick
 
-PERIOD = 2e-3  # coarse: errors of arithmetic show, and the oracle is quick
+PERIOD = 2e-3  # coarse, so that discretisation errors are visible and the oracle is fast
 MASS, VELOCITY, STIFFNESS = 350.0, 0.005, 124355.0
 IDEAL = {"model": "ideal"}
 SECOND_ORDER = {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.8, "delay": 0.0037}
@@ -33,8 +33,10 @@ run_rollout = jax.jit(rollout, static_argnums=0, compiler_options=QUICK)
 
 @partial(jax.jit, static_argnums=(0, 3), compiler_options=QUICK)
 def run_record(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[Metrics, Tick]:
-    """Metrics and every tick, (ticks, *batch), of so many ticks or a few more, up to a whole number of
-    stretches; free flight is not skipped."""
+    """Return metrics and every tick, (ticks, *batch), for at least this many ticks.
+
+    The number of ticks is rounded up to whole segments; free flight is not skipped.
+    """
     rig = build_rig_constants(loop, scenario)
 
     def body(run, _):
@@ -58,7 +60,7 @@ def mechanism(
     force_sensor: Mapping[str, float] | None = None,
     **rig: Any,
 ) -> dict[str, Any]:
-    """A mechanism file as plain data: 350 kg at 5 mm/s, Kelvin-Voigt unless `contact` says otherwise."""
+    """Return a mechanism file as plain data: 350 kg at 5 mm/s, Kelvin-Voigt contact by default."""
     return {
         "schema": "jaxhil/mechanism/1",
         "name": "case",
@@ -75,32 +77,32 @@ def mechanism(
 
 
 def validated(raw: Mapping[str, Any]) -> Mechanism:
-    """The mechanism of plain data."""
+    """Return the validated mechanism."""
     return from_plain_data(copy.deepcopy(dict(raw)), "case")
 
 
 def nominal_gains(mechanism: Mechanism, compensator: str, **values: float) -> dict[str, float]:
-    """The literature's gains for this mechanism, some replaced."""
+    """Return the literature's gains for this mechanism, some replaced."""
     gains = {gain.name: float(gain.nominal(mechanism)) for gain in COMPENSATORS[compensator].gains}
     assert set(values) <= set(gains)
     return gains | values
 
 
 def as_arrays(gains: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Gains as float64 arrays."""
+    """Return gains as float64 arrays."""
     return {name: np.asarray(value, float) for name, value in gains.items()}
 
 
 def join(scenarios: Iterable[Scenario]) -> Scenario:
-    """Scenarios of one form as the lanes of one batch."""
+    """Join scenarios of the same form as lanes of one batch."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *scenarios)
 
 
 def spread(parsed: Mechanism, lanes: int, **leaves: Any) -> Scenario:
-    """`lanes` copies of the nominal scenario with some arrays replaced, by their names in `Scenario`.
+    """Return `lanes` copies of the nominal scenario with some arrays replaced, by field name of `Scenario`.
 
-    A name of two parts, such as contact__damping, is a leaf of a part. What is given broadcasts over the
-    lanes and over successive contacts.
+    A compound name such as contact__damping is a field of a part. Values are broadcast over lanes and
+    successive contacts.
     """
     scenario = jax.tree.map(lambda leaf: np.repeat(leaf, lanes, axis=-1), build_scenarios(parsed))
     for name, value in leaves.items():
@@ -116,12 +118,12 @@ def spread(parsed: Mechanism, lanes: int, **leaves: Any) -> Scenario:
 
 
 def grid(*axes: Any) -> list[np.ndarray]:
-    """Every combination of the axes' values, flattened: one array per axis."""
+    """Return every combination of the axes' values, flattened: one array per axis."""
     return [axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")]
 
 
 def per_lane(gains: Mapping[str, Any], lanes: int) -> dict[str, np.ndarray]:
-    """Gains, scalars or one number per lane, as arrays over the lanes."""
+    """Return gains, given as scalars or per lane, as arrays over the lanes."""
     return {name: np.full(lanes, value, float) for name, value in gains.items()}
 
 
@@ -133,7 +135,7 @@ def first_contact(
     energies: bool = False,
     chatter: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Metrics of every lane's first contact, all of which must be over."""
+    """Return metrics of every lane's first contact; fail if a contact has not ended."""
     loop = build_loop(parsed, compensator, scenario, energies, chatter)
     metrics = run_rollout(loop, per_lane(gains or {}, scenario.velocity.shape[0]), scenario)
     assert np.all(np.asarray(metrics.status)[0] == OK)

@@ -1,4 +1,4 @@
-"""Contacts of the rig's plant with the impulse ledger, in lock-step."""
+"""Contacts of the rig plant with the impulse ledger, in lock-step."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -14,12 +14,12 @@ from tuning.rig.plant import RigHardware
 from tuning.rig.udp_protocol import NumericalModel
 
 LAW = "impulse_ledger"
-AFTER = 60  # ticks that are simulated after both have left the surface
+AFTER = 60  # ticks simulated after model and hardware have left the surface
 LONGEST = 2000
 
 
 class Ran(NamedTuple):
-    """Record of a contact by tick: rows of `c99_cases.ROW`, the controller's faults and the law's status."""
+    """Record of a contact by tick: rows of `c99_cases.ROW`, faults, and compensator status."""
 
     rows: np.ndarray
     faults: np.ndarray
@@ -27,7 +27,7 @@ class Ran(NamedTuple):
 
 
 def run(mechanism: Mechanism, law: Controller, seed: int = 0) -> Ran:
-    """Simulate one contact in lock-step with the rig's plant, until both have been outside for a while."""
+    """Simulate one contact in lock-step with the rig plant, until some time after its end."""
     plant, model = RigHardware(mechanism, seed), NumericalModel(to_plain_data(mechanism))
     period, quiet, entered = law.control_period, 0, False
     surface = min(mechanism.rig.contact_plane, 0.0)
@@ -53,7 +53,7 @@ def run(mechanism: Mechanism, law: Controller, seed: int = 0) -> Ran:
 
 
 def contacts_of(suite: str, seed: int, number: int, changes: tuple[str, ...] = ()) -> Iterator[Mechanism]:
-    """Yield that many draws of a suite, with the changes."""
+    """Yield contacts of this many draws of a suite, with the overrides applied."""
     drawn = draw(load(f"suite-{suite}", list(changes)).mechanism, number, seed)
     for index in range(number):
         one = {path: values[index].tolist() for path, values in drawn.items()}

@@ -1,4 +1,4 @@
-"""A compensator and a contact law as a user writes them: in a module of his own, from jaxhil's interfaces."""
+"""User-defined compensator and contact law in a separate module, written against jaxhil's interfaces."""
 
 from typing import ClassVar
 
@@ -9,7 +9,7 @@ from jaxhil.rig.registry import Compensator, GainSpecification
 
 
 class ScaledLead(jaxhil.Compensator):
-    """F_c = F + toy_lead (F - F of the tick before)/T: phase lead without a filter."""
+    """Phase lead without a filter: F_c = F + toy_lead (F - F_previous)/T."""
 
     name: ClassVar[str] = "scaled_lead"
     knows: ClassVar[tuple[str, ...]] = ("force delay",)
@@ -34,7 +34,7 @@ class ScaledLead(jaxhil.Compensator):
 
 
 class SquaredSpring(jaxhil.ContactLaw):
-    """F = k d^2: `stiffness` k [N/m^2]. Its reference is integrated."""
+    """Contact law F = k d^2 with `stiffness` k [N/m^2]; its ideal contact is integrated."""
 
     name: ClassVar[str] = "squared_spring"
 
@@ -49,7 +49,7 @@ class SquaredSpring(jaxhil.ContactLaw):
 
 
 class ScaledLeadOnTheRig(Compensator):
-    """`ScaledLead` in plain Python."""
+    """Rig controller of `ScaledLead` in plain Python."""
 
     gains: ClassVar = {"toy_lead": GainSpecification("s")}
 

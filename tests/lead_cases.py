@@ -1,4 +1,4 @@
-"""Small tasks for tests of the search: phase lead on a motion simulator that it can make up for."""
+"""Small tuning tasks for tests of the search: phase lead with a motion simulator that it can compensate."""
 
 from jaxhil.mechanism.file import load
 from tuning.gains.tasks import TuneTask, build_task
@@ -9,11 +9,11 @@ STIFFNESSES = "[1e5]", "[4e4]", "[2e5]"
 
 
 def lead_tasks() -> list[TuneTask]:
-    """Three that are alike."""
+    """Return three similar tasks."""
     return [lead_task(f"contact.stiffness={own}", f"name=m{i}") for i, own in enumerate(STIFFNESSES)]
 
 
 def lead_task(*overrides: str) -> TuneTask:
-    """One, with some more of the mechanism overridden."""
+    """Return a task with further mechanism values overridden."""
     mechanism = load("rig-300kg", [*overrides, *FAST]).mechanism
     return build_task(mechanism, "phase_lead", SCENARIOS, 0)

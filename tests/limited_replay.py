@@ -1,4 +1,4 @@
-"""Recorded runs through the rig's own controller: on which tick it trips, and why."""
+"""Recorded runs replayed through the rig's controller, to obtain the tick and cause of a trip."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -9,10 +9,10 @@ from tuning.watchdog.recording import RecordedSignals
 
 
 class Tripped(NamedTuple):
-    """A run that was stopped.
+    """Trip of a run.
 
-    tick: before or on which of its record; one more than the last: at its end.
-    status: the controller's.
+    tick: tick of the record on which, or before which, the controller tripped; after the last tick for a trip
+    at the end. status: status of the controller.
     """
 
     tick: int
@@ -20,16 +20,16 @@ class Tripped(NamedTuple):
 
 
 def limited_controller(loaded: LoadedGains, limits: Mapping[str, Mapping[str, Any]]) -> Controller:
-    """The controller of a gain file with these limits, a gain file's `limits`."""
+    """Return the controller of a gain file with these `limits`."""
     document = {**loaded.document, "limits": dict(limits)}
     return Controller.from_dict({**document, "sha256": digest(document)})
 
 
 def replay_lane(controller: Controller, signals: RecordedSignals, lane: int, mass: float) -> Tripped | None:
-    """Feed one lane's record to the controller; None if it never trips.
+    """Feed one lane's record to the controller; return None if it never trips.
 
-    The numerical model's motion is the record's: it goes on as if nothing had tripped. At the end the next
-    contact is announced, as it is between the contacts of a run.
+    The motion of the numerical model is that of the record, also after a trip. At the end the next contact is
+    announced, as between the contacts of a run.
     """
     if not controller.reset():
         raise ValueError("the controller's emergency stop is active")

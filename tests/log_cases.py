@@ -1,4 +1,4 @@
-"""Small logs of a rig with known truth, and ways to write them and to say what they are."""
+"""Small logs of a rig with known true parameters, their mapping, and functions to write them."""
 
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,12 @@ Columns = dict[str, np.ndarray]
 
 
 def touches(number: int = 1, speed: float = 5e-3, noise: float = 0.3, seed: int = 0) -> Columns:
-    """Touches of a spring, driven back in between; the reading of the position lags its command."""
+    """Return contacts of a spring with commanded return motion; the position reading lags its command."""
     random = np.random.default_rng(seed)
     x, v, rows = -1e-3, speed, []
     for _ in range(number * 600):
         if x < -1e-3:
-            # Driven back: towards the hardware again.
+            # Commanded motion back towards the hardware.
             x, v = -1e-3, speed
         depth = max(x, 0.0)
         force = STIFFNESS * depth + noise * random.standard_normal() * (depth > 0)
@@ -47,21 +47,21 @@ def touches(number: int = 1, speed: float = 5e-3, noise: float = 0.3, seed: int 
 
 
 def sway(rows: int = 800, amplitude: float = 1e-3) -> Columns:
-    """A motion of two lines, free of contact."""
+    """Return a motion with two frequencies, out of contact."""
     times = PERIOD * np.arange(rows + LAG)
     x = amplitude * (np.sin(2 * np.pi * 1.3 * times) + 0.4 * np.sin(2 * np.pi * 7.1 * times))
     return {"t": times[:rows], "xd": x[LAG:], "xm": x[:-LAG]}
 
 
 def write_csv(path: Path, columns: Columns, delimiter: str = ",", head: str = "") -> Path:
-    """As most loggers write it."""
+    """Write the log as most loggers do."""
     names, rows = delimiter.join(columns), zip(*(one.tolist() for one in columns.values()), strict=True)
     path.write_text(head + "\n".join([names, *(delimiter.join(map(repr, row)) for row in rows), ""]))
     return path
 
 
 def mapping(kind: str = "contact", timing: Any = (), text: Any = None, **channels: Any) -> LogMapping:
-    """The mapping of these columns, some said otherwise; None leaves a channel out."""
+    """Return the mapping of these columns with changes; None leaves out a channel."""
     named = {name: one for name, one in (CHANNELS | channels).items() if one is not None}
     raw = {
         "schema": "jaxhil/log/1",
@@ -75,5 +75,5 @@ def mapping(kind: str = "contact", timing: Any = (), text: Any = None, **channel
 
 
 def read(path: Path, kind: str = "contact", **said: Any) -> Campaign:
-    """The campaign of one file."""
+    """Return the campaign of one file."""
     return read_campaign([path], mapping(kind, **said))

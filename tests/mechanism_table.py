@@ -1,4 +1,4 @@
-"""A mechanism's whole table for tests of its keys, and ways to change it."""
+"""Complete table of a mechanism for tests of its keys, and functions to change it."""
 
 import copy
 
@@ -7,7 +7,7 @@ import pytest
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import from_plain_data, load
 
-# Every key of the schema, apart from those of other laws and models, and those that exclude each other.
+# Every key of the schema, except keys of other laws and models, and keys that exclude each other.
 FULL = {
     "schema": "jaxhil/mechanism/1",
     "name": "full",
@@ -55,7 +55,7 @@ FULL = {
 }
 
 
-# The models of the motion simulator: each with its keys, the others' taken out.
+# Motion simulator models: each with its own keys, without those of the other models.
 SECOND_ORDER = {"rig.simulator.natural_frequency": 12.0, "rig.simulator.damping_ratio": 0.8}
 _OTHERS = {"uncertainty": {}, **dict.fromkeys(SECOND_ORDER, ...)}
 IDEAL = {"rig.simulator.model": "ideal", **_OTHERS}
@@ -78,7 +78,7 @@ LAYERED = {
     "contact.stiffness": [[1e5, 2e5, 3e5]],
 }
 
-# Refused beside the law and the model of the full table: values with which they are otherwise right.
+# Keys that are refused with law and model of the full table, with otherwise valid values.
 OF_OTHERS = {
     "contact.depths": [0.001, 0.002],
     "contact.reference_depth": 2e-4,
@@ -93,7 +93,7 @@ OF_OTHERS = {
 
 
 def changed(changes=(), base=FULL):
-    """A copy of the full table with the values at dotted paths replaced; `...` removes a key."""
+    """Return a copy of the full table with values at dotted paths replaced; `...` removes a key."""
     raw = copy.deepcopy(base)
     for path, value in dict(changes).items():
         *tables, key = path.split(".")
@@ -108,7 +108,7 @@ def changed(changes=(), base=FULL):
 
 
 def refusal(raw):
-    """The message of a refused table: one printable line that names the source."""
+    """Return the message for a refused table after checking that it is one line that names the source."""
     with pytest.raises(InputError) as caught:
         from_plain_data(raw, "some file")
     message = str(caught.value)
@@ -132,7 +132,7 @@ def tables(node=FULL, path=""):
 
 
 def file_refusal(path, overrides=(), unset=()):
-    """The message of a refused file: one printable line that starts with the file's name."""
+    """Return the one-line message for a refused file after checking that it begins with the file name."""
     with pytest.raises(InputError) as caught:
         load(path, overrides, unset)
     message = str(caught.value)

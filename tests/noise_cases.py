@@ -1,4 +1,4 @@
-"""What a law makes of white noise: its closed form against the rig's own controller, tick by tick."""
+"""Noise amplification of a compensator: closed form compared with the rig's controller."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -13,7 +13,7 @@ from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.simulation_base import KnownConstants
 from jaxhil.rig import COMPENSATORS as ON_THE_RIG
 
-LONG = 4000  # ticks: every filter has died out
+LONG = 4000  # ticks, so many that every filter has settled
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
@@ -25,15 +25,17 @@ def _amplified(name, gains, period):
 
 
 def runtime_commands(name: str, gains: Mapping[str, float], forces: np.ndarray, period: float) -> np.ndarray:
-    """F_c [N] of the runtime for these force readings [N], out of contact."""
+    """Return F_c [N] of the runtime for these force readings [N], out of contact."""
     law = ON_THE_RIG[name](gains, period, np.inf)
     return np.array([law.step(force, -1.0, 0.0, -1.0) for force in forces.tolist()])
 
 
 def check_amplification(name: str, cases: Sequence[Mapping[str, float]], period: float = 1e-3) -> None:
-    """`noise_amplification` of a law that filters the force alone is the root of the sum of the squares of
-    the runtime's answer to an impulse, and what noise through it deviates by; its derivatives are those of
-    differences."""
+    """Check `noise_amplification` of a compensator that filters only the force.
+
+    The amplification equals the root of the sum of squares of the runtime's impulse response and the standard
+    deviation of filtered white noise. Its derivatives equal finite differences.
+    """
     noise = np.random.default_rng(2).normal(size=60_000)
     impulse = np.zeros(LONG)
     impulse[0] = 1.0
@@ -56,7 +58,7 @@ def check_amplification(name: str, cases: Sequence[Mapping[str, float]], period:
 
 
 def amplification(gains, period=1e-3):
-    """Of the lead filter: the root of the sum of the squares of its impulse response, filtered by SciPy."""
+    """Return the root of the sum of squares of the lead filter's impulse response, filtered by SciPy."""
     lead, smoothing = gains
     numerator, denominator = bilinear([lead + smoothing, 1], [smoothing, 1], 1 / period)
     impulse = np.zeros(3000)

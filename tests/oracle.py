@@ -1,12 +1,11 @@
-"""Event-accurate oracle of the exact sampled loop: plain NumPy and SciPy, independent on purpose.
+"""Event-accurate oracle of the exact sampled loop in plain NumPy and SciPy, independent of the simulation.
 
 The motion simulator's output is a polynomial in time (`oracle_motion`), and the contact force is one smooth
-formula on each of the pieces into which its events cut the time axis (`oracle_contact`). What the sensors
-read, delayed, lagging, quantised, is read off these pieces; then the compensator commands, and the numerical
-model is integrated.
-
-Time inside this module is counted in control periods ("ticks", a float); all other quantities are
-SI.
+formula on each of the segments between events (`oracle_contact`). Sensor readings (delayed, lagging,
+quantised) are evaluated on these segments; then the compensator computes the command, and the numerical model
+is integrated.
+Time inside this module is counted in control periods ("ticks", a float); all other quantities are in SI
+units.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from numpy.polynomial.polynomial import polyder
 from oracle_contact import SMOOTH_NODES, SMOOTH_WEIGHTS, Law, Piece, Work, cut
 from oracle_motion import TIME_TOLERANCE, Motion, delay_in_ticks
 
-FORGOTTEN = 50.0  # time constants after which nothing of a force is left in a lagging reading
+FORGOTTEN = 50.0  # time constants after which a lagging reading no longer depends on a past force
 
 
 class NoCompensator:
-    """F_c = F_measured."""
+    """Compensator F_c = F_measured."""
 
     def reset(self):
         pass
@@ -45,23 +44,20 @@ def simulate(
     record=False,
     **options,
 ) -> list[dict[str, Any]]:
-    """Run the contacts of a mechanism (the mechanism file, parsed); one dict per contact.
+    """Simulate the contacts of a mechanism (parsed mechanism file); return one dict per contact.
 
-    Keys: restitution, approach_velocity, peak_force [N], duration [s], work_in, work_out [J],
-    ticks (end_tick - begin_tick), begin_tick, end_tick, peak_command [N], excess_variation [N] of the
-    command, position_shortfall [m], what the velocity limit takes off the position command at most, status
-    ('over' or 'timeout'); `record=True` adds per-tick `signals` (of the whole run), among them the
-    force just before the tick (`force`).
-
-    The compensator has `reset()` and `step(force, x_d, v_d, x_measured)`; with
-    `position_command(x, v, a)` it leads the command, and `next_contact()`, if there, replaces
-    `reset()` between contacts. `force_noise` [N] and `position_noise` [m] are sequences indexed by
-    tick (a list of sequences: one per fresh run). `first_force_zero`: tick 0 commands F_c = 0
-    whatever it reads.
-
-    `index_waits_for_exit`: with clearance, the next stiffness acts only once x_a has left the
-    surface (damped contact separates at F = 0 inside it, where a stiffer next entry would push
-    again and count as a contact).
+    Keys: restitution, approach_velocity, peak_force [N], duration [s], work_in, work_out [J], ticks (end_tick
+    - begin_tick), begin_tick, end_tick, peak_command [N], excess_variation [N] of the command,
+    position_shortfall [m] (largest reduction of the position command by the velocity limit), status ('over'
+    or 'timeout'); `record=True` adds per-tick `signals` of the whole run, among them the force just before
+    the tick (`force`).
+    The compensator has `reset()` and `step(force, x_d, v_d, x_measured)`; an optional `position_command(x, v,
+    a)` modifies the position command, and an optional `next_contact()` replaces `reset()` between contacts.
+    `force_noise` [N] and `position_noise` [m] are sequences indexed by tick (a list of sequences: one per
+    run). With `first_force_zero`, tick 0 commands F_c = 0 for any reading.
+    With `index_waits_for_exit` and a clearance, the next stiffness applies only after x_a has left the
+    surface: damped contact separates at F = 0 inside the surface, where a stiffer next contact would push
+    again and count as a contact.
     """
     compensator = NoCompensator() if compensator is None else compensator
     approach = mechanism["approach"]
@@ -92,14 +88,14 @@ def simulate(
 
 @dataclass
 class _Contact:
-    """How far a contact has got."""
+    """State of the detection of the current contact."""
 
-    first: int  # tick at which it is looked for
-    before: float  # m/s, speed on the tick before
-    floor: float  # N, command at which it does not begin
+    first: int  # first tick at which the contact is searched for
+    before: float  # m/s, speed on the tick before the contact
+    floor: float  # N, threshold of the command that starts a contact
     begin: int | None = None  # tick
     approach_velocity: float | None = None  # m/s
-    waiting: int | None = None  # tick since which only the command has to die out
+    waiting: int | None = None  # tick since which only the decay of the command is awaited
     peak_command: float = 0.0  # N
     status: str | None = None
 
@@ -181,8 +177,8 @@ class _Run:
         return dict(zip(names, np.array(self.log).T, strict=True))
 
     def _contact(self, n):
-        """Ticks from n on until a contact is over; (result, first tick after it)."""
-        # In a gap, what is left of the last contact's command does not begin a new one.
+        """Simulate ticks from n on until a contact has ended; return the result and the next tick."""
+        # In a gap, the remaining command of the last contact does not begin a new contact.
         contact = _Contact(n, abs(self.log[-1][2]) if self.log else self.v, self.died_out)
         patience = self.time_limit / self.period
         if isfinite(self.law.clearance):
@@ -205,7 +201,7 @@ class _Run:
         return self._result(contact, n), n
 
     def _tick(self, n):
-        """Sense and compensate: whether the force differed from 0 since the last tick, and the command."""
+        """Read sensors and compute the command; also return whether a force acted since the last tick."""
         touched = self._advance(n)
         actual = self.motion.at_left(n)
         if not self.index_waits_for_exit or self.law.side(actual) == 0:
@@ -221,7 +217,7 @@ class _Run:
         if self.noisy:
             at_surface = self.reached or self.x >= 0.0 or self.x <= -self.law.clearance
             begins = touched or (self.armed and at_surface)
-            # Both positions must be back in the gap before one reaches a surface again.
+            # Both positions must have returned to the gap before a new contact can begin.
             self.armed = self.armed or not at_surface
             self.reached = False
         else:
@@ -239,7 +235,7 @@ class _Run:
             contact.waiting = n if contact.waiting is None else contact.waiting
             level = 1e-6 * contact.peak_command
             waited = (n - contact.waiting) * T >= 0.1 - TIME_TOLERANCE * T
-            # Between two surfaces a contact is over in the middle of the gap at the latest.
+            # Between two surfaces a contact ends at the latest in the middle of the gap.
             crossed = self.last_side != (1 if self.x > -self.law.clearance / 2.0 else -1)
             if abs(command) <= level or waited or crossed:
                 contact.status, self.died_out = "over", max(level, abs(command))
@@ -292,7 +288,7 @@ class _Run:
         return x if lead is None else float(lead(x, v, a))
 
     def _advance(self, n):
-        """Cut (n - 1, n] into pieces, add up work and peak; whether the force differed from 0 in it."""
+        """Divide (n - 1, n] at events; add work and peak force; return whether the force differed from 0."""
         touched = False
         if n == 0:
             return touched
@@ -314,7 +310,7 @@ class _Run:
         return touched
 
     def _true_force(self, time):
-        """F just before `time` (ticks); 0 before t = 0."""
+        """Return F just before `time` (ticks); 0 before t = 0."""
         if time <= TIME_TOLERANCE:
             return 0.0
         newest = bisect_left(self.pieces, time - TIME_TOLERANCE, key=lambda piece: piece.start)
@@ -333,7 +329,7 @@ class _Run:
         return float(min(max(force, -limit), limit))
 
     def _lagged(self, n):
-        """The lag's output at t_n: lag y' = F(t - tau_f) - y, exact over the last period."""
+        """Return the output of the lag at t_n: lag y' = F(t - tau_f) - y, exact over the last period."""
         if n == 0:
             return 0.0
         start, end = n - 1 - self.force_delay, n - self.force_delay
@@ -342,13 +338,13 @@ class _Run:
         while self.cursor < len(self.pieces) and self.pieces[self.cursor].end <= start:
             self.cursor += 1
         for piece in self.pieces[self.cursor :]:
-            # Before that the sensor has forgotten the force.
+            # Earlier forces no longer affect the reading.
             a, b = max(piece.start, start, end - FORGOTTEN / rate), min(piece.end, end)
             if piece.start >= end:
                 break
             if piece.side == 0 or b <= a:
                 continue
-            # In time constants before the end: of a short lag, times themselves would lose the digits.
+            # In time constants before the end: for a short lag, absolute times would lose digits.
             edges = np.linspace((end - a) * rate, (end - b) * rate, max(1, ceil((b - a) * rate)) + 1)
             for early, late in pairwise(edges):
                 ago = early + (late - early) * SMOOTH_NODES
@@ -371,7 +367,7 @@ def _equivalent_mass(bodies):
 
 
 def _excess_variation(commands):
-    """Half of the command's total variation, from 0 to 0, less its range."""
+    """Return half of the command's total variation, from 0 to 0, minus its range."""
     path = np.array([0.0, *commands, 0.0])
     return float(np.sum(np.abs(np.diff(path))) / 2.0 - np.ptp(path))
 

@@ -1,7 +1,7 @@
-"""The oracle's contact: the force law, the pieces of time on which it is one smooth formula, work and peak.
+"""Contact of the oracle: force law, time segments with one smooth formula, work and peak force.
 
-Contact, separation, changes of slope and turning points are roots found by brentq; they cut the time axis
-into pieces.
+Contact, separation, slope changes and turning points are roots found by brentq; they divide the time axis
+into segments.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SMOOTH_WEIGHTS = _WEIGHTS * 6.0 * _NODES * (1.0 - _NODES)
 
 
 class Law:
-    """Contact law: force(d, d') without the clamp, and where the formula changes."""
+    """Contact law: force(d, d') without the clamp at zero, and depths at which the formula changes."""
 
     def __init__(self, contact, plane=0.0):
         self.kind, self.plane = contact["law"], plane
@@ -35,7 +35,7 @@ class Law:
         self.damping = [0.0] if self.kind == "linear" else _as_list(contact.get("damping", 0.0))
         self.scale, self.ratio = contact.get("reference_depth"), contact.get("unloading_ratio")
         self.preload, self.friction = contact.get("preload", 0.0), contact.get("friction", 0.0)
-        self.deepest = 0.0  # of the surface in touch, so far; elastoplastic remembers it
+        self.deepest = 0.0  # largest depth of the current surface, which the elastoplastic law needs
         self.exponent = contact.get("exponent", 1.5)
         self.depths = _as_list(contact.get("depths", [])) if self.kind == "piecewise_linear" else []
         self.tension = bool(contact.get("tension", False)) and self.kind == "kelvin_voigt"
@@ -57,7 +57,7 @@ class Law:
         return any(self.damping) or self.friction > 0.0
 
     def levels(self):
-        """Positions at which the formula may change."""
+        """Return the positions at which the formula may change."""
         levels = [0.0, *self.depths]
         far = [-self.clearance - depth for depth in levels] if isfinite(self.clearance) else []
         return [self.plane + level for level in (*levels, *far)]
@@ -86,13 +86,13 @@ class Law:
         if self.kind == "depth_damped":
             return depth * self.sign_of(depth, rate, index)
         if self.kind == "elastoplastic":
-            # Two lines through the point at the deepest penetration; the virgin one is met by way of max.
+            # Two lines through the point of deepest penetration; max selects the loading line.
             peak = np.maximum(depth, deepest)
             return stiffness * (peak - self.ratio * (peak - depth))
         return self.preload + stiffness * depth + damping * rate + self.friction * np.sign(rate)
 
     def sign_of(self, depth, rate, index, deepest=0.0):
-        """A function with the sign of the unclamped force, without its d^n (which hides the root)."""
+        """Return a function with the sign of the unclamped force, without the factor d^n that hides the root."""
         if self.kind == "hunt_crossley":
             return 1.0 + 1.5 * self.parameters(index)[1] * rate + 0.0 * depth
         if self.kind == "depth_damped":
@@ -103,16 +103,16 @@ class Law:
 
 @dataclass
 class Piece:
-    """A stretch of time on which the force is one smooth formula (0 when `side` is 0)."""
+    """Time segment with one smooth formula of the force (0 if `side` is 0)."""
 
     origin: float  # ticks
-    length: float  # ticks per unit of theta
+    length: float
     theta: tuple
     position: np.ndarray
     velocity: np.ndarray  # m/s, coefficients in theta
     side: int
     index: int
-    deepest: float  # when it begins
+    deepest: float  # at the beginning of the segment
     law: Law = field(repr=False)
 
     @property
@@ -127,7 +127,7 @@ class Piece:
         return polynomial(self.position)(theta), polynomial(self.velocity)(theta)
 
     def force(self, theta):
-        """Force along +x's reaction: positive on the surface at 0, negative on the one at -clearance."""
+        """Return the contact force: positive at the surface at 0, negative at the surface at -clearance."""
         if self.side == 0:
             return np.zeros_like(np.asarray(theta, float))
         x, v = self.motion(theta)
@@ -140,7 +140,7 @@ class Piece:
 
 
 class Work:
-    """Work [J] done against the surface and by it, and the largest force [N], of one contact."""
+    """Work [J] done against the surface and by the surface, and largest force [N], of one contact."""
 
     def __init__(self, law, period):
         self.law, self.period = law, period
@@ -151,7 +151,7 @@ class Work:
         self.peak = self.work_in = self.work_out = self.duration = 0.0
 
     def jump(self, position, index):
-        """Work along a jump of the position (ideal simulator, zoh hold, undamped law)."""
+        """Return the work along a jump of the position (ideal simulator, zero-order hold, undamped law)."""
         before, self.jump_position = self.jump_position, position
         if before is None or before == position:
             return
@@ -173,7 +173,7 @@ class Work:
         theta = a + (b - a) * SMOOTH_NODES
         _, v = piece.motion(theta)
         power = piece.force(theta) * v * SMOOTH_WEIGHTS * (b - a) * piece.length * self.period
-        inward = np.sum(power)  # v has one sign on a piece
+        inward = np.sum(power)  # v has constant sign on a segment
         if np.sum(v) * piece.side > 0.0:
             self.work_in += inward
         else:
@@ -195,9 +195,10 @@ class Work:
 
 
 def cut(position, velocity, a, b, law, index):
-    """Cut theta in [a, b] where the force's formula changes: [((start, end), side, reached, deepest)].
+    """Divide theta in [a, b] where the force's formula changes: [((start, end), side, reached, deepest)].
 
-    `deepest` is the law's when the piece begins; by the end of the pieces the law has that of the last.
+    `deepest` is the law's value at the beginning of the segment; at the end the law has the value of the last
+    segment.
     """
 
     x, v = polynomial(position), polynomial(velocity)
@@ -214,7 +215,7 @@ def cut(position, velocity, a, b, law, index):
         for level in [
             *law.levels(),
             *(d for d in dent if isfinite(d)),
-        ]:  # x is monotone here: one root at most
+        ]:  # x is monotonic here, so there is at most one root
             cuts.update(_roots(lambda s, level=level: x(s) - level, low, high, samples=1))
     cuts = sorted(cuts)
     pieces = []
@@ -241,7 +242,7 @@ def cut(position, velocity, a, b, law, index):
 
 
 def _roots(function, a, b, samples=8):
-    """Sign changes of a smooth function in (a, b), each refined to rounding."""
+    """Return the sign changes of a smooth function in (a, b), each refined to rounding."""
     grid = np.array([*(a + k * ((b - a) / samples) for k in range(samples)), b])
     values = function(grid)
     found = []

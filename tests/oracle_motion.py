@@ -1,7 +1,7 @@
-"""The oracle's motion simulator: the exact output of a linear system whose command is a constant or a ramp.
+"""Motion simulator of the oracle: exact output of a linear system for a constant or ramp command.
 
-Between two breakpoints of the delayed command it is kept as a Taylor polynomial to machine precision, so
-that position and velocity can be evaluated at any real time, counted in control periods ("ticks").
+Between two breakpoints of the delayed command the output is a Taylor polynomial to machine precision, so that
+position and velocity can be evaluated at any real time, counted in control periods ("ticks").
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ TAYLOR_ORDER = 24
 
 
 def delay_in_ticks(delay, period):
-    """A delay in ticks; an integer number of them to within 1e-9 is exactly that integer."""
+    """Return a delay in ticks, rounded to an integer if within 1e-9."""
     ticks = delay / period
     return float(round(ticks)) if abs(ticks - round(ticks)) <= TIME_TOLERANCE else ticks
 
 
 def simulator_matrices(simulator) -> Any:
-    """(A, B, C) of G(s), or None for the ideal simulator; states scaled by the fastest pole."""
+    """Return (A, B, C) of G(s), or None for the ideal simulator; states are scaled by the fastest pole."""
     model = simulator["model"]
     if model == "ideal":
         return None
@@ -58,7 +58,7 @@ def simulator_matrices(simulator) -> Any:
 
 
 def taylor_rows(A, B, C, length):
-    """Rows that make the Taylor coefficients of y and the state after `length` of (state, u, ramp of u)."""
+    """Return rows that map (state, u, ramp of u) to the Taylor coefficients of y and the next state."""
     order = len(B)
     terms = [np.eye(order, order + 2)]
     for k in range(TAYLOR_ORDER):
@@ -73,7 +73,7 @@ class Motion:
     """x_a(t) as polynomials: command c(m) -> latency, hold -> u(t) -> transport delay, G(s)."""
 
     def __init__(self, rig, period, position, velocity, history):
-        """Command `position`, `velocity` at t = 0, uniform before; kept `history` ticks back."""
+        """Start with `position` and `velocity` at t = 0 after uniform motion; keep `history` past ticks."""
         simulator = rig["simulator"]
         self.period, self.velocity = period, velocity
         self.latency = int(rig.get("command_latency", 0))
@@ -95,7 +95,7 @@ class Motion:
                 start = self._command(self.first - self.latency)
                 self.state = gain * start + np.linalg.solve(A, gain) * velocity
             else:
-                # z = gain U - w with z(t + T) = z(t) + gain v T over every step of the staircase.
+                # z = gain U - w with z(t + T) = z(t) + gain v T for every step of the staircase command.
                 start = self._command(self.first + 1 - self.latency)
                 steps = gain * velocity * period
                 transition = expm(A * period)
@@ -111,7 +111,7 @@ class Motion:
         return self.position + self.velocity * m * self.period
 
     def segment(self, j, i):
-        """Taylor coefficients of x_a on substep i of the interval from j + delay, theta = 0..1."""
+        """Return Taylor coefficients of x_a on substep i of the interval from j + delay, theta = 0..1."""
         while self.first + len(self.intervals) <= j:
             self.intervals.append(self._solve(self.first + len(self.intervals)))
         return self.intervals[j - self.first][i]
@@ -129,7 +129,7 @@ class Motion:
         return polynomials
 
     def locate_left(self, time):
-        """(j, i, theta) of a time as the end of what came before it: theta in (0, 1]."""
+        """Return (j, i, theta), theta in (0, 1], of the substep that ends at or contains the time."""
         scaled = (time - self.delay) * self.substeps
         q = ceil(scaled - TIME_TOLERANCE * self.substeps) - 1
         j = q // self.substeps
@@ -140,7 +140,7 @@ class Motion:
         return polynomial(self.segment(j, i))(theta)
 
     def segments_between(self, start, end):
-        """(polynomial, origin, theta_a, theta_b) covering (start, end], in order."""
+        """Return (polynomial, origin, theta_a, theta_b) covering (start, end], in order."""
         q = floor((start - self.delay) * self.substeps + TIME_TOLERANCE)
         while True:
             origin = self.delay + q / self.substeps
@@ -155,7 +155,7 @@ class Motion:
 
 
 def polynomial(coefficients):
-    """The polynomial as a function of a number or an array: Horner's rule as NumPy's, less its checks."""
+    """Return the polynomial as a function (Horner's rule without NumPy's argument checks)."""
     last, *others = reversed(coefficients.tolist())
 
     def value(s):

@@ -1,4 +1,4 @@
-"""The rig's plant and the runtime's controller in lock-step: virtual time, no network, no jax."""
+"""Rig plant and runtime controller in lock-step: virtual time, no network, no jax."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -29,7 +29,7 @@ FINITE = st.floats(allow_nan=False, allow_infinity=False)
 
 
 def controller(mechanism: Mechanism, compensator: str, gains: Mapping[str, float], **limits: float):
-    """The runtime's controller for a mechanism."""
+    """Return the runtime controller for a mechanism."""
     made = GainFile(compensator, gains, mechanism.rig.control_period, mechanism.contact.clearance)
     return Controller(made._replace(limits={**made.limits, **limits}))
 
@@ -37,8 +37,11 @@ def controller(mechanism: Mechanism, compensator: str, gains: Mapping[str, float
 def closed_loop(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, float], seed: int = 0
 ) -> tuple[list[RigContact], dict[int, float]]:
-    """The mechanism's contacts as `jaxhil simulate` runs them, each entered at the speed of the rebound
-    before; the largest shortfall [m] of the position command in each."""
+    """Return the contacts of the mechanism as in `jaxhil simulate`, and the position shortfalls.
+
+    Each contact starts at the rebound speed of the previous contact. Shortfalls are the largest of each
+    contact [m].
+    """
     law, plant, watch = (
         controller(mechanism, compensator, gains),
         RigHardware(mechanism, seed),
@@ -85,8 +88,11 @@ def packets(
     seed: int = 0,
     resets: bool = False,
 ) -> tuple[RigTask, ControllerTask, list[AnswerPacket]]:
-    """Rig and controller exchanging packets for so many ticks. `delivered(way, packet)` is what arrives at
-    that tick instead of a packet `"there"` or `"back"`."""
+    """Exchange packets between rig and controller for the given number of ticks.
+
+    `delivered(way, packet)` returns the packets that arrive at this tick when `packet` is sent `"there"` or
+    `"back"`.
+    """
     rig, task = RigTask(mechanism, seed, resets=resets), ControllerTask(law, to_plain_data(mechanism))
     answers = []
     for _ in range(ticks):
@@ -102,18 +108,18 @@ def packets(
 
 
 def same(one, other):
-    """Whether two packets hold the same numbers, nan among them."""
+    """Return whether two packets hold the same numbers, including NaN."""
     return all(a == b or (a != a and b != b) for a, b in zip(one, other, strict=True))
 
 
 def a_reading(tick, sequence=None, force=0.0, position=-1.0, event=TICK, run=1):
-    """What the rig sends of a tick."""
+    """Return the reading packet of a tick."""
     sequence = tick + 10 if sequence is None else sequence
     return ReadingPacket(event, sequence, run, tick, 0.001 * sequence, force, position, -1.0, 0.005)
 
 
 def prepared(mechanism, **limits):
-    """The controller's task, its law without compensation, ready for a run."""
+    """Return the controller's task with compensator `none`, ready for a run."""
     law = controller(mechanism, "none", {}, **limits)
     task = ControllerTask(law, to_plain_data(mechanism))
     assert task.answer(a_reading(0, 1, event=PREPARE)).flags == READY

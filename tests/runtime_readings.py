@@ -9,7 +9,7 @@ Reading = tuple[float, float, float, float]
 
 
 def readings(count: int, *, seed: int = 0, two_sided: float = 0.0) -> list[Reading]:
-    """Noisy readings (F, x_d, v_d, x_m) of a contact and, with a gap, of the far surface too."""
+    """Return noisy readings (F, x_d, v_d, x_m) of a contact and, with a gap, of the far surface too."""
     rng = random.Random(seed)
     stiffness, damping, rate = 1.2e5, 300.0, 25.0
     amplitude = 2e-4 + two_sided

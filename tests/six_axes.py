@@ -1,4 +1,4 @@
-"""Parts of a rig in six axes that most tests have in common."""
+"""Common parts of six-axis rigs for tests."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,24 +23,24 @@ FULL = (
 
 
 def zeros(like):
-    """The vector 0 of a batch."""
+    """Return a zero vector for a batch."""
     return Vector(*(jnp.zeros_like(like) for _ in range(3)))
 
 
 def lanes(values, batch=()):
-    """Numbers, repeated over a trailing batch."""
+    """Repeat numbers over a trailing batch axis."""
     values = np.asarray(values, float)
     spread = values.reshape(*values.shape, *[1] * len(batch))
     return jnp.asarray(np.broadcast_to(spread, (*values.shape, *batch)))
 
 
 def no_tool(like):
-    """A tool without mass."""
+    """Return a tool without mass."""
     return Tool(jnp.zeros_like(like), zeros(like), Matrix(zeros(like), zeros(like), zeros(like)))
 
 
 def ideal_sensor(delay, **changes):
-    """A sensor on the fixed side, in T, with a delay [s] (*batch) and nothing else."""
+    """Return a sensor on the target side, in frame T, with a delay [s] (*batch) and no errors."""
     batch, none = delay.shape, jnp.zeros((6, *delay.shape))
     errors = SampleErrors(lanes(np.eye(6), batch), none, none, none, none + jnp.inf)
     mounting = Pose(zeros(delay), identity(delay))
@@ -52,7 +52,7 @@ def ideal_sensor(delay, **changes):
 
 
 def second_order(frequencies, dampings, delays):
-    """A motion simulator of natural frequencies [Hz], damping ratios and delays [s], each (axes, *batch)."""
+    """Return a simulator with natural frequencies [Hz], damping ratios and delays [s], (axes, *batch)."""
     frequency, same = 2 * np.pi * frequencies, jnp.ones_like(delays)
     return MotionSimulatorBatch(
         jnp.stack([0 * same, frequency**2]),
@@ -62,7 +62,7 @@ def second_order(frequencies, dampings, delays):
 
 
 def springs(stiffness, damping, exponent):
-    """Parameters of a contact law, each (candidates, *batch)."""
+    """Return parameters of a contact law, each (candidates, *batch)."""
     zero = jnp.zeros_like(stiffness)
     own = {key.name: zero for key in CONTACT_KEYS.values()}
     own |= {"exponent": exponent, "depths": zero[:1], "tension": zero > 1}
@@ -70,23 +70,23 @@ def springs(stiffness, damping, exponent):
 
 
 def place(values, batch=()):
-    """A vector of three numbers, over a batch."""
+    """Return a constant vector of three numbers over a batch."""
     return vector(lanes(values, batch))
 
 
 def plain_body(mass, inertia, interface, batch=()):
-    """A body of a mass, an inertia (3, 3) and an interface, whose frame is not turned against the body."""
+    """Return a body with mass, inertia (3, 3) and interface, whose frame is parallel to the body frame."""
     number = lanes(mass, batch)
     return build_body(number, matrix(lanes(inertia, batch)), place(interface, batch), identity(number))
 
 
 def meeting(bodies, pose, twist, before):
-    """States `before` [s] a pose (p, theta) and a twist (v, w), each (6, *batch)."""
+    """Return states `before` [s] the pose (p, theta) with twist (v, w), each (6, *batch)."""
     at = Pose(vector(pose[:3]), exponential(vector(pose[3:])))
     return begin(bodies, at, Twist(vector(twist[:3]), vector(twist[3:])), before)
 
 
 def spheres(centres, radii, shape, law, parameters, friction=None):
-    """A group of spheres of the chaser, centres (3, candidates, *batch)."""
+    """Return a group of spheres of the chaser, centres (3, candidates, *batch)."""
     candidates = ChaserSpheres(vector(centres), radii, shape)
     return ContactGroup(candidates, CONTACT_LAWS[law], parameters, friction or Frictionless())

@@ -1,10 +1,10 @@
-"""Rig and contact in six axes once more, in plain NumPy: rotation matrices, the matrix exponential and a
-Runge-Kutta method of order 8, one case at a time.
+"""Independent six-axis rig and contact in plain NumPy, one case at a time.
 
-A case is a dict: `masses`, `inertias` and `interfaces` of target and chaser; `start`, position, velocity,
-rotation matrix and angular velocity (body axes) of each; `spheres` (centre, radius), `shape` ("plane" or
-"drogue", with its numbers in `numbers`), `stiffness`, `exponent`, `damping`, `friction`, `slip`; of the rig
-`period`, `frequency`, `ratio` and `delays` of the six axes, `force_delay`, `position_delay`; on the moving
+It uses rotation matrices, the matrix exponential and a Runge-Kutta method of order 8. A case is a dict:
+`masses`, `inertias` and `interfaces` of target and chaser; `start`: position, velocity, rotation matrix and
+angular velocity (body axes) of each; `spheres` (centre, radius), `shape` ("plane" or "drogue", with its
+numbers in `numbers`), `stiffness`, `exponent`, `damping`, `friction`, `slip`; for the rig `period`,
+`frequency`, `ratio` and `delays` of the six axes, `force_delay`, `position_delay`; for a sensor on the moving
 side `tool` (mass, centre, inertia), `assumed` (mass, centre) and `gravity`, else None.
 """
 
@@ -19,7 +19,7 @@ def skew(a):
 
 
 def jacobian(theta):
-    """The left one: the mean of the rotations on the way to theta, by its power series."""
+    """Return the left Jacobian of rotations by its power series."""
     total, term = np.eye(3), np.eye(3)
     for order in range(2, 30):
         term = term @ skew(theta) / order
@@ -28,7 +28,7 @@ def jacobian(theta):
 
 
 def drogue(x, half_angle, radius, bottom):
-    """Signed distance and normal, from the profile: a circle, and a line that touches it."""
+    """Return signed distance and normal of the drogue profile: a circle and a tangent line."""
     rho, z = np.hypot(x[0], x[1]), x[2] - bottom
     outward = np.array([x[0], x[1], 0.0]) / rho if rho > 0 else np.zeros(3)
     touching = radius * np.array([np.cos(half_angle), -np.sin(half_angle)])
@@ -45,7 +45,7 @@ def plane(x):
 
 
 def wrench(case, p, rotation, v, w):
-    """Force and moment about T's origin on the chaser."""
+    """Return force on the chaser and moment about T's origin."""
     force, moment = np.zeros(3), np.zeros(3)
     for centre, radius in case["spheres"]:
         x = p + rotation @ np.asarray(centre)
@@ -63,7 +63,7 @@ def wrench(case, p, rotation, v, w):
 
 
 def relative(case, bodies):
-    """p, R, v, w of C against T, and T's place and attitude in the world."""
+    """Return p, R, v, w of C relative to T, and position and attitude of T in the world."""
     (r1, v1, a1, w1), (r2, v2, a2, w2) = bodies
     o1, o2 = (np.asarray(o) for o in case["interfaces"])
     world1, world2 = a1 @ w1, a2 @ w2
@@ -73,7 +73,7 @@ def relative(case, bodies):
 
 
 def loads(case, bodies, force, moment):
-    """Force and torque on each body, in world axes."""
+    """Return force and torque on each body, in world axes."""
     *_, place, axes = relative(case, bodies)
     f, m = axes @ force, axes @ moment
     (r1, *_), (r2, *_) = bodies
@@ -81,7 +81,7 @@ def loads(case, bodies, force, moment):
 
 
 def in_space(case, time):
-    """Bodies after a time, by a Runge-Kutta method of order 8 on rotation matrices."""
+    """Return the ideal motion of the bodies after a time."""
     inertias = [np.asarray(j) for j in case["inertias"]]
 
     def unpacked(y):
@@ -105,7 +105,7 @@ def in_space(case, time):
 
 
 def moved(case, bodies, force, moment):
-    """A period of the numerical model: the force first, then the motion."""
+    """Advance the numerical model by a period: velocities from the force first, then positions."""
     period, after = case["period"], []
     for (r, v, a, w), (f, torque), mass, j in zip(
         bodies, loads(case, bodies, force, moment), case["masses"], case["inertias"], strict=True
@@ -126,7 +126,7 @@ def command(case, bodies):
 
 
 class Axis:
-    """y'' + 2 zeta w y' + w^2 y = w^2 u, u straight between ticks, from uniform motion on."""
+    """Motion simulator axis y'' + 2 zeta w y' + w^2 y = w^2 u with linear hold, first in uniform motion."""
 
     def __init__(self, frequency, ratio, period, at, rate):
         w = 2 * np.pi * frequency
@@ -139,13 +139,13 @@ class Axis:
         self.state, self.sent = np.array([at - self.late, rate]), at
 
     def send(self, value):
-        """The command at the next tick."""
+        """Set the command at the next tick."""
         start = np.array([*self.state, self.sent, (value - self.sent) / self.period])
         self.starts.append(start)
         self.state, self.sent = (expm(self.flow * self.period) @ start)[:2], value
 
     def response(self, time):
-        """y, y', y'' at a time since the first tick."""
+        """Return y, y', y'' at a time since the first tick."""
         if time <= 1e-9 * self.period:
             return np.array([self.at - self.late + self.rate * time, self.rate, 0.0])
         index = min(int(np.ceil(time / self.period - 1e-9)) - 1, len(self.starts) - 1)
@@ -154,7 +154,7 @@ class Axis:
 
 
 def on_the_rig(case, ticks):
-    """Bodies of the numerical model after so many ticks."""
+    """Return the bodies of the numerical model after the given number of ticks."""
     bodies, period = case["start"], case["period"]
     at, rates = command(case, bodies)
     axes = [
@@ -181,7 +181,7 @@ def on_the_rig(case, ticks):
 
 
 def weighed(case, x, rotation, w, rate, bend, force, moment, measured):
-    """What a sensor behind the tool and a controller that takes its weight back make of a contact."""
+    """Return the compensated wrench of a sensor behind a tool for a contact wrench."""
     mass, centre, inertia = case["tool"]
     step = 1e-6
     ahead, behind = (

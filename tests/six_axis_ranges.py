@@ -1,8 +1,8 @@
-"""Built-in six-axis mechanisms with the wide ranges on which their compensators are judged."""
+"""Built-in six-axis mechanisms with the wide ranges on which their compensators are evaluated."""
 
 from jaxhil.mechanism.file import load_any
 
-OFFSETS = {"ring-capture": 0.01, "probe-drogue": 0.05}  # m; a larger one misses the ring's hooks
+OFFSETS = {"ring-capture": 0.01, "probe-drogue": 0.05}  # m; for larger offsets the ring misses the hooks
 ATTITUDES = {"ring-capture": 0.005, "hydraulic-hexapod": 0.015}  # rad
 NOISE = {"force": 0.5, "torque": 0.05}  # N, N m
 POSE_NOISE = {"translation": 5e-6, "rotation": 1e-5}  # m, rad

@@ -1,4 +1,4 @@
-"""Small sweeps for tests: one contact in coarse ticks, a few uncertain numbers."""
+"""Small sweeps for tests: one contact at a coarse control period, with a few uncertain parameters."""
 
 import math
 from typing import Any
@@ -24,7 +24,7 @@ def case(
     correlation: Any = None,
     **simulator: float,
 ) -> dict[str, Any]:
-    """A gain document for a mechanism of some contacts."""
+    """Return a gain document for a mechanism with the given number of contacts."""
     raw = mechanism({}, {**SECOND_ORDER, **simulator}, contacts=contacts, force_sensor=force_sensor)
     parsed = validated({**raw, "uncertainty": uncertainty, "correlation": correlation})
     gains = nominal_gains(parsed, compensator)
@@ -32,6 +32,6 @@ def case(
 
 
 def manifest(document: dict[str, Any] | None = None, scenarios: int = 100, **choices: Any) -> Manifest:
-    """A sweep over `case()`, in chunks of 32."""
+    """Return a sweep over `case()` in chunks of 32."""
     loaded = check_document(document or case())
     return build_manifest(loaded, ManifestOptions(scenarios, **{"chunk": 32, "limit": math.inf, **choices}))
