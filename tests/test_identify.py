@@ -265,7 +265,7 @@ def test_identify_copies_previous_list_entry_for_grazing_contact():
 
 
 def test_identify_keeps_position_delay_if_force_delay_may_be_zero(monkeypatch):
-    """Both sensors lag alike, so the force delay is 0; its estimate is negative, but by less than its spread."""
+    """Both sensors lag alike, so the force delay is 0; its estimate is negative within its spread."""
     rig = campaign_kinds.rig(force_sensor__delay=0.003, position_sensor__delay=0.003)
     monkeypatch.setitem(campaigns.KINDS, "same", campaign_kinds.Kind(rig, campaign_kinds.voigt()))
     campaign = campaigns.campaign("same", 2, speeds=FEW, seconds=30.0)

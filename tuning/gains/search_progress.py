@@ -46,7 +46,7 @@ class SearchProgress:
         self._show()
 
     def step(self, name: str, kind: Any, make: Callable[[], Any]) -> Any:
-        """Read a step's result, of type `kind`, from a checkpoint; if there is none, call `make` and save it."""
+        """Read a step's result, of type `kind`, from a checkpoint; without one, call `make` and save it."""
         return self.journal.step(name, kind, make)
 
     def _show(self) -> None:

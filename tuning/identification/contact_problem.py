@@ -295,7 +295,7 @@ class ContactProblem:
     def _design(
         self, near: list[_NearbyRows], flags: list[np.ndarray], onsets: _Onsets | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return design matrix (planes, coefficients, rows) and readings near contact, in units of the noise."""
+        """Return design matrix (planes, coefficients, rows) and readings near contact, divided by noise."""
         std, tables, first = self.readings.std, [], None
         for rows_near, flag in zip(near, flags, strict=True):
             # The last column belongs to the bias. It is 1 in all rows or, if there is a dead zone, only in
