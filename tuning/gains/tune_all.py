@@ -131,7 +131,7 @@ def _build_tasks(
 
 
 def _group_tasks(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int]]:
-    """Return the tasks' indices, grouped by program (and by number of contacts if a user's function needs it)."""
+    """Return indices of tasks grouped by program (and, with a user's function, number of contacts)."""
     groups = group_by_program([task.loop for task in tasks], [task.scenarios for task in tasks])
     if settings.objective.function is None:
         return groups
