@@ -1,7 +1,7 @@
 """Faults that the controller detects on the rig, and its reactions.
 
-Each fault is one bit, which `Controller.faults` has set on the tick on which the fault occurs. Documentation,
-exports and error texts are made from `FAULTS`. The bits are the same in the C controller.
+Each fault is one bit, which is set in `Controller.faults` on the tick on which the fault occurs.
+Documentation, exports and error texts are made from `FAULTS`. The bits are the same in the C controller.
 
 A *trip* is latched until `reset`: the force ramps to 0 and the position command comes to rest out of contact.
 """

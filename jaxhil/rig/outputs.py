@@ -112,7 +112,7 @@ class PositionGuard:
         self.fatal = 0
 
     def release(self) -> None:
-        """Forget the last output, because the drives have been moved by other means."""
+        """Forget the last output, after something else has moved the drives."""
         self.known = False
         self.restart()
 
@@ -192,7 +192,7 @@ class PositionGuard:
         self.at_rest = rate == 0.0 and target_rate == 0.0
 
     def _stand(self, measured: float, position: float) -> None:
-        """Set the output to `measured`, or if that is NaN to `position`, clamped to the free stroke."""
+        """Set the output to `measured`; if it is NaN, to `position` moved into the stroke, out of contact."""
         self.known = True
         self.output = measured
         if isfinite(measured):

@@ -1,1 +1,1 @@
-"""No compensation."""
+"""No compensation: baseline for all compensators."""
