@@ -228,7 +228,7 @@ def test_gain_file_of_earlier_version_is_rejected_with_advice(tmp_path, jaxhil):
         del document["gains"][name]
     text = (
         f"{file}: gains.prior_friction_spread: found nothing, expected all gains of impulse_ledger "
-        "(is it of an earlier version? `jaxhil tune` makes a new file)"
+        "(for a file of an earlier version, run `jaxhil tune` again)"
     )
     assert_refused_everywhere(file, document, text, jaxhil)
 

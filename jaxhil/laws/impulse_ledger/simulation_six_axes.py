@@ -74,17 +74,17 @@ class ImpulseLedger(SixAxisCompensator):
     def step(self, prepared, state, signals, tick):
         state = record(prepared, state, signals, tick)
         reading, state = read(prepared, state, signals, tick)
-        begins = reading.loud & ~state.in_contact
+        begins = reading.is_contact & ~state.in_contact
         contact = select_lanes(begins, onset(prepared, state, reading, signals), state.contact)
-        in_contact = state.in_contact | reading.loud
+        in_contact = state.in_contact | reading.is_contact
         command, contact, estimate = follow(prepared, state, reading, (contact, state.estimate, begins), tick)
-        quiet = jnp.where(reading.loud, 0, state.flight.quiet + 1)
+        ticks_since_contact = jnp.where(reading.is_contact, 0, state.flight.ticks_since_contact + 1)
         period = prepared.constants.control_period
-        in_contact = in_contact & ~(quiet * period > prepared.gains["release_time"])
+        in_contact = in_contact & ~(ticks_since_contact * period > prepared.gains["release_time"])
         command = jnp.where(in_contact[None], command, 0)
         state = state._replace(
             impulse=state.impulse + period[None] * command,
-            flight=state.flight._replace(quiet=quiet),
+            flight=state.flight._replace(ticks_since_contact=ticks_since_contact),
             in_contact=in_contact,
             contact=contact,
             estimate=estimate,

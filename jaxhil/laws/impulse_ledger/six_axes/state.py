@@ -29,7 +29,7 @@ class FreeFlightState(NamedTuple):
     lag: Six  # mean of the model's pose minus the hardware's pose, which is delayed like the force [m, rad]
     twist: Six  # mean twist of the model [m/s, rad/s]
     ticks: Float[Array, "*batch"]  # number of ticks in `lag` and `twist`
-    quiet: Float[Array, "*batch"]  # number of ticks since the last reading in contact; large before the first
+    ticks_since_contact: Float[Array, "*batch"]  # large before the first contact
 
 
 class SixAxisContact(NamedTuple):
@@ -67,5 +67,5 @@ class Reading(NamedTuple):
     variance: Float[Array, "*batch"]  # mean of |W|^2 by noise alone
     pose: Six  # xi_a, pose of the hardware, delayed like the force [m, rad]
     twist: Six  # rate of `pose` [m/s, rad/s]
-    moved: Six  # change of `pose` since the last tick [m, rad]
-    loud: Bool[Array, "*batch"]  # whether the wrench is large enough for a contact
+    pose_change: Six  # change of `pose` since the last tick [m, rad]
+    is_contact: Bool[Array, "*batch"]  # whether the wrench is large enough for a contact

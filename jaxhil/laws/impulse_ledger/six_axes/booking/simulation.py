@@ -47,7 +47,7 @@ def onset(
     delay = jnp.where(is_closing, -dot(direction, lag) / jnp.where(is_closing, closing, 1), mean) / period
     longest = len(state.ring) - 2.0
     delay = jnp.clip(delay, prepared.gains["identification_delay"] / period, longest)
-    is_recent = flight.quiet * period < fixed.RECENT
+    is_recent = flight.ticks_since_contact * period < fixed.RECENT
     zeros = jnp.zeros_like(lag)
     return SixAxisContact(
         delay=jnp.where(is_recent, last.delay, delay),
@@ -83,7 +83,7 @@ def follow(
     """
     contact_now, estimate, begins = contact
     gains, period = prepared.gains, prepared.constants.control_period
-    inverse_mass, loud = prepared.constants.inverse_mass, reading.loud
+    inverse_mass, is_contact = prepared.constants.inverse_mass, reading.is_contact
     delay = jnp.broadcast_to(contact_now.delay, state.impulse.shape)
     desired, twist, impulse = (
         look_back(state.ring[:, rows], tick, delay) for rows in (DESIRED, TWIST, IMPULSE)
@@ -92,10 +92,10 @@ def follow(
     direction, mixed = _direction(prepared, old, reading, begins)
     # If the direction turns, the contact is at a different surface: restart the tangent model.
     along = dot(old.modelled, product(inverse_mass, direction))
-    turns = begins | (loud & (along < fixed.TURNED))
+    turns = begins | (is_contact & (along < fixed.TURNED))
     modelled = jnp.where(turns[None], direction, old.modelled)
     estimate = select_lanes(turns, prepared.prior, estimate)
-    path = jnp.where(turns, 0, old.path - dot(direction, reading.moved))
+    path = jnp.where(turns, 0, old.path - dot(direction, reading.pose_change))
     force = dot(reading.wrench, product(inverse_mass, direction))
     estimate, tangent = _update_estimate(prepared, old, reading, estimate, (direction, path, force))
 
@@ -106,20 +106,20 @@ def follow(
     faster = -dot(direction, reading.twist - (twist - missing))
     least = jnp.minimum(force, 0)
     corrected = jnp.maximum(force + restoring(tangent, -deeper) - tangent.damping * faster, least)
-    corrected = jnp.where(loud, corrected, force)
+    corrected = jnp.where(is_contact, corrected, force)
     booked = old.impulse + period[None] * (reading.wrench + (corrected - force)[None] * direction)
 
     # Predict from t - D to the middle of the command's period (d).
     velocity = -dot(direction, twist - product(inverse_mass, impulse - booked))
     ahead = (old.delay + fixed.AHEAD) * period
-    touches = loud & (corrected != 0)
+    touches = is_contact & (corrected != 0)
     bridged, last_force = bridge(tangent, corrected, least, deeper, velocity, ahead)
     stiffness = jnp.maximum(tangent.stiffness, fixed.LEAST_STIFFNESS)
     peak = jnp.maximum(old.peak, jnp.abs(force))
     expected = jnp.maximum(jnp.sqrt(stiffness) * old.speed, peak)
     last_force = jnp.minimum(last_force, fixed.HIGHEST * expected)
     bridged, last_force = (jnp.where(touches, value, 0) for value in (bridged, last_force))
-    rest = jnp.where(loud[None], reading.wrench - force[None] * direction, 0)
+    rest = jnp.where(is_contact[None], reading.wrench - force[None] * direction, 0)
     unpaid = state.impulse - booked - bridged[None] * direction - ahead[None] * rest
 
     # Compute the command (e).
@@ -161,7 +161,7 @@ def _direction(
     old, pole = contact.direction, prepared.gains["direction_pole"][None]
     along = dot(old, product(prepared.constants.inverse_mass, reading.wrench))
     wrench = jnp.where((along < 0)[None], -1, 1) * reading.wrench
-    mixed = jnp.where((reading.loud & ~begins)[None], wrench + pole * (old - wrench), old)
+    mixed = jnp.where((reading.is_contact & ~begins)[None], wrench + pole * (old - wrench), old)
     return mixed / _norm(prepared, mixed)[None], mixed
 
 
@@ -189,8 +189,8 @@ def _update_estimate(
         reading.variance / speed**2,
         growth,
     )
-    mean = jnp.where(reading.loud[None], learned.mean, estimate.mean)
-    covariance = jnp.where(reading.loud[None, None], learned.covariance, estimate.covariance)
+    mean = jnp.where(reading.is_contact[None], learned.mean, estimate.mean)
+    covariance = jnp.where(reading.is_contact[None, None], learned.covariance, estimate.covariance)
     tangent = Tangent(
         stiffness=jnp.maximum(mean[0], 0),
         curvature=mean[3] / fixed.BEND,

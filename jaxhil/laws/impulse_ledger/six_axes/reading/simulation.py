@@ -49,22 +49,22 @@ def read(
     unbiased = corrected - state.flight.bias
     variance = noise_variance(prepared, pose)
     settles = signals.age.astype(period.dtype) * period < gains["settle"]
-    is_recent = state.flight.quiet * period < fixed.RECENT
+    is_recent = state.flight.ticks_since_contact * period < fixed.RECENT
     least = fixed.LEAST_RATE**2 * dot(
         signals.twist_desired, product(constants.mass_matrix, signals.twist_desired)
     )
     tool = jnp.where(state.in_contact | is_recent, state.contact.tool, 0)
     gate = fixed.ONSET_SIGMAS**2 * variance + least + tool
-    loud = (dot(unbiased, product(inverse_mass, unbiased)) > gate) & ~settles
+    is_contact = (dot(unbiased, product(inverse_mass, unbiased)) > gate) & ~settles
     reading = Reading(
         wrench=unbiased,
         variance=variance,
         pose=pose,
         twist=(pose - last) / period[None],
-        moved=pose - last,
-        loud=loud,
+        pose_change=pose - last,
+        is_contact=is_contact,
     )
-    free = ~state.in_contact & ~loud
+    free = ~state.in_contact & ~is_contact
     flight = _update_free_flight(state.flight, corrected, signals, pose, free, free & ~is_recent, period)
     return reading, state._replace(aligned=pose, flight=flight)
 
