@@ -130,7 +130,7 @@ LEGS = "hydraulic-hexapod"
           "uncertainty": {}}, "or has an eigenvalue below 0, expected the matrix of a spring"),
         ("ring-capture", {"latch.hooks.angel": 0.1}, "an unknown key, expected one of chaser, pattern"),
         ("ring-capture", {"latch.hooks.pattern.count": 0}, "count: found 0, expected an integer from 1"),
-        ("ring-capture", {"latch": {"a b": {"chaser": [0, 0, 0]}}}, "found the name 'a b', expected"),
+        ("ring-capture", {"latch": {"a b": {"chaser": [0, 0, 0]}}}, 'latch."a b": found the name'),
         (LEGS, {"rig.simulator.height": None}, 'height: found nothing, expected a value (space = "stewart" '
                                                'needs'),
         (LEGS, {"rig.simulator.base": [[0, 0, 0]]}, "base: found a list of 1 entry, expected a list of 6"),

@@ -268,11 +268,7 @@ class Latch(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     stiffness_matrix: (
         Annotated[
             list[StiffnessRow],
-            Meta(
-                min_length=6,
-                max_length=6,
-                description="stiffness matrix, instead of stiffness, in T axes: force, moment",
-            ),
+            Meta(min_length=6, max_length=6, description="stiffness matrix in T axes, instead of stiffness"),
         ]
         | None
     ) = None

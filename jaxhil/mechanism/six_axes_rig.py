@@ -197,7 +197,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         default_factory=zeros(6)
     )
     quantum: Annotated[
-        list[LoadMagnitude], six_axis_metadata("resolution: every reading is a multiple of this", LOAD_NAMES)
+        list[LoadMagnitude], six_axis_metadata("resolution: readings are multiples of this", LOAD_NAMES)
     ] = field(default_factory=zeros(6))
     dead_zone: Annotated[
         list[LoadMagnitude], six_axis_metadata("magnitude below which the reading is 0", LOAD_NAMES)
@@ -218,8 +218,8 @@ class PositionSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     noise_std: Annotated[list[Error], six_axis_metadata("standard deviation of white noise")] = field(
         default_factory=zeros(6)
     )
-    quantum: Annotated[list[Error], six_axis_metadata("resolution: every reading is a multiple of this")] = (
-        field(default_factory=zeros(6))
+    quantum: Annotated[list[Error], six_axis_metadata("resolution: readings are multiples of this")] = field(
+        default_factory=zeros(6)
     )
 
 

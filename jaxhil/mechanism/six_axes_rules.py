@@ -45,9 +45,8 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
     for table, names in (("contact", mechanism.contact), ("latch", mechanism.latch)):
         for name in names:
             if not NAME_PATTERN.fullmatch(name):
-                raise KeyProblem(
-                    (table, name), f"the name {format_value(name)}", "at most 60 letters, digits, - and _"
-                )
+                found = f"the name {format_value(name)}"
+                raise KeyProblem((table, name), found, "at most 60 letters, digits, - and _")
     for name, contact in mechanism.contact.items():
         check_contact(mechanism, name, contact)
     for name, latch in mechanism.latch.items():

@@ -205,9 +205,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         float, key_metadata("time constant of the reading's first-order lag", "s", ge=0.0)
     ] = 0.0
     noise_std: Annotated[float, key_metadata("standard deviation of white noise", "N", ge=0.0)] = 0.0
-    quantum: Annotated[
-        float, key_metadata("resolution: every reading is a multiple of this", "N", ge=0.0)
-    ] = 0.0
+    quantum: Annotated[float, key_metadata("resolution: readings are multiples of this", "N", ge=0.0)] = 0.0
     dead_zone: Annotated[float, key_metadata("magnitude below which the reading is 0", "N", ge=0.0)] = 0.0
     bias: Annotated[float, key_metadata("bias added to every reading", "N")] = 0.0
     range: Annotated[
@@ -220,9 +218,7 @@ class PositionSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     delay: Annotated[float, key_metadata("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
     noise_std: Annotated[float, key_metadata("standard deviation of white noise", "m", ge=0.0)] = 0.0
-    quantum: Annotated[
-        float, key_metadata("resolution: every reading is a multiple of this", "m", ge=0.0)
-    ] = 0.0
+    quantum: Annotated[float, key_metadata("resolution: readings are multiples of this", "m", ge=0.0)] = 0.0
 
 
 class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
