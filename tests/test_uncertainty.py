@@ -239,7 +239,7 @@ def test_normal_draws_are_truncated_to_allowed_values(path, nominal, std):
         ("contact.tension", {"distribution": "normal", "std": 1.0}, "numeric key"),
         ("contact.law", {"distribution": "normal", "std": 1.0}, "numeric key"),
         ("contact", {"distribution": "normal", "std": 1.0}, "numeric key"),
-        ("a\nb", {"distribution": "normal", "std": 1.0}, '"a\\nb": found no such'),
+        ("a\nb", {"distribution": "normal", "std": 1.0}, '"a\\nb": found a key that'),
         ("rig.simulator.numerator", {"distribution": "normal", "std": 1.0}, "G(0) = 1"),
         ("rig.simulator.time_constant", {"distribution": "normal", "std": 1.0}, "found nothing as"),
         ("contact.depths", {"distribution": "normal", "std": 1.0}, "found [] as its value"),

@@ -203,10 +203,7 @@ class ContactLaw(abc.ABC):
         raise self._missing_method_error("in_floats")
 
     def regression(self, contact: Any) -> Regression:
-        """Return the law as a linear combination of known functions, for fits to logs.
-
-        Raise `InputError` if the law does not define this method.
-        """
+        """Return the law for linear regression. Raise `InputError` if the law does not define this method."""
         raise self._missing_method_error("regression")
 
     def families(self, deepest: float, entries: int) -> list[RegressionFamily]:
@@ -223,7 +220,7 @@ class ContactLaw(abc.ABC):
         return [stiffness, damping]
 
     def file_values(self, fitted: Mapping[str, np.ndarray], entry: int) -> dict[str, np.ndarray]:
-        """Convert the `fitted` coefficients of a list entry to values of a mechanism file, by dotted key."""
+        """Convert the `fitted` coefficients of one contact to values of a mechanism file, by dotted key."""
         return {f"contact.stiffness.{entry}": fitted["stiffness"]}
 
     def _missing_method_error(self, method: str) -> InputError:

@@ -88,8 +88,8 @@ class StepEnd(NamedTuple):
 
     depth: Array  # penetration [m]
     velocity: Array  # rate of the penetration [m/s]
-    first: Array  # acceleration at the start of the step [m/s^2]
-    last: Array  # acceleration at the end of the step [m/s^2]
+    start_acceleration: Array  # acceleration at the start of the step [m/s^2]
+    end_acceleration: Array  # acceleration at the end of the step [m/s^2]
 
 
 def interpolate_step(
@@ -99,11 +99,11 @@ def interpolate_step(
 
     `depth` and `velocity` are the values at the start of the step.
     """
-    linear, square = velocity * length, end.first * length**2 / 2
+    linear, square = velocity * length, end.start_acceleration * length**2 / 2
     # Differences from uniform acceleration at the end of the step, multiplied by powers of the step length.
     position_rest = end.depth - depth - linear - square
     velocity_rest = end.velocity * length - linear - 2 * square
-    acceleration_rest = end.last * length**2 - 2 * square
+    acceleration_rest = end.end_acceleration * length**2 - 2 * square
     cubic = 10 * position_rest - 4 * velocity_rest + acceleration_rest / 2
     quartic = -15 * position_rest + 7 * velocity_rest - acceleration_rest
     quintic = 6 * position_rest - 3 * velocity_rest + acceleration_rest / 2

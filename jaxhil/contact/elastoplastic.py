@@ -92,7 +92,7 @@ class Elastoplastic(ContactLaw):
 
 
 def _in_floats(stiffness: float, unloading_ratio: float, deepest: float) -> FloatLaw:
-    """Return the law after a `deepest` penetration [m] so far."""
+    """Return the law in Python floats, given the `deepest` penetration so far [m]."""
 
     def spring(depth: float, rate: float) -> float:
         if depth >= deepest:

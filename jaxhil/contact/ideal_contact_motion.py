@@ -103,15 +103,13 @@ def integrate_contact(
     return IdealContactMotion(
         restitution=jnp.abs(end.velocity) / velocity,
         peak_force=end.peak,
-        duration=jnp.where((end.phase >= FREE) & is_moving, end.separated, jnp.inf),
+        duration=jnp.where((end.phase >= FREE) & is_moving, end.separation_time, jnp.inf),
         position=position,
         velocity=rate,
     )
 
 
 class _Problem(NamedTuple):
-    """Arguments of `integrate_contact`."""
-
     law: Any  # contact law
     parameters: Any  # parameters of the law (`jaxhil.contact.laws.ContactParameters`)
     mass: Array  # equivalent mass M [kg]
@@ -132,7 +130,7 @@ class _IntegrationState(NamedTuple):
     deepest: Array  # largest |penetration| so far [m]
     peak: Array  # largest contact force so far [N]
     hold_scale: Array  # `ContactLaw.hold` at the turning point
-    separated: Array  # time of separation [s]
+    separation_time: Array  # time of separation [s]
 
 
 class _Search(NamedTuple):
@@ -153,8 +151,8 @@ class _Nodes(NamedTuple):
     time: Array  # time since the first touch [s]
     depth: Array  # penetration [m]
     velocity: Array  # rate of the penetration [m/s]
-    first: Array  # acceleration at the start of the step [m/s^2]
-    last: Array  # acceleration at the end of the step [m/s^2]
+    start_acceleration: Array  # acceleration at the start of the step [m/s^2]
+    end_acceleration: Array  # acceleration at the end of the step [m/s^2]
 
 
 def _event_value(problem, state, time, depth, rate):
@@ -189,11 +187,10 @@ def _try_step(problem, state, length):
         return (motion[1], -force / problem.mass), None
 
     result = take_step(slope, (state.depth, state.velocity), length)
-    return StepEnd(*result.end, first=result.slopes[0][1], last=result.slopes[-1][1]), result.error
+    return StepEnd(*result.end, result.slopes[0][1], result.slopes[-1][1]), result.error
 
 
 def _initial_state(problem):
-    """Return the state at the first touch."""
     zeros = jnp.zeros_like(problem.approach)
     return _IntegrationState(
         time=zeros,
@@ -204,7 +201,7 @@ def _initial_state(problem):
         deepest=zeros,
         peak=zeros,
         hold_scale=zeros,
-        separated=zeros,
+        separation_time=zeros,
     )
 
 
@@ -228,7 +225,7 @@ def _integrate_phases(problem, records):
         step = _propose_step(problem, state, search)
         trial, error = _try_step(problem, state, step)
         if nodes is not None:
-            node = state.time, state.depth, state.velocity, trial.first, trial.last
+            node = state.time, state.depth, state.velocity, trial.start_acceleration, trial.end_acceleration
             nodes = _Nodes(*(leaf.at[count].set(value) for leaf, value in zip(nodes, node, strict=True)))
 
         deepest = jnp.maximum(state.deepest, jnp.abs(trial.depth))
@@ -240,9 +237,8 @@ def _integrate_phases(problem, records):
             return _event_value(problem, state, time, depth, rate)
 
         time = state.time + step
-        value, slope = jax.jvp(
-            event, (time, trial.depth, trial.velocity), (jnp.ones_like(time), trial.velocity, trial.last)
-        )
+        rates = jnp.ones_like(time), trial.velocity, trial.end_acceleration
+        value, slope = jax.jvp(event, (time, trial.depth, trial.velocity), rates)
         crosses = ~searching & is_accurate & (value <= 0)
         is_located = searching & ((search.tries >= MAX_EVENT_ITERATIONS) | (value == 0))
         is_accepted = active & (is_located | (~searching & is_accurate & ~crosses))
@@ -325,7 +321,7 @@ def _update_state(problem, state, step, trial, correction, is_located):
         peak = jnp.where(force > peak, force, peak)
     time = state.time + step + correction
     depth = trial.depth + correction * trial.velocity
-    velocity = trial.velocity + correction * trial.last
+    velocity = trial.velocity + correction * trial.end_acceleration
     _, memory = problem.law.step(problem.parameters, state.memory, depth, velocity)
     magnitude, hold = jnp.abs(depth), problem.law.hold(problem.parameters, memory, depth, velocity)
     phase = state.phase + is_located.astype(state.phase.dtype)
@@ -339,7 +335,7 @@ def _update_state(problem, state, step, trial, correction, is_located):
         deepest=lax.stop_gradient(jnp.where(magnitude > state.deepest, magnitude, state.deepest)),
         peak=peak,
         hold_scale=lax.stop_gradient(jnp.where(state.phase == INWARD, hold, state.hold_scale)),
-        separated=jnp.where(state.phase < FREE, time, state.separated),
+        separation_time=jnp.where(state.phase < FREE, time, state.separation_time),
     )
 
 
@@ -360,8 +356,8 @@ def _interpolate_nodes(nodes, end, approach, times):
     step_end = StepEnd(
         depth=pick(columns.depth, index + 1),
         velocity=pick(columns.velocity, index + 1),
-        first=pick(columns.first, index),
-        last=pick(columns.last, index),
+        start_acceleration=pick(columns.start_acceleration, index),
+        end_acceleration=pick(columns.end_acceleration, index),
     )
     s = (requested - time) / jnp.where(step > 0, step, 1)
     position, rate = interpolate_step(s, step, depth, velocity, step_end)

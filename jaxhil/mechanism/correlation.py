@@ -125,7 +125,6 @@ def check_correlation(mechanism: AnyMechanism) -> None:
 
 
 def _full_matrix(table: Correlation) -> np.ndarray:
-    """Return the full symmetric correlation matrix, (keys, keys)."""
     matrix = np.zeros((len(table.keys), len(table.keys)))
     for index, row in enumerate(table.matrix):
         matrix[index, : index + 1] = matrix[: index + 1, index] = row
@@ -138,7 +137,7 @@ def _cholesky_factor(matrix: np.ndarray) -> np.ndarray:
     for row in range(len(matrix)):
         for column in range(row + 1):
             rest = matrix[row, column]
-            for before in range(column):
-                rest = rest - factor[row, before] * factor[column, before]
+            for inner in range(column):
+                rest = rest - factor[row, inner] * factor[column, inner]
             factor[row, column] = np.sqrt(rest) if row == column else rest / factor[column, column]
     return factor

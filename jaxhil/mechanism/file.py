@@ -251,7 +251,7 @@ def _find_problem(raw: Mapping[str, Any]) -> str:
 
 
 def _requested_changes(overrides: Overrides, unset: Sequence[str]) -> dict[str, list[Any]]:
-    """Return the requested changes, by the name of the option or argument for messages."""
+    """Return the requested changes under the name of the option, or of the argument, that messages show."""
     is_mapping = isinstance(overrides, Mapping)
     return {
         "overrides" if is_mapping else "--set": list(overrides.items() if is_mapping else overrides),

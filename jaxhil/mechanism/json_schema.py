@@ -1,7 +1,6 @@
 """JSON Schema of mechanism files, for completion, descriptions and error marks in editors.
 
-The schema contains the allowed values of each key. Rules that involve several keys are checked when a file is
-read.
+The schema contains the allowed values of each key. Only the reader of files checks rules for several keys.
 """
 
 from __future__ import annotations
@@ -57,7 +56,6 @@ def _six_axes() -> dict[str, Any]:
 
 
 def _tables(kind: type[msgspec.Struct]) -> dict[str, Any]:
-    """Return the schemas of the tables of a struct type, by name."""
     tables = {name: _clean_schema(table) for name, table in msgspec.json.schema(kind)["$defs"].items()}
     tables["Contact"]["properties"]["law"]["enum"] = list(CONTACT_LAWS)
     return tables

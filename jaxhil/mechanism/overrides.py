@@ -63,24 +63,23 @@ def _to_python(value: Any) -> Any:
 
 
 def _parse_text(text: str) -> tuple[KeyPath, Any]:
-    """Parse a ``PATH=VALUE`` text into path and value. Raise `KeyProblem`."""
     path, position = _parse_path(text)
-    written = text[position:].strip()
-    if len(written) > _MAX_OVERRIDE_LENGTH:
-        raise KeyProblem(path, f"{len(written)} characters", f"at most {_MAX_OVERRIDE_LENGTH}")
+    value_text = text[position:].strip()
+    if len(value_text) > _MAX_OVERRIDE_LENGTH:
+        raise KeyProblem(path, f"{len(value_text)} characters", f"at most {_MAX_OVERRIDE_LENGTH}")
     try:
-        table = tomllib.loads(f"value = {written}")
+        table = tomllib.loads(f"value = {value_text}")
     except RecursionError:
         raise KeyProblem(path, "values nested too deeply", "a TOML value") from None
     except ValueError:
-        if _WORD_PATTERN.fullmatch(written):
-            return path, written
-        found = format_value(written) if written else "nothing after ="
+        if _WORD_PATTERN.fullmatch(value_text):
+            return path, value_text
+        found = format_value(value_text) if value_text else "nothing after ="
         raise KeyProblem(
             path, found, 'a TOML value, such as 0.5, [1.0, 2.0], "text" or a bare word'
         ) from None
     if list(table) != ["value"]:
-        raise KeyProblem(path, format_value(written), "one TOML value")
+        raise KeyProblem(path, format_value(value_text), "one TOML value")
     return path, table["value"]
 
 

@@ -150,7 +150,7 @@ def _check_depths(path: KeyPath, law: ContactLaw, depths: Sequence[float]) -> No
 def _check_keys(
     path: KeyPath, law: ContactLaw, contact: Any, uncertain: Collection[str], keys: Collection[ContactKey]
 ) -> None:
-    """Check that, of the `keys` that only some laws have, the contact has exactly those of its law."""
+    """Check that a contact has the `keys` of its law and no `keys` of other laws. Raise `KeyProblem`."""
     for key in keys:
         value = getattr(contact, key.name)
         laws = laws_with_key(key)
@@ -269,9 +269,7 @@ def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
     limit = clearance - start
     for plane in (float(extreme("rig.contact_plane", end)) for end in (0, 1)):
         if not abs(plane) < limit:
-            expected = (
-                f"a number > {-limit:g} and < {limit:g} m, the clearance less the distance of the start"
-            )
+            expected = f"a number > {-limit:g} and < {limit:g} m, the clearance less the start's distance"
             raise KeyProblem(("rig", "contact_plane"), format_value(plane), expected)
 
 

@@ -38,10 +38,7 @@ KEYS_OF_FRICTION: Mapping[str, tuple[str, ...]] = {
 
 
 def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> None:
-    """Check that a contact has a supported pair of shapes, with all keys of its shapes and laws.
-
-    Raise `KeyProblem`.
-    """
+    """Check the pair of shapes of a contact, and the keys of its shapes and laws. Raise `KeyProblem`."""
     path: KeyPath = ("contact", name)
     for body in ("chaser", "target"):
         _check_shape((*path, body), getattr(contact, body))

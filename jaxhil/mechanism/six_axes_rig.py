@@ -71,10 +71,7 @@ def vector_metadata(meaning: str) -> Meta:
 
 
 def six_axis_metadata(meaning: str, names: tuple[str, str] = MOTION_NAMES) -> Meta:
-    """Return the msgspec metadata of a key with six numbers.
-
-    A file may also have one number for all six, or a table with one number for each of the two `names`.
-    """
+    """Return the metadata of six numbers; files may have one for all six, or one for each of `names`."""
     schema: Any = {"six": list(names)}
     return Meta(
         min_length=6, max_length=6, description=meaning, extra={"six": names}, extra_json_schema=schema

@@ -162,10 +162,7 @@ def _check_states(start: Start) -> None:
 
 
 def _check_sides(mechanism: SixAxisMechanism) -> None:
-    """Check that each body lies on the correct side of its interface frame. Raise `KeyProblem`.
-
-    A body on the other side means that a z axis was reversed by mistake.
-    """
+    """Check that each body lies on its side of the interface. Raise `KeyProblem` for a reversed z axis."""
     for name, body, side in (("target", mechanism.target, 1.0), ("chaser", mechanism.chaser, -1.0)):
         axis = _rotate(body.interface_rotation, np.array([0.0, 0.0, 1.0]))
         projection = float(axis @ np.asarray(body.interface))

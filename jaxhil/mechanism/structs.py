@@ -83,7 +83,6 @@ CorrelationRow = Annotated[
 
 
 def _single_entry(value: float) -> Callable[[], list[float]]:
-    """Return a default factory for a list of one value."""
     return lambda: [value]
 
 

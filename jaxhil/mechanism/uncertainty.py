@@ -140,7 +140,6 @@ def _draw_uniform(path: str, count: int, number: int, seed: int, first: int) -> 
 
 
 def _compute_values(mechanism: AnyMechanism, uniform: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Convert the uniform numbers of every key to values of the key."""
     has_one_axis = isinstance(mechanism, Mechanism)
     ranges = numeric_keys_of(mechanism)
     return {
@@ -186,7 +185,7 @@ def _compute_key_values(
 def _build_quantile_function(
     uncertainty: Uncertainty, nominal: np.ndarray, allowed: Range
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the quantile function of a distribution; its argument broadcasts against `nominal`."""
+    """Return the quantile function of a distribution; uniform numbers broadcast against `nominal`."""
     if uncertainty.distribution == "normal":
         assert uncertainty.std is not None
         return _truncated_normal(nominal, uncertainty.std, allowed)

@@ -39,12 +39,12 @@ def check_uncertainty(mechanism: AnyMechanism, path: str) -> Span:
     low, high = _compute_span(where, path, uncertainty, nominal, key_ranges[path])
     ends = [float(end) for end in np.concatenate((low.ravel(), high.ravel()))]
     if uncertainty.distribution != "normal":
-        outside = [end for end in ends if not (key_ranges[path].allows(end) and math.isfinite(end))]
-        if outside:
-            raise KeyProblem(where, f"draws as far as {outside[0]:g}", str(key_ranges[path]))
-        beyond = [end for end in ends if not is_computable(end)]
-        if beyond:
-            raise KeyProblem(where, f"draws as far as {beyond[0]:g}", add_magnitude_limits(key_ranges[path]))
+        disallowed = [end for end in ends if not (key_ranges[path].allows(end) and math.isfinite(end))]
+        if disallowed:
+            raise KeyProblem(where, f"draws as far as {disallowed[0]:g}", str(key_ranges[path]))
+        extreme = [end for end in ends if not is_computable(end)]
+        if extreme:
+            raise KeyProblem(where, f"draws as far as {extreme[0]:g}", add_magnitude_limits(key_ranges[path]))
     if path.endswith(".depths") and uncertainty.independent and np.any(high[:-1] >= low[1:]):
         raise KeyProblem((*where, "independent"), "true", "false, or depths that keep their order")
     if path == "rig.simulator.coefficients" and mechanism.rig.simulator.model == "third_order":
