@@ -68,7 +68,7 @@ class ContactLaw(abc.ABC):
 
     @property
     def jumps(self) -> bool:
-        """Return whether the force jumps when the motion reverses, with its peak possibly between samples."""
+        """Return whether the force jumps when the motion reverses; a peak may then lie between samples."""
         return False
 
     @property
@@ -82,7 +82,7 @@ class ContactLaw(abc.ABC):
 
     @property
     def closed_form(self) -> bool:
-        """Return whether the ideal contact has a closed form; otherwise its motion is integrated."""
+        """Return whether the ideal contact has a closed form; otherwise the motion is integrated."""
         return type(self).reference is not ContactLaw.reference
 
     @property

@@ -20,8 +20,8 @@ class DepthDamped(PowerLaw):
     `reference_depth` [m]. The force does not jump at the onset. During the outward motion the surfaces
     separate at a depth d > 0, where k d^(n-1) = b |d'|/d_0.
 
-    The ideal contact is integrated. Without damping it equals that of Hunt and Crossley's law. With n = 1 the
-    force equals that of Hunt and Crossley's law with chi = 2 b/(3 k d_0).
+    The ideal contact is integrated. Hunt and Crossley's law has the same ideal contact without damping, and
+    also for n = 1 with chi = 2 b/(3 k d_0).
     """
 
     name: ClassVar[str] = "depth_damped"

@@ -84,7 +84,7 @@ def take_looped_step(slope: SlopeFunction, start: Any, length: Float[Array, "*ba
 
 
 class StepEnd(NamedTuple):
-    """Position and velocity at the end of a step, and the acceleration at its start and end."""
+    """Position and velocity at the end of a step, and acceleration at the start and the end of the step."""
 
     depth: Array  # penetration [m]
     velocity: Array  # rate of the penetration [m/s]

@@ -41,8 +41,8 @@ def ideal_kelvin_voigt(
 
     Without `tension`, F = max(0, k d + b d'). The bodies separate at F = 0, after 2 g(xi) / omega, with
     e = exp(-2 xi g(xi)) and g(xi) = acos(xi) / sqrt(1 - xi^2), continued analytically through xi = 1.
-    With `tension`, they separate at d = 0 with e = exp(-pi xi / sqrt(1 - xi^2)). For xi >= 1 they stick
-    together (e = 0, infinite duration). For xi >= 1/2 the peak force is b v, at the onset of contact.
+    With `tension`, the bodies separate at d = 0 with e = exp(-pi xi / sqrt(1 - xi^2)), or stick together
+    (e = 0, infinite duration) if xi >= 1. For xi >= 1/2 the peak force is b v, at the onset of contact.
     Source: impulse response of the damped oscillator.
 
     Args:
@@ -93,7 +93,7 @@ def ideal_hunt_crossley(
 
     With y = a d' and q = a v, the first integral is k a^2 d^(n+1) / ((n + 1) M) = G(q) - G(y),
     G(y) = y - log(1 + y). At each depth the inward rate y and the outward rate -p satisfy G(y) = G(-p). With
-    the parameter s = (y + p) / 2 they are y = s + L and p = s - L, L(s) = s coth(s) - 1, and
+    the parameter s = (y + p) / 2 the rates are y = s + L and p = s - L, L(s) = s coth(s) - 1, and
     G = L(s) + log(sinh(s) / s). Hence, with the root S of S + L(S) = q,
 
         e = (S - L(S)) / (S + L(S)),

@@ -3,7 +3,7 @@
     M d'' = -F(d, d') - p(t),   d(0) = 0,   d'(0) = v > 0
 
 F is the law's force while the bodies touch. The push p(t) >= 0 is a further force that drives the bodies
-apart, for example from a spring-loaded pusher; it also acts when the bodies do not touch. This integration
+apart, for example from a spring-loaded pusher; the push also acts without contact. This integration
 computes the ideal contact for laws without a closed form (`jaxhil.contact.ideal_contact`) and with a push.
 
 The method is Dormand and Prince's pair of order 5(4) with one step size for each batch element. Steps end at
@@ -156,7 +156,7 @@ class _Nodes(NamedTuple):
 
 
 def _event_value(problem, state, time, depth, rate):
-    """Return a value that is positive during a phase of the motion and 0 at its end.
+    """Return a value that is positive during a phase of the motion and 0 at the end of the phase.
 
     A phase ends at the turning point, at the separation, or at the end of the push.
     """
@@ -187,7 +187,8 @@ def _try_step(problem, state, length):
         return (motion[1], -force / problem.mass), None
 
     result = take_step(slope, (state.depth, state.velocity), length)
-    return StepEnd(*result.end, result.slopes[0][1], result.slopes[-1][1]), result.error
+    depth, velocity = result.end
+    return StepEnd(depth, velocity, result.slopes[0][1], result.slopes[-1][1]), result.error
 
 
 def _initial_state(problem):

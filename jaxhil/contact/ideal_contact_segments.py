@@ -157,7 +157,7 @@ def _traverse(decay, segment: _Segment, inward, state: _State) -> _State:
 
 
 def _compute_passage(decay, segment: _Segment, inward, state: _State, active) -> _SegmentPassage:
-    """Compute the motion of the `active` batch elements through a segment; its times have no derivative."""
+    """Compute the motion of the `active` batch elements through a segment; the times have no derivative."""
     stiffness, turns_here = segment.stiffness, state.segment == segment.number
     # The outward motion enters a segment at its upper depth, but the turning segment at the turning point.
     depth = jnp.where(inward, 0.0, jnp.where(turns_here, state.depth, segment.thickness))

@@ -106,7 +106,7 @@ def load_any(
 
 
 def source_sha256(mechanism: AnyMechanism) -> str:
-    """Return the SHA-256 (hex) of the mechanism's file, or of its content if it was not read from a file."""
+    """Return the SHA-256 (hex) of the mechanism's file, or of the mechanism's content if there is no file."""
     content = _content_sha256(mechanism)
     return _file_hashes.get(content, content)
 

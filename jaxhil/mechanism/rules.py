@@ -136,7 +136,7 @@ def check_contact_law(
 
 
 def _check_depths(path: KeyPath, law: ContactLaw, depths: Sequence[float]) -> None:
-    """Check that a segmented law has depths, and that they increase. Raise `KeyProblem`."""
+    """Check that a segmented law has depths, in increasing order. Raise `KeyProblem`."""
     if law.segmented and not depths:
         expected = f"a list of at least one depth (law {law.name} needs it)"
         raise KeyProblem((*path, "depths"), "no entries", expected)
