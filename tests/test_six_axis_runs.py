@@ -155,7 +155,7 @@ def test_unusable_six_axis_starting_states_are_refused():
         ({"approach.duration": 999.0, "rig.control_period": 1e-5}, "approach.duration: found 999.02 s"),
         (
             {**APART, "start.chaser.position": [0, 0, 2.2]},
-            "start.chaser.position: found a start that is in touch",
+            "start.chaser.position: found a contact at the start",
         ),
     ):
         with pytest.raises(InputError) as caught:
