@@ -119,7 +119,7 @@ def test_identify_reports_negative_delay_and_verdict_is_bad(monkeypatch, tmp_pat
     assert result["rig.force_sensor.delay"].value == pytest.approx(-0.0018, abs=3e-4)
     assert result.mechanism["rig"]["force_sensor"]["delay"] == 0.0
     assert result.mechanism["uncertainty"]["rig.force_sensor.delay"]["std"] > 0.0015
-    assert any(note.startswith("rig.force_sensor.delay: the logs give -0.001") for note in result.notes)
+    assert any(note.startswith("rig.force_sensor.delay: logs give -0.001") for note in result.notes)
     assert not result.good and not check_against_mechanism(campaign, written(result, tmp_path)).good
 
 

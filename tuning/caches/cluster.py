@@ -119,8 +119,8 @@ class ClusterWorkers:
         """Call `function` for every work unit on the workers; yield (name, result) when a unit is done.
 
         Workers can join later. `function` is defined at the top level of a module. Unless `setting` is None,
-        every worker must have this process setting. `what` is a unique name of the work. Raise `InputError` if
-        the scheduler is lost or a worker has another setting. Exceptions of `function` are raised too.
+        every worker must have this process setting. `what` is a unique name of the work. Raise `InputError`
+        if the scheduler is lost or a worker has another setting. Exceptions of `function` are raised too.
         """
         with _raise_if_lost(self._address):
             from cloudpickle import dumps  # pyright: ignore[reportMissingImports]

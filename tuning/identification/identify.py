@@ -274,8 +274,8 @@ def _note_clipped_values(draws_by_key: Mapping[str, np.ndarray]) -> list[str]:
     for key, draws in draws_by_key.items():
         if compute_bound_excess(key, draws) > 0.0:
             notes.append(
-                f"{key}: the logs give {draws.mean():.2g} {get_unit(key)}, standard deviation {draws.std():.2g};"
-                " the file has 0, the lowest value allowed, with an uncertainty that includes the difference"
+                f"{key}: logs give {draws.mean():.2g} {get_unit(key)}, standard deviation {draws.std():.2g}; "
+                "the file has 0, the lowest value allowed, with an uncertainty that includes the difference"
             )
     return notes
 
