@@ -261,7 +261,6 @@ def allowed_values(name: str) -> str:
 
 
 def _check_formats(formats: Any) -> None:
-    """Raise `InputError` if one of the formats does not exist."""
     from tuning.bundle.writers import WRITERS
 
     for name in formats or ():

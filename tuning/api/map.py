@@ -195,7 +195,6 @@ def _axes(
 
 
 def _write(stability_map: StabilityMap, folder: Path) -> None:
-    """Write a map to map.json and map.png in a folder."""
     with report_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / DOCUMENT_FILE, terminal.format_json(stability_map.document).encode("ascii"))
@@ -210,7 +209,6 @@ def _build_document(
     limit: float,
     seed: int,
 ) -> dict[str, Any]:
-    """Return the JSON document of a map: axes, errors, theory, spectral radii and margins."""
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS
     from jaxhil.simulation.source_fingerprint import dependency_versions
     from tuning.gain_file import VERSIONED_PACKAGES, to_json_data
@@ -250,7 +248,6 @@ def _build_document(
 
 
 def _nominal(nominal: "NominalPoint") -> dict[str, Any]:
-    """Return the JSON entry of the nominal point."""
     margins = {
         "error": nominal.error_margins,
         "contact": nominal.contact_margins,

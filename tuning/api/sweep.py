@@ -273,7 +273,6 @@ def _add_studies(
 def _build_document(
     options: SweepOptions, store: "SweepStore", finished_sweep, tally, rate: float | None
 ) -> dict[str, Any]:
-    """Return the JSON document of a sweep, before the additional studies are added."""
     from tuning.sweeps.run_sweep import count_outcomes
     from tuning.sweeps.tally import estimate_error_quantiles, estimate_failure_probability
 

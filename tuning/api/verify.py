@@ -142,7 +142,6 @@ def _verify_gains(gains: Any, document: dict[str, Any], scenarios: int, seed: in
 
 
 def _is_folder(path: Path) -> bool:
-    """Return whether a path is that of a folder; False if the path cannot be accessed."""
     try:
         return path.is_dir()
     except (OSError, ValueError):

@@ -117,7 +117,6 @@ def _has_tuned_gains(results: Sequence[LawMetrics]) -> bool:
 
 
 def _set_compact_style(table: Table) -> Table:
-    """Set the style of a table: names on one line, columns close together."""
     table.columns[0].no_wrap = True
     table.padding = (0, 1, 0, 0)
     return table

@@ -172,6 +172,5 @@ def _convert_to_plain(value: Any) -> Any:
 
 
 def _restore_array(kind: type, value: Any) -> Any:
-    """Restore a NumPy array from the plain data of `_convert_to_plain`."""
     name, shape, content = value
     return np.frombuffer(content, np.dtype(name)).reshape(shape).copy()

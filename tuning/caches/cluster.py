@@ -116,7 +116,7 @@ class ClusterWorkers:
         setting: ProcessSetting | None,
         what: str,
     ) -> Generator[tuple[Any, Any], None, None]:
-        """Call `function` for every work unit on the workers; yield (name, result) when a unit is done.
+        """Call `function` for every work unit on the workers; yield (name, result) of each finished unit.
 
         Workers can join later. `function` is defined at the top level of a module. Unless `setting` is None,
         every worker must have this process setting. `what` is a unique name of the work. Raise `InputError`

@@ -77,7 +77,6 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
 
 
 def _print_version() -> int:
-    """Print the version of the package and return exit code 0."""
     print(f"jaxhil {metadata.version('jaxhil')}")
     return 0
 
@@ -98,7 +97,6 @@ def complete_bare_options(arguments: list[str]) -> list[str]:
 
 
 def _is_number(word: str) -> bool:
-    """Return whether a word is a number."""
     try:
         float(word)
     except ValueError:

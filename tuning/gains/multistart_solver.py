@@ -220,7 +220,6 @@ def count_step_runs(tasks: list[TuneTask], names: tuple[str, ...]) -> int:
 
 
 def _choose_call_size(number: int) -> int:
-    """Return the number of problems per call if there are `number` problems in total."""
     return MIN_PROBLEMS_PER_CALL if number <= MIN_PROBLEMS_PER_CALL else MAX_PROBLEMS_PER_CALL
 
 

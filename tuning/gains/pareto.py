@@ -216,7 +216,6 @@ def compute_and_encode_fronts(tuned: list[TuneResult], number: int, axis: Pareto
 
 
 def _read_fronts(group: _FrontGroup, pieces: Checkpoints) -> list[ParetoFront] | None:
-    """Read the fronts of a group from the cache; return None if one front is missing."""
     if not pieces.is_enabled:
         return None
     group_fronts = [pieces.read(name, (group.inputs, i), ParetoFront) for i, name in enumerate(group.names)]
@@ -240,7 +239,6 @@ def _compute_group_fronts(group: _FrontGroup, work: SearchProgress) -> list[Pare
 
 
 def _count_evaluation_runs(tasks: list[TuneTask], settings: TuneSettings, number: int) -> int:
-    """Return the number of simulated runs that evaluate all gains of the Pareto fronts."""
     return (number + 2) * len(tasks) * count_evaluated_runs(settings.validation, tasks[0].probed)
 
 

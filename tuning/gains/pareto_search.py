@@ -240,7 +240,6 @@ def _collect_noise_candidates(
 
 
 def _pick_candidates(pool: list[_LadderCandidate], weights: np.ndarray) -> list[_LadderCandidate]:
-    """Return for each weight the candidate with the least objective."""
     return [min(pool, key=lambda candidate, weight=weight: candidate.value(weight)) for weight in weights]
 
 

@@ -150,7 +150,6 @@ def join_loops(loops: list[Any]) -> Any:
 
 
 def _list_delay_line_fields(loop: Any) -> list[str]:
-    """Return the names of a loop's fields that hold the length of a delay line."""
     return [name for name in ("ring", "controller_ring") if hasattr(loop, name)]
 
 

@@ -240,7 +240,6 @@ def _evaluate_baselines(validation: Validation) -> dict[str, list]:
 def _compute_transparency(
     validation: Validation, task: int, outcomes: Mapping[str, Outcome | None]
 ) -> dict[str, dict[str, IntervalEstimate]]:
-    """Return the transparency metrics of a task for each set of gains; empty without probes."""
     probed = validation.probed[task]
     if probed is None:
         return {}

@@ -131,7 +131,7 @@ def _build_tasks(
 
 
 def _group_tasks(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int]]:
-    """Return indices of tasks grouped by program (and, with a user's function, number of contacts)."""
+    """Return the indices of tasks that share a program (and, with a user's function, a number of contacts)."""
     groups = group_by_program([task.loop for task in tasks], [task.scenarios for task in tasks])
     if settings.objective.function is None:
         return groups
@@ -222,7 +222,6 @@ def _list_names(group: _TuneGroup) -> list[str]:
 
 
 def _read_results(group: _TuneGroup, settings: TuneSettings, pieces: Checkpoints) -> list[TuneResult] | None:
-    """Read the results of a group from the cache; return None if one result is missing."""
     if not pieces.is_enabled:
         return None
     inputs = _list_inputs(group, settings)

@@ -168,7 +168,6 @@ class ContactProblem:
         return near, flags, fit
 
     def _make_fits(self, fit: LeastSquaresFit) -> list[CoefficientFit]:
-        """Return one record per surface position, with the fit and its log posterior."""
         coefficients, covariance, misfit = fit.coefficients, fit.covariance, fit.misfit
         allowed = sum(
             special.log_ndtr(coefficients[:, i] / np.sqrt(covariance[:, i, i])) for i in self.damping_indices
@@ -295,7 +294,7 @@ class ContactProblem:
     def _design(
         self, near: list[_NearbyRows], flags: list[np.ndarray], onsets: _Onsets | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return design matrix (planes, coefficients, rows) and readings near contact, divided by noise."""
+        """Return design (planes, coefficients, rows) and readings near contact, in units of the noise."""
         std, tables, first = self.readings.std, [], None
         for rows_near, flag in zip(near, flags, strict=True):
             # The last column belongs to the bias. It is 1 in all rows or, if there is a dead zone, only in
@@ -423,7 +422,6 @@ class ContactProblem:
 
 
 def _whitened(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:
-    """Apply the whitening filter along the last axis."""
     filtered = values.copy() if len(whitening) > 1 else values
     for lag, weight in enumerate(whitening[1:], 1):
         filtered[..., lag:] += weight * values[..., :-lag]

@@ -223,7 +223,6 @@ def _marginalise_over_surface(
 
 
 def _compute_cell_posteriors(places: np.ndarray, cells: list[CoefficientFit]) -> np.ndarray:
-    """Return the log posterior of each cell of a grid."""
     return np.array([cell.evidence for cell in cells]) + np.log(places[:, 2])
 
 

@@ -79,7 +79,6 @@ def find_repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100)
 
 
 def _find_longest_run(flags: np.ndarray) -> tuple[int, int]:
-    """Return the start and the length of the longest sequence of successive true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
     if not len(edges):
         return 0, 0
@@ -178,7 +177,6 @@ def _add_distortion(U, Y, variance, excited, frequency, noise, count) -> Spectru
 
 
 def _smooth(variance: np.ndarray) -> np.ndarray:
-    """Return the running mean over `VARIANCE_SMOOTHING_LINES` lines; the line at 0 Hz is unchanged."""
     window = min(VARIANCE_SMOOTHING_LINES, len(variance) - 1)
     half = window // 2
     padded = np.concatenate([variance[1 : half + 1][::-1], variance[1:], variance[-half:][::-1]])

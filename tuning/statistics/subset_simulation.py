@@ -155,7 +155,6 @@ def convert_to_uniform(normals: np.ndarray) -> np.ndarray:
 def _build_result(
     state: _SubsetState, thresholds: list[np.ndarray], worst: _WorstScenarios, failing: float, level: float
 ) -> SubsetSimulation:
-    """Combine the estimates of all replicates into the result."""
     formula = np.sqrt(state.variance)
     if len(thresholds) == 1:
         # With one level, all scenarios are independent, and the exact interval applies.
@@ -302,7 +301,6 @@ def _evaluate_points(
 
 
 def _check_arguments(inputs, limit, seed, samples, replicates, level, levels) -> None:
-    """Raise ValueError if an argument of `subset_simulation` is out of its range."""
     allowed = {
         "inputs": (inputs, inputs >= 1, "1 or more"),
         "limit": (limit, np.isfinite(limit), "a finite number"),

@@ -163,7 +163,6 @@ def list_allowed_texts(column: str) -> tuple[str, ...]:
 
 
 def _list_stored_metrics(mechanism: AnyMechanism, works: bool) -> list[ContactMetric]:
-    """Return the metrics that are stored for every contact or six-axis episode."""
     if choose_rig_model(mechanism).axes == 1:
         return [*CONTACT_METRICS, *(WORK_METRICS if works else ())]
     errors = [ContactMetric(name, "1", meaning) for name, meaning in SIX_AXIS_ERRORS.items()]

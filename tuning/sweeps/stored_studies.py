@@ -153,7 +153,6 @@ def _restore_records(kind: Any, value: Any, null: float | None) -> Any:
 
 
 def _has_matching_shapes(rare: SubsetSimulation, request: RareFailureRequest) -> bool:
-    """Return whether the shapes of the result's arrays match the request and each other."""
     shape = (request.replicates,)
     fits = rare.estimates.shape == rare.formula_coefficients.shape == rare.thresholds.shape[1:] == shape
     return fits and rare.worst_points.ndim == 2 and rare.worst_points.shape[:1] == rare.worst_values.shape

@@ -65,7 +65,6 @@ def make_folder_name(name: str) -> str:
 
 
 def _is_permitted(character: str) -> bool:
-    """Return whether a character is a letter, mark, digit, dot, dash or underscore."""
     return character.isalnum() or character in "._-" or unicodedata.category(character)[0] == "M"
 
 

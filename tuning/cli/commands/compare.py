@@ -105,7 +105,6 @@ def _measure_tick_times(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[
 
 
 def _draw(options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]]) -> None:
-    """Draw the plots of errors and transparency."""
     from jaxhil.simulation.contact_plot import save_figure
     from tuning.plots.comparison import plot_errors, plot_transparency
 
@@ -117,7 +116,6 @@ def _draw(options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence
 def _print(
     options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]], document: dict[str, Any]
 ) -> None:
-    """Print the tables of all mechanisms, the costs, and the meaning of the columns."""
     from jaxhil.laws.compensators import COMPENSATORS
     from jaxhil.simulation.contact_bounds import MAX_DURATION_RATIO, MAX_PEAK_FORCE_RATIO, MIN_DURATION_RATIO
     from tuning.benchmark.tables import build_leaderboard, build_mechanism_table, describe_least_errors

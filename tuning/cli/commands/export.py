@@ -55,7 +55,6 @@ def _parse_limits(settings: tuple[str, ...]) -> dict[str, float | None]:
 
 
 def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
-    """Print the limits, the alarm rates, the files and the verdict."""
     from tuning.bundle.summary import describe_alarm_rates, is_user_limit
 
     tables = []

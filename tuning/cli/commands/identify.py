@@ -86,7 +86,6 @@ def run(options: IdentifyOptions) -> int:
 
 
 def _check_options(options: IdentifyOptions) -> None:
-    """Raise `InputError` if an option's value, or a combination of options, is not allowed."""
     arguments.check_limit(options.limit)
     arguments.check_integers(0, seed=options.seed, bootstrap=options.bootstrap)
     if not 0.0 <= options.hold_out < 1.0:
@@ -269,7 +268,6 @@ def _is_number_or_list(value: Any) -> bool:
 def _build_document(
     options: IdentifyOptions, campaign: Campaign, prior: Mechanism | None, result
 ) -> dict[str, Any]:
-    """Return the JSON document of an identification or a check."""
     kinds = [run.kind for run in campaign.runs]
     clock = campaign.timing.clock
     content = {
@@ -340,7 +338,6 @@ def _prior_value(prior: Mechanism | None, key: str) -> float | None:
 
 
 def _print(document: dict[str, Any], folder: Path | None) -> None:
-    """Print the estimates, the checks of the model and the verdict."""
     runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
     rows = [_estimate_row(entry) for entry in (*document["estimates"], *document["combinations"])]
     headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "off the prior"]

@@ -76,7 +76,6 @@ def _write(path: Path, excitation: Excitation, period: float) -> None:
 
 
 def _build_document(options: IdentifyOptions, name: str, design: ExcitationDesign) -> dict[str, Any]:
-    """Return the JSON document of the design."""
     from tuning.identification.estimates import get_unit
 
     effects = np.sqrt(np.mean(design.slopes**2, axis=0)) * design.std
@@ -111,7 +110,6 @@ def _build_document(options: IdentifyOptions, name: str, design: ExcitationDesig
 
 
 def _print(document: dict[str, Any], folder: Path) -> None:
-    """Print the predicted uncertainty, the crest factors and the files."""
     rows = [
         [entry[name] for name in ("key", "value", "std", "unit", "effect")] for entry in document["predicted"]
     ]

@@ -65,7 +65,6 @@ def _one_axis_text(source: str, name: str) -> str:
 
 
 def _six_axis_text(source: str, name: str) -> str:
-    """Return the file text of a built-in six-axis mechanism under a new name."""
     # A mechanism's name is printable, so its JSON string is also valid TOML.
     named = f"name = {json.dumps(name, ensure_ascii=False)}"
     return builtin_path(source).read_text(encoding="utf-8").replace(f'name = "{source}"', named, 1)

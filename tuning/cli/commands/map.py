@@ -83,7 +83,6 @@ def _describe_map(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _describe_bounds(document: Mapping[str, Any]) -> str:
-    """Return the bounds on the real contact's peak force and duration as text."""
     force, *duration = document["bounds"].values()
     return f"{force:g} times the peak force and {duration[0]:g} to {duration[1]:g} times the duration"
 

@@ -58,13 +58,11 @@ def run(options: MechanismsOptions) -> int:
 
 
 def _mechanism_row(entry: dict[str, Any]) -> list[Any]:
-    """Return the table row of a one-axis mechanism."""
     frequencies = " ".join(f"{value:.3g}" for value in entry["contact_frequencies"]) or "-"
     return [entry["name"], entry["law"], entry["contacts"], entry["mass"], frequencies]
 
 
 def _mechanism_entry(name: str, mechanism: Mechanism) -> dict[str, Any]:
-    """Return the JSON entry of a one-axis mechanism."""
     return {
         "name": name,
         "law": mechanism.contact.law,
@@ -81,7 +79,6 @@ SIX_AXIS_COLUMNS = ("name", "masses", "pairs")
 
 
 def _six_axis_entry(name: str) -> dict[str, Any]:
-    """Return the JSON entry of a six-axis mechanism."""
     mechanism = load_any(name).mechanism
     assert isinstance(mechanism, SixAxisMechanism)
     contacts = mechanism.contact.values()

@@ -71,7 +71,6 @@ def _contact_entry(number: int, result: MonitorResult) -> dict[str, Any]:
 
 
 def _print(document: dict[str, Any]) -> None:
-    """Print the table of contacts with their metrics, and the verdict."""
     headings = ["contact", *(_format_heading(name, unit) for name, unit, _ in METRICS)]
     rows = [
         [

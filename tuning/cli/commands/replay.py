@@ -59,7 +59,6 @@ def run(options: ReplayOptions) -> int:
 
 
 def _build_document(options: ReplayOptions, store, result) -> dict[str, Any]:
-    """Return the JSON document of the replayed scenario: inputs, contacts and differences."""
     from tuning.sweeps.columns import (
         EPISODE_METRICS,
         SIX_AXIS_ERRORS,
@@ -95,7 +94,6 @@ def _build_document(options: ReplayOptions, store, result) -> dict[str, Any]:
 
 
 def _print(document: dict[str, Any]) -> None:
-    """Print the scenario's inputs and contacts, and the verdict."""
     inputs = terminal.build_table(
         f"{document['mechanism']}, compensation: {document['compensator']}, scenario {document['index']}",
         ["input", "drawn"],
@@ -111,7 +109,6 @@ def _print(document: dict[str, Any]) -> None:
 
 
 def _contact_table(document: dict[str, Any]) -> Any:
-    """Return the table of the scenario's contacts (one axis) or episodes (six axes)."""
     if "contacts" in document:
         kind, runs, errors = "contact", document["contacts"], ["error"]
         cells = [[terminal.format_error(run["error"])] for run in runs]

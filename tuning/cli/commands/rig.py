@@ -156,7 +156,6 @@ def _check_injection(options: RigOptions) -> None:
 
 
 def _print(document: dict[str, Any]) -> None:
-    """Print the tables of ticks, times and contacts, and the remarks with the verdict."""
     loops = {"empty loop": document["empty_loop"], "controller": document["run"]}
     recorded = {name: loop for name, loop in loops.items() if loop is not None}
     terminal.emit(*_build_tables(document, recorded), *_session_remarks(document, recorded))

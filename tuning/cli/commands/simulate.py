@@ -106,7 +106,6 @@ def _contact_entry(contact: "ContactResult") -> dict[str, Any]:
 def _print(
     options: SimulateOptions, result: "Run", contacts: list[dict[str, Any]], reasons: list[str]
 ) -> None:
-    """Print the table of contacts, and the verdict with its reasons."""
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_TEXT
 
     # A line below the table states the number of contacts that were not reached.

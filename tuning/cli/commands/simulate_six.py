@@ -152,7 +152,6 @@ def _write(options: SimulateOptions, result: "SixAxisRun") -> None:
 
 
 def _build_document(options: SimulateOptions, result: "SixAxisRun", good: bool) -> dict[str, Any]:
-    """Return the JSON document of a six-axis run: episodes, final states and verdict."""
     return {
         "mechanism": result.mechanism.name,
         "axes": 6,
@@ -169,7 +168,6 @@ def _build_document(options: SimulateOptions, result: "SixAxisRun", good: bool) 
 
 
 def _print(options: SimulateOptions, result: "SixAxisRun", good: bool) -> None:
-    """Print the table of episodes, the parts of the twist errors, and the verdict."""
     rows = [
         [
             number,

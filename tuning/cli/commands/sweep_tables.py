@@ -92,7 +92,6 @@ def _summary_lines(document: dict[str, Any]) -> list[str]:
 
 
 def _quantile_table(document: dict[str, Any], symbol: str):
-    """Return the table of error quantiles with their confidence intervals."""
     return terminal.build_table(
         f"Worst {symbol} of a scenario",
         ["share of scenarios", "|error| up to", "95 % from", "to"],
@@ -122,7 +121,6 @@ def _sobol_index_table(drivers: dict[str, Any], symbol: str):
 
 
 def _subset_simulation_table(rare: dict[str, Any]):
-    """Return the table with the failure probability from subset simulation."""
     return terminal.build_table(
         "Subset simulation",
         [
@@ -161,10 +159,8 @@ def _describe_interval_width(document: dict[str, Any]) -> list[str]:
 
 
 def _format_error(value: float, infinite: str = "no result") -> str:
-    """Return an error as text, or the text `infinite` if the error is infinite."""
     return infinite if value == float("inf") else f"{value:.4g}"
 
 
 def _format_share(value: float) -> str:
-    """Return a ratio as text in percent, or a dash if the ratio is infinite."""
     return "-" if value == float("inf") else f"{100 * value:.3g} %"

@@ -232,7 +232,6 @@ def _show_overview(options: Tune, results: list[Any], entries: list[dict[str, An
 
 
 def _sort_by_index(by_index: dict[int, Any]) -> list[Any]:
-    """Return the values of a dictionary in the order of its integer keys."""
     return [by_index[index] for index in sorted(by_index)]
 
 

@@ -123,7 +123,6 @@ def _remove_stale_points(folder: Path, number: int) -> None:
 
 
 def _is_gain_file(path: Path) -> bool:
-    """Return whether a path is a valid gain file."""
     # The import is local, because it loads jax, which a command with unusable options must not do.
     from jaxhil.simulation.gain_file import load_gain_file
 

@@ -25,13 +25,11 @@ def run(options: Verify) -> int:
 
 
 def _format_exponential(value: float | None) -> str:
-    """Return a number in exponential notation, or a dash for None."""
     # In the document, None stands for a value that is not finite.
     return "-" if value is None else f"{value:.1e}"
 
 
 def _print(document: dict[str, Any]) -> None:
-    """Print the tables of replayed runs and of contacts, and the verdict."""
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_SHORT_TEXT
 
     tables: list[Any] = list(document.get("self_test", ()))

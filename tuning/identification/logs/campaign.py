@@ -298,7 +298,6 @@ def _make_timing(mapping: LogMapping, prior: Mechanism | None) -> CampaignTiming
 
 
 def _select_rows(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:
-    """Return the range of rows between `begin` and `end` of a `[[runs]]` entry."""
     if stamps is None:
         return slice(round(entry.begin / period), None if entry.end is None else round(entry.end / period))
     first = int(np.searchsorted(stamps, entry.begin)) if entry.begin else 0
