@@ -120,7 +120,7 @@ class ClusterWorkers:
 
         Workers can join later. `function` is defined at the top level of a module. Unless `setting` is None,
         every worker must have this process setting. `what` is a unique name of the work. Raise `InputError`
-        if the scheduler is lost or a worker has another setting. Exceptions of `function` are raised too.
+        if the scheduler is lost or a worker has another setting.
         """
         with _raise_if_lost(self._address):
             from cloudpickle import dumps  # pyright: ignore[reportMissingImports]

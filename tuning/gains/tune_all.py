@@ -131,7 +131,7 @@ def _build_tasks(
 
 
 def _group_tasks(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int]]:
-    """Return the indices of tasks that share a program (and, with a user's function, a number of contacts)."""
+    """Return the indices of tasks that share a program and, with a user's function, a number of contacts."""
     groups = group_by_program([task.loop for task in tasks], [task.scenarios for task in tasks])
     if settings.objective.function is None:
         return groups
