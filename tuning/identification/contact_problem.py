@@ -116,7 +116,7 @@ class ContactProblem:
 
     def whiten(self, values: np.ndarray) -> np.ndarray:
         """Apply the whitening filter along the rows of an array (..., rows, lanes)."""
-        return _whitened(values.swapaxes(-1, -2), self.readings.whitening).swapaxes(-1, -2)
+        return _whiten(values.swapaxes(-1, -2), self.readings.whitening).swapaxes(-1, -2)
 
     def changed(self, law: Law, time_constant: float) -> ContactProblem:
         """Return the same problem with another contact law and another time constant of the sensor [s]."""
@@ -132,7 +132,7 @@ class ContactProblem:
         (inner,) = self._make_fits(fit)
         if self.plane is not None:
             return replace(inner, plane=plane)
-        by_plane = self._by_plane(delay, plane, inner.coefficients, near, flags[0])
+        by_plane = self._differentiate_by_plane(delay, plane, inner.coefficients, near, flags[0])
         if pseudo is not None:
             by_plane = np.concatenate([by_plane, inner.coefficients @ pseudo.by_plane[0]])
         residual, design = fit.residual[0], fit.design[0]
@@ -153,13 +153,13 @@ class ContactProblem:
         Returns:
             The rows near contact, flags of the rows in contact, and the fit for each surface position.
         """
-        moved = self._motion_at(delay)
-        near = [self._near(*motion, self.needed_rows, planes) for motion in moved]
-        flags = [self._touching(rows, self._guess) for rows in near]
-        onsets = self._onsets(near[0], [x for x, _ in moved], planes)
+        moved = self._get_motion(delay)
+        near = [self._find_nearby_rows(*motion, self.needed_rows, planes) for motion in moved]
+        flags = [self._flag_rows_in_contact(rows, self._guess) for rows in near]
+        onsets = self._find_onsets(near[0], [x for x, _ in moved], planes)
         fit = self._solve(near, flags, onsets, pseudo)
         for _ in range(2):
-            again = [self._touching(rows, fit.coefficients) for rows in near]
+            again = [self._flag_rows_in_contact(rows, fit.coefficients) for rows in near]
             if all(np.array_equal(new, old) for new, old in zip(again, flags, strict=True)):
                 break
             flags = again
@@ -177,7 +177,7 @@ class ContactProblem:
             CoefficientFit(*values) for values in zip(coefficients, covariance, misfit, evidence, strict=True)
         ]
 
-    def _motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _get_motion(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return position [m] and velocity [m/s] in `needed_rows`, for each of `periods_before`."""
         if self._cached_motion is None or self._cached_motion[0] != delay:
             moved, rows = self.motion_at(delay), self.needed_rows
@@ -190,18 +190,18 @@ class ContactProblem:
 
     def onsets_between(self, delay: float, low: float, high: float) -> np.ndarray:
         """Return the surface positions [m] from `low` to `high` at which the rows in contact change."""
-        position, rate = self._motion_at(delay)[0]
+        position, rate = self._get_motion(delay)[0]
         return np.unique(position[(rate > 0.0) & (position > low) & (position < high)])
 
-    def _near(self, position, rate, where, planes: np.ndarray) -> _NearbyRows:
+    def _find_nearby_rows(self, position, rate, where, planes: np.ndarray) -> _NearbyRows:
         """Return the rows that are in contact for at least one of the surface positions `planes` [m]."""
         # Finite differences also need the rows that are in contact with a slightly nearer surface.
         rows = np.flatnonzero(position > planes.min() - (STEP if self.time_constant else 0.0))
         depth, rate = np.maximum(position[rows] - planes[:, None], 0.0), rate[rows]
-        return _NearbyRows(rows, depth, rate, self._columns(depth, rate, where[rows]))
+        return _NearbyRows(rows, depth, rate, self._tabulate(depth, rate, where[rows]))
 
-    def _columns(self, depth: np.ndarray, rate: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Compute the functions of the law in the given rows, shape (planes, coefficients, rows)."""
+    def _tabulate(self, depth: np.ndarray, rate: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Evaluate the functions of the law in the given rows, shape (planes, coefficients, rows)."""
         own_columns, entries = self.law.entry_functions(depth, rate), self.readings.entries
         if len(entries) > 1:
             entry = self.readings.entry.ravel()[rows]
@@ -212,7 +212,7 @@ class ContactProblem:
             columns[:, i] = column
         return columns
 
-    def _touching(self, near: _NearbyRows, coefficients: np.ndarray | None) -> np.ndarray:
+    def _flag_rows_in_contact(self, near: _NearbyRows, coefficients: np.ndarray | None) -> np.ndarray:
         """Return flags of the rows in contact, except rows in which the force of the law is negative."""
         inside = near.depth > 0.0
         if coefficients is None or self.law.pulls or not self.damping_indices:
@@ -223,7 +223,9 @@ class ContactProblem:
         sound = 2 * pushing.sum(axis=1) > inside.sum(axis=1)
         return np.where(sound[:, None], pushing, inside)
 
-    def _onsets(self, near: _NearbyRows, positions: list[np.ndarray], planes: np.ndarray) -> _Onsets | None:
+    def _find_onsets(
+        self, near: _NearbyRows, positions: list[np.ndarray], planes: np.ndarray
+    ) -> _Onsets | None:
         """Find the onsets of contact within control periods; return None if the sensor has no lag.
 
         `positions` holds the positions [m] in all rows, at the rows and half a period earlier.
@@ -235,15 +237,15 @@ class ContactProblem:
         last = np.where(before >= 0, now[np.maximum(before, 0)], now[near.rows])
         left = compute_onset_shares(last, half[near.rows], now[near.rows], planes[:, None])
         plane, row = np.nonzero(left)
-        columns = self._columns(np.zeros((1, len(row))), near.rate[row], self.needed_rows[near.rows[row]])[0]
+        columns = self._tabulate(np.zeros((1, len(row))), near.rate[row], self.needed_rows[near.rows[row]])[0]
         rate = self.motion.period / self.time_constant
         return _Onsets(plane, row, columns, *compute_onset_weights(rate, left[plane, row]))
 
-    def _packed(self, near: list[_NearbyRows]) -> PackedRows:
+    def _pack_nearby_rows(self, near: list[_NearbyRows]) -> PackedRows:
         """Return the rows in which filtered values depend on the rows near contact."""
         return pack_rows([part.rows for part in near], self.readings.force.shape, self.memory)
 
-    def _filtered(self, near, tables: list[np.ndarray], onsets, first, where: PackedRows, whitening):
+    def _filter(self, near, tables: list[np.ndarray], onsets, first, where: PackedRows, whitening):
         """Apply the lag of the sensor and the whitening filter to the functions of the law.
 
         Args:
@@ -260,7 +262,7 @@ class ContactProblem:
             table[:, :, columns_in_table] = columns
             full.append(table)
         if onsets is None or not len(where.rows):
-            return _whitened(full[0], whitening)
+            return _whiten(full[0], whitening)
         pole, (now, half, last) = compute_lag_weights(self.motion.period / self.time_constant)
         drive = now * full[0] + half * full[1]
         drive[:, :, 1:] += last * full[0][:, :, :-1]
@@ -275,7 +277,7 @@ class ContactProblem:
         rows = np.arange(self.readings.force.size).reshape(shape).T.ravel()
         for position, rate in self.motion_at(delay):
             depth = position.T.ravel() - planes[:, None]
-            columns = self._columns(depth, rate.T.ravel(), rows) / self.readings.std
+            columns = self._tabulate(depth, rate.T.ravel(), rows) / self.readings.std
             tables.append(columns.reshape(*columns.shape[:2], shape[1], shape[0]))
         drive = tables[0]
         if self.time_constant:
@@ -284,14 +286,14 @@ class ContactProblem:
             drive[..., 1:] += last * tables[0][..., :-1]
             drive = np.asarray(lfilter(self.readings.whitening, [1.0, -pole], drive))
         else:
-            drive = _whitened(drive, self.readings.whitening)
+            drive = _whiten(drive, self.readings.whitening)
         used = drive.swapaxes(2, 3).reshape(*drive.shape[:2], -1)[:, :, self.used_rows]
         bias = np.full(
             (len(planes), 1, used.shape[2]), float(np.sum(self.readings.whitening)) / self.readings.std
         )
         return np.concatenate([used, bias], axis=1)
 
-    def _design(
+    def _build_design(
         self, near: list[_NearbyRows], flags: list[np.ndarray], onsets: _Onsets | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return design (planes, coefficients, rows) and readings near contact, in units of the noise."""
@@ -308,16 +310,16 @@ class ContactProblem:
             first = np.vstack([onsets.columns, ones]) * flags[0][onsets.plane, onsets.row] / std
         if self.is_unfiltered:
             return tables[0], self.target[near[0].rows]
-        where = self._packed(near)
+        where = self._pack_nearby_rows(near)
         used = self.used_indices[where.rows]
-        design = self._filtered(near, tables, onsets, first, where, self.readings.whitening)[:, :, used >= 0]
+        design = self._filter(near, tables, onsets, first, where, self.readings.whitening)[:, :, used >= 0]
         if not self.has_dead_zone:
             design[:, -1] = self.bias_alone
         return design, self.target[used[used >= 0]]
 
     def _solve(self, near, flags, onsets, pseudo: PseudoRows | None) -> LeastSquaresFit:
         """Fit the coefficients at each surface position, with the rows in contact that `flags` marks."""
-        design, target = self._design(near, flags, onsets)
+        design, target = self._build_design(near, flags, onsets)
         # number, sum and sum of squares of the readings that depend on the bias alone
         count, total, square = (
             full - part for full, part in zip(self.sums, sum_and_squares(target), strict=True)
@@ -327,42 +329,42 @@ class ContactProblem:
             target = np.concatenate([target, pseudo.target])
         return fit_coefficients(design, target, (count, total, square), self.bias_alone, self.readings.bias)
 
-    def _by_plane(
+    def _differentiate_by_plane(
         self, delay: float, plane: float, coefficients, near: list[_NearbyRows], flag: np.ndarray
     ) -> np.ndarray:
         """Return the derivative of the predicted readings by the surface position, divided by the noise."""
         scale = 2.0 * STEP * self.readings.std
         if self.time_constant:
             shifted = self._all_rows_near_contact(
-                self._motion_at(delay), plane + STEP * np.array([1.0, -1.0]), coefficients
+                self._get_motion(delay), plane + STEP * np.array([1.0, -1.0]), coefficients
             )
-            where = self._packed(near)
-            high, low = self._predicted(*shifted, coefficients, where, self.readings.whitening)
+            where = self._pack_nearby_rows(near)
+            high, low = self._predict(*shifted, coefficients, where, self.readings.whitening)
             return (high - low)[self.used_indices[where.rows] >= 0] / scale
         now = near[0]
         rows = self.needed_rows[now.rows]
         up, down = (
-            compute_force(coefficients, self._columns(np.maximum(now.depth + d, 0.0), now.rate, rows))
+            compute_force(coefficients, self._tabulate(np.maximum(now.depth + d, 0.0), now.rate, rows))
             for d in (STEP, -STEP)
         )
         table = ((down - up) * flag / scale)[:, None]
         if self.is_unfiltered:
             return table[0, 0]
-        where = self._packed(near)
-        table = self._filtered(near, [table], None, None, where, self.readings.whitening)
+        where = self._pack_nearby_rows(near)
+        table = self._filter(near, [table], None, None, where, self.readings.whitening)
         return table[0, 0, self.used_indices[where.rows] >= 0]
 
     def force(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """Return the predicted force readings [N], including the bias, (rows, lanes)."""
         moved = [(position.ravel(), rate.ravel()) for position, rate in self.motion_at(delay)]
         near, flags, onsets = self._all_rows_near_contact(moved, np.array([plane]), coefficients)
-        where = self._packed(near)
+        where = self._pack_nearby_rows(near)
         force, real = np.zeros(self.readings.force.shape), where.rows >= 0
-        values = self._predicted(near, flags, onsets, coefficients, where, (1.0,))[0]
+        values = self._predict(near, flags, onsets, coefficients, where, (1.0,))[0]
         force.ravel()[where.rows[real]] = values[real]
         return force if self.has_dead_zone else force + coefficients[-1]
 
-    def _predicted(self, near, flags, onsets, coefficients, where: PackedRows, whitening) -> np.ndarray:
+    def _predict(self, near, flags, onsets, coefficients, where: PackedRows, whitening) -> np.ndarray:
         """Return the predicted and whitened force readings [N], (planes, rows), without a constant bias."""
         offset, first = self.has_dead_zone * coefficients[-1], None
         tables = [
@@ -371,7 +373,7 @@ class ContactProblem:
         ]
         if onsets is not None:
             first = (coefficients[:-1] @ onsets.columns + offset) * flags[0][onsets.plane, onsets.row]
-        return self._filtered(near, tables, onsets, first, where, whitening)[:, 0]
+        return self._filter(near, tables, onsets, first, where, whitening)[:, 0]
 
     def touching(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """Return flags of the rows that are in contact according to the model, shape (rows, lanes)."""
@@ -391,10 +393,10 @@ class ContactProblem:
             coefficients: Coefficients of the law.
         """
         all_rows = np.arange(moved[0][0].size)
-        near = [self._near(position, rate, all_rows, planes) for position, rate in moved]
+        near = [self._find_nearby_rows(position, rate, all_rows, planes) for position, rate in moved]
         repeated = np.repeat(coefficients[None], len(planes), axis=0)
-        flags = [self._touching(part, repeated) for part in near]
-        onsets = self._onsets(near[0], [x for x, _ in moved], planes) if len(moved) > 1 else None
+        flags = [self._flag_rows_in_contact(part, repeated) for part in near]
+        onsets = self._find_onsets(near[0], [x for x, _ in moved], planes) if len(moved) > 1 else None
         return near, flags, onsets
 
     def find_best_surface(self, delay: float, plane: float) -> tuple[float, CoefficientFit, float]:
@@ -421,7 +423,7 @@ class ContactProblem:
         return plane, inner, 0.0
 
 
-def _whitened(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:
+def _whiten(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:
     filtered = values.copy() if len(whitening) > 1 else values
     for lag, weight in enumerate(whitening[1:], 1):
         filtered[..., lag:] += weight * values[..., :-lag]

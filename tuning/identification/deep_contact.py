@@ -99,10 +99,10 @@ class SummarisedProblem(ContactProblem):
 
     def at(self, delay: float, plane: float, pseudo: PseudoRows | None = None) -> CoefficientFit:
         """Fit the coefficients at one force delay [s] and surface position [m]."""
-        table = self._table(delay, np.array([plane]))
+        table = self._find_table(delay, np.array([plane]))
         if table is not None and pseudo is None:
             inner = self.others.at(delay, plane, table.rows(delay, np.array([plane])))
-            if self._pushes(table, [inner]):
+            if self._is_pushing(table, [inner]):
                 return inner
         return super().at(delay, plane, pseudo)
 
@@ -110,33 +110,33 @@ class SummarisedProblem(ContactProblem):
         self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None = None
     ) -> list[CoefficientFit]:
         """Fit the coefficients at several surface positions [m], without derivatives by the position."""
-        table = self._table(delay, planes)
+        table = self._find_table(delay, planes)
         if table is not None and pseudo is None:
             fits = self.others.fit_surfaces(delay, planes, table.rows(delay, planes))
-            if self._pushes(table, fits):
+            if self._is_pushing(table, fits):
                 return fits
         return super().fit_surfaces(delay, planes, pseudo)
 
-    def _pushes(self, table: _DesignTable, fits: list[CoefficientFit]) -> bool:
+    def _is_pushing(self, table: _DesignTable, fits: list[CoefficientFit]) -> bool:
         """Return whether all fits have a positive force in every row of the deep lanes."""
         if self.law.pulls or not self.damping_indices:
             return True
         return all(np.all(compute_force(fit.coefficients[None], table.extreme) > 0.0) for fit in fits)
 
-    def _table(self, delay: float, planes: np.ndarray) -> _DesignTable | None:
+    def _find_table(self, delay: float, planes: np.ndarray) -> _DesignTable | None:
         """Find or compute an interpolation for a delay and surface positions; None if it is not accurate."""
         for table in self.tables:
             if table.covers(delay, planes):
                 return table
         while self.planes and len(self.tables) < MAX_TABLES:
-            table = self._new_table(delay, float(planes.mean()), self.planes[0])
+            table = self._build_table(delay, float(planes.mean()), self.planes[0])
             if table.is_accurate():
                 self.tables.append(table)
                 return table if table.covers(delay, planes) else None
             self.planes = self.planes[1:]
         return None
 
-    def _new_table(self, delay: float, plane: float, count: int) -> _DesignTable:
+    def _build_table(self, delay: float, plane: float, count: int) -> _DesignTable:
         """Compute an interpolation around a delay and a surface position, with `count` positions as nodes."""
         low = (
             self.delay + DELAY_RANGE * np.floor((delay - self.delay) / DELAY_RANGE + 0.5) - DELAY_RANGE / 2.0
@@ -155,7 +155,7 @@ class SummarisedProblem(ContactProblem):
              for row in [int(np.argmin(v / np.maximum(x - plane, 1e-9)))]),
             key=lambda point: point[0] / max(point[1], 1e-9),
         )  # fmt: skip
-        extreme = self._columns(np.full((1, 1), depth), np.full(1, rate), np.zeros(1, int))
+        extreme = self._tabulate(np.full((1, 1), depth), np.full(1, rate), np.zeros(1, int))
         limit = (-np.inf, lowest) if count == SURFACE_NODES[0] else (plane - half, min(plane + half, lowest))
         return _DesignTable(delays, planes, (low, low + DELAY_RANGE), limit, extreme,
                       *_factorise_columns(self.blocks, delays, planes))  # fmt: skip
