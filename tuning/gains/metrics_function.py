@@ -32,7 +32,7 @@ class ScenarioMetrics(NamedTuple):
         peak_force: largest magnitude of the real contact force [N].
         duration: time from the contact's onset to its end [s].
         approach_velocity: speed at the contact's onset [m/s].
-        status: 0 if the contact ended; otherwise an index into `jaxhil.simulation.metrics.STATUS_NAMES`.
+        status: 0 if the contact ended, else a key of `jaxhil.simulation.metrics.CONTACT_STATUS_NAMES`.
     """
 
     error: Float[Array, "contacts scenarios"]
