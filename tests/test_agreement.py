@@ -1,14 +1,13 @@
-"""Agreement of the runtime and the JAX compensators, written independently, on the same readings.
+"""Agreement of the independent runtime and JAX compensators on the same readings.
 
 On the recorded ticks of every built-in mechanism and on a million random ticks, the force commands agree to
 1e-11 of the command's range; those of compensators with a long recursion agree to 1e-9. Two groups are
 counted and compared separately:
-
 - ticks whose decisions lie within 1e-9 of a threshold (see `tuning.verification.runtime_replay`), and
-- lanes that magnify rounding: where successive regressors of the identification are nearly parallel, or gains
-  make a prior's variance 1e15 times that of the noise, one unit in the last place of every operation moves
-  the runtime's own command by as much as the two sides differ (Monte Carlo arithmetic: Parker, Pierce and
-  Eggert 2000).
+- lanes that amplify rounding errors: if successive regressors of the identification are nearly parallel, or
+if the prior variance is 1e15 times the noise variance, one unit in the last place of every operation changes
+the runtime's own command by as much as the difference (Monte Carlo arithmetic: Parker, Pierce and Eggert
+2000).
 """
 
 import functools
@@ -41,7 +40,7 @@ pytestmark = pytest.mark.users_options
 RING = 256  # samples, more than any identification delay at the shortest period
 RUNS = 6  # recorded runs of a mechanism
 RECORD = 3072  # ticks, longer than any record, so that all mechanisms share programs
-# Compare the compensators alone, also beyond the limits of a rig's controller.
+# Compare the compensators without the controller, also beyond the controller's limits.
 UNLIMITED = {
     name: limit.default if limit.default in (0.0, 0.5, 1.0) else math.copysign(math.inf, limit.default)
     for name, limit in LIMITS.items()
@@ -53,7 +52,7 @@ MECHANISMS = [
 
 
 class Readings(NamedTuple):
-    """Batch of lanes: signals (ticks, lanes), gains and constants (lanes,), as given to either controller."""
+    """Batch of lanes: signals (ticks, lanes), gains and constants (lanes,), inputs of both controllers."""
 
     signals: Signals
     gains: dict[str, np.ndarray]
@@ -61,7 +60,7 @@ class Readings(NamedTuple):
 
 
 class Count(NamedTuple):
-    """Coverage of a comparison; the largest differences are fractions of the command's range."""
+    """Numbers of compared ticks; the largest differences are fractions of the command's range."""
 
     ticks: int
     compared: int
@@ -106,7 +105,7 @@ def lane_replays(name: str, readings: Readings, ticks: list[int] | None = None) 
 
 
 class Jittered(float):
-    """Float whose results are moved at random to a neighbouring value or not."""
+    """Float whose results are randomly rounded to a neighbouring value."""
 
     generator = random.Random(0)
 
@@ -144,7 +143,7 @@ def rounding_spread(name: str, readings: Readings, lane: int, ticks: int) -> flo
 
 
 def compare(name: str, readings: Readings, ticks: list[int] | None = None) -> Count:
-    """Compare both controllers; fail where they differ by more than the limit and than rounding explains."""
+    """Compare both controllers; fail if a difference exceeds the limit and the effect of rounding."""
     replays = lane_replays(name, readings, ticks)
     limit = 1e-9 if name in LONG_LAWS else REPLAY_LIMIT
     assert {lane.status for lane in replays} == {"ok"}
@@ -181,7 +180,7 @@ def random_gains(name: str, rng: np.random.Generator, mechanism) -> dict[str, fl
 
 
 def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
-    """Draw white noise and contacts of all sizes: plain, noisy, coarsely quantised, or halting."""
+    """Draw white noise and contacts of all sizes: plain, noisy, coarsely quantised, or with pauses."""
     rng = np.random.default_rng(seed)
     mechanisms = [MECHANISMS[lane % len(MECHANISMS)] for lane in range(lanes)]
     gains = [random_gains(name, rng, mechanism) for mechanism in mechanisms]
@@ -225,8 +224,8 @@ def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
 
 
 LONG_LAWS = ("impulse_ledger",)
-# Its covariance is ill-conditioned after readings that no contact produces: more lanes magnify rounding.
-MAGNIFIED = {"impulse_ledger": 0.1}  # share of lanes, where it is not 0.02
+# Random readings make its covariance ill-conditioned, so that more lanes amplify rounding.
+MAGNIFIED = {"impulse_ledger": 0.1}  # allowed share of lanes; 0.02 for other compensators
 
 
 @pytest.mark.parametrize(
@@ -278,12 +277,12 @@ def test_runtime_and_jax_commands_agree_on_recorded_ticks(mechanism_name):
         count = compare(name, Readings(signals, columns, constants), ticks)
         print(mechanism_name, name, count)
         assert count.ticks == count.compared == sum(ticks)
-        # One of the draws has a prior with so large a variance.
+        # One of the draws has a very large prior variance.
         assert count.magnified <= (name in LONG_LAWS)
 
 
 def test_runtime_and_jax_commands_agree_in_long_held_contact():
-    """Push in, hold for 1e4 ticks, pull out: no state may wind up on either side."""
+    """Penetrate, hold for 1e4 ticks, and leave: no state may grow without bound."""
     forgetting = np.array([0.8, 0.9, 0.98])
     gains = {
         gain.name: np.full(3, gain.nominal(MECHANISMS[0])) for gain in COMPENSATORS["response_error"].gains

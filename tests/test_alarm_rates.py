@@ -1,9 +1,9 @@
-"""The watchdog's alarm rates on fresh scenarios agree with the verdict of `jaxhil export`.
+"""Alarm rates of the watchdog on new scenarios, compared with the verdict of `jaxhil export`.
 
 Cases: every built-in mechanism, and one whose damping and delay are both uncertain, at the literature's
-gains. The error limit is one that a third of the runs exceed: good and bad runs are then frequent enough to
-tell rates apart. Limits and verdict come from draws of one seed, the fresh rates from draws of another,
-through the controller in C. Run with `pytest -m slow -s tests/test_alarm_rates.py`.
+gains. About a third of the runs exceed the error limit, so that good and bad runs are frequent enough to
+estimate both rates. Limits and verdict come from draws of one seed, the new rates from draws of another seed,
+with the C controller. Run with `pytest -m slow -s tests/test_alarm_rates.py`.
 """
 
 import numpy as np
@@ -52,7 +52,7 @@ def test_alarm_rates_on_fresh_scenarios_lie_within_stated_intervals(case, tmp_pa
     noticed = rates["noticed_from"]["error"]
     print(f", 95 % noticed from {noticed:.2g}" if noticed else ", no error noticed", rates["verdict"])
     missed = len(count.missed)
-    # Whether the watchdog would have raised an alarm in a run that another guard stopped is unknown.
+    # It is unknown whether the watchdog would have raised an alarm in a run that another guard stopped.
     counts = {
         "false_alarms": (len(count.false), len(count.false), count.good),
         "missed_alarms": (missed, missed + count.guarded, count.bad),

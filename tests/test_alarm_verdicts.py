@@ -1,6 +1,4 @@
-"""Verdicts on the watchdog's alarm rates: good, bad or unknown, the sweep that would decide, and the smallest
-error that is detected.
-"""
+"""Verdicts on the watchdog's alarm rates, required numbers of scenarios, and smallest detectable error."""
 
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ from tuning.watchdog.verdict import DEFAULT_ALLOWED_RATES, AllowedAlarmRates, ad
 
 
 def rates(false, missed, held_out=1000):
-    """Return the alarm rates for these counts (alarms, runs) of either kind."""
+    """Return alarm rates for these counts (alarms, runs) of false and of missed alarms."""
     result = {"held_out_runs": held_out}
     for kind, (alarms, runs) in (("false_alarms", false), ("missed_alarms", missed)):
         _, low, high = binomial_interval(alarms, runs)

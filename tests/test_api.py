@@ -1,4 +1,4 @@
-"""`import jaxhil`: offered names, results, untouched JAX settings, one-line errors."""
+"""Public interface of `jaxhil`: names, results, unchanged JAX settings, and one-line errors."""
 
 import json
 import math
@@ -25,7 +25,7 @@ TWO = {"approach.contacts": 2, "contact.stiffness": [124355.0, 90000.0], "contac
 
 
 def refusal(function, *arguments, **named):
-    """Return the one-line message with which a call is rejected."""
+    """Return the one-line error message of a rejected call."""
     with pytest.raises(jaxhil.InputError) as refused:
         function(*arguments, **named)
     message = str(refused.value)
@@ -35,7 +35,7 @@ def refusal(function, *arguments, **named):
 
 
 def plain_process(script, **environment):
-    """Return the output of a script in its own process, with JAX in its default configuration."""
+    """Return the output of a script in a separate process with JAX's default configuration."""
     outside = {name: value for name, value in os.environ.items() if not name.startswith(("XLA", "JAX_"))}
     outside["PYTHONPATH"] = str(Path(__file__).parent.parent)
     command = [sys.executable, "-W", "error", "-c", script]
@@ -351,7 +351,7 @@ def test_jacobian_matches_finite_differences(law, of):
 def test_jacobian_with_respect_to_both_masses_matches_equivalent_mass():
     masses = {"bodies": {"chaser_mass": 500.0, "target_mass": 1000.0}}
     together = jaxhil.load("varying", {**TWO, **masses})
-    # As many keys as above: both share one program.
+    # The same number of keys as above, so that both tests share one program.
     both = ["bodies.chaser_mass", "bodies.target_mass"] * (len(KEYS) // 2)
     slopes = jaxhil.jacobian(together, "phase_lead", by=both)
     single = jaxhil.load("varying", {**TWO, "bodies": {"equivalent_mass": together.bodies.mass}})

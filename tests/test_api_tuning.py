@@ -1,4 +1,4 @@
-"""`import tuning`: five functions, the results of the commands, user-registered laws, one-line errors."""
+"""Public interface of `tuning`: its functions give the results of the commands; one-line errors."""
 
 import json
 import os
@@ -27,7 +27,7 @@ def tuned():
 @pytest.mark.slow
 @pytest.mark.users_options
 def test_python_interface_script_of_readme_runs(tmp_path):
-    """Run it in its own process, where JAX computes in float32 and must continue to."""
+    """Use a separate process, in which JAX must remain in its float32 default."""
     shutil.copy(SCRIPT, tmp_path)
     check = "import jax; assert not jax.config.jax_enable_x64 and 'XLA_FLAGS' not in __import__('os').environ"
     (tmp_path / "script.py").write_text(f"{SCRIPT.read_text()}\n{check}\n")
@@ -107,7 +107,7 @@ def test_user_registered_laws_are_tuned_swept_exported_and_verified(tmp_path):
     assert tuning.verify(tmp_path / "bundle").good
 
     class Other(ScaledLeadOnTheRig):
-        """The same controller from another source."""
+        """Controller of the same compensator, defined by other source code."""
 
     jaxhil.register(ScaledLead(), runtime=Other)
     actual = tuning.verify(tmp_path / "bundle")

@@ -1,4 +1,4 @@
-"""Bootstrap intervals: coverage, comparison with plain resampling, seeds."""
+"""Bootstrap intervals: coverage, comparison with plain resampling, reproducibility."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from tuning.statistics.bootstrap import compute_error_intervals
 
 
 def heavy_tailed(generator, scenarios):
-    """Return errors of three contacts per scenario that share a scale: dependent and far from normal."""
+    """Return errors of three contacts per scenario that share a random scale."""
     scale = np.exp(0.6 * generator.standard_normal(scenarios))
     return 0.01 * scale * generator.standard_normal((3, scenarios))
 
@@ -74,7 +74,7 @@ def test_bootstrap_ignores_failed_contacts_and_returns_nan_without_data():
     wild = np.where(good, errors, np.nan)
     assert compute_error_intervals(wild, good) == compute_error_intervals(np.where(good, errors, 7), good)
     assert np.isnan(compute_error_intervals(wild, np.zeros_like(good))).all()
-    # One scenario alone has no spread to resample.
+    # A single scenario has no variation to resample.
     assert np.isnan(compute_error_intervals(wild, good & (np.arange(50) == 3))).all()
 
 

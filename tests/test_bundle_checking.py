@@ -1,6 +1,6 @@
-"""Checks of an exported bundle: only files that this version exports are run, whatever its manifest claims.
+"""Checks of an exported bundle: only files that this version exports are ever run.
 
-The checks never wait for a file, and never follow a link out of the folder.
+The checks never block on a file, and never follow a link out of the folder.
 """
 
 import hashlib
@@ -40,7 +40,7 @@ def folder(tmp_path):
 
 @pytest.fixture(autouse=True)
 def _in_time():
-    """Fail a test that hangs."""
+    """Fail a test that does not finish."""
 
     def too_long(number, frame):
         raise TimeoutError(f"longer than {SHORT} s")
@@ -64,7 +64,7 @@ def document_of(files):
 
 
 def resealed(manifest):
-    """Return the content of a manifest of any form, with checksums of itself that fit."""
+    """Return the manifest content with valid checksums."""
     body = json.dumps(manifest, indent=1).encode().removesuffix(b"\n}")
     return body + selftest.build_manifest_seal(body)
 
@@ -74,7 +74,7 @@ def entry(content, **changes):
 
 
 def plain_manifest(files, **others):
-    """Return the manifest's content as data, with additional file entries."""
+    """Return the manifest content as data, with additional file entries."""
     made = json.loads(files["manifest.json"])
     made = {name: value for name, value in made.items() if not name.startswith("own_")}
     return {**made, "files": {**made["files"], **others}}
@@ -89,7 +89,7 @@ def test_bundle_check_accepts_exported_bundle(files, folder):
 
 @pytest.mark.parametrize("name", [*CODE, "c99/jaxhil_controller.c", "README.md", "ros2.yaml", "gains.mat"])
 def test_third_party_bundle_with_valid_checksums_is_not_run(files, folder, tmp_path, name):
-    """Change one file so that it leaves a trace if it is run, and let the manifest fit all files."""
+    """Add code that would leave a file if executed, and update the manifest."""
     trap = b"\nopen(%r, 'w')\n" % str(tmp_path / "ran").encode()
     signed_files = signed({**files, name: files[name] + trap}, document_of(files))
     verdict = tuning.verify(placed(folder, signed_files))
@@ -139,7 +139,7 @@ def test_bundle_check_names_version_that_wrote_bundle(files, folder):
         first, last = check_bundle(folder).reasons
         assert first == "manifest.json: differs from what this version exports for these files"
         assert words in last
-    assert run_selftest(folder)[0]  # the self-test on a rig sees a consistent bundle
+    assert run_selftest(folder)[0]  # the self-test on a rig finds no inconsistency
 
 
 def test_bundle_check_rejects_gain_file_with_other_formatting(files, folder):
@@ -212,7 +212,7 @@ def test_bundle_check_rejects_links_pipes_and_folders_without_blocking(
     elif kind == "folder":
         (path / "inner").mkdir(parents=True)
     elif kind == "socket":
-        monkeypatch.chdir(folder)  # such a name must be short
+        monkeypatch.chdir(folder)  # the path of a socket must be short
         with socket.socket(socket.AF_UNIX) as opened:
             opened.bind(name)
     else:

@@ -38,7 +38,7 @@ from tuning.bundle.c99_tables import UNUSABLE, format_double
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 LAWS = tuple(COMPENSATORS)
-# Together these cover most of the C code.
+# These compensators cover most of the C code.
 LONG_CODE = ("response_error", "virtual_contact", "impulse_ledger")
 KINDS = ("contact", "random", "hostile")
 
@@ -94,7 +94,6 @@ def test_c99_export_rejects_the_same_delays_as_python(delay):
 
 @pytest.mark.parametrize("law", LAWS)
 def test_c99_gains_are_compiled_to_the_same_bits(law, tmp_path):
-    """Take gains of every size, each within the domain of its compensator."""
     rng = np.random.default_rng(1)
     document = gain_document(law)
     wide = drawn_gains(law, rng, hostile=True)
@@ -129,7 +128,6 @@ def test_c99_decimal_literal_has_exact_double_value(value):
 
 @pytest.mark.parametrize("law", LAWS)
 def test_c99_accepts_the_same_gains_as_python(law, batch):
-    """Check a loaded struct as a gain file is checked."""
     made = batch(law)
     sane = drawn_gains(law, np.random.default_rng(3), hostile=False)
     assert made.begin(packed(law, sane))
@@ -214,7 +212,7 @@ def test_c99_rejects_the_same_conflicting_limits_as_python(low, high, batch):
 
 
 def compare(made: Batch, gain_file: GainFile, rows: np.ndarray) -> None:
-    """Compare C and Python bit for bit: the compensator alone, then the whole controller."""
+    """Compare C and Python bit for bit: first the compensator alone, then the whole controller."""
     gains = packed(made.law, gain_file)
     assert made.begin(gains)
     assert_same(made.run(rows, False), c99_cases.law_in_python(gain_file, rows), rows)
@@ -242,7 +240,7 @@ def test_c99_commands_equal_python_to_the_bit(law, kind, batch):
 
 
 def test_c99_impulse_ledger_contacts_equal_python_to_the_bit(batch):
-    """Take contacts after an approach that reach every status of the compensator."""
+    """Use contacts that reach every status of the compensator."""
     law, statuses = "impulse_ledger", set()
     for n in range(12):
         rng = np.random.default_rng([11, n])
@@ -275,9 +273,7 @@ def test_c99_commands_equal_python_if_compared_values_are_equal(law, batch):
 
 
 def test_c99_random_test_ticks_raise_every_fault(batch):
-    """Reach every fault except that of compensators with a status, passed audits, and a changing identified
-    stiffness.
-    """
+    """Exclude the fault of compensators with a status; include passed audits and changing stiffness."""
     made = batch("response_error")
     rng = np.random.default_rng(6)
     seen, audited, identified = 0, set(), set()
@@ -321,7 +317,7 @@ def limit_values(law, name):
     if name in c99_cases.delays(law):
         return st.floats(0.0, CAPACITY * PERIOD)
     lowest, highest = LIMITS[name].lowest, LIMITS[name].highest
-    # Draw half of the limits from values that become active.
+    # Draw half of the limits so that they become active.
     return st.one_of(st.floats(max(lowest, -1e3), min(highest, 1e3)), st.floats(lowest, highest))
 
 
@@ -336,7 +332,7 @@ def test_c99_commands_equal_python_on_hypothesis_ticks(case, batch):
     "law", [pytest.param(law, marks=() if law in LONG_CODE else pytest.mark.slow) for law in LAWS]
 )
 def test_c99_has_no_undefined_behaviour_under_sanitizers(law, tmp_path):
-    """Run hostile rows under the address and undefined-behaviour sanitizers, float conversions included."""
+    """Run hostile rows with the address and undefined-behaviour sanitizers."""
     program = sanitized(tmp_path, law)
     rng = np.random.default_rng(7)
     for guarded in (True, False):
@@ -359,7 +355,6 @@ def test_c99_has_no_undefined_behaviour_under_sanitizers(law, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_c99_commands_equal_python_over_ten_million_ticks(law, batch):
-    """Run 1e7 ticks in all, each through the compensator alone and through the whole controller."""
     rng = np.random.default_rng([8, LAWS.index(law)])
     chunk = 20_000
     for n in range(math.ceil(1e7 / len(LAWS) / chunk)):

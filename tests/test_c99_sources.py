@@ -1,4 +1,4 @@
-"""Sources of the C99 controller: no warnings, no static memory, nothing exported that is not needed."""
+"""Sources of the C99 controller: no warnings, no static memory, no unused exports."""
 
 import functools
 import inspect
@@ -95,7 +95,7 @@ int main(void) {
 @compilers("g++", "clang++")
 @pytest.mark.parametrize("standard", ["c++11", "c++17"])
 def test_c99_headers_compile_in_cpp(compiler, standard, tmp_path):
-    """Build as ROS 2 does: the controller in C, its caller in C++."""
+    """Build as ROS 2 does: controller in C, caller in C++."""
     folder = c99_cases.write_sources(tmp_path, gain_document())
     (folder / "use.cpp").write_text(USE)
     controller = compiled(folder, "jaxhil_controller.c", "controller.o", "-c", "-O2")
@@ -123,7 +123,7 @@ def test_c99_sources_compile_without_warnings(compiler, standard, tmp_path):
         ["-ffast-math"],
         ["-Ofast"],
         ["-ffinite-math-only"],
-        ["-D_M_FP_FAST"],  # as MSVC says it
+        ["-D_M_FP_FAST"],  # macro of MSVC
         ["-fassociative-math", "-fno-signed-zeros", "-fno-trapping-math"],
         ["-freciprocal-math"],
     ],
@@ -143,7 +143,7 @@ def test_c99_header_rejects_unsafe_math_flags(compiler, flags, tmp_path):
 
 @compilers("gcc", "clang")
 def test_c99_multiplication_and_addition_are_never_fused(compiler, tmp_path):
-    """Allow fused multiply-add by the flags; the sources must prevent it."""
+    """The compiler flags allow fused multiply-add; the sources must prevent it."""
     if platform.machine() != "x86_64":
         pytest.skip("the names of the instructions are those of x86")
     folder = c99_cases.write_sources(tmp_path, gain_document())
@@ -170,7 +170,7 @@ def test_c99_sources_contain_only_code_the_compensator_needs():
 
 
 class ToyLaw(Compensator):
-    """Compensator F_c = F + share (F - F of the tick before); é in a comment."""
+    """Compensator F_c = F + share (F - F_previous), with a non-ASCII character é in a comment."""
 
     gains: ClassVar = {"toy_share": GainSpecification("1")}
 
@@ -179,7 +179,7 @@ class ToyLaw(Compensator):
         self._before = 0.0
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured):
-        # The share of the change /* of a tick */ only.
+        # Only the share of the change /* of a tick */, which must not end the comment in C.
         command = force_measured + self._share * (force_measured - self._before)
         self._before = force_measured
         return command / (1.0 + velocity_desired)
@@ -189,7 +189,7 @@ class ToyLaw(Compensator):
 
 
 class ToyLawWithText(ToyLaw):
-    """Compensator outside the subset."""
+    """Compensator outside the C99 subset."""
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured):
         return force_measured + sum([position_desired, velocity_desired])

@@ -25,7 +25,7 @@ VECTORS_LIMITS = {"held_readings": 4.0, "late_fraction": 0.25, "force_slew": 1e5
 
 
 def vectors_document():
-    """Return a gain document whose limits are active now and then, without an immediate trip."""
+    """Return a gain document whose limits are sometimes active, without an immediate trip."""
     document = gain_document()
     document["limits"] = {
         name: {"value": value, "unit": LIMITS[name].unit} for name, value in VECTORS_LIMITS.items()
@@ -34,7 +34,7 @@ def vectors_document():
 
 
 def vectors(*kinds: str) -> list[str]:
-    """Return the lines of a vectors.csv from the Python controller, one run per kind of rows."""
+    """Return the lines of a vectors.csv from the Python controller, with one run for each kind of rows."""
     gain_file = check_gain_document(vectors_document())
     lines = [
         "run,event,force_measured,position_desired,velocity_desired,position_measured,time,position,velocity,"
@@ -70,7 +70,7 @@ def replay(tmp_path_factory):
 
 
 def test_c99_test_program_replays_recorded_vectors(replay):
-    """Replay contacts and readings that are not finite, late, or without a time."""
+    """Include non-finite readings, late ticks and ticks without a time."""
     lines = vectors("contact", "contact", "random", "hostile", "hostile")
     assert len({line.split(",")[12] for line in lines[1:]}) > 3
     assert replay(lines) == (0, "vectors.csv: 1000 ticks, the same bit for bit\n")

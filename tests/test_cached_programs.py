@@ -1,4 +1,4 @@
-"""Compiled programs cached in files: same bits, no second tracing, rebuilt if a dependency changes."""
+"""Compiled programs cached in files: same bits, no second tracing, and rebuilt after any change."""
 
 import dataclasses
 import errno
@@ -41,7 +41,7 @@ class Sums(NamedTuple):
 
 
 class Mine(KelvinVoigt):
-    """A user-registered law."""
+    """User-registered compensator."""
 
 
 traced = []
@@ -95,7 +95,7 @@ def test_cached_program_is_traced_once_and_gives_same_results(tmp_path):
 
 @where_kept
 def test_program_with_code_from_compile_cache_is_also_cached(tmp_path):
-    """Cover a limit of jax: what it writes of such code fails when it is loaded."""
+    """Guard against a jax limitation: such code cannot be loaded after serialisation."""
     for name in ("first", "second"):
         folder = tmp_path / name
         folder.mkdir()
@@ -200,7 +200,7 @@ def test_program_with_unwritable_cache_folder_still_returns_its_result(tmp_path)
 
 
 def test_program_is_rebuilt_if_settings_change_between_calls(tmp_path, monkeypatch):
-    """Use one process, which keeps what it has read from the cache."""
+    """Use a single process, which keeps the cached program in memory."""
     monkeypatch.setattr(cached_programs, "program_folder", lambda: tmp_path)
     again = partial(cached_programs.run_cached, sums, STATIC, jnp.asarray(VALUES), {"factor": jnp.array(3.0)})
     for precision in ("highest", "default"):
@@ -217,7 +217,7 @@ def phases(static, scenarios):
 
 @pytest.mark.parametrize("law", [Mine(), pytest.param(HuntCrossley(), marks=where_kept)])
 def test_program_with_user_registered_law_in_arguments_is_not_cached(tmp_path, monkeypatch, law):
-    """Cover laws that arguments contain, as scenarios in six axes do."""
+    """Six-axis scenarios contain laws in their arguments."""
     scenarios = six_axes_scenarios(load_any("petals").mechanism)
     groups = tuple(dataclasses.replace(group, law=law) for group in scenarios.groups)
     monkeypatch.setattr(cached_programs, "program_folder", lambda: tmp_path)

@@ -1,4 +1,4 @@
-"""Checkpoints: read back to the bit or not at all; none of other inputs, other code, or damaged."""
+"""Checkpoints: values are read back to the bit, and never for other inputs, other code, or damaged files."""
 
 import math
 import struct
@@ -27,7 +27,7 @@ def test_checkpoint_values_are_read_back_to_the_bit():
     assert [struct.pack("d", one) for one in result] == [struct.pack("d", one) for one in NUMBERS]
     point = decode_value(encode_value(POINT), Point)
     assert type(point) is Point and point.curvature.tobytes() == POINT.curvature.tobytes()
-    # A table shows its rows in the order in which they were found.
+    # The order of keys determines the order of rows in tables.
     assert list(point.gains) == ["z", "a"] and point.weight is None
     for array in (np.arange(6, dtype=np.int32).reshape(2, 3), np.array([True, False]), np.empty((0, 2))):
         again = decode_value(encode_value(array), np.ndarray)
@@ -52,7 +52,7 @@ def test_checkpoint_of_other_inputs_or_sources_is_ignored(tmp_path, monkeypatch)
     for changed in ({**inputs, "seed": 2}, {**inputs, "limit": 1.0}, {**inputs, "gains": POINT[:3]}):
         assert reader.read("one", changed, Point) is None
     assert reader.other == ["one"] * 3
-    # Read with another type than it was written with.
+    # Reading as another type returns None.
     assert reader.read("one", inputs, int) is None
     for name in ("sources_sha256", "dependency_versions", "active_xla_flags"):
         with monkeypatch.context() as patched:

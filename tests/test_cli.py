@@ -1,4 +1,4 @@
-"""The command line: exit codes, JSON output, one-line error messages, files that are kept."""
+"""Commands of `jaxhil`: exit codes, JSON output, one-line error messages, and preserved files."""
 
 import contextlib
 import io
@@ -19,7 +19,7 @@ CONTACT_KEYS = {
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory):
-    """Run a tiny tuning end to end; return its folder, exit code, output and error output."""
+    """Run a tiny tuning; return its folder, exit code, output and error output."""
     folder, out, err = tmp_path_factory.mktemp("tuned"), io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = main(["tune", "rig-300kg", "--compensator", "phase_lead", "-o", str(folder), *TINY])
@@ -28,12 +28,12 @@ def table(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def tuned(table):
-    """Return the folder of a tiny tuning."""
+    """Return the result folder of a tiny tuning."""
     return table[0]
 
 
 def refused(ran, *words):
-    """Check exit code 2, empty standard output, and one line on standard error with all `words`."""
+    """Check for exit code 2, no standard output, and one line on standard error with all `words`."""
     assert ran.code == 2
     assert ran.out == ""
     assert ran.err.startswith("jaxhil: ") and ran.err.count("\n") == 1 and ran.err.endswith("\n")
@@ -201,7 +201,7 @@ def test_tune_from_earlier_gains_is_never_worse_than_those_gains(jaxhil, tuned, 
 @pytest.mark.slow
 def test_tune_pareto_writes_gain_file_for_each_point(jaxhil, tmp_path):
     folder = tmp_path / "rig-300kg"
-    # A point of an earlier, longer front.
+    # A file left by an earlier, longer Pareto front.
     (folder / "pareto" / "07").mkdir(parents=True)
     write_gain_file(folder / "pareto" / "07" / "gains.json", case())
     # A file that this program did not write.

@@ -23,7 +23,7 @@ from tuning.gains.tune import ErrorMetrics
 
 
 def refused(ran, *words):
-    """Check exit code 2, empty standard output, and one line on standard error with all `words`."""
+    """Check for exit code 2, no standard output, and one line on standard error with all `words`."""
     assert ran.code == 2
     assert ran.out == ""
     assert ran.err.startswith("jaxhil: ") and ran.err.count("\n") == 1 and ran.err.endswith("\n")

@@ -19,7 +19,7 @@ BRIDGED = {"missed_in_a_row": 3.0}
 
 
 def faults(times, period: float = 1e-3, events=None, **limits: float) -> list[int]:
-    """Return the faults of ticks at these times [s], the same in C; after a trip, none."""
+    """Return the faults of ticks at these times [s], after checking that C agrees; None after a trip."""
     gain_file = GainFile("none", {}, period, math.inf, complete_limits(limits) if limits else NO_LIMITS)
     rows = np.zeros((len(times), len(ROW)))
     rows[:, ROW.index("time")] = times
@@ -73,7 +73,7 @@ def test_clock_trips_on_non_finite_time(time):
 
 @pytest.mark.parametrize("rate", [0.98, 0.984, 1.016, 1.02, 1.1])
 def test_clock_trips_on_rate_error_above_1_5_percent(rate):
-    """The drift after n ticks is r (1 - 0.99^n)/0.01 periods; it finally exceeds 1.5 if r > 0.015."""
+    """The drift after n ticks is r (1 - 0.99^n)/0.01 periods, which exceeds 1.5 if r > 0.015."""
     wrong = abs(rate - 1.0)
     ticks = math.ceil(math.log(1.0 - 0.015 / wrong) / math.log(0.99))
     result = faults(periods(*[rate] * 300))
@@ -95,7 +95,7 @@ def test_clock_accepts_jitter_below_an_eighth_of_the_period(jitter, period, star
 
 
 def test_clock_never_trips_on_ordinary_jitter():
-    """Draw normal jitter of 5 % of the period: about one tick in a thousand is flagged, none trips."""
+    """Use normal jitter of 5 % of the period, which flags about one tick in a thousand."""
     late = 0.05 * np.random.default_rng(3).standard_normal(100_000)
     result = np.array(faults((1e-3 * (np.arange(100_000) + late)).tolist()))
     assert set(result) <= {OK, EARLY_TICK, LATE_TICK}
@@ -107,18 +107,18 @@ def test_clock_accepts_early_tick_that_compensates_late_tick():
 
 
 def test_clock_flags_one_repeated_tick_and_trips_on_two_within_69_ticks():
-    """The drift of one repeated tick is 0.99^n periods after n ticks: half a period after 69."""
+    """The drift after one repeated tick is 0.99^n periods after n ticks: half a period after 69."""
     assert faults(periods(1.0, 0.001, *[1.0] * 20)) == [OK, OK, EARLY_TICK, *[OK] * 20]
     assert faults(periods(0.001, *[1.0] * 67, 0.001))[-1] == CLOCK
     assert faults(periods(0.001, *[1.0] * 69, 0.001))[-1] == EARLY_TICK
 
 
 def test_clock_counts_no_drift_after_stall_followed_by_burst():
-    """Three ticks late by 2.9, 1.9 and 0.9 periods count as missed before they arrive."""
+    """Three ticks arrive 2.9, 1.9 and 0.9 periods late and already count as missed."""
     stall = (1.0, 3.9, 0.02, 0.02, 0.06, 1.0)
     expected = [OK, MISSED_TICK, *[EARLY_TICK] * 3, OK]
     assert faults(periods(*stall * 5), **BRIDGED) == [OK, *expected * 5]
-    # One tick more than were missed is a repeated tick; a second one trips.
+    # One tick more than the missed ticks counts as repeated; a second one trips.
     assert faults(periods(3.9, *[0.02] * 5), **BRIDGED)[-2:] == [EARLY_TICK, CLOCK]
 
 

@@ -1,4 +1,4 @@
-"""Commands on a cluster under failures: one line, exit code 2 or 130; `--resume` gives the same result."""
+"""Commands on a failing cluster: one-line errors, exit code 2 or 130, and `--resume` with the same result."""
 
 import json
 import os
@@ -33,7 +33,7 @@ def begin(*arguments, folder):
 
 
 def ended(process):
-    """Return exit code, standard output, and the lines of standard error except progress."""
+    """Return exit code, standard output, and standard error without progress lines."""
     out, err = process.communicate(timeout=600)
     messages = [line for line in err.splitlines() if not line.startswith(tuple("0123456789"))]
     return process.returncode, out, messages

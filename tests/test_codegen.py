@@ -1,4 +1,4 @@
-"""The C99 generator on small programs: the same bits as Python, or an error with file and line."""
+"""C99 generator on small programs: the same bits as Python, or an error with file and line."""
 
 import ctypes
 import inspect
@@ -48,7 +48,7 @@ def product_of_ints(a: float, b: float) -> float:
 
 
 def sums_of_ints(a: float, b: float) -> float:
-    """Double an int a hundred times, subtract others, and multiply by a constant."""
+    """Double, subtract and multiply integers."""
     total, more = int(a), int(b)
     for _ in range(100):
         total = total + total
@@ -119,7 +119,7 @@ class Inner:
 
 
 class Outer:
-    """Objects, lists of lists, and a line of run-time length."""
+    """Objects, lists of lists, and a delay line whose length is known at run time."""
 
     inner: Inner
     matrix: Annotated[list[list[float]], 3, 2]
@@ -153,7 +153,7 @@ def dot(left: list[float], right: list[float]) -> float:
 
 
 def caught(function):
-    """Return a function that returns `FAILED` where `function` raises."""
+    """Return a function that returns `FAILED` if `function` raises."""
 
     def guarded(a: float, b: float) -> float:
         try:
@@ -182,7 +182,7 @@ OF_INTS = (whole, product_of_ints, sums_of_ints, remainders_of_ints)
 
 
 def compiled(tmp_path, program: CProgram, more: str = "") -> ctypes.CDLL:
-    """Return the program as a shared library, compiled as strictly as the controller."""
+    """Return the program as a shared library, compiled with the controller's strict flags."""
     output = program.output()
     text = f"{HEADER}#define T_LAG_SAMPLES 4\n{output.declarations}\n{output.definitions}\n{more}"
     (tmp_path / "program.c").write_text(text)
@@ -206,7 +206,7 @@ def test_c99_function_equals_python_to_the_bit_or_fails_where_python_raises(func
     results = set()
     for a, b in itertools.product(NUMBERS, repeat=2):
         expected = guarded(a, b)
-        # An int of the subset ends at 2^53, and no power is complex.
+        # Integers of the C99 subset are limited to 2^53, and powers are real.
         is_beyond = function in OF_INTS and max(abs(a), abs(b)) > 2.0**53
         is_beyond |= function is sums_of_ints and isfinite(a) and abs(a) >= 1.0
         assert same(in_c(a, b), FAILED if is_beyond or isinstance(expected, complex) else expected), (a, b)
@@ -231,7 +231,7 @@ double step(double a, double b) {{
 
 @needs_compiler
 def test_c99_classes_records_and_lists_equal_python_to_the_bit(tmp_path):
-    """Include state that a failed tick leaves half done."""
+    """Include the partial state after a failed tick."""
     program = CProgram("t_")
     program.add(Outer.__init__, Outer)
     program.add(Outer.step, Outer)
@@ -289,7 +289,7 @@ def hides_a_branch(a: float, b: float) -> float:
 
 
 class Aliasing:
-    """A name that stands for a list which an attribute then no longer has."""
+    """Local name for a list that is then replaced in its attribute."""
 
     rows: Annotated[list[list[float]], 2, 2]
 
@@ -356,7 +356,7 @@ class Aliasing:
 
 
 class Sharing:
-    """Two attributes that share one list, which changes in place."""
+    """Two attributes that share one list, which is modified in place."""
 
     def __init__(self, start: float) -> None:
         self.first = [start] * 2

@@ -1,4 +1,4 @@
-"""Common forms: a mechanism gives the same results in a shared program as alone."""
+"""Common programs: results in a shared program equal those in a separate program."""
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +92,7 @@ def test_common_program_gives_the_same_results_as_separate_programs():
 
 @pytest.mark.parametrize("exact", [True, False])
 def test_common_program_serves_force_sensors_with_and_without_lag(exact):
-    """Follow the exact motion, because it is requested or because one mechanism is stiff."""
+    """Simulate the exact motion, on request or because one mechanism is stiff."""
     lagging = mechanism(
         {"law": "kelvin_voigt"}, SECOND_ORDER, period=1e-3, force_sensor={"time_constant": 2e-4}
     )

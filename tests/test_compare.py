@@ -1,4 +1,4 @@
-"""`jaxhil compare` as a user calls it; tests that run the comparison itself are slow."""
+"""Command `jaxhil compare`; tests that run a comparison are slow."""
 
 import json
 import os
@@ -95,7 +95,7 @@ def test_compare_tables_mark_the_best_compensator(capsys):
 
 
 def test_compare_leaderboard_lists_all_compensators_and_settings(capsys):
-    """Print whole lines wider than a page; the settings of a compensator do not compete with it."""
+    """Lines may exceed the page width; settings of a compensator are not ranked against it."""
     ours = LawMetrics("impulse_ledger", "m", {}, {"literature": figures(0.05), "gentle": figures(0.06)})
     many = [*FOUND, ours, *(LawMetrics(f"law_{n}", "m", {}, {"literature": figures(0.5)}) for n in range(12))]
     better = [*FOUND, LawMetrics("impulse_ledger", "n", {}, {"literature": figures(0.2)})]
@@ -179,6 +179,6 @@ def test_compare_leaves_no_workers_after_kill(tmp_path, number):
     )  # fmt: skip
     time.sleep(6)
     process.send_signal(number)
-    # Every worker holds a copy of the pipe: it closes when all of them have ended.
+    # Every worker holds a copy of the pipe, so the pipe closes after the last worker has ended.
     out, _ = process.communicate(timeout=20)
     assert process.returncode == -number and out == b""

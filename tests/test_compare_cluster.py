@@ -1,4 +1,4 @@
-"""Comparison on a dask.distributed cluster: the same bits, even if a worker is killed."""
+"""Comparison on a dask.distributed cluster: identical results even if a worker is killed."""
 
 from typing import Any
 

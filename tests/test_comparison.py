@@ -1,4 +1,4 @@
-"""Metrics of a comparison, tested on compensators whose transparency is known beforehand."""
+"""Metrics of a comparison for compensators whose transparency is known."""
 
 from typing import ClassVar, NamedTuple
 
@@ -54,7 +54,7 @@ def test_ideal_rig_has_zero_error_and_full_transparency():
 
 
 class PlayedBack(Compensator):
-    """Ignore the hardware: return the force of the undelayed contact at the model's own penetration."""
+    """Compensator that returns the undelayed contact force at the model's penetration."""
 
     name: ClassVar[str] = "played_back"
     knows: ClassVar[tuple[str, ...]] = ()
@@ -73,14 +73,14 @@ class PlayedBack(Compensator):
 
 
 class Known(NamedTuple):
-    """Plant of every lane, which no compensator on a rig knows."""
+    """True mechanism parameters of every lane, unknown to real compensators."""
 
     stiffness: Array
     damping: Array
 
 
 def test_compensator_that_replays_the_reference_has_zero_transparency(monkeypatch):
-    """Error 0 and slope 1 although simulator and force are late; transparency 0."""
+    """Error 0 and slope 1 despite the delays; transparency 0."""
     monkeypatch.setitem(compensators.COMPENSATORS, "played_back", PlayedBack())
 
     def evaluate_with_plant(loop, gains, scenarios):
@@ -97,7 +97,7 @@ def test_compensator_that_replays_the_reference_has_zero_transparency(monkeypatc
 
 
 def test_uncompensated_delay_error_matches_closed_form():
-    """Take a pure force delay before an ideal simulator: e = |S'(t_s + tau)| (model.md, section 6)."""
+    """For a pure force delay and an ideal simulator, e = |S'(t_s + tau)| (model.md, section 6)."""
     tau = 0.004
     raw = mechanism({}, IDEAL, tau, period=2.5e-4)
     parsed = validated({**raw, "uncertainty": SPREAD})
@@ -167,7 +167,7 @@ def test_best_compensator_is_marked_only_if_intervals_are_disjoint():
     assert find_winner("rms", figures) is None
     assert find_winner("rms", {name: figures[name] for name in "ab"}) == "a"
     assert find_winner("rms", {"a": figures["a"]}) is None
-    # A compensator with unfinished contacts has no interval; it does not win and does not block a winner.
+    # A compensator with unfinished contacts has no interval; it is ignored in the ranking.
     assert (
         find_winner(
             "rms", {"a": figures["a"], "b": figures["b"], "d": IntervalEstimate(0.01, np.nan, np.nan)}
@@ -188,7 +188,7 @@ def test_transparency_metrics_are_ranked_by_distance_from_1():
 
 
 def test_comparison_resamples_scenarios_with_all_their_contacts():
-    """Four equal contacts say no more than one; a contact that is not good is ignored."""
+    """Four equal contacts have the information of one; failed contacts are ignored."""
     sample = np.random.default_rng(0).normal(1.0, 1.0, 40)
     good = np.ones((4, 40), bool)
 

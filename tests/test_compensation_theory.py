@@ -36,7 +36,7 @@ FINE = 2.5e-4
 
 
 def fixed_gains(parsed, **values):
-    """Return response-error gains that know the stiffness and identify nothing."""
+    """Return response-error gains with known stiffness and without identification."""
     identification = {"initial_stiffness": STIFFNESS, "stiffness_covariance": 0.0, "damping_covariance": 0.0}
     inactive = {
         "contact_threshold": 0.0,
@@ -47,7 +47,7 @@ def fixed_gains(parsed, **values):
     return nominal_gains(parsed, "response_error", **(identification | inactive | values))
 
 
-# (kappa, T_lead / tau_f, whether the position is late)
+# (kappa, T_lead / tau_f, whether the measured position is delayed)
 COMPENSATIONS = [(0, 0, 0), (0, 1, 0), (0.5, 0, 0), (0.5, 1, 0), (1, 1, 0), (1, 0.5, 0), (1, 0, 0), (1, 1, 1)]
 
 
@@ -91,14 +91,14 @@ def test_response_error_net_delay_matches_closed_form(model):
     net_delay = 2 * np.log(restitution.mean(axis=1)) / (pi * OMEGA)
     expected = (1 - lead) * force_delay + (1 - kappa) * (lag + transport) - kappa * position_delay
     expected = expected.reshape(-1, len(PHASES))[:, 0]
-    # The formula neglects terms of third order in the lags, and so does the bound; T contributes 1e-7 s.
+    # Both the formula and the bound neglect terms of third order in the lags; T contributes 1e-7 s.
     lags = (lag + transport + force_delay + position_delay).reshape(-1, len(PHASES))[:, 0]
     assert np.all(np.abs(net_delay - expected) < 0.5 * OMEGA**2 * lags**3 + 5e-7)
     # The bound is between 0.2 % and 8 % of the lags.
     assert np.ptp(expected) > 0.007
 
 
-# Items 5 and 6, on a contact that never ends.
+# Items 5 and 6, for an endless contact.
 
 DAMPING = 2 * 0.05 * MASS * OMEGA
 MARGIN = np.array([0.8, 0.95, 1.0, 1.05, 1.2])
@@ -143,7 +143,7 @@ LEADS = np.array([[0.1, 0], [0.2, 0], [0.3, 0], *([a, m] for a in (0.4, 0.6) for
 
 @functools.cache
 def first_order_leads():
-    """Return the growth for T -> 0 of endless contacts under phase lead, and their dominant roots."""
+    """Return growth for T -> 0 of endless contacts under phase lead, and the dominant roots."""
     angle, multiple = LEADS
     # At the threshold (k + j omega b)(1 + j theta) e^(-j theta) is real and M omega^2, theta = omega tau:
     # b omega/k = tan(theta - atan theta), about theta^3/3, twice the damping ratio.
@@ -203,9 +203,7 @@ def test_identification_with_misaligned_force_is_biased_as_predicted():
 
 
 class Clamped(Compensator):
-    """Another compensator clamped to max(0, F_c); the measured force alone for the first `blind` contact
-    ticks.
-    """
+    """Another compensator with output max(0, F_c); measured force during the first `blind` ticks."""
 
     name: ClassVar[str] = "clamped"
     knows: ClassVar[tuple] = ()
@@ -233,7 +231,7 @@ CLAMP_PHASES = np.array([0.05, 0.1, 0.2])
 
 
 def clamped_and_not(name, law, blind, gains, **leaves):
-    """Return the mean restitution over the contact phases without and with the clamp, per CLAMP_PHASES."""
+    """Return the mean restitution over contact phases without and with the clamp, per CLAMP_PHASES."""
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, IDEAL, 0.0, period=FINE))
     leaves = {key: np.repeat(value, len(PHASES)) for key, value in leaves.items()}
     gains = {key: np.repeat(value, len(PHASES)) if np.ndim(value) else value for key, value in gains.items()}

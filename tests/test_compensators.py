@@ -1,8 +1,7 @@
 """Properties of every registered compensator.
 
-Other tests also take every registered compensator: agreement with the runtime on many random and recorded
-readings (`test_agreement`), agreement of C with Python (`test_c99`), and the bundle with its self-test
-(`test_export`).
+Other tests of every registered compensator: agreement of JAX with the runtime (`test_agreement`), agreement
+of C with Python (`test_c99`), and the bundle with its self-test (`test_export`).
 """
 
 import functools
@@ -46,7 +45,7 @@ WORDS = {value for name, value in vars(known).items() if name.isupper()}
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def commands(name, signals, gains, constants):
-    """Return the force commands, (ticks, *batch); runs begin where `age` is 0."""
+    """Return the force commands, (ticks, *batch); runs start where `age` is 0."""
     law = COMPENSATORS[name]
     prepared = law.prepare(gains, constants)
 
@@ -72,7 +71,7 @@ def derivative(name, signals, gains, constants, along_signals, along_gains):
 
 
 def readings(shape=(), clearance=math.inf):
-    """Return two runs at either surface with late force and measured position, (ticks, *shape)."""
+    """Return readings of two runs at either surface with delayed force and position, (ticks, *shape)."""
     size = 1 + 0.1 * np.arange(math.prod(shape)).reshape(shape)
     time = PERIOD * np.arange(TICKS).reshape(-1, *(1 for _ in shape))
 
@@ -90,13 +89,12 @@ def readings(shape=(), clearance=math.inf):
 
 
 def some_gains(name, shape=()):
-    """Return gains that are all nonzero, the same in every lane."""
+    """Return nonzero gains that are equal in every lane."""
     return {gain: jnp.full(shape, entry["value"]) for gain, entry in GAINS[name].items()}
 
 
 @pytest.mark.parametrize("name", LAWS)
 def test_compensator_reads_position_only_if_declared(name):
-    """Replace the measured position by NaN."""
     signals, constants = readings()
     blind = signals._replace(position_measured=jnp.full_like(signals.position_measured, jnp.nan))
     seeing, unseeing = (
@@ -106,7 +104,7 @@ def test_compensator_reads_position_only_if_declared(name):
 
 
 def on_the_rig(name, signals):
-    """Return the runtime's commands on readings of one lane."""
+    """Return the runtime's commands for the readings of one lane."""
     gains = {gain: entry["value"] for gain, entry in GAINS[name].items()}
     controller = ON_THE_RIG[name](gains, PERIOD, GAP)
     result = []
@@ -198,7 +196,6 @@ def test_compensator_derivatives_are_finite_at_rest_and_without_force(name):
 
 @pytest.mark.parametrize("name", LAWS)
 def test_compensator_lanes_are_independent_for_any_batch_shape(name):
-    """Compare the shapes (), (n,) and (m, n)."""
     signals, constants = readings((2, 3), GAP)
     together = commands(name, signals, some_gains(name, (2, 3)), constants)
     row = jax.tree.map(lambda leaf: leaf[..., 1, :], (signals, constants))
@@ -239,9 +236,7 @@ def test_compensator_is_mirror_symmetric_between_surfaces(name):
 
 @pytest.mark.parametrize("name", LAWS)
 def test_compensator_state_is_cleared_when_a_run_starts(name):
-    """Without a start of a run nothing changes; the next contact keeps only what was identified; a reset
-    clears all.
-    """
+    """The next contact keeps only identified parameters; a reset clears all."""
     law, gains = COMPENSATORS[name], some_gains(name)
     signals, constants = readings((), GAP)
     first = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[60]), signals)
@@ -274,7 +269,7 @@ def test_compensator_state_is_cleared_when_a_run_starts(name):
 
 @pytest.mark.parametrize("name", LAWS)
 def test_compensator_noise_amplification_matches_prediction(name):
-    """Add white noise to the force readings of a contact held still."""
+    """Add white noise to the force readings of a static contact."""
     ticks, gains = 40_000, {gain: entry["value"] for gain, entry in GAINS[name].items()}
     law = COMPENSATORS[name]
     constants = KnownConstants(jnp.asarray(PERIOD), jnp.asarray(math.inf))
@@ -287,7 +282,7 @@ def test_compensator_noise_amplification_matches_prediction(name):
 
 @pytest.mark.parametrize("depth", [1.0, 1e4, 1e9])
 def test_peak_force_of_weak_hardening_equals_linear_contact(depth):
-    """Cancellation must not make the peak force 0."""
+    """Cancellation must not give a peak force of 0."""
     linear = load("claw-350kg", ["contact.damping=[0.0]"]).mechanism
     hardening = load(
         "claw-350kg", ['contact.law="hardening"', "contact.damping=[0.0]", f"contact.reference_depth={depth}"]

@@ -1,4 +1,4 @@
-"""Cache of compiled programs: checksummed, read unchanged or compiled again, without a message."""
+"""Cache of compiled programs: a checksummed file is read unchanged or silently recompiled."""
 
 import os
 import sys
@@ -18,7 +18,7 @@ VALUE = 1.75
 
 @pytest.fixture
 def folder(tmp_path):
-    """Let jax cache compiled programs in this folder only."""
+    """Set the folder of JAX's compile cache."""
     before = jax.config.jax_compilation_cache_dir
     assert use_checksummed_cache(tmp_path)
     compilation_cache.reset_cache()
@@ -33,7 +33,7 @@ def kept_sum(x):
 
 
 def compute():
-    """Compute the value as a new process would."""
+    """Compute the value as in a new process."""
     jax.clear_caches()
     return float(jax.jit(kept_sum)(VALUE))
 
@@ -45,7 +45,7 @@ def flipped(content, bit):
 
 
 def check_flips(folder, number, seed):
-    """Flip a bit and compute, repeatedly: the value is the same, and the file is repaired."""
+    """Repeatedly flip a bit and check that the value is unchanged and the file is repaired."""
     expected = compute()
     (file,) = (path for path in folder.iterdir() if "kept_sum" in path.name)
     whole = file.read_bytes()

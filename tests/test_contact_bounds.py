@@ -1,4 +1,4 @@
-"""Verdicts also bound the peak force and duration of the real contact relative to the ideal contact."""
+"""Bounds on peak force and duration of the real contact relative to the ideal contact."""
 
 import json
 import math
@@ -50,7 +50,7 @@ def test_duration_bound_of_short_contact_allows_rounding_to_control_periods():
 
 
 def test_undelayed_simulation_has_peak_force_and_duration_of_ideal_contact():
-    # With an ideal simulator and no delay, the rest is of the order of (omega T)^2 and of one control period.
+    # The remaining error is of the order of (omega T)^2 and of one control period.
     rig = {"rig.simulator": {"model": "ideal"}, "rig.force_sensor.delay": 0.0, "contact.damping": [0.0]}
     mechanism = jaxhil.load("claw-350kg", {**rig, "uncertainty": None})
     (contact,) = jaxhil.simulate(mechanism).contacts
@@ -64,9 +64,7 @@ def test_undelayed_simulation_has_peak_force_and_duration_of_ideal_contact():
 
 @pytest.fixture(scope="module")
 def slow_simulator():
-    """Simulate behind a motion simulator of 0.2 Hz: the error is right, the contact 15 times too hard and too
-    long.
-    """
+    """Simulate with a slow motion simulator: right restitution, 15 times the force and duration."""
     return jaxhil.simulate(jaxhil.load("claw-350kg", {FREQUENCY: 0.2}), LAW)
 
 
@@ -94,7 +92,7 @@ def test_verify_reports_excessive_peak_force_of_closed_loop(slow_simulator):
     (contact,) = report.closed_loop
     (simulated,) = slow_simulator.contacts
     assert contact.peak_force_ratio == pytest.approx(simulated.peak_force_ratio, rel=1e-6)
-    # The closed loop counts samples.
+    # The duration of the closed loop is a whole number of control periods.
     sample = mechanism.rig.control_period * simulated.duration_ratio / simulated.duration
     assert contact.duration_ratio == pytest.approx(simulated.duration_ratio, abs=sample)
     reason = f"closed loop, contact 1: found a real peak force of {contact.peak_force_ratio:.3g} times"

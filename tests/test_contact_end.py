@@ -1,8 +1,8 @@
-"""Noise does not change the mean restitution: no threshold of a contact's end depends on it.
+"""Sensor noise does not change the mean restitution through the detection of a contact's end.
 
-A contact is over when its command has died out; a noisy command is given 0.1 s for this. The mean over many
-seeds is compared with the contact without noise: in the simulation, around the exported controller in Python,
-and around the one in C on a rig with its own plant and its own rule for the end.
+A contact ends when its command has decayed; a noisy command gets 0.1 s for the decay. The mean over many
+seeds is compared with the contact without noise: in the simulation, with the exported Python controller, and
+with the C controller on a rig with its own plant and its own end detection.
 """
 
 import math
@@ -40,14 +40,14 @@ from tuning.rig.udp_protocol import NumericalModel
 from tuning.statistics.intervals import binomial_interval
 from tuning.watchdog.calibration import calibrate
 
-BIAS = 0.002  # of the mean restitution, beside three standard errors
-LOUDEST = 5.0  # amplification of noise by the loudest gains
+BIAS = 0.002  # largest bias of the mean restitution, in addition to three standard errors
+LOUDEST = 5.0  # largest noise amplification of the gains
 TICKS = 4000  # ticks of noise per run, as in noisy_plant.c
 PLANT = Path(__file__).with_name("noisy_plant.c")
 
 
 def heavy(**sensor: float) -> Mechanism:
-    """Return 420 and 6500 kg on a soft, damped mechanism, whose command decays slowly after a contact."""
+    """Return mechanisms of 420 and 6500 kg with soft, damped contact and slow decay of the command."""
     raw = mechanism(
         {"stiffness": [18e3], "damping": [320.0]},
         {"model": "second_order", "natural_frequency": 9.0, "damping_ratio": 0.7, "delay": 0.002},
@@ -63,7 +63,7 @@ def heavy(**sensor: float) -> Mechanism:
 
 # Gains with which the command is far from 0 when the force ends.
 SLOW_END = {"phase_lead": 0.0034, "response_error": 1.35}
-# Gains found by `jaxhil tune`: an error of 0.004 rms with noise, below 0.001 without.
+# Gains from `jaxhil tune`: an rms error of 0.004 with noise, below 0.001 without.
 TUNED = {
     "phase_lead": 3.385e-5,
     "response_error": 1.21745,
@@ -75,7 +75,7 @@ TUNED = {
 
 
 def amplification(name: str, gains: dict[str, float], period: float) -> float:
-    """Return by how much a compensator amplifies the sensor's noise."""
+    """Return the noise amplification of a compensator."""
     leaves = {key: jnp.asarray(value) for key, value in gains.items()}
     return float(COMPENSATORS[name].noise_amplification(leaves, KnownConstants(jnp.asarray(period), jnp.inf)))
 
@@ -117,10 +117,10 @@ def peak_force(parsed: Mechanism) -> float:
 
 
 def check_means(parsed: Mechanism, name: str, shares: tuple[float, ...], seeds: int) -> None:
-    """Check the first contact's mean at noise of these shares of the peak force.
+    """Check the mean restitution of the first contact for noise of these shares of the peak force.
 
-    Noise may bias the law, or a sensor with a dead zone. The same contact is then continued for ten times as
-    long, and has the same mean.
+    Noise may bias a compensator, or a sensor with a dead zone. The same contact is therefore also simulated
+    for ten times as long after its end and must have the same mean.
     """
     gains = loud_gains(parsed, name)
     quiet = with_noise(parsed, 0.0)
@@ -151,7 +151,7 @@ def test_mean_restitution_does_not_depend_on_noise_for_any_mechanism(built_in, n
 
 @pytest.mark.parametrize("name", ["phase_lead", "response_error", "smith_predictor"])
 def test_contact_end_is_declared_after_the_whole_impulse(name):
-    """Without noise, continue ten times as long after the contact: the model's velocity stays the same."""
+    """Without noise, the model's velocity no longer changes after the detected end."""
     parsed = heavy()
     gains = nominal_gains(parsed, name)
     over, later = continued(parsed, name, gains, 10.0)
@@ -159,7 +159,7 @@ def test_contact_end_is_declared_after_the_whole_impulse(name):
 
 
 def continued(parsed: Mechanism, name: str, gains: dict[str, float], factor: float) -> tuple[float, float]:
-    """Return the first contact's restitution, and that after another `factor` times the longest wait."""
+    """Return the first contact's restitution, and the value after `factor` times the longest wait."""
     law, plant, watch = controller(parsed, name, gains), RigHardware(parsed), ContactWatch(parsed)
     model = NumericalModel(to_plain_data(parsed))
     position, velocity = model.start
@@ -190,12 +190,12 @@ def test_exported_python_controller_has_mean_restitution_of_simulation():
 
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler")
 def test_exported_c_controller_has_restitution_of_simulation(tmp_path):
-    """Compare each run under the same noise, and the mean, 60 ticks later, with the contact without noise."""
+    """Compare each run with equal noise, and the mean with the noiseless contact."""
     parsed, seeds = heavy(noise_std=1.0), 16
     gains = nominal_gains(parsed, "response_error", **SLOW_END)
     (simulated,) = restitutions(parsed, "response_error", gains, seeds)
     runs = run_in_c(tmp_path, parsed, exported(parsed, gains), seeds)
-    # If the C rig detects the end of force a tick earlier or later, one command more or less is included.
+    # The C rig may detect the end a tick earlier or later, which includes one command more or less.
     assert np.median(np.abs(runs[:, 0] - simulated)) < 1e-6
     np.testing.assert_allclose(runs[:, 0], simulated, atol=1e-3)
     longer = run_in_c(tmp_path, parsed, exported(parsed, gains), 400, 60)[:, 0]
@@ -206,7 +206,7 @@ def test_exported_c_controller_has_restitution_of_simulation(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler")
 def test_exported_watchdog_false_alarms_lie_within_stated_interval(tmp_path):
-    """Run a rig that waits 60 ticks longer than the simulation."""
+    """Let the rig wait 60 ticks longer than the simulation."""
     parsed = heavy(noise_std=1.0)
     document = exported(parsed, nominal_gains(parsed, "response_error", **TUNED))
     result = calibrate(check_document(document), scenarios=1024, limit=0.02)
@@ -219,7 +219,6 @@ def test_exported_watchdog_false_alarms_lie_within_stated_interval(tmp_path):
 
 
 def test_tuning_time_limit_includes_wait_for_noisy_contact_end():
-    """A contact may last as long as without noise before it counts as failed."""
     noisy, free = (
         build_task(heavy(noise_std=std), "phase_lead", 8, 0).scenarios.time_limit for std in (1.0, 0.0)
     )

@@ -1,4 +1,4 @@
-"""Contact between samples: lags behind fast motion simulators, derivatives, number of cells."""
+"""Contact force between samples: sensor lags, derivatives, and subdivision of the control period."""
 
 import dataclasses
 
@@ -25,7 +25,7 @@ PERIOD = 4e-3
 
 
 def fast(simulator, time_constant=2e-3, **contact):
-    """Return 350 kg at 4 ms with a held command, behind a fast motion simulator."""
+    """Return a mechanism at a control period of 4 ms with held command and fast motion simulator."""
     sensor = {"time_constant": time_constant}
     return mechanism(
         {"law": "linear", "stiffness": [124e3], **contact},
@@ -42,7 +42,6 @@ def second_order(frequency):
 
 
 def test_lagging_sensor_restitution_converges_to_ideal_simulator():
-    """As the simulator gets faster, the restitution converges to that of the ideal simulator."""
     cases = [fast(second_order(frequency)) for frequency in (300.0, 600.0, 1200.0)]
     parsed = [validated(case) for case in cases]
     scenarios = join(build_scenarios(member) for member in parsed)
@@ -59,7 +58,6 @@ def test_lagging_sensor_restitution_converges_to_ideal_simulator():
 
 
 def test_lagging_contact_derivatives_match_finite_differences():
-    """Change stiffness and lag together."""
     parsed = validated(fast(second_order(60.0), law="kelvin_voigt", damping=[300.0]))
     loop = build_loop(parsed, "none", join([build_scenarios(parsed)]), energies=True)
     scenario = jax.tree.map(jax.numpy.asarray, join([build_scenarios(parsed)]))
@@ -132,7 +130,7 @@ RUBBING = {"law": "preloaded", "stiffness": [8e5], "preload": 3.0, "friction": 2
     ],
 )
 def test_sampled_contact_of_slow_mechanism_agrees_with_exact_motion(contact, frequency, lag, hold):
-    """Use the error bounds that the guide states, near the fastest values that it allows."""
+    """Use the error bounds of the guide near the fastest allowed values."""
     sensor = {"time_constant": lag}
     raw = mechanism(contact, second_order(frequency), period=1e-3, command_hold=hold, force_sensor=sensor)
     scenarios, *loops = loops_of(raw)
@@ -141,7 +139,7 @@ def test_sampled_contact_of_slow_mechanism_agrees_with_exact_motion(contact, fre
     bound = 1e-5 if lag else 1e-12
     np.testing.assert_allclose(sampled.restitution[0], exact.restitution[0], rtol=0, atol=bound)
     np.testing.assert_allclose(sampled.peak_force[0], exact.peak_force[0], rtol=2e-3)
-    # Either end lies between two samples, and a damper releases between steps of a held command.
+    # Onset and release lie between samples, and a damper releases between steps of a held command.
     np.testing.assert_allclose(sampled.duration[0], exact.duration[0], rtol=0, atol=4e-3)
 
 

@@ -1,6 +1,6 @@
 """Six-axis contact: closed forms of impacts, and independence of the choice of axes.
 
-Each friction law is one program with two candidates a lane; the lanes are the cases.
+Each friction law is one program with two candidates per lane; the lanes are the cases.
 """
 
 import jax
@@ -34,7 +34,7 @@ EYE, Z = np.eye(3), np.array([0.0, 0.0, 1.0])
 
 
 def case(**changes):
-    """Return a lane; lengths in m, speeds in m/s. The contact lasts half a period of sqrt(mass/k)."""
+    """Return a lane (lengths in m, speeds in m/s) whose contact lasts half a period of sqrt(mass/k)."""
     values = {
         "masses": (1800.0, 420.0),
         "inertias": (np.diag([1400.0, 1100.0, 800.0]), np.diag([150.0, 180.0, 110.0])),
@@ -103,7 +103,7 @@ def both(key):
 
 
 def world():
-    """Return the start of every lane: the target rests at the origin; the last lane is turned and boosted."""
+    """Return the initial states: target at rest at the origin; last lane rotated and boosted."""
     zero = np.zeros((3, len(LANES)))
     target_offset, chaser_offset = gathered("interfaces", 0), gathered("interfaces", 1)
     position = target_offset + gathered("pose") - chaser_offset
@@ -211,7 +211,7 @@ def test_six_axis_central_impact_equals_one_axis_impact(run):
 
 
 def test_six_axis_off_centre_impulse_follows_effective_mass(run):
-    """To first order in the rotation, the impulse is 2 m_n v_n, and no energy is lost."""
+    """To first order in the rotation, the impulse is 2 m_n v_n."""
     seen, mass, step = run
     result = seen["off_centre"]
     impulse = np.sum(result["force"][:, 2]) * step["off_centre"]
@@ -235,7 +235,7 @@ def test_six_axis_couple_oscillates_with_reduced_inertia(run):
 
 
 def test_six_axis_ball_slides_or_rolls_as_in_closed_form(run, request):
-    """Coulomb: v_t - mu (1 + e) v_n while the ball slides; 5/7 v_t if it ends up rolling (Walton)."""
+    """Tangential speed: v_t - mu (1 + e) v_n while sliding, 5/7 v_t if rolling (Walton)."""
     seen, *_ = run
     bristle = request.node.callspec.params["run"] == "bristle"
     sliding, rolling = seen["sliding"]["twist"][-1], seen["rolling"]["twist"][-1]
@@ -286,7 +286,7 @@ def test_six_axis_contact_is_invariant_to_rotation_and_boost(run):
 
 
 def test_six_axis_contact_combines_elastoplastic_contact_and_tether():
-    """On the central lane, e = 1/sqrt(r) under a bristle at rest, beside a tether that stays slack."""
+    """Central contact: e = 1/sqrt(r), with a bristle at rest and a slack tether."""
     pair, states, contact, step = prepared()
     parameters = contact.parameters._replace(unloading_ratio=jnp.full((2, len(LANES)), 4.0))
     same = [jnp.full((2, len(LANES)), value) for value in (0.2, 1e6, 10.0)]
@@ -304,7 +304,7 @@ def test_six_axis_contact_combines_elastoplastic_contact_and_tether():
 
 
 def test_six_axis_contact_derivatives_match_finite_differences():
-    """Differentiate the final twist by stiffness, damping and friction; without slip it is not NaN."""
+    """Include a lane without slip, where the derivative must not be NaN."""
     pair, states, contact, step = prepared()
 
     @jax.jit

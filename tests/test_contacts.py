@@ -1,4 +1,4 @@
-"""Contact laws with an integrated reference or with memory: closed forms, SciPy, work, derivatives."""
+"""Contact laws with integrated ideal contact or with memory: closed forms, SciPy, work, derivatives."""
 
 from functools import partial
 
@@ -18,7 +18,7 @@ PERIODS = np.array([4e-3, 2e-3, 1e-3, 5e-4])
 
 
 def contact(**values):
-    """Return the parameters of every lane by name, nominal unless specified."""
+    """Return the parameters of every lane by name; unspecified parameters are nominal."""
     numbers = {"stiffness": STIFFNESS, "damping": 0.0, "exponent": 1.5}
     numbers |= {"reference_depth": 2e-4, "unloading_ratio": 1.0, "preload": 0.0, "friction": 0.0}
     lanes = {
@@ -34,12 +34,12 @@ def reference(name, **values):
 
 
 def test_undamped_hardening_contact_matches_closed_form():
-    """e = 1; k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 at the peak force; a soft spring stays linear."""
+    """e = 1; k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 at the peak force."""
     unit = np.array([1e-5, 5e-5, 1e-4, 2e-4, 1e-3, 10.0])
     result = reference("hardening", reference_depth=unit)
     square = np.sqrt(1 + 2 * MASS * VELOCITY**2 / (STIFFNESS * unit**2)) - 1
     np.testing.assert_allclose(result.restitution, 1.0, rtol=0, atol=1e-8)
-    # For a spring that hardly stiffens, the square is dominated by rounding.
+    # For a spring that hardly stiffens, d^4 is dominated by rounding.
     peak = STIFFNESS * unit * np.sqrt(square) * (1 + square)
     np.testing.assert_allclose(result.peak_force[:-1], peak[:-1], rtol=1e-8)
     np.testing.assert_allclose(result.peak_force[-1], VELOCITY * np.sqrt(STIFFNESS * MASS), rtol=1e-8)
@@ -89,10 +89,7 @@ PRELOADS = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 6.0], [10.0, 6.0], [3.0, 6.0
 
 
 def test_preloaded_contact_closed_form_matches_integration():
-    """Energy: M v^2/2 = k d^2/2 + (F_0 + F_r) d in, k d^2/2 + (F_0 - F_r) d out.
-
-    If friction holds the mechanism back, some energy is left in the spring.
-    """
+    """Energy: M v^2/2 = k d^2/2 + (F_0 + F_r) d inwards, k d^2/2 + (F_0 - F_r) d outwards."""
     preload, friction = PRELOADS
     result = reference("preloaded", preload=preload, friction=friction)
     energy, inward = MASS * VELOCITY**2 / 2, preload + friction
@@ -123,7 +120,6 @@ def test_elastoplastic_contact_loads_unloads_reloads_and_resets():
 
 
 def test_integrated_ideal_contact_derivatives_match_finite_differences():
-    """Differentiate by stiffness, damping and velocity."""
     values = {"damping": np.linspace(50.0, 900.0, LANES)}
 
     for name in ("hardening", "depth_damped"):
@@ -183,9 +179,7 @@ def limit(name):
 
 @pytest.mark.parametrize("name, order", list(zip(LAWS_ALONE, [2, 1, 1, 2, 1], strict=True)))
 def test_undelayed_contact_converges_to_ideal_contact(name, order):
-    """Compare the restitution with SciPy or the closed form, and with the law's own reference; W_out/W_in
-    with e^2.
-    """
+    """Compare with SciPy or the closed form, with the law's ideal contact, and W_out/W_in with e^2."""
     expected, expected_peak = limit(name)
     parsed = validated(mechanism(LAWS_ALONE[name], IDEAL, 0.0))
     period, phase = grid(PERIODS, (np.arange(16) + 0.5) / 16)

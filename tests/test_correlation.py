@@ -37,7 +37,7 @@ def mechanism(keys=KEYS, matrix=MATRIX, changes=(), unset=()):
 
 
 def normals(values, parsed):
-    """Return the standard normal values behind each key's draws, by SciPy's distribution functions."""
+    """Return the standard normal values that correspond to each key's draws, by SciPy's distributions."""
     m = np.ravel(parsed.contact.stiffness)[0]
     return {
         DELAY: (values[DELAY] - parsed.rig.force_sensor.delay) / 0.0001,
@@ -111,7 +111,7 @@ def test_correlation_leaves_quantiles_and_extremes_unchanged():
         special.ndtri(points[:, 0]) * (np.sqrt(1 - 0.98**2) - 0.98),
         atol=1e-9,
     )
-    # This holds even for a coordinate at an end of the box.
+    # Include a coordinate at a bound of the unit cube.
     box = draw_at_points(
         mechanism(), np.array([np.zeros(points.shape[1]), np.full(points.shape[1], 1 - 2**-53)])
     )

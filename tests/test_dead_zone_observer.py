@@ -16,7 +16,7 @@ GAINS = nominal_gains(MECHANISM, "dead_zone_observer")
 
 @pytest.fixture(scope="module")
 def led():
-    """Run phase lead alone, with almost no dead zone and with the dead zone."""
+    """Run phase lead alone, with a negligible dead zone and with the nominal dead zone."""
     scenario = spread(MECHANISM, 2, force_sensor__dead_zone=np.array([1e-9, DEAD_ZONE]))
     return first_contact(MECHANISM, scenario, "phase_lead", nominal_gains(MECHANISM, "phase_lead"))
 
@@ -28,9 +28,7 @@ def test_dead_zone_shifts_the_surface(led):
 
 
 def test_dead_zone_observer_removes_dead_zone_error(led):
-    """With the right stiffness 1 % of the error is left, with 30 % wrong a tenth; aligned to F itself it
-    diverges.
-    """
+    """The error falls to 1 % with the right stiffness, to 10 % with 30 % stiffness error."""
     lag = 1 / (2 * math.pi * GAINS["observer_bandwidth"])
     assert GAINS["identification_delay"] == pytest.approx(DELAY - lag, rel=1e-12)
     stiffness = STIFFNESS * np.array([1.0, 0.7, 1.3, 0.0, 1.0])
@@ -57,7 +55,7 @@ def test_dead_zone_observer_equals_phase_lead_without_dead_zone():
 
 @pytest.mark.parametrize("overrides", [[], ["rig.force_sensor.delay=0.002"], ["rig.control_period=0.004"]])
 def test_dead_zone_observer_filter_has_gain_near_1_below_15_hz(overrides):
-    """|Q| >= 0.9 for the filter at its control period, and its lag is no longer than the force's delay."""
+    """|Q| >= 0.9, and the filter's lag does not exceed the force delay."""
     parsed = load("rig-300kg", [*overrides, "rig.force_sensor.dead_zone=12"]).mechanism
     gains, period = nominal_gains(parsed, "dead_zone_observer"), parsed.rig.control_period
     still = gains | {"phase_lead": 0.0, "identification_delay": 0.0, "observer_stiffness": 1.0}

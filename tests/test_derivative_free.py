@@ -57,7 +57,7 @@ def test_polishing_search_converges_faster_with_known_covariance():
 
 
 def test_polishing_search_is_never_worse_than_its_starting_point():
-    # Start at the minimum, with so wide a reach that no draw is better.
+    # Start at the minimum with so wide a search that no candidate is better.
     start = np.array([0.3, 0.7])
     result = polish(kinked, start, 64, reach=0.4)
     assert result.loss == kinked(start) == 0
@@ -85,7 +85,7 @@ def test_polishing_search_is_reproducible_and_uses_constant_batch_shape():
     first, second = (polish(losses, np.full(3, 0.99), 200, candidates=16, reach=0.3) for _ in range(2))
     np.testing.assert_array_equal(first.point, second.point)
     assert set(shapes) == {(16, 3)}
-    # Evaluations come in whole generations, no more than requested.
+    # Evaluations are whole generations within the budget.
     assert first.evaluations == 192 and len(shapes) == 2 * 12
 
 
@@ -100,7 +100,7 @@ def test_polishing_search_treats_nan_as_the_worst_loss():
         return np.where(points[..., 0] > 0.55, np.nan, rosenbrock(points))
 
     result = polish(losses, np.full(2, 0.5), 1000, reach=0.1)
-    # The valley descends to (1 - x)^2 at x = 0.2, where the wall is.
+    # The valley decreases to (1 - x)^2 at x = 0.2, at the bound.
     assert result.loss == pytest.approx(0.64, rel=1e-3)
     assert result.point[0] <= 0.55
     nowhere = polish(lambda points: np.full(len(points), np.nan), np.full(2, 0.5), 64)
@@ -116,7 +116,7 @@ def test_global_search_finds_the_best_of_many_basins(gains):
 
 def test_global_search_finds_minimum_that_local_search_misses():
     def losses(points):
-        """Return the lower of a wide basin at 0.2 and a narrow and deeper one at 0.8."""
+        """Return the minimum of a wide basin at 0.2 and a narrow, deeper basin at 0.8."""
         wide = np.sum((points - 0.2) ** 2, axis=-1)
         narrow = 20 * np.sum((points - 0.8) ** 2, axis=-1) - 0.5
         return np.minimum(wide, narrow)

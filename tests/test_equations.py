@@ -1,4 +1,4 @@
-"""Linear equations and square roots of small matrices, lane by lane, compared with NumPy; derivatives."""
+"""Linear equations and square roots of small matrices in lanes, compared with NumPy; derivatives."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Batches on every core: order, padding and tiles do not change results, and most calls reuse a program."""
+"""Evaluation of batches on every core: order, padding and tiles do not change results."""
 
 import os
 import subprocess
@@ -97,7 +97,7 @@ def test_evaluation_compares_every_contact_with_its_own_ideal_contact():
 
 
 def tiled(scenarios):
-    """Return whole delays and expected durations of the lanes in dealt order, (tiles in turn, lanes)."""
+    """Return whole delays and expected durations of the lanes in tile order, (tiles, lanes)."""
     _, _, dealt = ONE_AXIS.shard(scenarios, {})
 
     def in_turn(leaf):
@@ -112,7 +112,7 @@ def tiled(scenarios):
 
 
 def test_tiles_group_lanes_of_equal_delay_and_similar_duration():
-    """Exceptions: the last tile of each delay, and batches with only a few tiles per delay."""
+    """Exclude the last tile of each delay, and batches with few tiles per delay."""
     delays, durations = tiled(setting("none", lanes=4096)[2])
     assert np.sum(np.ptp(delays, axis=-1) > 0) < len(np.unique(delays)) == 2
     assert np.mean(np.ptp(durations, axis=-1)) < 0.1 * np.ptp(durations)

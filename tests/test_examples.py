@@ -26,7 +26,7 @@ SLOW = ["tuning.compare", "tuning.export", "tuning.map", "tuning.report"]
 
 
 def run_examples(path):
-    """Return the number of examples of a docstring that ran, after checking that none failed."""
+    """Run the examples of a docstring, check that none fails, and return their number."""
     [test] = doctest.DocTestFinder(recurse=False).find(resolve_name(path), path)
     report = []
     result = doctest.DocTestRunner(verbose=False).run(test, out=report.append)
@@ -36,7 +36,7 @@ def run_examples(path):
 
 @pytest.fixture(autouse=True)
 def keep_registered_compensators():
-    """Remove what an example registers."""
+    """Remove compensators that an example registers."""
     saved = [(table, dict(table)) for table in (COMPENSATORS, RIG_COMPENSATORS)]
     yield
     for table, content in saved:

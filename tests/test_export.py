@@ -1,4 +1,4 @@
-"""`jaxhil export` writes a bundle whole or not at all; `jaxhil verify` detects a corrupt bundle."""
+"""`jaxhil export` writes a bundle completely or not at all; `jaxhil verify` detects a corrupt bundle."""
 
 import errno
 import html
@@ -345,7 +345,6 @@ def test_bundle_readme_lists_faults_and_files():
 
 
 def test_bundle_readme_escapes_mechanism_name():
-    """Readers of HTML and of Markdown see the name itself, without markup."""
     name = "<img src=x onerror=a()> *a* _b_ `c` [d](e) | ~f~ \\ $g$ &amp; #"
     made = document()
     text = readme_text({**made, "mechanism": {**made["mechanism"], "name": name}}, ["gains.json"])

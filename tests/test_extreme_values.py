@@ -1,4 +1,4 @@
-"""Extreme values of every numeric key: the run is done or rejected in one line, without traceback or hang."""
+"""Extreme values of every numeric key: simulated or rejected in one line, without traceback or hang."""
 
 import itertools
 import math
@@ -36,7 +36,7 @@ LONGEST = 120.0  # s; on a busy machine most of it is compilation
 
 
 def overrides(others, key, value):
-    """Yield the overrides: the key itself, and for lists one of their entries."""
+    """Yield overrides of the key itself, or of a list entry."""
     for path in (key, key + ENTRIES.get(key, "[0]")):
         certain = ["uncertainty={}"] if others else []
         yield [*certain, *others, f"{path}={value}"]

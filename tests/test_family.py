@@ -26,7 +26,7 @@ def members():
 
 
 def undelayed(members, damped: bool) -> Any:
-    """Return the package's `IdealContact` of the nominal undelayed contacts, in the order of the members."""
+    """Return the package's `IdealContact` of the nominal mechanisms, in the order of the members."""
     references = {name: np.empty(len(members)) for name in IdealContact._fields}
     for name in LAWS:
         indices = [i for i, m in enumerate(members) if m.contact.law == name]

@@ -1,4 +1,4 @@
-"""Faults injected tick by tick: each is raised on its tick, no other; outputs stay finite and limited."""
+"""Faults injected tick by tick: exactly these are raised; outputs stay finite and limited."""
 
 from collections.abc import Iterable
 
@@ -13,7 +13,7 @@ from jaxhil.rig.faults import FAULTS, fault_names
 from jaxhil.rig.gain_file import check_gain_document
 
 BLOCK = 500_000
-# These need a closed loop, a faulty compensator or a call: the tests of guards and watchdog cover them.
+# These faults need a closed loop, a faulty compensator or a call; the guard and watchdog tests cover them.
 ELSEWHERE = (
     "command_not_finite",
     "restitution",
@@ -27,7 +27,7 @@ needs_compiler = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C com
 
 
 def check(run: FaultRun, results: np.ndarray) -> None:
-    """Raise AssertionError for the first tick at which the controller misbehaved."""
+    """Raise AssertionError for the first tick with wrong faults or outputs."""
     force, position = results[:, RESULT.index("force")], results[:, RESULT.index("position")]
     faults = results[:, RESULT.index("faults")].astype(np.int64)
     wrong = run.wrong(faults, results[:, RESULT.index("tripped")] != 0)
@@ -86,7 +86,7 @@ FEW = ("none", "response_error")
 
 
 def few_of(laws: Iterable[str]) -> pytest.MarkDecorator:
-    """Parametrise `law`: those in `FEW` every day, the others with the slow tests."""
+    """Parametrise `law`: compensators of `FEW` every day, the others as slow tests."""
     marked = [pytest.param(law, marks=() if law in FEW else pytest.mark.slow) for law in laws]
     return pytest.mark.parametrize("law", marked)
 

@@ -1,9 +1,8 @@
-"""Failing system calls and kills: whatever call fails, no output is wrong and none is lost.
+"""Recovery of commands from failing system calls and from kills, without wrong or lost output.
 
-The method is that of SQLite: every call that concerns the output folder or the folder of cached programs
-fails once, in turn, and the process is killed there once, in turn. Afterwards every file is either the old
-one or the one that the command writes, whole. The user's files are unchanged. Running the command again gives
-the result of an undisturbed run.
+The method is that of SQLite: every call on the output folder or the program cache fails once, in turn, and
+the process is killed there once, in turn. Afterwards every file is either the old one or the complete new
+one, and the user's files are unchanged. Running the command again gives the result of an undisturbed run.
 """
 
 import json
@@ -28,15 +27,15 @@ USERS = {".thesis.docx.tmp": b"years", ".thesis.docx.1.tmp": b"of", "notes.txt":
 
 
 class Command(NamedTuple):
-    """Command that writes files. `arguments` takes the output folder and the folder of the gain files."""
+    """Command that writes files; `arguments` takes the output folder and the folder of the gain files."""
 
     arguments: Callable[[Path, Path], list[Any]]
     again: tuple[str, ...] = ()  # arguments added in the next run
     before: tuple[tuple[str, ...], ...] = ()  # earlier undisturbed runs with these arguments
     one_piece: str | None = None  # folder that is replaced as a whole
-    cold: bool = False  # whether the cache of programs is empty
+    cold: bool = False  # whether the program cache is empty
     new: str | None = None  # file that the command refuses to overwrite
-    logged: bool = False  # whether it reads the log of a run
+    logged: bool = False  # whether the command reads the log of a run
 
 
 TUNED = ["--compensator", "phase_lead", "--scenarios", 2, "--starts", 1, "--steps", 1, "--validation", 4]
@@ -98,7 +97,7 @@ def runner(tmp_path_factory):
 
 
 class Bench:
-    """A command, the files that existed before it, and its undisturbed result."""
+    """Command, files that existed before the command, and result of an undisturbed run."""
 
     def __init__(self, runner: Runner, folder: Path, name: str) -> None:
         self.runner, self.command = runner, COMMANDS[name]
@@ -134,9 +133,7 @@ class Bench:
         return self.runner.run(*arguments, *more, folders=(self.out, self.runner.cache), **fault)
 
     def tree(self) -> dict[str, Any]:
-        """Return every finished file without dates and times; check separately that checkpoints are
-        checksummed.
-        """
+        """Return every finished file without dates and times, after checking the checksums of checkpoints."""
         paths = [path.relative_to(self.out) for path in self.out.rglob("*") if path.is_file()]
         finished = [path for path in paths if not any(map(is_temporary, path.parts))]
         assert all(read_checksummed(self.out / path) is not None for path in finished if PIECES in path.parts)
@@ -198,7 +195,7 @@ def _content(path: Path) -> Any:
 
 
 def _is_signed(content: Any) -> bool:
-    """Return whether it is a verdict; `_content` has checked its digest."""
+    """Return whether the document is a verdict, whose digest `_content` has checked."""
     return isinstance(content, dict) and "sweep_sha256" in content and "verdict" in content
 
 

@@ -1,6 +1,4 @@
-"""Files are written whole or not at all; checksummed files are read unchanged or not at all; foreign files
-stay.
-"""
+"""File functions: atomic writes, checksummed reads, and protection of third-party files."""
 
 import errno
 import os
@@ -67,7 +65,7 @@ def test_report_write_errors_passes_other_errors_through(tmp_path):
 
 
 def not_plain(folder):
-    """Create links, a pipe and a folder where a file belongs; return their names and the link's target."""
+    """Create links, a pipe and a folder instead of files; return their names and the link's target."""
     target = folder / "thesis"
     target.write_bytes(b"years")
     (folder / "link").symlink_to(target)

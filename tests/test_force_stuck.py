@@ -19,7 +19,7 @@ TARES = 7
 def contact(damping_ratio: float, side: float, gap: float) -> tuple[np.ndarray, np.ndarray]:
     """Return position [m] and force [N] of a damped contact in closed form, from `SPEED` until release.
 
-    M x'' = -k x - b x' while that pushes; then the mechanism stays behind, compressed, and the body leaves.
+    M x'' = -k x - b x' until the force is zero; then the mechanism stays compressed, and the body leaves.
     """
     frequency = math.sqrt(STIFFNESS / MASS)
     damped, decay = frequency * math.sqrt(1 - damping_ratio**2), damping_ratio * frequency
@@ -39,7 +39,7 @@ def contact(damping_ratio: float, side: float, gap: float) -> tuple[np.ndarray, 
 
 
 def first_stuck(position, force, gap: float, bias: float = 0.0, noise: float = 0.0) -> int | None:
-    """Return the tick on which Python and C report the force stuck; None if never."""
+    """Return the tick on which Python and C report force_stuck; None if never."""
     limits = complete_limits({"force_stuck_travel": TRAVEL, "tare_ticks": float(TARES)})
     gain_file = GainFile("none", {}, PERIOD, gap if gap else math.inf, limits)
     rows = np.zeros((TARES + len(force), len(ROW)))
@@ -67,7 +67,7 @@ SIDES = pytest.mark.parametrize(("side", "gap"), [(1.0, 0.0), (1.0, 0.02), (-1.0
 def test_force_stuck_fault_is_not_raised_for_noiseless_sensor_without_force(
     damping_ratio, dead_zone, bias, side, gap
 ):
-    """A damped contact ends by moving out several times `force_stuck_travel` without a force."""
+    """After a damped contact the body moves several `force_stuck_travel` without force."""
     position, force = contact(damping_ratio, side, gap)
     read = np.sign(force) * np.maximum(np.abs(force) - dead_zone, 0.0)
     assert first_stuck(position, read, gap, bias) is None
@@ -75,9 +75,7 @@ def test_force_stuck_fault_is_not_raised_for_noiseless_sensor_without_force(
 
 @SIDES
 def test_force_stuck_fault_is_not_raised_by_position_noise_without_force(side, gap):
-    """At a contact's end noise accumulates to far more than the travel, but the penetration does not
-    increase.
-    """
+    """Accumulated noise exceeds the travel limit, but the penetration does not increase."""
     position, force = contact(0.5, side, gap)
     assert first_stuck(position, force, gap, noise=TRAVEL / 10) is None
 
@@ -85,7 +83,7 @@ def test_force_stuck_fault_is_not_raised_by_position_noise_without_force(side, g
 @SIDES
 @pytest.mark.parametrize("bias", [0.0, -3.7])
 def test_force_stuck_fault_is_raised_if_sensor_never_reads_force(bias, side, gap):
-    """Disconnect the cable: no mechanism can be pressed in this far without a force."""
+    """A disconnected sensor reads no force at large penetration."""
     position, force = contact(0.5, side, gap)
     depth = position if side > 0 else -gap - position
     stuck_tick = first_stuck(position, np.zeros_like(force), gap, bias)
@@ -111,7 +109,6 @@ def test_force_stuck_fault_is_raised_for_constant_force_while_mechanism_moves(sh
 
 
 def test_force_stuck_fault_is_raised_on_next_contact_if_sensor_stays_at_zero():
-    """The sensor fails at the end of a contact; this shows as soon as the next contact presses."""
     position, force = contact(0.5, 1.0, 0.0)
     released = len(force) - int(np.argmax(force[::-1] > 0))
     twice = np.concatenate([position, position]), np.concatenate([force, np.zeros_like(force)])

@@ -1,4 +1,4 @@
-"""Skipped approaches compared with the same approaches simulated tick by tick."""
+"""Skipped approaches compared with approaches simulated tick by tick."""
 
 from typing import ClassVar
 
@@ -58,7 +58,7 @@ def test_approach_with_noise_or_limits_is_simulated_and_not_skipped(overrides):
 
 
 class Early(NoCompensator):
-    """Compensator that acts on the penetration of the numerical model."""
+    """Compensator that acts on the numerical model's position before contact."""
 
     name: ClassVar[str] = "early"
 
@@ -67,7 +67,7 @@ class Early(NoCompensator):
 
 
 def test_skipped_approach_is_disabled_for_compensators_active_before_contact():
-    """This includes a compensator built from one that waits for contact."""
+    """Include a compensator that wraps an ordinary one."""
     loop, _, _ = case("virtual_contact")
     assert not loop.is_idle_in_flight
     waiting, _, _ = case("none")

@@ -29,7 +29,7 @@ def along_x(force, speed):
 
 @jax.jit
 def pulled(forces, speeds):
-    """Return the tangential force along x, tick after tick."""
+    """Return the tangential force along x at every tick."""
 
     def tick(state, inputs):
         force, state = BRISTLE.step(along_x(*inputs), state)
@@ -44,7 +44,7 @@ def test_bristle_friction_sticks_then_slides_then_resets():
     speeds = np.r_[np.full(10, 1e-6), np.zeros(10), np.full(80, 1e-3), np.zeros(1), np.zeros(1)]
     forces = np.r_[np.full(100, 50.0), 0.0, 50.0]
     result = np.asarray(pulled(jnp.asarray(forces), jnp.asarray(speeds)))
-    # While it sticks it is a spring, up to its share of the friction limit.
+    # While sticking, the bristle is a spring, up to its share of the friction limit.
     stuck_force = STIFFNESS * 1e-6 * PERIOD * 10
     np.testing.assert_allclose(result[10:20], -stuck_force, rtol=stuck_force / (COEFFICIENT * 50))
     np.testing.assert_allclose(result[99], -COEFFICIENT * 50, rtol=1e-6)
@@ -65,7 +65,7 @@ def test_friction_force_stays_within_coulomb_cone():
 
 
 def touched(count, seed):
-    """Return random forces, slips in random tangent planes, and deflections; every eleventh of each is 0."""
+    """Return random forces, slips in random tangent planes, and deflections; every eleventh value is 0."""
     generator = np.random.default_rng(seed)
     normal = generator.normal(size=(3, count, 1))
     normal /= np.linalg.norm(normal, axis=0)

@@ -1,4 +1,4 @@
-"""Gain files: written whole, read back equal, rejected in one line; envelope compared with integration."""
+"""Gain files: atomic writes, equal values after reading, one-line errors, and the force envelope."""
 
 import copy
 import itertools
@@ -29,7 +29,7 @@ ENVELOPE = {"delay": {"low": 0.01, "high": 0.012, "unit": "s"}}
 
 
 def make(mechanism_name="varying", compensator="response_error", overrides=(), **changes):
-    """Return the document of a mechanism with gains by the literature's rule, or as in `changes`."""
+    """Return the document of a mechanism with gains by the literature's rule or from `changes`."""
     mechanism, sha256, _ = load(mechanism_name, overrides)
     gains = {gain.name: gain.nominal(mechanism) for gain in COMPENSATORS[compensator].gains}
     gains.update(changes)
@@ -327,7 +327,7 @@ def test_force_envelope_of_hunt_crossley_contact_uses_typical_stiffness():
 
 
 def test_force_envelope_of_user_registered_contact_law_matches_closed_form():
-    """F = k d^2: M v^2/2 = k d^3/3, so F = k^(1/3) (3 M v^2/2)^(2/3); the law has no damping."""
+    """F = k d^2: M v^2/2 = k d^3/3, so F = k^(1/3) (3 M v^2/2)^(2/3)."""
     jaxhil.register(SquaredSpring())
     stiffness, velocity = np.array([[4e8, 1e9], [2e8, 5e8]]), np.array([0.004, 0.006])
     overrides = ["contact.law=squared_spring", "contact.stiffness=[1e9, 5e8]", "approach.contacts=2"]

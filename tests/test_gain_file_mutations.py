@@ -17,7 +17,7 @@ ALPHABET = b'0123456789.-+eE,:{}[]" \n\ttruefalsnINaity\\/\x00\xff'
 
 
 def content() -> bytes:
-    """Return a gain file with limits, some of them null."""
+    """Return a gain file with limits, some of which are null."""
     document = gain_document()
     document["limits"] = {
         name: {"value": None if limit.default == limit.highest else limit.default, "unit": limit.unit}
@@ -27,7 +27,7 @@ def content() -> bytes:
 
 
 def mutated(whole: bytes, rng: random.Random) -> bytes:
-    """Return the file with one typical corruption."""
+    """Return the file with a typical corruption."""
     index = rng.randrange(len(whole))
     other = rng.randrange(len(whole))
     kind = rng.randrange(9)
@@ -56,8 +56,9 @@ def mutated(whole: bytes, rng: random.Random) -> bytes:
 
 
 def check(count: int, seed: int, path: Path) -> dict[str, int]:
-    """Mutate `count` times; return how many files were rejected and loaded. Raise AssertionError for a wrong
-    load.
+    """Mutate `count` times; return the numbers of rejected and loaded files.
+
+    Raise AssertionError if a loaded file has other values.
     """
     whole = content()
     path.write_bytes(whole)

@@ -1,4 +1,4 @@
-"""Gates of JAX and of the runtime: a triangle of two periods over the time beyond a threshold."""
+"""Contact gates of JAX and of the runtime: a triangle of two periods over the time beyond a threshold."""
 
 from itertools import pairwise
 
@@ -60,7 +60,7 @@ SIDES = pytest.mark.parametrize("gates", [on_jax, rig])
 
 
 def crossing(enters, leaves):
-    """Return a reading (ticks, lanes) that is beyond 0 between the two times, in periods."""
+    """Return a reading (ticks, lanes) that exceeds 0 between the two times, in periods."""
     rising, falling = TICKS[:, None] - enters, leaves - TICKS[:, None]
     return np.where(rising < falling, rising, falling)
 
@@ -107,7 +107,6 @@ def test_contact_gate_is_continuously_differentiable_in_crossing_time():
 
 @SIDES
 def test_contact_gate_is_reduced_while_reading_crosses_gap_between_surfaces(gates):
-    """A reading that crosses the gap is free for the time in the gap; less if that is under two periods."""
     speed = np.array([0.5, 1.1, 2.9, 6.0, 30.0])
     down = 10.5 * speed - speed * TICKS[:, None]
     result = gates(down, CLEARANCE)[8:]

@@ -1,10 +1,10 @@
 """Forward-mode derivatives of the restitution compared with central differences, scenario by scenario.
 
-Take 200 random scenarios of the built-in `varying` mechanism and random gains within their bounds: the
-derivative of the first contact's restitution by every gain of response_error, by both delays, stiffness and
-damping. The loop is piecewise smooth: if a discrete event moves to another tick within the step of the
-difference, the two rightly differ, and the event is named. The compensator's gates have a derivative there
-too: over an identification delay that crosses any number of ticks, the restitution is one smooth curve.
+For 200 random scenarios of the built-in `varying` mechanism with random gains, the first contact's
+restitution is differentiated by every gain of response_error, both delays, stiffness and damping. The loop is
+piecewise smooth: if a discrete event moves to another tick within the step of the difference, derivative and
+difference may disagree, and the event is reported. The restitution is also a smooth function of the
+identification delay, because the compensator's gates are differentiable.
 """
 
 import functools
@@ -25,22 +25,22 @@ from jaxhil.simulation.rollout import rollout
 from jaxhil.simulation.scenario import build_scenarios
 
 SCENARIOS = 200
-SPARE = 16  # extra scenarios, to replace those whose contact ends late or never under their gains
+SPARE = 16  # spare scenarios, to replace those whose contact ends late or never
 LONGEST = 480  # ticks
 GAINS = COMPENSATORS["response_error"].gains
 PHYSICAL = ("force_delay", "simulator_delay", "stiffness", "damping")
 NAMES = (*(gain.name for gain in GAINS), *PHYSICAL)
 OFFSETS = np.array([-2.0, -1.0, 1.0, 2.0])
-WEIGHTS = np.array([1.0, -8.0, 8.0, -1.0]) / 12  # error of fourth order in the step
-STEPS = (1e-6, 1e-5)  # of the scale of each parameter
-AGREEING = 48  # recorded pairs of a parameter and a scenario that agree
+WEIGHTS = np.array([1.0, -8.0, 8.0, -1.0]) / 12  # weights of central differences of fourth order
+STEPS = (1e-6, 1e-5)  # steps relative to the scale of each parameter
+AGREEING = 48  # recorded (parameter, scenario) pairs that agree
 
 MECHANISM = load("varying").mechanism
 PERIOD = MECHANISM.rig.control_period
 
 
 def random_gains(number):
-    """Draw gains within bounds, log-uniform where searched so; the threshold up to ten times its nominal."""
+    """Draw gains within bounds, some log-uniform; the threshold up to ten times its nominal value."""
     generator = np.random.default_rng(3)
     gains = {}
     for gain in GAINS:
@@ -59,7 +59,7 @@ def scales(values):
 
 
 def problem(scenario, values):
-    """Return (gains, scenario) with the parameters of `values`."""
+    """Return (gains, scenario) with the given parameter values."""
     table = scenario.contact.stiffness.shape
     contact = scenario.contact._replace(
         stiffness=jnp.broadcast_to(values["stiffness"], table),
@@ -106,12 +106,12 @@ def study():
     scenario = scenario._replace(contacts=np.ones(number, np.int32))
     values = random_gains(number) | {
         "force_delay": scenario.force_sensor.delay,
-        # The nominal value is a whole number of periods: every step would cross it.
+        # The nominal delay is a whole number of periods, which every step would cross.
         "simulator_delay": np.random.default_rng(4).uniform(0.0031, 0.0049, number),
         "stiffness": scenario.contact.stiffness[0],
         "damping": scenario.contact.damping[0],
     }
-    # As many lanes as the differences have: both share one program.
+    # The same number of lanes as for the differences, so that both share one program.
     lanes = np.resize(np.arange(number), len(OFFSETS) * SCENARIOS)
     loop = build_loop(MECHANISM, "response_error", scenario)
     ticks = np.asarray(evaluate(loop, *chosen((scenario, values), lanes))[1])[:number]
@@ -139,7 +139,7 @@ def differences(study, step):
 
 @pytest.fixture(scope="module")
 def disagreements(study):
-    """Return by step the (parameter, scenario) pairs for which derivative and difference disagree."""
+    """Return, for each step, the (parameter, scenario) pairs whose derivative and difference disagree."""
     exact = study[-1]
     return {
         step: np.argwhere(~(np.abs(differences(study, step) - exact) <= 1e-5 * np.abs(exact) + 1e-8))
@@ -162,7 +162,7 @@ def test_restitution_derivatives_match_central_differences(disagreements):
 
 @pytest.fixture(scope="module")
 def sweep():
-    """Return (delay [s], restitution, its derivative [1/s]) of the nominal first contact.
+    """Return (delay [s], restitution, derivative [1/s]) of the nominal first contact.
 
     The identification delay varies in fine steps over more than two periods.
     """
@@ -183,7 +183,6 @@ def sweep():
 
 
 def test_restitution_is_continuous_in_the_identification_delay(sweep):
-    """Ticks enter and leave the gates over the whole range."""
     delay, restitution, slope = sweep
     steps = np.diff(restitution)
     assert np.abs(restitution[-1] - restitution[0]) > 0.01
@@ -235,7 +234,7 @@ def events(loop, scenario, values):
 
 
 def named_events(study, pairs, step):
-    """Return for every pair the names of the events that differ between the runs of its difference."""
+    """Return, for every pair, the names of the events that differ between the runs of its difference."""
     loop, scenario, values, scale, _ = study
     offsets, asked = np.array([-2.0, -1.0, 0.0, 1.0, 2.0]), len(pairs)
     pairs = np.resize(pairs, (max(asked, AGREEING), 2))  # one program for both steps
@@ -272,7 +271,7 @@ def test_derivative_differs_from_finite_difference_only_if_discrete_event_moves(
 
 
 def test_derivative_equals_finite_difference_if_no_discrete_event_moves(study, disagreements):
-    """The events of the test above are not always present."""
+    """Check that events do not occur for all pairs."""
     step = STEPS[0]
     parted = {(p, s) for p, s in disagreements[step]}
     pairs = np.array([(p, s) for p in range(len(NAMES)) for s in range(SCENARIOS) if (p, s) not in parted])

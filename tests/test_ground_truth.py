@@ -46,7 +46,7 @@ LIMITS = {
 
 
 def fitted_order(errors):
-    """Return the order of convergence of the r.m.s. of errors (periods, ...)."""
+    """Return the order of convergence of the rms of errors (periods, ...)."""
     rms = np.sqrt(np.mean(errors.reshape(len(PERIODS), -1) ** 2, axis=1))
     return np.polyfit(np.log(PERIODS), np.log(rms), 1)[0]
 
@@ -99,9 +99,7 @@ def test_delayed_restitution_series_matches_reference_values():
 
 @pytest.fixture(scope="module")
 def behind_simulator():
-    """Return the restitution of linear contact behind a second-order simulator and two fractional delays, T
-    -> 0.
-    """
+    """Return the restitution of linear contact with a second-order simulator and two fractional delays."""
     return continuous.delayed_contact(MASS, VELOCITY, STIFFNESS, (2 * pi * 12.0, 0.8, 0.0037), 0.0083)
 
 
@@ -174,7 +172,7 @@ NONLINEAR = {
 
 @pytest.fixture(scope="module")
 def nonlinear():
-    """Return by name (restitution, peak force, W_in, W_out), (4, periods, phases); work in M v^2 / 2."""
+    """Return (restitution, peak force, W_in, W_out) by name, (4, periods, phases); work in M v^2 / 2."""
     results = {}
     period, phase = grid(PERIODS, (np.arange(32) + 0.5) / 32)
     for group in (("hertz", "hunt-crossley", "quadratic"), ("layers", "damped layers")):
@@ -213,7 +211,7 @@ def test_work_of_kelvin_voigt_contact_converges_to_closed_form(kelvin_voigt, nam
     restitution, work_in, work_out = kelvin_voigt[name]
     balance = work_out / work_in - restitution**2
     assert order - 0.25 < fitted_order(balance)
-    # The controller sees the jump b v at either end up to a period longer or shorter than the mechanism.
+    # The sampled force includes the jump b v for up to a period more or less than the mechanism.
     jump = 4 * ratio * OMEGA * PERIODS[-1]
     assert np.abs(balance[-1]).max() < (1e-4 if order == 2 else jump)
     assert np.abs(work_in[-1] - 1).max() < (1e-4 if order == 2 else 2 * jump)
@@ -224,7 +222,7 @@ def test_work_of_nonlinear_contact_converges_to_continuous_solution(nonlinear, n
     restitution, _, work_in, work_out = nonlinear[name]
     order = NONLINEAR[name][2]
     balance = work_out / work_in - restitution**2
-    # A damper acts on the mechanism's velocity, not on the model's: the work differs by a period's motion.
+    # The damper acts on the hardware velocity and the work uses the model's motion, which differ by a period.
     damped = "damping" in NONLINEAR[name][0]
     assert (1 if damped else order) - 0.3 < fitted_order(balance)
     assert np.abs(balance[-1]).max() < (2e-4 if order == 2 else 2e-3)

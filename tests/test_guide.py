@@ -1,4 +1,4 @@
-"""README and guide are consistent with the repository: links, files, names, and numbers from the theory."""
+"""README and guide are consistent with the repository: links, files, names, and numbers from theory."""
 
 import cmath
 import math
@@ -50,7 +50,7 @@ def page(request):
 
 
 def section(text, number):
-    """Return the text under the heading with this number."""
+    """Return the text of the section with this number."""
     return re.search(rf"^## {number} .*?(?=^## |\Z)", text, re.M | re.S)[0]
 
 
@@ -71,7 +71,7 @@ def test_guide_links_resolve(page):
 
 
 def test_guide_names_existing_files(page):
-    """Check every path below a folder of the repository, except those with NAME as placeholder."""
+    """Paths with NAME are placeholders."""
     result = FILE.findall(page.read_text(encoding="utf-8"))
     missing = [name for name in result if "NAME" not in name and not (ROOT / name).exists()]
     assert not missing
@@ -113,7 +113,7 @@ def test_guide_describes_gains_of_impulse_ledger():
 
 
 def numbers(words):
-    """Return every number with a decimal point."""
+    """Return every decimal number in the text."""
     return [float(number) for number in re.findall(r"\d+\.\d+", words)]
 
 
@@ -172,7 +172,6 @@ def test_guide_numbers_of_lead_and_smith_predictor_are_correct(model):
 
 
 def test_guide_script_is_the_tested_interface_script():
-    """`test_api_tuning` runs the script with small numbers."""
     block = re.search(r"^```python\n(.*?)^```", text_of("python.md"), re.M | re.S)
     run = (ROOT / "tests" / "interface_script.py").read_text(encoding="utf-8")
     sizes = re.compile(r"\b(scenarios|starts|judged)=[\d_]+")
@@ -189,7 +188,7 @@ def test_guide_script_is_the_tested_interface_script():
     ids=lambda path: path.name,
 )
 def test_guide_examples_run(path, tmp_path):
-    """Run the blocks of a page that are marked as runnable, in order, in their own process."""
+    """Run the runnable blocks of a page in order in a separate process."""
     blocks = RUNNABLE.findall(path.read_text(encoding="utf-8"))
     assert blocks
     inherited = os.environ.get("PYTHONPATH")

@@ -1,4 +1,4 @@
-"""Ideal contact against numerical integration and limits; derivatives against differences."""
+"""Ideal contact: comparison with numerical integration, limits and finite differences."""
 
 import functools
 
@@ -34,7 +34,7 @@ def evaluate(law, *parameters):
 
 
 class Terminal:
-    """Event that ends the integration where its value falls through 0."""
+    """Event that ends the integration when its value falls through 0."""
 
     terminal, direction = True, -1
 
@@ -46,7 +46,7 @@ class Terminal:
 
 
 def integrate(force, mass, velocity, time_scale, separation="force"):
-    """Integrate restitution, peak force and duration numerically, in units of v and the given time."""
+    """Integrate the contact; return restitution, peak force and duration in units of v and the given time."""
     length = velocity * time_scale
 
     def acceleration(depth, speed):
@@ -96,7 +96,7 @@ def damping_of(ratio):
 
 
 def staircase(slopes, depths, damping):
-    """Return the piecewise-linear force, written with ramps rather than with segments."""
+    """Return the piecewise-linear force, written as a sum of ramps."""
     edges = [0.0, *depths]
     rises = np.diff([0.0, *slopes])
 

@@ -1,4 +1,4 @@
-"""Motion of the ideal contact by integration: closed forms, convergence, pushes, paths, derivatives."""
+"""Integrated motion of the ideal contact: closed forms, convergence, pushes, trajectories, derivatives."""
 
 import functools
 
@@ -38,7 +38,7 @@ CASES = {
 
 
 def contact(dtype=float, **values):
-    """Return parameters of every lane, by name; those not named are nominal."""
+    """Return the parameters of every lane by name; unspecified parameters are nominal."""
 
     def lanes(value):
         return np.broadcast_to(np.asarray(value, dtype), (*np.shape(value)[:-1], LANES))
@@ -52,13 +52,13 @@ def contact(dtype=float, **values):
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def within(law, parameters, mass, velocity, tolerance):
-    """Use one program for a law, whatever the tolerance."""
+    """Return the contact integrated to the given tolerance; all tolerances share one program per law."""
     return integrate_contact(law, parameters, mass, velocity, tolerance=tolerance)
 
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def closed_form(law, parameters, mass, velocity):
-    """Return the contact by the law's own closed form."""
+    """Return the contact by the closed form of the law."""
     return law.reference(parameters, mass, velocity)
 
 
@@ -84,10 +84,10 @@ def test_integrated_contact_agrees_with_closed_forms(case):
 
 @pytest.mark.parametrize("case", [name for name in CASES if name != "piecewise_linear"])
 def test_ideal_contact_integration_error_decreases_with_tolerance(case):
-    """Expect errors to fall as E^(4/5).
+    """Expect errors proportional to E^(4/5).
 
-    A step of order 5 whose error is E is as long as E^(1/5), so that the sum of the errors of all steps falls
-    as E^(4/5).
+    A fifth-order step with error E has a length proportional to E^(1/5), so that the sum of all step errors
+    is proportional to E^(4/5).
     """
     tolerances = np.array([1e-5, 1e-7, 1e-9, 1e-11])
     errors = []
@@ -105,7 +105,7 @@ def test_ideal_contact_of_sticking_bodies_never_ends():
 
 
 def pulse(start, length, height):
-    """Return half a sine."""
+    """Return a half-sine push."""
 
     def push(time):
         inside = (time > start) & (time < start + length)
@@ -115,7 +115,7 @@ def pulse(start, length, height):
 
 
 def test_ideal_contact_with_external_push_agrees_with_scipy():
-    """Push at all times of a damped contact: before, at and after the turning point and the separation."""
+    """Push before, at and after the turning point and the separation."""
     starts, length, height = np.linspace(0.0, 0.21, LANES), 0.02, 6.0
     damping = 0.05 * CRITICAL
     push = pulse(jnp.asarray(starts), length, height)
@@ -163,7 +163,7 @@ def test_external_push_after_the_contact_adds_its_impulse():
 
 
 def test_trajectory_of_linear_contact_matches_closed_form():
-    """Use x = v sin(omega t) / omega, then uniform motion; times in any order."""
+    """Use x = v sin(omega t) / omega, then uniform motion."""
     times = np.linspace(-0.1, 0.4, 97)[::-1].copy()
     times = times[:, None] * np.ones(LANES)
     result, _ = integrated("linear", {}, times=jnp.asarray(times))
@@ -175,13 +175,13 @@ def test_trajectory_of_linear_contact_matches_closed_form():
     np.testing.assert_allclose(result.velocity / VELOCITY, speed, rtol=0, atol=2e-7)
 
 
-# Without damping the derivative by it is one-sided.
+# For zero damping the derivative by damping is one-sided.
 @pytest.mark.parametrize(
     "case, tolerance",
     [("kelvin_voigt", 1e-3), pytest.param("piecewise_linear", 1e-3, marks=pytest.mark.slow)],
 )
 def test_integrated_contact_derivatives_match_those_of_closed_forms(case, tolerance):
-    """Allow for steps with a kink inside: their derivative is that of a slightly different force."""
+    """Allow an error for steps that contain a kink of the force."""
     name, values = CASES[case]
     law, parameters = CONTACT_LAWS[name], contact(**values)
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
@@ -189,7 +189,7 @@ def test_integrated_contact_derivatives_match_those_of_closed_forms(case, tolera
     def derivatives(reference):
         def function(scales, parameters):
             stiffness = parameters.stiffness * (1 + scales[0])
-            # Without any damping the derivative by it has a side.
+            # For zero damping the derivative by damping is one-sided.
             damping = parameters.damping + 10 + CRITICAL * scales[1] / 10
             changed = parameters._replace(stiffness=stiffness, damping=damping)
             return jnp.stack(reference(changed, mass * (1 + scales[2]), velocity * (1 + scales[3]))[:3])

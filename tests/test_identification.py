@@ -1,4 +1,4 @@
-"""Identification in JAX and in the runtime compared with weighted batch least squares."""
+"""Recursive identification in JAX and in the runtime, compared with weighted batch least squares."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +29,7 @@ def rig(readings, weights, forgetting):
 
 
 def batch(readings, weights, forgetting):
-    """Return theta and P that minimise the squares of prior and readings, faded by all later readings."""
+    """Return theta and P that minimise the weighted squares of prior and readings with forgetting."""
     retention = 1 - weights * (1 - forgetting)
     faded = np.append(np.cumprod(retention[::-1])[::-1][1:], 1.0)
     phi, force = readings[:, :2], readings[:, 2]

@@ -1,4 +1,4 @@
-"""Identification of whole campaigns: estimates, verdict, mechanism file."""
+"""Identification from whole campaigns: estimates, verdict, mechanism file."""
 
 from dataclasses import replace
 
@@ -109,7 +109,7 @@ def test_identify_separates_dead_zone_from_bias_and_reports_confounded_pair():
 
 @pytest.mark.parametrize("surface", [-2e-5, 2e-5])
 def test_identify_estimates_surface_position_if_force_sensor_has_dead_zone(surface):
-    """A surface 14 um off gave a damping of 298 +- 0.4 N s/m for a true 348, with a good verdict."""
+    """An assumed surface with an error of 14 um would bias the damping by 50 N s/m."""
     campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
     moved = [
         replace(
@@ -131,7 +131,7 @@ def test_identify_estimates_surface_position_if_force_sensor_has_dead_zone(surfa
 
 
 def test_identify_detects_dead_zone_if_surface_is_nearer_than_assumed():
-    """The readings then lack no force: a fit without a dead zone erred by 0.018 in e - e*, verdict good."""
+    """A fit without a dead zone would have an error of 0.018 in e - e*."""
     campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
     moved = [
         replace(
@@ -149,7 +149,7 @@ def test_identify_detects_dead_zone_if_surface_is_nearer_than_assumed():
 
 @pytest.mark.parametrize("law", ["hunt_crossley", "piecewise_linear"])
 def test_identify_widens_dead_zone_interval_by_surface_uncertainty(law):
-    """Expect an interval of several newtons: 4 N of dead zone are as likely as a surface 33 um off."""
+    """A dead zone of 4 N and a surface error of 33 um are equally likely."""
     campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
     dead = identify(campaign, options=IdentificationOptions(law=law))["rig.force_sensor.dead_zone"]
     assert dead.low < 4.0 < dead.high and dead.high - dead.low > 5.0
@@ -157,7 +157,7 @@ def test_identify_widens_dead_zone_interval_by_surface_uncertainty(law):
 
 
 def test_identified_dead_zone_decreases_if_assumed_surface_is_further_away():
-    """The readings, stiffness (x - surface) - dead zone, determine only the sum of what both remove."""
+    """The readings determine only stiffness times surface position plus dead zone."""
     campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
     posterior = identify(campaign, options=IdentificationOptions(law="kelvin_voigt")).contact.posterior
     surface, bias = (posterior.draws[:, posterior.names.index(name)] for name in ("plane", "bias"))
@@ -256,7 +256,6 @@ def test_identify_copies_previous_list_entry_for_missing_contact():
 
 @pytest.mark.slow
 def test_identify_copies_previous_list_entry_for_grazing_contact():
-    """Touches of the second entry only graze the contact."""
     campaign = campaigns.campaign("stiffnesses", 0, speeds=(0.012, 0.0002, 0.012, 0.006, 0.0002, 0.006))
     result = identify(campaign, options=IdentificationOptions(law="kelvin_voigt", hold_out=0.0))
     first, second, last = result.mechanism["contact"]["stiffness"]
@@ -287,7 +286,7 @@ def test_identify_separates_delays_if_position_sensor_lags_more_than_force_senso
     assert 0.0 < result["rig.force_sensor.delay"].value == pytest.approx(share - 0.0018, abs=2.5e-4)
     assert "the position sensor lags more than the force sensor" in result.notes[0] and result.good
     assert check_against_mechanism(campaign, from_plain_data(result.mechanism, "found")).good
-    # A prior specifies the position sensor's share; the other delays follow.
+    # The prior specifies the delay of the position sensor; the other delays follow.
     prior = campaign_rigs.mechanism("slow")
     result = identify(campaign, prior, IdentificationOptions(law="kelvin_voigt"))
     assert result["rig.simulator.delay"].value == pytest.approx(0.0043, abs=2e-5)
@@ -296,7 +295,7 @@ def test_identify_separates_delays_if_position_sensor_lags_more_than_force_senso
 
 
 def test_identify_does_not_write_impossible_mechanism():
-    """The message must not name a key of a file that does not exist."""
+    """The message must not refer to a key of a file that was not written."""
     campaign = campaigns.campaign("clean", 0, speeds=(0.003, 0.006, 0.012) * 2, seconds=10.0)
     negative = tuple(replace(run, force_measured=-run.force_measured) for run in campaign.runs)
     result = identify(

@@ -1,7 +1,7 @@
-"""Damping and the age of the force, which touches hardly separate: intervals, verdict, bounds.
+"""Campaigns that hardly separate damping from force delay: intervals, verdict, bounds.
 
-The slow study counts how often files with a good verdict are right: print its results with `pytest -m slow -s
-tests/test_identify_ambiguous.py`.
+The slow study counts how often files with a good verdict are accurate; `pytest -m slow -s
+tests/test_identify_ambiguous.py` prints the results.
 """
 
 from dataclasses import replace
@@ -32,24 +32,20 @@ PRESS = "a press run with a multisine to 45 Hz"
 
 
 def delay_and_lag(result):
-    """Return the estimate of the force's delay, including its lag if that is estimated."""
+    """Return the estimated force delay, including the lag if the lag is estimated."""
     keys = ("delay and lag of force", "rig.force_sensor.delay")
     return next(estimate for estimate in (*result.combinations, *result.estimates) if estimate.key in keys)
 
 
 def written(result, folder):
-    """Return the mechanism as loaded from its written file."""
+    """Write the identified mechanism file, load it and return the mechanism."""
     (folder / "mechanism.toml").write_text(to_toml(result.mechanism, result.verdict))
     return load(folder / "mechanism.toml").mechanism
 
 
 @pytest.mark.parametrize(("name", "seed"), (("plain", 0), ("hidden", 1)))
 def test_identify_keeps_damping_in_the_model_while_delay_is_estimated(monkeypatch, tmp_path, name, seed):
-    """With these seeds, held-out touches do not reveal the damping.
-
-    The linear law was chosen, with a delay 2.1 ms too short, a standard deviation of 0.02 ms, and a good
-    verdict.
-    """
+    """With these seeds the validation contacts do not reveal the damping."""
     campaign = ambiguous.campaign(monkeypatch, name, seed, seconds=10.0)
     result = identify(campaign, ambiguous.prior(name), IdentificationOptions(seed=seed))
     assert result.contact.law.name == "kelvin_voigt"
@@ -68,7 +64,7 @@ def test_identify_keeps_damping_in_the_model_while_delay_is_estimated(monkeypatc
 
 @pytest.mark.slow
 def test_identify_widens_damping_and_delay_for_possible_lag(monkeypatch):
-    """Without the lag, the force's age was estimated as 2.84 +- 0.10 ms; the true value is 4.2 ms."""
+    """Without a lag in the model, the estimated delay would be 2.84 +- 0.10 ms instead of 4.2 ms."""
     name, seed = "lag", 1002
     campaign = ambiguous.campaign(monkeypatch, name, seed, seconds=10.0)
     result = identify(
@@ -92,7 +88,7 @@ def test_identify_uncertainty_draws_include_undamped_contact(monkeypatch, name, 
 
 
 def test_identified_delay_interval_includes_delay_of_undamped_contact():
-    """Draws of damping lie on one side of 0, those of the delay on one side of the true value."""
+    """Draws of damping lie on one side of 0, those of delay on one side of the true value."""
     rng = np.random.default_rng(0)
     damping = np.abs(rng.normal(0.0, 100.0, 4000))
     delay = 0.0037 + damping / 124355.0 + 2e-5 * rng.standard_normal(4000)
@@ -110,7 +106,7 @@ def test_identify_uses_specified_contact_law(monkeypatch):
 
 
 def test_identify_reports_negative_delay_and_verdict_is_bad(monkeypatch, tmp_path):
-    """The position sensor's delay is specified as 0 instead of 3 ms: the force's delay becomes -1.8 ms."""
+    """The position sensor delay is specified as 0 instead of 3 ms: the force delay becomes -1.8 ms."""
     rig = campaign_kinds.rig(force_sensor__delay=0.0012, position_sensor__delay=0.003)
     monkeypatch.setitem(campaigns.KINDS, "slow", campaign_kinds.Kind(rig, campaign_kinds.voigt()))
     campaign = campaigns.campaign("slow", 0, speeds=FEW, seconds=10.0)
@@ -145,7 +141,6 @@ PROPERTY = [
 
 @pytest.mark.parametrize(("name", "options", "change"), PROPERTY)
 def test_identify_verdict_equals_check_of_written_file(monkeypatch, tmp_path, name, options, change):
-    """Include cases with a bad verdict."""
     monkeypatch.setattr(campaigns, "KINDS", campaign_kinds.KINDS | ambiguous.KINDS)
     campaign = change(campaigns.campaign(name, 3, speeds=FEW, seconds=10.0))
     result = identify(campaign, options=IdentificationOptions(**options))
@@ -156,7 +151,7 @@ def test_identify_verdict_equals_check_of_written_file(monkeypatch, tmp_path, na
 
 @pytest.mark.parametrize("noise", (0.0, 0.5))
 def test_identify_accepts_log_of_one_contact(monkeypatch, noise):
-    """Without noise this once ended in an internal error."""
+    """Include a log without noise."""
     rig = campaign_kinds.rig(noise=noise, position_noise=noise * 1e-5)
     monkeypatch.setitem(campaigns.KINDS, "one", campaign_kinds.Kind(rig, ambiguous.SOFT))
     campaign = campaigns.campaign("one", 0, speeds=(0.006,), seconds=0, rest=0)
@@ -183,7 +178,7 @@ def test_effect_of_stiffness_uncertainty_matches_first_order_theory():
 
 
 def test_uncertainty_effect_includes_only_uncertainty_from_identification():
-    """Uncertainty of other origin describes how mechanisms vary."""
+    """Other uncertainty in the file describes variation between mechanisms."""
     assert compute_uncertainty_effect(load("rig-300kg").mechanism).parts == {}
     document = ambiguous.to_plain_data(ambiguous.truth("plain")) | {
         "source": f"{IDENTIFIED_SOURCE_PREFIX} logs"
@@ -202,7 +197,7 @@ GOOD_BUT_WRONG = 0.01
 @pytest.mark.users_options
 @pytest.mark.parametrize("name", ambiguous.KINDS)
 def test_identified_files_with_good_verdict_are_accurate(monkeypatch, name):
-    """Files with a good verdict err in e and in e - e* by less than the limit, and intervals cover."""
+    """Errors of e and e - e* are below the limit, and intervals have the stated coverage."""
     kind = ambiguous.KINDS[name]
     sensor, contact = kind.rig["force_sensor"], kind.contact
     true = {f"contact.{key}.0": contact[key][0] for key in ("stiffness", "damping")}

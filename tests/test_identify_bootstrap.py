@@ -1,4 +1,4 @@
-"""Bootstrap over contacts: intervals as stated for pure noise, and wider if contacts differ."""
+"""Bootstrap over contacts: stated intervals for pure noise, wider intervals if contacts differ."""
 
 from copy import copy
 from dataclasses import replace
@@ -17,7 +17,7 @@ from tuning.identification.rational import STRUCTURES, MotionModel
 
 
 def scattering(seed, share, speeds=campaigns.SPEEDS):
-    """Return a campaign whose stiffness and damping vary from contact to contact by that share."""
+    """Return a campaign whose stiffness and damping vary between contacts by this relative amount."""
     whole = campaigns.campaign("clean", seed, speeds=(), seconds=10.0)
     kind, rng = campaigns.KINDS["clean"], np.random.default_rng(seed)
     runs = list(whole.runs)
@@ -65,7 +65,7 @@ def test_bootstrap_widens_intervals_if_contacts_differ_from_each_other():
     campaign = scattering(0, 0.02, (0.012, 0.006) * 4)
     stated, wide = of(campaign, 0), of(campaign, 20)
     assert any("intervals are the bootstrap's" in note for note in wide.notes)
-    # 2 % over 8 contacts, of unequal weight.
+    # 2 % variation over 8 contacts of unequal weight.
     assert 0.004 < wide["contact.stiffness.0"].std / 1.2e5 < 0.015
     assert wide["contact.stiffness.0"].std > 2.0 * stated["contact.stiffness.0"].std
     assert wide["contact.stiffness.0"].value == pytest.approx(stated["contact.stiffness.0"].value, rel=1e-9)
@@ -77,7 +77,7 @@ def test_bootstrap_resumes_with_the_same_draws(fit, tmp_path, monkeypatch):
     done, messages, most = [], [], 2
 
     def means(drawn, problem, readings, seed, near):
-        """Return scattering numbers in place of fits."""
+        """Return random numbers instead of fits."""
         if len(done) == most:
             raise KeyboardInterrupt
         done.append(drawn)

@@ -1,7 +1,7 @@
-"""Acceptance of the identification on campaigns with known truth: coverage, errors, laws, verdicts.
+"""Accuracy of the identification on simulated campaigns: coverage, errors, contact laws, verdicts.
 
-All tests are slow; `test_identify.py` has a sample for every day. Print the results with `pytest -m slow -s
-tests/test_identify_campaigns.py`.
+All tests are slow; `test_identify.py` has a daily sample. `pytest -m slow -s
+tests/test_identify_campaigns.py` prints the results.
 """
 
 import campaigns
@@ -18,7 +18,7 @@ MASS = 350.0
 
 
 def truth(name):
-    """Return the true values by key, as seen by a gauge without a delay of the position sensor."""
+    """Return the true values by key, for a position sensor without delay."""
     kind = campaigns.KINDS[name]
     simulator, sensor = kind.rig["simulator"], kind.rig["force_sensor"]
     ahead = kind.rig["position_sensor"].get("delay", 0.0)
@@ -155,7 +155,7 @@ def test_identify_detects_every_drift():
 
 
 def test_identify_delay_and_lag_errors_reach_cramer_rao_bound():
-    """Compute the joint bound of delay, lag, plane, stiffness, damping and bias by differences."""
+    """The joint bound of delay, lag, surface, stiffness, damping and bias uses differences."""
     true = np.array([0.0025, 0.0016, 0.0, 1.2e5, 650.0, 0.0])
     steps = np.array([2e-6, 2e-6, 2e-8, 10.0, 0.1, 0.01])
     off, bounds = [], []
@@ -182,9 +182,7 @@ def test_identify_delay_and_lag_errors_reach_cramer_rao_bound():
 
 
 def test_identify_separates_force_delay_from_damping_with_press_run():
-    """At the published noise the Cramer-Rao bound of 30 s at 0.05 mm is 0.05 ms; from touches alone it is 0.2
-    ms.
-    """
+    """The Cramer-Rao bound is 0.05 ms with a press of 30 s at 0.05 mm, and 0.2 ms from contacts alone."""
     off = []
     for seed in range(5):
         result = identify(

@@ -1,4 +1,4 @@
-"""`check_against_mechanism` on logs of an independent rig, with its own mechanism and with similar ones."""
+"""`check_against_mechanism` on logs of an independent simulator, with right and wrong mechanism files."""
 
 from dataclasses import replace
 
@@ -41,7 +41,6 @@ def test_mechanism_check_accepts_logs_of_the_same_mechanism(clean):
     ],
 )
 def test_mechanism_check_rejects_logs_of_another_mechanism(clean, changed, name):
-    """The command hold belongs to the logs, not to the mechanism."""
     result = check_against_mechanism(clean, campaign_rigs.mechanism("clean", **changed))
     assert result.good == (name is None)
     assert name in [None, *(line.name for line in result.lines if line.there)]

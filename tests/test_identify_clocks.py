@@ -1,4 +1,4 @@
-"""Forces logged by a clock of their own: the constant offset is unobservable, the rate is not."""
+"""Forces logged with a separate clock: the clock rate is observable, a constant offset is not."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ DELAY = {"rig.force_sensor.delay": 0.0037}
 
 
 def day(seed=0, constant=0.005, rate=4e-5, every=120.0, kind="clean", speeds=(0.003, 0.006, 0.012) * 2):
-    """Return touches every `every` seconds; the force stamps are late by a constant [s] and by a rate."""
+    """Return contacts every `every` seconds; force time stamps have a constant delay [s] and a rate error."""
     whole, rng = campaigns.campaign(kind, seed, speeds=(), seconds=10.0), np.random.default_rng(seed)
     kind, runs = campaigns.KINDS[kind], list(whole.runs)
     for number, speed in enumerate(speeds):
@@ -40,7 +40,7 @@ def test_identify_estimates_clock_rate_and_contact(constant, rate, every):
     assert abs(result["contact.damping.0"].value - 650.0) < 4.0 * result["contact.damping.0"].std < 240.0
     assert result["rig.contact_plane"].value == pytest.approx(0.0, abs=5e-6)
     assert result["rig.force_sensor.delay"].is_fixed
-    # The only reason is the uncertain damping after six touches.
+    # The only reason is the uncertain damping after six contacts.
     assert result.verdict.startswith("Bad: the parameters are too uncertain: contact.damping")
     assert replace(result, limit=0.03).good
     assert result.mechanism["rig"]["force_sensor"]["delay"] == 0.0037
@@ -64,7 +64,6 @@ def test_identify_verdict_is_bad_for_undeclared_second_clock():
     )
     line = next(item for item in result.lines if item.name == "drift of the force delay")
     assert line.there and not result.good
-    # From 7 s to 607 s.
     assert float(line.finding.split()[0]) == pytest.approx(0.96, abs=0.15)
 
 

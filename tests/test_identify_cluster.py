@@ -1,4 +1,4 @@
-"""Bootstrap over contacts on a dask.distributed cluster: the same bits, even if a worker is killed."""
+"""Bootstrap over contacts on a dask.distributed cluster: identical results even if a worker is killed."""
 
 import campaigns
 import numpy as np
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.users_options
 
 @pytest.fixture(scope="module")
 def fit():
-    """Fit so many rows that BLAS would divide a dot product among its threads."""
+    """Fit so many rows that BLAS would use several threads for a dot product."""
     runs = campaigns._touch_runs(campaigns.KINDS["clean"], np.random.default_rng(0), (0.006, 0.012) * 15)
     model = MotionModel(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
     timing = campaigns.campaign("clean", 0, (), 0, 0).timing

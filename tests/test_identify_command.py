@@ -1,4 +1,4 @@
-"""`jaxhil identify`: from log files of an independent rig to a mechanism file and an exit code."""
+"""Command `jaxhil identify`: from log files of an independent simulator to mechanism file and exit code."""
 
 import json
 
@@ -17,13 +17,13 @@ FEW = (0.003, 0.006, 0.012) * 3
 
 @pytest.fixture(autouse=True)
 def _undrawn(monkeypatch):
-    """Skip the plots; they have their own tests."""
+    """Disable plots, which have separate tests."""
     monkeypatch.setattr("tuning.plots.identification.draw_identification", lambda *_: {})
 
 
 @pytest.fixture(scope="module")
 def day(tmp_path_factory):
-    """Return the logs of a clean rig."""
+    """Return the logs of a rig without defects."""
     folder = tmp_path_factory.mktemp("day")
     write(folder, campaigns.campaign("clean", 0, speeds=FEW, seconds=30.0))
     return folder
@@ -54,7 +54,7 @@ def test_identify_command_writes_mechanism_file_from_logs(jaxhil, day, tmp_path)
     (delay,) = (item for item in ran.document["estimates"] if item["key"] == "rig.force_sensor.delay")
     assert delay["low"] < 0.0037 < delay["high"] and delay["unit"] == "s" and delay["prior"] is None
 
-    # Without a prior all mechanisms share a name; logs of another rig must not overwrite the results.
+    # Without a prior all mechanisms have the same name; logs of another rig must not overwrite the results.
     (tmp_path / "other").mkdir()
     write(tmp_path / "other", campaigns.campaign("clean", 1, speeds=FEW[:3], seconds=5.0))
     refused = jaxhil("identify", *logs(tmp_path / "other"), *command[-6:])
@@ -146,7 +146,7 @@ KINDS = ["jitter", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("no
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_read_campaign_recovers_signals_of_independent_rig(jaxhil, kind, tmp_path):
-    """Ticks, commands and readings survive scattered stamps and lost rows."""
+    """Use jittering time stamps and lost rows."""
     campaign = campaigns.campaign(kind, 1, speeds=FEW, seconds=20.0)
     write(tmp_path, campaign, campaigns.KINDS[kind].jitter)
     recovered = read_campaign(logs(tmp_path), load_mapping(drafted(jaxhil, tmp_path)))

@@ -1,4 +1,4 @@
-"""Contact identification from forces over known motion: exact without noise, calibrated with noise."""
+"""Contact parameters from forces at known motion: exact without noise, with correct intervals with noise."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -25,7 +25,7 @@ SECOND = MotionModel(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log
 
 
 def problem(name, law, noise=0.5, speeds=campaigns.SPEEDS, seed=0, plane=None, time_constant=0.0):
-    """Return the readings of a kind of campaign over the motion of the true motion simulator."""
+    """Return the readings of a kind of campaign with the motion of the true motion simulator."""
     kind = campaigns.KINDS[name]
     sensor = {**kind.rig["force_sensor"], "noise_std": noise}
     kind = replace(kind, rig={**kind.rig, "force_sensor": sensor})
@@ -54,7 +54,7 @@ def test_contact_parameter_fit_is_exact_without_noise(name, law, plane, expected
 
 
 def test_contact_fit_is_exact_with_force_sensor_lag():
-    """The position sensor's delay is added to that of the motion and subtracted from that of the force."""
+    """The delay of the position sensor adds to the motion delay and is subtracted from the force delay."""
     lagging = problem("lagging", kelvin_voigt(), 0.0, (0.006, 0.012), 0, 0.0, 0.0016)
     inner = lagging.at(0.0037 - 0.0012, 0.0)
     np.testing.assert_allclose(inner.coefficients, [1.2e5, 650.0, 0.0], rtol=2e-4, atol=0.01)
@@ -129,7 +129,7 @@ def test_contact_fit_of_press_run_in_chunks_is_exact():
 
 
 def test_contact_fit_skips_rows_after_gap_until_transient_has_decayed():
-    """Lose 30 rows at the turning point of the touches: the commands there affect the later motion."""
+    """Lose 30 rows at the turning point; the missing commands affect the later motion."""
     kind = campaigns.KINDS["clean"]
     silent = {"force_sensor": {**kind.rig["force_sensor"], "noise_std": 0.0}}
     runs = campaigns._touch_runs(
@@ -200,7 +200,6 @@ def test_contact_profile_grid_is_divided_at_contact_onsets():
 
 
 def test_quick_delay_search_stays_within_longest_delay():
-    """Beyond the longest delay, the grid about the delay had a single point."""
     clean = problem("clean", kelvin_voigt(), speeds=(0.006, 0.012))
     late = replace(clean.readings, force=np.roll(clean.readings.force, 40, axis=0))
     late = ContactProblem(clean.motion, late, clean.law, clean.plane)

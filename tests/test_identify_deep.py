@@ -1,4 +1,4 @@
-"""Long presses in fits: pseudo-rows have the misfit of all rows, and filters keep lanes apart."""
+"""Long press runs in fits: pseudo-rows with the misfit of all rows, and independent noise filters."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -31,13 +31,13 @@ COLOURED = (1.0, -0.6, 0.1)
 
 
 def problem(law, time_constant=0.0, whitening=(1.0,), threshold=0.0, seconds=12.0):
-    """Return touches and a long press of the same rig."""
+    """Return contacts and a long press of the same rig."""
     kind, rng = campaigns.KINDS["clean"], np.random.default_rng(1)
     press = campaigns._press_run(kind, rng, seconds=seconds, depth=0.0008)
     runs = [*split_long_run(press, 0.001), *campaigns._touch_runs(kind, rng, (0.003, 0.006, 0.012))]
     readings = ForceReadings.of(runs, 0.5, whitening, threshold)
     if threshold:
-        # A dead zone and a surface further away are alike, so the dead zone must be known.
+        # A dead zone has the effect of a more distant surface, so the dead zone must be known.
         readings = replace(readings, bias=(0.0, 0.01))
     return ContactProblem(MotionResponse(MODEL, runs, TIMING, 0.022), readings, law, None, time_constant)
 
@@ -63,7 +63,7 @@ def test_pseudo_rows_of_long_press_have_the_misfit_of_all_rows(law, lag, whiteni
         assert abs(fit.slope - exact.slope) < 0.02 * np.sqrt(exact.curvature) * np.sqrt(exact.misfit)
         (across,) = few.fit_surfaces(delay - lag, np.array([plane]))
         assert across.misfit == pytest.approx(fit.misfit, rel=1e-9)
-    # They were used at all: only touches and the ends of the press were computed row by row.
+    # Pseudo-rows are used: only contacts and the ends of the press are computed row by row.
     assert len(few.tables) > 0 and len(few.others.used_rows) < 0.6 * len(full.used_rows)
 
 

@@ -1,4 +1,4 @@
-"""Excitation design: least errors within the limits, low crest factors, correct predictions."""
+"""Excitation design: minimum variance within limits, low crest factors, correct predictions."""
 
 from functools import partial
 
@@ -24,9 +24,7 @@ SLOPES = np.array([[0.0076, -0.089, -3.9, 30.4, -2.8e-7, -5.7e-5]])
 
 
 def test_optimal_design_for_a_slope_uses_both_ends_of_the_range():
-    """Elfving 1952: for y = a + b x on -1 <= x <= 1, b is best estimated with half the readings at either
-    end.
-    """
+    """Elfving 1952: for y = a + b x on -1 <= x <= 1, half of the readings at either end are optimal for b."""
     x = np.linspace(-1.0, 1.0, 21)
     rows = np.stack([np.ones_like(x), x])
     group = powers.RunLines(np.einsum("il,jl->lij", rows, rows), np.ones((1, 21)))
@@ -81,7 +79,7 @@ def test_excitation_design_reaches_but_does_not_exceed_limits(planned):
     speed, acceleration = np.diff(free) / 1e-3, np.diff(free, 2) / 1e-6
     assert np.abs(speed).max() < 0.3 and np.abs(acceleration).max() < 20.0
     assert np.abs(free).max() > 0.0017 or np.abs(acceleration).max() > 0.85 * 18.0
-    # With limits on stroke, speed and acceleration, no wave has a low crest factor in all three.
+    # No signal has a low crest factor in position, velocity and acceleration together.
     assert max(planned.free.crest, planned.press.crest) < 2.1
     # The press never leaves the mechanism, and its force stays within that of an approach.
     force = campaign_rigs.commanded("clean", "press", press, 0, noise=False).force_measured
@@ -96,7 +94,7 @@ def test_excitation_design_is_more_informative_than_flat_spectrum(planned):
 
 
 def spread(planned, repeats):
-    """Return the standard deviations of the motion parameters over campaigns, relative to those predicted."""
+    """Return standard deviations of motion parameters over campaigns, relative to the predicted values."""
     timing, rows = CampaignTiming(1e-3, "linear", 0, "tick"), []
     for seed in range(repeats):
         run = campaign_rigs.commanded("clean", "free", planned.free.position - 0.05, seed)

@@ -1,4 +1,4 @@
-"""Edges of contact reveal a filter that the model lacks; forces are used at the times of their reading."""
+"""Filter missing from the model, detected at onset and end of contact; sampling times of forces."""
 
 from dataclasses import replace
 from typing import Any
@@ -17,7 +17,7 @@ from tuning.identification.rational import STRUCTURES, MotionModel
 
 
 def checked(monkeypatch, lag):
-    """Return the check of the edges for a file with the true lag [s], or with it as a longer delay."""
+    """Return the check of onset and end for a file with the true lag [s], or with the lag as a delay."""
     campaign = ambiguous.campaign(monkeypatch, "lag", 0, seconds=5.0)
     raw: dict[str, Any] = to_plain_data(ambiguous.truth("lag")) | {"source": "identified from logs"}
     sensor = raw["rig"]["force_sensor"]

@@ -1,4 +1,4 @@
-"""Spoilt logs of a good rig: rejected in one line, or with a bad verdict, or identified correctly."""
+"""Corrupted logs of a good rig: rejected in one line, bad verdict, or identified correctly."""
 
 import campaign_rigs
 import campaigns
@@ -22,7 +22,7 @@ def _undrawn(monkeypatch):
 
 @pytest.fixture(scope="module")
 def day():
-    """Return the columns of a clean rig's logs by file."""
+    """Return the columns of a defect-free rig's logs by file."""
     campaign = campaigns.campaign("clean", 0, speeds=(0.003, 0.006, 0.012) * 3, seconds=20.0, rest=2.0)
     return {f"{run.kind}_{index:02}.csv": columns(run) for index, run in enumerate(campaign.runs)}
 
@@ -38,7 +38,7 @@ def identified(jaxhil, folder, files, mapping=MAPPING, *options):
 
 
 def changed(day, column, change, kinds=KINDS, reveals=False):
-    """Return all files with one column changed; drop the columns that reveal it, unless `reveals`."""
+    """Return all files with one column changed; omit columns that reveal the change, unless `reveals`."""
     files = {}
     for name, table in day.items():
         remaining = {key: values for key, values in table.items() if reveals or key not in TOLD}
@@ -52,7 +52,7 @@ def held(every):
 
 
 def joined(every):
-    """Keep every n-th row and interpolate linearly in between."""
+    """Keep every n-th row and interpolate linearly between these rows."""
     return lambda values: np.interp(np.arange(len(values)), np.arange(0, len(values), every), values[::every])
 
 
@@ -106,7 +106,7 @@ def test_identify_command_rejects_corrupted_logs_in_one_line(jaxhil, day, tmp_pa
 
 
 def late(day):
-    """Add a second free run whose readings are late by 3 ms."""
+    """Add a second free run whose readings are delayed by 3 ms."""
     run = day["free_01.csv"]
     return {**day, "free_99.csv": {**run, POSITION: np.roll(run[POSITION], 3)}}
 
@@ -148,7 +148,7 @@ def test_identify_command_verdict_is_bad_for_log_at_rest_with_prior(jaxhil, day,
 
 
 def gaps(day):
-    """Lose 16 rows in the middle of every contact."""
+    """Remove 16 rows in the middle of every contact."""
     files = {}
     for name, table in day.items():
         deep = int(np.argmax(table[FORCE]))
@@ -190,7 +190,7 @@ def test_identify_command_is_accurate_despite_gaps_and_noise(jaxhil, day, tmp_pa
 
 
 def test_identified_file_with_good_verdict_predicts_the_rig(jaxhil, day, tmp_path):
-    """Commands interpolated over 4 rows lose fast content: another model of the same contacts may fit."""
+    """Interpolating commands over 4 rows removes fast content, so another model may fit the same contacts."""
     ran = identified(jaxhil, tmp_path, changed(day, COMMAND, joined(4)))
     noise_free = {"force_sensor__noise_std": 0.0, "position_sensor__noise_std": 0.0}
     truth = package.simulate(campaign_rigs.mechanism("clean", **noise_free), "response_error")

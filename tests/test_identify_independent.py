@@ -1,4 +1,4 @@
-"""`jaxhil identify` on logs of a second generator, which was written from the user guide alone."""
+"""`jaxhil identify` on logs of a second simulator, which was written only from the user guide."""
 
 import shutil
 from dataclasses import replace
@@ -9,7 +9,7 @@ from independent_logs import KINDS, mechanism_file, write_campaign
 from independent_rig import Rig, drive, ideal_restitution, restitution, touch
 from independent_study import LIMIT, errors_of, judge, summary
 
-CAMPAIGNS = 100  # of each kind in the study
+CAMPAIGNS = 100  # number of campaigns of each kind in the study
 WRONG = 0.01  # share of campaigns that may get a good verdict for a wrong file
 
 
@@ -27,7 +27,7 @@ def test_independent_simulator_has_ideal_restitution_of_damped_springs():
 
 
 def test_independent_simulator_without_delays_conserves_energy():
-    # A moving average over an instant is a drive without lag.
+    # A moving average over a very short time is a drive without lag.
     rig = Rig(period=0.0005, mass=300.0, stiffness=1.1e5, window=1e-9)
     real, *_ = touch(rig, np.array([-0.001]), np.array([0.005]), pass_on, 1200)[:, :, 0]
     duration = np.count_nonzero(real) * rig.period
@@ -47,7 +47,7 @@ def test_independent_simulator_loses_energy_by_friction():
     rig = Rig(mass=300.0, stiffness=1.1e5, friction=2.0)
     omega, speed, offset = np.sqrt(rig.stiffness / rig.mass), 0.005, rig.friction / rig.stiffness
     depth = np.hypot(offset, speed / omega) - offset
-    # The friction changes its sign at the deepest point; the force ends at the depth `offset`.
+    # Friction changes its sign at the deepest point; the force ends at the depth `offset`.
     assert ideal_restitution(rig, speed) == pytest.approx(omega * (depth - offset) / speed, abs=1e-4)
 
 

@@ -1,4 +1,4 @@
-"""Knowledge beside the logs: fixed values and a prior's marginals, compared with weighted least squares."""
+"""Fixed values and prior in addition to logs, compared with weighted least squares."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ NUMBER = 4000
 
 
 def logs_say(keys, seed=0):
-    """Return draws with exactly these means and covariances."""
+    """Return parameter draws with exactly these means and covariances."""
     indices = [KEYS.index(key) for key in keys]
     white = np.random.default_rng(seed).standard_normal((len(keys), NUMBER))
     white -= white.mean(axis=1, keepdims=True)
@@ -36,7 +36,7 @@ def logs_say(keys, seed=0):
 
 
 def prior(shift=1.0, scale=1.5):
-    """Return a mechanism whose marginals are off by so many standard deviations."""
+    """Return a mechanism whose marginal distributions are off by this number of standard deviations."""
     mean = MEAN + shift * STD * np.array([1, -1, 1, -1])
     document = to_plain_data(campaign_rigs.mechanism("clean", simulator__natural_frequency=mean[0],
                            force_sensor__delay=mean[1], contact__stiffness=[mean[2]],
@@ -57,7 +57,7 @@ def summary(draws, keys=KEYS):
 
 
 def close(actual, expected, share=0.06):
-    """Check agreement within the scatter of 4000 draws."""
+    """Check agreement within the sampling error of 4000 draws."""
     (mean, covariance), (wanted, spread) = actual, expected
     std = np.sqrt(np.diag(spread))
     np.testing.assert_allclose((mean - wanted) / std, 0.0, atol=share)
@@ -73,9 +73,7 @@ def test_combination_of_logs_and_prior_equals_weighted_least_squares():
 
 
 def test_combination_of_logs_and_prior_updates_values_known_only_from_prior():
-    """Without free motion, the force delay is estimated for the given simulator, so it holds the sum of both
-    lags.
-    """
+    """Without free motion, the estimated force delay includes the error of the prior's motion simulator."""
     mechanism, mean, spread = prior()
     draws = conditioning.condition_on_prior(logs_say(KEYS[1:]), mechanism, 3.0)
     slope = conditioning._differentiate_lag(mechanism, KEYS[:1], 3.0)[KEYS[0]]

@@ -1,4 +1,4 @@
-"""Motion simulator from free motion: spectra, hold, orders, and errors against the Cramer-Rao bound."""
+"""Motion simulator from free motion: spectra, hold, orders, and errors relative to Cramer-Rao bounds."""
 
 import campaigns
 import numpy as np
@@ -26,7 +26,7 @@ def lines_of(model, hold="linear", latency=0, period=0.001, shift=0, std=5e-7):
 
 @pytest.mark.parametrize("name", ("clean", "third_order", "resonance"))
 def test_motion_model_matches_exactly_sampled_simulator(name):
-    """Compare one steady-state period of the multisine, by the oracle's matrices and by the lines."""
+    """Compare one steady-state period of the multisine with the oracle's matrices."""
     kind = campaigns.KINDS[name]
     T = kind.rig["control_period"]
     wave = campaigns.multisine(T)
@@ -92,7 +92,7 @@ def test_motion_model_selection_takes_lowest_order_that_explains_the_data(name):
 
 
 def errors(repeats):
-    """Return normalised errors of frequency, damping ratio and delay, and the share covered."""
+    """Return normalised errors of frequency, damping ratio and delay, and the coverage of their intervals."""
     kind, T, scores = campaigns.KINDS["clean"], 0.001, []
     wave = campaigns.multisine(T)
     steady = campaigns._position(campaigns.Plant(kind.rig), np.tile(wave, 2), 4.3)[-len(wave) :]
@@ -159,7 +159,7 @@ def test_spectrum_detects_nonlinearity_at_unexcited_frequencies():
 
 @pytest.mark.parametrize("logarithms", [(4.3, -0.2), (4.3, 1.1), (156.8, 153.0)])
 def test_motion_model_limits_poles_above_all_measured_frequencies(logarithms):
-    """A pole of 1e134 rad/s made the motion overflow; at the frequencies of the lines nothing changes."""
+    """A pole of 1e134 rad/s would make the motion overflow."""
     structure = rational.STRUCTURES[2]
     asked = np.array([*logarithms, 0.001])
     bounded = rational._limit_fast_poles(structure, asked)

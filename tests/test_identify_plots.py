@@ -1,4 +1,4 @@
-"""Plots of an identification show measurements and estimates, and are reproducible."""
+"""Plots of an identification: measurements, estimates, and reproducible files."""
 
 import campaigns
 import numpy as np

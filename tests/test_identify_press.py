@@ -1,4 +1,4 @@
-"""A real servo-hydraulic press (`data/press_0A.md`): order, lag, delay, and its nonlinearity."""
+"""Data of a servo-hydraulic press (`data/press_0A.md`): order, lag, delay, and friction."""
 
 from pathlib import Path
 

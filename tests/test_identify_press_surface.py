@@ -1,4 +1,4 @@
-"""Surface of a contact that a press never leaves: estimated with the bias at rest, or rejected by name."""
+"""Surface position from a press run in permanent contact: estimated with the bias at rest, or rejected."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def multisine(seed=3, depth=0.0008, noise=1.0):
 
 
 def ramp(begin, deepest=0.001, seconds=4.0):
-    """Return a slow push from one position to another and back."""
+    """Return a slow motion from one position to another and back."""
     up = np.linspace(begin, deepest, round(500 * seconds))
     return commanded("clean", "press", np.concatenate([np.full(500, begin), up, up[::-1]]), 1)
 
@@ -65,7 +65,7 @@ def test_press_run_in_contact_is_rejected_without_bias_at_rest():
 
 
 def test_press_run_that_starts_out_of_contact_estimates_bias():
-    """A bias that changed since the run at rest has no effect."""
+    """A bias that has changed since the run at rest has no effect."""
     run = ramp(-1e-3)
     run = replace(run, force_measured=run.force_measured + 5.0)
     for noise in (rest(bias=0.0), None):

@@ -1,7 +1,7 @@
-"""Stage-by-stage fit compared with a joint fit: how much more information all runs together contain.
+"""Staged fit compared with a joint fit of all runs.
 
-The force delay is profiled either way, so the other parameters have a Cramer-Rao bound at each delay. Print
-it with `pytest -m "slow or not slow" -s tests/test_identify_stages.py`.
+The force delay is profiled in both fits, so the other parameters have a Cramer-Rao bound at each delay.
+`pytest -m "slow or not slow" -s tests/test_identify_stages.py` prints the bounds.
 """
 
 import campaigns
@@ -28,7 +28,7 @@ MOTION, PROFILED = slice(0, 3), 3
 
 
 def readings(runs, timing, numbers, noise, touching=None):
-    """Return positions and forces of the touches over their noise, and the rows in contact."""
+    """Return positions and forces of the contacts divided by their noise, and the rows in contact."""
     motion = MotionResponse(MotionModel(STRUCTURES[2], numbers[MOTION]), runs, timing, 0.022)
     position, velocity = motion.at(numbers[3])
     force = numbers[5] * (position - numbers[4]) + numbers[6] * velocity

@@ -1,6 +1,6 @@
-"""From logs to gains: the loss on the true rig of gains tuned on the identified file.
+"""Gains tuned on an identified file, evaluated on the true rig.
 
-Print the results with `pytest -m slow -s tests/test_identify_tuning.py`.
+`pytest -m slow -s tests/test_identify_tuning.py` prints the results.
 """
 
 import math
@@ -20,7 +20,7 @@ from tuning.identification.identify import IdentificationOptions, identify
 
 pytestmark = [pytest.mark.slow, pytest.mark.users_options]
 PHASES = 511
-LEAST_DEVIATION = 1.02e-4  # s, of the force's age on the lagging rig, without a press
+LEAST_DEVIATION = 1.02e-4  # s, standard deviation of the force delay on the lagging rig, without a press
 
 
 def error(mechanism, compensator, gains):
@@ -32,11 +32,11 @@ def error(mechanism, compensator, gains):
 
 
 def truth_within_bound(truth, identified):
-    """Return the truth with the force's age off by 1.2 times the least standard deviation.
+    """Return the true rig with the force delay off by 1.2 times the least standard deviation.
 
-    The bound is that of `test_identify_campaigns.py`; the shift is to the side of the identified age. Contact
-    alone determines delay and lag through B - K (tau_f + T_s): the damping compensates for the error of the
-    delay.
+    The least standard deviation is the bound of `test_identify_campaigns`; the sign is that of the identified
+    error. Contacts determine delay and lag only through B - K (tau_f + T_s), so the damping compensates for
+    the delay error.
     """
     off = force_age(identified) - force_age(truth)
     shift = math.copysign(1.2 * LEAST_DEVIATION, off)
@@ -49,7 +49,7 @@ def truth_within_bound(truth, identified):
 
 
 def force_age(mechanism):
-    """Return by how much a force of contact is older than the motion [s]."""
+    """Return the delay of the contact force relative to the motion [s]."""
     sensor, ahead = mechanism.rig.force_sensor, mechanism.rig.position_sensor.delay
     return sensor.delay + sensor.time_constant - ahead
 
@@ -82,7 +82,7 @@ def test_gains_tuned_on_identified_file_have_little_additional_error_on_true_rig
 
 
 def with_noise(name):
-    """Return the true rig with the noise of its sensors."""
+    """Return the true rig with sensor noise."""
     raw, sensors = to_plain_data(ambiguous.truth(name)), ambiguous.KINDS[name].rig
     raw["rig"]["force_sensor"]["noise_std"] = sensors["force_sensor"]["noise_std"]
     position = {"delay": sensors["position_sensor"].get("delay", 0.0)}
@@ -91,16 +91,16 @@ def with_noise(name):
 
 
 GOOD, TRIED = 40, 80
-LIMIT = 0.01  # error to which gains are tuned on the file
+LIMIT = 0.01  # error limit for tuning on the file
 HARDLY_TOLD = ("plain", "no delay", "undamped", "lost rows")  # kinds for which some files get a good verdict
 
 
 def test_gains_tuned_on_files_with_good_verdict_have_little_additional_error(monkeypatch):
-    """The priors lack damping, lag, delay and dead zone; e* is that of the true mechanism.
+    """Priors lack damping, lag, delay and dead zone; e* is that of the true mechanism.
 
-    The quietest gains within the limit on the file are taken. On the true rig they may err by up to that
-    limit, while those tuned on the truth err by less: these touches determine the force's age to 50 to 100 us
-    at best, which corresponds to 0.0015 to 0.003 in e - e*.
+    Tuning takes the quietest gains within the error limit on the file. On the true rig their error may reach
+    this limit, while gains tuned on the true rig have smaller errors: these contacts determine the force
+    delay to 50 to 100 us at best, which corresponds to 0.0015 to 0.003 in e - e*.
     """
     best, losses = {}, []
     for number in range(TRIED):

@@ -1,6 +1,6 @@
-"""The impulse ledger: unknown force delay and status.
+"""Impulse ledger with unknown force delay: estimates, errors and status.
 
-`pytest -m slow -s tests/test_impulse_ledger.py` prints the errors that an unknown delay leaves.
+`pytest -m slow -s tests/test_impulse_ledger.py` prints the remaining errors.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ SPREADS = (80.0, 120.0, 1.0, 0.12, 0.5, 0.0, 1.0)
 
 
 def fitted(delay: float, damping: float, delay_spread: float) -> ContactModel:
-    """Return the model of a contact of 3 Hz whose force is older than specified by `delay` [s]."""
+    """Return the model of a contact of 3 Hz whose force delay exceeds the specified value by `delay` [s]."""
     model = ContactModel()
     model.restart(10.0, SPREADS, delay_spread**2)
     omega, deepest = 2 * np.pi * 3, 0.0
@@ -93,7 +93,7 @@ def test_impulse_ledger_status_is_unexplained_for_damped_contact_with_delay():
     [("noisy", 0.8, 0.3), ("hertz", 1.5, 0.3), ("hardening", 2.0, 0.5), ("damped", 1.6, 1.8)],
 )
 def test_impulse_ledger_error_falls_over_contacts_with_unknown_delay(suite, first, eighth, capsys):
-    """Simulate eight contacts, each with the velocity at which the previous one was left."""
+    """Simulate eight contacts, each at the rebound speed of the previous contact."""
     mechanism = load(f"suite-{suite}", ["approach.contacts=8", UNCERTAIN]).mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, 200, 77), 77)
     outcome = evaluate(build_loop(mechanism, LAW, scenarios), literature_gains(mechanism, LAW), scenarios)

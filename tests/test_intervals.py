@@ -1,4 +1,4 @@
-"""Confidence intervals of a failure probability: stated coverage without unnecessary width."""
+"""Confidence intervals of a failure probability: stated coverage without excessive width."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def test_binomial_interval_has_stated_coverage_for_every_probability(number):
 
 @pytest.mark.parametrize("probability", PROBABILITIES)
 def test_binomial_interval_covers_truth_over_repeated_sweeps(probability, capsys):
-    """Run 1000 sweeps of scenarios that fail beyond a limit: P(|x| > limit), x standard normal."""
+    """Run 1000 sweeps with P(|x| > limit) for standard normal x."""
     rng = np.random.default_rng(0)
     limit = stats.norm.isf(probability / 2)
     failures = np.array([np.sum(np.abs(rng.standard_normal(1000)) > limit) for _ in range(1000)])
@@ -68,7 +68,7 @@ def test_binomial_interval_covers_truth_over_repeated_sweeps(probability, capsys
 
 
 def test_confidence_sequence_equals_mixture_martingale():
-    """Compute the martingale by definition: the mixture likelihood over that under p, by quadrature."""
+    """Compute the mixture likelihood relative to that of p by quadrature."""
     failures, number = 3, 50
     result = confidence_sequence(failures, number)
     prior = stats.beta(0.5, 0.5)
@@ -110,7 +110,7 @@ def walks(probability, repeats=1000, looks=150, step=25):
 
 
 def of_each(interval, failures, number):
-    """Return the interval of many looks, computed once for equal looks."""
+    """Return the interval of every look, computed once for equal counts."""
     pairs, which = np.unique(np.stack([failures.ravel(), number.ravel()]), axis=1, return_inverse=True)
     return IntervalEstimate(*(part[which].reshape(failures.shape) for part in interval(*pairs)))
 
@@ -121,7 +121,7 @@ def ever_outside(interval, probability):
 
 @pytest.mark.parametrize("probability", PROBABILITIES)
 def test_confidence_sequence_has_stated_coverage_for_any_stopping_rule(probability, capsys):
-    """Stopping at the worst of 150 looks keeps the coverage; with exact intervals it does not."""
+    """Stopping at the worst of 150 looks keeps the coverage, unlike exact intervals."""
     failures, number = walks(probability)
     missed = np.mean(ever_outside(of_each(confidence_sequence, failures, number), probability))
     peeked = np.mean(ever_outside(of_each(binomial_interval, failures, number), probability))
@@ -172,7 +172,7 @@ def test_sequential_interval_is_intersection_and_restarts_on_contradiction():
     looks = confidence_sequence(failures[0], number[0])
     assert (running.failures, running.number) == (failures[0, -1], 1250)
     assert (running.low, running.high) == (np.max(looks.low), np.min(looks.high))
-    # These cannot be Bernoulli trials: none fails, then all do.
+    # Not Bernoulli trials: 1000 successes, then 1000 failures.
     contradiction = update_sequence(update_sequence(SequentialState(), 0, 1000), 1000, 1000)
     last = confidence_sequence(1000, 2000)
     assert (contradiction.low, contradiction.high) == (last.low, last.high)
@@ -233,7 +233,6 @@ def test_replicate_interval_has_stated_coverage_over_a_thousand_sweeps(name, pro
 
 @pytest.mark.parametrize("probability", (*PROBABILITIES, 1e-4, 1e-5))
 def test_replicate_interval_has_stated_coverage_for_independent_points(probability, capsys):
-    """Use independent points, the least even ones."""
     failures = np.random.default_rng(4).binomial(1024, probability, (1000, 16))
     interval = replicate_interval(failures, 1024)
     with capsys.disabled():
@@ -249,7 +248,7 @@ def test_replicate_interval_has_stated_coverage_for_independent_points(probabili
 
 @pytest.mark.parametrize("part", (0.0, 0.1, 0.3, 0.5, 0.8))
 def test_replicate_interval_has_stated_coverage_for_perfectly_even_points(part):
-    """Each scrambling counts one of the integers around n p, often the same."""
+    """Each replicate counts one of the integers around n p, often the same."""
     failures = 300 + (np.random.default_rng(5).random((2000, 8)) < part)
     assert covered(replicate_interval(failures, 1024), (300 + part) / 1024) >= BAR
 

@@ -1,4 +1,4 @@
-"""Compiler options that the next version may lack, and use of half of the cores."""
+"""Compiler options that other XLA versions may lack, and use of half of the cores."""
 
 import os
 

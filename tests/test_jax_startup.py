@@ -1,4 +1,4 @@
-"""Environment variables and standard streams with which a command starts, or says in one line why not."""
+"""Environment variables and standard streams with which a command starts, or fails in one line."""
 
 import json
 import os
@@ -33,7 +33,7 @@ DEBUGGING = {
 
 
 def run(*arguments, shell=None, **variables):
-    """Run a command as a process of its own; `shell` is appended to its command line."""
+    """Run a command in a separate process; `shell` is appended to its command line."""
     command = [*COMMAND, *arguments]
     if shell is not None:
         command = ["bash", "-c", f'"$@" {shell}', "bash", *command]

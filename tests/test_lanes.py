@@ -1,4 +1,4 @@
-"""Operations on lanes: selection between pytrees, and the square root with a derivative at 0."""
+"""Operations on lanes: selection between pytrees, and a square root with finite derivative at 0."""
 
 import jax
 import jax.numpy as jnp

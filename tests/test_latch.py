@@ -1,4 +1,4 @@
-"""Latches: the condition of capture, and the spring that holds the bodies."""
+"""Latches: condition of capture, and the spring that connects the captured bodies."""
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ def at(position, theta):
 
 
 def test_latch_captures_and_holds_bodies_if_deep_enough_and_aligned():
-    """Check for no force before the capture, none at first, and a spring from there on."""
+    """The force is zero before and at the capture, then that of a spring."""
     one = latch(False)
     still = Twist(place([0, 0, 0], BATCH), place([0, 0, 0], BATCH))
     state = init_latch(one, at([0, 0, 0.01], [0, 0, 0]))
@@ -40,7 +40,7 @@ def test_latch_captures_and_holds_bodies_if_deep_enough_and_aligned():
     caught = [3e-3, 0, -2e-3]
     wrench, state = step(one, state, at(caught, [0.01, 0, 0]), still)
     assert state.caught.all() and np.max(np.abs(components(wrench.force))) < 1e-12
-    # Also from far away, and about T's origin.
+    # Include distant bodies, and rotation about T's origin.
     wrench, state = step(one, state, at([3e-3, 0, 0.098], [0.01, 0, 0]), still)
     np.testing.assert_allclose(components(wrench.force)[:, 0], [0, 0, -2e4], atol=1e-9)
     np.testing.assert_allclose(components(wrench.moment)[:, 0], [0, 3e-3 * 2e4, 0], atol=1e-9)
@@ -49,7 +49,7 @@ def test_latch_captures_and_holds_bodies_if_deep_enough_and_aligned():
 
 @pytest.mark.slow
 def test_wrench_of_several_latches_is_sum_of_separate_wrenches():
-    """Capture at different depths, with different springs and with dampers."""
+    """Use different capture depths, springs and dampers."""
     one, share = latch(False, 0.01), jnp.array([[1.0], [2.0], [3.0]])
     points = place([[0.2, 0.2, 0.2], [-0.1, 0.0, 0.3], [0.0, 0.0, 0.0]], BATCH)
     all_three = Latch(
@@ -67,7 +67,7 @@ def test_wrench_of_several_latches_is_sum_of_separate_wrenches():
 
     held, together = after(all_three)
     assert held.caught.shape == (3, 1) and held.caught.all()
-    # Alone: the other latches are never deep enough.
+    # For a separate wrench, the other latches are never captured.
     alone = [after(all_three._replace(depth=jnp.where(one[:, None], 1e-3, jnp.inf))) for one in np.eye(3) > 0]
     assert all(held.caught.sum() == 1 for held, _ in alone)
     for result, *parts in zip(
@@ -79,7 +79,7 @@ def test_wrench_of_several_latches_is_sum_of_separate_wrenches():
 
 @pytest.mark.slow
 def test_latch_spring_is_conservative():
-    """Check that the spring does no work around a closed path of large rotations."""
+    """The spring does no work around a closed path of large rotations."""
     phase = np.linspace(0, 2 * np.pi, 200, endpoint=False)
     way = 0.8 * np.stack([np.cos(phase) - 1, np.sin(phase), 0.5 * np.sin(2 * phase)])
     rates = 0.8 * np.stack([-np.sin(phase), np.cos(phase), np.cos(2 * phase)])

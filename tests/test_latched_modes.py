@@ -1,7 +1,7 @@
-"""Modes of a latched contact under delay, and the response error with its true stiffness.
+"""Vibration modes of a latched contact under delay, and response error with its true stiffness.
 
-A latch with a full stiffness K holds bodies off each other's line from the start; M is their relative mass
-matrix. The motion is so slow that nonlinear terms are lost in rounding.
+A latch with a full stiffness matrix K connects bodies that are not aligned; M is their relative mass matrix.
+The motion is so small that nonlinear terms are below rounding.
 """
 
 import jax
@@ -38,7 +38,7 @@ def latch():
 
 
 def started():
-    """Return the bodies, docked and moving in all six coordinates."""
+    """Return docked bodies that move in all six coordinates."""
     bodies = Pair(
         plain_body(1800.0, FULL[0], (0.05, -0.02, 1.2), BATCH),
         plain_body(420.0, FULL[1], (0.01, 0.04, -1.0), BATCH),
@@ -48,7 +48,7 @@ def started():
 
 
 def scenario(delays):
-    """Return a scenario with a motion simulator that is late and nothing else."""
+    """Return a scenario with a motion simulator that only has delays."""
     late = lanes(delays, BATCH)
     free = late + jnp.inf
     simulator = MotionSimulatorBatch(jnp.zeros((0, 6, 1)), jnp.ones((1, 6, 1)), late, free, free)
@@ -63,8 +63,8 @@ def scenario(delays):
 def test_latched_vibration_modes_grow_under_delay_as_characteristic_roots(delays):
     """Compare with the fastest growing root of det(s^2 M + K diag(exp(-s tau))) = 0.
 
-    With equal delays it is that of the stiffest mode by Lambert's function. The integrator adds half a period
-    of delay.
+    For equal delays this is the root of the stiffest mode, by Lambert's function. The integrator adds half a
+    period of delay.
     """
     given = scenario(delays)
     loop = build_loop(given, integrator="zoh", hold="linear", latency=0)
@@ -82,7 +82,7 @@ def test_latched_vibration_modes_grow_under_delay_as_characteristic_roots(delays
 
 
 def test_response_error_with_true_stiffness_cancels_rig_dynamics_of_latched_bodies():
-    """Check that -K xi_a - K (xi_d - xi_a) = -K xi_d for any six axes; without it the same run diverges."""
+    """-K xi_a - K (xi_d - xi_a) = -K xi_d for six axes; the uncompensated run diverges."""
     bodies, start = started()
     pose = Pose(vector(jnp.zeros((3, 1))), identity(jnp.zeros(1)))
     one, period = latch(), lanes(PERIOD, BATCH)
@@ -93,7 +93,7 @@ def test_response_error_with_true_stiffness_cancels_rig_dynamics_of_latched_bodi
     still = init_latch(one, pose)
 
     def pulled(share):
-        """Return the chaser's coordinates tick by tick, and the given share of the response error."""
+        """Return the chaser's coordinates at every tick with the given share of the response error."""
 
         def tick(carry, now):
             states, hardware = carry
@@ -112,7 +112,7 @@ def test_response_error_with_true_stiffness_cancels_rig_dynamics_of_latched_bodi
         return jax.lax.scan(tick, (start, hardware), jnp.arange(TICKS // 2, dtype=jnp.int32))[1]
 
     def alone(states, _):
-        """Simulate the numerical model on its own spring."""
+        """Simulate the numerical model with its own spring, without the rig."""
         wanted, *_ = model_motion(bodies, states)
         pull = -jnp.einsum("ij,jb->ib", jnp.asarray(STIFFNESS), wanted)
         wrench = Wrench(vector(pull[:3]), vector(pull[3:]))

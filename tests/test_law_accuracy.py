@@ -1,8 +1,8 @@
-"""Errors of the impulse ledger on fresh scenarios beyond the standard suites, with one set of gains.
+"""Errors of the impulse ledger on new scenarios beyond the standard suites, with one set of gains.
 
-Surface, sensor offset, preload, friction, duration and control period are not those of the suites.
-`pytest -m slow -s tests/test_law_accuracy.py` prints root mean square, 99th percentile and maximum of
-|e - e*| in %.
+Surface, sensor offset, preload, friction, duration and control period differ from those of the suites.
+`pytest -m slow -s tests/test_law_accuracy.py` prints root mean square, 99th percentile and maximum of |e -
+e*| in %.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ from tuning.transparency.probes import (
 )
 
 pytestmark = pytest.mark.slow
-LAW, SEED = "impulse_ledger", 0xACC  # of scenarios that nothing else was tuned or evaluated on
+LAW, SEED = "impulse_ledger", 0xACC  # seed of scenarios used for no tuning or evaluation
 CONTACTS = 4
 
 
@@ -37,7 +37,7 @@ RMS, PERCENTILE, LARGEST, TRANSPARENCY = 0.5, 1.5, 3.0, 0.75
 
 
 def within(path: str, low: float, high: float) -> str:
-    """Return an override: a number that lies anywhere between two."""
+    """Return an override that draws a number uniformly between two values."""
     return f'uncertainty."{path}"={{distribution="uniform",low={low},high={high}}}'
 
 
@@ -48,13 +48,13 @@ FRICTION = "contact.friction=3.0", within("contact.friction", 0.0, 6.0)
 
 def outcome_of(mechanism: Mechanism, gains: Mapping[str, Any], scenarios: Scenario) -> Outcome:
     loop = build_loop(mechanism, LAW, scenarios)
-    # Run lane by lane, so that one program serves every set of gains.
+    # Run the lanes one after the other, so that one program serves every set of gains.
     lanes = scenarios.velocity.shape
     return evaluate(loop, {name: np.broadcast_to(value, lanes) for name, value in gains.items()}, scenarios)
 
 
 def left(errors: Any) -> tuple[float, float, float]:
-    """Return root mean square, 99th percentile and largest of |e - e*| [%]."""
+    """Return root mean square, 99th percentile and maximum of |e - e*| [%]."""
     size = 100 * np.abs(np.asarray(errors))
     return float(np.sqrt(np.mean(size**2))), float(np.percentile(size, 99)), float(np.max(size))
 
@@ -64,7 +64,7 @@ def printed(*what: object) -> None:
 
 
 def copies_of(probed: ProbedScenarios, outcome: Outcome) -> Outcome:
-    """Return copies with an axis for a scenario's plain run, its two pushes and its damping perturbation."""
+    """Return scenario copies along a new axis: plain run, two pushes, damping perturbation."""
     number = len(probed.plain)
     return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], number, LANES_PER_SCENARIO), outcome)
 
@@ -72,7 +72,7 @@ def copies_of(probed: ProbedScenarios, outcome: Outcome) -> Outcome:
 @pytest.mark.parametrize("noise", ["0.5 %", "none"])
 @pytest.mark.parametrize("suite", ["noisy", "damped", "hertz", "hardening", "layered"])
 def test_impulse_ledger_is_accurate_with_surface_within_1_mm(suite, noise):
-    """Run four contacts at 5 mm/s, next to the same ones with the surface where it is specified."""
+    """Run four contacts at 5 mm/s, with the surface at and near the specified position."""
     clean = ("rig.force_sensor.noise_std=0.0",) if noise == "none" else ()
     mechanism = load(f"suite-{suite}", [*PLANE, *clean, f"approach.contacts={CONTACTS}"]).mechanism
     probed = build_probed_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)
@@ -92,10 +92,7 @@ def test_impulse_ledger_is_accurate_with_surface_within_1_mm(suite, noise):
 @pytest.mark.parametrize("noise", ["none", "0.5 % of its own peak", "0.15 N"])
 @pytest.mark.parametrize("period", [2.5e-4, 1e-3, 4e-3])
 def test_impulse_ledger_is_accurate_for_contacts_of_1_to_8_s(period, noise):
-    """Cover 0.06 to 0.5 Hz.
-
-    No command goes beyond 3 times the peak of the ideal contact and 20 times the noise.
-    """
+    """Check that commands stay below 3 times the ideal peak force plus 20 times the noise."""
     sensor = "rig.force_sensor.noise_std=0.15"
     for damped in (False, True):
         damping = [f"contact.damping=[{2 * 0.05 * np.sqrt(414.5 * 350):.6g}]"] if damped else []
@@ -126,7 +123,7 @@ OFFSETS = {
 
 @pytest.mark.parametrize("case", OFFSETS)
 def test_impulse_ledger_is_accurate_with_preload_friction_and_bias(case):
-    """Cover up to 10 N, 6 N and 5 N in either direction, alone and together."""
+    """Use up to 10 N, 6 N and 5 N of either sign, alone and together."""
     suite, changes = OFFSETS[case]
     mechanism = load(f"suite-{suite}", changes).mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)

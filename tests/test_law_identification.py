@@ -1,6 +1,6 @@
-"""Errors of contacts that the impulse ledger calls identified, and of those that it doubts.
+"""Errors of contacts with status identified, and of contacts with other status, under the impulse ledger.
 
-`pytest -m slow -s tests/test_law_identification.py` prints how often an identified contact errs.
+`pytest -m slow -s tests/test_law_identification.py` prints how often identified contacts exceed the limit.
 """
 
 import math
@@ -21,9 +21,9 @@ from jaxhil.rig.law_status import MAX_DOUBTFUL_SHARE
 @pytest.mark.slow
 @pytest.mark.parametrize("suite", ["noisy", "hertz", "hardening", "layered", "fast"])
 def test_share_of_doubtful_ticks_distinguishes_too_short_contacts(suite):
-    """Print the share of ticks in doubt, and check the gap that contains `MAX_DOUBTFUL_SHARE`.
+    """Print the share of doubtful ticks; check the gap that contains `MAX_DOUBTFUL_SHARE`.
 
-    A contact is too short if the law says so on any tick.
+    A contact is too short if the compensator reports so on any tick.
     """
     contacts = 200
     doubt, short = np.empty((2, contacts))
@@ -48,7 +48,7 @@ def test_share_of_doubtful_ticks_distinguishes_too_short_contacts(suite):
 
 
 def test_impulse_ledger_status_is_unexplained_if_contact_seems_to_add_energy():
-    """The force is 1 ms older than specified; some errors are too small for the test of the energy alone."""
+    """The force delay exceeds the specified value by 1 ms."""
     nominal = load("suite-noisy").mechanism
     errors, statuses = [], []
     for index, mechanism in enumerate(contacts_of("hardening", 6, 10, ("rig.force_sensor.delay=0.009",))):
@@ -61,7 +61,7 @@ def test_impulse_ledger_status_is_unexplained_if_contact_seems_to_add_energy():
 
 
 class Wrong(NamedTuple):
-    """Differences from the nominal mechanism, and those of them that the controller knows."""
+    """Differences from the nominal mechanism, and those that the controller knows."""
 
     changes: tuple[str, ...] = ()
     known: tuple[str, ...] = ()
@@ -85,7 +85,7 @@ WRONG = {
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", WRONG)
 def test_contacts_with_status_identified_rarely_exceed_error_limit(wrong):
-    """Expect few errors above 1.5 %, whatever is wrong; if nothing is wrong, 98 in 100 are identified."""
+    """Few errors exceed 1.5 % with any modelling error; without, 98 % of contacts are identified."""
     (changes, known), contacts = WRONG[wrong], 100
     mechanism_known = load("suite-noisy", list(known)).mechanism
     odd = identified = 0
@@ -108,10 +108,7 @@ def test_contacts_with_status_identified_rarely_exceed_error_limit(wrong):
 
 
 def restitution(mechanism: Mechanism) -> float:
-    """Return the restitution of linear damped contact that does not adhere.
-
-    Its force is 0 where the speed is largest.
-    """
+    """Return the restitution of linear damped contact without tension."""
     [stiffness], [damping] = mechanism.contact.stiffness, mechanism.contact.damping
     ratio = damping / (2 * math.sqrt(stiffness * mechanism.bodies.mass))
     return math.exp(-ratio / math.sqrt(1 - ratio**2) * (math.pi - 2 * math.asin(ratio)))
@@ -120,7 +117,7 @@ def restitution(mechanism: Mechanism) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("lag", [0.0, 1e-3, 3e-3])
 def test_contact_with_status_identified_is_accurate_for_damper_with_unmodelled_lag(lag):
-    """Cover a damper whose loss is offset by the unmodelled lag, so that it reads like no damper."""
+    """The lag offsets the loss of the damper, so that the readings suggest no damper."""
     contacts, mechanism_known = 60, load("suite-damped").mechanism
     errors, statuses = np.empty(contacts), []
     changes = (f"rig.force_sensor.time_constant={lag}",) if lag else ()
@@ -139,7 +136,7 @@ def test_contact_with_status_identified_is_accurate_for_damper_with_unmodelled_l
 
 @pytest.mark.slow
 def test_slow_contacts_get_status_identified_by_impulse_ledger():
-    """Run contacts of 0.4 to 1.4 Hz."""
+    """Use contacts of 0.4 to 1.4 Hz."""
     changes = ("contact.stiffness=[8000.0]",)
     mechanism_known = load("suite-noisy", list(changes)).mechanism
     for index, mechanism in enumerate(contacts_of("noisy", 9, 25, changes)):

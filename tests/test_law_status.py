@@ -1,6 +1,6 @@
-"""Status of the impulse ledger, tick by tick and over a contact, and how the watchdog uses it.
+"""Status of the impulse ledger, tick by tick and for a contact, and its use by the watchdog.
 
-The counting in C is compared with the one in Python.
+Status counts in C are compared with those in Python.
 """
 
 import ctypes
@@ -41,7 +41,7 @@ from jaxhil.rig.limits import NO_LIMITS
 
 
 class Kind(NamedTuple):
-    """A contact: its suite, its overrides, the gains that differ, and the expected status of the law."""
+    """Kind of contact: suite, overrides, gains that differ, and expected status of the compensator."""
 
     suite: str
     changes: tuple[str, ...]
@@ -76,7 +76,7 @@ def gain_file(kind: Kind, limits: Mapping[str, float]) -> tuple[Mechanism, GainF
 
 @cache
 def ran(name: str, limits: str) -> tuple[Controller, Ran]:
-    """Run one of the kinds under these limits; return it and its controller."""
+    """Run a kind of contact under these limits; return the record and its controller."""
     mechanism, made = gain_file(KINDS[name], LIMITS[limits])
     law = Controller(made)
     return law, run(mechanism, law)
@@ -92,7 +92,7 @@ def ran(name: str, limits: str) -> tuple[Controller, Ran]:
     ],
 )
 def test_status_of_contact_is_most_frequent_status_of_its_ticks(name, limits):
-    """Expect it after the contact, on one tick, without a trip; with the energy audit and without."""
+    """The status is reported on one tick after the contact, without a trip, with and without energy audit."""
     law, result = ran(name, limits)
     record, wanted = law.last_contact, KINDS[name].status
     assert (record.number, record.status) == (1, wanted)
@@ -109,7 +109,7 @@ def test_status_of_contact_is_most_frequent_status_of_its_ticks(name, limits):
 
 @pytest.mark.parametrize("nearer", [1e-3, 4e-3])
 def test_contact_in_front_of_specified_surface_is_audited_by_watchdog(nearer):
-    """Expect the audit to begin when the law acts."""
+    """The audit begins when the compensator acts."""
     changes = (f"rig.contact_plane={-nearer}",)
     mechanism, made = gain_file(Kind("noisy", changes, {}, "identified"), {"settling": 0.02})
     law = Controller(made)
@@ -132,7 +132,7 @@ void count_read(int measured, long long *numbers) {
 
 @pytest.fixture(scope="module")
 def counting_in_c(tmp_path_factory):
-    """Load the counting of statuses in C as a shared library."""
+    """Load the C code that counts statuses as a shared library."""
     if c99_cases.COMPILER is None:
         pytest.skip("no C compiler (cc) on this machine")
     folder = c99_cases.write_sources(tmp_path_factory.mktemp("status"), gain_document("none"))
@@ -141,7 +141,7 @@ def counting_in_c(tmp_path_factory):
 
 
 def test_contact_status_counts_in_c_agree_with_python(counting_in_c):
-    """Use contacts of 40 ticks in which one or two random statuses prevail."""
+    """Use contacts of 40 ticks with one or two prevailing random statuses."""
     rng = np.random.default_rng(0)
     numbers = [status.number for status in STATUSES if status.number != NOT_REACHED]
     record_type, statuses = ctypes.c_longlong * 7, set()
@@ -174,9 +174,9 @@ def test_sample_contacts_cover_every_status_of_impulse_ledger():
 
 
 def test_contact_without_measured_force_has_status_not_reached():
-    """Let the model pass the surface and come back without a measured force, whatever the law does.
+    """The model passes the surface and returns without a measured force.
 
-    The hardware never touches, a dead zone hides its contact, or the contact has a single reading.
+    Reasons: the hardware never touches, a dead zone hides its contact, or the contact has a single reading.
     """
     mechanism = load("suite-noise-free").mechanism
     time = 1e-3 * np.arange(260)
@@ -227,7 +227,7 @@ def test_unfinished_contact_is_audited_when_next_contact_is_announced():
 
 
 def test_restitution_trip_reports_status_of_compensator():
-    """Expect both faults on one tick; a fault that does not trip is no cause."""
+    """Both faults are raised on the same tick."""
     mechanism, made = gain_file(KINDS["8 Hz"], {**LIMITS["energies"], "restitution_margin": 1e-6})
     law = Controller(made)
     result = run(mechanism, law)

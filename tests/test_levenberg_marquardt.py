@@ -1,4 +1,4 @@
-"""Bounded least squares: known minima, inside and on the bounds, a status per start."""
+"""Bounded least squares: minima inside and on the bounds, and a status per start."""
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +51,7 @@ def test_gain_with_equal_bounds_stays_fixed():
 
 
 def tilted(static, gains, arguments):
-    """Return linear residuals whose free minimum lies far outside of the box, along a narrow valley."""
+    """Return linear residuals whose unconstrained minimum lies far outside the box, along a narrow valley."""
     matrix = jnp.array([[1.0, 0.9], [0.9, 1.0], [0.1, -0.1]])
     return (gains - arguments) @ matrix.T
 
@@ -81,7 +81,7 @@ def test_gain_without_influence_keeps_its_starting_value():
 
 
 def test_least_squares_without_further_progress_reports_convergence():
-    """Use a ripple finer than any step: the loss stops falling long before the residuals settle."""
+    """Use a ripple finer than any step, so that the loss stops falling before the residuals do."""
 
     def rippled(static, gains, arguments):
         return jnp.concatenate([gains - 2.0, 1e-3 * jnp.sin(1e6 * gains)], axis=1)

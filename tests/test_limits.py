@@ -1,4 +1,4 @@
-"""Velocity and acceleration limits of the command: respected, without overshoot, inert where not binding."""
+"""Velocity and acceleration limits of the command: respected, without overshoot, no effect if not reached."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ def follow(targets, velocity_limit, acceleration_limit):
 
 
 def limited(targets, velocity_limit=np.inf, acceleration_limit=np.inf):
-    """Return `follow` with the start in front."""
+    """Return `follow` with the initial position in front."""
     limits = np.array([velocity_limit, acceleration_limit], np.asarray(targets).dtype)
     return np.concatenate([targets[:1], np.asarray(follow(jnp.asarray(targets), *limits))])
 
@@ -57,7 +57,7 @@ def test_command_velocity_and_acceleration_limits_hold_for_any_motion(speeds):
 
 
 def gap(distance, speed=0.0):
-    """Return the command's lag behind a target that jumps ahead by `distance` and goes on at its speed."""
+    """Return the distance of the command from a target that jumps by `distance` at constant speed."""
     targets = moves(np.full(800, speed))
     targets[2:] += distance
     return (targets - limited(targets, VELOCITY_LIMIT, ACCELERATION_LIMIT)) * np.sign(distance)
@@ -83,7 +83,7 @@ def test_limited_command_does_not_overshoot_displaced_target(distance, speed):
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.integers(1, 30), st.floats(0, 1))
 def test_limited_command_reaches_displaced_target_in_fewest_periods(count, spare):
-    """Take steps of q, 2 q, ..., q, 2 count - 1 of them: no fewer steps go as far as count^2 q."""
+    """Steps of q, 2 q, ..., q: at least 2 count - 1 steps are needed for count^2 q."""
     change = ACCELERATION_LIMIT * PERIOD**2
     distance = (count**2 - spare * (2 * count - 2 if count > 1 else 1)) * change
     targets = np.r_[0.0, 0.0, np.full(200, distance)]
@@ -94,9 +94,9 @@ def test_limited_command_reaches_displaced_target_in_fewest_periods(count, spare
 
 @pytest.mark.parametrize("limit", [1.0, 0.1])
 def test_limited_command_stops_in_the_minimum_time(limit):
-    """Compare with a jump by x, which takes at least 2 sqrt(x/a).
+    """A displacement x takes at least 2 sqrt(x/a).
 
-    To 0.99 x it takes a tenth of sqrt(2 x/a) less; times are whole periods.
+    Reaching 0.99 x takes a tenth of sqrt(2 x/a) less; times are whole periods.
     """
     distance = 1e-4
     commands = limited(np.r_[0.0, 0.0, np.full(600, distance)], acceleration_limit=limit)
@@ -123,7 +123,7 @@ def test_command_limits_that_are_not_reached_leave_commands_bit_identical(offset
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("origin", [0.0, 0.05])
 def test_command_limit_that_is_just_reached_does_not_change_the_command(origin, dtype):
-    """Move uniformly at the drives' largest speed, through 0 and far from it."""
+    """Move uniformly at the speed limit."""
     speed, period = np.array(VELOCITY_LIMIT, dtype), np.array(PERIOD, dtype)
     targets = np.full(400, origin - 0.004, dtype)
     for n in range(1, len(targets)):
@@ -142,7 +142,7 @@ def test_limited_command_equals_target_to_the_bit_after_reaching_the_target(dist
 
 @pytest.mark.parametrize("limits", [(0.0053, np.inf), (np.inf, 0.06), (0.0053, 0.06)])
 def test_command_limits_hold_over_a_whole_contact(limits):
-    """Use the ideal simulator without delay: its position is the command."""
+    """Use the ideal simulator without delay, whose position is the command."""
     names = ("velocity_limit", "acceleration_limit")
     simulator = {"model": "ideal"} | {n: x for n, x in zip(names, limits, strict=True) if np.isfinite(x)}
     batch = cases.build_batch({"": Case(mechanism({"law": "linear"}, simulator, 0.012, period=PERIOD))})
@@ -155,7 +155,7 @@ def test_command_limits_hold_over_a_whole_contact(limits):
     steps = np.diff(commands[going])
     assert np.abs(steps).max() <= limits[0] * PERIOD * (1 + 1e-9)
     assert np.abs(np.diff(steps)).max() <= limits[1] * PERIOD**2 * (1 + 1e-9)
-    # The limits bind in this contact: the model is faster than the drives.
+    # The limits are reached in this contact: the model is faster than the drives.
     assert metrics.status[0, 0] == OK
     # Count from the first touch to the tick at which the contact ends and is no longer active.
     begin, end = np.argmax(np.asarray(ticks.plant_signals.force)[:, 0] != 0), np.argmin(going)

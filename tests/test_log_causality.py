@@ -1,4 +1,4 @@
-"""Tick of the readings in a row of a log, estimated from noise; rigs of an independent simulator."""
+"""Tick of the readings in a log row, estimated from noise; logs of an independent simulator."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ SPEEDS = (0.003, 0.006, 0.012) * 2
 
 
 def logged(run, ahead):
-    """Return the run in rows whose readings are `ahead` of those of one tick."""
+    """Return the run in rows whose readings are from `ahead` ticks later."""
     end = len(run.tick) - 1
     command = slice(1, None) if ahead > 0 else slice(0, end)
     reading = slice(1, None) if ahead < 0 else slice(0, end)
@@ -56,7 +56,7 @@ def test_sensor_noise_reveals_the_tick_of_readings_in_a_log_row(kind):
 
 
 def test_tick_of_log_readings_is_estimated_if_rig_moves_before_and_after_contact():
-    """Add a thousand rows on either side in which commands follow a path and forces are noise."""
+    """Add a thousand rows before and after, with moving commands and noisy forces."""
     runs, _ = runs_of("noisy", -1)
     rng, path = np.random.default_rng(0), 1e-3 * np.cos(np.linspace(0.0, 3.0, 1000))
     for at, run in enumerate(runs):
@@ -69,7 +69,7 @@ def test_tick_of_log_readings_is_estimated_if_rig_moves_before_and_after_contact
 
 
 def test_force_command_of_explicit_integrator_acts_one_tick_later():
-    """Move by the velocity before the force: commands are those of a controller that takes a tick."""
+    """The position uses the velocity before the force, as if the controller needed a tick."""
     runs, timing = runs_of("noisy", -1)
     speeds = [np.diff(run.position_desired, append=np.nan) / 1e-3 for run in runs]
     moved = [replace(run, velocity_desired=v) for run, v in zip(runs, speeds, strict=True)]

@@ -1,4 +1,4 @@
-"""Wrongly described channels of a log, detected by the numerical model's own motion."""
+"""Wrong descriptions of log channels, detected by the motion of the numerical model."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def message(path, kind="contact", **said):
 
 
 def model(integrator, row, sign=1):
-    """Return commands of a model under a given force, and the rows in which a logger writes them."""
+    """Return commands of a model under a given force, and the rows in which a logger writes the commands."""
     times = PERIOD * np.arange(900)
     force = 40 * np.sin(np.pi * times / 0.25) ** 2 * ((times > 0.1) & (times < 0.6))
     x, v, result = -5e-3, 0.02, []
@@ -140,7 +140,7 @@ def test_log_commands_and_forces_sampled_at_another_rate_are_detected(tmp_path, 
 
 
 def far_side():
-    """Simulate a touch, and the flight back to another one on the far side of a clearance of 2 mm."""
+    """Simulate a contact, and the flight to a contact on the far side of a clearance of 2 mm."""
     log = touches(2)
     back = int(np.flatnonzero(np.diff(np.sign(log["vd"])) > 0)[0]) + 1  # the log is driven back there
     other = {name: -column for name, column in log.items() if name != "t"}
@@ -151,7 +151,7 @@ def far_side():
 
 @pytest.mark.parametrize("gone", [(), ("velocity_desired", "force_command")])
 def test_log_contacts_on_the_far_side_of_a_clearance_are_refused(tmp_path, gone):
-    """Cover forces that were taken for ones in a wrong unit, or ended in an internal error."""
+    """Their forces must not be mistaken for forces in a wrong unit."""
     log, back = far_side()
     path = write_csv(tmp_path / "a.csv", log)
     with pytest.raises(InputError, match=r"row \d+: found a contact at the second surface") as caught:
@@ -162,6 +162,5 @@ def test_log_contacts_on_the_far_side_of_a_clearance_are_refused(tmp_path, gone)
 
 @pytest.mark.parametrize("rows", range(150, 180))
 def test_log_that_ends_soon_after_a_pulling_force_is_accepted(rows):
-    """Cover a search for the speed after the pull that went beyond the last row."""
     pull = np.where((np.arange(rows) > 100) & (np.arange(rows) < 140), -1.0, 0.0)
     checks._check_one_side("a.csv", pull, np.linspace(0.0, 1e-3, rows), PERIOD, MASS)

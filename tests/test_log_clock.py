@@ -10,7 +10,7 @@ PERIOD = 1e-3
 
 
 def stamps(rows=20_000, jitter=0.0, drift=0.0, lost=(), seed=0):
-    """Return stamps of the remaining ticks, and these ticks."""
+    """Return time stamps of the remaining ticks, and these ticks."""
     tick = np.setdiff1d(np.arange(rows), np.asarray(lost, int))
     error = jitter * np.random.default_rng(seed).standard_normal(len(tick))
     return 12.3 + PERIOD * (1 + drift) * tick + np.clip(error, -0.45 * PERIOD, 0.45 * PERIOD), tick
@@ -55,7 +55,8 @@ def test_unusable_time_stamps_are_refused():
         (slower[:2900], "row 1537: time: found rows 0.002 s apart, expected 0.001 s throughout"),
         (np.where(np.arange(3000) == 9, times[3], times), "row 10: time: found 12.303 s after 12.308 s"),
         (stamps(3000, jitter=4e-4)[0], "time: found"),
-        # Stay within a tenth of the period, where phases of row groups could be taken for their neighbours'.
+        # Jitter stays within a tenth of the period, so that phases of neighbouring row groups cannot be
+        # confused.
         (0.98 * times, "time: found rows 0.00098 s apart, expected the control period, 0.001 s"),
     ]
     for given, reason in cases:

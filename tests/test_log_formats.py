@@ -1,4 +1,4 @@
-"""Logs in other tools' formats: each is written by the format's own library and read like text."""
+"""Log formats of other tools, written by each format's own library and read like text files."""
 
 import numpy as np
 import pytest
@@ -105,7 +105,7 @@ FORMATS = [
 ]
 
 
-@pytest.mark.filterwarnings("ignore")  # those of other libraries
+@pytest.mark.filterwarnings("ignore")  # warnings of other libraries
 @pytest.mark.parametrize(("name", "write"), FORMATS)
 def test_all_log_formats_give_the_same_campaign(tmp_path, name, write):
     if write is mat_5:
@@ -137,7 +137,7 @@ def test_truncated_log_or_missing_library_is_refused_in_one_line(tmp_path, suffi
 
 
 def bag_of_topics(path, log, late):
-    """Write a bag whose force is a topic of its own, with its first message some ticks later."""
+    """Write a bag whose force has a separate topic, with its first message some ticks later."""
     pytest.importorskip("rosbags")
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -207,7 +207,7 @@ OWN_CLOCKS = [
 @pytest.mark.parametrize(("name", "write"), OWN_CLOCKS)
 @pytest.mark.parametrize("late", [0.005, -0.007])
 def test_log_channels_that_begin_at_different_times_are_aligned(tmp_path, name, write, late):
-    """Expect the force of the command's tick, whatever row it is written in."""
+    """Each command has the force of the same tick."""
     path, columns = write(tmp_path / name, LOG, late)
     result = read(path, **columns)
     (run,) = result.runs

@@ -1,4 +1,4 @@
-"""Draft mappings: each reads the logs that it was drafted from, whatever their columns are called."""
+"""Drafted mapping files: each reads the logs of its draft, for any column names."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Logs that were cut, torn, mistyped or shuffled: read as finite numbers or refused in one line."""
+"""Truncated, corrupted or shuffled logs: read as finite numbers or refused in one line."""
 
 import tempfile
 from contextlib import suppress

@@ -1,4 +1,4 @@
-"""Channels with clocks of their own: joined to the rows of the desired position, or refused by name."""
+"""Channels with separate clocks: aligned with the rows of the desired position, or refused by name."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ PERIOD, ROWS = 1e-3, 2000
 
 
 def smooth(times):
-    """Return a signal that is known at any time."""
+    """Return a smooth signal at the given times."""
     return np.sin(2 * np.pi * 2.3 * times) + 0.3 * np.cos(2 * np.pi * 7.1 * times + 1.0)
 
 
@@ -22,7 +22,7 @@ def scattered(times, jitter, seed=0):
 
 
 def joined(sampled, stamps=None, ticks=None, jitter=0.0):
-    """Return the rows' ticks, joined readings and notes; `sampled` are the times of the readings [s]."""
+    """Return row ticks, aligned readings and notes; `sampled` are the times of the readings [s]."""
     ticks = np.arange(ROWS) if ticks is None else ticks
     rows = scattered(PERIOD * ticks, jitter, 1)
     columns = {"position_desired": ticks.astype(float), "position_measured": smooth(sampled)}
@@ -124,7 +124,7 @@ def test_log_channel_that_holds_its_value_is_not_interpolated():
 
 
 def separate(late, rows=580):
-    """Write a log whose force has its own stamps and its own number of rows."""
+    """Write a log whose force has separate time stamps and another number of rows."""
     log = touches(1)
     force = {"tF": 1e3 * (log["t"][:rows] + late), "F": log["F"][:rows]}
     return log, {"tx": 1e3 * log["t"], **{name: log[name] for name in ("xd", "xm", "vd", "Fc")}}, force

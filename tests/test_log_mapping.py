@@ -1,4 +1,4 @@
-"""Mapping files of logs: allowed content, and messages about everything else."""
+"""Mapping files of logs: allowed content, and error messages."""
 
 import copy
 

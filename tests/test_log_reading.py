@@ -1,4 +1,4 @@
-"""Logs as files: text dialects and Parquet give the same campaign; an error is one line."""
+"""Log files: text dialects and Parquet give the same campaign; one-line errors."""
 
 import hashlib
 from pathlib import Path
@@ -39,7 +39,7 @@ def test_log_is_read_as_it_was_written(tmp_path):
     for run in result.runs:
         assert run.valid.all() and run.time_stamp_error < 1e-12
         assert run.speed == pytest.approx(5e-3, rel=1e-3)
-        # Cut midway between the contacts.
+        # The log is divided midway between the contacts.
         touched = np.flatnonzero(run.force_command)
         assert 100 < touched[0] and touched[-1] < len(run.tick) - 100
     assert result.equivalent_mass == MASS and result.timing.control_period == PERIOD

@@ -1,4 +1,4 @@
-"""Lost rows: commands are restored as the model made them, sensor readings are not invented; cuts."""
+"""Lost rows: commands are restored by the model, sensor readings are not; division into runs."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Scales of forces, positions and velocities by the model's momentum; rounded, torn and late logs."""
+"""Scales of forces, positions and velocities, checked by the momentum of the model."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def lose(log, share, seed=0):
 
 
 def scatter(log, std, seed=1, samples=False):
-    """Scatter the stamps, and sample at the scattered times."""
+    """Add jitter to the time stamps, optionally with samples at the jittered times."""
     late = np.clip(std * np.random.default_rng(seed).standard_normal(len(log["t"])), -4e-4, 4e-4)
     times = log["t"] + late
     if samples:
@@ -144,7 +144,7 @@ def test_undetermined_tick_of_log_readings_is_reported(tmp_path):
 
 
 def test_compensator_damping_and_dead_zone_are_not_mistaken_for_wrong_unit(tmp_path):
-    """Allow for the impulse that the compensator adds and the dead zone takes."""
+    """Allow for the impulse of the compensator and of the dead zone."""
     log = touches(1, speed=12e-3, noise=0.0)
     dead = log | {"F": np.sign(log["F"]) * np.maximum(np.abs(log["F"]) - 45.0, 0.0)}
     impulse = np.sum(dead["F"]) / np.sum(log["F"])
@@ -153,7 +153,7 @@ def test_compensator_damping_and_dead_zone_are_not_mistaken_for_wrong_unit(tmp_p
     assert "times the impulse" in refused(tmp_path, scaled(dead, F=1 / LBF), **NO_COMMAND)
 
 
-# Where rounding dominates differences over few rows, these alone favour the wrong row convention.
+# If rounding dominates differences over few rows, these alone favour the wrong row convention.
 @example(factor=1.0, quantum=1e-8, noise=0.0, lost=0.1, seed=1)
 @settings(deadline=None, max_examples=25)
 @given(

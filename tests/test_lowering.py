@@ -43,7 +43,7 @@ def case(name, compensator):
 
 
 def batch(name, compensator):
-    """Return the external calls of a batch on all devices."""
+    """Return the external calls of a rollout batch on all devices."""
     model, loop, gains, scenarios = case(name, compensator)
     return calls(lambda *parts: run_tiles((model, loop), *parts), *model.shard(scenarios, gains))
 
@@ -64,7 +64,7 @@ def test_rollout_batch_lowers_for_cuda_without_external_calls():
 
 
 def test_tuning_program_lowers_for_cuda(monkeypatch):
-    """Lower the whole solver; the card's own Cholesky decomposition computes its steps."""
+    """Steps of the solver use the CUDA Cholesky decomposition."""
     programs = []
     monkeypatch.setattr(cached_programs, "compile_cached", lambda *program, options: programs.append(program))
     compile_solver([build_task(load_any("varying").mechanism, "phase_lead", 4, 0)], starts=1)
@@ -90,7 +90,7 @@ def test_every_compensator_and_derivatives_lower_for_cuda(name, compensator):
 @pytest.mark.slow
 @pytest.mark.parametrize("compensator", SIX_AXIS_COMPENSATORS)
 def test_six_axis_rollout_and_derivatives_lower_for_cuda(compensator):
-    """Solve six equations in six unknowns by the card's own routine."""
+    """Six linear equations are solved by a CUDA routine."""
     assert batch("probe-drogue", compensator) <= LINEAR_EQUATIONS
     assert jacobian("probe-drogue", compensator) <= LINEAR_EQUATIONS
 
@@ -105,7 +105,7 @@ def test_cpu_compiler_options_are_passed_only_to_cpu_compiler(monkeypatch):
     ("plugin", "platforms", "given"), ((None, "", True), ("there", "", False), ("there", "cpu", True))
 )
 def test_reduced_optimisation_flag_is_set_only_if_jax_uses_cpus_alone(monkeypatch, plugin, platforms, given):
-    """Cover a jax plugin, as a graphics card needs one, that jax is not told to leave out."""
+    """An installed jax plugin may provide a graphics card, unless JAX_PLATFORMS excludes it."""
     monkeypatch.setattr(jax_environment, "find_spec", {"jax_plugins": plugin}.get)
     monkeypatch.setenv("JAX_PLATFORMS", platforms)
     assert (LEVEL in build_xla_flags("")) == given

@@ -1,4 +1,4 @@
-"""Stability maps: theory, growth in contact against long simulations, margins and refusals."""
+"""Stability maps: theory, growth rate compared with long simulations, margins and refusals."""
 
 import cmath
 import json
@@ -41,7 +41,7 @@ RIGS = {
 
 
 def simulated_growth(run, period):
-    """Return ln|z|/T of the slowest mode z^n of x_d in contact, after all faster modes have died out."""
+    """Return ln|z|/T of the slowest mode z^n of x_d in contact, after all faster modes have decayed."""
     position = run.position_desired
     begin, step = round(1.5 / period), round(0.7 / period)
     end = np.flatnonzero(position > 0)[-1] - round(0.2 / period)
@@ -74,7 +74,7 @@ def test_stability_map_derivatives_by_gains_match_finite_differences():
         for side in (-2, -1, 1, 2):
             moved = compute_growth(mechanism, "phase_lead", gains | {name: value + side * step}, scenarios)
             at[side] = moved.spectral_radius
-        # The error is of fourth order in the step; a smaller step would leave no digits of an eigenvalue.
+        # The error is of fourth order in the step; a smaller step would be dominated by rounding.
         difference = (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * step)
         assert slopes[name] == pytest.approx(difference, rel=1e-5)
 
@@ -102,7 +102,7 @@ def test_stability_map_growth_rate_agrees_with_closed_forms():
 
 
 def solved_root(phase):
-    """Return Newton's root of s^2 + e^(-s phase) = 0 near j."""
+    """Return the root of s^2 + e^(-s phase) = 0 near j by Newton's method."""
     root = 1j
     for _ in range(50):
         grown = cmath.exp(-root * phase)
@@ -130,7 +130,7 @@ def test_stability_map_of_uncompensated_contact_agrees_with_theory(ideal):
 
 
 def growing(found, restitution):
-    """Return the spectral radius of a contact that grows over half an oscillation as its restitution says."""
+    """Return the spectral radius that corresponds to the restitution over half an oscillation."""
     stiffness, delay = np.meshgrid(found.x, found.y)
     frequency = np.sqrt(stiffness / 350.0)
     roots = np.vectorize(solved_root)(frequency * delay)
@@ -176,7 +176,7 @@ def test_stability_map_refuses_unusable_arguments(jaxhil, tmp_path, axes, said):
 
 @pytest.mark.slow
 def test_stability_map_reaches_theoretical_limits_at_small_control_periods():
-    """Compare the contours of items 1 and 2 and the growth limit of item 5, each to 1e-3."""
+    """Compare with model.md, items 1, 2 and 5, to 1e-3."""
     axes = "contact.stiffness=5e4:2e5", "rig.force_sensor.delay=0.0005:0.008"
     for period, allowed in ((4e-4, 1e-3), (1e-4, 1e-4)):
         result = tuning.map(jaxhil.load("varying", IDEAL | {"rig.control_period": period}), *axes, points=12)

@@ -1,4 +1,4 @@
-"""Keys of a mechanism, one by one: values, defaults, refusals and their messages."""
+"""Mechanism keys: values, defaults, refusals and their messages."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Mechanism files: built-ins, unreadable files, round trips and the meaning of each key."""
+"""Mechanism files: built-in mechanisms, unreadable files, round trips and key descriptions."""
 
 import hashlib
 import json
@@ -147,7 +147,6 @@ def test_mechanism_file_without_read_permission_is_refused(written):
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cut=st.integers(0, len(TEXT) - 1))
 def test_truncated_mechanism_file_is_refused_unless_still_complete(written, cut):
-    """Cut the file anywhere: it is refused in one line, or the rest is a whole mechanism."""
     path = written(TEXT[:cut])
     try:
         mechanism = load(path).mechanism
@@ -196,7 +195,7 @@ def test_every_mechanism_key_has_a_description_and_every_number_a_unit():
                 yield from keys(field.type, f"{path}{field.name}.")
 
     def texts(kind):
-        """Yield meanings and units anywhere in a type."""
+        """Yield all descriptions and units in a type."""
         if isinstance(kind, UnionType):
             return [text for member in kind.types for text in texts(member)]
         if not isinstance(kind, Metadata):

@@ -1,4 +1,4 @@
-"""Rules across a mechanism's keys: laws, models, the start of a run, transfer functions."""
+"""Rules that involve several mechanism keys: laws, models, start of a run, transfer functions."""
 
 import math
 
@@ -197,7 +197,7 @@ def test_contact_plane_beyond_starting_position_is_refused(side):
     ],
 )
 def test_unusable_transfer_function_is_refused_by_key(numerator, denominator, key):
-    # A gap would have to be wider than the lag of some of these, so the contact is one-sided.
+    # The contact has a single surface, because some of these lags exceed any gap.
     changes = {**TRANSFER_FUNCTION, "contact.clearance": ...}
     changes |= {"rig.simulator.numerator": numerator, "rig.simulator.denominator": denominator}
     raw = changed(changes)
@@ -218,7 +218,7 @@ def test_hurwitz_criterion_agrees_with_roots(pairs, reals):
     roots = [*pairs, *np.conj(pairs), *reals]
     rightmost = max((root.real for root in map(complex, roots)), default=-1.0)
     polynomial = np.real(np.poly(roots)) if roots else np.ones(1)
-    # Rounding of the coefficients moves roots that are next to the axis across it.
+    # Rounding of the coefficients may move roots across the imaginary axis.
     if abs(rightmost) > 1e-2:
         assert is_hurwitz(polynomial.tolist()) == (rightmost < 0.0)
         assert is_hurwitz((-polynomial).tolist()) == (rightmost < 0.0)

@@ -1,4 +1,4 @@
-"""New mechanism files, their JSON Schema, and the key descriptions that both are made of."""
+"""New mechanism files, their JSON Schema, and the key descriptions used for both."""
 
 import functools
 import re
@@ -50,7 +50,7 @@ def test_new_mechanism_file_is_equivalent_to_its_source(name, written):
 
 
 def test_new_mechanism_file_has_every_key_at_its_default(written):
-    """Remove the comment signs: what a comment states as the default is the default."""
+    """Uncommenting a default in the file changes nothing."""
     text = format_mechanism_file(load("rig-300kg").mechanism)
     defaults = {
         f"{table.path}.{key.name}".lstrip("."): key.default

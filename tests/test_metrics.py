@@ -1,7 +1,7 @@
-"""Excess variation of the command: sequences with known swings, through the onset and end of a contact.
+"""Excess variation of the command for sequences with known swings, including onset and end of a contact.
 
-The mechanism touches, with a given command at every tick; what is recorded of it is compared with the sum
-over the sequence by hand. Runs of the loop are compared with the oracle in test_rollout.
+The mechanism is in contact with a given command at every tick, and the recorded value is compared with an
+explicit sum. Simulated contacts are compared with the oracle in test_rollout.
 """
 
 from functools import partial
@@ -27,13 +27,13 @@ BEFORE, AFTER = 5, 40  # ticks without force
 
 @partial(jax.jit, compiler_options=QUICK)
 def excess(commands, touching):
-    """Return the excess variation [N] of commands (ticks,), while the mechanism touches or not."""
+    """Return the excess variation [N] of commands (ticks,), with or without contact."""
     rules = build_end_conditions(SCENARIO)
     zeros = jnp.zeros(1)
 
     def tick(watch, now):
         command, touches = now
-        # The model turns round at once, so that the quiet after it ends the contact.
+        # The model reverses immediately, so that the subsequent rest ends the contact.
         signals = Signals(zeros, zeros, zeros - 1, zeros, jnp.zeros(1, jnp.int32))
         plant_signals = PlantSignals(jnp.where(touches, 10.0, 0.0)[None], None, None, None)
         return record_contact(LOOP, rules, watch, signals, plant_signals, command[None], None), None
@@ -45,7 +45,7 @@ def excess(commands, touching):
 
 
 def recorded(commands, after=()):
-    """Return the excess variation of a contact with these commands; others come `after` it has ended."""
+    """Return the excess variation of a contact with these commands; `after` holds commands after its end."""
     quiet = np.zeros(AFTER)
     late = AFTER - len(after)
     quiet[late:] = after
@@ -93,7 +93,7 @@ def test_excess_variation_ignores_commands_after_the_contact():
 
 
 def test_excess_variation_counts_return_of_the_last_command_to_zero():
-    """Leave half of the undershoot when the waiting time ends."""
+    """Half of the undershoot remains at the end of the wait."""
     commands = np.concatenate([HUMP, np.full(120, -10.0)])
     touching = np.zeros(400, bool)
     touching[BEFORE : BEFORE + len(HUMP)] = True
@@ -118,7 +118,7 @@ def test_excess_variation_derivatives_equal_those_of_explicit_sum():
 
 
 def test_commands_of_compensators_without_identification_have_no_excess_variation():
-    """Count the undershoot of a phase lead as part of its one swing."""
+    """The undershoot of a phase lead belongs to its only swing."""
     for compensator, gains in (("none", {}), ("phase_lead", nominal_gains(PARSED, "phase_lead"))):
         recorded = first_contact(PARSED, spread(PARSED, 1), compensator, gains, chatter=True)
         assert recorded["excess_variation"] == pytest.approx(0, abs=1e-11 * recorded["peak_command"][0])

@@ -1,4 +1,4 @@
-"""Missed alarms: counted on runs with an injected fault, scaled until the error is just too large."""
+"""Missed alarms, counted on runs with an injected fault that makes the error just too large."""
 
 import math
 
@@ -51,7 +51,7 @@ def fault(rates, name):
 
 
 def test_injected_delay_that_reaches_error_limit_matches_theory(rates):
-    """Use e = exp(pi omega tau/2) of a force delayed by tau; the error is LIMIT to BAND times LIMIT."""
+    """For a force delay tau, e = exp(pi omega tau/2); errors are LIMIT to BAND times LIMIT."""
     mechanism = load("claw-350kg", EXACT).mechanism
     omega = math.sqrt(mechanism.contact.stiffness[0] / mechanism.bodies.mass)
     for name in ("force_delay", "simulator_delay"):

@@ -1,4 +1,4 @@
-"""Monitor: contacts of an independent rig against a mechanism file, exact without noise, else calibrated."""
+"""Monitor: contacts of an independent simulator compared with a mechanism file."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ STATED = {
 
 
 def file_of(kind, stated=None):
-    """Write a mechanism file that knows the rig of that kind."""
+    """Write a mechanism file with the true values of this kind of rig."""
     bodies = {"equivalent_mass": kind.mass}
     document = {"schema": "jaxhil/mechanism/1", "name": "known", "bodies": bodies, "rig": kind.rig}
     document |= {"approach": {"velocity": 0.006}, "contact": kind.contact}
@@ -53,7 +53,7 @@ def contacts(kind, seed=0, speeds=SPEEDS, name="monitored"):
 
 
 def changed(kind, **sections):
-    """Return the kind with other numbers in some tables of its rig."""
+    """Return the kind with changed numbers in its rig."""
     return replace(kind, rig=kind.rig | {one: kind.rig[one] | table for one, table in sections.items()})
 
 
@@ -64,7 +64,7 @@ RARER = ("clean", "third_order", "resonance", "hertz", "layered")
 
 @pytest.mark.parametrize("name", (*EVERY, *(pytest.param(one, marks=pytest.mark.slow) for one in RARER)))
 def test_monitor_reports_no_deviation_for_exact_file_without_noise(name):
-    """Use a file whose laws, lags, latencies and holds are those of the independent rig."""
+    """Laws, lags, latencies and holds equal those of the simulator."""
     kind = quiet(campaigns.KINDS[name])
     stated = {k: v for k, v in STATED.items() if k == "rig.force_sensor.delay"}
     result = monitor_contacts(contacts(kind, speeds=(0.006, 0.012, 0.006)), file_of(kind, stated))
@@ -116,7 +116,7 @@ def test_monitor_detects_and_names_a_changed_parameter(what):
 
 
 def test_monitor_state_is_watch_if_change_lies_within_stated_uncertainty():
-    """Change a value within a wide range after contacts that showed where in the range the rig is."""
+    """Earlier contacts have narrowed a wide range; then a value changes within this range."""
     wide = STATED | {"contact.stiffness": {"distribution": "uniform", "factor": [0.8, 1.2]}}
     before = contacts(CLEAN, seed=4, speeds=SPEEDS)
     after = contacts(replace(CLEAN, contact=campaign_kinds.voigt((1.3e5,))), seed=5, speeds=SPEEDS[:2])
@@ -149,7 +149,7 @@ def test_monitor_uses_correlations_stated_in_mechanism_file():
 
 
 def written(folder, campaign):
-    """Write the contacts as `simulate --log` does, a file each."""
+    """Write the contacts as `simulate --log` does, one file each."""
     folder.mkdir()
     columns = ("position_desired", "position_measured", "force_measured", "velocity_desired", "force_command")
     for number, run in enumerate(campaign.runs):

@@ -1,7 +1,7 @@
-"""Error rates and detection times of the monitor, on files identified from other contacts.
+"""False alarm rates and detection times of the monitor, with files identified from other contacts.
 
-All of it is slow; `test_monitor.py` has a sample for every day. Print the figures with
-`pytest -m slow -s tests/test_monitor_campaigns.py`.
+All tests are slow; `test_monitor.py` has a daily sample. `pytest -m slow -s tests/test_monitor_campaigns.py`
+prints the results.
 """
 
 from dataclasses import replace
@@ -37,7 +37,7 @@ def contacts(name, seed, speeds):
 
 
 def delayed(seed, speeds, growth):
-    """Return contacts during which the force delay grows [s]."""
+    """Return contacts during which the force delay increases [s]."""
     runs = []
     for i, speed in enumerate(speeds):
         delay = CLEAN.rig["force_sensor"]["delay"] + growth * i / (len(speeds) - 1)
@@ -64,7 +64,7 @@ def test_monitor_raises_no_alarm_in_500_contacts_of_an_unchanged_rig(files):
 
 @pytest.mark.parametrize("number", (15, 60))
 def test_monitor_detects_drifts_early(files, number):
-    """Let the stiffness grow by 15 %, or the force delay by 0.6 ms, over so many contacts."""
+    """Increase the stiffness by 15 %, or the force delay by 0.6 ms, over several contacts."""
     result = {"stiffness [%]": [], "force delay [ms]": []}
     for seed, mechanism in enumerate(files):
         speeds = np.repeat(SPEEDS, 5) if number == 15 else np.random.default_rng(seed).choice(SPEEDS, number)

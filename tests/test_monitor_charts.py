@@ -1,4 +1,4 @@
-"""Control charts of the monitor: the change point by hand, false alarms and detection times."""
+"""Control charts of the monitor: change point, false alarms and detection times."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_monitor_change_point_equals_calculation_by_hand():
 
 
 def alarms(mean, lanes, contacts, rng):
-    """Return each lane's contact of the first alarm of one metric, by likelihood ratio and by both charts."""
+    """Return the contact of the first alarm in each lane, by likelihood ratio and by both other charts."""
     sums, up, down, average = np.zeros((CHANGE_WINDOW, lanes)), *np.zeros((3, lanes))
     first = np.full((2, lanes), contacts)
     for i in range(contacts):
@@ -53,7 +53,6 @@ def alarms(mean, lanes, contacts, rng):
 
 
 def test_first_monitor_alarm_equals_that_of_control_charts():
-    """Compare the ratios that are counted here with those of `detect_changes`."""
     z = np.random.default_rng(2).standard_normal((40, 3)) + np.array([0.0, 1.5, -4.0])
     for figure in range(3):
         first = next((i for i in range(40) if detect_changes(z[: i + 1])[0][figure] > ALARM_THRESHOLD), 40)

@@ -1,4 +1,4 @@
-"""Nominal run tick by tick: laws side by side, and the ideal contact."""
+"""Nominal motion tick by tick: several compensators, and the ideal contact."""
 
 import math
 

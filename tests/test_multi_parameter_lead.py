@@ -1,4 +1,4 @@
-"""Multi-parameter lead: pole placement against the characteristic equation, and the law in the loop."""
+"""Multi-parameter lead: pole placement by the characteristic equation, and the simulated loop."""
 
 import itertools
 from math import log, pi
@@ -53,7 +53,7 @@ def test_pole_placement_refuses_nonpositive_and_nonfinite_arguments(bad):
 
 
 def placed(phases):
-    """Return gains for every desired restitution at each omega tau, one lane each, and those omega tau."""
+    """Return gains for every desired restitution and omega tau, one lane each, and omega tau."""
     phase, desired = grid(phases, DESIRED)
     gain, rate = np.transpose(
         [pole_placement(OMEGA, p / OMEGA, e) for p, e in zip(phase, desired, strict=True)]

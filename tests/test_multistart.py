@@ -1,4 +1,4 @@
-"""Best gains of many tasks: scans, batches of starts until several agree, polishing of the best."""
+"""Best gains of many tasks: scans, batches of starts until several agree, and the polishing search."""
 
 import dataclasses
 
@@ -39,7 +39,7 @@ def value(validation, index, start, objective=RMS_OBJECTIVE):
 
 @pytest.mark.slow
 def test_every_tuning_task_is_solved_with_its_own_objective(tasks, validation):
-    """Compare the starts and ends of tasks together with those of each task alone."""
+    """Compare joint results with those of separate tasks."""
     several = [Objective(divergence_weight=weight) for weight in (1.0, 4.0, 16.0)]
     chosen = choose_starts(validation, 3, 0, several)
     polished = polish_best_starts(validation, solve_tasks(tasks, chosen, 2, several), 32, 0, several)
@@ -80,7 +80,7 @@ def test_scan_with_part_of_scenarios_chooses_same_points_as_full_scan(seed, monk
 
 @pytest.mark.slow
 def test_best_optimisation_result_is_refined_by_polishing_search(tasks, validation):
-    """Stop the solver far too early, so that none is at its minimum; if all fail, none is polished."""
+    """Stop the solver early, so that no start reaches its minimum; failed starts are not refined."""
     early = solve_tasks(tasks, choose_starts(validation, 3, 0), 1)
     early[1] = [start._replace(rms=np.nan) for start in early[1]]
     polished = polish_best_starts(validation, early, 128, seed=0)
@@ -98,7 +98,7 @@ def test_best_optimisation_result_is_refined_by_polishing_search(tasks, validati
 
 
 def test_further_batches_of_starts_run_until_several_optima_agree(tasks, validation, monkeypatch):
-    """Let one task's starts never agree, whatever they end at, and the others' at once."""
+    """The starts of one task never agree, those of the others agree immediately."""
     asked = []
 
     def solve(tasks, starts, steps, objective, work):
@@ -140,7 +140,6 @@ def test_single_start_uses_literature_gains_and_polishing_search(tasks, validati
 
 
 def test_callback_runs_once_while_the_solver_compiles(validation, monkeypatch):
-    """Expect it once, before the first round."""
     done = []
     monkeypatch.setattr(multistart, "solve_tasks", lambda *_: done.append("round") or [[], [], []])
     monkeypatch.setattr(multistart, "compile_solver", lambda *_: None)
@@ -151,7 +150,7 @@ def test_callback_runs_once_while_the_solver_compiles(validation, monkeypatch):
 
 @pytest.mark.slow
 def test_best_start_is_selected_by_true_objective_instead_of_surrogate_norm(tasks, validation):
-    """Let the solver lower a norm in place of the mean of the worst contacts; that mean counts."""
+    """The solver minimises a norm; the objective is the mean of the worst contacts."""
     objective = Objective("cvar")
     for index, one in enumerate(find_gains(validation, searched(3, 4, 16, objective))):
         assert one.best is not None
@@ -172,7 +171,7 @@ def test_failed_tuning_task_does_not_affect_best_gains_of_other_tasks(tasks, val
 
 
 class Kinked:
-    """Task whose objective has a kink along an edge; it replaces that of a validation."""
+    """Validation whose objective has a kink along an edge."""
 
     def losses(self, objective, which, points):
         x, y = points[..., 0], points[..., 1]

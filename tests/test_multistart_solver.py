@@ -1,4 +1,4 @@
-"""Many problems in one program: same optima as alone, hopeless starts dropped, failures isolated."""
+"""Many problems in one program: same optima as separately, weak starts dropped, failures isolated."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def tasks():
 
 
 def spread(tasks, number=STARTS):
-    """The literature's gains and points around them."""
+    """Return the literature's gains and points around these gains."""
     names = list_tuned_gains(tasks)
     starts = []
     for task in tasks:
@@ -76,7 +76,7 @@ def test_failed_task_does_not_change_results_of_other_tasks(tasks, solved):
 
 
 def test_solver_reduces_the_requested_objective(tasks):
-    """Weigh a squared divergence 16 times, so that less diverges; both objectives in one call."""
+    """A weight of 16 on squared divergence reduces the divergence."""
     objectives = [RMS_OBJECTIVE, Objective(divergence_weight=16.0)]
     plain, cautious = (
         min(starts, key=lambda start: start.rms)
@@ -100,7 +100,6 @@ def test_global_search_uses_the_objective_of_the_solver(tasks, solved, validatio
 
 
 def test_global_search_evaluates_every_task_with_its_own_objective(tasks, validation):
-    """Compare the values, starts and ends of tasks together with those of each task alone."""
     several = [Objective(divergence_weight=4.0), Objective(noise_weight=0.01), Objective(noise_weight=0.1)]
     points = np.random.default_rng(0).random((2, 5, 2))
     together = validation.losses(several, [2, 0], points)
@@ -120,6 +119,6 @@ def restitution_errors_of(task, gains):
 
 
 def test_tasks_with_long_simulations_are_spread_evenly_over_devices():
-    """Divide the slots of a call into one contiguous part for each of the two devices."""
+    """Each device gets a contiguous part of the slots of a call."""
     np.testing.assert_array_equal(multistart_solver.assign_to_devices(8), [0, 2, 4, 6, 1, 3, 5, 7])
     np.testing.assert_array_equal(multistart_solver.assign_to_devices(3), [0, 1, 2])

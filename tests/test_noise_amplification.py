@@ -1,4 +1,4 @@
-"""Noise amplification: of a law's filter, and of a loop in contact."""
+"""Noise amplification of a compensator's filter and of a loop in contact."""
 
 from functools import partial
 
@@ -58,7 +58,7 @@ LEAD_ALONE = {"response_error": 0.0, "response_error_damping": 0.0}
 
 
 def noisy_contact(velocity, damping=0.0, bodies=None, lanes=LANES, ticks=TICKS, **values):
-    """Return gains of response_error, and F_c and the real force [N] of a noisy contact, (ticks, lanes)."""
+    """Return gains of response_error, and F_c and true force [N] of a noisy contact, (ticks, lanes)."""
     contact, sensor = {"damping": [damping]}, {"noise_std": DEVIATION}
     raw = mechanism(contact, period=1e-3, velocity=velocity, force_sensor=sensor)
     parsed = validated(raw | ({"bodies": bodies} if bodies else {}))
@@ -70,9 +70,9 @@ def noisy_contact(velocity, damping=0.0, bodies=None, lanes=LANES, ticks=TICKS, 
 
 
 def steady_contact(**values):
-    """Return gains, and the deviation of F_c from its straight line [N], (ticks, lanes).
+    """Return gains, and the deviation of F_c from a straight line [N], (ticks, lanes).
 
-    A heavy body hardly moves during seconds of contact under a slowly rising force.
+    A heavy body hardly moves during a contact of some seconds under a slowly rising force.
     """
     gains, command, force = noisy_contact(1e-3, bodies={"equivalent_mass": 1e9}, **values)
     assert force[500:].min() > 3 * DEVIATION
@@ -94,7 +94,7 @@ def test_noise_amplification_matches_simulated_loop_in_steady_contact():
 
 
 def test_identification_increases_noise_amplification_early_in_contact():
-    """Expect more for a larger initial covariance, and in the first tenth of a contact only.
+    """The increase depends on the initial covariance and ends after a tenth of the contact.
 
     A force above the contact threshold is hardly ever noise.
     """

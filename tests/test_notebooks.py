@@ -1,6 +1,6 @@
-"""Notebooks: each runs from top to bottom on a copy, and is committed clean, with its outputs.
+"""Notebooks: each runs without errors on a copy, and is committed with the outputs of one run.
 
-They run with `-m slow`, as `.ci/run` does; what is committed is checked every day.
+Notebooks run with `-m slow`, as in `.ci/run`; committed outputs are checked every day.
 """
 
 import os
@@ -18,7 +18,7 @@ LARGEST = 500_000  # bytes
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
 SOLVER = re.compile(r"\btune\(")
 IMPORTED = re.compile(r"^(?:import|from)\s+([\w.]+)", re.M)
-# Besides the public interface: the rig's controller, and intervals of many sweeps at once.
+# In addition to the public interface: the rig's controller, and vectorised intervals.
 ALSO_PUBLIC = {"jaxhil.rig", "tuning.statistics.intervals"}
 MACHINE_PATH = re.compile(r"(?:/(?:home|root|tmp|work|Users|usr|opt)/|[A-Z]:\\\\)[\w.-]")
 
@@ -59,8 +59,7 @@ def test_every_notebook_cell_runs_without_error(path, tmp_path, monkeypatch):
         words, numbers = _printed(before)
         new_words, new_numbers = _printed(after)
         assert new_words == words, "execute it again"
-        # The result of a solver depends on the last bits, and so does all that follows; simulated numbers
-        # do not.
+        # Results of a solver depend on the last bits, and so do all numbers after the solver's first result.
         solved = solved or SOLVER.search(before.source) is not None
         assert solved or new_numbers == pytest.approx(numbers, rel=2e-3), "execute it again"
 

@@ -1,6 +1,6 @@
-"""Numerical model in six degrees of freedom: closed forms of free tops, momentum, relative mass.
+"""Six-axis numerical model: closed forms of free tops, momentum, relative mass.
 
-One program follows two bodies under given wrenches; its lanes are the cases.
+One program simulates two bodies under given wrenches; its lanes are the cases.
 """
 
 import jax
@@ -154,7 +154,7 @@ def test_free_top_converges_to_jacobis_solution_at_second_order(run):
 
 
 def test_attitude_of_axisymmetric_top_matches_closed_form(run):
-    """Expect it to turn about its spin momentum at |pi|/J_1, and about its own axis at (1 - J_3/J_1) w_3."""
+    """Precession at |pi|/J_1 about the angular momentum, spin at (1 - J_3/J_1) w_3."""
     first = Rotation.from_quat(run["attitude"][0].T)
     time = 250 * PERIOD
     spin = first.apply(SYMMETRIC * SPUN)
@@ -181,7 +181,6 @@ def test_momentum_is_conserved_under_any_wrench(run):
 
 @pytest.mark.slow
 def test_six_axis_integrators_agree_with_one_axis_along_and_about_an_axis():
-    """Apply a force along a principal axis and a torque about it, under each of the three."""
     pushes = SEEDED.normal(size=40) * 20
 
     @jax.jit
@@ -225,7 +224,7 @@ def push_from_rest(pair, states, wrench, point, normal):
 
 @pytest.mark.slow
 def test_acceleration_under_contact_wrench_matches_relative_mass():
-    """Start from rest, in a very short period; in half of the lanes, push along a normal."""
+    """Start at rest with a very short period; half of the lanes push along a normal."""
     pair, states = begin()
     states = States(*(state._replace(velocity=0 * state.velocity, spin=0 * state.spin) for state in states))
     wrench, point, normal = (SEEDED.normal(size=(size, LANES)) for size in (6, 3, 3))
@@ -249,6 +248,6 @@ def test_acceleration_under_contact_wrench_matches_relative_mass():
             np.testing.assert_allclose(along @ gained, 1 / effective, rtol=1e-7)
         mobility = np.linalg.inv(mass)
         np.testing.assert_allclose(along @ mobility @ along, 1 / effective, rtol=1e-9)
-        # If its tangential motion is held, a contact meets more mass.
+        # If tangential motion is prevented, the effective mass is larger.
         held = np.linalg.inv(at_point @ mobility @ at_point.T)
         assert normal[:, lane] @ held @ normal[:, lane] > 1.001 * effective

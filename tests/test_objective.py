@@ -1,4 +1,4 @@
-"""Objectives: residuals against a plain recomputation, derivatives, failures; noise from the gains."""
+"""Objectives: residuals compared with direct computation, derivatives, failures, noise amplification."""
 
 from dataclasses import replace
 from functools import partial
@@ -47,7 +47,7 @@ def of_name(name):
 
 
 def build_batch(overrides=()):
-    """Return (loop, scenarios, rigs); the scenario `SHORT` fails under all gains."""
+    """Return (loop, scenarios, rigs); the scenario `SHORT` fails for all gains."""
     parsed = load("varying", overrides).mechanism
     scenarios = build_scenarios(parsed, draw(parsed, SCENARIOS, 5), 5)
     limit = np.where(np.arange(SCENARIOS) == SHORT, 0.05, scenarios.time_limit)
@@ -142,7 +142,6 @@ def test_residual_sum_of_squares_equals_or_slightly_exceeds_objective(outcomes, 
 
 
 def test_every_problem_of_a_batch_uses_its_own_objective_weights(batch):
-    """Compare each with its residuals in a program where all have the same weights."""
     several = [STATED, replace(STATED, noise_weight=0.02, limit=0.7), Objective("rms", 5.0, 10.0, 0.1, 1.0)]
     together = run(batch, objective=several)[0]
     for i, objective in enumerate(several):
@@ -160,7 +159,7 @@ def test_objective_terms_with_weight_zero_are_ignored():
 
 
 def test_objective_weights_are_scaled_by_the_error_limit():
-    """Check that a weight w of a metric X costs the error at most sqrt(J_0^2 - X_0^2) = w limit X_0."""
+    """A weight w of a metric X costs an error of at most sqrt(J_0^2 - X_0^2) = w limit X_0."""
     errors, excesses, swings = np.array([0.01, -0.02]), np.array([0.3, 0.5]), np.array([0.7, 0.1])
     for limit in (0.003, 0.01, 0.2):
         for name, value in (("command", excesses), ("chatter", swings), ("noise", np.array([2.5]))):
@@ -187,7 +186,7 @@ def test_errors_within_tolerance_hardly_affect_objective(tolerance):
     expected = np.sqrt(counted**2 + (0.01 * 0.2 * 0.4) ** 2 + (0.01 * 0.1 * 2.0) ** 2)
     assert evaluate_objective(objective, errors, excesses, 3.0) == pytest.approx(expected, rel=1e-13)
     assert sum_of_squares(objective, errors, excesses, 3.0) == pytest.approx(expected**2, rel=1e-12)
-    # Along the errors themselves the derivative is the size, which grows in proportion.
+    # The derivative along the errors themselves equals their rms, which is homogeneous.
     _, slopes = alone(objective, errors, excesses, 3.0, (), (errors, (), (), 0.0))
     values, _ = alone(objective, errors, excesses, 3.0)
     grown = counted if counted <= TOLERATED_ERROR_FACTOR * size or tolerance == 0 else size
@@ -239,10 +238,7 @@ def test_objective_derivatives_match_central_differences(batch, known):
 
 
 def test_sensor_noise_in_objective_is_the_same_for_all_gains(known):
-    """Use the same noise at every call.
-
-    If gains change a little, the residuals change a little: derivatives need that.
-    """
+    """Every call uses the same noise, so that residuals are differentiable by gains."""
     noisy = build_batch(["rig.force_sensor.noise_std=2.667", "rig.position_sensor.noise_std=1e-6"])
     value, jacobian = run(noisy)
     assert np.all(np.max(np.abs(value - known[0]), axis=1) > 0.3)
@@ -276,7 +272,7 @@ def test_failed_contacts_increase_objective_with_zero_derivative(batch, known):
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def weighed(static, weights, terms, tangents):
-    """Return one problem's residuals and derivative; (errors, excesses, chatter, wanted, amplification)."""
+    """Return residuals and derivative of one problem from its errors, excesses, variation and noise."""
     *contacts, wanted, noise = terms
 
     def value(error, excess, chatter, noise):
@@ -291,7 +287,7 @@ def padded(contacts):
 
 
 def alone(objective, errors, excesses=(), noise=1.0, chatter=(), tangents=((), (), (), 0.0)):
-    """Return one problem's residuals with these contacts, in more slots than needed, with derivative."""
+    """Return residuals and derivative of one problem with these contacts in more slots than needed."""
     wanted = np.arange(SLOTS) < len(errors)
     terms = padded(errors), padded(excesses), padded(chatter), wanted, np.asarray(noise)
     tangents = *map(padded, tangents[:-1]), np.asarray(tangents[-1])
@@ -309,7 +305,7 @@ def test_cvar_objective_is_mean_of_worst_5_percent(number, tail):
     errors[::2] *= -1
     expected = np.mean(np.arange(number - tail + 1, number + 1)) / number
     assert evaluate_objective(Objective("cvar"), errors) == pytest.approx(expected, rel=1e-14)
-    # The solver sees an upper bound: the root of the mean of powers.
+    # The solver minimises an upper bound: the root of the mean of powers.
     bound = (np.sum(np.abs(errors) ** NORM_POWERS["cvar"]) / tail) ** (1 / NORM_POWERS["cvar"])
     np.testing.assert_allclose(sum_of_squares(Objective("cvar"), errors), bound**2, rtol=1e-13)
     assert expected <= bound

@@ -1,4 +1,4 @@
-"""Options stated once: the command line, the function and the range check all read them."""
+"""Options defined once and used by the command line, the function and the range check."""
 
 import dataclasses
 import inspect
@@ -28,7 +28,7 @@ COMMANDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class ToyOptions(TuneOptions):
-    """Options with one additional option, which is stated here and nowhere else."""
+    """Options with one additional option, which is defined only here."""
 
     toys: Annotated[int, number_option("Toys to play with."), AllowedValues(1, 3)] = 2
 

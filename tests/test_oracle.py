@@ -1,4 +1,4 @@
-"""The oracle against closed forms and a brute-force solve_ivp of the whole hybrid system."""
+"""Oracle compared with closed forms and with a brute-force integration of the hybrid system."""
 
 from itertools import pairwise
 from math import atan2, exp, factorial, pi, sqrt
@@ -15,7 +15,7 @@ MASS, VELOCITY = 350.0, 0.005
 
 
 class PhaseLead:
-    """(1 + T1 s)/(1 + T2 s) by Tustin at period T; states start at 0."""
+    """Compensator (1 + T1 s)/(1 + T2 s), discretised by Tustin at period T, with states starting at 0."""
 
     def __init__(self, T1, T2, T):
         self.lead, self.lag = 2.0 * T1 / T, 2.0 * T2 / T

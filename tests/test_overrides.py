@@ -1,4 +1,4 @@
-"""`--set` and `--unset`: changes of a mechanism file's values on the command line, and refusals."""
+"""`--set` and `--unset`: changes of mechanism values on the command line, and refusals."""
 
 import math
 
@@ -188,7 +188,6 @@ def test_any_override_is_applied_or_refused_in_one_line(text):
 
 @pytest.mark.parametrize("path", [*numeric_keys()])
 def test_every_numeric_key_can_be_overridden_or_error_names_the_key(path):
-    """Set PATH=1 for every key: the value is accepted, or the message is about that very path."""
     try:
         mechanism = load("varying", [f"{path}=1"]).mechanism
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Protection of files: commands replace what they wrote, and no other file, link or pipe."""
+"""Protection of files: commands replace only files that they have written, and no links or pipes."""
 
 import json
 import os
@@ -14,7 +14,7 @@ COMPARE = ("compare", "rig-300kg", "--untuned", "--compensators", "none", "--sce
 
 @pytest.fixture
 def thesis(tmp_path):
-    """A folder of the user's."""
+    """Return a folder with files of the user."""
     folder = tmp_path / "thesis"
     folder.mkdir()
     for name in (".thesis.docx.tmp", ".thesis.docx.1.tmp", "errors.png", "loss.png", ".lock"):
@@ -24,7 +24,7 @@ def thesis(tmp_path):
 
 @pytest.fixture
 def untouched(thesis):
-    """Check that everything below the folder is unchanged at the end."""
+    """Check at the end that all files below the folder are unchanged."""
 
     def everything():
         files = sorted(thesis.rglob("*"))
@@ -163,7 +163,7 @@ def test_gains_of_different_mechanism_with_same_name_are_replaced_with_warning(j
     ids=" ".join,
 )
 def test_input_from_a_pipe_or_device_is_refused(jaxhil, tmp_path, monkeypatch, command, kind):
-    """Avoid waiting for a pipe, and reading a device without end."""
+    """Reading would block on a pipe and never end on a device."""
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "input.csv"
     if kind == "pipe":

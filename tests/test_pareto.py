@@ -1,6 +1,6 @@
-"""Trade-off of accuracy against noise: weights, undominated points, one program.
+"""Pareto front of accuracy and noise amplification: weights, undominated points, one program.
 
-Every metric is compared with an evaluation of its own.
+Every metric is compared with a separate evaluation.
 """
 
 import dataclasses
@@ -55,7 +55,7 @@ def results():
 
 @pytest.fixture(scope="module")
 def made(results):
-    """Return fronts, and the number of programs needed to solve them."""
+    """Return Pareto fronts, and the number of compiled programs."""
     cached_programs._programs.clear()
     every = dict(compute_fronts(results, POINTS))
     count = sum(key[0].__name__ == "_solve_call" for key in cached_programs._programs)
@@ -141,10 +141,10 @@ def test_metrics_of_every_pareto_point_equal_those_of_an_evaluation(results, mad
 
 @pytest.mark.slow
 def test_each_pareto_point_is_best_for_its_own_noise_weight(results, made):
-    """Compare on the training scenarios.
+    """Compare points on the training scenarios.
 
-    No point beats another at its own weight, nor do the gains that were tuned before. So the heavier the
-    weight, the quieter and the less accurate the gains.
+    No other point and no earlier gains are better under a point's own weight, so larger weights give less
+    noise and larger errors.
     """
     for mechanism, front in zip(MECHANISMS, made[0], strict=True):
         task = build_task(mechanism, "phase_lead", SETTINGS.scenarios, SETTINGS.seed)
@@ -156,7 +156,7 @@ def test_each_pareto_point_is_best_for_its_own_noise_weight(results, made):
                 evaluate_objective(objective, error, None, other.cost)
                 for error, other in zip(errors, every, strict=True)
             ]
-            # As exact as a start's own record: its last step is not in its history.
+            # The last step of a start is not in its history, so its value is compared exactly.
             assert evaluate_objective(objective, own, None, point.cost) <= min(values) * (1 + 2e-4)
         weights = [point.weight for point in front.points]
         assert weights[0] == 0 and weights == sorted(weights) and len(weights) == POINTS

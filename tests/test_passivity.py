@@ -1,4 +1,4 @@
-"""Passivity: the contact never returns more energy than it has taken, whatever the readings."""
+"""Passivity controller: the contact never returns more energy than it has received, for any readings."""
 
 import math
 from fractions import Fraction
@@ -30,7 +30,7 @@ EPSILON = 2.0**-52
 
 
 def check(forces, velocities, period):
-    """Check in exact arithmetic that the energy taken by the contact is below 0 by rounding alone."""
+    """Check in exact arithmetic that the energy received by the contact is negative only by rounding."""
     law = ON_THE_RIG["passivity"]({}, period, math.inf)
     energy, moved, least, corrected = Fraction(0), Fraction(0), Fraction(0), 0
     for force, velocity in zip(forces, velocities, strict=True):
@@ -75,7 +75,7 @@ def test_passivity_observer_resets_energy_that_overflows():
 
 
 def test_virtual_damping_of_passivity_controller_returns_energy_to_zero():
-    """Use alpha = -E/(T v^2) of the source, where E includes this tick's F."""
+    """alpha = -E/(T v^2), where E includes the F of this tick."""
     law = ON_THE_RIG["passivity"]({}, 1e-3, math.inf)
     assert law.step(100.0, 0.0, 0.005, 0.0) == 100.0
     energy = 1e-3 * 100.0 * 0.005 + 1e-3 * 150.0 * -0.004
@@ -93,7 +93,7 @@ def test_passivity_energy_is_reset_at_next_contact_but_not_at_other_surface():
 
 @pytest.mark.parametrize("damping", [0.0, 300.0])
 def test_passivity_controller_limits_restitution_of_delayed_contact(damping):
-    """Allow for what the observation of the energy at the ticks leaves: (T F_c)^2/(2 M) a tick."""
+    """Observing the energy only at ticks leaves an excess of (T F_c)^2/(2 M) per tick."""
     parsed = validated(mechanism({"damping": [damping]}, IDEAL))
     delay = np.array([0.001, 0.004, 0.01, 0.02])
     scenario = spread(parsed, len(delay), force_sensor__delay=delay)
@@ -105,5 +105,5 @@ def test_passivity_controller_limits_restitution_of_delayed_contact(damping):
     print(without, result, most)
     assert np.all(without[1:] > 1.02) and np.all(result[1:] > 0.95)
     assert np.all(result <= most + 1e-9) and np.all(result <= without + 1e-12)
-    # An arc of the undelayed contact leaves 1 + pi omega T/4, a delayed one is longer and higher.
+    # The undelayed contact leaves 1 + pi omega T/4; a delayed contact is longer and has a larger force.
     assert np.all(most - 1 < 2 * math.pi * math.sqrt(STIFFNESS / MASS) * PERIOD / 4)

@@ -1,4 +1,4 @@
-"""Rig plant in plain floats: against the oracle, jax's loop and closed forms."""
+"""Rig plant in plain Python floats, compared with the oracle, the JAX simulation and closed forms."""
 
 import math
 import time

@@ -1,4 +1,4 @@
-"""Plausibility of a mechanism file: its summary, its warnings, and runs refused before they begin."""
+"""Plausibility of a mechanism file: summary, warnings, and refused runs."""
 
 import math
 
@@ -110,7 +110,7 @@ def test_summary_frequency_of_damped_spring_equals_undamped_frequency():
     for tension in (False, True):
         [contact] = summarise_mechanism(rig(damped, contact__tension=tension)).contacts
         assert contact.frequency == pytest.approx(math.sqrt(STIFFNESS / MASS) / (2 * math.pi))
-        # It is overdamped and is pulled back as well: the bodies never part.
+        # This contact is overdamped with tension, so the bodies never separate.
         assert math.isinf(contact.duration) == tension
 
 
@@ -292,7 +292,7 @@ def test_motion_simulator_too_fast_for_control_period_is_refused(simulator):
 
 @pytest.mark.parametrize("angle", [0.0, 0.6, np.pi / 2])
 def test_fastest_accepted_simulator_poles_are_propagated_exactly(angle):
-    """Use two poles of the magnitude 64 / T, at some angle to the negative axis."""
+    """Use two poles of magnitude 64 / T at an angle to the negative axis."""
     damping = 2 * MAX_POLE * math.cos(angle)
     matrix = np.array([[0.0, MAX_POLE], [-MAX_POLE, -damping]])
     whole = np.zeros((4, 4))

@@ -29,7 +29,7 @@ LANES = 40
 
 
 def result(error_size=(0.5, 0.05, 0.005)):
-    """Return a result as tuning gives it, with errors drawn from a seed."""
+    """Return a tuning result with random errors."""
     mechanism = load("varying").mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, LANES, 1), 1)
     generator = np.random.default_rng(0)
@@ -120,7 +120,7 @@ def test_best_optimisation_start_is_highlighted_in_the_plot():
 
 
 def front(places=((0.01, 3.0), (0.01, 3.0), (0.02, 2.0), (0.03, 2.5), (0.04, 1.1))):
-    """Return points at (error, amplification), the fourth dominated by the third."""
+    """Return points at (error, amplification); the third dominates the fourth."""
     made = result()
 
     def point(error, noise, on_front):
@@ -140,7 +140,7 @@ def test_pareto_plot_has_units_point_numbers_and_literature_gains():
     assert labels(axes) == [
         *("front", "dominated by another point", "literature's rule", "tuned", "limit 0.015"),
     ]
-    # Points with the same result share a place.
+    # Points with the same result share a position.
     assert {text.get_text(): text.xy for text in axes.texts} == {
         **{"1, 2": (3.0, 0.01), "3": (2.0, 0.02), "4": (2.5, 0.03), "5": (1.1, 0.04)},
     }
@@ -221,7 +221,7 @@ DRAWING = [
 
 @pytest.mark.parametrize("path", DRAWING, ids=lambda path: "/".join(path.parts[-2:]))
 def test_all_plots_use_the_same_colours_and_have_units(path):
-    """Expect colours of `plot_contacts` or greys; axes have a unit, unless they count."""
+    """Only the colours of `plot_contacts` and greys occur; only counts have no unit."""
     counted = ("", "solver step", "contact")
     for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         for keyword in call.keywords if isinstance(call, ast.Call) else ():

@@ -1,4 +1,4 @@
-"""Position commands continue from the drives' position, whatever comes: in Python and, bit for bit, in C."""
+"""Position commands start and continue at the drives' position, in Python and, bit for bit, in C."""
 
 import math
 
@@ -45,7 +45,7 @@ POSITION, ANSWER, TRIPPED = (RESULT.index(name) for name in ("position", "answer
 
 
 def in_both(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
-    """Return the results of the rows in Python; with a compiler, check that C has the same."""
+    """Return the results of the rows in Python, after checking that C agrees if a compiler is installed."""
     results = controller_in_python(gain_file, rows)
     if c99_cases.COMPILER is not None:
         made = c99_cases.loaded(gain_file.compensator)
@@ -55,7 +55,7 @@ def in_both(gain_file: GainFile, rows: np.ndarray) -> np.ndarray:
 
 
 def rows_of(*rows: dict[str, float]) -> np.ndarray:
-    """Return ticks at rest, one period after the other, with the given exceptions."""
+    """Return rows of successive ticks at rest, with the given exceptions."""
     made = np.zeros((len(rows), len(ROW)))
     for n, row in enumerate(rows):
         for name, value in {"time": n * PERIOD, "timed": 1.0, **row}.items():
@@ -64,7 +64,7 @@ def rows_of(*rows: dict[str, float]) -> np.ndarray:
 
 
 class Reference:
-    """Reference from the rows alone: the place at which a run may begin, and the allowed distance from it."""
+    """Allowed starting position and allowed distance from it, computed from the rows alone."""
 
     def __init__(self, gain_file: GainFile) -> None:
         self.limits, self.clearance = gain_file.limits, gain_file.clearance
@@ -88,7 +88,7 @@ class Reference:
             far += limits["start_distance"]
         assert math.isfinite(command)
         if where is None:
-            # The drives' position is unknown, so the command is out of contact.
+            # The drive position is unknown, so the command must be out of contact.
             assert abs(deflection(command, self.clearance)) <= most or limits["command_lowest"] > 0.0
         else:
             assert abs(command - where) <= far * (1 + 1e-9) + 1e-14 * abs(where)
@@ -103,7 +103,7 @@ class Reference:
             event, tripped = row[0], bool(result[TRIPPED])
             if event == COMMAND_FIRST:
                 self.check(result[ANSWER], row[7], tripped)
-            # An audit that trips when the next contact is announced leaves the run as it was.
+            # An audit that trips when the next contact is announced does not change the current run.
             audited = int(result[RESULT.index("cause")]) & (RESTITUTION | ENERGY_BALANCE)
             if event == NEXT_CONTACT and not before and not audited:
                 self.last, self.fresh = None, False
@@ -179,14 +179,14 @@ def plain(law: str = "none", **limits: float) -> GainFile:
 @pytest.mark.parametrize("model", [5e-3, 0.02, 1e300, -0.5])
 @pytest.mark.parametrize("drives", [-5e-3, -5e-4, 0.02, 5e-4])
 def test_first_position_command_does_not_jump_for_model_of_wrong_sign(drives, model, before):
-    """Give the model the wrong sign: it trips at once, or moves there within the velocity limit."""
+    """The controller trips at once, or moves within the velocity limit."""
     wrong = {"desired": model, "measured": drives, "x": model}
     sent = in_both(plain(), rows_of(*before, {**wrong, "event": NEXT_CONTACT}, *[wrong] * 400))[len(before) :]
     commands = sent[:, POSITION]
     assert abs(commands[0] - drives) <= STEP * (1 + 1e-9)
     assert np.all(np.abs(np.diff(commands)) <= STEP * (1 + 1e-9))
     if not LIMITED["command_lowest"] <= model <= LIMITED["command_highest"]:
-        # After a trip the command is out of contact, and never at the deepest place that is allowed.
+        # After a trip the command is out of contact, and never at the deepest allowed position.
         assert np.all(sent[:, TRIPPED]) and np.all(np.diff(commands) <= 0.0)
         assert (
             int(sent[0, RESULT.index("cause")]) & STROKE or not LIMITED["measured_lowest"] <= drives <= 0.01
@@ -204,7 +204,7 @@ def test_nonfinite_first_model_position_holds_the_drive_position(bad, drives):
 
 @pytest.mark.parametrize(("drives", "way", "rest"), [(0.02, -1.0, -5e-4), (-0.046, 1.0, -0.0295)])
 def test_retreat_from_position_outside_the_stroke_has_no_jump(drives, way, rest):
-    """Begin beyond either end, and beyond either surface of a gap of 30 mm."""
+    """Start beyond either end, and beyond either surface of a gap of 30 mm."""
     gain_file = plain()._replace(clearance=0.03)
     results = in_both(gain_file, rows_of(*[{"measured": drives, "x": math.nan}] * 4000))
     commands = results[:, POSITION]
@@ -216,7 +216,7 @@ def test_retreat_from_position_outside_the_stroke_has_no_jump(drives, way, rest)
 def test_next_run_begins_at_current_drive_position():
     """Announce the run.
 
-    Before its first reading the model says where it begins, but only out of contact.
+    Before the first reading of the run, the model position is used if it is out of contact.
     """
     controller = limited()
     for model, expected in ((-0.03, -0.03), (5e-4, -0.01 + STEP), (0.02, -0.01)):
@@ -228,7 +228,7 @@ def test_next_run_begins_at_current_drive_position():
 
 
 def test_nonfinite_first_position_reading_trips_immediately():
-    """Expect this whatever may be bridged later: there is no good reading to continue with."""
+    """There is no earlier good reading to continue with."""
     rows = rows_of({"measured": math.nan, "desired": -5e-3, "x": -5e-3}, {"measured": -0.02})
     results = in_both(plain(), rows)
     assert int(results[0, RESULT.index("cause")]) == POSITION_NOT_FINITE
@@ -245,14 +245,14 @@ def test_emergency_stop_before_the_first_command_holds_the_drives():
     [(-5e-3, -5e-3), (-5e-4, -5e-4), (5e-4, -5e-4), (math.nan, -5e-4), (1e300, -5e-4), (-1e300, -0.04)],
 )
 def test_command_before_the_first_reading_is_never_in_contact(model, expected):
-    """Follow the model while the drives' position is unknown, but not into a contact."""
+    """The command follows the model out of contact while the drive position is unknown."""
     results = in_both(plain(), rows_of({"event": COMMAND_FIRST, "x": model, "measured": -5e-3}))
     assert results[0, ANSWER] == pytest.approx(expected, abs=STEP * (1 + 1e-9))
 
 
 @pytest.mark.parametrize("law", LAWS)
 def test_run_with_delayed_drives_starts_without_a_jump(law):
-    """Expect the law's own first command, without a fault, within `start_distance` and out of contact."""
+    """The first command is that of the compensator, without a fault, within `start_distance`."""
     start = {"desired": -4e-4, "velocity": 5e-3, "measured": -5e-4, "x": -3.95e-4, "v": 5e-3}
     gain_file = plain(law, start_distance=5e-4)
     result = in_both(gain_file, rows_of(start))[0]
@@ -276,7 +276,7 @@ def test_run_that_starts_away_from_drive_position_catches_up_within_velocity_lim
 
 
 def test_command_after_reset_continues_from_last_command():
-    """Begin the run at the drives' reading if they have been moved meanwhile."""
+    """If the drives have been moved meanwhile, the run begins at their reading."""
     here, there = {"desired": -0.01, "measured": -0.01, "x": -0.01}, {"measured": -0.03, "desired": -0.03}
     moved = {**there, "x": -0.03}
     rows = rows_of(here, {**here, "x": math.nan}, {**moved, "event": RESET}, {**moved, "event": NEXT_CONTACT})

@@ -1,4 +1,4 @@
-"""Position lead: the simulator's exact inverse removes its lag; the record is the sent command."""
+"""Position lead: the simulator's exact inverse removes its lag; recorded commands are those sent."""
 
 import functools
 from math import pi
@@ -46,7 +46,7 @@ DELAY = 0.005
 def restitutions():
     """Return mean restitutions over the contact phase, (3, periods).
 
-    The rows are the exact inverse, no lead, and the inverse with a force delay.
+    The rows are: exact inverse, no lead, and exact inverse with a force delay.
     """
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, EXACT, 0.0, period=PERIODS[-1]))
     gains = nominal_gains(parsed, "position_lead")
@@ -62,7 +62,7 @@ def restitutions():
 
 def test_exact_inverse_position_lead_leaves_error_of_first_order_in_control_period():
     error, without, _ = restitutions() - 1
-    # Behind the simulator alone the contact diverges, whatever the period.
+    # Without position lead the contact diverges for any period.
     assert np.all(without > 0.5)
     # v and a are half a period late: the error halves with the period.
     assert error[-1] < 2e-3 * without[-1]
@@ -147,7 +147,7 @@ def test_recorded_position_command_is_the_value_before_simulator_limits():
     expected = x + loaded.gains["position_lead"] * v + loaded.gains["acceleration_lead"] * acceleration
     assert lane.sent is not None and np.sum(~same_run) == 1
     np.testing.assert_allclose(np.asarray(lane.sent)[:-1][same_run], expected[same_run], rtol=0, atol=1e-15)
-    # It is not the model's position: it is ahead of it on the way in.
+    # The sent command leads the model's position during the approach.
     assert np.max(np.abs(np.asarray(lane.sent)[:-1] - x)[same_run]) > 0.02 * VELOCITY
 
 

@@ -1,4 +1,4 @@
-"""Probe: a push on the hardware against its closed form, and what the probe leaves unchanged."""
+"""Probe push on the hardware: closed form, and unchanged results without a push."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,19 +37,19 @@ def test_sensor_without_lag_reads_the_probe_push():
 
 
 def run(parsed, *push, **table):
-    """Return metrics of a run with a push of so many newtons at 0.06 s of the contact."""
+    """Return metrics of a run with a push of the given force [N] at 0.06 s of the contact."""
     probed = with_push(build_scenarios(parsed), *push, **table)
     return run_rollout(build_loop(parsed, "none", probed), nominal_gains(parsed, "none"), probed)
 
 
 def recorded(parsed, scenarios):
-    """Return metrics of a run whose approach is simulated, probed or not."""
+    """Return metrics of a run with simulated approach, with or without a probe."""
     loop = build_loop(parsed, "none", scenarios)
     return run_record(loop, nominal_gains(parsed, "none"), scenarios, 400)[0]
 
 
 def with_push(scenarios, size=0.0, share=0.25, depth=None, span=0.1):
-    """Return scenarios probed with a push of so many newtons at this share of 0.16 s."""
+    """Return scenarios with a push of the given force [N] at this share of 0.16 s."""
     shape = scenarios.phase.shape
     full = np.full(shape, 1.0)
     push = Push(size * full, share * 0.16 * full, 0.02 * full)

@@ -1,4 +1,4 @@
-"""Progress of long work without a terminal: work done, rate and remaining time, at intervals."""
+"""Progress messages of long computations without a terminal: completed work, rate and remaining time."""
 
 import re
 import time
@@ -10,7 +10,7 @@ from tuning import terminal
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Clock whose seconds pass as the test says."""
+    """Return a clock whose time is set by the test."""
     now = [1000.0]
     monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
     return now

@@ -1,4 +1,4 @@
-"""Quantiles of |error|: intervals that cover for any distribution, from values or from bins."""
+"""Quantiles of |error|: intervals with stated coverage for any distribution, from values or from bins."""
 
 import numpy as np
 import pytest
@@ -19,12 +19,12 @@ from tuning.statistics.quantiles import (
 @pytest.mark.parametrize("number", (1, 20, 300, 5000))
 @pytest.mark.parametrize("order", (0.05, 0.5, 0.95, 0.999))
 def test_quantile_interval_ranks_have_stated_coverage(number, order):
-    """Use P(X_(low) <= quantile <= X_(high)) = P(low <= B < high) of a binomial B, exactly."""
+    """P(X_(low) <= quantile <= X_(high)) = P(low <= B < high) for a binomial B."""
     low, high = compute_order_ranks(number, order)
     law = stats.binom(number, order)
     below, above = law.cdf(low - 1), law.sf(high - 1)
     assert below <= 0.025 and above <= 0.025
-    # No further rank could be left out.
+    # The next smaller interval would not have the coverage.
     assert law.cdf(low) >= 0.025 and law.sf(high - 2) >= 0.025
     wider = compute_order_ranks(number, order, sequential=True)
     assert wider[0] <= low and wider[1] >= high
@@ -43,7 +43,7 @@ def test_sequential_quantile_ranks_have_coverage_at_all_sample_sizes_together():
 
 @pytest.mark.parametrize("order", (0.5, 0.95, 0.99))
 def test_quantile_intervals_have_stated_coverage_over_repeated_sweeps(order, capsys):
-    """Draw half-normal |error| of known quantile; use the values, and the bins of two halves."""
+    """Draw half-normal |error|; use the values, and the bins of two halves."""
     truth = stats.halfnorm.ppf(order)
     rng = np.random.default_rng(1)
     exact, binned, widths = [], [], []
@@ -72,7 +72,7 @@ def test_quantile_intervals_have_stated_coverage_over_repeated_sweeps(order, cap
 def test_quantile_intervals_of_replicates_have_stated_coverage(order, sampling, capsys):
     """Draw |u_1 + u_2 - 1| for 16 replicates of 64 points.
 
-    It is triangular on 0..1, with the quantile 1 - sqrt(1 - q).
+    The distribution is triangular on 0..1, with the quantile 1 - sqrt(1 - q).
     """
     truth, rng = 1 - np.sqrt(1 - order), np.random.default_rng(4)
     inside, widths = [], []
@@ -109,7 +109,7 @@ def test_quantile_of_replicates_without_results_has_no_bound():
 
 
 def test_quantile_intervals_have_stated_coverage_for_tied_values():
-    """Draw from three values only: the quantile is one of them, and both ends may be."""
+    """The values are drawn from three numbers."""
     rng = np.random.default_rng(2)
     inside = []
     for _ in range(500):

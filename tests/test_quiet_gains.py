@@ -1,4 +1,4 @@
-"""Quietest gains within a limit: against a grid of all gains, next to the least error, in one program."""
+"""Quietest gains within an error limit: comparison with a grid of gains, in one program."""
 
 import math
 from types import SimpleNamespace
@@ -47,7 +47,7 @@ def noisy(name, stiffness, delay, noise):
     return load("varying", [*changes, *sensor]).mechanism
 
 
-# For the last one no gains are within the limit.
+# For the last mechanism no gains meet the limit.
 RIGS = [("soft", 5e4, 0.004, 0.3), ("late", 2e5, 0.03, 3.0)]
 MECHANISMS = [noisy(*rig) for rig in RIGS]
 
@@ -59,7 +59,7 @@ def tuned(settings, **options):
 
 @pytest.fixture(scope="module")
 def quiet():
-    """Return the quietest gains, and the number of solver programs they took."""
+    """Return the quietest gains, and the number of compiled programs."""
     cached_programs._programs.clear()
     result = tuned(SETTINGS)
     return result, sum(key[0].__name__ == "_solve_call" for key in cached_programs._programs)
@@ -70,7 +70,7 @@ def noise_of(result, gains):
 
 
 def most_accurate(result):
-    """Return the best of the starts of least error."""
+    """Return the start with the smallest error."""
     return min(result.starts, key=lambda start: start.rms)
 
 
@@ -92,7 +92,7 @@ def test_most_accurate_gains_are_kept_if_no_gains_meet_error_limit(quiet, valida
 
 @pytest.fixture(scope="module")
 def validation():
-    """Validation on the training scenarios of all mechanisms."""
+    """Return the validation on the training scenarios of all mechanisms."""
     tasks = [build_task(one, LAW, SETTINGS.scenarios, SETTINGS.seed) for one in MECHANISMS]
     return build_validation(tasks, SETTINGS.validation, SETTINGS.seed)
 
@@ -102,7 +102,7 @@ def test_searches_for_quiet_gains_and_accurate_gains_share_one_program(quiet):
 
 
 def test_no_gains_on_a_grid_have_less_noise_within_the_error_tolerance(quiet, validation):
-    """Measure the loudness of every pair of the two gains, with the weights of this task."""
+    """Evaluate every pair of the two gains."""
     result = quiet[0][0]
     accurate = most_accurate(result).gains
     side = np.linspace(0, 1, 24)
@@ -171,7 +171,7 @@ def test_quiet_search_runs_unless_another_objective_is_requested(options, wanted
 
 
 def result_of(rms=0.005, silent=0.004, failed=0, unlike=0.0, peaks=(1.0, 1.2), gains=(0.0, 0.001)):
-    """Return a result with all that the verdict reads."""
+    """Return a tuning result with the fields that the verdict uses."""
 
     def figures_of(rms, failed=0):
         shares = {"peak_force_ratio": 1.1, "duration_ratio": (0.9, 1.2), "unlike": unlike}

@@ -1,4 +1,4 @@
-"""User-registered laws: registered, simulated and differentiated, or refused."""
+"""User-registered compensators and contact laws: registered, simulated, differentiated, or refused."""
 
 import math
 
@@ -26,7 +26,7 @@ def registered():
 
 
 def test_user_registered_compensator_is_simulated(registered):
-    """Give it the lead of the built-in phase lead, without the filter: the results differ little."""
+    """Its lead is that of the built-in phase lead without filter, so results differ little."""
     mechanism = jaxhil.load("varying", TWO)
     plain, none = jaxhil.simulate(mechanism, "scaled_lead", {"toy_lead": 0.0}), jaxhil.simulate(mechanism)
     assert [c.restitution for c in plain.contacts] == [c.restitution for c in none.contacts]
@@ -134,7 +134,7 @@ def test_unusable_law_is_not_registered(registered):
 
 
 def test_redefined_compensator_replaces_the_earlier_definition():
-    """Check that no compiled program of the first law serves the second."""
+    """Programs compiled for the first definition are not reused."""
 
     def defined(share):
         class Share(ScaledLead):

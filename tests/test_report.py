@@ -1,4 +1,4 @@
-"""Report page for a review board: refusals, names as text, and behaviour in a browser."""
+"""Report page for a review board: refusals, escaped names, and behaviour in a browser."""
 
 import html
 import json
@@ -24,7 +24,7 @@ def signed(document):
 
 
 def identified(name=HOSTILE, **others):
-    """Write what `jaxhil identify` writes, with third-party texts."""
+    """Write the result file of `jaxhil identify` with third-party texts."""
     estimate = {"key": name, "value": 1.0, "std": 0.1, "low": 0.8, "high": 1.2, "unit": name, "known": False}
     check = {"name": name, "finding": name, "where": name, "there": False, "effect": 0.001}
     document = {
@@ -36,7 +36,7 @@ def identified(name=HOSTILE, **others):
 
 
 def mapped(name=HOSTILE):
-    """Write what `jaxhil map` writes."""
+    """Write the result file of `jaxhil map`."""
     error = [[0.1, -0.02, None], [0.3, 0.0, 0.01]]
     margin = {"low": None, "high": 4.0}
     return signed({
@@ -52,7 +52,7 @@ def mapped(name=HOSTILE):
 
 
 def monitored(name=HOSTILE, **others):
-    """Write what `jaxhil monitor --json` prints."""
+    """Write the output of `jaxhil monitor --json`."""
     figures = {one: {"value": 0.01, "predicted_std": 0.02, "z": 0.5} for one in ("stiffness", "noise", name)}
     figures["bias"] = {"value": None, "predicted_std": None, "z": None}
     contacts = [{"contact": n, "log": name, "state": "good", "figures": figures} for n in range(1, 81)]
@@ -65,7 +65,7 @@ def monitored(name=HOSTILE, **others):
 
 
 def compared(name=HOSTILE):
-    """Write what `jaxhil compare` writes."""
+    """Write the result file of `jaxhil compare`."""
     figures = {name: {"rms": {"value": 0.1, "low": 0.05, "high": None}, "noise": {"value": None}}}
     return signed({
         "limit": 0.01, "seed": 0, "scenarios": 2, "judged": 4, "tuned": True,
@@ -145,7 +145,7 @@ def test_report_arguments_are_checked(jaxhil, put, tmp_path):
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """Results of a complete workflow under a third-party name: tuned, swept, compared, mapped, exported."""
+    """Results of a complete workflow with a third-party name: tuned, swept, compared, mapped, exported."""
     folder = tmp_path_factory.mktemp("results")
     mechanism = jaxhil.load("varying", {"name": HOSTILE, "rig.force_sensor.noise_std": 0.5})
     tuned = tuning.tune(mechanism, "phase_lead", scenarios=16, starts=1)
@@ -213,9 +213,9 @@ def test_report_pictures_can_be_magnified(whole, browser):
 
 @pytest.mark.slow
 def test_report_page_is_accessible(whole, browser):
-    """Expect no serious finding of axe-core.
+    """axe-core reports no serious problem.
 
-    Pictures are left out, which would take minutes; each has a name as a whole.
+    Pictures are excluded to save minutes; each has a text alternative.
     """
     package = pytest.importorskip("axe_core_python")
     axe = (Path(package.__file__).parent / "axe.min.js").read_text(encoding="utf-8")
@@ -230,7 +230,7 @@ def test_report_page_is_accessible(whole, browser):
 
 @pytest.mark.slow
 def test_printed_report_cuts_no_picture(whole, browser):
-    """Expect everything that stands on a page to fit on it, and nothing to be broken between two."""
+    """No element exceeds a page or is split between pages."""
     browser.open(whole, 1440)
     pages, faults = browser.printed(*A4)
     assert pages > 3 and faults == []

@@ -1,4 +1,4 @@
-"""`jaxhil tune` and `compare_laws` stopped at any moment: resumed, they end as without interruption."""
+"""`jaxhil tune` and `compare_laws` interrupted at any time: resumed runs give the uninterrupted result."""
 
 import json
 import math
@@ -26,7 +26,7 @@ from tuning.gains.tune_all import tune_all
 from tuning.statistics.intervals import IntervalEstimate
 
 HERE = Path(__file__).parent
-FILES = 5  # more than those that have pictures of their own
+FILES = 5  # more mechanisms than have separate plots
 TINY = ["--compensator", "phase_lead", "--scenarios", "4", "--starts", "2", "--steps", "2"]
 TINY += ["--validation", "16", "--limit", "inf", "--json"]
 SETTINGS = TuneSettings(scenarios=4, starts=2, steps=2, validation=16)
@@ -43,7 +43,7 @@ def files(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(files, tmp_path_factory):
-    """A run without interruption: its results, and the number of checkpoints written."""
+    """Return results of an uninterrupted run, and the number of checkpoints written."""
     from tuning import terminal
     from tuning.__main__ import main
 
@@ -56,7 +56,7 @@ def whole(files, tmp_path_factory):
 
 
 def outputs(said, folder):
-    """Return what a run printed and wrote, without dates, timings and output folders."""
+    """Return output and files of a run without dates, timings and output folders."""
     document = json.loads(said.replace(str(folder), "DIR"))
     for entry in document["mechanisms"]:
         entry.pop("timings")
@@ -70,7 +70,7 @@ def outputs(said, folder):
 
 
 class Writes:
-    """Interrupts at the write of checkpoint number `stop`, before it or after."""
+    """Interrupts before or after the write of checkpoint number `stop`."""
 
     def __init__(self, monkeypatch, stop=None, after=False):
         self.number, self.stop, self.after = 0, stop, after
@@ -101,7 +101,7 @@ def interrupted_and_resumed(jaxhil, files, folder, stop, after):
 @pytest.mark.slow
 def test_resumed_run_gives_result_of_uninterrupted_run(jaxhil, files, whole, tmp_path):
     expected, every = whole
-    # Rounds of the search, the search, and one result each.
+    # Checkpoints of search rounds, of the search, and one per result.
     assert every >= 2 + FILES
     for stop in (2, every):
         result, made = interrupted_and_resumed(jaxhil, files, tmp_path / str(stop), stop, after=stop > 2)
@@ -137,7 +137,7 @@ def test_checkpoints_of_other_files_and_options_are_not_used(jaxhil, files, tmp_
 
 @pytest.mark.parametrize("number", [1, pytest.param(FILES, marks=pytest.mark.slow)])
 def test_result_read_from_checkpoint_is_bit_identical(tmp_path, number):
-    """Compare all of it to the bit, including what pictures are made of."""
+    """Include the data of plots."""
     mechanisms = [load("rig-300kg", [f"name=m{i}"]).mechanism for i in range(number)]
     made = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Checkpoints(tmp_path)))
     read = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Checkpoints(tmp_path, resume=True)))
@@ -178,13 +178,13 @@ def test_pareto_front_is_checkpointed(jaxhil, tmp_path):
 
 
 class Scene(NamedTuple):
-    """Scene with only the attributes that name its purpose."""
+    """Scenario set with only the attributes that identify it."""
 
     mechanism: Mechanism
 
 
 def test_resumed_comparison_computes_only_missing_results(tmp_path, monkeypatch):
-    """Make up the metrics; group, save and read them as usual."""
+    """Metrics are made up; grouping, saving and reading are real."""
     names = ["rig-300kg", "suite-noisy", "varying"]
     mechanisms = [load(name).mechanism for name in names]
     groups = [[mechanisms[i] for i in group] for group, _ in group_by_common_program(mechanisms)]

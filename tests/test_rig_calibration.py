@@ -1,4 +1,4 @@
-"""Calibrated limits for the rig: the watchdog's audit, its expectation, missed runs and false stops."""
+"""Calibrated limits for the rig: audit of the watchdog, expected restitution, missed and false alarms."""
 
 import functools
 import math
@@ -41,7 +41,7 @@ LIMIT = 0.02
 
 
 def gains(contact=None, uncertainty=UNCERTAIN, compensator="response_error", contacts=2, **parts):
-    """Two damped contacts in coarse ticks, compensated so that some runs are good and some are not."""
+    """Return gains for two damped contacts at a coarse control period, with both good and bad runs."""
     contact = {"damping": [400.0], **(contact or {})}
     raw = mechanism(contact, {**SECOND_ORDER, "natural_frequency": 20.0}, contacts=contacts, **parts)
     parsed = validated({**raw, "uncertainty": uncertainty})
@@ -49,26 +49,26 @@ def gains(contact=None, uncertainty=UNCERTAIN, compensator="response_error", con
     return check_document(build_document(compensator, law, parsed, "0" * 64, {}, {}, 0, {}))
 
 
-LANES = 128  # the same everywhere, so that there is one program
+LANES = 128  # equal in all tests, so that a single program is compiled
 ONE_SIDED = gains()
 NOISY_GAP = gains({"clearance": 0.001}, force_sensor=NOISY, contacts=3)
 
 
 @functools.cache
 def recorded(sided):
-    """Recorded runs of either mechanism."""
+    """Return recorded runs of either mechanism."""
     (chunk,) = record_selection({1: ONE_SIDED, 2: NOISY_GAP}[sided], ScenarioSelection("random", 1, LANES))
     return chunk
 
 
 @pytest.fixture(scope="module")
 def calibrated():
-    """The limits, and other runs."""
+    """Return the calibrated limits, and other runs."""
     return calibrate(ONE_SIDED, scenarios=2 * LANES, limit=LIMIT, lanes=LANES), recorded(1)
 
 
 def watch(limits, signals, rules, lane):
-    """Return (restitution, expected, imbalance, fault) of a lane's contacts by the runtime's watchdog."""
+    """Return (restitution, expected, imbalance, fault) of a lane's contacts from the runtime's watchdog."""
     watchdog = Watchdog(complete_limits(limits), rules.period, rules.clearance)
     result, given = [], 0.0
 
@@ -133,7 +133,7 @@ def test_calibration_audit_restitution_equals_simulated_restitution():
 
 
 def test_audit_of_impulse_ledger_begins_when_the_compensator_acts():
-    """Place the surface 1 mm nearer than specified: neither position ever passes the specified one."""
+    """The surface is 1 mm nearer than specified, so that neither position passes the specified surface."""
     nearer = gains(uncertainty={}, compensator="impulse_ledger", contact_plane=-1e-3)
     assert build_audit_rules(nearer)[0].has_status and not build_audit_rules(ONE_SIDED)[0].has_status
     (chunk,) = record_selection(nearer, ScenarioSelection("random", 1, 8))
@@ -172,7 +172,7 @@ def test_long_approach_under_calibrated_limits_raises_no_fault(calibrated):
 
 
 def test_contacts_end_without_force_even_if_compensator_output_decays_slowly(calibrated):
-    """Alternate contact and flight, with less flight than the output is given to die out."""
+    """Free flight between contacts is shorter than the decay of the output."""
     limits = {name: value for name, value in calibrated[0].limits.items() if value is not None}
 
     def faults(output):
@@ -226,7 +226,7 @@ def test_watchdog_with_specified_damping_does_not_use_identified_damping(calibra
 
 
 def test_watchdog_without_specified_damping_cannot_distinguish_damping_from_delay():
-    """Expect a margin that is widened until good runs pass, at a stated price."""
+    """The margin is widened until good runs pass, and the verdict states the missed alarms."""
     loaded = gains(uncertainty={**UNCERTAIN, **DAMPING})
     rates = calibrate(loaded, scenarios=8 * LANES, limit=LIMIT, lanes=LANES).rates
     assert "z" in rates["terms"]
@@ -293,7 +293,7 @@ def test_calibration_repeats_the_runs_of_a_stored_sweep(tmp_path):
 
 @pytest.mark.slow
 def test_calibrated_watchdog_misses_no_bad_run_in_a_hundred_thousand_scenarios():
-    """Use the built-in claw and gains near the literature's, so that many runs are good and many are not."""
+    """Use the built-in claw with many good and many bad runs."""
     parsed = load("claw-350kg").mechanism
     law = literature_gains(parsed, "response_error")
     law |= {"response_error": 0.93 * law["response_error"], "phase_lead": 1.1 * law["phase_lead"]}
@@ -359,7 +359,7 @@ def test_run_extremes_are_largest_and_smallest_signal_values():
 
 @pytest.mark.parametrize(("force", "travel"), [(0.0, 1.5 + 0.5), (5.0, 1.5 + 0.5 + 0.5 + 0.3 + 0.5)])
 def test_travel_without_force_is_counted_only_while_penetration_increases(force, travel):
-    """Count as the runtime's guard does: a damped mechanism leaves the contact without a force."""
+    """A damped mechanism leaves the contact without force."""
     flat = dict.fromkeys(("position", "velocity", "command", "sent"), [0.0] * 6)
     made = signals(force=[force] * 6, measured=[-1.0, 0.5, 1.0, 0.5, 0.2, 0.7], **flat)
     result = find_signal_extremes(made, period=0.5, clearance=math.inf, free_distance=2.0, settling=0.5)

@@ -1,6 +1,6 @@
-"""Rig's loop in six degrees of freedom: one axis as oracle, momentum, and a rotated and boosted world.
+"""Six-axis loop of the rig: comparison with one axis, momentum, and a rotated and boosted world.
 
-One program; its lanes are the cases. All have the rig of claw-350kg, but for the delays of two.
+One program, whose lanes are the cases. All lanes have the rig of claw-350kg, but two have other delays.
 """
 
 from functools import partial
@@ -38,12 +38,12 @@ EYE = np.eye(3)
 MASSES = np.array([1050.0, 525.0])  # an equivalent mass of 350 kg
 MOMENTS = np.array([[900.0, 700.0, 500.0], [150.0, 180.0, 110.0]])
 OFFSETS = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-ARM = np.array([0.4, -0.3, 0.0])  # of the contact from the line through both centres of mass
+ARM = np.array([0.4, -0.3, 0.0])  # m, offset of the contact from the line through both centres of mass
 STIFFNESS, DAMPING = 124355.0, 395.8
 
 
 def effective_mass():
-    """Return the effective mass of a contact off the line by ARM."""
+    """Return the effective mass of a contact that is off the centre line by ARM."""
     turned = np.cross(ARM, [0, 0, 1])
     return 1 / (np.sum(1 / MASSES) + np.sum(turned**2 / MOMENTS))
 
@@ -68,7 +68,7 @@ TURNED, BOOST = Rotation.from_rotvec([0.5, -1.0, 2.0]), np.array([0.03, -0.07, 0
 
 
 def start(masses, speeds, begin):
-    """Return (bodies, states) as NumPy arrays; the last lane's world is rotated and boosted."""
+    """Return (bodies, states) as NumPy arrays; the world of the last lane is rotated and boosted."""
     zero = np.zeros((3, LANES))
     gap = speeds * -begin
     places = [zero.copy(), OFFSETS[0][:, None] + gap - OFFSETS[1][:, None]]
@@ -144,7 +144,7 @@ def seen():
 
 
 def energy_error(seen, lane, mass, speed):
-    """Return the gained kinetic energy as a share of that of the approach."""
+    """Return the gained kinetic energy relative to the kinetic energy of the approach."""
     energy = seen["energy"][lane, :, 0]
     assert np.all(seen["force"][lane, -20:] == 0)
     return (energy[-1] - energy[0]) / (mass * speed**2 / 2)
@@ -164,7 +164,7 @@ def test_six_axis_rig_central_contact_equals_one_axis_contact(integrator, hold, 
 
 
 def test_six_axis_rig_off_centre_contact_follows_effective_mass(seen):
-    """Compare to first order in the rotation during the contact: ten times slower, ten times nearer."""
+    """To first order in the rotation during the contact, the restitution is that of one axis."""
     mass = effective_mass()
     assert mass < 300
     expected = energy_error(seen, LIGHT, mass, 5e-3)

@@ -1,7 +1,7 @@
-"""Loop against the event-accurate oracle over the registry of cases; promises of a batch to its lanes.
+"""Rollout compared with the event-accurate oracle for all registered cases; independence of lanes.
 
-Where nothing but linear systems and samples of a memoryless law is involved the two agree to rounding; what
-is read off between samples (peak, work, a sensor's lag) has the errors stated below.
+Linear systems and samples of memoryless laws agree to rounding. Values between samples (peak, work, sensor
+lag) agree within the errors stated below.
 """
 
 from functools import partial
@@ -52,7 +52,7 @@ WORK_ACCURACY = {
     "rattling, the next touch at once": 3e-4,
 }
 
-# Each of these is the first of a program of its own; their features are tested elsewhere, one by one.
+# Each of these cases has its own program; their features have separate tests.
 SELDOM = ("rattling, elastoplastic", "rattling against layers", "depth-damped", "layers", "damped layers")
 SELDOM += ("transfer function with latency", "third order with latency", "position lead", "first order")
 SELDOM += ("hardening", "damped hardening", "elastoplastic", "rattling, lag")
@@ -63,7 +63,7 @@ every_case = pytest.mark.parametrize("name", slow_if_seldom)
 
 
 def both(name):
-    """Return (contact of the loop, contact of the oracle) for every contact of a case."""
+    """Return (contact of the simulation, contact of the oracle) for every contact of a case."""
     return zip(cases.loop_contacts(name), cases.oracle_contacts(name), strict=True)
 
 
@@ -77,7 +77,7 @@ def test_rollout_motion_agrees_with_oracle_in_every_contact(name):
             expected["approach_velocity"], rel=min(accuracy, 1e-7)
         )
         assert result["peak_command"] == pytest.approx(expected["peak_command"], rel=accuracy)
-        # It is 0, to the bit, if no limit binds.
+        # The shortfall is exactly 0 if no limit is reached.
         shortfall = expected["position_shortfall"]
         assert result["position_shortfall"] == pytest.approx(shortfall, rel=1e-8, abs=0)
         assert shortfall == 0 or "velocity_limit" in CASES[name].mechanism["rig"]["simulator"]
@@ -122,7 +122,7 @@ def test_rollout_first_contact_ends_at_same_tick_as_oracle(name):
 
 @pytest.mark.slow
 def test_rollout_with_sensor_lag_agrees_with_oracle_at_every_control_period():
-    """Use contact at 5 Hz, elastic and heavily damped, with the compensation that a lag upsets most."""
+    """Use contact at 5 Hz, elastic and heavily damped, with the most sensitive compensator."""
     periods = (0.25e-3, 1e-3, 2e-3, 4e-3)
     lagged = {
         (ratio, period): Case(
@@ -228,7 +228,7 @@ LANES = {
 
 @pytest.fixture(scope="module")
 def mixed():
-    """One program and its results for the lanes above, as a function whose programs are counted."""
+    """Return a batch of the lanes above, the function that runs it, and its metrics."""
 
     def run_mixed(*arguments):
         return rollout(*arguments)
@@ -280,11 +280,11 @@ def test_padding_lanes_do_not_affect_other_lanes(mixed):
     for name, values in metrics._asdict().items():
         if name == "status":
             continue
-        # No limit can make a command fall short, no probe is set, and no delay is estimated.
+        # These fields are 0: no shortfall, no probe, no delay estimate.
         nothing = "ticks", "position_shortfall", "trajectory_error", "force_delay"
         expected = 0 if name in nothing else np.nan
         np.testing.assert_array_equal(values[:, lane], expected, err_msg=name)
-    # With padding alone the program does not even start.
+    # With only padding lanes the loop runs no tick.
     idle = batch.scenario._replace(contacts=jnp.zeros_like(batch.scenario.contacts))
     assert np.all(np.asarray(run(batch.loop, batch.gains, idle).status) == NOT_REACHED)
     # The first lane is the same, bit for bit, when all others are padding.
@@ -307,7 +307,7 @@ def test_rollouts_of_similar_mechanisms_share_a_compiled_program(mixed):
     draws = {"contact.stiffness": np.outer(np.linspace(0.5, 1.5, 5), [2e5, 1e5])}
     for seed in (0, 1):
         scenario = join([build_scenarios(other, draws, seed=seed)])
-        # Delay lines have lengths of powers of two, in steps wide enough for such delays.
+        # Delay lines have lengths of powers of two; the delays of all lanes must fit.
         loop = build_loop(other, "phase_lead", scenario, energies=True, chatter=True)
         assert (loop.ring, loop.controller_ring) == (batch.loop.ring, batch.loop.controller_ring)
         result = run(batch.loop, per_lane(nominal_gains(other, "phase_lead"), 5), scenario)

@@ -1,4 +1,4 @@
-"""Roots within a bracket: functions on which Newton's method overshoots, and their derivatives."""
+"""Roots within a bracket: functions for which Newton's method overshoots, and derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ POWERS = np.array([1.0, 0.5, 0.2, 0.1])
 
 
 def root_of(height):
-    """Return roots of s^p - height between 0 and 1, for all powers at once."""
+    """Return roots of s^p - height between 0 and 1 for all powers."""
 
     def function(height, s):
         touching = s > 0
@@ -25,7 +25,7 @@ def root_of(height):
 
 @pytest.mark.parametrize("height", [0.9, 0.3, 0.1])
 def test_bracketed_roots_of_powers_match_closed_form(height):
-    """Cover a contact whose force ends at a power of the depth: its root is next to the surface."""
+    """Include a contact whose force ends as a power of the depth, with a root near the surface."""
     result, slope = jax.jvp(root_of, (jnp.asarray(height),), (jnp.ones(()),))
     np.testing.assert_allclose(result, height ** (1 / POWERS), rtol=0, atol=ARGUMENT_TOLERANCE)
     np.testing.assert_allclose(slope, height ** (1 / POWERS - 1) / POWERS, rtol=1e-3, atol=1e-6)

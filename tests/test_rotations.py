@@ -1,4 +1,4 @@
-"""Rotations against SciPy's, near no rotation and near half a turn; derivatives of any order at 0."""
+"""Rotations compared with SciPy, also near zero and near half a turn; derivatives of any order at 0."""
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +73,7 @@ def test_rotation_logarithm_inverts_the_exponential_map(results):
 
 
 def test_left_jacobian_equals_mean_of_intermediate_rotations(results):
-    """Compare with the mean of exp(s theta) over s in [0, 1], the upper right block of an exponential."""
+    """Compute the mean of exp(s theta) over s in [0, 1] as a block of a matrix exponential."""
     for column in range(THETA.shape[1]):
         x, y, z = THETA[:, column]
         hat = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -83,7 +83,7 @@ def test_left_jacobian_equals_mean_of_intermediate_rotations(results):
 
 
 def test_rotations_of_many_radians_agree_with_scipy():
-    """Cover the limits of the series and multiples of half a turn, exactly and next to each."""
+    """Include the limits of the series and multiples of half a turn."""
     angles = np.r_[np.pi * np.arange(1, 9) + 1e-7, np.pi * np.arange(1, 9) - 1e-7, np.linspace(3, 400, 24)]
     results = [np.asarray(part) for part in everything(jnp.asarray(AXES * angles), jnp.asarray(RATE))]
     turns = Rotation.from_rotvec((AXES * angles).T)
@@ -118,7 +118,7 @@ def test_rotation_derivatives_at_zero_are_those_of_the_series():
 
 @pytest.mark.slow
 def test_rotation_derivatives_to_third_order_agree_along_a_ray():
-    """Compare each with central differences of the lower order, on both sides of the limit of the series."""
+    """Compare with central differences on both sides of the limit of the series."""
     angles = jnp.asarray([0.0, 1e-8, 0.1, 0.19, 0.2, 0.21, 0.49, 0.5, 0.51, 1.5, 3.0])
     axis, rate = (vector(jnp.asarray(part)[:, :11]) for part in (AXES, RATE))
 

@@ -1,4 +1,4 @@
-"""Runtime controller from run to run: repeatability, reset, trips, and where it runs."""
+"""Runtime controller over several runs: repeatability, reset, trips, and standalone use."""
 
 import json
 import math

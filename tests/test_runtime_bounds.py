@@ -1,4 +1,4 @@
-"""Bounds in the code: they admit what tuning, the literature and settings give for any sane rig."""
+"""Bounds in the code accept gains from tuning, the literature and settings for any realistic rig."""
 
 import math
 
@@ -17,7 +17,7 @@ from jaxhil.rig.limits import LIMITS
 
 
 def beyond(mechanism: Mechanism) -> list[tuple]:
-    """Return the bounds and nominal values of gains that are not admitted."""
+    """Return the bounds and nominal values of gains that are not accepted."""
     result = []
     for name, law in COMPENSATORS.items():
         for gain in law.gains:

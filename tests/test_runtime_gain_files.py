@@ -1,4 +1,4 @@
-"""Gain files in the runtime's controller: a file that does not fit is refused with one line."""
+"""Gain files in the runtime controller: inconsistent files are refused in one line."""
 
 import json
 import math
@@ -109,7 +109,7 @@ def test_gain_file_digest_covers_content_but_not_date_and_timings():
 
 
 def change(*path_and_value: Any) -> dict[str, Any]:
-    """Return a response-error document with one entry replaced, or removed where the value is `...`."""
+    """Return a response-error document with one entry replaced, or removed for `...`."""
     *path, key, value = path_and_value
     document = gain_document()
     container = at(document, tuple(path))

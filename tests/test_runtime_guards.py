@@ -1,4 +1,4 @@
-"""Guards of the runtime: every fault on its tick, its reaction, and outputs within their limits."""
+"""Guards of the runtime: every fault on its tick, its reaction, and limited outputs."""
 
 import itertools
 import math
@@ -68,7 +68,7 @@ def test_nonfinite_readings_are_bridged_for_a_few_ticks_before_trip(fault):
         )
         assert controller.faults == fault
         assert controller.tripped is (n > 2)
-        # While bridged, the last good force is used; where the position is bad, the force is the reading.
+        # While bridging, the last good force is used; for a bad position, the force is the reading.
         assert command == (0.0 if n > 2 else 3.0 if measured is None else 3.0 + n)
     assert controller.seen == controller.cause == fault
 
@@ -120,7 +120,7 @@ def test_force_out_of_contact_raises_fault_after_settling_time():
         if controller.tripped:
             break
     assert (n, controller.cause) == (12, FORCE_IN_FLIGHT)
-    # Near the surface it is no fault.
+    # Near the surface this is no fault.
     controller = limited()
     for n in range(40):
         controller.step(6.0, -4e-4, 0.0, -4e-4, n * PERIOD)
@@ -173,7 +173,7 @@ def test_force_command_fades_after_force_limit_trip():
     controller = limited()
     for n in range(10):
         assert controller.step(100.0 * (n + 1), 1e-4 * n, 0.0, 1e-4 * n) == 100.0 * (n + 1)
-    # From a limit of 1000 N, 1001 N is beyond it: the force goes to 0 by 100 N a tick.
+    # 1001 N exceeds the limit of 1000 N: the force decreases to 0 by 100 N per tick.
     forces = [controller.step(1001.0, 2e-3, 0.0, 2e-3) for _ in range(12)]
     assert controller.cause == FORCE_LIMIT
     assert forces == [*(1000.0 - 100.0 * (n + 1) for n in range(10)), 0.0, 0.0]

@@ -1,4 +1,4 @@
-"""Hostile input of a controller: commands stay finite and within limits, memory does not grow."""
+"""Hostile input of a controller: commands stay finite and within limits, and memory does not grow."""
 
 import math
 import random
@@ -33,7 +33,8 @@ def test_controller_outputs_are_finite_and_within_limits_for_any_input(calls, na
         elif call == "position":
             new = controller.position_command(*values[:3])
             if sent is not None:
-                # Outside the stroke only if the drives were there when the run began, and never further out.
+                # Commands outside the stroke are allowed only if the drives were there at the start, and
+                # never further out.
                 assert min(-0.04, sent) <= new <= max(0.008, sent)
                 assert abs(new - sent) <= 2e-5 * (1 + 1e-9) + 1e-14
             sent = new

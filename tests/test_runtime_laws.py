@@ -1,4 +1,4 @@
-"""Compensators of the runtime and their parts against matrix equations and transfer functions."""
+"""Compensators of the runtime and their parts, compared with matrix equations and transfer functions."""
 
 import math
 from typing import Any
@@ -19,7 +19,7 @@ def by_matrices(document: dict[str, Any], ticks: list[Reading]) -> tuple[np.ndar
     """Return F_c and theta per tick of the response-error law, computed with whole signals and matrices.
 
     Lead and velocity are state-space models discretised by the bilinear transform. The delay interpolates the
-    whole record, and the contact's share of each period is a length on the polygon. The identification is
+    whole record, and the time in contact within a period is a length on the polygon. The identification is
     textbook weighted recursive least squares with bounded covariance.
     """
     gain = {name: entry["value"] for name, entry in document["gains"].items()}
@@ -82,7 +82,7 @@ def bounded(covariance: np.ndarray, most: tuple[float, float]) -> np.ndarray:
 
 
 def measure(signal: np.ndarray, start: float, low: float, high: float) -> np.ndarray:
-    """Return each period's share in which the polygon through `start` and the signal is in (low, high)."""
+    """Return the share of each period in which the polygon through `start` and signal is in (low, high)."""
     ends = np.stack([np.concatenate([[start], signal[:-1]]), signal])
     bottom, top = ends.min(axis=0), ends.max(axis=0)
     inside = np.maximum(np.minimum(top, high) - np.maximum(bottom, low), 0.0)
@@ -91,7 +91,7 @@ def measure(signal: np.ndarray, start: float, low: float, high: float) -> np.nda
 
 
 def triangle(share: np.ndarray) -> np.ndarray:
-    """Return each period's share of a two-period triangle over the time beyond a threshold."""
+    """Return, for each period, the share of a two-period triangle over the time beyond a threshold."""
     before = np.concatenate([[0.0], share[:-1]])
     return (share**2 + before**2) / 2 + share * before * (2 - share - before)
 
@@ -106,7 +106,7 @@ def bilinear(
     state: float,
     before: float,
 ) -> np.ndarray:
-    """Return the trapezoidal simulation of z' = a z + c u, y = b z + d u, from the sample before the first.
+    """Return the trapezoidal simulation of z' = a z + c u, y = b z + d u, from uniform motion.
 
     For the lead, (1 + T_1 s)/(1 + T_2 s) = T_1/T_2 + (1 - T_1/T_2)/(1 + T_2 s); for the filtered derivative,
     1/tau - (1/tau)/(1 + tau s).
@@ -128,7 +128,7 @@ def test_no_compensation_returns_the_measured_force():
 
 
 def test_phase_lead_frequency_response_matches_tustin_transfer_function():
-    """Compare the steady response to a sine with the discrete transfer function's gain and phase."""
+    """Compare gain and phase of the steady response to a sine."""
     lead, lag, period, omega = 0.008, 0.001, 0.001, 40.0
     controller = Controller.from_dict(gain_document("phase_lead", phase_lead=lead, lead_filter=lag))
     output = [controller.step(math.sin(omega * n * period), 0.0, 0.0, 0.0) for n in range(400)]
@@ -210,7 +210,7 @@ def test_delay_line_interpolates_between_samples(periods):
 
 
 def test_delay_line_of_whole_periods_does_not_interpolate():
-    # Values like 0.003/0.001 round either way.
+    # Quotients such as 0.003/0.001 may be rounded up or down.
     for whole in range(40):
         line = DelayLine(whole * 0.001, 0.001)
         line.start(0.0, 0.0)
@@ -226,7 +226,7 @@ def test_delay_line_refuses_excessive_delay():
 @given(seed=st.integers(0, 2**32 - 1), forgetting=st.floats(0.9, 1.0))
 @settings(max_examples=30, deadline=None)
 def test_runtime_identification_equals_weighted_recursive_least_squares(seed, forgetting):
-    """Include the bound on its covariance."""
+    """Include the bound on the covariance."""
     rng = np.random.default_rng(seed)
     identification = ContactIdentification(2.0, -1.0, 5.0, 0.5, forgetting)
     theta, covariance = np.array([2.0, -1.0]), np.diag([5.0, 0.5])
@@ -245,7 +245,7 @@ def test_runtime_identification_equals_weighted_recursive_least_squares(seed, fo
 
 
 def test_runtime_identification_covariance_stays_bounded():
-    """Hold the contact still, which shows no damping, and at no depth, which shows no stiffness."""
+    """Hold the contact still, so that damping is unobservable, and at zero depth, so that stiffness is."""
     for deflection, rate in ((2e-4, 0.0), (0.0, 1e-3), (0.0, 0.0)):
         identification = ContactIdentification(1e5, 100.0, 1e12, 1e6, 0.8)
         for _ in range(100_000):

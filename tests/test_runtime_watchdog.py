@@ -1,4 +1,4 @@
-"""Watchdog of the runtime: contacts audited before the next begins, causes, and energies."""
+"""Watchdog of the runtime: audits of contacts before the next begins, causes, and energies."""
 
 import itertools
 import math
@@ -37,7 +37,7 @@ def watched(clearance: float | None = None, **limits: float) -> Controller:
 def bounce(
     controller: Controller, *, late: int = 0, damping: float = 0.0, clearance: float = math.inf, ticks=3000
 ) -> tuple[int, list[float], list[float]]:
-    """Simulate an ideal rig under `none`, the force `late` ticks late.
+    """Simulate an ideal rig with compensator `none` and a force delay of `late` ticks.
 
     Return the tick of the trip, positions and velocities.
     """
@@ -177,7 +177,7 @@ def test_expected_restitution_is_polynomial_with_inputs_limited_to_stated_ranges
 
 
 def test_watchdog_contact_does_not_end_while_bodies_touch():
-    """Allow no settling time: the contact does not end where the force crosses 0 on the way back either."""
+    """Without settling time, a zero crossing of the force must not end the contact."""
     controller = watched(settling=0.0, energy_balance=1e9, restitution_margin=1e9)
     position, velocity, audited = -1e-4, SPEED, []
     for n in range(300):

@@ -1,4 +1,4 @@
-"""Self-test of an export: it passes unchanged files, and names file, line and value of any change."""
+"""Self-test of an export: passes unchanged files, and names file, line and value of any change."""
 
 import json
 import os
@@ -27,7 +27,7 @@ def files():
 
 @pytest.fixture
 def folder(files, tmp_path):
-    """A copy of the small bundle, to be damaged."""
+    """Return a copy of the small bundle."""
     index = tmp_path / "bundle"
     for name, content in files.items():
         (index / name).parent.mkdir(parents=True, exist_ok=True)
@@ -36,7 +36,7 @@ def folder(files, tmp_path):
 
 
 def in_a_bare_process(folder, *arguments, cwd="/", python=("-I", "-S")):
-    """Run the self-test as a rig engineer does, where no package can be imported."""
+    """Run the self-test in Python without installed packages."""
     command = [sys.executable, *python, str(folder / "selftest.py"), *arguments]
     ran = subprocess.run(command, capture_output=True, text=True, errors="replace", cwd=cwd, check=False)
     return ran.returncode, ran.stdout, ran.stderr
@@ -110,12 +110,12 @@ def test_self_test_never_passes_if_its_own_code_was_changed(files, folder):
     content = files["selftest.py"]
     program = content.index(b"def main")
     for turn in range(OWN_MUTATIONS):
-        # Include docstrings and constants, but above all code that runs.
+        # Mutations include docstrings and constants, but mostly executed code.
         begin = program if turn % 4 else 0
         changed, _ = mutated(source, content[begin:])
         (folder / "selftest.py").write_bytes(content[:begin] + changed)
         code, out, err = in_a_bare_process(folder)
-        # Python itself reports text that is no Python any more.
+        # A syntax error is reported by Python itself.
         assert code != 0 and "selftest.py" in out + err, (changed, out, err)
 
 
@@ -177,7 +177,7 @@ def test_self_test_names_recorded_and_computed_command_if_different(files, folde
 
 
 def test_self_test_replays_vectors_even_if_all_checksums_match(files, folder):
-    """Cover what a wrong port of the controller would look like."""
+    """A wrong port of the controller may have a matching manifest."""
     document = json.loads(files["gains.json"])
     runtime = files["jaxhil_runtime.py"]
     for old, new in [(b"2.0 * lag - period", b"2.0 * lag + period"), (b"held = 0", b"held = 1")]:

@@ -1,15 +1,15 @@
-"""Tolerance of each gain before the objective rises, against closed forms."""
+"""Tolerance of each gain for a given rise of the objective, compared with closed forms."""
 
 import numpy as np
 import pytest
 
 from tuning.optimisation.sensitivity import LOSS_RISE, compute_gain_tolerance
 
-STIFF_ENOUGH = 0.05  # the box adds its square to the region, relatively
+STIFF_ENOUGH = 0.05  # the box constraint changes the region by the square of this
 
 
 def quadratic():
-    """Return J of two combinations of three gains: a stiff one and a weaker one; the third gain is free."""
+    """Return J of a stiff and a weak combination of three gains; the third gain has no effect."""
     return np.array([[300.0, 300.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 
@@ -40,7 +40,7 @@ def test_loss_at_gain_tolerance_is_higher_by_the_stated_amount():
     covariance = np.linalg.inv(jacobian.T @ jacobian)
     for gain in range(4):
         alone = result.alone[gain] * np.eye(4)[gain]
-        # With the other gains at their best: along the gain's column of the covariance.
+        # The other gains are re-optimised: move along the gain's column of the covariance.
         together = result.together[gain] * covariance[gain] / covariance[gain, gain]
         for step in (alone, together):
             assert np.max(np.abs(step)) < STIFF_ENOUGH

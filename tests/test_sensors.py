@@ -1,4 +1,4 @@
-"""Sensor noise: the generator against published vectors and `jax.random`, samples against the normal."""
+"""Sensor noise: generator compared with published vectors and `jax.random`; normally distributed samples."""
 
 import jax
 import jax.numpy as jnp

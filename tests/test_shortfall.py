@@ -1,4 +1,4 @@
-"""Shortfall of the motion simulator behind its limits: exactly 0 if none binds, else the oracle's."""
+"""Position shortfall of the motion simulator due to its limits: exactly 0, or as in the oracle."""
 
 import dataclasses
 import functools
@@ -17,7 +17,7 @@ from jaxhil.simulation.metrics import NOT_REACHED, OK
 from jaxhil.simulation.rollout import start_rollout
 
 LATE = 0.011  # s of force delay: uncompensated, a contact ends faster than it begins
-LIMITS = {  # speed [m/s], and whether the limit binds
+LIMITS = {  # speed [m/s], and whether the limit is reached
     "none": (np.inf, False),
     "far above": (100 * VELOCITY, False),
     "above the rebounds": (7 * VELOCITY, False),
@@ -27,7 +27,7 @@ LIMITS = {  # speed [m/s], and whether the limit binds
 
 
 class Leading(NoCompensator):
-    """Compensator that commands where the model will be a little later."""
+    """Compensator that commands the future position of the model."""
 
     lead: float
 
@@ -36,7 +36,7 @@ class Leading(NoCompensator):
 
 
 class LeadingOracle(oracle.NoCompensator):
-    """Oracle of the same compensator."""
+    """Version of the same compensator for the oracle."""
 
     def __init__(self, lead):
         self.lead = lead
@@ -53,7 +53,7 @@ def limited(limit, damping, force_delay=LATE):
 
 
 CONTACTS = {name: limited(limit, 300.0) for name, (limit, _) in LIMITS.items()}
-# Exactly as fast as the drives, and slower ever after.
+# Starts exactly at the speed limit and then slows down.
 CONTACTS["just reached"] = limited(VELOCITY, 6000.0, 0.0)
 BINDING = [name for name, (_, binds) in LIMITS.items() if binds]
 
@@ -77,7 +77,7 @@ def batch():
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
 def shortfalls_found(request, batch):
-    """Return shortfalls [m] of every contact, by the case's name."""
+    """Return the position shortfalls [m] of every contact by the case's name."""
     scenario = batch.scenario if request.param == "float64" else single(batch.scenario)
     metrics = batch._replace(scenario=scenario).run()
     assert metrics.position_shortfall.dtype == request.param

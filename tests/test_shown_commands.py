@@ -1,4 +1,4 @@
-"""Commands of README and guide print what stands below them; numbers stand below their command."""
+"""Commands of README and guide print the output shown below them."""
 
 import os
 import re
@@ -22,13 +22,13 @@ COMMAND = re.compile(
 NUMBER = re.compile(r"\d+\.\d+|\d+")
 # Commands that take more than minutes, or need a rig's logs.
 LEFT_OUT = ("rig", "compare", "identify", "monitor")
-# Pages in the order in which a reader takes them, each with the files of the pages before.
+# Pages in reading order; each uses the files of the pages before.
 ORDER = ("first_ten_minutes", "tuning", "sweeps", "to_the_rig")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_numbers_in_guide_stand_below_the_command_that_prints_them(page):
-    """Look for the command, or the script, between a block of numbers and the heading above it."""
+    """Search for the command or script between a block of numbers and the heading above."""
     text = page.read_text(encoding="utf-8")
     for block in BLOCK.finditer(text):
         if block[1] == "text" and re.search(r"\d\.\d", block[2]):
@@ -46,7 +46,7 @@ def shown(page):
 
 @pytest.mark.slow
 def test_commands_in_guide_print_the_output_shown(tmp_path):
-    """Compare words and lines; print the numbers that differ, which depend on a solver."""
+    """Words and lines must agree; differing numbers, which depend on a solver, are printed."""
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": path, "COLUMNS": "110"}
     names = {"jaxhil": [sys.executable, "-m", "tuning"], "python": [sys.executable]}
@@ -73,7 +73,7 @@ def test_commands_in_guide_print_the_output_shown(tmp_path):
 
 @pytest.mark.slow
 def test_commands_of_guide_page_on_logs_print_the_output_shown(tmp_path):
-    """Run the first day of the page on logs, with the rig that the page names."""
+    """Use the rig that the page names."""
     (tmp_path / "day1").mkdir()
     write(tmp_path / "day1", campaigns.campaign("clean", 0))
     environment = {**os.environ, "COLUMNS": "110"}

@@ -1,6 +1,6 @@
-"""Gain files changed and signed anew: refused in one line, or within the bounds of the code.
+"""Gain files changed with a valid digest: refused in one line, or loaded within the bounds of the code.
 
-What loads is driven by whatever sensors and models may give, in Python and in C, which agree to the bit.
+Loaded controllers run with hostile readings in Python and in C, which agree to the bit.
 """
 
 import hashlib
@@ -38,7 +38,7 @@ COMPILED = "phase_lead", "response_error"  # every day: compiling takes long
 
 
 def load(path: Path) -> GainFile | None:
-    """Load a file into the runtime; return None if it is refused."""
+    """Load a file into the runtime; return None if the file is refused."""
     try:
         gain_file = check_gain_document(read_gain_document(path), str(path))
         Controller(gain_file, str(path))
@@ -65,14 +65,15 @@ def is_within_bounds(gain_file: GainFile) -> bool:
 
 
 def drive(gain_file: GainFile, rows: np.ndarray, in_c: Collection[str]) -> None:
-    """Check that a controller's commands stay within its limits and the code's; C agrees with Python."""
+    """Check that commands stay within the limits of controller and code, and that C agrees with Python."""
     results = controller_in_python(gain_file, rows)
     limits, period = gain_file.limits, gain_file.control_period
     force, position = results[:, 0], results[:, 1]
     assert np.all(np.abs(force) <= min(limits["force_limit"], FORCES[1]))
     assert np.all((position >= POSITIONS[0]) & (position <= POSITIONS[1]))
     same_run = rows[1:, 0] != NEXT_CONTACT
-    # Outside the stroke only if the drives were there when a run began, and never further out.
+    # Commands outside the stroke are allowed only if the drives were there at the start, and never further
+    # out.
     outside = np.maximum(limits["command_lowest"] - position, position - limits["command_highest"])
     assert np.all(np.diff(np.maximum(outside, 0.0))[same_run] <= 0.0)
     moved = np.abs(np.diff(position))[same_run]
@@ -85,7 +86,7 @@ def drive(gain_file: GainFile, rows: np.ndarray, in_c: Collection[str]) -> None:
 
 
 def as_numbers(document: dict) -> GainFile:
-    """Return the numbers of a document whose form is good, whatever they are."""
+    """Return the numbers of a document with valid structure."""
 
     def number(value: float) -> float:
         try:
@@ -108,7 +109,7 @@ def as_numbers(document: dict) -> GainFile:
 
 
 def longest_line(gain_file: GainFile) -> float:
-    """Return the longest delay in periods; 0 if a period is none."""
+    """Return the longest delay in periods; 0 if a period is invalid."""
     numbers = {**gain_file.limits, **gain_file.gains}
     period = gain_file.control_period
     delays = c99_cases.delays(gain_file.compensator) if period > 0.0 else ()
@@ -116,9 +117,9 @@ def longest_line(gain_file: GainFile) -> float:
 
 
 def check(count: int, seed: int, path: Path, laws: Collection[str]) -> dict[str, int]:
-    """Change and sign `count` files; return how many loaded and were refused.
+    """Change and sign `count` files; return how many were loaded and refused.
 
-    These `laws` are driven in C too.
+    The given `laws` also run in C.
     """
     in_c = laws if c99_cases.COMPILER is not None else ()
     rng = random.Random(seed)
@@ -138,12 +139,12 @@ def check(count: int, seed: int, path: Path, laws: Collection[str]) -> dict[str,
             assert is_within_bounds(gain_file), text
             drive(gain_file, rng.choice(pool), in_c)
         elif only_numbers:
-            # Form and digest are good: C also refuses the file for its numbers.
+            # Structure and digest are valid, so C must refuse the file for its numbers.
             numbers = as_numbers(document)
             if numbers.compensator in in_c and text == json.dumps(document):
                 line = longest_line(numbers)
                 assert line > 100_000.0 or not is_within_bounds(numbers), text
-                # C counts the excess length of a line in whole periods.
+                # C checks the length of a delay line in whole periods.
                 if not 100_000.0 < line < 100_002.0:
                     made = c99_cases.loaded(numbers.compensator)
                     assert not made.begin(packed(numbers.compensator, numbers)), text
@@ -179,5 +180,5 @@ def test_gain_file_with_any_of_1000_flipped_bits_loads_no_other_content(tmp_path
         if result is not None:
             loaded += 1
             assert result == expected and digest(read_gain_document(path)) == document["sha256"]
-    # The digest does not cover date and timings, nor blanks.
+    # The digest does not cover date, timings and white space.
     assert loaded < 200

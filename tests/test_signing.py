@@ -1,4 +1,4 @@
-"""Signed bundles: `verify --key` proves who signed a bundle, and OpenSSL agrees."""
+"""Signed bundles: `verify --key` proves the origin of a bundle, and OpenSSL agrees."""
 
 import json
 import random
@@ -36,7 +36,7 @@ def as_public(key):
 
 @pytest.fixture
 def key(tmp_path):
-    """Files of a pair of keys, private and public."""
+    """Return files of a private and a public key."""
     pair = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
     files = tmp_path / "key.pem", tmp_path / "public.pem"
     for file, text in zip(files, (as_private(pair), as_public(pair)), strict=True):
@@ -46,14 +46,14 @@ def key(tmp_path):
 
 @pytest.fixture
 def folder(key, tmp_path):
-    """A signed bundle."""
+    """Return a signed bundle."""
     files = small_files()
     signature = load_signer(key[0])(files["manifest.json"])
     return placed(tmp_path / "bundle", {**files, "manifest.sig": signature})
 
 
 def test_bundle_signature_matches_example_of_rfc_8032(tmp_path):
-    """Use section 7.1, test 2."""
+    """Section 7.1, test 2."""
     secret = "4ccd089b28ff96da9db6c346ec114e0f5b8a319f35aba624da8cf6ed4fb8a6fb"
     signature = (
         "92a009a9f0d4cab8720e820b5f642540a2b27b5416503f8fb3762223ebdb69da"
@@ -82,7 +82,7 @@ def test_verify_refuses_signature_of_another_key_or_manifest(key, folder, tmp_pa
     result = tuning.verify(folder, key=tmp_path / "other.pem")
     expected = "manifest.sig: found another signature, expected one of the manifest by the given key"
     assert not result.good and result.reasons == [expected] and result.document["self_test"] == []
-    # Reseal after a change, as anybody without the key could: all but the signature fits.
+    # Update all checksums after a change, as is possible without the key; only the signature is wrong.
     files = small_files()
     shorter = files["vectors.csv"].rpartition(b"\n1,")[0] + b"\n"
     placed(folder, signed({**files, "vectors.csv": shorter}, json.loads(files["gains.json"])))

@@ -1,4 +1,4 @@
-"""Simulations that tuning runs: a large law is compiled apart from the loops, with the same results."""
+"""Simulations run by tuning: large compensators are compiled outside of loops with the same results."""
 
 import re
 from typing import ClassVar
@@ -15,7 +15,7 @@ from jaxhil.simulation.one_axis import ONE_AXIS
 
 
 class LargeLaw(NoCompensator):
-    """Compensator `none` with a large step, as it says."""
+    """Compensator `none` that declares a large step."""
 
     waits_for_contact: ClassVar[bool] = True
     is_large: ClassVar[bool] = True
@@ -40,7 +40,7 @@ def test_large_compensators_are_compiled_outside_of_loops(monkeypatch):
         result.append(program(scenarios))
         text = program.as_text() or ""
         loops_left.append(len(re.findall(r" while\(", text[text.index("\nENTRY") :])))
-    # The compiler makes a loop of small laws a function, with all that is in it.
+    # The compiler turns the loop of a small compensator into a function.
     assert loops_left == [0, 1]
     for a, b in zip(*map(jax.tree.leaves, result), strict=True):
         np.testing.assert_array_equal(a, b)

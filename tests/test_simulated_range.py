@@ -1,4 +1,4 @@
-"""Metrics of a contact over the whole range of mechanisms, against the event-accurate oracle."""
+"""Metrics of a contact over the whole range of mechanisms, compared with the event-accurate oracle."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ LANES = 6
 
 
 def compare(form: Form, seed: int, lanes: int, longest: int) -> list[tuple[dict[str, Any], dict[str, float]]]:
-    """Compare metrics of the mechanisms of a form that end well and that the oracle vouches for."""
+    """Compare metrics of mechanisms whose contact ends and whose oracle result is well-conditioned."""
     rng = np.random.default_rng(seed)
     drawn = [form.draw(rng, longest) for _ in range(lanes)]
     mechanisms = [validated(one) for one in drawn]
@@ -42,7 +42,6 @@ def test_contacts_of_random_mechanisms_agree_with_oracle(number):
 
 @pytest.mark.slow
 def test_contacts_of_300_random_mechanisms_agree_with_oracle():
-    """Draw 300 mechanisms that end well and that the oracle vouches for."""
     compared = []
     for number in range(FORMS):
         compared += compare(Form(number), seed=number, lanes=LANES, longest=60)

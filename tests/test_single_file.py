@@ -1,4 +1,4 @@
-"""Runtime in one file: it does what the package does, whatever the package grows into."""
+"""Runtime in a single file: identical results to the package."""
 
 import importlib
 import json
@@ -18,7 +18,7 @@ from tuning.bundle.single_file import build_runtime_source
 
 @pytest.fixture(scope="module", params=sorted(COMPENSATORS))
 def exported(request, tmp_path_factory):
-    """Write the runtime for one compensator as one file, beside a gain file of it."""
+    """Write the runtime with one compensator as a single file, and a gain file for it."""
     folder = tmp_path_factory.mktemp("single")
     (folder / "jaxhil_runtime.py").write_text(build_runtime_source(request.param))
     (folder / "gains.json").write_text(json.dumps(gain_document(request.param)))
@@ -83,7 +83,7 @@ def test_single_file_runtime_keeps_comments_and_labels_each_module(exported):
 
 @pytest.fixture
 def package(tmp_path, monkeypatch):
-    """Make a package of the given modules, in which two laws are registered, and import it."""
+    """Create a package with the given modules, which register two compensators, and import it."""
     monkeypatch.syspath_prepend(str(tmp_path))
 
     def make(**modules):
@@ -115,7 +115,7 @@ MODULES = {
 
 
 def absolute(text, package):
-    """Return a module's text with its relative imports made absolute, but for `from . import`."""
+    """Return a module's text with relative imports made absolute, except `from . import`."""
     return re.sub(r"from \.(?=\w)", f"from {package}.", text)
 
 

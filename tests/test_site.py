@@ -1,4 +1,4 @@
-"""Documentation site: generated pages are complete; the site is built, and opened in a browser."""
+"""Documentation site: complete generated pages; built and opened in a browser."""
 
 import dataclasses
 import os
@@ -93,7 +93,7 @@ def test_documentation_build_fails_for_undocumented_options_and_gains(reference,
 
     @dataclasses.dataclass
     class Options:
-        """Options with an option that has no help text."""
+        """Options with an option without help text."""
 
         depth: Annotated[float, tyro.conf.arg(metavar="NUMBER")] = 1.0
 
@@ -113,7 +113,7 @@ def test_documentation_site_has_every_gain(reference):
 
 
 def test_error_messages_on_documentation_site_equal_real_messages(jaxhil, reference):
-    """Find a refusal on the page, with `…` where something is filled in."""
+    """`…` on the page stands for inserted values."""
     lines = re.findall(r"^(.*….*)$", reference["reference/messages.md"], re.M)
     patterns = [re.compile(".*".join(map(re.escape, line.split("…"))) + "$") for line in lines]
     for arguments in (
@@ -126,7 +126,7 @@ def test_error_messages_on_documentation_site_equal_real_messages(jaxhil, refere
 
 
 def test_documentation_navigation_has_every_page_and_notebook():
-    """Build strictly: `mkdocs build` fails for a file that the navigation lacks."""
+    """A strict `mkdocs build` fails for a file missing from the navigation."""
 
     def leaves(entry):
         if isinstance(entry, str):
@@ -168,7 +168,7 @@ def site(tmp_path_factory):
 
 
 class Page(HTMLParser):
-    """Links of a page, the files it loads, and the names of its anchors."""
+    """Links of a page, files that it loads, and names of its anchors."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -217,7 +217,7 @@ def test_browser_check_detects_errors_of_a_page(browser, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("width", WIDTHS)
 def test_documentation_pages_open_offline(site, browser, width):
-    """Expect no error, external request, missing picture, excess width or overlapping text."""
+    """Check for no error, external request, missing picture, excess width or overlapping text."""
     for path in sorted(site.rglob("*.html")):
         name = str(path.relative_to(site))
         assert browser.open(path, width) == ([], [], []), name
@@ -235,7 +235,7 @@ def test_printed_documentation_pages_cut_no_content(site, browser):
 
 @pytest.mark.slow
 def test_documentation_pages_are_accessible(site, browser):
-    """Expect no serious finding of axe-core; check one notebook, as they are alike and long."""
+    """axe-core reports no serious problem; a single notebook represents all."""
     package = pytest.importorskip("axe_core_python")
     axe = (Path(package.__file__).parent / "axe.min.js").read_text(encoding="utf-8")
     notebooks = sorted(site.glob("0*.html"))

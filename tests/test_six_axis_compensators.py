@@ -1,4 +1,4 @@
-"""Interface of compensators in six axes: signals, constants, lead of the pose command."""
+"""Interface of six-axis compensators: signals, constants, lead of the pose command."""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ NOISE, QUANTUM = {"translation": 2e-5, "rotation": 1e-4}, {"translation": 1e-3, 
 
 
 class Recorder(SixAxisCompensator):
-    """Compensator that stores the measured poses and passes on the wrench."""
+    """Compensator that stores the measured poses and returns the measured wrench."""
 
     name = "recorder"
     knows = ()
@@ -39,7 +39,7 @@ class Recorder(SixAxisCompensator):
 
 
 def recorded(changes, gains=None, compensator="recorder"):
-    """Return the final state of a run, and its ticks, for one lane."""
+    """Return the final state of a run and its ticks, for one lane."""
     mechanism = load_any("petals", {**FREE, **changes}).mechanism
     with jax_context():
         scenario = build_scenarios(mechanism)
@@ -53,7 +53,7 @@ def recorded(changes, gains=None, compensator="recorder"):
 
 @pytest.fixture
 def poses(monkeypatch):
-    """Return a function for the poses that a compensator reads, and those of the hardware, (ticks, 6)."""
+    """Return a function for the poses that a compensator reads and those of the hardware, (ticks, 6)."""
     monkeypatch.setitem(SIX_AXIS_COMPENSATORS, "recorder", Recorder())
 
     def of(changes):
@@ -64,7 +64,7 @@ def poses(monkeypatch):
 
 
 def test_six_axis_compensator_reads_pose_delayed_by_sensor(poses):
-    """Both sensors have the same delay: the pose of the hardware when the force is sampled."""
+    """With equal sensor delays, the pose is that at the sampling time of the force."""
     measured, hardware = poses({"rig.position_sensor.delay": 0.0037, "rig.force_sensor.delay": 0.0037})
     np.testing.assert_allclose(measured, hardware, atol=1e-12)
     later, _ = poses({"rig.position_sensor.delay": 0.0})
@@ -88,7 +88,7 @@ def test_measured_six_axis_pose_has_noise_and_quantisation(poses):
 
 
 def test_six_axis_lag_lead_shifts_pose_command_along_its_motion():
-    """Lead one coordinate by the lag of its axis: the hardware is where the model is when it is sampled."""
+    """A lead by the lag of the axis makes hardware and model coincide."""
     mechanism = load_any("petals", FREE).mechanism
     gains = {**literature_gains(mechanism, "phase_lead"), "lead_filter": 1e-3}
     _, late = recorded({}, gains, "phase_lead")
@@ -100,7 +100,7 @@ def test_six_axis_lag_lead_shifts_pose_command_along_its_motion():
 
 
 def test_six_axis_controller_constants_match_masses_of_docked_bodies():
-    """Compare with M^-1 = D diag(m, J)^-1 D' of both bodies by hand, and A with its inverse."""
+    """Compare with M^-1 = D diag(m, J)^-1 D' of both bodies."""
     mechanism = load_any("probe-drogue").mechanism
     with jax_context():
         constants = jax.tree.map(np.asarray, controller_constants(build_scenarios(mechanism), True))

@@ -1,7 +1,7 @@
-"""Derivatives through the whole six-axis loop: of both errors, by numbers of a rig and of a contact.
+"""Derivatives of six-axis energy and twist errors by parameters of rig and contact.
 
-Half of the lanes are a probe in a drogue, half a ring of three points on a plane: one program has both. The
-first lane of each is straight on the axis: not turned, without slip.
+Half of the lanes are a probe in a drogue, half a ring of three points on a plane, in one program. The first
+lane of each is aligned with the axis, without rotation and slip.
 """
 
 import jax
@@ -25,12 +25,12 @@ from jaxhil.sixdof.vectors import vector
 
 pytestmark = pytest.mark.slow
 DRAWS, PERIOD = 256, 1e-3
-LANES = 2 * DRAWS  # lanes of a probe, then of a ring
-STEP = 2e-5  # relative step of each number: few touches begin at another tick because of it
+LANES = 2 * DRAWS  # first the lanes with a probe, then those with a ring
+STEP = 2e-5  # relative step; so small that few touches move to another tick
 BY = ("stiffness", "dissipation", "friction", "force delay", "axes' delays", "axes' frequencies")
-POINTS = np.array([[1.0, -0.5, -0.5], [0.0, 0.866, -0.866], [0.0, 0.0, 0.0]])  # of the ring, for radius 1
-HALF_ANGLE = 0.75  # rad, of the drogue
-AWAY = 10.0  # m: the place of candidates that the lane does not have
+POINTS = np.array([[1.0, -0.5, -0.5], [0.0, 0.866, -0.866], [0.0, 0.0, 0.0]])  # on the ring
+HALF_ANGLE = 0.75  # rad, half cone angle of the drogue
+AWAY = 10.0  # m, distance of candidates that are unused in a lane
 
 
 def contact(scales):
@@ -60,7 +60,7 @@ def bodies():
 
 
 def drawn():
-    """Draw offsets (2), attitudes (3) and twists (6) at the first touch, (number, lanes)."""
+    """Draw offsets (2), attitudes (3) and twists (6) at the first touch, (components, lanes)."""
     seeded = np.random.default_rng(7)
     offset = seeded.uniform(-0.04, 0.04, (2, LANES))
     theta = seeded.uniform(-0.03, 0.03, (3, LANES))
@@ -96,8 +96,8 @@ def scenario(scales, start):
 def passes_over(start):
     """Return the lanes whose probe passes from the drogue's bottom to its wall, or back, in ideal contact.
 
-    The surface's curvature jumps there, and steps conserve the energy to 1e-8, a hundred times worse than
-    elsewhere.
+    The surface's curvature jumps there, and the integration conserves energy only to 1e-8, a hundred times
+    worse than elsewhere.
     """
     space = Space(bodies(), contact(np.ones(3)), ())
     _, seen = follow(space, start, jnp.full(LANES, PERIOD), 300, jnp.full(LANES, 2 * PERIOD))
@@ -108,9 +108,9 @@ def passes_over(start):
 
 
 def test_six_axis_error_derivatives_match_finite_differences():
-    """Compare with central differences of order four, to 1e-4 on 98 % of lanes.
+    """Compare with fourth-order central differences, to 1e-4 on 98 % of lanes.
 
-    The other lanes have a known event, and none is NaN.
+    The other lanes have a known discrete event; no derivative is NaN.
     """
     ones, start = jnp.ones(len(BY)), started(*drawn())
     static = {"integrator": "semi_implicit_euler", "hold": "linear", "latency": 0}

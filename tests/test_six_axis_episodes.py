@@ -1,8 +1,8 @@
-"""Six-axis episodes: compared with one axis by its own metrics, and with closed forms.
+"""Six-axis contact episodes: comparison with one axis and with closed forms.
 
-One program; its lanes are the cases: a central contact of claw-350kg, an oblique one far off the line through
-the centres of mass, the same in a run that begins earlier, and with a biased sensor, a miss, a contact whose
-rotation makes another point touch, and one that hardly changes a fast motion along the surface.
+One program, whose lanes are the cases: central contact of claw-350kg, oblique contact far off the centre
+line, the same in a run that begins earlier, and with a biased sensor, a miss, a contact whose rotation makes
+another point touch, and a contact that hardly changes a fast motion along the surface.
 """
 
 from functools import partial
@@ -32,7 +32,7 @@ CENTRAL, ASIDE, EARLIER, BIASED, AWAY, AGAIN, GRAZING = range(7)
 LANES = 7
 TICKS = 1500
 SIDEWAYS = 0.5  # m/s, along the surface
-QUIET = 0.06  # s; time without a touch after which an episode is over
+QUIET = 0.06  # s, time without touch after which an episode ends
 BATCH = (LANES,)
 PERIOD = 1e-3
 EYE = np.eye(3)
@@ -112,10 +112,10 @@ def test_oblique_six_axis_episode_has_normal_tangential_and_rotational_errors(ev
 
 
 def test_six_axis_episode_does_not_depend_on_start_time_of_run(evaluated):
-    """Expect the same metrics, whichever ticks the check for the end falls on."""
+    """The check for the end of an episode falls on other ticks."""
     for name, figure in evaluated.metrics._asdict().items():
         one, other = (figure[..., 0, lane] for lane in (ASIDE, EARLIER))
-        # The ideal contact finds the begin and end of a touch to 1 us.
+        # The ideal contact determines begin and end of a touch to 1 us.
         tolerance = EVENT_ACCURACY if name == "reference_duration" else 1e-10
         np.testing.assert_allclose(one, other, rtol=1e-7, atol=tolerance, err_msg=name)
 
@@ -124,7 +124,7 @@ def test_six_axis_episode_does_not_depend_on_start_time_of_run(evaluated):
 def followed(loop, given):
     """Return touches and energies at every tick, of the rig and of the ideal contact.
 
-    For the rig these are touches of the hardware and the energy of the numerical model before the tick.
+    For the rig these are touches of the hardware, and the energy of the numerical model before the tick.
     """
     _, seen = run(loop, {}, given, TICKS)
     space = Space(given.bodies, given.groups, ())
@@ -147,13 +147,13 @@ def ticks():
 
 
 def last_touches(touches):
-    """Return the last tick in touch at each tick, or -inf before the first touch."""
+    """Return, for each tick, the last tick in touch so far, or -inf before the first touch."""
     return np.maximum.accumulate(np.where(touches, np.arange(len(touches)), -np.inf))
 
 
 @pytest.mark.parametrize("lane", [CENTRAL, ASIDE, AGAIN])
 def test_six_axis_episode_ends_60_ms_after_last_touch_of_rig_and_ideal_contact(evaluated, ticks, lane):
-    """Find the end tick by tick: nothing has touched for 60 ms, on the hardware and in the ideal contact."""
+    """Search the end tick by tick."""
     rig, energy, ideal, expected = (part[:, lane] for part in ticks)
     since = [np.arange(TICKS) - last_touches(touches) for touches in (rig, ideal)]
     over = np.flatnonzero((np.minimum(*since) > QUIET / PERIOD) & np.isfinite(since[0] + since[1]))[0]
@@ -167,13 +167,13 @@ def test_six_axis_episode_ends_60_ms_after_last_touch_of_rig_and_ideal_contact(e
     onsets = [np.sum(np.diff(touches[: over + 1].astype(int)) > 0) for touches in (rig, ideal)]
     assert onsets == [of("touches"), of("reference_touches")]
     if lane == AGAIN:
-        # The ideal contact is quiet for a while before the rig is, and touches again.
+        # The ideal contact is separated for a while before the rig is, and touches again.
         assert np.max(np.diff(np.flatnonzero(ideal[:over]))) > QUIET / PERIOD
         assert onsets == [1, 2]
 
 
 def test_six_axis_episode_with_sensor_bias_ends_after_longest_wait(evaluated, ticks):
-    """A biased wrench never decays: the numerical model moves before and after the contact."""
+    """A biased wrench never decays, so the model also moves before and after contact."""
     rig, energy, *_ = (part[:, BIASED] for part in ticks)
     over = np.flatnonzero(rig)[-1] + round((QUIET + 0.1) / PERIOD) + 2
     change = energy[over] - energy[0]
@@ -181,7 +181,7 @@ def test_six_axis_episode_with_sensor_bias_ends_after_longest_wait(evaluated, ti
 
 
 def test_six_axis_episode_does_not_end_after_contact_of_little_energy(evaluated):
-    """Judge it at the end of the run, with energies over 5 % of that of the approach."""
+    """Such a contact is evaluated at the end of the run, relative to 5 % of the approach energy."""
     result = evaluated.metrics
     assert STATUS_NAMES[result.status[0, GRAZING]] == "timeout"
     assert result.touches[0, GRAZING] == result.reference_touches[0, GRAZING] == 1

@@ -1,4 +1,4 @@
-"""Mechanism files of six axes: their content, and refusals in one line."""
+"""Six-axis mechanism files: their content, and refusals in one line."""
 
 import copy
 import json
@@ -238,7 +238,7 @@ PLACES = [(name, path) for name, raw in RAW.items() for path in places(raw)]
 @settings(deadline=None, max_examples=40)
 @given(place=st.sampled_from(PLACES), junk=JUNK, sibling=st.sampled_from(PLACES))
 def test_any_six_axis_mechanism_table_is_read_or_refused_in_one_line(place, junk, sibling):
-    """Replace one value by another one of any kind, or by one from another place in the files."""
+    """Replace one value by a value of any type, or by a value from elsewhere in the files."""
     name, path = place
     for value in (junk, at(RAW[sibling[0]], sibling[1])):
         raw = copy.deepcopy(RAW[name])

@@ -1,8 +1,8 @@
-"""Invariance of six-axis contact to the interface frames and to which body is called the target.
+"""Invariance of six-axis contact to interface frames and to exchange of target and chaser.
 
-A probe in a drogue and a ball on a plane, off-centre and oblique, with friction: once the bodies are swapped,
-and the drogue is the chaser's; once T and C are elsewhere on their bodies, turned, and the shapes are said
-from there.
+Cases: a probe in a drogue and a ball on a plane, off-centre and oblique, with friction. First the bodies are
+exchanged, so that the drogue belongs to the chaser; then the frames T and C are moved and rotated on their
+bodies.
 """
 
 import jax
@@ -37,7 +37,7 @@ def bodies():
 
 
 def start(pair):
-    """Return the states of both bodies, whatever their frames."""
+    """Return the states of both bodies, independent of their interface frames."""
     target = build_state(
         pair.target, place([0, 0, 0], BATCH), place([0, 0, 0], BATCH), identity(jnp.ones(1)),
         place([1e-3, 2e-3, -1e-3], BATCH),
@@ -50,7 +50,7 @@ def start(pair):
 
 
 def after(pair, states, group):
-    """Return the bodies' states after the contact, and the energy lost in it."""
+    """Return the states of the bodies after the contact, and the lost energy."""
     space, time, longest = Space(pair, (group,), ()), lanes(DURATION, BATCH), lanes(1e-3, BATCH)
 
     @jax.jit
@@ -63,7 +63,7 @@ def after(pair, states, group):
 
 
 def close(found, expected, before):
-    """Compare to 1e-9 of what the contact changed, which is not zero."""
+    """Compare to 1e-9 of the change during the contact, which must not be zero."""
     for one, other, begun in zip(found, expected, before, strict=True):
         for name in ("velocity", "spin", "position"):
             a, b, c = (np.asarray(components(getattr(state, name))) for state in (one, other, begun))
@@ -90,7 +90,7 @@ def test_six_axis_contact_is_invariant_to_frames_and_exchange_of_bodies():
 
 
 def elsewhere(pair, before):
-    """Return a ball's contact with an oblique plane, with the frames unchanged and moved in their bodies."""
+    """Return a ball's contact with an oblique plane, with original and with moved frames."""
     normal, centre = place([[0.2], [-0.1], [0.97]], BATCH), place([[0.1], [0.2], [0.05]], BATCH)
     normal = (1 / np.sqrt(0.2**2 + 0.1**2 + 0.97**2)) * normal
     on_it, radius = place([[0.0], [0.0], [0.052]], BATCH), 0.02 * ONE

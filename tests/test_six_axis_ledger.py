@@ -1,4 +1,4 @@
-"""Impulse ledger in six axes: its errors beside those of a lead, silence without contact."""
+"""Six-axis impulse ledger: errors compared with those of a lead, and no command without contact."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ BARS = {
 
 
 def evaluated(mechanism, compensator, *changes, lanes=LANES, scenario=None):
-    """Return the metrics of the first episode for each change of the literature's gains, from one program."""
+    """Return the metrics of the first episode for each change of the literature's gains."""
     with jax_context():
         scenarios = build_scenarios(mechanism, draw(mechanism, lanes, 1), seed=1)
         if scenario is not None:
@@ -49,14 +49,14 @@ def rms(values):
 
 
 def check_good(metrics):
-    """Check that every lane has ended in one of the good ways."""
+    """Check that every lane has a status of success."""
     assert {STATUS_NAMES[status] for status in metrics["status"]} <= {"rebounded", "captured"}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BARS)
 def test_six_axis_impulse_ledger_has_much_smaller_errors_than_lead(name):
-    """Compare with the best of several leads as long as the whole loop, on the same draws."""
+    """Compare with the best of several leads on the same draws."""
     mechanism = with_ranges(name)
     [ledger] = evaluated(mechanism, LAW)
     check_good(ledger)
@@ -78,7 +78,7 @@ def test_six_axis_impulse_ledger_is_accurate_with_pose_noise():
 
 @pytest.mark.slow
 def test_six_axis_impulse_ledger_is_accurate_with_wrong_rig_parameters():
-    """Cover a bias of 5 N, a tool 2 % too light, and a force delay 1 ms longer than assumed."""
+    """Bias of 5 N, tool 2 % too light, force delay 1 ms longer than specified."""
     mechanism = with_ranges("probe-drogue")
     delay = mechanism.rig.force_sensor.delay
 
@@ -102,7 +102,7 @@ def test_six_axis_impulse_ledger_is_accurate_with_wrong_rig_parameters():
 
 @pytest.mark.slow
 def test_six_axis_impulse_ledger_commands_zero_wrench_without_contact():
-    """Approach from afar, with noise, a tool and gravity."""
+    """Approach from afar, with noise, tool and gravity."""
     mechanism = with_ranges("probe-drogue", POSE_NOISE)
     with jax_context():
         scenarios = build_scenarios(mechanism, draw(mechanism, LANES, 2), seed=2)

@@ -1,7 +1,8 @@
-"""Six-axis motion against MuJoCo: a free top, a tether, three tethers. Skipped without `mujoco`.
+"""Six-axis motion compared with MuJoCo: a free top, one tether, three tethers. Skipped without `mujoco`.
 
-A tether is slack up to its length and a spring beyond: MuJoCo's tendon with a dead band, and here a point of
-the chaser within a sphere on the target. MuJoCo's contacts are no measure: a stiffness in N/m is not theirs.
+A tether is slack up to its length and a spring beyond: a tendon with a dead band in MuJoCo, and here a point
+of the chaser in a sphere on the target. Contacts of MuJoCo are not comparable: their stiffness is not
+specified in N/m.
 """
 
 import jax
@@ -41,7 +42,7 @@ def test_six_axis_twists_agree_with_mujoco(tethers):
 
 
 def ours(tethers, duration):
-    """Return velocities of both (world axes), then angular velocities (body axes)."""
+    """Return velocities of both bodies (world axes), then angular velocities (body axes)."""
     bodies = Pair(*(
         plain_body(mass, inertia, (0, 0, 0), BATCH) for mass, inertia in zip(MASSES, FULL, strict=True)
     ))  # fmt: skip

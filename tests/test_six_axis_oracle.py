@@ -1,7 +1,7 @@
-"""Rig and ideal contact in six axes against an independent implementation (`six_axis_oracle`).
+"""Six-axis rig and ideal contact compared with an independent implementation (`six_axis_oracle`).
 
-Off-centre and oblique, with friction, unequal delays: a probe in a drogue, three points of a ring on a plane,
-and the probe on a sensor that carries its tool.
+Off-centre and oblique contacts with friction and unequal delays: a probe in a drogue, three points of a ring
+on a plane, and the probe on a sensor that carries its tool.
 """
 
 import jax
@@ -61,7 +61,7 @@ CASES = {
 
 
 def started(case):
-    """Place the bodies of the case: C off T, rotated, and moving towards it."""
+    """Return the initial states of the case: C off T, rotated, and approaching."""
     o1, o2 = (np.asarray(o) for o in case["interfaces"])
     apart = np.array([0.03, -0.025, case["height"]])
     chaser = (o1 + apart - TURN @ o2, np.array([1e-3, -2e-3, -0.025]), TURN, np.array([3e-3, -2e-3, 1e-3]))
@@ -107,7 +107,7 @@ def as_scenario(case):
 
 
 def close(states, expected, tolerance):
-    """Compare positions and velocities with those of the other implementation."""
+    """Compare positions and velocities with those of the independent implementation."""
     for state, (r, v, attitude, _) in zip(states, expected, strict=True):
         np.testing.assert_allclose(np.asarray(components(state.velocity))[:, 0], v, atol=tolerance)
         np.testing.assert_allclose(np.asarray(components(state.position))[:, 0], r, atol=tolerance)
@@ -128,7 +128,7 @@ def test_six_axis_rig_agrees_with_independent_implementation(name):
     assert np.max(np.abs(components(seen.contact.force))) > 20
     expected = on_the_rig(case, TICKS)
     close(end.states, expected, 1e-10)
-    # Angular velocities, and the momentum of the whole.
+    # Angular velocities, and total momentum.
     spins = [np.asarray(components(state.spin))[:, 0] for state in end.states]
     for spin, (_, _, attitude, w), inertia in zip(spins, expected, case["inertias"], strict=True):
         np.testing.assert_allclose(spin, attitude @ inertia @ w, atol=1e-9)

@@ -1,4 +1,4 @@
-"""Runs of six-axis mechanism files: what is built, what `jaxhil simulate` prints, one axis as oracle."""
+"""Runs of six-axis mechanism files: construction, output of `jaxhil simulate`, comparison with one axis."""
 
 import copy
 import json
@@ -38,7 +38,7 @@ def test_six_axis_contact_patterns_are_rotated_copies():
 
 
 def test_six_axis_parameter_draws_are_stored_as_lanes():
-    """Draw lists, matrices and numbers of tables, different in each lane; the rest is nominal."""
+    """Draw lists, matrices and numbers of tables, different in each lane."""
     factor = {"distribution": "uniform", "factor": [0.9, 1.1]}
     uncertain = {
         key: factor for key in ("target.inertia", "contact.edge_left.chaser.from", "rig.simulator.delay")
@@ -73,7 +73,7 @@ def test_six_axis_latches_and_robots_are_built_as_specified():
     assert scenario.simulator.delay[:, 0].tolist() == [0.008] * 6 + [0.016] * 6
     own = load_any("claw-two-arms", APART).mechanism
     assert build_scenarios(own).simulator.delay[:, 0].tolist() == [0.008] * 12
-    # Each robot is late by its share.
+    # The delay of each robot counts by its share.
     lag = 0.9 / (np.pi * np.array([14.0, 12.0]))
     delay = 0.004 + 0.7 * (lag[0] + 0.008) + 0.3 * (lag[1] + 0.016)
     late = meaning(mechanism, 1.0, 1.0, 1.0, 1.0, 1.0).delay
@@ -83,7 +83,7 @@ def test_six_axis_latches_and_robots_are_built_as_specified():
 
 
 def central(name):
-    """Return one contact of a built-in mechanism of one axis as two bodies that meet on their line."""
+    """Return one contact of a one-axis mechanism as two bodies with central impact."""
     one = load_any(name, {"approach.contacts": 1}).mechanism
     raw = to_plain_data(one)
     body = {"mass": 2 * one.bodies.mass, "inertia": [3.0, 4.0, 5.0]}
@@ -179,7 +179,7 @@ def test_simulate_command_runs_a_six_axis_builtin_mechanism(jaxhil, tmp_path, na
     np.testing.assert_allclose(np.linalg.norm(parts), episode["twist_error"], rtol=1e-6)
     assert episode["status"] == document["status"] == ("captured" if captured else "rebounded")
     assert (document["meaning"]["frequency"] is None) == captured
-    # Without an external force momentum is constant: the target's was 0.
+    # Without an external force momentum is constant: the target was at rest.
     mechanism = load_any(name).mechanism
     momenta = [mechanism.target.mass * np.array(document["final"]["v1"])]
     momenta.append(mechanism.chaser.mass * np.array(document["final"]["v2"]))
@@ -203,7 +203,7 @@ def test_simulate_command_runs_a_six_axis_builtin_mechanism(jaxhil, tmp_path, na
 
 
 def check_table(ticks, mechanism, final):
-    """Check that bodies, poses and wrenches of a table are consistent, and lead to the end of the run."""
+    """Check that bodies, poses and wrenches of a table are consistent until the end of the run."""
 
     def of(name, suffixes):
         return np.stack([ticks[f"{name}_{suffix}"] for suffix in suffixes.split()], axis=1)
@@ -230,7 +230,7 @@ def check_table(ticks, mechanism, final):
     np.testing.assert_allclose(change, period * force, atol=1e-9 * np.abs(force).max())
     np.testing.assert_allclose(mechanism.target.mass * np.diff(velocities["target"], axis=0), -change,
                                atol=1e-9 * np.abs(force).max())  # fmt: skip
-    # The real contact has a force where something is deep.
+    # The real contact force is nonzero if a candidate penetrates.
     depths = [ticks[name] for name in ticks.dtype.names if name.startswith("depth_")]
     forces = [ticks[name] for name in ticks.dtype.names if name.startswith("force_")]
     assert len(depths) == len(forces) > 0 and np.any(np.array(forces)[np.array(depths) > 0] > 0)
@@ -239,7 +239,7 @@ def check_table(ticks, mechanism, final):
 
 @pytest.mark.slow
 def test_simulate_command_runs_a_six_axis_flight_without_contact(jaxhil, tmp_path):
-    """Start from states of both bodies; the chaser turns about a principal axis."""
+    """The chaser rotates about a principal axis."""
     state = "{{position=[0,0,{}], attitude=[1,0,0,0], velocity=[0,0,0], angular_velocity=[0,{},0]}}"
     start = f"start={{duration=0.2, target={state.format(0, 0)}, chaser={state.format(3, 0.5)}}}"
     overrides = [start, "contact={}", "latch={}", "uncertainty={}"]
@@ -266,7 +266,7 @@ def test_simulate_command_runs_a_six_axis_flight_without_contact(jaxhil, tmp_pat
 
 @pytest.mark.slow
 def test_too_stiff_six_axis_friction_is_named_in_error():
-    """Cover an ideal contact that would need steps of 1e-9 s."""
+    """The ideal contact would need steps of 1e-9 s."""
     stiff = {"contact.tip.friction.coefficient": 10.0, "contact.tip.friction.slip": 1e-9, "uncertainty": {}}
     with pytest.raises(InputError, match=r"^probe-drogue: contact\.tip\.friction\.slip: found 1e-09 m/s"):
         package.simulate(package.load("probe-drogue", stiff))
@@ -298,7 +298,7 @@ def test_hexapod_run_ends_at_the_tick_at_which_a_leg_exceeds_its_length():
 
 @pytest.mark.slow
 def test_six_axis_bodies_at_rest_with_noise_are_not_reported_as_divergent():
-    """Move them by noise alone, by more than the energy of the start, which is zero."""
+    """The initial energy is zero, so noise exceeds any multiple of it."""
     rest = {"attitude": [1, 0, 0, 0], "velocity": [0, 0, 0], "angular_velocity": [0, 0, 0]}
     bodies = {"target": {"position": [0, 0, 0], **rest}, "chaser": {"position": [0, 0, 3], **rest}}
     overrides = {"approach": None, "start": {"duration": 0.2, **bodies}, "uncertainty": {}}

@@ -1,4 +1,4 @@
-"""Six-axis sensor: a tool of many particles, compensated readings, and the effect of wrong parameters."""
+"""Six-axis sensor: wrench of a tool of many particles, compensated readings, and wrong tool parameters."""
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +40,7 @@ def tool():
 
 
 def along(time):
-    """Return the coordinates at a time."""
+    """Return the coordinates of the motion at a time."""
     at = MOTION[0] + time * MOTION[1] + time**2 / 2 * MOTION[2]
     return Coordinates(vector(at[:3]), vector(at[3:]))
 
@@ -67,7 +67,7 @@ def close(found, expected, **tolerances):
 
 @pytest.mark.slow
 def test_tool_wrench_equals_sum_over_its_particles():
-    """Let the motion carry each particle, which pushes with its weight less its inertia."""
+    """Each particle exerts its weight minus its inertial force."""
 
     def places(time):
         at = along(time)
@@ -103,7 +103,7 @@ def test_correct_tool_parameters_recover_contact_wrench_from_sensor():
 
 
 def test_wrong_tool_parameters_leave_residual_gravity_wrench():
-    """Expect a share of the weight for the mass, and the weight times the angle for the attitude."""
+    """Mass error: share of the weight; attitude error: weight times angle."""
     still = Twist(triple([0.0] * 3), triple([0.0] * 3))
     level = Pose(triple([0.1, 0.0, 0.2]), exponential(triple([0.0, 0.0, 0.0])))
     down = triple([0.0, 0.0, -9.80665])
@@ -113,7 +113,7 @@ def test_wrong_tool_parameters_leave_residual_gravity_wrench():
     lighter = tool_load(tool_carried._replace(mass=0.98 * tool_carried.mass), level, still, still, down)
     left = undo_moving(reading, lighter, level).force - wrench().force
     np.testing.assert_allclose(components(left), [0, 0, -0.02 * 12 * 9.80665], atol=1e-12)
-    # The contact's own force rotates with the measured attitude, too.
+    # The contact force itself also rotates with the measured attitude.
     tilted = level._replace(attitude=exponential(triple([0.03, 0.0, 0.0])))
     left = undo_moving(read_moving(jax.tree.map(jnp.zeros_like, load), load, level), load, tilted).force
     np.testing.assert_allclose(left.y, 0.03 * 12 * 9.80665, rtol=2e-4)

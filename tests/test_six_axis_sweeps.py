@@ -1,4 +1,4 @@
-"""Six-axis sweeps: scenarios repeat to the bit; a cluster keeps rows and gains if a worker dies."""
+"""Six-axis sweeps: bit-identical replays, and unchanged rows and gains if a cluster worker is killed."""
 
 import json
 
@@ -25,7 +25,7 @@ ASKED = {"scenarios": 32, "chunk": 4, "limit": 1.2}
 
 @pytest.fixture(scope="module")
 def gains(tmp_path_factory):
-    """The literature's gains."""
+    """Return the literature's gains."""
     mechanism, path = load_any(NAME).mechanism, tmp_path_factory.mktemp("gains") / "gains.json"
     result = literature_gains(mechanism, LAW)
     write_gain_file(path, build_document(LAW, result, mechanism, "0" * 64, {}, {}, 0, {}))
@@ -34,7 +34,7 @@ def gains(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def here(gains):
-    """Sweep computed locally."""
+    """Return a sweep computed locally."""
     return tuning.sweep(gains, **ASKED, folder=gains.parent / "store")
 
 

@@ -1,4 +1,4 @@
-"""Six axes tuned and swept end to end: gain file, store and report; refusals of what six axes lack."""
+"""Six-axis mechanisms tuned and swept: gain file, store and report; refusals of unsupported features."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Plausible units: numbers in another unit than the file's are reported, with the requested unit."""
+"""Plausibility of units: numbers that seem to have a wrong unit are reported with the required unit."""
 
 import pytest
 

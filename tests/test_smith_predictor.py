@@ -1,4 +1,4 @@
-"""Smith predictor and hybrid: what they leave is what their characteristic root says."""
+"""Smith predictor and hybrid compensator compared with their characteristic roots."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import builtin_names, load
 from tuning.gains.pareto_search import compute_noise_amplification as pareto_amplification
 
-# Lag of the motion simulator and delay of the force [s]; the first are model.md's.
+# Lag of the motion simulator and delay of the force [s]; the first pair is that of model.md.
 LAGS = np.array([[0.010, 0.008], [0.010, 0.002], [0.004, 0.008], [0.015, 0.0]])
 SMITH = {"smith_predictor": 1.0, "smith_hybrid": 0.5}
 
@@ -18,7 +18,7 @@ SMITH = {"smith_predictor": 1.0, "smith_hybrid": 0.5}
 def expected_decay(share, lag, delay):
     """Return the decay of the root of s^2 + omega^2 C(s) e^(-s (lag + delay)) = 0.
 
-    C has the given share of the predictor.
+    C is the controller with the given share of the predictor.
     """
 
     def equation(s):
@@ -60,7 +60,7 @@ def test_smith_predictor_restitution_is_near_prediction_of_characteristic_root(n
     gains = {"phase_lead": delay, "simulator_lag": lag, "lead_filter": period / 2}
     result = first_contact(parsed, scenario, name, gains)["restitution"].reshape(2, -1).mean(axis=1)
     print(name, 2 * result[1] - result[0], np.exp(expected_decay(SMITH[name], lag, delay)))
-    # Onset and end of the contact are no oscillation.
+    # Onset and end of the contact are not part of the oscillation.
     expected = np.exp(expected_decay(SMITH[name], lag, delay))
     assert 2 * result[1] - result[0] == pytest.approx(expected, abs=0.2 * (OMEGA * (lag + delay)) ** 3)
 

@@ -1,4 +1,4 @@
-"""Sobol indices against closed forms: the Ishigami function, a linear one, inputs of several columns."""
+"""Sobol indices compared with closed forms: Ishigami function, linear function, inputs of several columns."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Fingerprint of sources: it changes with the code, including that of user-registered laws."""
+"""Fingerprint of sources: changes with any code, including user-registered laws."""
 
 import importlib
 import sys

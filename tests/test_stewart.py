@@ -1,4 +1,4 @@
-"""Hexapod: inverse and forward kinematics; equal legs against task space; two robots."""
+"""Hexapod: inverse and forward kinematics; equal legs compared with a task-space simulator; two robots."""
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ def poses():
 
 
 def test_hexapod_pose_survives_inverse_and_forward_kinematics():
-    """Include rates and accelerations of the legs and of the pose."""
+    """Include rates and accelerations."""
     rig, (at, rate, bend) = hexapod(), poses()
 
     def along(time):
@@ -68,7 +68,7 @@ def test_hexapod_pose_derivatives_agree_with_differences():
 
 
 def moved(kinematics, axes, amplitude):
-    """Return the coordinates that the sensor has while the command swings."""
+    """Return the coordinates at the sensor for an oscillating command."""
     shape = jnp.asarray([1.0, -0.5, 0.7, 0.8, 0.6, -0.9])[:, None] * jnp.ones((6, 2))
     number = kinematics.command(shape).shape[0]
     late = lanes([4.4e-3] * number, BATCH)
@@ -87,7 +87,7 @@ def moved(kinematics, axes, amplitude):
 
 
 def test_hexapod_with_equal_legs_equals_task_space_simulator_for_small_strokes():
-    """Expect a difference of second order in the stroke."""
+    """The difference is of second order in the stroke."""
     both = [
         [np.asarray(jax.jit(moved, static_argnums=(1, 2))(one, 12.0, size)) for size in (1e-2, 1e-3)]
         for one in (hexapod(), TaskSpace())
@@ -102,7 +102,7 @@ def test_two_equal_robots_move_like_a_single_robot():
     one, two = (jax.jit(moved, static_argnums=(1, 2)) for _ in range(2))
     expected = np.asarray(one(TaskSpace(), 12.0, 0.01))
     np.testing.assert_allclose(two(TwoRobots(share), 12.0, 0.01), expected, atol=1e-14)
-    # A slow robot of the target shows whether it has a share.
+    # A slow second robot changes the motion by its share.
     slow = jnp.concatenate([lanes([12.0] * 6, BATCH), lanes([3.0] * 6, BATCH)])
     result = np.asarray(jax.jit(lambda share: moved(TwoRobots(share), slow, 0.01))(share))
     apart = np.max(np.abs(result - expected), axis=(0, 2))

@@ -1,4 +1,4 @@
-"""Causes that stop a run on the rig: fault, value, limit, contact and time; and what lets the run pass."""
+"""Causes that stop a run on the rig: fault, value, limit, contact and time, and sufficient limits."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ AUDIT = {
 
 @pytest.fixture(scope="module")
 def loaded():
-    """Gains with which every contact of `varying` diverges by several percent."""
+    """Return gains with which every contact of `varying` diverges by several percent."""
     parsed = load("varying").mechanism
     gains = literature_gains(parsed, LAW)
     return check_document(build_document(LAW, gains, parsed, "0" * 64, {}, {}, 0, {}))
@@ -36,7 +36,7 @@ def loaded():
 
 @pytest.fixture(scope="module")
 def recorded(loaded):
-    """The nominal run: its metrics and its record."""
+    """Return metrics and record of the nominal run."""
     metrics, lanes = record_lanes(loaded, nominal_and_draws(loaded.mechanism, 1, 0))
     return metrics, lanes[0]
 
@@ -58,7 +58,7 @@ def test_run_without_limits_is_not_stopped(loaded, recorded):
 
 
 def reaches(lane):
-    """Return the value of every guard's limit that the nominal run needs, from its record alone."""
+    """Return the values that the nominal run requires of every guard limit, from its record alone."""
     signals, period = lane.signals, 1e-3
     same = np.asarray(signals.age)[1:] > 0
     sent = np.asarray(lane.sent)
@@ -164,7 +164,7 @@ def test_verify_reports_the_fault_that_stopped_the_closed_loop(loaded):
     limits = {**AUDIT, "restitution_margin": 0.05}
     report = verify(check_document(limited(loaded, **limits)), scenarios=1)
     assert not report.verdict and report.stop.fault == "restitution" and report.stop.contact == 1
-    # Contacts that are not reached because of that have no line of their own.
+    # Contacts that are not reached because of the stop have no separate line.
     assert len(report.reasons) == 1 and report.reasons[0] == f"closed loop: {report.stop.text}"
     assert [one.status for one in report.closed_loop] == ["ok", "not reached", "not reached"]
     assert verify(loaded, scenarios=1).stop is None

@@ -1,4 +1,4 @@
-"""Subset simulation against closed forms, down to 1e-6: its interval contains the probability."""
+"""Subset simulation compared with closed forms, down to a probability of 1e-6."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ LIMIT_STATES = {
     "plane of 20": plane(20),
     "sphere of 3": sphere(3),
     "sphere of 10": sphere(10),
-    # Two branches: opposite planes, and planes at right angles: 1 - (1 - q)^2 = p.
+    # Two failure regions: opposite half spaces, and perpendicular half spaces with 1 - (1 - q)^2 = p.
     "opposite": (2, lambda u: np.abs(u[:, 0] + u[:, 1]) / np.sqrt(2), lambda p: stats.norm.isf(p / 2)),
     "series": (
         5,
@@ -38,7 +38,7 @@ def repeated(name, probability, repeats):
     return [subset_simulation(performance, inputs, limit(probability), seed) for seed in range(repeats)]
 
 
-# The run to 1e-6 passes 1e-4.
+# The levels down to 1e-6 include 1e-4.
 @pytest.mark.parametrize("probability", (pytest.param(1e-4, marks=pytest.mark.slow), 1e-6))
 @pytest.mark.parametrize("name", LIMIT_STATES)
 def test_subset_simulation_interval_contains_the_probability(name, probability, capsys):
@@ -72,7 +72,7 @@ def test_repeated_subset_simulation_intervals_contain_the_probability(name, prob
 
 
 def test_subset_simulation_coefficient_of_variation_matches_repeats():
-    """Compare over repeats: the replicates' spread is right, the formula is too small."""
+    """The spread over replicates is right; the published formula underestimates."""
     results = repeated("plane of 5", 1e-4, 40)
     seen = np.std([result.estimates for result in results]) / 1e-4
     of_replicates = np.sqrt(np.mean([result.coefficient_of_variation**2 for result in results]) * 10)
@@ -127,7 +127,7 @@ def test_subset_simulation_worst_scenarios_are_distinct_and_reproducible():
 
 @pytest.mark.parametrize("broken", (np.nan, np.inf, -np.inf))
 def test_subset_simulation_counts_nonfinite_performance_as_failure(broken):
-    """Use a run that diverges beyond 3.5 standard deviations, long before the limit 1e9."""
+    """Diverge beyond 3.5 standard deviations, before the limit 1e9."""
 
     def performance(u):
         return np.where(u[:, 0] > 3.5, broken, u[:, 0])
@@ -143,7 +143,7 @@ def test_subset_simulation_counts_nonfinite_performance_as_failure(broken):
 
 @pytest.mark.parametrize("quantum", (0.25, 1.0))
 def test_subset_simulation_works_for_stepwise_performance_function(quantum):
-    """Use whole steps: many scenarios are equal, often more than a tenth of them at once."""
+    """Many scenarios have equal performance, often more than a tenth."""
 
     def performance(u):
         return quantum * np.floor(np.sum(u, axis=1) / np.sqrt(3) / quantum)
@@ -155,7 +155,7 @@ def test_subset_simulation_works_for_stepwise_performance_function(quantum):
 
 @pytest.mark.parametrize("probability", (0.0, 0.02, 0.05, 0.3, 1.0))
 def test_subset_simulation_of_frequent_failures_uses_binomial_interval(probability):
-    """Use two values of performance: passed or failed, and nothing between."""
+    """The performance has two values: passed and failed."""
     limit = stats.norm.isf(probability)
     inside = 0
     for seed in range(40):
@@ -169,7 +169,7 @@ def test_subset_simulation_of_frequent_failures_uses_binomial_interval(probabili
 
 
 def test_subset_simulation_upper_bound_covers_failures_beyond_a_plateau():
-    """Use a failure without a slope towards it: the performance rises to a plateau, and fails beyond."""
+    """The performance rises to a plateau, and fails beyond."""
 
     def performance(u):
         return np.where(u[:, 0] > 5.5, 10.0, np.minimum(u[:, 0], 2.0))

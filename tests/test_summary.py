@@ -1,4 +1,4 @@
-"""Summary page: it holds every gain and limit, is one file, and states nothing that is not known."""
+"""Summary page of a bundle: every gain and limit, self-contained, without unknown facts."""
 
 import base64
 import copy
@@ -44,13 +44,13 @@ def full_document():
         "approach_velocity": {"low": 0.005, "high": 0.005, "unit": "m/s"},
         "force": {"low": 15.0, "high": 83.0, "unit": "N"},
     }
-    # Values that stand for themselves, and some missing limits.
+    # Special values, and some missing limits.
     limits = {name: None if index % 7 == 3 else 1.5 + index for index, name in enumerate(LIMITS)}
     return replace_limits(made, limits, RATES)
 
 
 class Page(HTMLParser):
-    """The page's text, its balanced tags, and its references."""
+    """Texts of the page, its balanced tags, and its references."""
 
     def __init__(self, content):
         super().__init__()

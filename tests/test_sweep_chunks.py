@@ -1,4 +1,4 @@
-"""Chunks of a sweep: the same rows to the bit for any chunks, in either precision, of good and bad runs."""
+"""Chunks of a sweep: bit-identical rows for any division, in either precision, for good and bad runs."""
 
 import numpy as np
 import pytest
@@ -62,7 +62,7 @@ def test_sweep_results_in_float32_are_close_to_float64():
 
 
 def test_failed_runs_are_stored_as_sweep_rows():
-    # A sensor that reads next to nothing: the bodies are never stopped.
+    # The sensor reads almost nothing, so the bodies are never stopped.
     uncertain = {"rig.force_sensor.range": {"distribution": "loguniform", "low": 1e-7, "high": 1e3}}
     sweep = build_sweep(manifest(case(force_sensor={"range": 1.0}, uncertainty=uncertain)))
     rows = run_chunk(sweep, 0, 32)
@@ -73,7 +73,7 @@ def test_failed_runs_are_stored_as_sweep_rows():
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_run_counts_as_saturated_if_simulator_cannot_follow_the_model(tmp_path, precision):
-    """Omit damping and compensation: the force only pushes back, so the model is fastest in flight."""
+    """Without damping and compensation, the model is fastest in free flight."""
     uncertain = {"rig.simulator.velocity_limit": {"distribution": "loguniform", "low": 0.0055, "high": 0.024}}
     label = manifest(case(uncertainty=uncertain, velocity_limit=0.01), 32, precision=precision)
     sweep = build_sweep(label)

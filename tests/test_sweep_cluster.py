@@ -1,4 +1,4 @@
-"""Sweeps on a dask.distributed cluster with workers started by hand: the same rows, whichever worker dies."""
+"""Sweeps on a dask.distributed cluster with manually started workers: rows unchanged by a killed worker."""
 
 import os
 import socket
@@ -39,7 +39,7 @@ def rows_of(folder, computer=None, label=MANIFEST, each=lambda tally: None):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Sweep computed locally."""
+    """Return a sweep computed locally."""
     return rows_of(tmp_path_factory.mktemp("whole") / "store")
 
 
@@ -61,7 +61,7 @@ def test_sweep_with_unresponsive_scheduler_fails_in_one_line(monkeypatch, says, 
     waited = Event()
 
     def answer(listening):
-        """Answer a call; release whoever still waits after a minute."""
+        """Answer a call; release callers that still wait after a minute."""
         with listening.accept()[0] as accepted:
             accepted.sendall(says)
             waited.wait(60)
@@ -119,7 +119,7 @@ def test_cluster_worker_with_running_jax_is_refused_or_preloaded(whole, tmp_path
 
 @pytest.mark.slow
 def test_sweep_chunk_that_kills_its_workers_is_computed_locally(tmp_path):
-    """Let every worker die of its first chunk, and start anew."""
+    """Every worker dies during its first chunk and is restarted."""
     few = manifest(case(), scenarios=64, limit=1.5)
     code = "import os, signal, tuning.caches.worker as w\n"
     (tmp_path / "deadly.py").write_text(code + "w.prepare = lambda: os.kill(os.getpid(), signal.SIGKILL)\n")

@@ -1,4 +1,4 @@
-"""Rows of a sweep: columns of good runs and of failed ones."""
+"""Rows of a sweep: columns of good and of failed runs."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,8 @@ NAN = np.nan
 def rows(errors, status, peak_force=10.0, force_range=np.inf, shortfall=0.0, ideal=(10.0, 1.0)):
     """Return rows of a sweep of two contacts; errors and status are (2, lanes).
 
-    `ideal` holds peak force [N] and duration [s], beside `peak_force` and a duration of 1 s.
+    `ideal` holds peak force [N] and duration [s] of the ideal contact; the real contact has `peak_force` and
+    a duration of 1 s.
     """
     parsed = check_document(case(2, force_sensor={"range": 1e6})).mechanism
     errors, status = np.array(errors, float), np.array(status, np.int32)
@@ -89,7 +90,7 @@ def test_failed_run_is_stored_as_row_with_cause_of_failure():
         "timeout",
         "not reached",
     ]
-    # Known values of a contact that did not end stay; those that only its end gives are missing.
+    # A contact that did not end keeps known values; values that require its end are missing.
     np.testing.assert_array_equal(np.isnan(result["restitution_1"]), [True, True, False, False])
     assert np.isfinite(result["peak_force_1"]).all()
     np.testing.assert_array_equal(np.isnan(result["peak_force_2"]), [True, True, False, True])
@@ -103,7 +104,7 @@ def test_force_beyond_the_sensor_range_counts_as_saturation():
 def test_reached_limit_of_the_motion_simulator_counts_as_saturation():
     errors, status = [[0.0, 0.5, 0.0], [0.0, 0.0, NAN]], [[OK] * 3, [OK, OK, TIMEOUT]]
     result = rows(errors, status, shortfall=1e-9)
-    # It ranks above an error and below a contact that does not end; it is known for that one, too.
+    # Saturation ranks above an error and below a contact without end, for which it is also known.
     assert outcomes(result) == ["saturated", "saturated", "timeout"] and result["failed"].all()
     np.testing.assert_array_equal(result["position_shortfall_2"], 1e-9)
     assert outcomes(rows(errors, status)) == ["good", "error beyond limit", "timeout"]

@@ -1,4 +1,4 @@
-"""`jaxhil sweep` and `jaxhil replay`: exit codes, one JSON document, refusals in one line."""
+"""`jaxhil sweep` and `jaxhil replay`: exit codes, JSON documents, refusals in one line."""
 
 import json
 import resource
@@ -36,7 +36,7 @@ def store(gains, tmp_path_factory):
 
 @pytest.fixture
 def own(gains, store, tmp_path):
-    """A store that only one test uses, and the command that continues it."""
+    """Return a store used by a single test, and the command that resumes its sweep."""
     folder = tmp_path / "own"
     shutil.copytree(store, folder)
     return folder, ["sweep", gains, *TINY, "-o", folder, "--limit", "1.5", "--resume"]
@@ -75,7 +75,7 @@ def test_sweep_verdict_depends_on_the_acceptable_probability(jaxhil, gains, stor
 
 
 def test_sweep_verdict_is_good_without_failures(jaxhil, gains, tmp_path):
-    """Expect the store beside the gain file unless a folder is named."""
+    """By default the store is beside the gain file."""
     shutil.copy(gains, tmp_path / "best.json")
     code, out, _ = jaxhil("sweep", tmp_path / "best.json", *TINY, "--limit", "inf")
     assert code == 0 and "Good" in out and "Failure probability 0," in out
@@ -146,7 +146,7 @@ KEPT = ("studies/drivers-16.json", "studies/rare-1.6-10x1000.json")
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Options for subset simulation with few samples, and no plots."""
+    """Return options for subset simulation with few samples, without plots."""
     monkeypatch.setattr(
         "tuning.sweeps.studies.estimate_rare_failure", partial(estimate_rare_failure, samples=20)
     )
@@ -231,7 +231,7 @@ def test_damaged_study_is_run_again(jaxhil, own, quick):
 
 
 def unwritable(ran, name):
-    """Check for one line and exit code 2; the verdict is printed nevertheless."""
+    """Check for one line and exit code 2, with the verdict printed."""
     code, out, err = ran
     assert code == 2 and err.splitlines()[-1].startswith("jaxhil: ") and err.count("jaxhil: ") == 1
     assert f"{name}: cannot be written: " in err.splitlines()[-1]
@@ -323,7 +323,7 @@ def test_sweep_and_replay_refuse_impossible_arguments(jaxhil, gains, store, tmp_
 
 
 def test_jax_is_not_imported_before_it_is_configured():
-    # Its flags, and with them the last bits of every row, are read when it starts.
+    # XLA reads its flags, which affect the last bits of every row, when it starts.
     program = (
         "import sys, tuning.cli.commands.sweep, tuning.cli.commands.replay; sys.exit('jax' in sys.modules)"
     )

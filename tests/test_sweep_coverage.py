@@ -1,9 +1,9 @@
-"""Coverage of the intervals of whole sweeps: scenarios are drawn, run and counted as the command does.
+"""Coverage of intervals of complete sweeps: scenarios are drawn, simulated and counted as by the command.
 
-The truth is known in closed form: a linear contact of speed v, stiffness k and equivalent mass m presses with
-at most v sqrt(k m), so that a force sensor of range R saturates when v > R / sqrt(k m). Of v uniform from low
-to high that is a share of (high - R / sqrt(k m)) / (high - low). Ticks are short beside the contact, and
-neither motion simulator nor sensors are late.
+The true probability has a closed form: a linear contact of speed v, stiffness k and equivalent mass m has a
+peak force of at most v sqrt(k m), so that a force sensor of range R saturates if v > R / sqrt(k m). For v
+uniform between low and high, the probability is (high - R / sqrt(k m)) / (high - low). Ticks are short
+compared with the contact, and motion simulator and sensors have no delay.
 """
 
 import math
@@ -35,7 +35,7 @@ TRUTHS = 0.3, 0.05
 
 
 def repeated(truth, sampling):
-    """Return the rows of sweeps that differ by their seeds."""
+    """Return the rows of sweeps with different seeds."""
     sensor = {"range": (HIGH - truth * (HIGH - LOW)) * math.sqrt(STIFFNESS * MASS)}
     raw = mechanism({}, IDEAL, 0.0, period=2e-4, force_sensor=sensor)
     parsed = validated({**raw, "uncertainty": SPEEDS})

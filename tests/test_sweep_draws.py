@@ -1,4 +1,4 @@
-"""Scenario i as a function of the seed and of i alone."""
+"""Scenario i depends only on the seed and on i."""
 
 import jax
 import numpy as np

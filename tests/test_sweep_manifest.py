@@ -1,4 +1,4 @@
-"""Manifests of sweeps: read as they were written; a changed one is refused in one line."""
+"""Manifests of sweeps: read as written; a changed manifest is refused in one line."""
 
 import json
 
@@ -45,7 +45,7 @@ def test_sweep_manifest_survives_a_round_trip():
 
 
 def test_sweep_manifest_contains_interval_width_only_if_specified():
-    # Without it a manifest is as it was before widths existed.
+    # Without a width, the manifest has no entry for it, as in earlier versions.
     assert b"until_width" not in encode_manifest(GOOD) and "until_width" not in DOCUMENT
     wide = manifest(until_width=0.1)
     assert decode_manifest(encode_manifest(wide), "f") == wide and wide.until_width == 0.1
@@ -70,7 +70,7 @@ def test_sweep_manifest_with_changed_value_and_valid_digest_is_read_or_refused(k
     except InputError as error:
         assert str(error).startswith("store/manifest.json: ") and str(error).isprintable()
     else:
-        # Nothing is read as something else than what was written.
+        # A changed value is read as that value or refused.
         assert msgspec.to_builtins(result) == changed
         assert signed or key in ("created", "sha256") or DOCUMENT[key] == value
 

@@ -1,4 +1,4 @@
-"""Plots of a sweep: they accumulate what NumPy finds in the whole, however it is divided."""
+"""Plots of a sweep: accumulated statistics equal NumPy's on all rows, for any division."""
 
 import json
 
@@ -31,7 +31,7 @@ from tuning.sweeps.store import PLOTS
 NUMBER = 96
 LOST = {
     "contact.stiffness": {"distribution": "loguniform", "factor": [0.3, 3.0]},
-    # A sensor that reads next to nothing: some bodies are never stopped.
+    # The sensor reads almost nothing, so some bodies are never stopped.
     "rig.force_sensor.range": {"distribution": "loguniform", "low": 1e-7, "high": 1e3},
 }
 
@@ -255,7 +255,7 @@ def test_every_axis_of_sweep_plots_is_labelled_with_unit(request, name, limit):
         FigureCanvasAgg(figure).draw()
         named = [axes for axes in figure.axes if axes.axison]
         assert named
-        # Above a map no axis is named twice; a colour bar has one.
+        # Plots above a map repeat no axis label; colour bars have a label.
         mapped = figure is drawn[0] and name != "phases"
         across = named[1:2] if mapped else named
         labels = [*(axes.get_ylabel() for axes in named), *(axes.get_xlabel() for axes in across)]

@@ -1,4 +1,4 @@
-"""Points of a sweep's studies: in chunks of any size, saved when finished, the same to the bit."""
+"""Points of a sweep's studies: bit-identical results for any chunk size, and saved when finished."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ NUMBER = 100
 
 @pytest.fixture(scope="module")
 def asked():
-    """A sweep, points, realisations of noise, and their results."""
+    """Return a sweep, points, noise indices, and the results."""
     sweep = build_sweep(manifest(case(force_sensor={"noise_std": 1.0})))
     inputs = np.random.default_rng(0).uniform(size=(NUMBER, 3))
     noise = np.arange(NUMBER) % 7
@@ -28,7 +28,7 @@ def test_finished_study_points_are_not_simulated_again(asked, tmp_path, monkeypa
     ran, result = [], []
 
     def interrupted(sweep, pieces):
-        # As on a cluster: in any order, and none twice.
+        # As on a cluster: in any order, and each only once.
         for number, one in enumerate(run_locally(sweep, list(pieces)[::-1])):
             if number == 3:
                 raise KeyboardInterrupt

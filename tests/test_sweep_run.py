@@ -1,4 +1,4 @@
-"""Sweeps that are interrupted, resumed or spread over workers: the store is the same, row for row."""
+"""Sweeps that are interrupted, resumed or distributed over workers: identical stores."""
 
 import os
 import shutil
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.users_options
 
 MANIFEST = manifest(case(), scenarios=300, limit=1.5)
 HERE = Path(__file__).parent
-UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"  # no process has such a number
+UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"  # no process has this number
 
 
 class Log(list):
@@ -55,7 +55,7 @@ def all_rows(store):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A sweep without interruptions: rows, sweep and tally."""
+    """Return rows, sweep and tally of a sweep without interruptions."""
     store, sweep, tally = Log().sweep(tmp_path_factory.mktemp("whole") / "store", resume=False)
     return store, all_rows(store), sweep, tally
 
@@ -155,13 +155,13 @@ def test_float32_and_float64_are_compared_on_the_same_scenarios(whole):
     assert result.changed_outcomes == abs(result.failed_float64 - result.failed_float32)
 
 
-WIDE = 0.25  # a width that 300 scenarios reach, and 64 do not
+WIDE = 0.25  # a width reached after 300 scenarios, but not after 64
 UNTIL = manifest(case(), scenarios=300, limit=1.5, until_width=WIDE)
 
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
-    """A sweep until its interval is narrow: store, parts, tally."""
+    """Return store, chunks and tally of a sweep that stopped at a narrow interval."""
     store, _, tally = Log().sweep(tmp_path_factory.mktemp("until") / "store", resume=False, label=UNTIL)
     return store, parts_of(store), tally
 
@@ -212,7 +212,7 @@ def test_sweep_stops_at_the_same_look_for_any_order_of_chunks(stopped, tmp_path)
 
     store, _, again = Log().sweep(tmp_path / "store", label=UNTIL, computer=shuffled)
     assert again == tally and parts_of(store) == parts
-    # The order has gaps too.
+    # Some chunks are missing in between.
     store.chunk_path(0).unlink()
     store.chunk_path(2).unlink()
     log = Log()
@@ -225,7 +225,7 @@ def test_sweep_ends_at_its_largest_number_of_scenarios(whole, tmp_path):
     label = manifest(case(), scenarios=300, limit=1.5, until_width=1e-6)
     store, _, tally = Log().sweep(tmp_path / "store", label=label)
     assert tally.scenarios == 300 and list_different_columns(all_rows(store), rows) == []
-    # Parts beyond the stop of a sweep are removed if an interruption has left them.
+    # Chunks beyond the stop of a sweep, left by an interruption, are removed.
     wide = read_store(store.folder)._replace(manifest=msgspec.structs.replace(label, until_width=WIDE))
     _, tally = run_sweep(wide, lambda *_: None, lambda *_: None)
     assert tally.scenarios < 300 and len(parts_of(store)) == -(-tally.scenarios // 32)

@@ -1,4 +1,4 @@
-"""Store of a sweep: parts are complete or absent, and nothing else is taken for one."""
+"""Store of a sweep: chunks are complete or absent; other files are never mistaken for chunks."""
 
 import os
 import resource
@@ -28,14 +28,14 @@ from tuning.sweeps.stored_studies import IndicesRequest, write_study
 from tuning.sweeps.studies import ErrorIndices
 
 MANIFEST = manifest(case(2))
-UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"  # no process has such a number
+UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"  # no process has this number
 
 
 SLOTS = list_error_columns(("error",), 2)
 
 
 def made_up(part, label=MANIFEST, seed=0):
-    """Return made-up rows of a part, with gaps."""
+    """Return artificial rows of a chunk, with missing values."""
     first, number = label.chunk_range(part)
     generator = np.random.default_rng([seed, part])
     rows = {}
@@ -187,7 +187,7 @@ def test_sweep_store_with_missing_column_is_refused_with_column_name(tmp_path):
     difference = "columns: found other columns than this version writes"
     with refused("other code", difference):
         open_store(folder, MANIFEST, resume=True)
-    # It can still be read, with a warning.
+    # The store can still be read, with a warning.
     assert list_process_differences(read_store(folder).manifest) == [
         difference
     ] and not list_process_differences(MANIFEST)

@@ -1,4 +1,4 @@
-"""Studies stored beside the rows: read as they were written, to the bit, or not at all."""
+"""Studies stored with the rows of a sweep: read as written, to the bit, or ignored."""
 
 import json
 import math
@@ -33,7 +33,7 @@ COUNTS = st.integers(0, 2**40)
 
 
 def same(one, other):
-    """Return whether named tuples are the same to the bit: texts, numbers, arrays, nan and the sign of 0."""
+    """Return whether named tuples are equal to the bit: texts, numbers, arrays, NaN and the sign of 0."""
     if isinstance(one, np.ndarray):
         return (one.shape, one.dtype, one.tobytes()) == (other.shape, other.dtype, other.tobytes())
     if isinstance(one, tuple):
@@ -127,7 +127,7 @@ JSON = st.recursive(
 @given(st.sampled_from(STUDIES), st.data())
 @settings(max_examples=300)
 def test_changed_study_file_with_valid_digest_is_read_as_written_or_ignored(study, data):
-    """Include other types or shapes, which are no result and must not crash."""
+    """Include wrong types and shapes."""
     request, result = study
     document = json.loads(encode_study(MANIFEST, request, result))
     place = data.draw(st.sampled_from([document, document["result"]]))
@@ -136,12 +136,12 @@ def test_changed_study_file_with_valid_digest_is_read_as_written_or_ignored(stud
     read = decode_study(MANIFEST, request, json.dumps(document).encode())
     if read is not None:
         again = json.loads(encode_study(MANIFEST, request, read))
-        # Another digest, if 1 was written for 1.0.
+        # The digest differs if 1 was written for 1.0.
         assert {**again, "sha256": document["sha256"]} == document
 
 
 def test_study_result_that_json_cannot_express_is_not_written(store):
-    # Where no nan can be, it has no symbol.
+    # JSON has no symbol for NaN where NaN is impossible.
     with unwritten("drivers-2.json: ", "JSON"):
         write_study(store, IndicesRequest(2), SOME_DRIVERS._replace(cap=math.nan))
     with unwritten("rare-1.5-10x1000.json: ", "JSON"):
@@ -190,7 +190,7 @@ def test_stored_study_of_other_arguments_or_another_sweep_is_not_used(store):
         read_study(store, RareFailureRequest(1.5, samples=500, replicates=2)) is None
         and read_study(store, RareFailureRequest(1.5)) is None
     )
-    # The same holds for a study renamed to another file's name.
+    # The same applies to a study file with another file's name.
     os.replace(study_path(store, IndicesRequest(128)), study_path(store, IndicesRequest(64)))
     os.replace(
         study_path(store, RareFailureRequest(1.5, 1000, 2)),

@@ -34,7 +34,7 @@ def sweep_of(document, **choices):
 
 @pytest.fixture(scope="module")
 def whole():
-    """A sweep with an input that has no effect, and the rows of all its scenarios."""
+    """Return a sweep with an input that has no effect, and the rows of all its scenarios."""
     sweep = sweep_of(case(uncertainty=UNCERTAIN | IDLE))
     halves = [run_chunk(sweep, first, 1024) for first in (0, 1024)]
     return sweep, {name: np.concatenate([half[name] for half in halves]) for name in halves[0]}
@@ -56,13 +56,13 @@ def test_input_without_effect_has_zero_sensitivity_index(whole):
 
 
 def test_single_uncertain_input_has_sensitivity_index_1():
-    # One input beside the phase: the law of total variance by brute force, with the phase's mean in cells.
+    # One input besides the phase: law of total variance by brute force, with phase means in cells.
     sweep = sweep_of(case(uncertainty={"contact.stiffness": UNCERTAIN["contact.stiffness"]}))
     result = {one.input: one for one in compute_error_indices(sweep, 256).inputs}
     cells = (np.arange(64) + 0.5) / 64
     grid = np.stack([axis.ravel() for axis in np.meshgrid(cells, cells, indexing="ij")], axis=1)
     sizes = compute_error_sizes(run_points(sweep, grid, np.zeros(len(grid)))).reshape(64, 64)
-    assert np.max(sizes) < 10  # which is the cap
+    assert np.max(sizes) < 10  # the cap
     share = np.var(np.mean(sizes, axis=1)) / np.var(sizes)
     stiffness, phase = result["contact.stiffness"], result["approach.phase"]
     assert stiffness.first_order_low < share < stiffness.first_order_high
@@ -79,7 +79,7 @@ def test_correlated_inputs_have_a_joint_sensitivity_index():
         "contact.stiffness": [1],
         "approach.phase": [3],
     }
-    # The velocity has no effect in linear contact: the correlated pair has the delay's share.
+    # The velocity has no effect in linear contact, so the correlated pair has the delay's index.
     joint, *others = sorted(
         compute_error_indices(together, 128).inputs, key=lambda one: "delay" not in one.input
     )
@@ -139,7 +139,7 @@ def test_rare_failure_estimate_is_reproducible(whole):
 
 
 def test_saturated_runs_count_as_failures_for_any_error_limit():
-    # A force sensor that reads only a little of the force.
+    # The force sensor reads only a small part of the force.
     sweep = sweep_of(case(force_sensor={"range": 1e-3}), chunk=64)
     assert estimate_rare_failure(sweep, 1e9, samples=20, replicates=2).probability == 1
 

@@ -1,4 +1,4 @@
-"""Tally of a sweep: the same in any order, and an interval with a known closed form."""
+"""Tally of a sweep: independent of the order, and intervals with known closed forms."""
 
 import numpy as np
 import pytest

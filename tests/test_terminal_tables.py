@@ -1,4 +1,4 @@
-"""Terminal output: tables that lose no digit and break no name at any width, and JSON."""
+"""Terminal output: tables without lost digits or broken names at any width, and JSON."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""`--timings`: nested times are counted once, and the command's results do not change."""
+"""Option `--timings`: nested times are counted once, and results do not change."""
 
 import jax
 import pytest

@@ -1,4 +1,4 @@
-"""Shapes and candidates: signed distances, normals, rates of depth, and nearest points of segments."""
+"""Contact shapes and candidates: signed distances, normals, depth rates, and nearest points of segments."""
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ SHAPES = {
     "box": Box(place(0.1, 0, 0), TURN, place(0.5, 0.3, 0.1), *numbers(0.05)),
 }
 SLANT = (np.cos(0.75), 0, -np.sin(0.75))
-# A ray from the first point along the second meets the surface at the given distance.
+# The ray from the first point in the direction of the second meets the surface at the given distance.
 MET = {
     "plane": ((1.1, 0, 0), (-0.6, 0, -0.8), 0.6),
     "ball": ((0.1, 0.2, 1.3), (0, 0, -1), 0.6),
@@ -49,7 +49,7 @@ MET = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHAPES)
 def test_signed_distance_has_unit_slope_along_its_normal(name):
-    """Expect the gradient to be the normal, of length 1, and a step along it to end on the surface."""
+    """The gradient is the normal, and a step along the normal ends on the surface."""
     shape = SHAPES[name]
 
     def distance(points):
@@ -63,7 +63,7 @@ def test_signed_distance_has_unit_slope_along_its_normal(name):
         return result.distance, normal, slopes, distance(points - result.distance[None] * normal)
 
     distances, normals, slopes, landed = seen(jnp.asarray(POINTS))
-    # There is no gradient midway between two nearest points of a surface; no test point is there.
+    # No test point has two nearest points on a surface, where the gradient does not exist.
     np.testing.assert_allclose(np.linalg.norm(normals, axis=0), 1, rtol=1e-12)
     np.testing.assert_allclose(np.broadcast_to(normals, slopes.shape), slopes, atol=1e-9)
     beyond = np.asarray(distances) > -0.02
@@ -78,7 +78,7 @@ def test_signed_distance_has_unit_slope_along_its_normal(name):
 
 @pytest.mark.slow
 def test_signed_distance_at_singular_points_is_not_nan():
-    """Cover the axis, a centre, a segment and the faces of a box."""
+    """Points: the axis, a centre, a segment and the faces of a box."""
     singular = {
         "ball": (0.1, 0.2, 0.3), "cavity": (0.1, 0.2, 0.3), "drogue": (0, 0, -0.1), "rim": (0.5, 0, 0.1),
         "capsule": (-0.3, 0, 0), "box": (0.1, 0, 0),
@@ -131,7 +131,7 @@ def test_penetration_rate_is_derivative_of_depth_and_slip_is_tangential(name):
 
 @pytest.mark.slow
 def test_contact_of_exchanged_shapes_is_the_same():
-    """Swap the shape of a sphere and a ball: the force acts on the shape."""
+    """Exchange the shape and the ball; the force then acts on the shape."""
     pose, _ = pose_and_twist()
     one = CANDIDATES["ball on sphere"].touch(pose)
     ball = Ball(place(0.1, 0.05, -0.4), *numbers(0.1))
@@ -145,7 +145,7 @@ def test_contact_of_exchanged_shapes_is_the_same():
 
 @pytest.mark.slow
 def test_nearest_points_of_segments_agree_with_least_squares():
-    """Compare with bounded least squares; parallel segments touch in the middle of each other."""
+    """Parallel segments touch at the centre of their overlap."""
     for _ in range(40):
         ends = SEEDED.normal(size=(4, 3))
         radii = numbers(0.1)[0], numbers(0.2)[0]

@@ -1,4 +1,4 @@
-"""Toy contact law with a key of its own, added to a copy of the package by one file and one entry."""
+"""Toy contact law with an additional key, added to a copy of the package by one file and one entry."""
 
 import os
 import re
@@ -74,7 +74,7 @@ class Toy(ContactLaw):
         depth = fitted["stiffness"] / np.maximum(fitted["square"], 1e-9)
         return {**super().file_values(fitted, entry), "contact.doubling_depth": depth}
 '''
-# The file's keys, its refusals and the rig's rehearsal all work without JAX.
+# Keys, refusals and the rehearsal of the rig work without JAX.
 WITHOUT_JAX = """
 import sys
 from jaxhil.errors import InputError
@@ -135,7 +135,7 @@ print(contact.law, contact.stiffness[0], contact.damping[0], contact.doubling_de
 
 @pytest.fixture(scope="module")
 def copied(tmp_path_factory):
-    """A copy of the package with the toy law: one new file and one entry."""
+    """Return a copy of the package with the toy law: one new file and one entry."""
     folder = tmp_path_factory.mktemp("copy")
     for part in ("jaxhil", "tuning"):
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
@@ -150,7 +150,7 @@ def copied(tmp_path_factory):
 
 
 def run(copied, folder, script):
-    """Return what a script prints, in a process that sees the copy alone."""
+    """Return the output of a script in a process that imports only the copy."""
     environment = {**os.environ, "PYTHONPATH": str(copied)}
     ran = subprocess.run(
         [sys.executable, "-c", script],

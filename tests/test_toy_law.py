@@ -81,7 +81,7 @@ RUN = (
 
 @pytest.fixture
 def copied(tmp_path):
-    """A copy of the repository with a toy law in it."""
+    """Return a copy of the repository with a toy compensator."""
     folder = tmp_path / "copy"
     for part in ("jaxhil", "tuning", "tests"):
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
@@ -94,7 +94,7 @@ def copied(tmp_path):
 
 @pytest.mark.slow
 def test_toy_compensator_of_two_files_is_tested_and_exported(copied):
-    """Run the tests named `...[toy...]` in a process that sees the copy alone."""
+    """Run the tests named `...[toy...]` in a process that imports only the copy."""
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "-k", "toy", *RUN]
     environment = {**os.environ, "PYTHONPATH": str(copied)}
     folder = copied / "tests"

@@ -1,4 +1,4 @@
-"""Transfer of gains between mechanisms: exact on the same, within bounds on another, never a loss."""
+"""Transfer of gains between mechanisms: unchanged for equal mechanisms, within bounds for others."""
 
 import math
 from types import SimpleNamespace
@@ -33,12 +33,12 @@ def claw(*overrides):
 
 
 def behind(simulator):
-    """Return the claw behind another motion simulator with its own delay."""
+    """Return the claw with another motion simulator."""
     return claw(f"rig.simulator={{delay=0.004, model={simulator}}}", "uncertainty={}")
 
 
 def anywhere(mechanism, compensator, seed=0):
-    """Return gains anywhere within their bounds."""
+    """Draw gains within their bounds."""
     generator, gains = np.random.default_rng(seed), {}
     for gain in COMPENSATORS[compensator].gains:
         lower, upper = gain.lower(mechanism), gain.upper(mechanism)
@@ -64,7 +64,7 @@ def test_mechanism_distance_is_symmetric_and_zero_for_identical_mechanisms():
 @pytest.mark.parametrize(
     "override, expected",
     [
-        # Four times the stiffness is twice as fast; damping of the same damper counts half as much.
+        # Four times the stiffness doubles the frequency; the same damper then has half the damping ratio.
         ("contact.stiffness=[497420.0]", math.hypot(math.log(2), math.pi * 0.015)),
         ("contact.damping=[0.0]", math.pi * 0.03),
         ("rig.force_sensor.delay=0.009", math.pi / 2 * OMEGA * 0.005),
@@ -99,7 +99,7 @@ def test_mechanism_properties_do_not_depend_on_form_of_simulator_model():
 
 
 def test_equivalent_damping_of_every_contact_law_matches_its_restitution():
-    """Use Hunt and Crossley's e = 1 - chi v."""
+    """Hunt and Crossley: e = 1 - chi v."""
     hertz = compute_traits(claw("contact.law='hunt_crossley'", "contact.damping=[4.0]"))
     assert math.exp(-math.pi * hertz.damping_ratio) == pytest.approx(1 - 4.0 * 0.005, rel=1e-3)
     assert compute_traits(claw()).damping_ratio == pytest.approx(0.03, rel=1e-3)
@@ -140,10 +140,10 @@ def test_transferred_gains_keep_relative_position_to_literature_and_range():
     target = claw("contact.stiffness=[497420.0]", "rig.force_sensor.delay=0.01", "rig.control_period=0.002")
     gains = {**literature_gains(source, "response_error"), "initial_stiffness": 1e5, "lead_filter": 1.5e-3}
     transferred = transfer_gains("response_error", {**gains, "phase_lead": 0.0054}, source, target)
-    # A range of 2 tau + 0.02 s, of which 1.4 ms beyond the delay are a twentieth.
+    # The range is 2 tau + 0.02 s, of which 1.4 ms beyond the delay are a twentieth.
     assert transferred["phase_lead"] == pytest.approx(0.01 + 0.05 * 0.04, rel=1e-12)
     assert transferred["initial_stiffness"] == pytest.approx(4e5, rel=1e-12)
-    # The literature's one period times one and a half, logarithmically.
+    # The literature's filter time is one period; 1.5 times this value, on a logarithmic scale.
     assert transferred["lead_filter"] == pytest.approx(3e-3, rel=1e-12)
 
 
@@ -183,7 +183,7 @@ def test_starting_gains_from_user_replace_the_last_random_starts(task, validatio
     (points,) = choose_starts(validation, 3, 0, first=[[gains]])
     np.testing.assert_array_equal(points[:2], usual[:2])
     assert validation.gains(0, points[2]) == pytest.approx(gains, rel=1e-12)
-    # It begins at exactly these gains: its first value is theirs.
+    # The first loss is that of exactly these gains.
     (starts,) = solve_tasks([task], [points], 6)
     errors = np.where(task.scenarios.contacts > 0, evaluate(task.loop, gains, task.scenarios).error[0], 0)
     assert starts[2].history[0] == pytest.approx(evaluate_objective(RMS_OBJECTIVE, errors), rel=1e-9)
@@ -198,7 +198,7 @@ def test_literature_gains_are_kept_beside_starting_gains_from_user(task, validat
 
 
 def test_tuning_from_user_gains_never_ends_worse_than_those_gains(task, validation, solved):
-    """Use tuned gains that lie at a bound."""
+    """Use gains that lie at a bound."""
     best = min(solved, key=lambda start: start.rms)
     upper = COMPENSATORS["phase_lead"].gains[0].upper(task.mechanism)
     assert best.gains["phase_lead"] == pytest.approx(upper, rel=1e-12)
@@ -211,7 +211,7 @@ def test_tuning_from_user_gains_never_ends_worse_than_those_gains(task, validati
 
 @pytest.fixture
 def in_blocks(monkeypatch):
-    """Return the origin of starts when mechanisms of 1e5, 3e5 and 2.9e5 N/m are tuned two at a time."""
+    """Return the origins of the starts when mechanisms of 1e5, 3e5 and 2.9e5 N/m are tuned two at a time."""
     monkeypatch.setattr(tune_all, "MAX_GROUP_SIZE", 2)
 
     def block(tasks, settings, work, near):

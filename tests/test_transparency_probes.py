@@ -37,12 +37,12 @@ SMALL = TuneSettings(scenarios=4, starts=2, steps=4, validation=15, objective=WE
 
 
 def kind(scenarios, number):
-    """Return one lane of each scenario: 0 plain, 1 early, 2 late, 3 damped."""
+    """Return one lane of each scenario: 0 plain, 1 early push, 2 late push, 3 damping perturbation."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., number::LANES_PER_SCENARIO], scenarios)
 
 
 def test_contact_with_probe_push_has_restitution_of_pushed_ideal_contact():
-    """Compare with SciPy, event by event, under the very push that the scenario's hardware gets."""
+    """Compare with SciPy under the push on the hardware."""
     probed = build_probed_scenarios(DAMPED, draw(DAMPED, 3, 0))
     for number, known in ((1, probed.early), (2, probed.late)):
         own = kind(probed.scenarios, number)
@@ -62,7 +62,7 @@ def test_contact_with_probe_push_has_restitution_of_pushed_ideal_contact():
             end = solve_ivp(motion, (0, 0.5), [0, velocity], **tight).y[1, -1]
             assert known[lane] == pytest.approx(-end / velocity, abs=2e-5)
             assert own.reference.restitution[0, lane] == known[lane]
-            # The push separates a law that reacts to it from one that does not.
+            # The push distinguishes compensators that react to it from others.
             assert abs(known[lane] - probed.plain[lane]) > 0.01
 
 
@@ -172,7 +172,7 @@ def test_objective_weights_trade_error_against_peak_force_or_transparency(result
         if axis == PEAK_CRITERION:
             assert point.cost == pytest.approx(point.transparency["peak"].value, rel=1e-12)
     assert front.tuned.transparency == result.transparency["tuned"]
-    # On the training scenarios the heavier weight is no worse in what it weighs.
+    # On the training scenarios, a larger weight does not increase the weighted metric.
     task = build_task(DAMPED, "phase_lead", SMALL.scenarios, SMALL.seed, probed=True)
     validation = build_validation([task], 3, 0)
     starts = [pareto_search.StartResult("made up", 1, 1.0, [1.0], point.gains) for point in front.points]

@@ -1,4 +1,4 @@
-"""Tuning end to end with small settings: better than the literature on fresh scenarios."""
+"""Tuning with small settings: better than the literature on new scenarios."""
 
 import dataclasses
 
@@ -56,7 +56,7 @@ def test_every_tuning_start_has_a_status_and_a_decreasing_loss_history(result):
 
 @pytest.mark.slow
 def test_gains_tuned_with_noise_are_better_on_noisy_scenarios(result):
-    """Use three times the published noise, on scenarios that neither of the two has seen."""
+    """Use three times the published noise on new scenarios."""
     noisy = load("varying", ["rig.force_sensor.noise_std=8"]).mechanism
     task = build_task(noisy, "phase_lead", SMALL.scenarios, SMALL.seed)
     validation = build_validation([task], 15, SMALL.seed)

@@ -1,4 +1,4 @@
-"""Tuning on a dask.distributed cluster: the same gains to the bit, and the same fronts."""
+"""Tuning on a dask.distributed cluster: bit-identical gains and Pareto fronts."""
 
 from typing import Any
 

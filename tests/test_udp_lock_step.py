@@ -1,4 +1,4 @@
-"""Rig and controller in lock-step over UDP: the contacts of the closed loop, and lost packets."""
+"""Rig and controller in lock-step over UDP: contacts of the closed loop, and lost packets."""
 
 import math
 from random import Random
@@ -43,7 +43,7 @@ def test_udp_lock_step_contacts_equal_those_of_closed_loop(name):
     result = rig.contacts[: len(wanted)]
     assert [one.restitution for one in result] == [one.restitution for one in wanted]
     assert [one.begun for one in result] == [one.begun for one in wanted]
-    # Run after run, cycle through the lists of the mechanism at the nominal speed.
+    # Each run uses the next entries of the mechanism's lists at the nominal speed.
     numbers = [contact.number for contact in rig.contacts]
     assert len(numbers) > len(wanted)
     assert numbers == [i % mechanism.approach.contacts for i in range(len(numbers))]
@@ -52,7 +52,7 @@ def test_udp_lock_step_contacts_equal_those_of_closed_loop(name):
 
 
 class Unreliable:
-    """Network that loses packets with a probability, or holds them back by up to so many ticks."""
+    """Network that loses packets with a probability, or delays packets by up to the given number of ticks."""
 
     def __init__(self, drops, ticks, seed):
         self.random, self.drops, self.ticks = Random(seed), drops, ticks
@@ -84,7 +84,7 @@ def test_udp_rig_compensates_for_lost_and_late_packets(varying, drops, ticks):
 
 
 def test_contacts_without_status_identified_are_counted_over_udp():
-    """Send contacts that are too short: an answer reports each once, and the process their number."""
+    """Use contacts that are too short."""
     mechanism = load("suite-fast", ["contact.stiffness=[884316.0]"]).mechanism
     gains = literature_gains(mechanism, "impulse_ledger")
     rig, task, answers = packets(mechanism, controller(mechanism, "impulse_ledger", gains), 900)
@@ -115,7 +115,7 @@ def test_readings_of_a_long_gap_are_not_interpolated(varying):
     gap = MAX_INTERPOLATED_TICKS + 1
     answer = task.answer(a_reading(1 + gap, force=7.0))
     assert task.interpolated == 0 and not answer.trip_reason and answer.faults & MISSED_TICK
-    # Model time is rig time: the model continued under the last force.
+    # The model continued during the gap under the last force.
     mass, period = mechanism.bodies.equivalent_mass, mechanism.rig.control_period
     assert answer.velocity == pytest.approx(first.velocity - (gap + 1) * period * 7.0 / mass, rel=1e-12)
     tripped = task.answer(a_reading(60, force=7.0))
@@ -128,7 +128,7 @@ def test_outdated_packets_are_dropped_and_counted(varying):
     assert task.answer(a_reading(3)) is not None
     assert task.answer(a_reading(2)) is None  # overtaken
     assert task.answer(a_reading(3)) is None  # twice
-    assert task.answer(a_reading(4, run=9)) is None  # a run that was never prepared
+    assert task.answer(a_reading(4, run=9)) is None  # a run that was not prepared
     assert task.stale == 3
     assert task.answer(a_reading(4)) is not None
 
@@ -233,7 +233,7 @@ def test_udp_rig_tares_force_sensor_before_the_first_run():
     assert law.bias == pytest.approx(3.0, abs=1e-12)
     assert next(i for i, one in enumerate(answers) if one.flags & READY) == 49
     assert rig.contacts and rig.contacts[0].status == "ok"
-    # The rest of the bias would push the model all the way through its approach.
+    # A remaining bias would push the model during its whole approach.
     quiet = load("rig-300kg").mechanism
     expected = packets(quiet, controller(quiet, "none", {}), 600)[0].contacts[0]
     assert rig.contacts[0].restitution == pytest.approx(expected.restitution, abs=1e-6)

@@ -1,4 +1,4 @@
-"""Faults of the network, the cause of a missed tick, and a rig that was held up."""
+"""Network faults, causes of missed ticks, and a stalled rig."""
 
 import math
 import socket
@@ -106,7 +106,7 @@ def test_overrunning_ticks_are_repeated_to_identify_the_cause(varying):
     record.add(15, 1, 3_000_000_000)
     assert record.count == record.packet_count == 4  # rows that do not fit are dropped
     again = replay_slow_ticks(lambda: prepared(mechanism), record, 1e9)
-    # The machine's second is not needed again.
+    # The second spent by the computer is not needed again.
     assert list(again) == [11] and 0 < again[11] < 1e9
     assert replay_slow_ticks(lambda: pytest.fail("nothing to go through"), record, 1e10) == {}
 
@@ -141,7 +141,7 @@ def test_contacts_without_commands_due_to_a_stall_are_not_evaluated(varying):
 
 
 class Sleepy(EmptyTask):
-    """Rig that is held up once."""
+    """Rig that stalls once."""
 
     held = 0.03
 

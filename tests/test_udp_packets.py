@@ -1,4 +1,4 @@
-"""Packets between rig and controller: they are decoded as sent, and any other bytes are refused."""
+"""Packets between rig and controller: decoded as sent; any other bytes are refused."""
 
 import math
 
@@ -58,7 +58,7 @@ ANSWER = encode_answer(AnswerPacket(READY, 1, 2, 3, *[4.0] * 5, 5, "ok"), SESSIO
 
 
 def mutated(packet):
-    """Return any bytes: none like a packet, cut, lengthened, or with a few bytes changed."""
+    """Return any bytes: random, truncated, extended, or a packet with a few bytes changed."""
     index = st.integers(0, len(packet) - 1)
     change = st.lists(st.tuples(index, st.integers(0, 255)), max_size=4)
 
@@ -143,7 +143,7 @@ def test_packet_with_any_sequence_number_outdates_at_most_one_window_of_packets(
     sequence.is_newer(wild)
     following = newer(sequence, *range(newest + 1, newest + MAX_SEQUENCE_STEP + 3))
     first = following.index(True)
-    # Right after the packet, or from its place if that was ahead within the window.
+    # Accepted right after the packet, or from its number on if that is ahead within the window.
     assert first <= MAX_SEQUENCE_STEP and all(following[first:])
     assert first in (0, (wild - newest) & 0xFFFFFFFF)
 
@@ -152,7 +152,7 @@ def test_first_packet_after_a_long_loss_is_also_dropped():
     for gap in (MAX_SEQUENCE_STEP + 1, 10**6, 2**31 - 10):
         sequence = SequenceFilter(5)
         assert newer(sequence, 5 + gap, 6 + gap, 7 + gap) == [False, True, True]
-    # Two wild numbers, neither of which follows the other.
+    # Two arbitrary numbers that are not consecutive.
     assert newer(SequenceFilter(5), 2**30, 2**29, 2**28, 6) == [False, False, False, True]
-    # Never from behind: that may be a record of what was sent before.
+    # Never an older number, which may be a replay of earlier packets.
     assert not any(newer(SequenceFilter(2**31), *range(1000)))

@@ -1,4 +1,4 @@
-"""`jaxhil rig` and the controller's process: short runs over UDP, and refusals of both."""
+"""`jaxhil rig` and the controller process: short runs over UDP, and refusals of both."""
 
 import json
 import os
@@ -34,7 +34,7 @@ def gain_file(folder, compensator="response_error", limits=None, **values):
 
 
 def test_rig_command_refuses_bundle_with_modified_controller(jaxhil, tmp_path):
-    """Run what this version exports, or nothing."""
+    """Only code exported by this version is run."""
     made = build_bundle(document(), [])
     trap = b"open(%r, 'w')\n" % str(tmp_path / "ran")
     folder = tmp_path / "bundle"
@@ -60,7 +60,7 @@ def test_controller_process_without_gain_file_exits_with_error(capfd):
 @pytest.mark.slow
 def test_rig_command_reports_results_of_a_short_run(jaxhil, tmp_path):
     path = gain_file(tmp_path)
-    # One contact of this gain file's takes most of a second.
+    # One contact under this gain file takes almost a second.
     ran = jaxhil("rig", path, "--duration", 2, "--limit", "inf", "--json", "--plot", tmp_path / "rig.png")
     result = ran.document
     assert result["empty_loop"]["ticks"] == 400 and result["run"]["ticks"] == 2000
@@ -104,7 +104,7 @@ def test_rig_verdict_is_bad_if_controller_trips_without_injected_fault(jaxhil, t
 
 def test_interrupted_rig_command_reports_measurements_so_far(tmp_path):
     path = gain_file(tmp_path)
-    # A shell's background jobs ignore interrupts, and hand that on.
+    # Background jobs of a shell ignore interrupts, and so do their child processes.
     heeding = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
         "from tuning.__main__ import main; sys.exit(main(sys.argv[1:]))"

@@ -1,4 +1,4 @@
-"""Session of the controller's process: its owner, intruding packets, and its end."""
+"""Sessions of the controller process: their rig, packets of other senders, and the end."""
 
 import json
 import socket
@@ -26,7 +26,7 @@ SILENCE = 0.5  # s
 
 
 class Rig:
-    """Rig that plays to the process at `address`."""
+    """Rig that sends packets to the process at `address`."""
 
     def __init__(self, stack, address, number=1):
         self.socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
@@ -61,7 +61,7 @@ class Rig:
 
 
 class Process:
-    """Process of the controller, its record once it has ended, and rigs for it."""
+    """Controller process, its final record, and rigs for it."""
 
     def __init__(self, folder, stack, *options):
         gains, self._record = folder / "gains.json", folder / "ticks.json"
@@ -87,7 +87,7 @@ class Process:
 
 @pytest.fixture
 def process(tmp_path):
-    """Return `process(*options)`, which starts a controller's process."""
+    """Return `process(*options)`, which starts a controller process."""
     with ExitStack() as stack:
 
         def made(*options):
@@ -100,7 +100,7 @@ def process(tmp_path):
 
 @contextmanager
 def flood(*senders):
-    """Packets that are sent during a wait: `next` sends one of each."""
+    """Packets that are sent during a wait; `next` sends one of each."""
 
     def once():
         for rig, packet in senders:
@@ -114,10 +114,10 @@ def test_controller_process_answers_only_the_rig_of_its_session(process):
     served = process()
     rig, stranger, guesser = served.rig(), served.rig(), served.rig()
     rig.send(b"no packet at all")
-    stranger.open()  # who asks has no session yet
+    stranger.open()  # the requesting sender has no session yet
     rig.prepare()
     stranger.tell(a_reading(50))
-    # One packet with the largest number, even with the rig's session, but from another address.
+    # One packet with the largest number and the rig's session number, but from another address.
     guesser.session = rig.session
     guesser.tell(a_reading(0, 2**32 - 1))
     guesser.tell(a_reading(0, 99, event=STOP))
@@ -136,7 +136,7 @@ def test_controller_process_answers_only_the_rig_of_its_session(process):
 
 
 def test_packet_from_rig_address_without_session_number_is_ignored(process):
-    """Send what somebody can send who forges the rig's address but does not receive there."""
+    """Such packets are possible for a sender that forges the rig's address."""
     served = process()
     rig = served.rig()
     rig.prepare()
@@ -157,7 +157,7 @@ def test_packet_with_arbitrary_sequence_number_does_not_block_the_controller(pro
     for number in (2**32 - 1, 2**31, 2**31 - 1, 5000, 0):
         rig.tell(a_reading(0, number))
     assert [rig.ask(a_reading(tick)).tick for tick in range(3)] == [0, 1, 2]
-    # Rig and network were away for long: one more packet is lost.
+    # After a long loss, one more packet is lost.
     rig.tell(a_reading(3, 5000))
     assert rig.ask(a_reading(4, 5001)).tick == 4
     rig.tell(a_reading(0, 99, event=STOP))
@@ -174,7 +174,7 @@ def test_replayed_packet_is_dropped(process):
         rig.tell(a_reading(tick))
     assert rig.hears_nothing()
     assert rig.ask(a_reading(4)).position > before[-1].position
-    # Such packets do not keep the session alive either.
+    # Such packets also do not keep the session open.
     begun = time.monotonic()
     with flood((rig, encode_reading(a_reading(4), rig.session))) as once:
         while time.monotonic() < begun + 2 * SILENCE:
@@ -223,7 +223,7 @@ def test_restarted_rig_does_not_continue_the_old_session(process):
     rig.prepare()
     assert rig.ask(a_reading(0)).tick == 0
     again = served.rig()
-    for one in (again, rig):  # from another port, and from the same
+    for one in (again, rig):  # from another port, then from the same port
         one.send(encode_session_request(77))
         assert one.hears_nothing()
     code, result = served.ended()
@@ -234,7 +234,7 @@ def test_lost_session_request_or_answer_is_sent_again(process):
     served = process()
     rig = served.rig()
     rig.send(encode_session_request(1)[:-1])
-    rig.send(encode_session_request(1))  # whose answer the rig does not wait for
+    rig.send(encode_session_request(1))  # the rig does not wait for the answer
     first = rig.socket.recv(1000)
     rig.prepare()
     assert decode_session(first, 1) == rig.session

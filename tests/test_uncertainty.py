@@ -1,4 +1,4 @@
-"""Draws of uncertain numbers: their distributions against SciPy's, and what a draw depends on."""
+"""Draws of uncertain parameters: distributions compared with SciPy; dependence on seed and index alone."""
 
 import copy
 
@@ -157,7 +157,7 @@ def test_draws_of_a_key_do_not_depend_on_other_uncertain_keys():
 
 
 def test_recorded_draws_are_reproduced():
-    """Keep recorded sweeps reproducible: these numbers may not change between versions."""
+    """These numbers must not change between versions, so that recorded sweeps are reproducible."""
     values = draw(load().mechanism, 1, seed=1, first=1024)
     np.testing.assert_allclose(
         [values["approach.velocity"][0], values[DELAY][0], values[PHASE_KEY][0, 2]],
@@ -344,7 +344,7 @@ def test_every_draw_lies_between_the_reported_extremes(name):
     ends = draw_extremes(parsed)
     for path, values in draw(parsed, 2000, 5).items():
         assert np.all(np.minimum(*ends[path]) <= values) and np.all(values <= np.maximum(*ends[path]))
-        # These ends can be reached; they are not just any bounds.
+        # The extremes are attainable, not just bounds.
         assert np.all(np.ptp(ends[path], axis=0) <= 4 * np.ptp(values, axis=0))
 
 

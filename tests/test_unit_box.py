@@ -1,4 +1,4 @@
-"""Gains and coordinates: one to one inside the bounds, bounded and differentiable at them."""
+"""Gains and unit coordinates: one to one within the bounds, and differentiable at the bounds."""
 
 import jax
 import jax.numpy as jnp

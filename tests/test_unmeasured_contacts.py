@@ -1,6 +1,7 @@
-"""Contacts without a measured force: none is reached, whatever turns the numerical model back.
+"""Contacts without a measured force have status not_reached, for any cause of the model's reversal.
 
-A virtual spring on the numerical model's own motion stands for a law that does not wait for the hardware.
+A virtual spring on the numerical model's own motion represents a compensator that acts without hardware
+contact.
 """
 
 import math
@@ -15,7 +16,7 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.gain_choice import choose_gains
 
 MASS, SPEED, VIRTUAL = 350.0, 5e-3, 1.2e5  # kg, m/s, N/m
-DEEPEST = SPEED * math.sqrt(MASS / VIRTUAL)  # m, where the virtual spring alone turns the model back
+DEEPEST = SPEED * math.sqrt(MASS / VIRTUAL)  # m, depth at which the virtual spring alone reverses the model
 
 
 def rig(plane: float = 0.0, simulator: dict | None = None, **sensor: float) -> Mechanism:
@@ -46,9 +47,9 @@ def test_contact_that_hardware_never_touches_has_status_not_reached(noise):
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_contact_has_status_not_reached_if_only_sensor_bias_reverses_model(noise):
-    """Use a bias of 70 N or 40 N, and expect no contact.
+    """Use a bias of 70 N or 40 N.
 
-    The first turns the model back 0.09 mm before the surface, the second 0.2 mm behind it.
+    The first reverses the model 0.09 mm before the surface, the second 0.2 mm behind the surface.
     """
     for bias in (70.0, 40.0):
         result = run(rig(1.2 * DEEPEST, bias=bias, noise_std=noise))
@@ -70,14 +71,14 @@ def test_single_force_reading_counts_as_contact():
 
 
 def test_run_waits_for_delayed_contact_of_hardware():
-    """Turn the model back by the virtual spring after 85 ms; the hardware touches after 91 ms."""
+    """The virtual spring reverses the model at 85 ms; the hardware touches at 91 ms."""
     result = run(rig(0.3 * DEEPEST, {"model": "ideal", "delay": 0.075}))
     assert result.contacts[0].status == "ok" and result.contacts[0].peak_force > 0
 
 
 @pytest.mark.slow
 def test_impulse_ledger_does_not_act_without_hardware_contact():
-    """Place the surface where the run does not reach it."""
+    """The surface is beyond the reach of the run."""
     made = jaxhil.load("suite-noisy", {"rig.contact_plane": 0.1})
     result = jaxhil.simulate(made, "impulse_ledger")
     assert result.status in ("not reached", "timeout") and math.isnan(result.contacts[0].restitution)

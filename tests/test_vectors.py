@@ -1,4 +1,4 @@
-"""Test vectors: readings of the simulation with the runtime's answers, and hostile ticks of every kind."""
+"""Test vectors: readings of the simulation with the runtime's commands, and hostile ticks."""
 
 import csv
 import io
@@ -71,7 +71,7 @@ def test_recorded_vectors_contain_simulation_and_agree_with_runtime(loaded, vect
 
 
 def test_model_motion_in_vectors_equals_simulation(vectors):
-    """Compare position and velocity after a tick with those of the next tick, but for rounding."""
+    """Position and velocity after a tick equal those of the next tick, to rounding."""
     for rows in list(runs_of(vectors).values())[:3]:
         for row, following in itertools.pairwise(rows):
             if following.event == 0:
@@ -143,7 +143,7 @@ def test_vector_comparison_with_simulation_ends_when_a_limit_acts(loaded):
 
 
 def test_trip_between_two_contacts_ends_vector_comparison(loaded):
-    """Let the audit, which waits for the force to die out, come with the next contact."""
+    """The audit waits for the force to decay, until the next contact."""
     limits = {"equivalent_mass": 300.0, "settling": 10.0, "restitution_margin": 1e-9}
     result = make_vectors(check_document(replace_limits(loaded.document, limits)), seed=3, draws=1)
     assert result.reasons == []
@@ -166,7 +166,7 @@ def test_runtime_command_that_differs_from_vectors_is_reported(loaded, monkeypat
 
 
 def test_vectors_of_a_noisy_biased_rig_agree_with_runtime():
-    """Leave out the first tick: the loop takes its force as none, whatever the sensor reads."""
+    """Except the first tick, whose force is zero in the simulation."""
     rough = ("rig.force_sensor.noise_std=0.5", "rig.force_sensor.bias=0.3", "rig.command_latency=1")
     result = make_vectors(check_document(document("claw-350kg", "phase_lead", rough)), seed=0, draws=1)
     assert result.reasons == [] and result.ended == [None, None]

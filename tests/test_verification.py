@@ -1,4 +1,4 @@
-"""Verification: it passes runtimes that agree, and names in plain words what a wrong one does."""
+"""Verification of the runtime against the simulation: agreeing controllers pass, differences are reported."""
 
 import jax
 import msgspec
@@ -32,7 +32,7 @@ def loaded_gains(mechanism_name, compensator, overrides=(), **changes):
     return check_document(build_document(compensator, gains, mechanism, sha256, {}, {}, 0, {}))
 
 
-# A noisy, biased, coarse rig, whose first tick the loop takes without force.
+# Noisy, biased rig with coarse readings; the simulation has no force on the first tick.
 ROUGH = (
     "rig.force_sensor.noise_std=0.5",
     "rig.force_sensor.bias=0.3",
@@ -89,14 +89,14 @@ def test_verification_with_the_same_seed_gives_the_same_report(varying):
 
 
 class Late(ON_THE_RIG["response_error"]):
-    """Runtime that forgets the identification when the next contact begins."""
+    """Runtime that loses the identification when the next contact begins."""
 
     def next_contact(self):
         self.reset()
 
 
 class Loose(ON_THE_RIG["response_error"]):
-    """Runtime that rounds in single precision."""
+    """Runtime that rounds to single precision."""
 
     def step(self, *signals):
         return float(np.float32(super().step(*signals)))
@@ -151,7 +151,7 @@ def test_verification_refuses_single_precision(varying):
 
 
 def lane_of(measured, force, gain_file):
-    """Return the lane whose commands the runtime itself gives for these readings."""
+    """Return a lane with the runtime's own commands for these readings."""
     ticks = len(measured)
     signals = Signals(
         np.array(force, float),
@@ -174,26 +174,26 @@ def gain_file(varying):
 
 def test_verification_reports_number_of_ticks_near_a_threshold(gain_file):
     measured = np.arange(-20, 20) * 5e-6
-    measured[20] = 3e-18  # instead of 0: in contact, but by less than rounding
+    measured[20] = 3e-18  # instead of 0: in contact by less than rounding
     force = np.where(measured > 0, 1e5 * measured, 0.0)
     force[30] = 10.0 * (1 + 1e-12)
-    force[3] = 10.0  # not in contact: this force decides nothing
+    force[3] = 10.0  # not in contact, so this force affects no decision
     lane = lane_of(measured, force, gain_file)
     assert np.nonzero(find_threshold_ticks(lane.signals, gain_file))[0].tolist() == [22, 30]
     seen = replay_lane(lane, gain_file)
     assert (seen.ticks, seen.compared, seen.near, seen.parted) == (40, 40, 2, None)
     assert seen.difference == seen.near_difference == 0.0
-    # Second surface at -9e-5 m: the force of tick 3 decides, and so does the position at tick 4.
+    # Second surface at -9e-5 m: the force of tick 3 and the position of tick 4 affect decisions.
     two_sided = gain_file._replace(clearance=9e-5)
     assert np.nonzero(find_threshold_ticks(lane.signals, two_sided))[0].tolist() == [3, 4, 22, 30]
 
 
 def test_verification_comparison_ends_at_first_different_threshold_decision(gain_file):
     measured = np.arange(-20, 20) * 5e-6
-    measured[20:23] = -3e-18, 3e-18, 6e-18  # standstill at the surface: rounding decides
+    measured[20:23] = -3e-18, 3e-18, 6e-18  # at rest on the surface, where rounding decides
     force = np.where(np.arange(40) > 17, 50.0, 0.0)
     lane = lane_of(measured, force, gain_file)
-    # The other side took the second of these ticks as free: no response, nothing identified.
+    # The other controller considered the second of these ticks out of contact.
     measured[21] = -3e-18
     other = lane_of(measured, force, gain_file)
     parted = replay_lane(lane._replace(command=other.command, identified=other.identified), gain_file)
@@ -202,7 +202,7 @@ def test_verification_comparison_ends_at_first_different_threshold_decision(gain
 
 
 def test_verification_ignores_onset_that_differs_by_rounding(gain_file):
-    """Let a contact begin just before a tick or after it: it begins at the same time."""
+    """The onset is just before or just after a tick."""
     measured = np.arange(-20, 20) * 5e-6
     measured[20] = 3e-18
     force = np.where(np.arange(40) > 17, 50.0, 0.0)

@@ -1,4 +1,4 @@
-"""Virtual contact and its characteristic equation: a root at the limit, and the simulated loop there."""
+"""Virtual contact: root of its characteristic equation at the stability limit, and the simulated loop."""
 
 import cmath
 import math
@@ -26,13 +26,13 @@ def test_virtual_contact_has_an_imaginary_root_at_the_stability_limit(mass, freq
     root = 1j * critical
     value = mass * root**2 + damping * root + stiffness * cmath.exp(-root * delay)
     assert abs(value) <= 1e-9 * stiffness and damping >= 0 and 0 < critical <= frequency
-    # The lowest frequency: below it the two sides of the condition do not meet.
+    # Lowest frequency of a solution of the condition.
     below = critical * np.linspace(0, 0.999, 50)
     assert np.all(np.cos(below * delay) > (below / frequency) ** 2)
 
 
 def test_nominal_virtual_damping_is_stability_limit_for_total_delay():
-    """Include the force measurement, and the motion simulator as it follows a uniform motion."""
+    """Include the delays of force measurement and motion simulator."""
     overrides = ["rig.force_sensor.delay=0.003", "rig.force_sensor.time_constant=0.002"]
     simulator = 'rig.simulator={model="first_order", time_constant=0.01, delay=0.004}'
     mechanism = load("rod-100n-mm", [*overrides, simulator, "uncertainty={}"]).mechanism
@@ -44,9 +44,10 @@ def test_nominal_virtual_damping_is_stability_limit_for_total_delay():
 
 
 def test_simulated_virtual_contact_is_marginal_at_the_stability_limit():
-    """Compare the growth per half-cycle, pi Re s/Im s of the characteristic root, with 0 at the limit.
+    """The growth per half-cycle, pi Re s/Im s, is 0 at the limit.
 
-    Semi-implicit Euler has the velocity half a period late: what is of first order in T is extrapolated.
+    Semi-implicit Euler delays the velocity by half a period; errors of first order in T are extrapolated to
+    0.
     """
     delay = np.repeat([0.1, 0.2, 0.4], 3) / OMEGA
     share, added = np.tile([0.9, 1.0, 1.1], 3), np.tile([0.0, 0.0, 0.2 * STIFFNESS], 3)

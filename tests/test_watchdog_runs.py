@@ -1,6 +1,6 @@
-"""Watchdog on fresh scenarios, by the controller in C: no missed runs and no false stops.
+"""Watchdog of the C controller on new scenarios: no missed bad runs and no false stops.
 
-Limits are calibrated on some draws, and judged on draws of another seed (`tests/fresh_runs.py`).
+Limits are calibrated on some draws, and evaluated on draws of another seed (`fresh_runs.py`).
 """
 
 from typing import Any
@@ -34,7 +34,7 @@ CHOSEN = {
 
 
 def coarse(contact: dict[str, Any], **parts: Any) -> LoadedGains:
-    """Return damped contacts in coarse ticks, compensated so that some runs are good and some are not."""
+    """Return damped contacts at a coarse control period, with both good and bad runs."""
     contact = {"damping": [400.0], **contact}
     raw = mechanism(contact, {**SECOND_ORDER, "natural_frequency": 20.0}, **parts)
     parsed = validated({**raw, "uncertainty": UNCERTAIN})
@@ -51,10 +51,10 @@ def test_c_watchdog_misses_no_bad_run_and_stops_no_good_run(tmp_path):
 
 @pytest.mark.slow
 def test_watchdog_for_noisy_contacts_at_two_surfaces_performs_as_calibrated(tmp_path):
-    """Let noise go on to change the model's velocity in flight.
+    """Noise changes the model's velocity in flight.
 
-    Where the change exceeds what the limit leaves room for, the margin is widened until good runs pass; here
-    still nothing is missed.
+    If this change exceeds the margin of the error limit, the margin is widened until good runs pass; here
+    still no bad run is missed.
     """
     loaded = coarse({"clearance": 0.001}, contacts=3, force_sensor=NOISY)
     both = [export(loaded, limit, tmp_path, scenarios=1024, lanes=128) for limit in (0.05, 0.1)]
@@ -73,7 +73,7 @@ def test_watchdog_for_noisy_contacts_at_two_surfaces_performs_as_calibrated(tmp_
 
 
 def test_bad_run_that_is_not_stopped_in_time_is_counted_as_missed(tmp_path):
-    """Set the largest margin on the restitution, which misses every bad run, and 0, which stops every run."""
+    """The largest margin misses every bad run; a margin of 0 stops every run."""
     loaded = coarse({}, contacts=2)
     one, _ = export(loaded, 0.02, tmp_path, scenarios=256, lanes=128)
     margin = list(one.parameters).index(one.gain_file.limits["restitution_margin"])

@@ -1,4 +1,4 @@
-"""Habits of writing that make docstrings hard to read stay out of the packages."""
+"""Style rules for docstrings and names of the packages."""
 
 import ast
 import re
@@ -13,7 +13,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def docstrings(path: Path):
-    """Yield line and docstring of everything documented in a file."""
+    """Yield line and docstring of all documented objects in a file."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, DOCUMENTED) and (text := ast.get_docstring(node)):
             yield getattr(node, "lineno", 1), text
@@ -37,7 +37,7 @@ MESSAGE_PARTS = {"found"}
 
 
 def bound_names(path: Path):
-    """Yield line and name of everything that functions of a file bind: parameters and variables."""
+    """Yield line and name of all parameters and variables in the functions of a file."""
     for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
             parameters = function.args
@@ -60,7 +60,7 @@ def test_variables_have_no_meaningless_names(package):
 
 
 def concept(path: Path) -> str:
-    """Return what a file's classes belong to: versions of one class have the same name on purpose."""
+    """Return the concept of a file's classes; variants of a concept may share class names."""
     relative = path.relative_to(ROOT).as_posix()
     if relative.startswith("jaxhil/laws/") or relative in ("jaxhil/rig/filters.py", "jaxhil/rig/registry.py"):
         return "compensator"

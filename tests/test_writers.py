@@ -1,4 +1,4 @@
-"""Writers of gain files: an independent reader reads back the same bits."""
+"""Writers of gain files: independent readers return the same bits."""
 
 import copy
 import csv
@@ -29,7 +29,7 @@ def bits(value):
 
 
 def document(values, limits):
-    """Return a document whose gains have these values, whatever a compensator would say of them."""
+    """Return a document whose gains have these values, without checking their bounds."""
     made = copy.deepcopy(gain_document("response_error"))
     for name, value in zip(made["gains"], values, strict=True):
         made["gains"][name]["value"] = value
@@ -66,7 +66,7 @@ def test_ros2_parameter_file_is_read_back_to_the_bit(made):
 @writer_test
 @given(documents)
 def test_ros2_parameter_numbers_are_doubles_and_texts_are_strings(made):
-    """Follow ROS 2's parser by the letter: a decimal point or .inf makes a double, quotes make a string."""
+    """ROS 2's parser: a decimal point or .inf makes a double, quotes make a string."""
     sections = []
     for line in ros2_files(made)["ros2.yaml"].decode().splitlines()[3:]:
         indent, name, value = re.fullmatch(r"( +)([A-Za-z_][A-Za-z0-9_]*):(?: (\S.*))?", line).groups()
@@ -109,11 +109,11 @@ def test_matlab_struct_is_read_back_to_the_bit(made):
 
 
 def mat_elements(content):
-    """Yield (type, bytes) of the elements of MATLAB's level 5 format, by its published description."""
+    """Yield (type, bytes) of the elements of MATLAB's level 5 format, from its published description."""
     offset = 0
     while offset < len(content):
         kind, size = struct.unpack_from("<II", content, offset)
-        if kind >> 16:  # a small element: size and type in one word
+        if kind >> 16:  # small element: size and type in one word
             yield kind & 0xFFFF, content[offset + 4 : offset + 4 + (kind >> 16)]
             offset += 8
         else:
