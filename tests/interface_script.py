@@ -24,7 +24,7 @@ tuning.export(result, "bundle", sweep=study)
 print(tuning.verify("bundle").good)
 
 slope = jaxhil.jacobian(mechanism, "response_error", of="restitution", by=["rig.force_sensor.delay", "gains.phase_lead"])
-print(slope["rig.force_sensor.delay"])  # one number per contact
+print(slope["rig.force_sensor.delay"])                  # one number a contact
 worst = tuning.tune(mechanism, "phase_lead", scenarios=4, starts=1, objective=lambda metrics: jnp.abs(metrics.error).max())
 batch = tuning.tune([jaxhil.load(name) for name in ("varying", "rig-300kg")], "phase_lead", scenarios=4, starts=1)
 print([one.figures["tuned"].rms for one in batch])
