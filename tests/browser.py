@@ -136,9 +136,9 @@ class Browser:
 
     def evaluate(self, script: str) -> Any:
         """Return the value of an expression in the page; wait for the result of a promise."""
-        told = self._call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
-        assert "exceptionDetails" not in told, told
-        return told["result"].get("value")
+        answer = self._call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
 
     def click(self, selector: str) -> None:
         """Scroll the first matching element into view and click its centre."""
@@ -175,7 +175,7 @@ class Browser:
         message = {"id": self._number, "method": method, "params": parameters, **self._session}
         self._out.write(json.dumps(message).encode() + b"\0")
         self._out.flush()
-        answer = self._read(lambda told: told.get("id") == message["id"])
+        answer = self._read(lambda values: values.get("id") == message["id"])
         assert "error" not in answer, (method, answer)
         return answer["result"]
 
@@ -193,29 +193,31 @@ class Browser:
                 time.sleep(0.002)
                 continue
             self._rest = rest
-            told = json.loads(message)
-            if "method" in told:
-                self._events.append(told)
-            if wanted(told):
-                return told
+            event = json.loads(message)
+            if "method" in event:
+                self._events.append(event)
+            if wanted(event):
+                return event
         raise TimeoutError("the browser does not answer")
 
 
 def _opened(events: list[dict[str, Any]]) -> Opened:
     opened = Opened([], [], [])
     for event in events:
-        said = event["params"]
+        parameters = event["params"]
         match event["method"]:
             case "Runtime.exceptionThrown":
-                opened.errors.append(said["exceptionDetails"]["exception"].get("description", "an exception"))
-            case "Runtime.consoleAPICalled" if said["type"] in ("error", "assert"):
-                opened.errors.append(json.dumps(said["args"]))
-            case "Log.entryAdded" if said["entry"]["level"] == "error":
-                opened.errors.append(json.dumps(said["entry"]))
-            case "Network.requestWillBeSent" if not said["request"]["url"].startswith(
+                opened.errors.append(
+                    parameters["exceptionDetails"]["exception"].get("description", "an exception")
+                )
+            case "Runtime.consoleAPICalled" if parameters["type"] in ("error", "assert"):
+                opened.errors.append(json.dumps(parameters["args"]))
+            case "Log.entryAdded" if parameters["entry"]["level"] == "error":
+                opened.errors.append(json.dumps(parameters["entry"]))
+            case "Network.requestWillBeSent" if not parameters["request"]["url"].startswith(
                 ("file:", "data:", "blob:")
             ):
-                opened.elsewhere.append(said["request"]["url"])
-            case "Network.loadingFailed" if not said.get("canceled"):
-                opened.missing.append(said["errorText"])
+                opened.elsewhere.append(parameters["request"]["url"])
+            case "Network.loadingFailed" if not parameters.get("canceled"):
+                opened.missing.append(parameters["errorText"])
     return opened

@@ -93,10 +93,10 @@ class _Simulator:
     def _solve(self, rhs, end, events):
         while end - self.time > 1e-15:
             span = self.time, end
-            found = solve_ivp(rhs, span, self.state, events=events, dense_output=True, **OPTIONS)
-            self.dense.append((self.time, found.t[-1], found.sol))
-            self.time, self.state = found.t[-1], found.y[:, -1]
-            if found.status == 1 and end - self.time > 1e-12:  # step off the event
+            solution = solve_ivp(rhs, span, self.state, events=events, dense_output=True, **OPTIONS)
+            self.dense.append((self.time, solution.t[-1], solution.sol))
+            self.time, self.state = solution.t[-1], solution.y[:, -1]
+            if solution.status == 1 and end - self.time > 1e-12:  # step off the event
                 nudge = solve_ivp(rhs, (self.time, self.time + 1e-12), self.state, **OPTIONS)
                 self.time, self.state = nudge.t[-1], nudge.y[:, -1]
 
@@ -122,6 +122,6 @@ class _Lag:
             if force((low + high) / 2) == 0.0:
                 value *= exp(-(high - low) / lag)
                 continue
-            found = solve_ivp(lambda t, y, f=force: (f(t) - y) / lag, (low, high), [value], **OPTIONS)
-            value = found.y[0, -1]
+            solved = solve_ivp(lambda t, y, f=force: (f(t) - y) / lag, (low, high), [value], **OPTIONS)
+            value = solved.y[0, -1]
         return value

@@ -386,17 +386,17 @@ def _event(controller: Controller, row: list[float]) -> float:
     return False
 
 
-def same_bits(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
+def same_bits(result: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """Return where two arrays of doubles have equal bits or are both NaN."""
-    return (found.view(np.uint64) == expected.view(np.uint64)) | (np.isnan(found) & np.isnan(expected))
+    return (result.view(np.uint64) == expected.view(np.uint64)) | (np.isnan(result) & np.isnan(expected))
 
 
-def assert_same(found: np.ndarray, expected: np.ndarray, rows: np.ndarray) -> None:
+def assert_same(result: np.ndarray, expected: np.ndarray, rows: np.ndarray) -> None:
     """Raise AssertionError with the first tick and column in which C and Python differ."""
-    same = same_bits(found, expected)
+    same = same_bits(result, expected)
     if not same.all():
         tick, column = (int(index) for index in np.argwhere(~same)[0])
         raise AssertionError(
-            f"tick {tick}: {RESULT[column]}: C {found[tick, column]!r}, Python {expected[tick, column]!r}, "
+            f"tick {tick}: {RESULT[column]}: C {result[tick, column]!r}, Python {expected[tick, column]!r}, "
             f"row {rows[tick].tolist()}"
         )

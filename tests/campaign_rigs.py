@@ -27,9 +27,11 @@ def commanded(name, what, command, seed, noise=True):
     kind, rng = campaigns.KINDS[name], np.random.default_rng(seed)
     rig, T, sensor = kind.rig, kind.rig["control_period"], kind.rig["force_sensor"]
     plant, law = campaigns.Plant(rig), Law(kind.contact, rig.get("contact_plane", 0.0))
-    own = rig["simulator"].get("delay", 0.0)
-    measured = campaigns._position(plant, command, (own + rig["position_sensor"].get("delay", 0.0)) / T)
-    lag, near = (own + sensor.get("delay", 0.0)) / T, 1e-3
+    simulator_delay = rig["simulator"].get("delay", 0.0)
+    measured = campaigns._position(
+        plant, command, (simulator_delay + rig["position_sensor"].get("delay", 0.0)) / T
+    )
+    lag, near = (simulator_delay + sensor.get("delay", 0.0)) / T, 1e-3
     before, at, after = (campaigns._position(plant, command, lag + shift) for shift in (near, 0.0, -near))
     raw = law.raw(at - law.plane, (after - before) / (2.0 * near * T), 0)
     force = np.where((at > law.plane) & (what == "press"), np.maximum(raw, 0.0), 0.0)

@@ -249,9 +249,9 @@ def campaign(name, seed, speeds=SPEEDS, seconds=60.0, rest=5.0, press=False) -> 
 
 def _rest_run(kind, rng, seconds):
     rig, rows = kind.rig, round(seconds / kind.rig["control_period"])
-    held = np.full(rows, -0.02)
+    command = np.full(rows, -0.02)
     force = sense(_coloured(rng, rows, rig["force_sensor"]["noise_std"], kind.colour), rig["force_sensor"])
-    return _run(kind, "rest", held, _measured(kind, rng, held), force)
+    return _run(kind, "rest", command, _measured(kind, rng, command), force)
 
 
 def _free_run(kind, rng, seconds):

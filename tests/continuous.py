@@ -64,7 +64,7 @@ def contact(
     events[1].__dict__["direction"] = -1
     state, time, peak = np.array([0.0, velocity]), 0.0, law(0.0, velocity)
     while True:
-        found = solve_ivp(
+        solution = solve_ivp(
             lambda _, y: [y[1], -max(0.0, law(*y)) / mass],
             (time, time + 10.0),
             state,
@@ -72,9 +72,9 @@ def contact(
             max_step=1e-3,
             **TIGHT,
         )
-        peak = max([peak, *(law(*y) for y in found.y.T)])
-        state, time = found.y[:, -1], found.t[-1]
-        if found.t_events[0].size or found.t_events[1].size:
+        peak = max([peak, *(law(*y) for y in solution.y.T)])
+        state, time = solution.y[:, -1], solution.t[-1]
+        if solution.t_events[0].size or solution.t_events[1].size:
             return abs(state[1]) / velocity, peak
         # Step off the event; otherwise it is detected again.
         time += 1e-9
@@ -112,10 +112,10 @@ def delayed_contact(
 
     state = np.array([0.0, velocity, -velocity * lag, velocity])
     for start, end in pairwise(np.arange(0.0, 1.0, step)):
-        found = solve_ivp(slope, (start, end), state, dense_output=True, max_step=step / 4, **TIGHT)
-        assert found.sol is not None
-        pieces.append((start, found.sol))
-        state = found.y[:, -1]
+        solution = solve_ivp(slope, (start, end), state, dense_output=True, max_step=step / 4, **TIGHT)
+        assert solution.sol is not None
+        pieces.append((start, solution.sol))
+        state = solution.y[:, -1]
         if state[2] < 0 and state[1] < 0 and past(end - force_delay, 2) < 0:
             return abs(state[1]) / velocity
     raise AssertionError("the contact goes on for longer than a second")

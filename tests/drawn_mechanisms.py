@@ -152,8 +152,8 @@ def oracle_figures(parsed: dict[str, Any]) -> dict[str, float] | None:
     Returns None if the contact does not end, or if a change of an input by `NUDGE` changes a metric by more
     than the tolerance.
     """
-    found = simulate(parsed)[0]
-    if found["status"] != "over":
+    contact = simulate(parsed)[0]
+    if contact["status"] != "over":
         return None
     approach, bodies = parsed["approach"], parsed["bodies"]
     nudged = (
@@ -162,12 +162,12 @@ def oracle_figures(parsed: dict[str, Any]) -> dict[str, float] | None:
     )
     for change in nudged:
         moved = simulate(parsed | change)[0]
-        if moved["status"] != "over" or max(differences(moved, found).values()) > BAR:
+        if moved["status"] != "over" or max(differences(moved, contact).values()) > BAR:
             return None
-    return {name: float(found[name]) for name in FIGURES}
+    return {name: float(contact[name]) for name in FIGURES}
 
 
-def differences(found: dict[str, Any], expected: dict[str, Any]) -> dict[str, float]:
+def differences(result: dict[str, Any], expected: dict[str, Any]) -> dict[str, float]:
     """Return the differences of metrics relative to their scale."""
     scales = {
         "restitution": max(1.0, expected["restitution"]),
@@ -176,4 +176,4 @@ def differences(found: dict[str, Any], expected: dict[str, Any]) -> dict[str, fl
         "work_in": expected["work_in"],
         "work_out": expected["work_in"],
     }
-    return {name: abs(found[name] - expected[name]) / scales[name] for name in FIGURES}
+    return {name: abs(result[name] - expected[name]) / scales[name] for name in FIGURES}

@@ -139,8 +139,8 @@ def _command(job: dict[str, Any]) -> None:
 def _ended(process: int) -> int | str:
     begun = time.monotonic()
     while time.monotonic() - begun < LONGEST:
-        found, status = os.waitpid(process, os.WNOHANG)
-        if found:
+        ended, status = os.waitpid(process, os.WNOHANG)
+        if ended:
             return os.waitstatus_to_exitcode(status)
         time.sleep(0.01)
     os.kill(process, 9)

@@ -10,7 +10,9 @@ STIFFNESSES = "[1e5]", "[4e4]", "[2e5]"
 
 def lead_tasks() -> list[TuneTask]:
     """Return three similar tasks."""
-    return [lead_task(f"contact.stiffness={own}", f"name=m{i}") for i, own in enumerate(STIFFNESSES)]
+    return [
+        lead_task(f"contact.stiffness={stiffness}", f"name=m{i}") for i, stiffness in enumerate(STIFFNESSES)
+    ]
 
 
 def lead_task(*overrides: str) -> TuneTask:

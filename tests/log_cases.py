@@ -35,13 +35,15 @@ def touches(number: int = 1, speed: float = 5e-3, noise: float = 0.3, seed: int 
         rows.append((x, v, force))
         v -= PERIOD * force / MASS
         x += PERIOD * v
-    found = np.array(rows).T
-    lagged = np.concatenate([found[0][0] - speed * PERIOD * np.arange(LAG, 0, -1), found[0][:-LAG]])
-    sensed = found[2] + noise * random.standard_normal(len(lagged))
+    samples = np.array(rows).T
+    lagged = np.concatenate([samples[0][0] - speed * PERIOD * np.arange(LAG, 0, -1), samples[0][:-LAG]])
+    sensed = samples[2] + noise * random.standard_normal(len(lagged))
     times = PERIOD * np.arange(len(lagged))
     return dict(
         zip(
-            CHANNELS.values(), (times, found[0], lagged, sensed, found[1], sensed * 0 + found[2]), strict=True
+            CHANNELS.values(),
+            (times, samples[0], lagged, sensed, samples[1], sensed * 0 + samples[2]),
+            strict=True,
         )
     )
 
@@ -74,6 +76,6 @@ def mapping(kind: str = "contact", timing: Any = (), text: Any = None, **channel
     return parse_mapping(raw, "map")
 
 
-def read(path: Path, kind: str = "contact", **said: Any) -> Campaign:
+def read(path: Path, kind: str = "contact", **changes: Any) -> Campaign:
     """Return the campaign of one file."""
-    return read_campaign([path], mapping(kind, **said))
+    return read_campaign([path], mapping(kind, **changes))

@@ -185,13 +185,13 @@ class Work:
             self.peak = float(magnitude[best])
             bounds = theta[max(best - 1, 0)], theta[min(best + 1, len(theta) - 1)]
             if 0 < best < len(theta) - 1 and bounds[1] > bounds[0]:
-                found: Any = minimize_scalar(
+                minimum: Any = minimize_scalar(
                     lambda s: -abs(float(piece.force(s))),
                     bounds=bounds,
                     method="bounded",
                     options={"xatol": 1e-10},
                 )
-                self.peak = max(self.peak, -float(found.fun))
+                self.peak = max(self.peak, -float(minimum.fun))
 
 
 def cut(position, velocity, a, b, law, index):
@@ -245,14 +245,14 @@ def _roots(function, a, b, samples=8):
     """Return the sign changes of a smooth function in (a, b), each refined to rounding."""
     grid = np.array([*(a + k * ((b - a) / samples) for k in range(samples)), b])
     values = function(grid)
-    found = []
+    roots = []
     for low, high, f_low, f_high in zip(grid[:-1], grid[1:], values[:-1], values[1:], strict=True):
         if f_low * f_high < 0.0:
             root: Any = brentq(function, low, high, xtol=1e-15)
-            found.append(float(root))
+            roots.append(float(root))
         elif f_high == 0.0 and high < b:
-            found.append(float(high))
-    return found
+            roots.append(float(high))
+    return roots
 
 
 def _as_list(value):

@@ -64,9 +64,9 @@ def second_order(frequencies, dampings, delays):
 def springs(stiffness, damping, exponent):
     """Return parameters of a contact law, each (candidates, *batch)."""
     zero = jnp.zeros_like(stiffness)
-    own = {key.name: zero for key in CONTACT_KEYS.values()}
-    own |= {"exponent": exponent, "depths": zero[:1], "tension": zero > 1}
-    return ContactParameters(stiffness, damping, **own)
+    parameters = {key.name: zero for key in CONTACT_KEYS.values()}
+    parameters |= {"exponent": exponent, "depths": zero[:1], "tension": zero > 1}
+    return ContactParameters(stiffness, damping, **parameters)
 
 
 def place(values, batch=()):

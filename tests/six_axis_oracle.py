@@ -89,10 +89,10 @@ def in_space(case, time):
 
     def slope(_, y):
         bodies = unpacked(y)
-        found = wrench(case, *relative(case, bodies)[:4])
+        loads_on_chaser = wrench(case, *relative(case, bodies)[:4])
         rates = []
         for body, (f, torque), mass, j in zip(
-            bodies, loads(case, bodies, *found), case["masses"], inertias, strict=True
+            bodies, loads(case, bodies, *loads_on_chaser), case["masses"], inertias, strict=True
         ):
             _, v, a, w = body
             spun = np.linalg.solve(j, a.T @ torque - np.cross(w, j @ w))
@@ -100,8 +100,8 @@ def in_space(case, time):
         return np.concatenate(rates)
 
     begin = np.concatenate([np.ravel(part) for body in case["start"] for part in body])
-    found = solve_ivp(slope, (0, time), begin, method="DOP853", rtol=1e-12, atol=1e-14, max_step=5e-4)
-    return unpacked(found.y[:, -1])
+    solution = solve_ivp(slope, (0, time), begin, method="DOP853", rtol=1e-12, atol=1e-14, max_step=5e-4)
+    return unpacked(solution.y[:, -1])
 
 
 def moved(case, bodies, force, moment):
@@ -149,8 +149,8 @@ class Axis:
         if time <= 1e-9 * self.period:
             return np.array([self.at - self.late + self.rate * time, self.rate, 0.0])
         index = min(int(np.ceil(time / self.period - 1e-9)) - 1, len(self.starts) - 1)
-        found = expm(self.flow * (time - index * self.period)) @ self.starts[index]
-        return np.array([found[0], found[1], (self.flow @ found)[1]])
+        state = expm(self.flow * (time - index * self.period)) @ self.starts[index]
+        return np.array([state[0], state[1], (self.flow @ state)[1]])
 
 
 def on_the_rig(case, ticks):
@@ -189,14 +189,14 @@ def weighed(case, x, rotation, w, rate, bend, force, moment, measured):
     )
     alpha = (ahead - behind) / (2 * step)
     arm = rotation @ centre
-    carried = bend[:3] + np.cross(alpha, arm) + np.cross(w, np.cross(w, arm))
-    pull = mass * (case["gravity"] - carried)
+    acceleration = bend[:3] + np.cross(alpha, arm) + np.cross(w, np.cross(w, arm))
+    pull = mass * (case["gravity"] - acceleration)
     j = rotation @ inertia @ rotation.T
     at_flange = moment - np.cross(x[:3], force) + np.cross(arm, pull) - j @ alpha - np.cross(w, j @ w)
     reading = rotation.T @ (force + pull), rotation.T @ at_flange
-    found = Rotation.from_rotvec(measured[3:]).as_matrix()
+    attitude = Rotation.from_rotvec(measured[3:]).as_matrix()
     mass, centre = case["assumed"]
     weight = mass * case["gravity"]
-    force = found @ reading[0] - weight
-    moment = found @ reading[1] - np.cross(found @ centre, weight) + np.cross(measured[:3], force)
+    force = attitude @ reading[0] - weight
+    moment = attitude @ reading[1] - np.cross(attitude @ centre, weight) + np.cross(measured[:3], force)
     return force, moment

@@ -14,17 +14,17 @@ def uniform(size, middle=0.0, **more):
 
 def with_ranges(name, pose_noise=None, **overrides):
     """Return a built-in with stiffness x 0.3 to 3, friction 0 to 0.2, force delay +- 0.3 ms, and noise."""
-    own = load_any(name).mechanism
-    delay = own.rig.force_sensor.delay
+    mechanism = load_any(name).mechanism
+    delay = mechanism.rig.force_sensor.delay
     uncertain = {
         "approach.offset": uniform(OFFSETS.get(name, 0.03), independent=True),
         "approach.attitude": uniform(ATTITUDES.get(name, 0.03), independent=True),
         "rig.force_sensor.delay": uniform(3e-4, delay),
     }
-    for contact in own.contact:
+    for contact in mechanism.contact:
         uncertain[f"contact.{contact}.stiffness"] = {"distribution": "loguniform", "factor": [0.3, 3.0]}
         uncertain[f"contact.{contact}.friction.coefficient"] = uniform(0.1, 0.1)
-    if "rig.simulator.natural_frequency" in own.uncertainty:
+    if "rig.simulator.natural_frequency" in mechanism.uncertainty:
         legs = {"independent": True} if name == "hydraulic-hexapod" else {}
         frequency = {"distribution": "uniform", "factor": [0.85, 1.15], **legs}
         uncertain["rig.simulator.natural_frequency"] = frequency

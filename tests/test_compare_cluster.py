@@ -36,6 +36,6 @@ def test_compare_gives_the_same_results_if_a_worker_is_killed(tmp_path, monkeypa
         from tuning.benchmark import comparison
 
         killed_meanwhile(monkeypatch, comparison, cluster, first)
-        there = tuning.compare(mechanisms, LAWS, scheduler=cluster.address, **FEW)
+        on_cluster_result = tuning.compare(mechanisms, LAWS, scheduler=cluster.address, **FEW)
         assert first.poll() is not None
-    assert [figures(board) for board in there] == [figures(board) for board in here]
+    assert [figures(board) for board in on_cluster_result] == [figures(board) for board in here]

@@ -148,8 +148,8 @@ def first_order_leads():
     # At the threshold (k + j omega b)(1 + j theta) e^(-j theta) is real and M omega^2, theta = omega tau:
     # b omega/k = tan(theta - atan theta), about theta^3/3, twice the damping ratio.
     short = angle - np.arctan(angle)
-    there = OMEGA * np.sqrt(np.sqrt(1 + angle**2) / np.cos(short))
-    omega = np.where(multiple > 0, there, OMEGA)
+    threshold = OMEGA * np.sqrt(np.sqrt(1 + angle**2) / np.cos(short))
+    omega = np.where(multiple > 0, threshold, OMEGA)
     damping, delay = multiple * STIFFNESS * np.tan(short) / omega, angle / omega
     leaves = {"contact__damping": damping, "force_sensor__delay": delay}
     result = without_period("phase_lead", 2.5, {"phase_lead": delay}, **leaves)
@@ -190,11 +190,11 @@ def test_identification_with_misaligned_force_is_biased_as_predicted():
     gains |= {"initial_stiffness": 0.0, "identification_delay": aligned}
     leaves = {"contact__damping": damping, "force_sensor__delay": delay}
     stiffness, result = persistent(parsed, "response_error", 1.5, gains, **leaves).identified
-    left = omega * (delay - aligned)
-    biased = STIFFNESS * np.cos(left) + damping * omega * np.sin(left)
+    misalignment = omega * (delay - aligned)
+    biased = STIFFNESS * np.cos(misalignment) + damping * omega * np.sin(misalignment)
     assert np.ptp(biased) > 0.02 * STIFFNESS
     np.testing.assert_allclose(stiffness[-1], biased, rtol=0, atol=2e-3 * STIFFNESS)
-    biased = damping * np.cos(left) - STIFFNESS / omega * np.sin(left)
+    biased = damping * np.cos(misalignment) - STIFFNESS / omega * np.sin(misalignment)
     assert np.all(np.abs(biased[:3]) < 1e-9) and np.all(biased[3:] == damping[3:])
     np.testing.assert_allclose(result[-1] / damping, biased / damping, rtol=0, atol=2e-3)
 

@@ -165,14 +165,14 @@ def continued(parsed: Mechanism, name: str, gains: dict[str, float], factor: flo
     position, velocity = model.start
     model.place(position, velocity)
     plant.begin(position, velocity, law.position_command(position, velocity, 0.0), 0)
-    result, left = None, math.ceil(factor * MAX_DECAY_WAIT / parsed.rig.control_period)
-    while left > 0:
+    result, ticks_to_wait = None, math.ceil(factor * MAX_DECAY_WAIT / parsed.rig.control_period)
+    while ticks_to_wait > 0:
         reading, measured = plant.read()
         force = law.step(reading, model.position, model.velocity, measured)
         if result is None:
             result = watch.observe(model.position, model.velocity, force, plant.force, reading)
         else:
-            left -= 1
+            ticks_to_wait -= 1
         model.integrate(force)
         plant.move(law.position_command(model.position, model.velocity, model.acceleration))
     return result.restitution, abs(model.velocity) / velocity

@@ -94,8 +94,8 @@ def test_preloaded_contact_closed_form_matches_integration():
     result = reference("preloaded", preload=preload, friction=friction)
     energy, inward = MASS * VELOCITY**2 / 2, preload + friction
     deepest = 2 * energy / (inward + np.sqrt(inward**2 + 2 * STIFFNESS * energy))
-    left = np.maximum(friction - preload, 0) ** 2 / (2 * STIFFNESS)
-    out = STIFFNESS * deepest**2 / 2 + (preload - friction) * deepest + left
+    stored_energy = np.maximum(friction - preload, 0) ** 2 / (2 * STIFFNESS)
+    out = STIFFNESS * deepest**2 / 2 + (preload - friction) * deepest + stored_energy
     np.testing.assert_allclose(result.restitution, np.sqrt(out / energy), rtol=1e-12)
     np.testing.assert_allclose(result.peak_force, inward + STIFFNESS * deepest, rtol=1e-12)
     np.testing.assert_allclose(result.duration[0], np.pi * np.sqrt(MASS / STIFFNESS), rtol=1e-12)

@@ -155,10 +155,10 @@ def test_correlated_keys_are_grouped_by_connected_components():
 
 
 def test_unset_removes_keys_from_correlation_table():
-    left = mechanism(unset=[f"uncertainty.'{STIFFNESS}'"])
-    assert left.correlation.keys == [DELAY, DAMPING, FREQUENCY]
-    assert left.correlation.matrix == [[1.0], [0.98, 1.0], [0.0, 0.0, 1.0]]
-    assert to_plain_data(left) == to_plain_data(fix_at_nominal(mechanism(), [STIFFNESS]))
+    changed = mechanism(unset=[f"uncertainty.'{STIFFNESS}'"])
+    assert changed.correlation.keys == [DELAY, DAMPING, FREQUENCY]
+    assert changed.correlation.matrix == [[1.0], [0.98, 1.0], [0.0, 0.0, 1.0]]
+    assert to_plain_data(changed) == to_plain_data(fix_at_nominal(mechanism(), [STIFFNESS]))
     assert mechanism(unset=["contact.damping"]).correlation.keys == [DELAY, STIFFNESS, FREQUENCY]
     for none in (
         mechanism(unset=["uncertainty"]),
@@ -166,7 +166,7 @@ def test_unset_removes_keys_from_correlation_table():
         fix_at_nominal(mechanism(), KEYS),
     ):
         assert none.correlation is None
-    assert from_plain_data(to_plain_data(left), "again") == left
+    assert from_plain_data(to_plain_data(changed), "again") == changed
 
 
 @pytest.mark.parametrize(

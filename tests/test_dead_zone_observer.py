@@ -35,10 +35,14 @@ def test_dead_zone_observer_removes_dead_zone_error(led):
     alignment = np.array([*[GAINS["identification_delay"]] * 4, DELAY])
     changed = {"observer_stiffness": stiffness, "identification_delay": alignment}
     result = first_contact(MECHANISM, spread(MECHANISM, 5), "dead_zone_observer", GAINS | changed)
-    left = (result["peak_force"] - led["peak_force"][0]) / DEAD_ZONE
+    remaining_error = (result["peak_force"] - led["peak_force"][0]) / DEAD_ZONE
     moved = result["restitution"] - led["restitution"][0]
-    print(left, moved)
-    assert abs(left[0]) < 0.01 and np.all(np.abs(left[1:3]) < 0.1) and left[3] == pytest.approx(1, rel=1e-3)
+    print(remaining_error, moved)
+    assert (
+        abs(remaining_error[0]) < 0.01
+        and np.all(np.abs(remaining_error[1:3]) < 0.1)
+        and remaining_error[3] == pytest.approx(1, rel=1e-3)
+    )
     assert np.all(np.abs(moved[:4]) < 1e-3) and moved[4] > 0.05
 
 

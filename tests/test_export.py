@@ -243,7 +243,7 @@ def test_write_bundle_keeps_old_bundle_after_failed_write(tmp_path, monkeypatch,
     folder = tmp_path / "bundle"
     if before:
         placed(folder)
-    there = {name: (folder / name).read_bytes() for name in files_of(folder)}
+    old_files = {name: (folder / name).read_bytes() for name in files_of(folder)}
     calls = []
 
     def full(descriptor):
@@ -254,7 +254,7 @@ def test_write_bundle_keeps_old_bundle_after_failed_write(tmp_path, monkeypatch,
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(ValueError, match="bundle: cannot be written: No space left"):
         write_bundle(folder, small_files())
-    assert {name: (folder / name).read_bytes() for name in files_of(folder)} == there
+    assert {name: (folder / name).read_bytes() for name in files_of(folder)} == old_files
     assert [name for name in os.listdir(tmp_path) if name.endswith(TEMPORARY_SUFFIX)] == []
     monkeypatch.undo()
     move, moved = os.replace, []
@@ -273,7 +273,7 @@ def test_write_bundle_keeps_old_bundle_after_failed_write(tmp_path, monkeypatch,
     monkeypatch.setattr(os, "replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_bundle(folder, small_files())
-    assert {name: (folder / name).read_bytes() for name in files_of(folder)} == there
+    assert {name: (folder / name).read_bytes() for name in files_of(folder)} == old_files
     assert {*os.listdir(tmp_path)} - {"file"} == ({"bundle"} if before else set())
     monkeypatch.setattr(os, "replace", move)
     write_bundle(folder, small_files())

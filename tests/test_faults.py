@@ -148,7 +148,7 @@ class Bench:
 
     def disturb(self, at: int, kill: bool, *more: str) -> bool:
         """Run with a fault and check the files; return whether any file changed."""
-        there, everything = self.tree(), self.everything()
+        files_before, everything = self.tree(), self.everything()
         ran = self.run(*more, at=at, kill=kill)
         what = f"{'killed' if kill else 'failed'} at call {at}, {ran.calls[-1:]}: {ran.code} {ran.err[-400:]}"
         assert ran.code != HANGS and "internal error" not in ran.err and "Traceback" not in ran.err, what
@@ -160,13 +160,13 @@ class Bench:
             assert ran.code == 2 and ran.err.splitlines()[-1].startswith("jaxhil: "), what
         for name, content in result.items():
             # A verdict changes as more results are finished.
-            whole = content in (there.get(name), self.after.get(name)) or _is_signed(content)
+            whole = content in (files_before.get(name), self.after.get(name)) or _is_signed(content)
             assert whole, f"{what}: {name}"
-        assert there.keys() <= result.keys(), f"{what}: {there.keys() - result.keys()}"
+        assert files_before.keys() <= result.keys(), f"{what}: {files_before.keys() - result.keys()}"
         for name, content in USERS.items():
             assert result[name] == (self.runner.cache / name).read_bytes() == content, f"{what}: {name}"
         if (piece := self.command.one_piece) is not None:
-            now, old, new = (_below(tree, piece) for tree in (result, there, self.after))
+            now, old, new = (_below(tree, piece) for tree in (result, files_before, self.after))
             assert now in (old, new), what
         return self.everything() != everything
 

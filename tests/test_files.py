@@ -145,14 +145,14 @@ files.write_atomically(Path(sys.argv[1]) / "file", b"new")
 """
     ended = subprocess.run([sys.executable, "-c", killed, tmp_path], timeout=60)
     assert ended.returncode == -signal.SIGKILL
-    (left,) = tmp_path.iterdir()
-    users = [".thesis.docx.tmp", ".jaxhil.tmp", ".jaxhil-12-cafe.tmp", f"{left.name}.tmp", f"a{left.name}"]
+    (stale,) = tmp_path.iterdir()
+    users = [".thesis.docx.tmp", ".jaxhil.tmp", ".jaxhil-12-cafe.tmp", f"{stale.name}.tmp", f"a{stale.name}"]
     for name in users:
         (tmp_path / name).write_text("years")
     # Also create a file that a live process is writing, and a link with such a name.
-    writes = left.name.replace(left.name.split("-")[1], str(os.getppid()))
+    writes = stale.name.replace(stale.name.split("-")[1], str(os.getppid()))
     (tmp_path / writes).write_text("half")
-    linked = left.name.replace("-0.tmp", "-1.tmp")
+    linked = stale.name.replace("-0.tmp", "-1.tmp")
     (tmp_path / linked).symlink_to(tmp_path / users[0])
     remove_stale(tmp_path)
     assert sorted(os.listdir(tmp_path)) == sorted([*users, writes, linked])

@@ -85,8 +85,8 @@ def test_contact_gate_is_1_in_contact_0_outside_and_triangular_between(gates):
     early = TICKS[1:] < 15
     np.testing.assert_allclose(result[early], entered[early], rtol=0, atol=1e-14)
     # The release mirrors the onset.
-    left = gates(crossing(PHASES - 20, PHASES))
-    np.testing.assert_allclose(left[early][1:], 1 - entered[early][1:], rtol=0, atol=1e-14)
+    release_gates = gates(crossing(PHASES - 20, PHASES))
+    np.testing.assert_allclose(release_gates[early][1:], 1 - entered[early][1:], rtol=0, atol=1e-14)
     assert np.all((result >= 0) & (result <= 1)) and np.any(result == 1) and np.any(result == 0)
 
 

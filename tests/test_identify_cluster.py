@@ -39,7 +39,7 @@ def test_bootstrap_gives_the_same_draws_if_a_worker_is_killed(fit, tmp_path, mon
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker(OMP_NUM_THREADS="2", OPENBLAS_NUM_THREADS="2")
         killed_meanwhile(monkeypatch, bootstrap, cluster, first)
-        there = bootstrap.bootstrap(fit, 20, scheduler=cluster.address)
+        cluster_result = bootstrap.bootstrap(fit, 20, scheduler=cluster.address)
         assert first.poll() is not None
-    assert there.resampled == here.resampled
-    np.testing.assert_array_equal(there.posterior.draws, here.posterior.draws)
+    assert cluster_result.resampled == here.resampled
+    np.testing.assert_array_equal(cluster_result.posterior.draws, here.posterior.draws)

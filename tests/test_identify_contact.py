@@ -73,9 +73,9 @@ def test_lag_filter_weights_are_exact_for_quadratic_force():
 
 
 def test_lag_filter_weights_are_exact_for_contact_onset_within_a_period():
-    rate, left = 0.7, np.array([0.03, 0.4, 1.0])
-    after, end = compute_onset_weights(rate, left)
-    for share, begin_weight, end_weight in zip(left, after, end, strict=True):
+    rate, remaining = 0.7, np.array([0.03, 0.4, 1.0])
+    after, end = compute_onset_weights(rate, remaining)
+    for share, begin_weight, end_weight in zip(remaining, after, end, strict=True):
         t = np.linspace(1.0 - share, 1.0, 200_001)
         line = 3.0 + 2.0 * (t - t[0]) / share
         exact = np.trapezoid(rate * np.exp(-(1.0 - t) * rate) * line, t)

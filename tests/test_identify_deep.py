@@ -104,6 +104,6 @@ def test_noise_filter_of_a_run_does_not_depend_on_other_runs(whitening):
         np.testing.assert_allclose(
             alone.force(0.002, 0.0, values)[:, 0], together[:, lane], rtol=0, atol=1e-9
         )
-        left = alone.whiten(alone.readings.force - alone.force(0.002, 0.0, inner.coefficients))
-        misfit += float(np.sum((left[alone.readings.counts] / 0.5) ** 2))
+        residuals = alone.whiten(alone.readings.force - alone.force(0.002, 0.0, inner.coefficients))
+        misfit += float(np.sum((residuals[alone.readings.counts] / 0.5) ** 2))
     assert misfit == pytest.approx(inner.misfit, rel=1e-9)

@@ -42,10 +42,10 @@ def test_bode_plot_shows_response_of_the_rig(identified):
 
 
 def test_contact_plots_show_contacts_and_residuals(identified):
-    left, right = plot_force_delay(identified.contact, 0.0037).axes
-    profile = line(left, "profile of the likelihood")
+    left_axes, right_axes = plot_force_delay(identified.contact, 0.0037).axes
+    profile = line(left_axes, "profile of the likelihood")
     assert profile[1].max() == 1.0 and abs(profile[0][np.argmax(profile[1])] - 3.7) < 0.5
-    assert line(left, "prior")[0][0] == pytest.approx(3.7) and "correlation 0." in right.get_title()
+    assert line(left_axes, "prior")[0][0] == pytest.approx(3.7) and "correlation 0." in right_axes.get_title()
     panels = plot_contacts(identified.contact).axes
     assert len(panels) == 6 and panels[0].get_title() == "contact 0" and panels[2].get_title() == "contact 2"
     for axes, speed in zip(panels[:3], (0.003, 0.006, 0.012), strict=True):

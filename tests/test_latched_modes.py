@@ -66,10 +66,10 @@ def test_latched_vibration_modes_grow_under_delay_as_characteristic_roots(delays
     For equal delays this is the root of the stiffest mode, by Lambert's function. The integrator adds half a
     period of delay.
     """
-    given = scenario(delays)
-    loop = build_loop(given, integrator="zoh", hold="linear", latency=0)
-    _, seen = jax.jit(run, static_argnums=(0, 3))(loop, {}, given, TICKS)
-    mass = np.asarray(mass_matrix(given.bodies, given.start))[..., 0]
+    scenarios = scenario(delays)
+    loop = build_loop(scenarios, integrator="zoh", hold="linear", latency=0)
+    _, seen = jax.jit(run, static_argnums=(0, 3))(loop, {}, scenarios, TICKS)
+    mass = np.asarray(mass_matrix(scenarios.bodies, scenarios.start))[..., 0]
     signal = np.concatenate([np.asarray(components(part))[..., 0] for part in seen.command])
     frequencies = np.sqrt(np.linalg.eigvals(np.linalg.solve(mass, STIFFNESS)).real)
     late = np.asarray(delays) + PERIOD / 2

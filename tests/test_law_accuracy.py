@@ -53,7 +53,7 @@ def outcome_of(mechanism: Mechanism, gains: Mapping[str, Any], scenarios: Scenar
     return evaluate(loop, {name: np.broadcast_to(value, lanes) for name, value in gains.items()}, scenarios)
 
 
-def left(errors: Any) -> tuple[float, float, float]:
+def error_statistics(errors: Any) -> tuple[float, float, float]:
     """Return root mean square, 99th percentile and maximum of |e - e*| [%]."""
     size = 100 * np.abs(np.asarray(errors))
     return float(np.sqrt(np.mean(size**2))), float(np.percentile(size, 99)), float(np.max(size))
@@ -80,8 +80,8 @@ def test_impulse_ledger_is_accurate_with_surface_within_1_mm(suite, noise):
     gains = literature_gains(mechanism, LAW)
     copies = copies_of(probed, outcome_of(mechanism, gains, probed.scenarios))
     assert np.all(copies.good[..., 0])
-    first, fourth = left(copies.error[0, :, 0]), left(copies.error[3, :, 0])
-    specified = left(copies_of(probed, outcome_of(mechanism, gains, in_place)).error[3, :, 0])
+    first, fourth = error_statistics(copies.error[0, :, 0]), error_statistics(copies.error[3, :, 0])
+    specified = error_statistics(copies_of(probed, outcome_of(mechanism, gains, in_place)).error[3, :, 0])
     figures = {name: estimate.value for name, estimate in compute_probe_metrics(probed, copies).items()}
     printed(suite, "noise", noise, *first, "fourth", *fourth, "as specified", *specified, figures)
     assert first[0] < RMS and first[1] < PERCENTILE and first[2] < LARGEST
@@ -104,7 +104,7 @@ def test_impulse_ledger_is_accurate_for_contacts_of_1_to_8_s(period, noise):
         gains = literature_gains(mechanism, LAW)
         outcome = outcome_of(mechanism, {**gains, "force_noise": std}, scenarios)
         assert np.all(outcome.good[0])
-        errors = left(outcome.error[0])
+        errors = error_statistics(outcome.error[0])
         excess = (outcome.peak_ratio[0] - 3) * outcome.reference_peak_force[0]
         beyond = int(np.sum(excess > 20 * std))
         kind = "damped" if damped else "elastic"
@@ -129,6 +129,6 @@ def test_impulse_ledger_is_accurate_with_preload_friction_and_bias(case):
     scenarios = build_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)
     outcome = outcome_of(mechanism, literature_gains(mechanism, LAW), scenarios)
     assert np.all(outcome.good[0])
-    errors = left(outcome.error[0])
+    errors = error_statistics(outcome.error[0])
     printed(case, *errors)
     assert errors[0] < 0.8 and errors[2] < 2.0

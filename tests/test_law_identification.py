@@ -35,12 +35,12 @@ def test_share_of_doubtful_ticks_distinguishes_too_short_contacts(suite):
         doubts = record.unsure + record.too_short + record.noisy
         doubt[index] = doubts / record.ticks
         short[index] = record.too_short > 0
-    known = doubt[short == 0]
+    shares_of_long_contacts = doubt[short == 0]
     print(
-        f"{suite}: {len(known)} contacts that are not too short, in doubt on up to "
-        f"{np.max(known):.2f} of their ticks"
+        f"{suite}: {len(shares_of_long_contacts)} contacts that are not too short, in doubt on up to "
+        f"{np.max(shares_of_long_contacts):.2f} of their ticks"
     )
-    assert np.max(known) < MAX_DOUBTFUL_SHARE
+    assert np.max(shares_of_long_contacts) < MAX_DOUBTFUL_SHARE
     if np.any(short):
         least, most = np.quantile(doubt[short > 0], [0.0, 0.05])
         print(f"{int(np.sum(short))} that are, on {least:.2f} and more, all but a twentieth on {most:.2f}")

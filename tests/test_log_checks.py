@@ -10,9 +10,9 @@ from tuning.identification.logs import checks
 LOG = touches(2, noise=0.0)
 
 
-def message(path, kind="contact", **said):
+def message(path, kind="contact", **changes):
     with pytest.raises(InputError) as caught:
-        read(path, kind, **said)
+        read(path, kind, **changes)
     assert str(caught.value).isprintable() and str(caught.value).startswith(f"{path}: ")
     return str(caught.value)
 

@@ -59,7 +59,7 @@ def test_unusable_time_stamps_are_refused():
         # confused.
         (0.98 * times, "time: found rows 0.00098 s apart, expected the control period, 0.001 s"),
     ]
-    for given, reason in cases:
+    for bad_times, reason in cases:
         with pytest.raises(InputError) as caught:
-            assign_ticks(given, PERIOD, "a.csv")
+            assign_ticks(bad_times, PERIOD, "a.csv")
         assert str(caught.value).startswith("a.csv: ") and reason in str(caught.value)

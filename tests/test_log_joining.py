@@ -30,17 +30,17 @@ def joined(sampled, stamps=None, ticks=None, jitter=0.0):
     clocks = dict.fromkeys(columns, sampled if stamps is None else stamps) | {"position_desired": rows}
     named = {"position_desired": "xd", "position_measured": "xm", "force_measured": "F"}
     result, times, notes = resample_to_rows("a", columns, clocks, named, PERIOD)
-    kept = result["position_desired"].astype(int)
-    assert len(times) == len(kept) == len(result["position_measured"])
+    remaining_ticks = result["position_desired"].astype(int)
+    assert len(times) == len(remaining_ticks) == len(result["position_measured"])
     assert np.all(np.isin(times, rows))
     if "force_late" in result:
         # Forces are not interpolated: each is one of the readings, and its delay is reported.
         assert np.all(np.isin(result["force_measured"], columns["force_measured"]))
         moved = (2 * np.pi * 7.1) * (0.02 * PERIOD + jitter)
-        at = PERIOD * kept + result["force_late"]
+        at = PERIOD * remaining_ticks + result["force_late"]
         assert np.max(np.abs(result["force_late"])) <= (0.51 * PERIOD if jitter == 0.0 else 0.7 * PERIOD)
         assert np.max(np.abs(result["force_measured"] - smooth(at))) < moved
-    return kept, result["position_measured"], notes
+    return remaining_ticks, result["position_measured"], notes
 
 
 @pytest.mark.parametrize("late", [5.0, -7.0, 0.0])
@@ -178,16 +178,18 @@ def test_time_stamps_of_channel_group_that_differ_from_row_stamps_are_refused(tm
         for name in ("xd", "xm", "vd", "Fc"):
             file[f"x/{name}"] = log[name]
         file["f/F"] = log["F"]
-    said = TIMES | {"time": "x/time", "force_measured": "f/F"}
+    columns = TIMES | {"time": "x/time", "force_measured": "f/F"}
     with pytest.raises(
         InputError, match=r"'f/F': found separate time stamps in 'f/time' that differ from 'x/time'"
     ):
-        read(tmp_path / "a.h5", **said)
+        read(tmp_path / "a.h5", **columns)
     if unit == 1.0:
-        assert read(tmp_path / "a.h5", **said | {"force_measured": {"column": "f/F", "time": "f/time"}}).notes
+        assert read(
+            tmp_path / "a.h5", **columns | {"force_measured": {"column": "f/F", "time": "f/time"}}
+        ).notes
     with h5py.File(tmp_path / "a.h5", "a") as file:
         file["f/time"][:] = unit * log["t"]
-    (run,) = read(tmp_path / "a.h5", **said).runs
+    (run,) = read(tmp_path / "a.h5", **columns).runs
     np.testing.assert_array_equal(run.force_measured, log["F"])
 
 

@@ -41,10 +41,10 @@ def scatter(log, std, seed=1, samples=False):
     return log | {"t": times}
 
 
-def refused(tmp_path, log, **said):
+def refused(tmp_path, log, **changes):
     path = write_csv(tmp_path / "a.csv", log)
     with pytest.raises(InputError) as caught:
-        read(path, **said)
+        read(path, **changes)
     result = str(caught.value)
     assert result.isprintable() and result.startswith(f"{path}: ")
     return result

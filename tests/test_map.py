@@ -97,8 +97,10 @@ def test_stability_map_growth_rate_agrees_with_closed_forms():
     for b, tau in zip(damping, delay, strict=True):
         # At the limit M s^2 + (b s + k) e^(-s tau) = 0 has a root on the imaginary axis.
         frequencies = np.geomspace(1, 1e3, 200_001)
-        left = -mass * frequencies**2 + (1j * b * frequencies + stiffness) * np.exp(-1j * frequencies * tau)
-        assert np.min(np.abs(left)) < 1e-4 * stiffness
+        residual = -mass * frequencies**2 + (1j * b * frequencies + stiffness) * np.exp(
+            -1j * frequencies * tau
+        )
+        assert np.min(np.abs(residual)) < 1e-4 * stiffness
 
 
 def solved_root(phase):
@@ -129,9 +131,9 @@ def test_stability_map_of_uncompensated_contact_agrees_with_theory(ideal):
     assert document["spectral_radius"]["values"] == pytest.approx(growing(result, root), abs=1e-5)
 
 
-def growing(found, restitution):
+def growing(e, restitution):
     """Return the spectral radius that corresponds to the restitution over half an oscillation."""
-    stiffness, delay = np.meshgrid(found.x, found.y)
+    stiffness, delay = np.meshgrid(e.x, e.y)
     frequency = np.sqrt(stiffness / 350.0)
     roots = np.vectorize(solved_root)(frequency * delay)
     assert np.exp(np.pi * roots.real / abs(roots.imag)) == pytest.approx(restitution, rel=1e-9)
@@ -219,8 +221,8 @@ def test_stability_map_computed_on_a_cluster_is_bit_identical(tmp_path):
     here = tuning.map("varying", **asked)
     with started(tmp_path) as cluster:
         cluster.worker()
-        there = tuning.map("varying", scheduler=cluster.address, **asked)
-    assert there.document == here.document
+        cluster_result = tuning.map("varying", scheduler=cluster.address, **asked)
+    assert cluster_result.document == here.document
 
 
 def test_interrupted_stability_map_computation_resumes(tmp_path, monkeypatch):

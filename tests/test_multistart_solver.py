@@ -48,11 +48,11 @@ def test_every_optimisation_start_has_history_and_status(solved):
             assert len(start.history) == start.steps <= STEPS
             assert (np.diff(start.history) <= 0).all()
             assert start.rms == start.history[-1]
-        left = [start for start in starts if start.status == GIVEN_UP]
+        dropped = [start for start in starts if start.status == GIVEN_UP]
         went_on = [start for start in starts if start.steps > multistart_solver.STEPS_BEFORE_SELECTION]
-        assert len(left) <= STARTS - multistart_solver.MAX_CONTINUED_STARTS
-        assert all(start.steps == multistart_solver.STEPS_BEFORE_SELECTION for start in left)
-        for start in left:
+        assert len(dropped) <= STARTS - multistart_solver.MAX_CONTINUED_STARTS
+        assert all(start.steps == multistart_solver.STEPS_BEFORE_SELECTION for start in dropped)
+        for start in dropped:
             assert all(
                 start.rms >= other.history[multistart_solver.STEPS_BEFORE_SELECTION - 1] for other in went_on
             )

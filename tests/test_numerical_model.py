@@ -249,5 +249,5 @@ def test_acceleration_under_contact_wrench_matches_relative_mass():
         mobility = np.linalg.inv(mass)
         np.testing.assert_allclose(along @ mobility @ along, 1 / effective, rtol=1e-9)
         # If tangential motion is prevented, the effective mass is larger.
-        held = np.linalg.inv(at_point @ mobility @ at_point.T)
-        assert normal[:, lane] @ held @ normal[:, lane] > 1.001 * effective
+        constrained_mass = np.linalg.inv(at_point @ mobility @ at_point.T)
+        assert normal[:, lane] @ constrained_mass @ normal[:, lane] > 1.001 * effective

@@ -93,9 +93,9 @@ def test_unset_option_removes_keys_tables_and_uncertainty():
     assert mechanism.contact.damping == [0.0] and mechanism.rig.force_sensor.delay == 0.0
     assert mechanism.approach.contacts == 1 and "rig.force_sensor.delay" not in mechanism.uncertainty
     assert load("varying", (), ["uncertainty"]).mechanism.uncertainty == {}
-    left = load("varying", (), ["uncertainty.'contact.stiffness'"]).mechanism
-    assert left.contact == load("varying").mechanism.contact
-    assert "contact.stiffness" not in left.uncertainty and "approach.velocity" in left.uncertainty
+    changed = load("varying", (), ["uncertainty.'contact.stiffness'"]).mechanism
+    assert changed.contact == load("varying").mechanism.contact
+    assert "contact.stiffness" not in changed.uncertainty and "approach.velocity" in changed.uncertainty
     masses = ["bodies.chaser_mass=700", "bodies.target_mass=700"]
     assert load("varying", masses, ["bodies.equivalent_mass"]).mechanism.bodies.mass == 350.0
 

@@ -75,17 +75,17 @@ def labels(axes):
 
 
 def test_error_plot_has_units_and_a_legend():
-    left, right = errors_plot(result(), 0.01).axes
-    assert "|e - e*|" in left.get_xlabel() and "share" in left.get_ylabel()
-    assert "[Hz]" in right.get_xlabel() and "divergence" in right.get_ylabel()
-    assert labels(left) == ["before: no compensation", "literature's rule", "tuned", "limit 0.01"]
-    assert labels(right)[-1] == "within 0.01"
+    left_axes, right_axes = errors_plot(result(), 0.01).axes
+    assert "|e - e*|" in left_axes.get_xlabel() and "share" in left_axes.get_ylabel()
+    assert "[Hz]" in right_axes.get_xlabel() and "divergence" in right_axes.get_ylabel()
+    assert labels(left_axes) == ["before: no compensation", "literature's rule", "tuned", "limit 0.01"]
+    assert labels(right_axes)[-1] == "within 0.01"
 
 
 def test_exceedance_curve_is_share_of_errors_above_each_value():
     made = result()
-    left = errors_plot(made, 0.01).axes[0]
-    line = next(line for line in left.lines if line.get_label() == "tuned")
+    axes = errors_plot(made, 0.01).axes[0]
+    line = next(line for line in axes.lines if line.get_label() == "tuned")
     size, share = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
     outcome = made.outcomes["tuned"]
     errors = np.abs(outcome.error[outcome.good])

@@ -277,9 +277,14 @@ def test_run_that_starts_away_from_drive_position_catches_up_within_velocity_lim
 
 def test_command_after_reset_continues_from_last_command():
     """If the drives have been moved meanwhile, the run begins at their reading."""
-    here, there = {"desired": -0.01, "measured": -0.01, "x": -0.01}, {"measured": -0.03, "desired": -0.03}
-    moved = {**there, "x": -0.03}
-    rows = rows_of(here, {**here, "x": math.nan}, {**moved, "event": RESET}, {**moved, "event": NEXT_CONTACT})
+    first_row, second_row = (
+        {"desired": -0.01, "measured": -0.01, "x": -0.01},
+        {"measured": -0.03, "desired": -0.03},
+    )
+    moved = {**second_row, "x": -0.03}
+    rows = rows_of(
+        first_row, {**first_row, "x": math.nan}, {**moved, "event": RESET}, {**moved, "event": NEXT_CONTACT}
+    )
     commands = in_both(plain(), rows)[:, POSITION]
     assert commands[2] == pytest.approx(commands[1] - STEP, rel=1e-12)
     assert commands[3] == -0.03

@@ -86,8 +86,8 @@ def test_most_accurate_gains_are_kept_if_no_gains_meet_error_limit(quiet, valida
     result = quiet[0][1]
     accurate = most_accurate(result)
     assert not result.quiet and accurate.rms > compute_training_tolerance(LIMIT, SETTINGS.scenarios or 0)
-    found = validation.losses(Objective(), [1], validation.coordinates(1, [result.gains])[None])
-    assert found[0, 0] <= accurate.rms * (1 + 1e-9)
+    losses = validation.losses(Objective(), [1], validation.coordinates(1, [result.gains])[None])
+    assert losses[0, 0] <= accurate.rms * (1 + 1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,9 @@ def test_no_gains_on_a_grid_have_less_noise_within_the_error_tolerance(quiet, va
     errors = validation.losses(Objective(), [0], points)[0]
     beside = validation.losses(Objective(command_weight=1.0, limit=1.0), [0], points)[0]
     peaks = np.sqrt(np.maximum(0, beside**2 - errors**2))
-    noise = np.array([max(0.0, noise_of(result, validation.gains(0, own))) for own in points[0]])
+    noise = np.array(
+        [max(0.0, noise_of(result, validation.gains(0, coordinates))) for coordinates in points[0]]
+    )
     loudness = np.hypot(noise / max(noise[-1], 1), peaks / max(peaks[-1], 0.5))
     tolerance = compute_training_tolerance(LIMIT, SETTINGS.scenarios or 0)
     assert errors[-2] <= 1.05 * tolerance

@@ -48,9 +48,9 @@ def test_user_registered_compensator_is_simulated(registered):
 
 
 def test_user_registered_contact_law_agrees_with_its_integrated_ideal_contact(registered):
-    own = {"contact": {"law": "squared_spring", "stiffness": [1e8]}, "approach.contacts": 1}
+    overrides = {"contact": {"law": "squared_spring", "stiffness": [1e8]}, "approach.contacts": 1}
     prompt = {"rig.simulator": {"model": "ideal"}, "rig.force_sensor.delay": 0.0, "uncertainty": {}}
-    mechanism = jaxhil.load("rig-300kg", own | prompt)
+    mechanism = jaxhil.load("rig-300kg", overrides | prompt)
     [contact] = jaxhil.simulate(mechanism, "phase_lead").contacts
     # M v^2/2 = k d^3/3 at the deepest point: no energy is lost.
     mass, speed = mechanism.bodies.mass, mechanism.approach.velocity

@@ -188,10 +188,10 @@ def test_resumed_comparison_computes_only_missing_results(tmp_path, monkeypatch)
     names = ["rig-300kg", "suite-noisy", "varying"]
     mechanisms = [load(name).mechanism for name in names]
     groups = [[mechanisms[i] for i in group] for group, _ in group_by_common_program(mechanisms)]
-    judged = []
+    evaluated = []
 
-    def judge(scenes, law, settings, tell):
-        judged.append((law, len(scenes)))
+    def evaluate(scenes, law, settings, tell):
+        evaluated.append((law, len(scenes)))
         if law == "smith":
             raise KeyboardInterrupt
         figures = {"literature": {"rms": IntervalEstimate(0.1, math.nan, 1 / 3)}}
@@ -202,14 +202,14 @@ def test_resumed_comparison_computes_only_missing_results(tmp_path, monkeypatch)
     def build(mechanisms, settings):
         return [[Scene(one) for one in group] for group in groups if group[0] in mechanisms]
 
-    monkeypatch.setattr(comparison, "evaluate_law", judge)
+    monkeypatch.setattr(comparison, "evaluate_law", evaluate)
     monkeypatch.setattr(comparison, "build_scenario_sets", build)
 
     def run(*laws, resume=True, **settings):
-        judged.clear()
+        evaluated.clear()
         checkpoints = Checkpoints(tmp_path, resume)
         result = list(compare_laws(mechanisms, laws, CompareSettings(**settings), 0, pieces=checkpoints))
-        return sorted(map(repr, result)), [law for law, _ in judged]
+        return sorted(map(repr, result)), [law for law, _ in evaluated]
 
     with pytest.raises(KeyboardInterrupt):
         run("none", "smith", resume=False)

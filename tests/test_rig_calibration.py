@@ -70,7 +70,7 @@ def calibrated():
 def watch(limits, signals, rules, lane):
     """Return (restitution, expected, imbalance, fault) of a lane's contacts from the runtime's watchdog."""
     watchdog = Watchdog(complete_limits(limits), rules.period, rules.clearance)
-    result, given = [], 0.0
+    result, output = [], 0.0
 
     def note(fault):
         if watchdog.contacts > len(result):
@@ -79,11 +79,11 @@ def watch(limits, signals, rules, lane):
     for tick in range(int(np.sum(signals.live[:, lane]))):
         force, position, velocity, measured, command = (float(leaf[tick, lane]) for leaf in signals[:5])
         if tick and signals.begins[tick, lane]:
-            note(watchdog.conclude(given, UNSTATED))
+            note(watchdog.conclude(output, UNSTATED))
             watchdog.restart()
-        note(watchdog.tick(given, UNSTATED, force, position, velocity, measured))
-        given = command
-    note(watchdog.conclude(given, UNSTATED))
+        note(watchdog.tick(output, UNSTATED, force, position, velocity, measured))
+        output = command
+    note(watchdog.conclude(output, UNSTATED))
     return result
 
 
@@ -124,12 +124,12 @@ def test_calibration_audit_equals_watchdog_audit_to_the_bit(sided):
 def test_calibration_audit_restitution_equals_simulated_restitution():
     rules, distance = build_audit_rules(ONE_SIDED)
     chunk = recorded(1)
-    judged = evaluate_runs(chunk, rules, distance)
-    ended = (judged.status == OK) & (np.abs(judged.error) < 0.1)
+    evaluated = evaluate_runs(chunk, rules, distance)
+    ended = (evaluated.status == OK) & (np.abs(evaluated.error) < 0.1)
     ended = np.logical_and.accumulate(ended, axis=0)
-    apart = np.abs(judged.audited.restitution - chunk.contacts.restitution)[ended]
+    apart = np.abs(evaluated.audited.restitution - chunk.contacts.restitution)[ended]
     assert len(apart) >= LANES and np.max(apart) < 1e-6
-    assert np.max(judged.audited.imbalance[ended]) < 1e-11
+    assert np.max(evaluated.audited.imbalance[ended]) < 1e-11
 
 
 def test_audit_of_impulse_ledger_begins_when_the_compensator_acts():
@@ -199,9 +199,9 @@ def test_rig_specific_limits_are_preserved_and_counted_as_false_alarms():
 def test_calibrated_controller_stops_every_bad_run_and_no_good_run(calibrated):
     (limits, rates), chunk = calibrated
     rules, distance = build_audit_rules(ONE_SIDED)
-    judged = evaluate_runs(chunk, rules, distance)
-    bad = (judged.status != OK) | ~(np.abs(judged.error) <= LIMIT)
-    first, good = find_first_true(bad), find_good_runs(judged, LIMIT / 2)
+    evaluated = evaluate_runs(chunk, rules, distance)
+    bad = (evaluated.status != OK) | ~(np.abs(evaluated.error) <= LIMIT)
+    first, good = find_first_true(bad), find_good_runs(evaluated, LIMIT / 2)
     controller = limited_controller(ONE_SIDED, build_limits_section(limits))
     stopped = 0
     for lane in range(len(good)):
@@ -210,7 +210,7 @@ def test_calibrated_controller_stops_every_bad_run_and_no_good_run(calibrated):
             assert tripped is None
         if np.any(bad[:, lane]):
             assert tripped is not None
-            following = judged.audited.tick[first[lane] + 1 :, lane]
+            following = evaluated.audited.tick[first[lane] + 1 :, lane]
             assert not np.any(tripped.tick >= following[:1])
             stopped += 1
     assert stopped > 10 and np.sum(good) > 5
@@ -309,8 +309,8 @@ def test_calibrated_watchdog_misses_no_bad_run_in_a_hundred_thousand_scenarios()
     rules, distance = build_audit_rules(loaded)
     controller = limited_controller(loaded, build_limits_section(limits))
     (chunk,) = record_selection(loaded, ScenarioSelection("random", 1, 1024))
-    judged = evaluate_runs(chunk, rules, distance)
-    error = np.abs(judged.error[0])
+    evaluated = evaluate_runs(chunk, rules, distance)
+    error = np.abs(evaluated.error[0])
     for lane in range(1024):
         tripped = replay_lane(controller, chunk.signals, lane, rules.mass)
         assert (tripped is not None) >= (not error[lane] <= limit)
@@ -369,9 +369,9 @@ def test_travel_without_force_is_counted_only_while_penetration_increases(force,
 def test_calibrated_limits_depend_only_on_good_runs(calibrated):
     _, chunk = calibrated
     rules, distance = build_audit_rules(ONE_SIDED)
-    judged = evaluate_runs(chunk, rules, distance)
-    one = np.arange(len(judged.index)) == 5
-    limits = compute_guard_limits(ONE_SIDED, judged, one, rules, distance)
+    evaluated = evaluate_runs(chunk, rules, distance)
+    one = np.arange(len(evaluated.index)) == 5
+    limits = compute_guard_limits(ONE_SIDED, evaluated, one, rules, distance)
     assert limits["force_limit"] == 1.5 * np.max(np.abs(chunk.signals.command[chunk.signals.live[:, 5], 5]))
 
 

@@ -34,7 +34,7 @@ RATE = SEEDED.normal(size=THETA.shape)
 @jax.jit
 def everything(theta, rate):
     theta, rate = vector(theta), vector(rate)
-    turn, other, given = exponential(theta), exponential(rate), matrix(jnp.asarray(MATRIX))
+    turn, other, product = exponential(theta), exponential(rate), matrix(jnp.asarray(MATRIX))
     return (
         jnp.stack([turn.w, *components(turn.v)]),
         components(rotate(turn, rate)),
@@ -44,7 +44,7 @@ def everything(theta, rate):
         components(rotate_back(turn, rotate(turn, rate))),
         components(rotate(compose(turn, other), rate)),
         components(logarithm(normalise(Quaternion(-3 * turn.w, -3 * turn.v)))),
-        components(inverse(given) @ (given @ rate)),
+        components(inverse(product) @ (product @ rate)),
     )
 
 

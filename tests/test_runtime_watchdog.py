@@ -86,8 +86,8 @@ def test_watchdog_stops_divergence_once_the_contact_has_ended():
     assert f"contact 1: restitution {divergence:.4g}, expected 1" in controller.status
     assert velocities[-1] == pytest.approx(-divergence * SPEED, rel=1e-12)
     # Out of contact for 5 ms; the force is 3 ticks late.
-    left = next(n for n in range(len(positions)) if velocities[n] < 0 and positions[n] < 0)
-    assert n - left in (4, 5, 6)
+    release = next(n for n in range(len(positions)) if velocities[n] < 0 and positions[n] < 0)
+    assert n - release in (4, 5, 6)
 
 
 def test_watchdog_trips_only_if_error_exceeds_margin():

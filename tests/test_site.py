@@ -136,11 +136,11 @@ def test_documentation_navigation_has_every_page_and_notebook():
 
     listed = leaves(yaml.safe_load((SITE / "mkdocs.yml").read_text(encoding="utf-8"))["nav"])
     folder = ROOT / "notebooks"
-    there = {
+    files = {
         path.relative_to(folder).as_posix() for path in [*folder.glob("*.ipynb"), *folder.glob("guide/*.md")]
     }
     assert len(listed) == len(set(listed))
-    assert there == {path for path in listed if (folder / path).exists()}
+    assert files == {path for path in listed if (folder / path).exists()}
 
 
 def test_package_versions_on_documentation_site_agree():
@@ -176,12 +176,12 @@ class Page(HTMLParser):
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag, attrs):
-        given = dict(attrs)
-        self.places.add(given.get("id"))
-        if tag == "a" and "href" in given:
-            self.links.append(given["href"])
+        attributes = dict(attrs)
+        self.places.add(attributes.get("id"))
+        if tag == "a" and "href" in attributes:
+            self.links.append(attributes["href"])
         elif tag in ("link", "script", "img", "iframe"):
-            self.loads += [given[name] for name in ("href", "src") if name in given]
+            self.loads += [attributes[name] for name in ("href", "src") if name in attributes]
 
 
 @pytest.mark.slow

@@ -72,9 +72,9 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def evaluated():
-    given = scenario()
-    loop = build_loop(given, **STATIC)
-    return jax.tree.map(np.asarray, jax.jit(evaluate, static_argnums=0)(loop, {}, given))
+    scenarios = scenario()
+    loop = build_loop(scenarios, **STATIC)
+    return jax.tree.map(np.asarray, jax.jit(evaluate, static_argnums=0)(loop, {}, scenarios))
 
 
 def test_central_six_axis_episode_equals_one_axis_contact(evaluated):
@@ -142,8 +142,8 @@ def followed(loop, given):
 
 @pytest.fixture(scope="module")
 def ticks():
-    given = scenario()
-    return [np.asarray(part) for part in followed(build_loop(given, **STATIC), given)]
+    scenarios = scenario()
+    return [np.asarray(part) for part in followed(build_loop(scenarios, **STATIC), scenarios)]
 
 
 def last_touches(touches):

@@ -28,9 +28,9 @@ BODY = {"position": [0, 0, 0], "attitude": [1, 0, 0, 0], "velocity": [0, 0, 0], 
 
 
 def refusal(*overrides, name="probe-drogue", unset=()):
-    given = overrides[0] if len(overrides) == 1 and isinstance(overrides[0], dict) else overrides
+    arguments = overrides[0] if len(overrides) == 1 and isinstance(overrides[0], dict) else overrides
     with pytest.raises(InputError) as caught:
-        load_any(name, given, unset)
+        load_any(name, arguments, unset)
     message = str(caught.value)
     assert message.isprintable() and message.startswith(f"{name}: ")
     return message
@@ -182,8 +182,8 @@ def test_six_axis_start_table_in_the_guide_is_read():
     text = (Path(__file__).parents[1] / "notebooks" / "guide" / "six_axes.md").read_text(encoding="utf-8")
     shown = re.search(r"^```toml\n(\[start\].*?)^```", text, re.M | re.S)
     assert shown is not None
-    given = {"approach": None, "start": parse_toml(shown[1].encode(), "guide", "")["start"]}
-    start = load_any("probe-drogue", given).mechanism.start
+    changes = {"approach": None, "start": parse_toml(shown[1].encode(), "guide", "")["start"]}
+    start = load_any("probe-drogue", changes).mechanism.start
     assert start.duration == 1.2 and start.chaser.position == [0.06, -0.05, 2.21]
 
 

@@ -62,9 +62,9 @@ def after(pair, states, group):
     return end, energies[0] - energies[1]
 
 
-def close(found, expected, before):
+def close(result, expected, before):
     """Compare to 1e-9 of the change during the contact, which must not be zero."""
-    for one, other, begun in zip(found, expected, before, strict=True):
+    for one, other, begun in zip(result, expected, before, strict=True):
         for name in ("velocity", "spin", "position"):
             a, b, c = (np.asarray(components(getattr(state, name))) for state in (one, other, begun))
             changed = np.max(np.abs(b - c))
@@ -108,8 +108,8 @@ def elsewhere(pair, before):
         turned.append(build_body(body.mass, body.inertia, body.interface + offset, attitude))
         frames.append((place(np.array(by)[:, None], BATCH), jax.tree.map(lambda leaf: leaf[None], attitude)))
     (target, to_target), (chaser, to_chaser) = frames
-    found = result(
+    moved_result = result(
         Pair(*turned), rotate_back(to_chaser, centre - chaser), rotate_back(to_target, on_it - target),
         rotate_back(to_target, normal),
     )  # fmt: skip
-    return found, expected
+    return moved_result, expected

@@ -59,8 +59,8 @@ def wrench():
     return Wrench(triple([40.0, -15.0, 120.0]), triple([3.0, 8.0, -2.0]))
 
 
-def close(found, expected, **tolerances):
-    leaves = zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True)
+def close(result, expected, **tolerances):
+    leaves = zip(jax.tree.leaves(result), jax.tree.leaves(expected), strict=True)
     for one, other in leaves:
         np.testing.assert_allclose(one, other, **tolerances)
 
@@ -111,12 +111,14 @@ def test_wrong_tool_parameters_leave_residual_gravity_wrench():
     load = tool_load(tool_carried, level, still, still, down)
     reading = read_moving(wrench(), load, level)
     lighter = tool_load(tool_carried._replace(mass=0.98 * tool_carried.mass), level, still, still, down)
-    left = undo_moving(reading, lighter, level).force - wrench().force
-    np.testing.assert_allclose(components(left), [0, 0, -0.02 * 12 * 9.80665], atol=1e-12)
+    residual_force = undo_moving(reading, lighter, level).force - wrench().force
+    np.testing.assert_allclose(components(residual_force), [0, 0, -0.02 * 12 * 9.80665], atol=1e-12)
     # The contact force itself also rotates with the measured attitude.
     tilted = level._replace(attitude=exponential(triple([0.03, 0.0, 0.0])))
-    left = undo_moving(read_moving(jax.tree.map(jnp.zeros_like, load), load, level), load, tilted).force
-    np.testing.assert_allclose(left.y, 0.03 * 12 * 9.80665, rtol=2e-4)
+    residual_force = undo_moving(
+        read_moving(jax.tree.map(jnp.zeros_like, load), load, level), load, tilted
+    ).force
+    np.testing.assert_allclose(residual_force.y, 0.03 * 12 * 9.80665, rtol=2e-4)
 
 
 @pytest.mark.slow

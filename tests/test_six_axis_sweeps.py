@@ -63,11 +63,11 @@ def test_six_axis_cluster_sweep_is_unchanged_if_a_worker_is_killed(here, gains, 
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker()
         killed_meanwhile(monkeypatch, ClusterWorkers, cluster, first, "run")
-        there = tuning.sweep(gains, **ASKED, scheduler=cluster.address)
+        cluster_result = tuning.sweep(gains, **ASKED, scheduler=cluster.address)
         assert first.poll() is not None
-    assert there.table.equals(here.table)
+    assert cluster_result.table.equals(here.table)
     for name in ("outcomes", "worst", "failure_probability", "error_quantiles"):
-        assert there.document[name] == here.document[name]
+        assert cluster_result.document[name] == here.document[name]
 
 
 def test_six_axis_cluster_tuning_is_unchanged_if_a_worker_is_killed(tmp_path, monkeypatch):
@@ -78,8 +78,8 @@ def test_six_axis_cluster_tuning_is_unchanged_if_a_worker_is_killed(tmp_path, mo
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker()
         killed_meanwhile(monkeypatch, tune_all, cluster, first)
-        there = tuning.tune(mechanisms, LAW, scheduler=cluster.address, **few)
+        cluster_result = tuning.tune(mechanisms, LAW, scheduler=cluster.address, **few)
         assert first.poll() is not None
-    for local, other in zip(here, there, strict=True):
+    for local, other in zip(here, cluster_result, strict=True):
         assert other.gains == local.gains and other.figures == local.figures and other.parts == local.parts
         assert other.found.starts[0].history == local.found.starts[0].history

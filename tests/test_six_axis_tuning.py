@@ -125,8 +125,11 @@ def test_six_axis_gain_file_is_refused_by_one_axis_controller(tuned, jaxhil, tmp
     _, path = tuned
     with pytest.raises(GainFileError, match="axes: found 6, expected 1"):
         Controller.from_file(path)
-    for given in (["export", path, "-o", tmp_path / "bundle"], ["simulate", "rig-300kg", "--gains", path]):
-        ran = jaxhil(*given)
+    for command_line in (
+        ["export", path, "-o", tmp_path / "bundle"],
+        ["simulate", "rig-300kg", "--gains", path],
+    ):
+        ran = jaxhil(*command_line)
         assert ran.code == 2 and ran.err.count("\n") == 1 and "axes: found" in ran.err
 
 
@@ -169,13 +172,13 @@ def test_six_axis_derivatives_pass_through_the_loop():
         static = SIX_AXES, loop, ("phase_lead", "lead_filter"), join_terms([RMS_OBJECTIVE], contacts=2)
 
         @jax.jit
-        def found(gains):
+        def loss(gains):
             return compute_residuals(static, gains[None], SolverProblem(rig, {}, weights))[0]
 
         at = np.array([0.015, 0.001])
-        slopes = jax.jit(jax.jacfwd(found))(at)
+        slopes = jax.jit(jax.jacfwd(loss))(at)
         for index, step in enumerate((1e-6, 1e-7)):
-            either = [found(at + sign * step * np.eye(2)[index]) for sign in (1, -1)]
+            either = [loss(at + sign * step * np.eye(2)[index]) for sign in (1, -1)]
             expected = (either[0] - either[1]) / (2 * step)
             np.testing.assert_allclose(
                 slopes[:, index], expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max()

@@ -193,10 +193,10 @@ def test_sweep_studies_are_unchanged_if_a_worker_is_killed(tmp_path, monkeypatch
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker("--nthreads", "2")
         killed_meanwhile(monkeypatch, ClusterWorkers, cluster, first, "run")
-        there = tuning.sweep(
+        cluster_result = tuning.sweep(
             gains, **asked, **studies, folder=folder, resume=True, scheduler=cluster.address
         ).document
         assert first.poll() is not None
     assert not (folder / ".pieces").exists()
     for name in ("drivers", "rare", "failure_probability", "worst"):
-        assert there[name] == here[name]
+        assert cluster_result[name] == here[name]

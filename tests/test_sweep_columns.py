@@ -67,8 +67,8 @@ def rows(errors, status, peak_force=10.0, force_range=np.inf, shortfall=0.0, ide
     return build_rows(parsed, 7, draws, scenarios, outcome, LIMIT, False)
 
 
-def outcomes(found):
-    return [SCENARIO_OUTCOMES[index] for index in found["outcome"]]
+def outcomes(rows_of_sweep):
+    return [SCENARIO_OUTCOMES[index] for index in rows_of_sweep["outcome"]]
 
 
 def test_error_of_largest_magnitude_decides_the_outcome():
@@ -141,10 +141,10 @@ def test_contact_unlike_ideal_contact_ranks_between_error_and_saturation():
 def test_outcomes_without_ideal_contact_columns_depend_only_on_errors():
     result = rows([[0.0], [0.0]], [[OK], [OK]], ideal=(1.0, 1.0))
     old = {name: values for name, values in result.items() if not name.startswith("reference_")}
-    judged = classify_outcomes(
+    classified = classify_outcomes(
         old, list_error_columns(("error",), 2), np.array(np.inf), np.array(2e-3), LIMIT
     )
-    assert outcomes(result) == ["unlike the ideal contact"] and outcomes(judged) == ["good"]
+    assert outcomes(result) == ["unlike the ideal contact"] and outcomes(classified) == ["good"]
 
 
 def test_energy_columns_are_kinetic_energies_of_the_numerical_model():

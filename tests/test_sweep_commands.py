@@ -35,7 +35,7 @@ def store(gains, tmp_path_factory):
 
 
 @pytest.fixture
-def own(gains, store, tmp_path):
+def own_store(gains, store, tmp_path):
     """Return a store used by a single test, and the command that resumes its sweep."""
     folder = tmp_path / "own"
     shutil.copytree(store, folder)
@@ -126,8 +126,8 @@ def test_sweep_reports_quantiles(jaxhil, gains, store):
     assert "99.9 %" in out and "no bound" in out
 
 
-def test_sweep_reports_studies(jaxhil, own):
-    again = [*own[1], "--drivers", "16", "--rare"]
+def test_sweep_reports_studies(jaxhil, own_store):
+    again = [*own_store[1], "--drivers", "16", "--rare"]
     result = document(jaxhil(*again, "--json"))
     drivers, rare = result["drivers"], result["rare"]
     assert drivers["evaluations"] == 16 * 5 and drivers["cap"] == 15
@@ -158,8 +158,8 @@ def no_study(monkeypatch, *names):
         monkeypatch.setattr(f"tuning.sweeps.studies.{name}", lambda *_: pytest.fail("run again"))
 
 
-def test_sweep_verdict_is_saved_as_it_was_printed(jaxhil, own):
-    folder, again = own
+def test_sweep_verdict_is_saved_as_it_was_printed(jaxhil, own_store):
+    folder, again = own_store
     ran = jaxhil(*again, "--json")
     assert (folder / "verdict.json").read_text() == ran[1]
     (folder / "verdict.json").unlink()
@@ -171,8 +171,8 @@ def test_sweep_verdict_is_saved_as_it_was_printed(jaxhil, own):
     assert jaxhil("replay", folder, 5)[0] == 0
 
 
-def test_finished_sweep_studies_are_not_repeated(jaxhil, own, quick, monkeypatch):
-    folder, again = own
+def test_finished_sweep_studies_are_not_repeated(jaxhil, own_store, quick, monkeypatch):
+    folder, again = own_store
     first = jaxhil(*again, *STUDIES, "--json")
     assert (folder / "verdict.json").read_text() == first[1] and "as kept" not in first[2]
     assert sorted(path.name for path in (folder / "studies").iterdir()) == [Path(one).name for one in KEPT]
@@ -185,8 +185,8 @@ def test_finished_sweep_studies_are_not_repeated(jaxhil, own, quick, monkeypatch
         jaxhil(*again, "--drivers", "32")
 
 
-def test_new_sweep_does_not_reuse_studies_of_old_sweep(jaxhil, gains, own, quick, tmp_path):
-    folder, again = own
+def test_new_sweep_does_not_reuse_studies_of_old_sweep(jaxhil, gains, own_store, quick, tmp_path):
+    folder, again = own_store
     jaxhil(*again, *STUDIES)
     new = [*("sweep", gains, *TINY, "-o", tmp_path / "other", "--limit", "1.5"), *STUDIES]
     ran = jaxhil(*new)
@@ -197,8 +197,8 @@ def test_new_sweep_does_not_reuse_studies_of_old_sweep(jaxhil, gains, own, quick
     refused(jaxhil(*new), "other", "--resume")
 
 
-def test_interrupted_sweep_keeps_verdict_and_finished_studies(jaxhil, own, quick, monkeypatch):
-    folder, again = own
+def test_interrupted_sweep_keeps_verdict_and_finished_studies(jaxhil, own_store, quick, monkeypatch):
+    folder, again = own_store
     (folder / "verdict.json").unlink()
 
     def interrupted(*_):
@@ -219,8 +219,8 @@ def test_interrupted_sweep_keeps_verdict_and_finished_studies(jaxhil, own, quick
     assert result["drivers"] == so_far["drivers"] and result["rare"]["limit"] == 1.6
 
 
-def test_damaged_study_is_run_again(jaxhil, own, quick):
-    folder, again = own
+def test_damaged_study_is_run_again(jaxhil, own_store, quick):
+    folder, again = own_store
     first = jaxhil(*again, *STUDIES, "--json")
     contents = {folder / one: (folder / one).read_bytes() for one in KEPT}
     for path, content in contents.items():
@@ -238,8 +238,8 @@ def unwritable(ran, name):
     return json.loads(out)
 
 
-def test_sweep_verdict_is_printed_if_study_cannot_be_written(jaxhil, own, quick):
-    folder, again = own
+def test_sweep_verdict_is_printed_if_study_cannot_be_written(jaxhil, own_store, quick):
+    folder, again = own_store
     (folder / "studies").touch()
     result = unwritable(jaxhil(*again, *STUDIES, "--json"), KEPT[0])
     assert (
@@ -252,8 +252,8 @@ def test_sweep_verdict_is_printed_if_study_cannot_be_written(jaxhil, own, quick)
     assert document(jaxhil(*again, *STUDIES, "--json")) == result
 
 
-def test_sweep_verdict_is_printed_if_disk_is_full(jaxhil, own, quick):
-    folder, again = own
+def test_sweep_verdict_is_printed_if_disk_is_full(jaxhil, own_store, quick):
+    folder, again = own_store
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))

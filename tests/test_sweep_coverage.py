@@ -42,14 +42,14 @@ def repeated(truth, sampling):
     document = build_document("none", nominal_gains(parsed, "none"), parsed, "0" * 64, {}, {}, 0, {})
     sweep = build_sweep(manifest(document, NUMBER, sampling=sampling, chunk=NUMBER))
     for seed in range(SWEEPS):
-        own = msgspec.structs.replace(sweep.manifest, seed=seed)
-        yield run_chunk(sweep._replace(manifest=own), 0, NUMBER)
+        seeded = msgspec.structs.replace(sweep.manifest, seed=seed)
+        yield run_chunk(sweep._replace(manifest=seeded), 0, NUMBER)
 
 
-def check(found: list[ProbabilityEstimate], truth: float, name: str, capsys) -> None:
-    inside = np.mean([one.low <= truth <= one.high for one in found])
-    width = np.mean([one.high - one.low for one in found])
-    value = np.mean([one.value for one in found])
+def check(intervals: list[ProbabilityEstimate], truth: float, name: str, capsys) -> None:
+    inside = np.mean([one.low <= truth <= one.high for one in intervals])
+    width = np.mean([one.high - one.low for one in intervals])
+    value = np.mean([one.value for one in intervals])
     with capsys.disabled():
         stated = f"coverage {inside:.3f}, mean width {width:.4f}, mean {value:.4f}"
         print(f"\n{name}, p = {truth}: {stated}", end="")

@@ -195,13 +195,13 @@ def test_sweep_store_with_missing_column_is_refused_with_column_name(tmp_path):
 
 def test_resumed_sweep_removes_unfinished_files_of_the_store(store):
     (store.folder / "studies").mkdir()
-    left = [store.folder / folder / UNFINISHED for folder in ("", "parts", "studies")]
+    unfinished = [store.folder / folder / UNFINISHED for folder in ("", "parts", "studies")]
     remaining = ["verdict.json", "studies/drivers-2.json", ".thesis.docx.tmp", "parts/.thesis.docx.1.tmp"]
     remaining = [store.folder / name for name in remaining]
-    for path in (*left, *remaining):
+    for path in (*unfinished, *remaining):
         path.write_text("{}")
     assert open_store(store.folder, MANIFEST, resume=True).manifest == MANIFEST
-    assert [path.exists() for path in (*left, *remaining)] == [False] * 3 + [True] * 4
+    assert [path.exists() for path in (*unfinished, *remaining)] == [False] * 3 + [True] * 4
 
 
 def test_new_sweep_store_refuses_folder_with_old_studies_or_verdict(store):

@@ -136,8 +136,8 @@ def test_contact_of_exchanged_shapes_is_the_same():
     one = CANDIDATES["ball on sphere"].touch(pose)
     ball = Ball(place(0.1, 0.05, -0.4), *numbers(0.1))
     other = TargetSpheres(SHAPES["ball"].centre, SHAPES["ball"].radius, ball).touch(pose)
-    there = one._replace(point=one.point - one.depth * one.normal)
-    for a, b in zip(jax.tree.leaves(there), jax.tree.leaves(other), strict=True):
+    exchanged = one._replace(point=one.point - one.depth * one.normal)
+    for a, b in zip(jax.tree.leaves(exchanged), jax.tree.leaves(other), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
     far = rotate(pose.attitude, ball.centre) + pose.position - SHAPES["ball"].centre
     np.testing.assert_allclose(one.depth, 0.5 - norm(far), rtol=1e-12)

@@ -44,14 +44,14 @@ def kind(scenarios, number):
 def test_contact_with_probe_push_has_restitution_of_pushed_ideal_contact():
     """Compare with SciPy under the push on the hardware."""
     probed = build_probed_scenarios(DAMPED, draw(DAMPED, 3, 0))
-    for number, known in ((1, probed.early), (2, probed.late)):
-        own = kind(probed.scenarios, number)
-        assert (own.contacts == 1).all()
+    for number, expected in ((1, probed.early), (2, probed.late)):
+        scenarios = kind(probed.scenarios, number)
+        assert (scenarios.contacts == 1).all()
         for lane in range(3):
-            stiffness, damping = own.contact.stiffness[0, lane], own.contact.damping[0, lane]
-            mass, velocity = own.equivalent_mass[lane], own.velocity[lane]
-            size, centre = own.probe.push.size[0, lane], own.probe.push.centre[0, lane]
-            assert size == pytest.approx(PUSH_SIZE * own.reference.peak_force[0, lane])
+            stiffness, damping = scenarios.contact.stiffness[0, lane], scenarios.contact.damping[0, lane]
+            mass, velocity = scenarios.equivalent_mass[lane], scenarios.velocity[lane]
+            size, centre = scenarios.probe.push.size[0, lane], scenarios.probe.push.centre[0, lane]
+            assert size == pytest.approx(PUSH_SIZE * scenarios.reference.peak_force[0, lane])
 
             def motion(t, y, k=stiffness, b=damping, m=mass, size=size, begin=centre - PUSH_DURATION / 2):
                 inside = 0 < t - begin < PUSH_DURATION
@@ -60,10 +60,10 @@ def test_contact_with_probe_push_has_restitution_of_pushed_ideal_contact():
 
             tight = {"method": "DOP853", "rtol": 1e-9, "atol": 1e-13, "max_step": 1e-3}
             end = solve_ivp(motion, (0, 0.5), [0, velocity], **tight).y[1, -1]
-            assert known[lane] == pytest.approx(-end / velocity, abs=2e-5)
-            assert own.reference.restitution[0, lane] == known[lane]
+            assert expected[lane] == pytest.approx(-end / velocity, abs=2e-5)
+            assert scenarios.reference.restitution[0, lane] == expected[lane]
             # The push distinguishes compensators that react to it from others.
-            assert abs(known[lane] - probed.plain[lane]) > 0.01
+            assert abs(expected[lane] - probed.plain[lane]) > 0.01
 
 
 def test_probed_scenario_copies_have_zero_error_on_an_ideal_rig():
@@ -148,10 +148,10 @@ def result():
 @pytest.mark.slow
 def test_transparency_is_evaluated_for_literature_and_tuned_gains(result):
     assert list(result.transparency) == ["before", "literature", "tuned"]
-    for key, own in result.transparency.items():
+    for key, metrics in result.transparency.items():
         peaks = result.outcomes[key].peak_ratio[result.outcomes[key].good]
-        assert own["peak"].value == pytest.approx(np.percentile(peaks, 99), rel=1e-12)
-        assert own["peak"].low <= own["peak"].value <= own["peak"].high
+        assert metrics["peak"].value == pytest.approx(np.percentile(peaks, 99), rel=1e-12)
+        assert metrics["peak"].low <= metrics["peak"].value <= metrics["peak"].high
     assert len(result.scenarios.velocity) == SMALL.validation == result.outcomes["tuned"].error.shape[-1]
     assert result.nominal["tuned"] != result.figures["tuned"]
 

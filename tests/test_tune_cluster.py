@@ -31,8 +31,8 @@ def test_tuning_on_a_cluster_gives_the_same_gains_and_fronts(tmp_path, monkeypat
     with started(tmp_path) as cluster:
         cluster.worker()
         cluster.worker()
-        there = tuning.tune(mechanisms, pareto=2, scheduler=cluster.address, **FEW)
-    for local, other in zip(here, there, strict=True):
+        cluster_result = tuning.tune(mechanisms, pareto=2, scheduler=cluster.address, **FEW)
+    for local, other in zip(here, cluster_result, strict=True):
         assert other.gains == local.gains and other.figures == local.figures
         assert other.found.starts[0].history == local.found.starts[0].history
         assert [one.point for one in other.pareto] == [one.point for one in local.pareto]

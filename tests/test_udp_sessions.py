@@ -140,10 +140,10 @@ def test_packet_from_rig_address_without_session_number_is_ignored(process):
     served = process()
     rig = served.rig()
     rig.prepare()
-    own, rig.session = rig.session, rig.session ^ 1
+    session, rig.session = rig.session, rig.session ^ 1
     rig.tell(a_reading(0, 99, event=STOP))
     rig.tell(a_reading(0, 2**31 - 1))
-    rig.session = own
+    rig.session = session
     assert rig.ask(a_reading(0)).tick == 0
     rig.tell(a_reading(0, 99, event=STOP))
     code, result = served.ended()

@@ -86,8 +86,8 @@ def test_uncertain_list_entries_scale_jointly_or_independently(draws):
     joint = draws(mechanism_with("contact.stiffness", entry), 4096, 1)["contact.stiffness"]
     assert joint.shape == (4096, 3)
     np.testing.assert_allclose(joint / NOMINAL, (joint[:, :1] / NOMINAL[0]) * np.ones(3), rtol=1e-15)
-    own = mechanism_with("contact.stiffness", entry | {"independent": True})
-    independent = draws(own, 4096, 1)["contact.stiffness"]
+    mechanism = mechanism_with("contact.stiffness", entry | {"independent": True})
+    independent = draws(mechanism, 4096, 1)["contact.stiffness"]
     correlation = np.corrcoef(np.log(independent).T) - np.eye(3)
     assert np.max(np.abs(correlation)) < 4 / np.sqrt(4096)
     for factors in ((joint / NOMINAL)[:, 0], *(independent / NOMINAL).T):

@@ -30,8 +30,8 @@ def parametric(data, method):
         orders = {"ARX_orders": [2, 2, delay]} if method == "ARX" else {"OE_orders": [2, 2, delay]}
         # The solver requires numbers of order 1.
         model = system_identification(1e3 * y, 1e3 * u, method, tsample=1.0, max_iterations=100, **orders)
-        left = np.ravel(model.Yid)[50:] - 1e3 * y[0, 50:]
-        tried.append((float(left @ left), delay, model.G))
+        residuals = np.ravel(model.Yid)[50:] - 1e3 * y[0, 50:]
+        tried.append((float(residuals @ residuals), delay, model.G))
     _, delay, model = min(tried, key=lambda one: one[0])
     z = np.exp(2j * np.pi * data["at"] * data["period"])
     return [complex(np.squeeze(model(one))) for one in z], float(delay * data["period"])
@@ -47,9 +47,9 @@ def subspace(data):
 
     rows = slice(0, None, THINNED)
     frame = pandas.DataFrame({"u": 1e3 * data["command"][rows], "y": 1e3 * data["reading"][rows]})
-    found = NFourSID(frame, output_columns=["y"], input_columns=["u"], num_block_rows=BLOCKS)
-    found.subspace_identification()
-    model, _ = found.system_identification(rank=4)
+    identified = NFourSID(frame, output_columns=["y"], input_columns=["u"], num_block_rows=BLOCKS)
+    identified.subspace_identification()
+    model, _ = identified.system_identification(rank=4)
     z = np.exp(2j * np.pi * data["at"] * THINNED * data["period"])
     eye = np.eye(len(model.a))
     return [
@@ -77,7 +77,7 @@ def main():
         "nfoursid N4SID": lambda: subspace(data),
         "scikit-rf vector fitting": lambda: vectors(data),
     }
-    found = {}
+    responses = {}
     warnings.simplefilter("ignore")
     for name, method in methods.items():
         begin = time.process_time()
@@ -85,13 +85,13 @@ def main():
         with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
             response, delay = method()
         took = time.process_time() - begin
-        found[name] = {
+        responses[name] = {
             "response": [[one.real, one.imag] for one in response],
             "delay": delay,
             "seconds": took,
         }
     sys.stderr.flush()
-    print("\n" + json.dumps(found))
+    print("\n" + json.dumps(responses))
 
 
 if __name__ == "__main__":

@@ -157,7 +157,7 @@ def _losses(static, points, number, problem, bounds) -> Float[Array, "devices po
     def one_device(problem, points, number, bounds):
         copies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (together, *leaf.shape)), problem)
 
-        def some(i, found):
+        def add_tile(i, found):
             coordinates = jax.lax.dynamic_slice_in_dim(points, i * together, together)
             rows = compute_residuals(
                 (ONE_AXIS, loop, names, join_terms([RMS_OBJECTIVE])),
@@ -168,7 +168,7 @@ def _losses(static, points, number, problem, bounds) -> Float[Array, "devices po
             return jax.lax.dynamic_update_slice_in_dim(found, losses, i * together, 0)
 
         found = jnp.zeros(len(points), points.dtype)
-        return jax.lax.fori_loop(0, (number + together - 1) // together, some, found)
+        return jax.lax.fori_loop(0, (number + together - 1) // together, add_tile, found)
 
     return over_scenarios(one_device, problem, points, number, bounds)
 

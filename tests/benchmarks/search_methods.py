@@ -88,14 +88,17 @@ def particle_swarm(losses: Losses, start: Float[np.ndarray, "gains"], seed: int)
         place = generator.random((PARTICLES, len(start)))
         place[0] = start
         velocity = (generator.random(place.shape) - place) / 2
-        own, own_loss = place, np.full(PARTICLES, np.inf)
+        best_places, own_loss = place, np.full(PARTICLES, np.inf)
         for _ in range(ITERATIONS):
-            found = losses(place)
-            better = found < own_loss
-            own, own_loss = np.where(better[:, None], place, own), np.where(better, found, own_loss)
-            best = own[np.argmin(own_loss)]
+            swarm_losses = losses(place)
+            better = swarm_losses < own_loss
+            best_places, own_loss = (
+                np.where(better[:, None], place, best_places),
+                np.where(better, swarm_losses, own_loss),
+            )
+            best = best_places[np.argmin(own_loss)]
             to_own, to_best = PULL * generator.random((2, *place.shape))
-            velocity = INERTIA * velocity + to_own * (own - place) + to_best * (best - place)
+            velocity = INERTIA * velocity + to_own * (best_places - place) + to_best * (best - place)
             moved = place + velocity
             place = np.clip(moved, 0, 1)
             velocity = np.where(moved == place, velocity, 0)

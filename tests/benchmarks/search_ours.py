@@ -124,10 +124,10 @@ def _descend(case: Case, coordinates, steps, most) -> SolverResult:
     padded = np.concatenate([coordinates, np.repeat(coordinates[:1], size - len(coordinates), axis=0)])
     problems, bounds = several((case.problem, case.bounds), size)
     static = case.loop, case.names, join_terms([RMS_OBJECTIVE])
-    found = solve_least_squares(
+    result = solve_least_squares(
         compute_residuals, static, problems, bounds, np.clip(padded, 0, 1), np.array(steps), LONGEST, tile=1
     )
-    return jax.tree.map(lambda leaf: leaf[: len(coordinates)], jax.device_get(found))
+    return jax.tree.map(lambda leaf: leaf[: len(coordinates)], jax.device_get(result))
 
 
 class _Stages:
@@ -146,12 +146,12 @@ class _Stages:
         self.best.append(reached)
         self.seconds.append((time.perf_counter() - self.begin) / self.number)
 
-    def add_steps(self, which, rollouts: int, found: SolverResult) -> None:
+    def add_steps(self, which, rollouts: int, result: SolverResult) -> None:
         """Add an entry for every step of the descents from the selected starting points."""
         begin = self.seconds[-1]
         end = (time.perf_counter() - self.begin) / self.number
-        steps = np.asarray(found.steps).reshape(len(which), -1)
-        history = np.asarray(found.history).reshape(*steps.shape, -1)
+        steps = np.asarray(result.steps).reshape(len(which), -1)
+        history = np.asarray(result.history).reshape(*steps.shape, -1)
         before, last = 0, max(1, int(np.max(steps)))
         for step in range(1, last + 1):
             taken = rollouts * np.minimum(steps, step).sum(axis=1)

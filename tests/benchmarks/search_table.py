@@ -49,8 +49,8 @@ def ratios(ours: Success, others: Sequence[Success]) -> tuple[float, float]:
     """Return expected rollouts and seconds of `ours` divided by those of the best other method."""
 
     def ratio(field: str) -> float:
-        own, best = getattr(ours, field), min(getattr(other, field) for other in others)
-        return own / best if np.isfinite(own) else np.inf
+        value, best = getattr(ours, field), min(getattr(other, field) for other in others)
+        return value / best if np.isfinite(value) else np.inf
 
     return ratio("rollouts"), ratio("seconds")
 
@@ -63,11 +63,11 @@ def table(results: Results) -> str:
         f"{'':24}{'succeed':>12}  {'rollouts':>9} {'seconds':>9}  {'least':>8} {'median':>8}"
         f"  {'rollouts':>9} {'seconds':>9}",
     ]
-    for name, own in results.items():
+    for name, success in results.items():
         lines.append(
-            f"{name:24}{own.share:>12.0%}  {own.rollouts:>9.0f} {own.seconds:>9.2f}"
-            f"  {own.best - 1:>8.1%} {own.median - 1:>8.1%}"
-            f"  {own.rollouts_done:>9.0f} {own.seconds_done:>9.2f}"
+            f"{name:24}{success.share:>12.0%}  {success.rollouts:>9.0f} {success.seconds:>9.2f}"
+            f"  {success.best - 1:>8.1%} {success.median - 1:>8.1%}"
+            f"  {success.rollouts_done:>9.0f} {success.seconds_done:>9.2f}"
         )
     return "\n".join(lines)
 
@@ -76,11 +76,15 @@ def _success(traces: Sequence[Trace], best: float) -> Success:
     ends = np.array([trace.loss[-1] for trace in traces]) / best
     # Losses decrease, so this is the first entry that is close enough.
     first = [int(np.argmax(trace.loss <= (1 + CLOSE) * best)) for trace in traces]
-    there = [(trace, i) for trace, i, end in zip(traces, first, ends, strict=True) if end <= 1 + CLOSE]
-    share = len(there) / len(traces)
+    successes = [(trace, i) for trace, i, end in zip(traces, first, ends, strict=True) if end <= 1 + CLOSE]
+    share = len(successes) / len(traces)
 
     def expected(field: str) -> float:
-        return float(np.median([getattr(trace, field)[i] for trace, i in there])) / share if there else np.inf
+        return (
+            float(np.median([getattr(trace, field)[i] for trace, i in successes])) / share
+            if successes
+            else np.inf
+        )
 
     return Success(
         share=share,

@@ -51,14 +51,14 @@ def case(compensator, overrides=()):
 def test_cpp_baseline_contacts_agree_with_jax_simulation(baseline, compensator, threads):
     loop, gains, scenario, rig = case(compensator)
     expected = jax.jit(rollout, static_argnums=0)(loop, gains, scenario)
-    found = baseline.run(loop, rig, gains, scenario, int(np.max(expected.ticks)), threads)
-    np.testing.assert_array_equal(found["status"], expected.status)
+    result = baseline.run(loop, rig, gains, scenario, int(np.max(expected.ticks)), threads)
+    np.testing.assert_array_equal(result["status"], expected.status)
     # A contact that sticks until its timeout is dominated by rounding, so its numbers are not compared.
     ended = np.asarray(expected.status) == OK
     assert np.mean(ended[: scenario.contacts[0]]) > 0.85
     for name in RESULTS:
         np.testing.assert_allclose(
-            found[name][ended],
+            result[name][ended],
             np.asarray(getattr(expected, name))[ended],
             rtol=1e-11,
             err_msg=name,

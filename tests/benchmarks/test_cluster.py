@@ -40,23 +40,27 @@ def swept(folder, manifest, computer=run_chunks):
 @pytest.mark.parametrize("workers", [2, 4, 8])
 def test_cluster_sweep_is_at_least_half_as_fast_as_local_sweep(workers, tmp_path, capsys):
     manifest = build_manifest(check_document(default_gains()), ManifestOptions(PARTS * CHUNK, chunk=CHUNK))
-    here, there = [], []
+    local_times, cluster_times = [], []
     with started(tmp_path) as cluster:
         for _ in range(workers):
             cluster.worker("--nthreads", "1")
         # In the first repetition every worker reads the program.
         for turn in range(1 + REPEATS):
-            own, rows = swept(tmp_path / f"here {turn}", manifest)
-            other, found = swept(tmp_path / f"there {turn}", manifest, on_cluster(cluster.address))
-            assert all(list_different_columns(one, two) == [] for one, two in zip(rows, found, strict=True))
-            here.append(own)
-            there.append(other)
-    efficiency = min(here[1:]) / min(there[1:])
+            local_time, rows = swept(tmp_path / f"here {turn}", manifest)
+            cluster_time, cluster_rows = swept(
+                tmp_path / f"there {turn}", manifest, on_cluster(cluster.address)
+            )
+            assert all(
+                list_different_columns(one, two) == [] for one, two in zip(rows, cluster_rows, strict=True)
+            )
+            local_times.append(local_time)
+            tlocal_times.append(cluster_time)
+    efficiency = min(local_times[1:]) / min(cluster_times[1:])
     with capsys.disabled():
         print(
             f"\n{workers} workers on the cores of one process, the same rows: {efficiency:.2f} of its"
-            f" scenarios/s ({PARTS * CHUNK / min(there[1:]):.3g} over {PARTS * CHUNK / min(here[1:]):.3g};"
-            f" pieces of {workers * min(there[1:]) / PARTS:.2f} s)"
+            f" scenarios/s ({PARTS * CHUNK / min(cluster_times[1:]):.3g} over"
+            f" {PARTS * CHUNK / min(local_times[1:]):.3g}; chunks of {workers * min(cluster_times[1:]) / PARTS:.2f} s)"
         )
     assert efficiency >= 0.5
 
@@ -75,10 +79,10 @@ def test_scheduler_serves_a_thousand_workers_without_becoming_the_bottleneck(tmp
                 time.sleep(1.0)
         scheduler, ours, begin = spent(cluster.processes[0]), time.process_time(), time.perf_counter()
         pieces = (WorkUnit(i, (-i,)) for i in range(PIECES))
-        found = dict(run_on_workers(cluster.address, abs, pieces, None, "stubs"))
+        results = dict(run_on_workers(cluster.address, abs, pieces, None, "stubs"))
         took, ours = time.perf_counter() - begin, time.process_time() - ours
         scheduler = spent(cluster.processes[0]) - scheduler
-    np.testing.assert_array_equal([found[i] for i in range(PIECES)], np.arange(PIECES))
+    np.testing.assert_array_equal([results[i] for i in range(PIECES)], np.arange(PIECES))
     busy = THOUSAND * max(scheduler, ours) / PIECES
     with capsys.disabled():
         print(

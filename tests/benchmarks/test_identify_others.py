@@ -30,13 +30,13 @@ AT = np.concatenate([[CONTACT], np.linspace(5.0, 20.0, 301)])
 def by_hand(spectrum):
     """Fit the response by unweighted least squares without a model of the command hold."""
 
-    def left(parameters):
+    def residuals(parameters):
         model = MotionModel(STRUCTURES[2], np.array([*parameters[:2], 1e-3 * parameters[2]]))
         off = model.response(2j * np.pi * spectrum.frequency) - spectrum.output / spectrum.command
         return np.concatenate([off.real, off.imag])
 
-    found = optimize.least_squares(left, [np.log(60.0), 0.0, 1.0]).x
-    return MotionModel(STRUCTURES[2], np.array([*found[:2], 1e-3 * found[2]]))
+    solution = optimize.least_squares(residuals, [np.log(60.0), 0.0, 1.0]).x
+    return MotionModel(STRUCTURES[2], np.array([*solution[:2], 1e-3 * solution[2]]))
 
 
 def figures(response):
@@ -78,8 +78,8 @@ def test_identify_is_more_accurate_than_other_identification_methods(tmp_path, c
         for name, one in json.loads(ran.stdout.splitlines()[-1]).items():
             values = np.array(one["response"]) @ [1.0, 1j]
             # The response from commands to readings includes the command hold.
-            held = hold_response(AT, period, "linear", 0)
-            rows.append((name, values / held, one["delay"], one["seconds"]))
+            hold = hold_response(AT, period, "linear", 0)
+            rows.append((name, values / hold, one["delay"], one["seconds"]))
     headings = "lag at 3 Hz [ms]", "bandwidth [%]", "delay [ms]", "time [s]"
     with capsys.disabled():
         print("\nErrors of" + "".join(f"{one:>18s}" for one in headings))

@@ -46,16 +46,16 @@ def test_identify_processes_logs_of_one_day_within_time_limit(capsys):
     options = IdentificationOptions(law="kelvin_voigt")
     identify(campaign, options=options)
     begin = time.process_time()
-    found = identify(campaign, options=options)
+    result = identify(campaign, options=options)
     took = time.process_time() - begin
     begin = time.process_time()
     identify(campaign)
     every = time.process_time() - begin
     begin = time.process_time()
-    numbers = general(campaign, found.motion.model)
+    numbers = general(campaign, result.motion.model)
     alone = time.process_time() - begin
     keys = "rig.force_sensor.delay", "contact.damping.0"
-    ours = [abs(found[key].value - true) for key, true in zip(keys, TRUE[[0, 3]], strict=True)]
+    ours = [abs(result[key].value - true) for key, true in zip(keys, TRUE[[0, 3]], strict=True)]
     theirs = np.abs(numbers - TRUE)[[0, 3]]
     with capsys.disabled():
         print(
@@ -72,8 +72,8 @@ def test_identify_processes_a_long_press_run_within_time_limit(capsys):
     kind, campaign = campaigns.KINDS["lagging"], campaigns.campaign("lagging", 0)
     press = campaigns._press_run(kind, np.random.default_rng(0), seconds=40.0)
     begin = time.process_time()
-    found = identify(replace(campaign, runs=(*campaign.runs, press)))
+    result = identify(replace(campaign, runs=(*campaign.runs, press)))
     took = time.process_time() - begin
     with capsys.disabled():
-        print(f"\nidentify with a press of 40 s behind a lag: {took:.1f} s; {found.verdict}")
+        print(f"\nidentify with a press of 40 s behind a lag: {took:.1f} s; {result.verdict}")
     assert took < PRESS_BAR

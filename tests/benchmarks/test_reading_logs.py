@@ -70,7 +70,7 @@ def test_log_reading_time_and_memory_are_within_limits(kind, rows, tmp_path, cap
     path = tmp_path / "log.csv"
     write(path, rows, kind)
     _, bare, bare_processor, bare_memory = run(BARE, path)
-    found, took, processor, memory = run(READ, path, kind)
+    rows_read, took, processor, memory = run(READ, path, kind)
     with capsys.disabled():
         print(
             f"\n{kind}, {rows} rows ({path.stat().st_size / 1e6:.0f} MB): {took:.1f} s, {rows / took:.2g}/s, "
@@ -78,6 +78,6 @@ def test_log_reading_time_and_memory_are_within_limits(kind, rows, tmp_path, cap
             f"{bare_processor:.1f} s of the processor, {bare_memory:.2f} GiB"
         )
     path.unlink()
-    assert found >= 0.99 * rows and memory <= LARGEST
+    assert rows_read >= 0.99 * rows and memory <= LARGEST
     # A single thread reads, so its CPU time is the duration on an idle machine.
     assert processor <= SECONDS[rows]

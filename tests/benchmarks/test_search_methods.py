@@ -132,7 +132,7 @@ def test_expected_cost_is_median_cost_divided_by_success_rate():
         calls = np.arange(1, 1 + len(losses))
         return Trace(10.0 * calls, 0.5 * calls, np.array(losses))
 
-    best, found = judge(
+    best, success = judge(
         {
             "ours": [trace(5, 2.01, 2), trace(2.02, 2.02, 2.02), trace(9, 9, 9), trace(3, 2.03, 2.021)],
             "theirs": [trace(3, 3)],
@@ -140,9 +140,9 @@ def test_expected_cost_is_median_cost_divided_by_success_rate():
     )
     assert best == 2
     # Two starts come within 1 % of the best, after 20 and after 10 rollouts.
-    assert found["ours"].share == 0.5
-    assert found["ours"].rollouts == 30 and found["ours"].seconds == 1.5
-    assert found["theirs"].share == 0 and found["theirs"].rollouts == np.inf
-    assert found["theirs"].best == found["theirs"].median == 1.5
-    assert ratios(found["ours"], [found["theirs"]]) == (0, 0)
-    assert ratios(found["theirs"], [found["ours"]]) == (np.inf, np.inf)
+    assert success["ours"].share == 0.5
+    assert success["ours"].rollouts == 30 and success["ours"].seconds == 1.5
+    assert success["theirs"].share == 0 and success["theirs"].rollouts == np.inf
+    assert success["theirs"].best == success["theirs"].median == 1.5
+    assert ratios(success["ours"], [success["theirs"]]) == (0, 0)
+    assert ratios(success["theirs"], [success["ours"]]) == (np.inf, np.inf)

@@ -73,7 +73,7 @@ def inputs(loop, rig, run):
     exact, hardware = rig.axes.propagation, run.hardware
     rows = [exact.position, exact.velocity]
     bodies = [(body.mass, body.inertia, body.inverse_inertia, body.interface) for body in rig.bodies]
-    given = {
+    values = {
         "period": rig.period,
         "bodies": flat(*bodies),
         "states": flat(*run.states),
@@ -85,7 +85,7 @@ def inputs(loop, rig, run):
         "contact": np.stack([np.broadcast_to(one[0], (LANES,)) for one in contact]),
         "bias": rig.sensor.errors.bias,
     }
-    arrays = {name: np.array(value, float, order="C") for name, value in given.items()}
+    arrays = {name: np.array(value, float, order="C") for name, value in values.items()}
     return arrays | {"intervals": np.array(rig.axes.force.intervals, np.int64, order="C")}
 
 
@@ -141,10 +141,12 @@ def test_six_axis_simulation_speed_is_compared_with_cpp_and_mujoco(tmp_path, cap
     first = arrays["states"].copy()
     problem = Problem(LANES, loop.ring, *(arrays[name].ctypes.data for name in NUMBERS))
     tiles = tiled(rig), tiled(run)
-    found = np.stack(jax.tree.leaves(ticks(loop, *tiles))).reshape(len(first), LANES)
+    final_states = np.stack(jax.tree.leaves(ticks(loop, *tiles))).reshape(len(first), LANES)
     library.run_ticks(ctypes.byref(problem), TICKS)
-    np.testing.assert_allclose(found, arrays["states"], atol=1e-9 * np.max(np.abs(found - first)))
-    assert np.median(np.abs(found - first)[16]) > 0.003  # most chasers have changed their direction
+    np.testing.assert_allclose(
+        final_states, arrays["states"], atol=1e-9 * np.max(np.abs(final_states - first))
+    )
+    assert np.median(np.abs(final_states - first)[16]) > 0.003  # most chasers have changed their direction
 
     ours, cpp = [], []
     for _ in range(REPEATS):

@@ -45,17 +45,17 @@ def run(arguments, folder, programs):
         cwd=folder, capture_output=True, text=True, check=False,
     )  # fmt: skip
     took = time.perf_counter() - begin
-    (said,) = re.findall(r"took: (.*)", done.stderr)
-    return took, said
+    (timings,) = re.findall(r"took: (.*)", done.stderr)
+    return took, timings
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_repeated_command_finishes_within_time_limit(name, tmp_path, capsys):
     arguments, most = COMMANDS[name]
     first, *others = (run(arguments, tmp_path, tmp_path / "programs") for _ in range(1 + REPEATS))
-    took, said = min(others)
+    took, timings = min(others)
     with capsys.disabled():
-        print(f"\njaxhil {' '.join(arguments)}: at first {first[0]:.1f} s, then {took:.2f} s ({said})")
+        print(f"\njaxhil {' '.join(arguments)}: at first {first[0]:.1f} s, then {took:.2f} s ({timings})")
     assert took <= most
 
 
@@ -105,8 +105,8 @@ def test_rollouts_with_derivatives_compile_within_time_limit(compensator, nothin
 def test_programs_of_tuning_compile_within_time_limit(compensator, tmp_path, capsys):
     """A single solver step compiles all programs of tuning."""
     few = "--starts", "1", "--steps", "1", "--validation", "15", "--compensator", compensator
-    took, said = run(("tune", "varying", *few), tmp_path, tmp_path / "programs")
-    parts = {part: float(seconds) for part, seconds in re.findall(r"(\w+) ([\d.]+) s", said)}
+    took, timings = run(("tune", "varying", *few), tmp_path, tmp_path / "programs")
+    parts = {part: float(seconds) for part, seconds in re.findall(r"(\w+) ([\d.]+) s", timings)}
     with capsys.disabled():
-        print(f"\n{compensator}: compiling {parts['compiling']:.1f} s of {took:.1f} s ({said})")
+        print(f"\n{compensator}: compiling {parts['compiling']:.1f} s of {took:.1f} s ({timings})")
     assert parts["compiling"] <= REACHED.get(compensator, COMPILING)
