@@ -79,7 +79,7 @@ def test_sweep_without_folder_equals_stored_sweep(tuned, tmp_path, monkeypatch, 
 
 
 @pytest.mark.slow
-def test_user_registered_laws_are_tuned_swept_exported_and_verified(tmp_path):
+def test_user_registered_compensators_are_tuned_swept_exported_and_verified(tmp_path):
     jaxhil.register(SquaredSpring())
     jaxhil.register(ScaledLead())
     contact = {"law": "squared_spring", "stiffness": [1e8]}

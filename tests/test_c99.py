@@ -85,7 +85,7 @@ def test_c99_status_codes_match_runtime(batch):
 
 
 @pytest.mark.parametrize("delay", [101_000.0 * PERIOD, 1e306])
-def test_c99_export_rejects_the_same_delays_as_python(delay):
+def test_c99_export_rejects_the_same_delays_as_python_runtime(delay):
     document = gain_document()
     document["gains"]["identification_delay"] |= {"value": delay, "upper": delay}
     with pytest.raises(GainFileError, match="delay"):
@@ -93,7 +93,7 @@ def test_c99_export_rejects_the_same_delays_as_python(delay):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_c99_gains_are_compiled_to_the_same_bits(law, tmp_path):
+def test_c99_source_reproduces_gain_values_to_the_bit(law, tmp_path):
     rng = np.random.default_rng(1)
     document = gain_document(law)
     wide = drawn_gains(law, rng, hostile=True)
@@ -106,7 +106,7 @@ def test_c99_gains_are_compiled_to_the_same_bits(law, tmp_path):
     assert made.exported().tobytes() == packed(law, gain_file).tobytes()
 
 
-def test_c99_decimal_constants_are_compiled_to_the_same_bits(tmp_path):
+def test_c99_source_reproduces_decimal_constants_to_the_bit(tmp_path):
     rng = np.random.default_rng(2)
     values = rng.integers(0, 2**64, 5000, dtype=np.uint64).view(np.float64)
     values = np.concatenate([values[np.isfinite(values)], c99_cases.HOSTILE[:-1], np.arange(5.0)])
@@ -127,7 +127,7 @@ def test_c99_decimal_literal_has_exact_double_value(value):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_c99_accepts_the_same_gains_as_python(law, batch):
+def test_c99_controller_accepts_the_same_gains_as_python_runtime(law, batch):
     made = batch(law)
     sane = drawn_gains(law, np.random.default_rng(3), hostile=False)
     assert made.begin(packed(law, sane))
@@ -168,7 +168,7 @@ def test_c99_controller_commands_zero_force_if_delay_exceeds_delay_line(law, del
         assert len(np.unique(results[commanded, 1])) == 1
 
 
-def test_c99_accepts_the_same_limits_as_python(batch):
+def test_c99_controller_accepts_the_same_limits_as_python_runtime(batch):
     made = batch("none")
     plain = check_gain_document(gain_document("none"))
     assert made.begin(packed("none", plain))
@@ -190,7 +190,7 @@ def test_c99_accepts_the_same_limits_as_python(batch):
 
 @pytest.mark.parametrize("low", [-1.0, 0.0, 1.0, 2.0])
 @pytest.mark.parametrize("high", [-1.0, 1.0, 2.0])
-def test_c99_rejects_the_same_conflicting_limits_as_python(low, high, batch):
+def test_c99_controller_rejects_the_same_conflicting_limits_as_python_runtime(low, high, batch):
     made = batch("none")
     plain = check_gain_document(gain_document("none"))
     for names_of in (

@@ -85,7 +85,7 @@ def check(result, total=31.0):
 
 
 @where_kept
-def test_cached_program_is_traced_once_and_gives_same_results(tmp_path):
+def test_cached_program_is_traced_once_and_gives_results_of_uncached_program(tmp_path):
     check(run(None))
     assert len(traced) == 1
     for _ in range(3):
@@ -117,7 +117,7 @@ def test_damaged_program_file_is_rebuilt(tmp_path, spoil):
 
 @where_kept
 @pytest.mark.parametrize("number", [10, pytest.param(1000, marks=pytest.mark.slow)])
-def test_program_file_with_flipped_bit_is_retraced_with_same_result(tmp_path, number):
+def test_corrupted_program_file_is_replaced_and_result_is_unchanged(tmp_path, number):
     run(tmp_path)
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()
@@ -173,7 +173,7 @@ def test_program_is_rebuilt_if_sources_change(tmp_path, monkeypatch, changed):
     assert len(traced) == 2
 
 
-def test_program_of_user_registered_law_is_not_cached(tmp_path):
+def test_program_with_user_registered_compensator_is_not_cached(tmp_path):
     for _ in range(2):
         check(run(tmp_path, (Mine(), 1)))
     assert len(traced) == 2 and not list(tmp_path.iterdir())
@@ -216,7 +216,7 @@ def phases(static, scenarios):
 
 
 @pytest.mark.parametrize("law", [Mine(), pytest.param(HuntCrossley(), marks=where_kept)])
-def test_program_with_user_registered_law_in_arguments_is_not_cached(tmp_path, monkeypatch, law):
+def test_program_with_user_registered_law_in_its_arguments_is_not_cached(tmp_path, monkeypatch, law):
     """Six-axis scenarios contain laws in their arguments."""
     scenarios = six_axes_scenarios(load_any("petals").mechanism)
     groups = tuple(dataclasses.replace(group, law=law) for group in scenarios.groups)
@@ -284,7 +284,7 @@ def test_cached_linear_solve_runs_in_process_that_traces_nothing(tmp_path):
 
 @where_kept
 @pytest.mark.parametrize("lanes", [(), (20,)])
-def test_cached_batch_has_same_bits_and_is_not_recompiled(tmp_path, monkeypatch, lanes):
+def test_batch_from_cached_program_is_bit_identical_and_not_recompiled(tmp_path, monkeypatch, lanes):
     mechanism = load("varying").mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, 20, 0))
     loop = build_loop(mechanism, "phase_lead", scenarios)

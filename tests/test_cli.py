@@ -240,7 +240,7 @@ def test_tune_rejects_impossible_pareto_option(jaxhil, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_tune_rejects_unusable_start_gains(jaxhil, tuned, tmp_path):
+def test_tune_rejects_unusable_starting_gains(jaxhil, tuned, tmp_path):
     (tmp_path / "broken.json").write_text("{")
     start = ["tune", "rig-300kg", "-o", tmp_path / "out", "--start"]
     refused(jaxhil(*start, tuned), "--start", str(tuned)[:20], "phase_lead", "response_error")

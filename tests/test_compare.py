@@ -108,7 +108,7 @@ def test_compare_leaderboard_lists_all_compensators_and_settings(capsys):
     assert describe_least_errors(["m"], {"m": FOUND[:1]}) == ""
 
 
-def test_compare_tables_omit_tuned_rows_without_tuning(capsys):
+def test_compare_tables_have_no_rows_for_tuned_gains_without_tuning(capsys):
     both = {"literature": figures(0.4), "gentle": figures(0.3)}
     result = [FOUND[0], LawMetrics("impulse_ledger", "m", {}, both)]
     terminal.emit(build_mechanism_table("m", result), build_leaderboard(["m"], {"m": result}))

@@ -28,7 +28,7 @@ def test_compare_reports_missing_scheduler_in_one_line():
 
 
 @pytest.mark.slow
-def test_compare_gives_the_same_results_if_a_worker_is_killed(tmp_path, monkeypatch):
+def test_compare_results_are_unchanged_if_a_cluster_worker_is_killed(tmp_path, monkeypatch):
     mechanisms = [jaxhil.load("varying"), jaxhil.load("suite-rattling")]
     here = tuning.compare(mechanisms, LAWS, **FEW)
     with started(tmp_path) as cluster:

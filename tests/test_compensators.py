@@ -195,7 +195,7 @@ def test_compensator_derivatives_are_finite_at_rest_and_without_force(name):
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_compensator_lanes_are_independent_for_any_batch_shape(name):
+def test_compensator_outputs_of_batch_elements_are_independent_for_any_batch_shape(name):
     signals, constants = readings((2, 3), GAP)
     together = commands(name, signals, some_gains(name, (2, 3)), constants)
     row = jax.tree.map(lambda leaf: leaf[..., 1, :], (signals, constants))

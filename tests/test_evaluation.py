@@ -39,7 +39,7 @@ def take(leaf, lanes):
     return None if leaf is None else np.asarray(leaf)[..., lanes]
 
 
-def test_evaluation_of_a_lane_does_not_depend_on_its_batch():
+def test_evaluation_of_a_scenario_does_not_depend_on_its_batch():
     loop, gains, scenarios = setting()
     whole = evaluate(loop, gains, scenarios)
     lanes = np.array([63, 2, 17])
@@ -51,7 +51,7 @@ def test_evaluation_of_a_lane_does_not_depend_on_its_batch():
     np.testing.assert_array_equal(part.metrics.status, whole.metrics.status[..., lanes])
 
 
-def test_evaluation_with_separate_gains_per_lane_equals_evaluation_with_common_gains():
+def test_evaluation_with_gains_per_scenario_equals_evaluation_with_common_gains():
     loop, gains, scenarios = setting(lanes=20)
     common = evaluate(loop, gains, scenarios)
     per_lane = evaluate(loop, {name: np.full(20, value) for name, value in gains.items()}, scenarios)
@@ -111,7 +111,7 @@ def tiled(scenarios):
     )
 
 
-def test_tiles_group_lanes_of_equal_delay_and_similar_duration():
+def test_batch_tiles_contain_scenarios_of_equal_delay_and_similar_duration():
     """Exclude the last tile of each delay, and batches with few tiles per delay."""
     delays, durations = tiled(setting("none", lanes=4096)[2])
     assert np.sum(np.ptp(delays, axis=-1) > 0) < len(np.unique(delays)) == 2
@@ -122,7 +122,7 @@ def test_tiles_group_lanes_of_equal_delay_and_similar_duration():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["varying", "rattling"])
-def test_evaluation_of_a_lane_is_bit_identical_in_any_batch(name):
+def test_evaluation_of_a_scenario_is_bit_identical_in_any_batch(name):
     # With a lagging sensor, a tile without contact skips work.
     overrides = ("rig.force_sensor.time_constant=0.002",)
     loop, gains, scenarios = setting(lanes=600, name=name, overrides=overrides)
@@ -148,7 +148,7 @@ print(jax.device_count(), hashlib.sha256(content).hexdigest())
 
 
 @pytest.mark.slow
-def test_evaluation_of_a_lane_is_bit_identical_on_any_number_of_cores():
+def test_evaluation_of_a_scenario_is_bit_identical_on_any_number_of_cores():
     digests = {}
     for cores in 1, 2, 3:
         flags = "" if cores == 1 else f"{DEVICE_COUNT_FLAG}={cores}"

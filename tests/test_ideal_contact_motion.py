@@ -154,7 +154,7 @@ def test_ideal_contact_with_external_push_agrees_with_scipy():
         np.testing.assert_allclose(result.velocity[:, lane], speed, rtol=0, atol=1e-6 * VELOCITY)
 
 
-def test_external_push_after_the_contact_adds_its_impulse():
+def test_external_push_after_ideal_contact_adds_the_push_impulse():
     push = pulse(0.25, 0.02, 6.0)
     result, alone = integrated("kelvin_voigt", {}, push=push, push_duration=0.27)
     impulse = 6.0 * 0.02 * 2 / np.pi

@@ -309,7 +309,7 @@ def test_identify_does_not_write_impossible_mechanism():
     ({"law": "rubber"}, "law: found 'rubber', expected linear"),
     ({"order": 7}, "order: found 7, expected 0, 1, 2"),
 ))  # fmt: skip
-def test_identify_rejects_unknown_law_and_order(options, message):
+def test_identify_rejects_unknown_contact_law_and_simulator_order(options, message):
     with pytest.raises(jaxhil.InputError, match=message):
         identify(campaigns.campaign("clean", 0, (), 5.0), options=IdentificationOptions(**options))
 

@@ -73,7 +73,7 @@ def test_bootstrap_widens_intervals_if_contacts_differ_from_each_other():
     assert written == pytest.approx(wide["contact.stiffness.0"].std, rel=0.01)
 
 
-def test_bootstrap_resumes_with_the_same_draws(fit, tmp_path, monkeypatch):
+def test_resumed_bootstrap_gives_the_same_draws_as_uninterrupted_bootstrap(fit, tmp_path, monkeypatch):
     done, messages, most = [], [], 2
 
     def means(drawn, problem, readings, seed, near):

@@ -31,7 +31,7 @@ def test_identify_rejects_bootstrap_options_without_bootstrap(jaxhil, asked):
 
 
 @pytest.mark.slow
-def test_bootstrap_gives_the_same_draws_if_a_worker_is_killed(fit, tmp_path, monkeypatch):
+def test_bootstrap_draws_are_unchanged_if_a_cluster_worker_is_killed(fit, tmp_path, monkeypatch):
     assert fit.readings.counts.sum() > 10_000
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
         bootstrap.bootstrap(fit, 20, scheduler="nowhere://x")

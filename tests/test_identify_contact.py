@@ -169,7 +169,7 @@ def test_contact_fit_of_undamped_contact_has_no_negative_damping():
 
 
 @pytest.mark.parametrize("name, law", (("clean", "kelvin_voigt"), ("hertz", "hunt_crossley")))
-def test_contact_law_selection_finds_the_true_law(name, law):
+def test_contact_law_selection_selects_the_true_law(name, law):
     readings_problem = problem(name, kelvin_voigt(), speeds=(0.003, 0.006, 0.012) * 2)
     candidates = choose_contact_law(
         readings_problem.motion, readings_problem.readings, None, ("linear", "kelvin_voigt", "hunt_crossley")

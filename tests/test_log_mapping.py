@@ -56,7 +56,7 @@ def test_mapping_applies_scale_unit_offset_and_sign_to_logged_numbers():
     assert get_si_conversion(channels.force_command, "force_command") == (1.0, 0.0)
 
 
-def test_mapping_file_is_equivalent_to_its_table(tmp_path):
+def test_mapping_file_is_equivalent_to_mapping_dictionary(tmp_path):
     path = tmp_path / "map.toml"
     path.write_text("""
         schema = "jaxhil/log/1"

@@ -24,7 +24,7 @@ def same(one, other):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
-def test_log_is_read_as_it_was_written(tmp_path):
+def test_log_file_is_read_back_with_the_written_values(tmp_path):
     path = write_csv(tmp_path / "a.csv", LOG)
     result = read(path)
     assert [(run.kind, run.source, set(run.contact_index)) for run in result.runs] == [

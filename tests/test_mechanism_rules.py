@@ -121,7 +121,7 @@ def test_mechanism_keys_that_contradict_each_other_are_refused(changes, key):
         {**IDEAL, "rig.command_hold": "linear"},
     ],
 )
-def test_mechanism_of_every_law_and_model_survives_round_trip_through_json(changes):
+def test_mechanism_of_every_contact_law_and_simulator_survives_json_round_trip(changes):
     mechanism = from_plain_data(changed(changes), "f")
     assert from_plain_data(to_plain_data(mechanism), "f") == mechanism
 

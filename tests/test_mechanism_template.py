@@ -42,7 +42,7 @@ CORRELATED = {
 
 
 @pytest.mark.parametrize("name", [*NAMES, "correlated"])
-def test_new_mechanism_file_is_equivalent_to_its_source(name, written):
+def test_new_mechanism_file_is_equivalent_to_the_copied_mechanism(name, written):
     mechanism = load("varying", CORRELATED).mechanism if name == "correlated" else load(name).mechanism
     text = format_mechanism_file(mechanism)
     assert load(written(text)).mechanism == mechanism

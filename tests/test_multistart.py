@@ -65,7 +65,7 @@ def test_starting_gains_are_literature_gains_and_best_points_of_a_scan(tasks, va
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_scan_with_part_of_scenarios_chooses_same_points_as_full_scan(seed, monkeypatch):
+def test_scan_of_starting_gains_on_few_scenarios_chooses_same_points_as_full_scan(seed, monkeypatch):
     runs = []
     work = SearchProgress()
     monkeypatch.setattr(work, "report_runs", runs.append)

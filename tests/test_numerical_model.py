@@ -180,7 +180,7 @@ def test_momentum_is_conserved_under_any_wrench(run):
 
 
 @pytest.mark.slow
-def test_six_axis_integrators_agree_with_one_axis_along_and_about_an_axis():
+def test_six_axis_integrators_agree_with_one_axis_for_single_axis_motion():
     pushes = SEEDED.normal(size=40) * 20
 
     @jax.jit

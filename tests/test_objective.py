@@ -193,7 +193,7 @@ def test_errors_within_tolerance_hardly_affect_objective(tolerance):
     assert RESIDUAL_SCALE**2 * np.sum(values * slopes) == pytest.approx(counted * grown, rel=1e-12)
 
 
-def test_tolerance_of_zero_gives_the_same_objective_in_a_shared_program():
+def test_error_tolerance_of_zero_does_not_change_objective_in_shared_program():
     terms = join_terms([Objective(tolerance=0.0)])
     assert terms == join_terms([Objective(command_weight=0.1, noise_weight=0.2, tolerance=0.5)])
     assert terms == ObjectiveTerms("rms", True, True, False, tolerance=True)

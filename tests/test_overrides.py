@@ -72,7 +72,7 @@ def test_override_of_list_entry_accepts_single_number_in_file(written):
 SECOND_ORDER = ["rig.simulator.natural_frequency", "rig.simulator.damping_ratio"]
 
 
-def test_override_of_a_model_accepts_its_keys_and_no_others():
+def test_override_of_simulator_model_accepts_only_keys_of_that_model():
     first_order = ["rig.simulator.model=first_order", "rig.simulator.time_constant=0.01"]
     message = file_refusal("varying", first_order)
     assert message.startswith(f"varying: --set {' '.join(first_order)}: rig.simulator.")

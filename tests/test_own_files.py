@@ -55,7 +55,7 @@ def test_overview_plot_does_not_replace_a_third_party_picture(jaxhil, thesis):
 
 
 @pytest.mark.parametrize("content", ["{}", "years", "[1]", ""])
-def test_third_party_document_is_not_replaced(jaxhil, tmp_path, content):
+def test_third_party_json_document_is_not_replaced(jaxhil, tmp_path, content):
     for name in ("compare.json", "gains.json"):
         (tmp_path / name).write_text(content)
     refused(jaxhil(*COMPARE, "-o", tmp_path), "compare.json: found a file that jaxhil did not write")

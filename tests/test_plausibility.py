@@ -217,7 +217,7 @@ def test_warning_names_the_implausible_contact():
     assert "0.00919 Hz (contact 3)" in slow and "less than contact 2 lasts" in late
 
 
-def test_damping_of_an_undamped_law_gives_a_warning():
+def test_damping_key_of_an_undamped_contact_law_gives_a_warning():
     [warning] = summarise_mechanism(rig(contact__law="linear", contact__damping=[0.0, 4.0])).warnings
     assert warning == "contact.damping: found 4 N s/m, expected 0: law linear has no damping"
 

@@ -82,7 +82,7 @@ def test_contact_laws_with_shared_key_must_describe_the_key_identically():
         assert all(laws.CONTACT_KEYS[key.name] == key for key in law.keys or ())
 
 
-def test_unusable_law_is_not_registered(registered):
+def test_unusable_compensator_or_contact_law_is_not_registered(registered):
     class Unnamed(SquaredSpring):
         name = ""
 

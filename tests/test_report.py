@@ -189,7 +189,7 @@ SHOWN = "[...document.querySelectorAll('.trace')].filter(one => one.checkVisibil
 
 
 @pytest.mark.slow
-def test_click_on_a_scenario_shows_its_trace(whole, browser):
+def test_click_on_a_scenario_in_report_shows_its_time_history(whole, browser):
     browser.open(whole, 1440)
     first = browser.evaluate(SHOWN)
     links = browser.evaluate(

@@ -240,7 +240,7 @@ def mixed():
     return batch, run, jax.tree.map(np.asarray, run(batch.loop, batch.gains, batch.scenario))
 
 
-def test_rollout_reports_a_status_for_every_lane(mixed):
+def test_rollout_reports_a_contact_status_for_every_scenario(mixed):
     batch, _, metrics = mixed
     assert dict(zip(batch.names, metrics.status[0].tolist(), strict=True)) == {
         "plain": OK,
@@ -274,7 +274,7 @@ def test_unused_position_reading_does_not_change_rollout(name):
     jax.tree.map(np.testing.assert_array_equal, metrics, run(True, scenario))
 
 
-def test_padding_lanes_do_not_affect_other_lanes(mixed):
+def test_padding_elements_of_a_batch_do_not_affect_other_elements(mixed):
     batch, run, metrics = mixed
     lane = batch.names.index("padding")
     for name, values in metrics._asdict().items():
@@ -351,7 +351,7 @@ def noise():
     return tuple(np.stack(values) for values in zip(*drawn, strict=True))
 
 
-def test_sensor_noise_of_a_lane_does_not_depend_on_batch(noisy_run):
+def test_sensor_noise_of_a_scenario_does_not_depend_on_its_batch(noisy_run):
     together = noisy_run
     assert len(set(together.restitution[0])) == 6 and np.all(together.status[0] == OK)
     shifted = jax.tree.map(np.asarray, run_rollout(*noisy_batch(6, first=3)))

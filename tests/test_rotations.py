@@ -96,7 +96,7 @@ def test_rotations_of_many_radians_agree_with_scipy():
 
 
 @pytest.mark.slow
-def test_rotation_derivatives_at_zero_are_those_of_the_series():
+def test_rotation_derivatives_at_zero_match_power_series():
     rate = Vector(*jnp.asarray([0.3, -0.2, 0.5]))
 
     def there_and_back(theta):

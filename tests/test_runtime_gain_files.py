@@ -68,7 +68,7 @@ def test_gain_file_with_any_field_mutated_is_refused(place, value, remove):
 
 @given(value=JSON_VALUES, path=st.sampled_from([p for n, p in SIGNED if n == "response_error"]))
 @settings(max_examples=300, deadline=None)
-def test_mutated_gain_file_with_valid_digest_loads_or_is_refused_in_one_line(path, value):
+def test_changed_gain_file_with_valid_digest_loads_or_is_refused_in_one_line(path, value):
     document = gain_document()
     at(document, path[:-1])[path[-1]] = value
     try:
@@ -85,7 +85,7 @@ def test_mutated_gain_file_with_valid_digest_loads_or_is_refused_in_one_line(pat
 
 
 @pytest.mark.parametrize("name", sorted(GAINS))
-def test_gain_file_and_dictionary_give_the_same_controller(name, tmp_path):
+def test_controller_from_gain_file_equals_controller_from_dictionary(name, tmp_path):
     document = gain_document(name)
     path = tmp_path / "gains.json"
     path.write_text(json.dumps(document, indent=2), encoding="utf-8")

@@ -125,7 +125,7 @@ def test_watchdog_audits_unfinished_contact_when_next_contact_is_announced():
     assert not controller.tripped and controller._watchdog.contacts == 1
 
 
-def test_watchdog_detects_a_model_that_does_not_integrate_its_force():
+def test_watchdog_detects_numerical_model_that_does_not_follow_force_command():
     controller = watched(restitution_margin=1.0)
     position, velocity = -1e-4, SPEED
     for n in range(500):

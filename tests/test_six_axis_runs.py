@@ -37,7 +37,7 @@ def test_six_axis_contact_patterns_are_rotated_copies():
     np.testing.assert_allclose(rings.candidates.shape.normal.z, np.ones((6, 1)))
 
 
-def test_six_axis_parameter_draws_are_stored_as_lanes():
+def test_six_axis_parameter_draws_are_stored_along_last_array_axis():
     """Draw lists, matrices and numbers of tables, different in each lane."""
     factor = {"distribution": "uniform", "factor": [0.9, 1.1]}
     uncertain = {

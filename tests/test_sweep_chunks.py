@@ -29,7 +29,7 @@ def sweep(request):
     return build_sweep(manifest(case(2, "phase_lead", sensor), 112, sampling=sampling))
 
 
-def test_sweep_rows_do_not_depend_on_the_chunks(sweep):
+def test_sweep_rows_do_not_depend_on_division_into_chunks(sweep):
     whole = run_chunk(sweep, 0, 112)
     assert list_different_columns(joined([rows for _, rows in run_chunks(sweep, range(4))]), whole) == []
     uneven = [run_chunk(sweep, first, until - first) for first, until in ((0, 1), (1, 80), (80, 112))]

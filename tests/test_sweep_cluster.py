@@ -172,7 +172,7 @@ def test_killed_scheduler_is_reported_in_one_line_and_finished_chunks_are_kept(w
 
 
 @pytest.mark.slow
-def test_sweep_on_a_cluster_stops_after_the_same_number_of_scenarios(tmp_path):
+def test_sweep_on_a_cluster_stops_after_same_number_of_scenarios_as_local_sweep(tmp_path):
     until = manifest(case(), scenarios=300, limit=1.5, until_width=0.25)
     here, tally = rows_of(tmp_path / "here", label=until)
     with started(tmp_path) as cluster:

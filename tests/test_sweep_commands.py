@@ -158,7 +158,7 @@ def no_study(monkeypatch, *names):
         monkeypatch.setattr(f"tuning.sweeps.studies.{name}", lambda *_: pytest.fail("run again"))
 
 
-def test_sweep_verdict_is_saved_as_it_was_printed(jaxhil, own_store):
+def test_saved_sweep_verdict_equals_printed_verdict(jaxhil, own_store):
     folder, again = own_store
     ran = jaxhil(*again, "--json")
     assert (folder / "verdict.json").read_text() == ran[1]
@@ -322,7 +322,7 @@ def test_sweep_and_replay_refuse_impossible_arguments(jaxhil, gains, store, tmp_
     assert not (tmp_path / "new").exists()
 
 
-def test_jax_is_not_imported_before_it_is_configured():
+def test_jax_is_configured_before_import_by_sweep_command():
     # XLA reads its flags, which affect the last bits of every row, when it starts.
     program = (
         "import sys, tuning.cli.commands.sweep, tuning.cli.commands.replay; sys.exit('jax' in sys.modules)"

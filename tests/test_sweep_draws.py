@@ -24,7 +24,7 @@ def leaves(found, part=slice(None)):
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 @given(first=st.integers(0, 2990), number=st.integers(0, 1500))
 @settings(max_examples=25)
-def test_draws_of_a_chunk_equal_the_same_rows_of_the_whole_sweep(sampling, first, number):
+def test_draws_of_a_chunk_equal_corresponding_draws_of_the_whole_sweep(sampling, first, number):
     number = min(number, 3000 - first)
     result = leaves(draw_scenarios(MECHANISM, sampling, 3, first, number))
     expected = leaves(WHOLE[sampling], slice(first, first + number))

@@ -105,7 +105,7 @@ def test_plotted_inputs_are_those_with_strongest_rank_correlation(lost):
     assert plan_statistics(made, mechanism, made_up).per_scenario[1].columns == ("approach.phase_2",)
 
 
-def test_accumulated_cell_counts_equal_histogram_of_all_rows(usual):
+def test_accumulated_plot_counts_equal_histogram_of_all_sweep_rows(usual):
     made, mechanism, rows = usual
     plan = plan_statistics(made, mechanism, rows)
     sizes = accumulated(plan, rows, [(0, NUMBER)]).sizes

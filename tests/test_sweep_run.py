@@ -100,7 +100,7 @@ def test_interrupted_sweep_keeps_written_rows(whole, tmp_path):
     assert list_different_columns(all_rows(store), rows) == [] and again == tally
 
 
-def test_killed_and_resumed_sweep_gives_the_same_store(whole, tmp_path):
+def test_killed_and_resumed_sweep_gives_store_of_uninterrupted_sweep(whole, tmp_path):
     _, rows, _, _ = whole
     write_gain_file(tmp_path / "gains.json", case())
     folder = tmp_path / "store"
@@ -170,7 +170,7 @@ def parts_of(store):
     return sorted(path.name for path in store.folder.glob("parts/part-*"))
 
 
-def test_sweep_stops_at_first_look_with_narrow_enough_interval(whole, stopped):
+def test_sweep_stops_when_failure_interval_is_first_narrow_enough(whole, stopped):
     _, rows, _, _ = whole
     store, parts, tally = stopped
     failed, running = rows["failed"], SequentialState()
@@ -203,7 +203,7 @@ def test_sweep_that_reached_its_interval_width_is_not_continued(stopped):
         Log().sweep(store.folder, label=manifest(case(), scenarios=300, limit=1.5, until_width=0.1))
 
 
-def test_sweep_stops_at_the_same_look_for_any_order_of_chunks(stopped, tmp_path):
+def test_sweep_stop_does_not_depend_on_order_of_finished_chunks(stopped, tmp_path):
     _, parts, tally = stopped
 
     def shuffled(sweep, missing):

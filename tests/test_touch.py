@@ -130,7 +130,7 @@ def test_penetration_rate_is_derivative_of_depth_and_slip_is_tangential(name):
 
 
 @pytest.mark.slow
-def test_contact_of_exchanged_shapes_is_the_same():
+def test_contact_is_unchanged_if_the_two_shapes_are_exchanged():
     """Exchange the shape and the ball; the force then acts on the shape."""
     pose, _ = pose_and_twist()
     one = CANDIDATES["ball on sphere"].touch(pose)

@@ -121,7 +121,7 @@ def test_nearest_mechanism_has_least_distance_and_is_first_among_equals():
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
 @pytest.mark.parametrize("name", builtin_names())
-def test_transferred_gains_on_the_same_mechanism_are_unchanged(compensator, name):
+def test_gains_transferred_to_an_identical_mechanism_are_unchanged(compensator, name):
     mechanism = load(name).mechanism
     gains = anywhere(mechanism, compensator)
     assert transfer_gains(compensator, gains, mechanism, load(name).mechanism) == gains

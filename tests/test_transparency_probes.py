@@ -78,7 +78,7 @@ def test_probed_scenario_copies_have_zero_error_on_an_ideal_rig():
     assert [one.value for one in figures.values()] == pytest.approx([1] * 4, abs=2e-3)
 
 
-def test_first_lanes_contain_every_kind_of_probed_copy():
+def test_first_scenarios_of_a_batch_contain_every_kind_of_probed_copy():
     assert list(mask_probes(8)) == [False, True, True, True] * 2
     probed = build_probed_scenarios(DAMPED, draw(DAMPED, 5, 1)).scenarios
     damping = np.asarray(probed.contact.damping)[0]

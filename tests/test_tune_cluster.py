@@ -21,7 +21,7 @@ def test_tuning_without_scheduler_fails_in_one_line():
 
 
 @pytest.mark.slow
-def test_tuning_on_a_cluster_gives_the_same_gains_and_fronts(tmp_path, monkeypatch):
+def test_tuning_on_a_cluster_gives_gains_and_pareto_fronts_of_local_tuning(tmp_path, monkeypatch):
     for name in ("tune_all", "pareto"):
         monkeypatch.setattr(f"tuning.gains.{name}.BLOCK", 2)
     changes = [{"bodies.equivalent_mass": mass} for mass in (3e2, 4e2, 5e2)]

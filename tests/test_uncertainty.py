@@ -94,7 +94,7 @@ def test_uncertain_list_entries_scale_jointly_or_independently(draws):
         assert stats.kstest(factors, stats.loguniform(0.3, 3.0).cdf).pvalue > 0.01
 
 
-def test_absolute_uncertainty_of_a_list_applies_to_its_first_entry():
+def test_absolute_uncertainty_of_a_list_key_applies_to_its_first_entry():
     absolute = {"distribution": "uniform", "low": 2.0, "high": 4.0}
     values = draw(mechanism_with("contact.damping", absolute), 1000, 1)["contact.damping"]
     assert np.all((values[:, 0] >= 2.0) & (values[:, 0] <= 4.0))

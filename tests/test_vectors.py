@@ -106,7 +106,7 @@ def test_hostile_vectors_contain_every_kind_of_bad_reading(vectors):
     assert all(math.isnan(row.force_simulated) for row in rows)
 
 
-def test_new_controller_replays_every_vector_row_to_the_bit(loaded, vectors):
+def test_new_controller_reproduces_every_test_vector_to_the_bit(loaded, vectors):
     gain_file = check_gain_document(loaded.document)
     controller = None
     for row in vectors.rows:

@@ -60,7 +60,8 @@ def test_cluster_sweep_is_at_least_half_as_fast_as_local_sweep(workers, tmp_path
         print(
             f"\n{workers} workers on the cores of one process, the same rows: {efficiency:.2f} of its"
             f" scenarios/s ({PARTS * CHUNK / min(cluster_times[1:]):.3g} over"
-            f" {PARTS * CHUNK / min(local_times[1:]):.3g}; chunks of {workers * min(cluster_times[1:]) / PARTS:.2f} s)"
+            f" {PARTS * CHUNK / min(local_times[1:]):.3g};"
+            f" chunks of {workers * min(cluster_times[1:]) / PARTS:.2f} s)"
         )
     assert efficiency >= 0.5
 
