@@ -40,7 +40,7 @@ def third(loaded):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_alarm_rates_on_fresh_scenarios_lie_within_stated_intervals(case, tmp_path):
+def test_alarm_rates_on_new_scenarios_lie_within_stated_intervals(case, tmp_path):
     name, overrides, compensator = CASES[case]
     parsed = load(name, overrides).mechanism
     loaded = gains(parsed, literature_gains(parsed, compensator), compensator)

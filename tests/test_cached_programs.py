@@ -106,7 +106,7 @@ def test_program_with_code_from_compile_cache_is_also_cached(tmp_path):
 
 @where_kept
 @pytest.mark.parametrize("spoil", [lambda content: b"", lambda content: content[:-100], lambda c: b"no" + c])
-def test_damaged_program_file_is_rebuilt(tmp_path, spoil):
+def test_damaged_cached_program_is_rebuilt(tmp_path, spoil):
     run(tmp_path)
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()
@@ -131,7 +131,7 @@ def test_corrupted_program_file_is_replaced_and_result_is_unchanged(tmp_path, nu
 
 
 @where_kept
-def test_program_without_its_compiled_code_is_rebuilt(tmp_path):
+def test_cached_program_without_compiled_code_is_rebuilt(tmp_path):
     run(tmp_path)
     for file in Path(str(program_folder())).glob(f"jit_sums-*{EXECUTABLE_SUFFIX}"):
         file.unlink()
@@ -142,7 +142,7 @@ def test_program_without_its_compiled_code_is_rebuilt(tmp_path):
 
 
 @where_kept
-def test_program_is_rebuilt_if_any_dependency_changes(tmp_path, monkeypatch):
+def test_cached_program_is_rebuilt_if_any_dependency_changes(tmp_path, monkeypatch):
     check(run(tmp_path))
     check(run(tmp_path, (HuntCrossley(), 1)), 46.0)
     check(run(tmp_path, (KelvinVoigt(), 2)), 32.0)
@@ -160,7 +160,7 @@ def test_program_is_rebuilt_if_any_dependency_changes(tmp_path, monkeypatch):
 
 @where_kept
 @pytest.mark.parametrize("changed", ["jaxhil", "tuning"])
-def test_program_is_rebuilt_if_sources_change(tmp_path, monkeypatch, changed):
+def test_cached_program_is_rebuilt_if_source_code_changes(tmp_path, monkeypatch, changed):
     folder = tmp_path / "kept"
     folder.mkdir()
     importlib.import_module("tuning")
@@ -199,7 +199,7 @@ def test_program_with_unwritable_cache_folder_still_returns_its_result(tmp_path)
     check(run(tmp_path / "missing"))
 
 
-def test_program_is_rebuilt_if_settings_change_between_calls(tmp_path, monkeypatch):
+def test_cached_program_is_rebuilt_if_jax_settings_change_between_calls(tmp_path, monkeypatch):
     """Use a single process, which keeps the cached program in memory."""
     monkeypatch.setattr(cached_programs, "program_folder", lambda: tmp_path)
     again = partial(cached_programs.run_cached, sums, STATIC, jnp.asarray(VALUES), {"factor": jnp.array(3.0)})

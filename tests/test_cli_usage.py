@@ -118,7 +118,7 @@ def test_cli_help_and_usage_errors_do_not_import_jax():
     assert done.returncode == 0, done.stderr
 
 
-def test_module_runs_as_command_and_ignores_closed_pipe():
+def test_python_module_runs_as_command_and_tolerates_closed_pipe():
     command = [sys.executable, "-m", "tuning", "mechanisms"]
     read, write = os.pipe()
     os.close(read)

@@ -61,18 +61,18 @@ def periods(*gaps: float, period: float = 1e-3, start: float = 7.0) -> list[floa
         (-1.0, [OK, CLOCK]),
     ],
 )
-def test_clock_raises_faults_for_wrong_tick_rate_at_default_limits(gap, expected, period):
+def test_clock_check_raises_faults_for_wrong_tick_rate_at_default_limits(gap, expected, period):
     assert faults(periods(*[gap] * (len(expected) - 1), period=period), period) == expected
 
 
 @pytest.mark.parametrize("time", [math.nan, math.inf, -math.inf])
-def test_clock_trips_on_non_finite_time(time):
+def test_clock_check_trips_on_non_finite_time(time):
     assert faults([0.0, 1e-3, time]) == [OK, OK, CLOCK]
     assert faults([time]) == [CLOCK]
 
 
 @pytest.mark.parametrize("rate", [0.98, 0.984, 1.016, 1.02, 1.1])
-def test_clock_trips_on_rate_error_above_1_5_percent(rate):
+def test_clock_check_trips_on_rate_error_above_1_5_percent(rate):
     """The drift after n ticks is r (1 - 0.99^n)/0.01 periods, which exceeds 1.5 if r > 0.015."""
     wrong = abs(rate - 1.0)
     ticks = math.ceil(math.log(1.0 - 0.015 / wrong) / math.log(0.99))
@@ -81,7 +81,7 @@ def test_clock_trips_on_rate_error_above_1_5_percent(rate):
 
 
 @pytest.mark.parametrize("rate", [0.986, 0.9999, 1.0001, 1.014])
-def test_clock_accepts_rate_error_below_1_5_percent(rate):
+def test_clock_check_accepts_rate_error_below_1_5_percent(rate):
     assert not any(faults(periods(*[rate] * 5000)))
 
 
@@ -90,11 +90,11 @@ def test_clock_accepts_rate_error_below_1_5_percent(rate):
     period=st.sampled_from([1e-4, 1e-3, 0.1]),
     start=st.floats(0.0, 1e5),
 )
-def test_clock_accepts_jitter_below_an_eighth_of_the_period(jitter, period, start):
+def test_clock_check_accepts_jitter_below_an_eighth_of_the_period(jitter, period, start):
     assert not any(faults([start + period * (n + late) for n, late in enumerate(jitter)], period))
 
 
-def test_clock_never_trips_on_ordinary_jitter():
+def test_clock_check_never_trips_on_ordinary_jitter():
     """Use normal jitter of 5 % of the period, which flags about one tick in a thousand."""
     late = 0.05 * np.random.default_rng(3).standard_normal(100_000)
     result = np.array(faults((1e-3 * (np.arange(100_000) + late)).tolist()))
@@ -102,18 +102,18 @@ def test_clock_never_trips_on_ordinary_jitter():
     assert 0 < np.count_nonzero(result) < 100
 
 
-def test_clock_accepts_early_tick_that_compensates_late_tick():
+def test_clock_check_accepts_early_tick_that_compensates_late_tick():
     assert faults(periods(1.0, 1.4, 0.6, 1.0)) == [OK, OK, LATE_TICK, EARLY_TICK, OK]
 
 
-def test_clock_flags_one_repeated_tick_and_trips_on_two_within_69_ticks():
+def test_clock_check_flags_a_repeated_tick_and_trips_on_two_within_69_ticks():
     """The drift after one repeated tick is 0.99^n periods after n ticks: half a period after 69."""
     assert faults(periods(1.0, 0.001, *[1.0] * 20)) == [OK, OK, EARLY_TICK, *[OK] * 20]
     assert faults(periods(0.001, *[1.0] * 67, 0.001))[-1] == CLOCK
     assert faults(periods(0.001, *[1.0] * 69, 0.001))[-1] == EARLY_TICK
 
 
-def test_clock_counts_no_drift_after_stall_followed_by_burst():
+def test_clock_check_counts_no_drift_after_stall_followed_by_burst():
     """Three ticks arrive 2.9, 1.9 and 0.9 periods late and already count as missed."""
     stall = (1.0, 3.9, 0.02, 0.02, 0.06, 1.0)
     expected = [OK, MISSED_TICK, *[EARLY_TICK] * 3, OK]
@@ -122,7 +122,7 @@ def test_clock_counts_no_drift_after_stall_followed_by_burst():
     assert faults(periods(3.9, *[0.02] * 5), **BRIDGED)[-2:] == [EARLY_TICK, CLOCK]
 
 
-def test_clock_trips_on_consecutive_missed_ticks():
+def test_clock_check_trips_on_consecutive_missed_ticks():
     assert faults(periods(4.0, 1.0, 4.0), **BRIDGED) == [OK, MISSED_TICK, OK, MISSED_TICK]
     # A loop at half the rate misses every second tick.
     half = faults(periods(*[2.0] * 6), **BRIDGED)

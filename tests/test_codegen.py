@@ -379,7 +379,7 @@ class Sharing:
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_construct_outside_c99_subset_is_rejected_with_file_and_line(function, line, message):
+def test_python_construct_outside_c99_subset_is_rejected_with_file_and_line(function, line, message):
     program = CProgram("t_")
     with pytest.raises(SubsetError) as error:
         program.add(function, Sharing if function is Sharing.__init__ else None)

@@ -22,7 +22,7 @@ FREQUENCY = "rig.simulator.natural_frequency"
 
 
 @pytest.mark.parametrize("array", [float, np.array])
-def test_contact_bounds_are_twice_the_force_and_half_to_twice_the_duration(array):
+def test_contact_bounds_allow_twice_the_ideal_force_and_half_to_twice_the_duration(array):
     assert not is_peak_force_excessive(array(2.0), array(1.0)) and is_peak_force_excessive(
         array(2.001), array(1.0)
     )

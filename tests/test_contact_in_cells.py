@@ -155,7 +155,7 @@ def test_subdivisions_of_control_period_are_at_most_one_radian_and_one_time_cons
     assert counts.degree == (1 if fastest == 0 else 8 if fastest <= 0.12 else 16)
 
 
-def test_merged_cell_counts_suffice_for_every_mechanism():
+def test_merged_subdivision_counts_suffice_for_every_mechanism():
     whole, windowed, plain = CellCounts(0, 16, 16), CellCounts(2, 64, 8), CellCounts(4, 0, 8)
     assert merge_cell_counts([NO_CELLS, NO_CELLS]) == NO_CELLS
     assert merge_cell_counts([NO_CELLS, plain]) == plain
@@ -174,7 +174,7 @@ def test_fastest_simulator_pole_is_correct_for_every_order():
     np.testing.assert_allclose(fastest_pole(pair), 50.0, rtol=1e-12)
 
 
-def test_exact_loop_differs_from_sampled_loop_only_in_cell_counts():
+def test_exact_simulation_differs_from_sampled_simulation_only_in_subdivision():
     parsed = validated(mechanism({}, second_order(12.0), period=1e-3))
     scenarios = join([build_scenarios(parsed)])
     plain = build_loop(parsed, "none", scenarios)

@@ -47,7 +47,7 @@ def test_undamped_hardening_contact_matches_closed_form():
 
 
 @pytest.mark.parametrize("name", [name for name in CONTACT_LAWS if name != "piecewise_linear"])
-def test_single_surface_equals_two_surfaces_infinitely_apart(name):
+def test_contact_with_single_surface_equals_two_surfaces_infinitely_apart(name):
     law, parameters = CONTACT_LAWS[name], contact(damping=260.0, preload=3.0, friction=2.0)
     position, velocity = np.array([-1e-3, -0.0, 1e-5, 2e-4, 2e-4, np.nan]), np.array([1, -1, 2, -3, 0, 1e-3])
     state = law.init(jnp.asarray(position))

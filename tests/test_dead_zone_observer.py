@@ -21,7 +21,7 @@ def led():
     return first_contact(MECHANISM, scenario, "phase_lead", nominal_gains(MECHANISM, "phase_lead"))
 
 
-def test_dead_zone_shifts_the_surface(led):
+def test_force_sensor_dead_zone_shifts_the_apparent_surface(led):
     """The surface moves by dz/k: the hardware is pressed by dz more and rebounds at the same speed."""
     assert led["restitution"][1] == pytest.approx(led["restitution"][0], abs=1e-4)
     assert led["peak_force"][1] - led["peak_force"][0] == pytest.approx(DEAD_ZONE, rel=1e-3)

@@ -142,7 +142,7 @@ def test_global_search_keeps_evaluation_budget_and_constant_batch_shape():
     assert result.loss == kinked(result.point)
 
 
-def test_mirror_maps_points_into_unit_box():
+def test_reflection_at_bounds_maps_points_into_unit_box():
     np.testing.assert_allclose(
         reflect_into_box(np.array([-0.2, 0.3, 1.2, 2.1, -1.4])), [0.2, 0.3, 0.8, 0.1, 0.6]
     )

@@ -85,7 +85,7 @@ def test_simulate_runs_or_rejects_extreme_value_in_one_line(jaxhil, change):
     check_simulate(jaxhil, "rig-300kg", ["uncertainty={}", change])
 
 
-def test_load_rejects_very_long_list():
+def test_load_rejects_mechanism_with_very_long_list():
     for key in ("contact.stiffness", "contact.damping", "contact.depths"):
         with pytest.raises(jaxhil.InputError, match=f"{key}: found a list of 10000000 entries"):
             jaxhil.load("rig-300kg", {key: [1.0] * 10_000_000})

@@ -64,7 +64,7 @@ def test_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 200
 
 
-def test_guide_links_resolve(page):
+def test_guide_has_no_broken_links(page):
     links = [target for target, _ in LINK.findall(page.read_text(encoding="utf-8"))]
     missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
     assert not missing

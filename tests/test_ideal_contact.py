@@ -342,7 +342,7 @@ def test_undamped_ideal_contact_has_derivative_with_respect_to_damping(function,
 
 @pytest.mark.parametrize("function", [FREE, HELD, POWER, BUFFER])
 @pytest.mark.parametrize("damping", [0.0, 1e-300, 1e-16, 1e-8, 0.5, 1.0, 2 - 1e-15, 2.0, 2 + 4e-15, 1e3, 1e6])
-def test_ideal_contact_is_never_nan(function, damping):
+def test_ideal_contact_results_are_never_nan(function, damping):
     parameters = {
         FREE: [1.0, 1.0, damping, 1.0],
         HELD: [1.0, 1.0, damping, 1.0],

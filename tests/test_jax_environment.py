@@ -43,7 +43,7 @@ def test_cpu_affinity_is_restored_after_use_of_half_the_cores():
 
 
 @AFFINITY
-def test_all_cores_are_used_if_affinity_is_forbidden(monkeypatch):
+def test_all_cores_are_used_if_cpu_affinity_cannot_be_set(monkeypatch):
     def forbidden(*_):
         raise PermissionError
 

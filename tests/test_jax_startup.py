@@ -123,7 +123,7 @@ def test_command_result_is_unchanged_if_standard_error_is_closed(jaxhil, tmp_pat
     assert json.loads(ran.stdout) == jaxhil(*arguments).document
 
 
-def test_closed_output_pipe_is_no_error(tmp_path):
+def test_closed_output_pipe_causes_no_error(tmp_path):
     ran = run(
         "simulate", "rig-300kg", "--log", str(tmp_path / "log.csv"), shell="| true; exit ${PIPESTATUS[0]}"
     )

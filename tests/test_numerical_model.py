@@ -167,7 +167,7 @@ def test_attitude_of_axisymmetric_top_matches_closed_form(run):
     assert errors[-1] < 1e-6
 
 
-def test_momentum_is_conserved_under_any_wrench(run):
+def test_numerical_model_conserves_momentum_under_any_contact_wrench(run):
     exchanged = np.sum(np.abs(GIVEN[:, :3]), axis=(0, 1)) * PERIODS
     linear = run["linear"] - run["linear"][:1]
     assert np.all(np.abs(linear) <= 1e-12 * np.maximum(exchanged, 1))

@@ -41,7 +41,7 @@ def refused(ran, *words):
         assert word in ran.err
 
 
-def test_results_do_not_replace_third_party_files(jaxhil, thesis, untouched):
+def test_command_results_do_not_replace_third_party_files(jaxhil, thesis, untouched):
     refused(jaxhil(*COMPARE, "-o", thesis), "errors.png: found a file that jaxhil did not write")
     tune = ("tune", "rig-300kg", "-o", thesis.parent, "--set", "name='thesis'")
     refused(jaxhil(*tune), "thesis/errors.png: found a file that jaxhil did not write")

@@ -135,7 +135,7 @@ def test_merged_quantile_bins_contain_every_error():
     np.testing.assert_array_equal(count_in_bins(np.float32([0.5])), count_in_bins([0.5]))
 
 
-def test_failed_runs_count_as_the_largest_errors():
+def test_quantiles_count_failed_runs_as_the_largest_errors():
     values = [1.0] * 90 + [np.nan] * 10
     for interval in (quantile(values, 0.95), binned_quantile(count_in_bins(values), 0.95)):
         assert np.isinf(interval.value) and np.isinf(interval.high)

@@ -74,7 +74,7 @@ def most_accurate(result):
     return min(result.starts, key=lambda start: start.rms)
 
 
-def test_quiet_gains_meet_error_limit_on_fresh_scenarios(quiet):
+def test_quiet_gains_meet_error_limit_on_new_scenarios(quiet):
     result = quiet[0][0]
     accurate = most_accurate(result)
     assert result.quiet and accurate.rms < compute_training_tolerance(LIMIT, SETTINGS.scenarios or 0)
@@ -164,7 +164,7 @@ def test_quiet_gains_from_cached_program_are_identical(quiet, tmp_path):
         ({"divergence_weight": 2.0}, False),
     ],
 )
-def test_quiet_search_runs_unless_another_objective_is_requested(options, wanted):
+def test_search_for_quiet_gains_runs_unless_another_objective_is_requested(options, wanted):
     settings = TuneOptions(**options).settings()
     assert settings.quiet is wanted and settings.objective.tolerance is None
 
@@ -210,7 +210,7 @@ def test_tuning_verdict_names_the_metrics_used(changes, good, words):
     assert "sensor noise x 1" in line or "Real contacts" in line
 
 
-def test_warnings_name_peaks_and_noise_beyond_their_bounds():
+def test_tuning_warnings_report_peak_force_and_noise_beyond_bounds():
     def warned(**changes):
         result = result_of(**changes)
         return tune_verdict.command_warnings(result, tune_verdict.command_metrics(result))

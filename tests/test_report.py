@@ -130,7 +130,7 @@ def test_report_refuses_third_party_results_in_one_line(jaxhil, put, tmp_path, d
     assert not (tmp_path / "page.html").exists()
 
 
-def test_report_arguments_are_checked(jaxhil, put, tmp_path):
+def test_report_command_refuses_invalid_arguments(jaxhil, put, tmp_path):
     one = put(identified())
     for arguments, message in (
         ([], "RESULT: found none"),

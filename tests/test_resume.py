@@ -222,7 +222,7 @@ def test_resumed_comparison_computes_only_missing_results(tmp_path, monkeypatch)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGINT])
-def test_killed_process_loses_nothing(jaxhil, files, whole, tmp_path, signal_number):
+def test_killed_run_loses_no_finished_result(jaxhil, files, whole, tmp_path, signal_number):
     program = "import conftest, sys; from tuning.__main__ import main; sys.exit(main())"
     out = tmp_path / "out"
     command = [sys.executable, "-c", program, "tune", str(files), "-o", str(out), *TINY, "--resume"]

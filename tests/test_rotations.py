@@ -72,7 +72,7 @@ def test_rotation_logarithm_inverts_the_exponential_map(results):
     np.testing.assert_allclose(np.abs(results[2][:, -1] @ AXES[:, -1]), np.pi, rtol=1e-15)
 
 
-def test_left_jacobian_equals_mean_of_intermediate_rotations(results):
+def test_rotation_left_jacobian_equals_mean_of_intermediate_rotations(results):
     """Compute the mean of exp(s theta) over s in [0, 1] as a block of a matrix exponential."""
     for column in range(THETA.shape[1]):
         x, y, z = THETA[:, column]

@@ -160,7 +160,7 @@ def test_tare_removes_the_bias_from_every_reading_until_the_next_tare():
 
 
 @pytest.mark.parametrize("readings", [[25.0], [0.0, 9.0], [math.nan], [1999.0, 2001.0]])
-def test_unusable_tare_trips(readings):
+def test_controller_trips_if_tare_is_unusable(readings):
     controller = limited()
     for n in range(50):
         if controller.tare(readings[n % len(readings)]):

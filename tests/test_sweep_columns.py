@@ -71,7 +71,7 @@ def outcomes(rows_of_sweep):
     return [SCENARIO_OUTCOMES[index] for index in rows_of_sweep["outcome"]]
 
 
-def test_error_of_largest_magnitude_decides_the_outcome():
+def test_scenario_outcome_depends_on_error_of_largest_magnitude():
     result = rows([[0.005, 0.002, -0.03], [-0.009, 0.02, 0.02]], [[OK] * 3, [OK] * 3])
     np.testing.assert_array_equal(result["worst_error"], [-0.009, 0.02, -0.03])
     assert outcomes(result) == ["good", "error beyond limit", "error beyond limit"]

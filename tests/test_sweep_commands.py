@@ -96,7 +96,7 @@ def test_sobol_sweep_excludes_last_incomplete_block_from_replicates(jaxhil, gain
     assert code == 1 and "The last 4 scenarios" in out
 
 
-def test_sweep_compares_float32_with_float64(jaxhil, gains, tmp_path):
+def test_sweep_command_compares_float32_with_float64(jaxhil, gains, tmp_path):
     ran = jaxhil("sweep", gains, *TINY, "-o", tmp_path / "n", "--precision", "float32", "--json")
     compared = document(ran)["float32"]
     assert compared["scenarios"] == 64 and 0 < compared["largest_difference"] < 1e-4
@@ -219,7 +219,7 @@ def test_interrupted_sweep_keeps_verdict_and_finished_studies(jaxhil, own_store,
     assert result["drivers"] == so_far["drivers"] and result["rare"]["limit"] == 1.6
 
 
-def test_damaged_study_is_run_again(jaxhil, own_store, quick):
+def test_damaged_sweep_study_is_computed_again(jaxhil, own_store, quick):
     folder, again = own_store
     first = jaxhil(*again, *STUDIES, "--json")
     contents = {folder / one: (folder / one).read_bytes() for one in KEPT}

@@ -32,7 +32,7 @@ def test_draws_of_a_chunk_equal_corresponding_draws_of_the_whole_sweep(sampling,
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_draws_of_different_seeds_differ(sampling):
+def test_sweep_draws_of_different_seeds_differ(sampling):
     other, _ = draw_scenarios(MECHANISM, sampling, 4, 0, 100)
     for path, values in WHOLE[sampling][0].items():
         assert not np.any(values[:100] == other[path])

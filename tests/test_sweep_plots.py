@@ -89,7 +89,7 @@ def test_sweep_plots_do_not_depend_on_division_into_chunks(swept, few_points, cu
         np.testing.assert_array_equal(one, other)
 
 
-def test_stiffness_and_force_delay_are_plotted_first(usual):
+def test_sweep_plots_prefer_stiffness_and_force_delay_as_axes(usual):
     made, mechanism, rows = usual
     plan = plan_statistics(made, mechanism, rows)
     assert [one.label for one in plan.per_contact] == ["contact stiffness [kN/m]", "force delay [ms]"]

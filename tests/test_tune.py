@@ -36,7 +36,7 @@ def result():
     return tune(load().mechanism, "phase_lead", SMALL)
 
 
-def test_tuned_gains_beat_the_literature_on_fresh_scenarios(result):
+def test_tuned_gains_are_better_than_literature_gains_on_new_scenarios(result):
     before, literature, tuned = (result.figures[name] for name in ("before", "literature", "tuned"))
     assert before.rms > literature.rms > tuned.rms
     assert before.failed == literature.failed == tuned.failed == 0

@@ -201,7 +201,7 @@ def test_trip_not_caused_by_a_stall_of_the_computer_is_not_reset(varying):
     assert "force_limit" in rig.tripped and rig.forgiven == ()
 
 
-def test_failed_sensor_trips_and_the_rig_is_safe(varying):
+def test_failed_sensor_trips_the_controller_and_rig_stays_safe(varying):
     mechanism, gains = varying
     limits = {"held_readings": 3.0, "retreat_velocity": 0.01, "deceleration": 0.5, "velocity_limit": 0.1}
     law = controller(mechanism, "response_error", gains, **limits)

@@ -156,7 +156,7 @@ def test_draws_of_a_key_do_not_depend_on_other_uncertain_keys():
         np.testing.assert_array_equal(values, other[path][:, :3] if path == PHASE_KEY else other[path])
 
 
-def test_recorded_draws_are_reproduced():
+def test_recorded_uncertainty_draws_are_reproduced():
     """These numbers must not change between versions, so that recorded sweeps are reproducible."""
     values = draw(load().mechanism, 1, seed=1, first=1024)
     np.testing.assert_allclose(

@@ -102,7 +102,7 @@ def test_bad_run_that_is_not_stopped_in_time_is_counted_as_missed(tmp_path):
         ("literature", [(0.02, 8192), (0.03, DEFAULT_DRAWS), (0.03, 8192)]),
     ],
 )
-def test_watchdog_misses_none_of_a_hundred_thousand_fresh_runs(chosen, exports, tmp_path):
+def test_watchdog_misses_no_bad_run_in_a_hundred_thousand_new_runs(chosen, exports, tmp_path):
     parsed = load(DEFAULT_MECHANISM).mechanism
     loaded = gains(parsed, literature_gains(parsed, "response_error") | CHOSEN[chosen])
     exported = [export(loaded, limit, tmp_path, scenarios)[0] for limit, scenarios in exports]
