@@ -50,9 +50,6 @@ def command(request):
     return request.getfixturevalue("jaxhil")
 
 
-# Public names.
-
-
 def test_jaxhil_package_exports_and_lists_public_names():
     assert set(jaxhil.__all__) == {*OFFERED, "__version__"} <= set(dir(jaxhil))
     for name in OFFERED:
@@ -132,9 +129,6 @@ def test_simulate_rejects_any_invalid_argument_in_one_line(value):
     refusal(jaxhil.jacobian, "varying", by=value)
 
 
-# Simulating.
-
-
 @pytest.fixture(scope="module")
 def run():
     return jaxhil.simulate(jaxhil.load("varying", TWO), "phase_lead")
@@ -165,7 +159,7 @@ def test_run_ticks_are_consistent_with_contacts(run):
         in_contact = run.contact == index
         assert run.velocity_desired[in_contact][0] == pytest.approx(contact.approach_velocity, rel=1e-12)
         rebound = contact.restitution * contact.approach_velocity
-        # The contact ends a tick later, when the command has died out.
+        # The contact ends a tick later, after the command has decayed.
         assert -run.velocity_desired[in_contact][-1] == pytest.approx(rebound, rel=1e-6)
         assert np.max(np.abs(run.force_command[in_contact])) == pytest.approx(contact.peak_command, rel=1e-12)
         # M dv = -F_c T, tick by tick.
@@ -244,8 +238,6 @@ def test_simulate_rejects_unknown_setting_and_lists_available_settings(monkeypat
     assert "'gentle', 'firm' (did you mean gentle?)" in message
 
 
-# JAX settings of the caller.
-
 GUEST = """
 import jax, jax.numpy as jnp, json
 {flags}
@@ -296,8 +288,6 @@ def test_simulate_does_not_depend_on_jax_config(as_by_default):
     )
     assert plain_process(GUEST.format(flags=flags, dtype="'float64'")) == as_by_default
 
-
-# Derivatives.
 
 KEYS = {
     "rig.force_sensor.delay": 1e-7,

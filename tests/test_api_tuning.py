@@ -1,4 +1,4 @@
-"""Public interface of `tuning`: its functions give the results of the commands; one-line errors."""
+"""Public interface of `tuning`: its functions give the results of the commands, errors are one line."""
 
 import json
 import os

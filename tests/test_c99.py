@@ -1,4 +1,4 @@
-"""The C99 controller agrees with the Python runtime bit for bit: gains, limits, commands, faults."""
+"""Bit-for-bit agreement of the C99 controller with the Python runtime: gains, limits, commands, faults."""
 
 import ctypes
 import math
@@ -79,9 +79,6 @@ def test_c99_status_codes_match_runtime(batch):
     made = batch("none")
     for number in range(-1, 1 + max(numbers.values()) + 1):
         assert made.status_name(number) == STATUS_NAMES.get(number, "")
-
-
-# Gains and limits
 
 
 @pytest.mark.parametrize("delay", [101_000.0 * PERIOD, 1e306])
@@ -252,7 +249,7 @@ def test_c99_impulse_ledger_contacts_equal_python_to_the_bit(batch):
         gain_file = gain_file._replace(gains=gains, limits=limits, clearance=clearance)
         motion = rng.uniform(0, 6), rng.uniform(8, 60), 10 ** rng.uniform(-4.5, -2.7)
         rows = c99_cases.contact_rows(2000, rng, PERIOD, *motion)
-        if n % 4 == 0:  # a sensor without delay and noise
+        if n % 4 == 0:  # sensor without delay and noise
             rows[:, 1] = 1.2e5 * np.maximum(rows[:, 4], 0.0) + 0.1 * rng.standard_normal(len(rows))
         if n % 4 == 2:  # a contact that ends soon
             rows[:, 1] *= 300.0

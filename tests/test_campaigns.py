@@ -1,4 +1,4 @@
-"""The campaign generator agrees with the oracle, touch by touch."""
+"""Campaign generator compared with the oracle, contact by contact."""
 
 from dataclasses import replace
 

@@ -204,7 +204,7 @@ def test_tune_pareto_writes_gain_file_for_each_point(jaxhil, tmp_path):
     # A file left by an earlier, longer Pareto front.
     (folder / "pareto" / "07").mkdir(parents=True)
     write_gain_file(folder / "pareto" / "07" / "gains.json", case())
-    # A file that this program did not write.
+    # A file that was not written by this program.
     (folder / "pareto" / "08").mkdir(parents=True)
     (folder / "pareto" / "08" / "gains.json").write_text("{}")
     arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]

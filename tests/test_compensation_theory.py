@@ -199,7 +199,7 @@ def test_identification_with_misaligned_force_is_biased_as_predicted():
     np.testing.assert_allclose(result[-1] / damping, biased / damping, rtol=0, atol=2e-3)
 
 
-# Item 8: effect of a clamp of F_c at zero.
+# Item 8: effect of clamping F_c at zero.
 
 
 class Clamped(Compensator):

@@ -42,7 +42,7 @@ from tuning.watchdog.calibration import calibrate
 
 BIAS = 0.002  # largest bias of the mean restitution, in addition to three standard errors
 LOUDEST = 5.0  # largest noise amplification of the gains
-TICKS = 4000  # ticks of noise per run, as in noisy_plant.c
+TICKS = 4000  # ticks of noise per run; same value as in noisy_plant.c
 PLANT = Path(__file__).with_name("noisy_plant.c")
 
 

@@ -39,7 +39,7 @@ def case(**changes):
         "masses": (1800.0, 420.0),
         "inertias": (np.diag([1400.0, 1100.0, 800.0]), np.diag([150.0, 180.0, 110.0])),
         "interfaces": ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
-        "pose": (0.0, 0.0, 1e-9),  # of C against T
+        "pose": (0.0, 0.0, 1e-9),  # pose of C relative to T
         "velocity": (0.0, 0.0, -0.02),
         "angular": (0.0, 0.0, 0.0),
         "spheres": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),

@@ -1,4 +1,4 @@
-"""The generated family of mechanisms: files that load, values within their ranges, reproducible."""
+"""Generated family of mechanisms: files that load, values within their ranges, reproducible."""
 
 import math
 import subprocess

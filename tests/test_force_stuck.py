@@ -1,4 +1,4 @@
-"""A stuck force sensor trips the controller; a sensor that truly reads no force after a contact does not."""
+"""Fault force_stuck: raised for a stuck force sensor, not for a sensor that truly reads no force."""
 
 import math
 

@@ -18,7 +18,7 @@ from jaxhil.simulation.scenario import build_scenarios
 
 LANES, TICKS = 5, 1200
 WAITING = sorted(name for name, law in COMPENSATORS.items() if vars(type(law)).get("waits_for_contact"))
-EVERYDAY = "none", "response_error"  # each compensator takes two programs
+EVERYDAY = "none", "response_error"  # each compensator needs two compiled programs
 
 
 def case(law, mechanism="varying", overrides=()):

@@ -1,4 +1,4 @@
-"""A corrupted gain file is rejected or loads exactly the same values."""
+"""Corrupted gain files: rejected, or loaded with exactly the same values."""
 
 import json
 import random

@@ -98,7 +98,7 @@ def test_contact_gate_is_continuously_differentiable_in_crossing_time():
         return gate(shares[1:], shares[:-1])
 
     slope_of = jax.jit(jax.jacfwd(gates_of))
-    for at in (-1.0, 0.0, 2.0):  # where an onset moves to another tick
+    for at in (-1.0, 0.0, 2.0):  # times at which an onset moves to another tick
         slopes = [slope_of(jnp.asarray(at + side)) for side in (-1e-9, 0.0, 1e-9)]
         np.testing.assert_allclose(slopes[0], slopes[2], rtol=0, atol=1e-8)
         np.testing.assert_allclose(slopes[1], slopes[2], rtol=0, atol=1e-8)
@@ -127,6 +127,6 @@ READINGS = NORMAL | st.sampled_from([0.0, 1e-300, -1e-300, -CLEARANCE])
 def test_contact_gates_of_jax_and_runtime_agree_and_have_finite_derivatives(readings, clearance):
     x = np.array(readings)[:, None]
     np.testing.assert_allclose(on_jax(x, clearance), rig(x, clearance), rtol=0, atol=1e-12)
-    # The slope of a change of a few denormals overflows.
+    # The derivative for a change of a few denormals overflows.
     if np.abs(np.diff(x, axis=0))[np.diff(x, axis=0) != 0].min(initial=1.0) > 1e-150:
         assert np.all(np.isfinite(slope(jnp.asarray(x[:, 0]), clearance)))

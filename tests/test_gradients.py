@@ -216,7 +216,6 @@ def events(loop, scenario, values):
         line.start(measured[0, lane], ticks.signals.velocity_desired[0, lane])
         aligned[:, lane] = [line.step(x) for x in measured[:, lane]]
     running = ticks.active
-    # All recorded contacts have ended.
     assert not running[-1].any()
 
     def whole(delay):

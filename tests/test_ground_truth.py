@@ -1,8 +1,8 @@
-"""The closed loop compared with the closed forms of model.md, section 6, and with SciPy for T -> 0.
+"""Closed loop compared with the closed forms of model.md, section 6, and with SciPy for T -> 0.
 
 The order of convergence is that of the error's root mean square over contact phases, and, with a delay, over
-contact frequencies within 10 %: at any single frequency the last sample before separation falls differently
-for each T, and the error varies irregularly.
+contact frequencies within 10 %: at a single frequency the last sample before separation falls differently for
+each T, and the error varies irregularly.
 """
 
 from math import pi
@@ -229,7 +229,7 @@ def test_work_of_nonlinear_contact_converges_to_continuous_solution(nonlinear, n
     assert np.abs(work_in[-1] - 1).max() < (1e-3 if damped else 2e-4)
 
 
-# Item 7; for hold and latency see above.
+# Item 7; tests above cover hold and latency.
 
 
 @pytest.mark.parametrize(

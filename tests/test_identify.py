@@ -59,7 +59,7 @@ def test_identified_mechanism_file_loads_with_uncertainty_and_correlation(clean,
     apparent = (
         draws["contact.damping"][:, 0] - draws["contact.stiffness"][:, 0] * draws["rig.force_sensor.delay"]
     )
-    # The floors of the delay and the stiffness alone are 2e-5 s and 0.1 %.
+    # The lower bounds of the standard deviations of delay and stiffness are 2e-5 s and 0.1 %.
     floor = np.hypot(1.2e5 * 2e-5, 0.001 * 1.2e5 * 0.0037)
     assert apparent.std() < 1.3 * np.hypot(clean["apparent damping"].std, floor)
 

@@ -24,7 +24,7 @@ from tuning.identification.records import CampaignTiming
 
 TIMING = CampaignTiming(0.001, "linear", 0, "tick", None)
 MODEL = MotionModel(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
-NEAR = (0.0037, 0.0)  # s, m; the true delay and surface
+NEAR = (0.0037, 0.0)  # true delay [s] and surface position [m]
 HERTZ = find_contact_law("hunt_crossley").regression(SimpleNamespace(exponent=1.5))
 (KINKED,) = find_contact_law("piecewise_linear").families(0.0008, 1)
 COLOURED = (1.0, -0.6, 0.1)

@@ -18,7 +18,7 @@ from tuning.statistics.intervals import (
     update_sequence,
 )
 
-BAR = 0.935  # required coverage over repeated sweeps, for stated 95 %
+BAR = 0.935  # required coverage of repeated sweeps for intervals of stated 95 %
 PROBABILITIES = (0.5, 0.2, 0.05, 0.01, 0.001)
 
 
@@ -73,7 +73,7 @@ def test_confidence_sequence_equals_mixture_martingale():
     result = confidence_sequence(failures, number)
     prior = stats.beta(0.5, 0.5)
     mixture, _ = integrate.quad(
-        # The substitution p = sin^2 removes the singularities of the prior.
+        # The substitution p = sin^2(theta) removes the singularities of the prior.
         lambda angle: (
             prior.pdf(np.sin(angle) ** 2)
             * 2
@@ -153,7 +153,7 @@ def test_confidence_sequence_has_stated_coverage_if_stopped_at_a_width(probabili
         )
     assert coverage >= BAR
     assert 0.7 * width < mean <= width
-    # The forecast has the right order of magnitude.
+    # The predicted number of scenarios has the right order of magnitude.
     assert 0.7 < needed / estimate_sequence_scenarios(probability, width) < 1.4
     # Repeat one of the sweeps look by look.
     running = SequentialState()

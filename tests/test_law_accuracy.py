@@ -32,7 +32,7 @@ LAW, SEED = "impulse_ledger", 0xACC  # seed of scenarios used for no tuning or e
 CONTACTS = 4
 
 
-# Largest rms, 99th percentile and maximum of a contact's error [%], least transparency.
+# Limits: rms, 99th percentile and maximum of a contact's error [%], and smallest transparency.
 RMS, PERCENTILE, LARGEST, TRANSPARENCY = 0.5, 1.5, 3.0, 0.75
 
 

@@ -82,7 +82,7 @@ def ran(name: str, limits: str) -> tuple[Controller, Ran]:
     return law, run(mechanism, law)
 
 
-# All kinds run without the audit; with it, only some run every day.
+# Without energy audit, all kinds run every day; with it, only some.
 @pytest.mark.parametrize(
     "name, limits",
     [

@@ -48,7 +48,7 @@ def moves(speeds):
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.lists(st.floats(-0.08, 0.08), min_size=8, max_size=8))
 def test_command_velocity_and_acceleration_limits_hold_for_any_motion(speeds):
-    # The drives can reach the first speed.
+    # The drives can reach the initial speed.
     speeds[0] = np.clip(speeds[0], -VELOCITY_LIMIT, VELOCITY_LIMIT)
     commands = limited(moves(np.repeat(speeds, 12)), VELOCITY_LIMIT, ACCELERATION_LIMIT)
     steps = np.diff(commands)
@@ -68,7 +68,7 @@ def gap(distance, speed=0.0):
 def test_limited_command_reaches_displaced_target(distance, speed):
     behind = gap(distance, speed)
     assert np.all(behind[:2] == 0) and abs(behind[-1]) < 1e-12
-    # The gap closes all the way and is never overshot.
+    # The gap closes completely and is never overshot.
     assert np.diff(behind[2:]).max() < 1e-15
     assert behind.min() > -1e-15
 
@@ -115,7 +115,7 @@ def test_command_limits_that_are_not_reached_leave_commands_bit_identical(offset
     targets = smooth.astype(dtype)
     for limits in (loose, (loose[0], np.inf), (np.inf, loose[1])):
         np.testing.assert_array_equal(limited(targets, *limits), targets)
-    # A limit that is this much lower does bind.
+    # A limit that is lower by this amount does bind.
     assert np.abs(limited(targets, loose[0] / margin**2, np.inf) - targets).max() > 1e-6
     assert np.abs(limited(targets, np.inf, loose[1] / margin**2) - targets).max() > 1e-7
 
@@ -157,7 +157,7 @@ def test_command_limits_hold_over_a_whole_contact(limits):
     assert np.abs(np.diff(steps)).max() <= limits[1] * PERIOD**2 * (1 + 1e-9)
     # The limits are reached in this contact: the model is faster than the drives.
     assert metrics.status[0, 0] == OK
-    # Count from the first touch to the tick at which the contact ends and is no longer active.
+    # Ticks from the first touch to the tick at which the contact ends.
     begin, end = np.argmax(np.asarray(ticks.plant_signals.force)[:, 0] != 0), np.argmin(going)
     largest = behind[begin : end + 1].max()
     assert largest > 1e-6 and metrics.position_shortfall[0, 0] == pytest.approx(largest, rel=1e-9)

@@ -142,7 +142,7 @@ def test_log_commands_and_forces_sampled_at_another_rate_are_detected(tmp_path, 
 def far_side():
     """Simulate a contact, and the flight to a contact on the far side of a clearance of 2 mm."""
     log = touches(2)
-    back = int(np.flatnonzero(np.diff(np.sign(log["vd"])) > 0)[0]) + 1  # the log is driven back there
+    back = int(np.flatnonzero(np.diff(np.sign(log["vd"])) > 0)[0]) + 1  # start of the commanded return motion
     other = {name: -column for name, column in log.items() if name != "t"}
     other = other | {name: other[name] - 2e-3 for name in ("xd", "xm")}
     both = {name: np.concatenate([log[name][:back], other[name]]) for name in other}

@@ -69,7 +69,7 @@ def test_readings_with_own_clock_are_interpolated_to_times_of_log_rows(late, rat
     sampled = (late + PERIOD * rate * np.arange(count))[random.uniform(size=count) >= lost]
     ticks = np.flatnonzero(random.uniform(size=ROWS) >= lost)
     kept, force, _ = joined(sampled, scattered(sampled, jitter * rate, seed), ticks, jitter)
-    # Between readings a period apart the signal bends by T^2 / 8 of its curvature.
+    # Between readings a period apart, the interpolation error is T^2 / 8 times the curvature.
     bent = (2 * np.pi * 7.1) ** 2 * PERIOD**2 / 8
     moved = (2 * np.pi * 7.1) * (0.02 * PERIOD + jitter)
     assert np.max(np.abs(force - smooth(PERIOD * kept))) < bent + moved
@@ -150,7 +150,7 @@ def test_log_channel_is_aligned_by_time_stamps_named_in_mapping_file(tmp_path, l
     shift, first = round(1e3 * late), np.flatnonzero(log["xd"] == run.position_desired[0])[0]
     np.testing.assert_array_equal(run.force_measured, log["F"][first - shift : first - shift + len(run.tick)])
     assert f"which begin {abs(shift)} ms" in campaign.notes[0]
-    # They cannot be joined by row numbers.
+    # Different numbers of rows cannot be aligned by row number.
     with pytest.raises(InputError, match="found columns of different lengths"):
         read(tmp_path / "a.h5", **TIMES | {"force_measured": "f/F"})
     with pytest.raises(InputError, match=r"channels.force_measured.time is given"):

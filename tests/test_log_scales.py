@@ -123,7 +123,7 @@ def test_uninformative_force_command_column_is_ignored_with_a_note(tmp_path):
     assert all(run.force_command is None for run in result.runs)
     result = read(write_csv(tmp_path / "b.csv", LOG | {"Fc": 0.0 * LOG["Fc"], "vd": 0.0 * LOG["vd"]}))
     assert "force_command: ignored, because it is 0 N in every contact" in "\n".join(result.notes)
-    # The measured force is then compared with the momentum of the positions.
+    # Without force_command, the measured force is compared with the change of momentum.
     assert "force in lbf" in refused(tmp_path, scaled(noise, F=1 / LBF))
 
 

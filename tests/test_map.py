@@ -18,7 +18,7 @@ from tuning.stability_map import grid
 from tuning.stability_map.closed_forms import critical_delay, restitution_by_root, restitution_by_series
 from tuning.stability_map.contact_growth import LINEAR_COMPENSATORS, compute_growth
 
-SOFT = {  # one contact of about 4.8 s; the other motions are almost uniform on this scale
+SOFT = {  # one contact of about 4.8 s; other dynamics are much faster
     "approach.contacts": 1, "contact.stiffness": [150.0], "contact.damping": [0.4], "uncertainty": {},
 }  # fmt: skip
 IDEAL = {

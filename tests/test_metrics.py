@@ -66,15 +66,15 @@ HUMP = 60 * np.sin(np.linspace(0, np.pi, 101))
         # An undershoot is part of the swing, wherever it is.
         (np.concatenate([HUMP, -0.2 * HUMP]), 0),
         (np.concatenate([-0.2 * HUMP, HUMP]), 0),
-        # A second hump and a third add a swing each.
+        # Each further maximum adds a swing.
         (np.concatenate([HUMP, HUMP]), 60),
         (np.concatenate([HUMP, 0.25 * HUMP, HUMP]), 75),
-        # A spike of ten peaks on the way up is itself a swing to the peak: the hump is one too many.
+        # A spike of ten times the peak is the regular swing; the following hump counts as excess.
         (np.concatenate([[600], HUMP]), 60),
         (np.concatenate([[600, -200], HUMP]), 60),
-        # Ripple of 2 N on a plateau of 60: 20 times up, of which one belongs to the swing.
+        # Ripple of 2 N on a plateau of 60 N: 20 rises, one of which belongs to the regular swing.
         (60 + np.tile([0, 2], 20), 2 * 19),
-        # A limit cycle: ten swings through the whole range of 100 N.
+        # Limit cycle: ten swings through the whole range of 100 N.
         (np.tile([50, -50], 10), 9 * 100),
     ],
 )
@@ -113,7 +113,7 @@ def test_excess_variation_derivatives_equal_those_of_explicit_sum():
 
     up, down = (float(excess(commands + step * way, touching)) for step in (1e-6, -1e-6))
     assert float(slope(commands)) == pytest.approx((up - down) / 2e-6, rel=1e-7)
-    # If nothing moves, neither direction is preferred.
+    # If the command is constant, neither direction is preferred.
     assert np.isfinite(slope(np.where(touching, 60.0, 0.0)))
 
 

@@ -77,7 +77,7 @@ def test_injected_fault_without_effect_is_not_counted(rates):
 def test_watchdog_that_detects_every_error_misses_no_injected_fault(rates):
     for name in ("force_delay", "simulator_delay"):
         assert fault(rates, name)["alarms"] == 0 and fault(rates, name)["high"] < 0.06
-    assert rates["missed_alarms"]["runs"] == 0  # no draw is bad, so that nothing could be counted on draws
+    assert rates["missed_alarms"]["runs"] == 0  # no draw is bad, so none can be missed
 
 
 def test_watchdog_without_restitution_check_misses_every_injected_fault():
@@ -92,7 +92,7 @@ def test_watchdog_without_restitution_check_misses_every_injected_fault():
 
 def test_neutral_gains_are_injected_as_fault_only_if_gains_have_an_effect(rates):
     result = calibrated("phase_lead")
-    # Nothing is late here: the literature's lead is already 0, and there is nothing to remove.
+    # There is no delay here, so the literature's lead is already 0.
     names = [kind.name for kind in INJECTED_FAULTS if kind.name != "gains"]
     assert [run["name"] for run in result["fault_runs"]] == names
     assert fault(result, "force_delay")["runs"] == NUMBER

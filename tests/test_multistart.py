@@ -16,7 +16,7 @@ from tuning.gains.tasks import build_task, spread_points
 from tuning.gains.validation import build_validation
 
 SCANNED = TuneSettings().scanned
-FEW = 32  # points of a scan whose result is not tested
+FEW = 32  # points of scans whose result is not checked
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def test_starting_gains_are_literature_gains_and_best_points_of_a_scan(tasks, va
         values = validation.losses(RMS_OBJECTIVE, [index], points[None])[0]
         looked_at = spread_points(points[0], SCANNED, 3)
         every = validation.losses(RMS_OBJECTIVE, [index], looked_at[None])[0]
-        # The best gains lie apart from the literature's, and so do those of all tasks from each other.
+        # The selected points differ clearly from the literature's gains and from each other.
         assert np.min(every) <= values[1] <= np.quantile(every, 0.05)
         assert (values[1:] < np.median(every)).all()
         assert (np.diff(values[1:]) >= 0).all()

@@ -86,10 +86,10 @@ def test_noise_amplification_matches_simulated_loop_in_steady_contact():
     _, lead = steady_contact(**LEAD_ALONE)
     expected = amplified("response_error", gains)[0]
     assert expected > 3
-    # 40000 samples, neighbours of which are anticorrelated.
+    # 40000 samples, with anticorrelated neighbours.
     np.testing.assert_allclose(np.std(lead) / DEVIATION, expected, rtol=0.005)
     np.testing.assert_allclose(np.std(whole) / DEVIATION, expected, rtol=0.01)
-    # The noise is the same; identification independently adds a tenth, which is half a percent in all.
+    # The same noise through the identification adds independently a tenth, 0.5 % of the sum.
     assert 0 < np.std(whole - lead) < 0.15 * np.std(lead)
 
 

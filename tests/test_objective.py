@@ -38,7 +38,7 @@ NAMES = ("phase_lead", "lead_filter")
 GAINS = np.array([[0.004, 0.001], [0.0077, 0.0031], [0.002, 0.0008]])
 SCENARIOS = 6
 SLOTS = 144
-SHORT = 2  # the scenario with too little time for its contacts
+SHORT = 2  # index of the scenario whose time is too short for its contacts
 STATED = Objective("rms", 2.0, 0.3, 0.004, 0.05, limit=1.0)
 
 
@@ -319,7 +319,7 @@ def test_error_metrics_of_known_errors_are_exact():
         == evaluate_objective(Objective("worst"), errors)
         == 0.04
     )
-    # Twice the weight on divergence makes it the worst.
+    # With twice the weight on divergence, this error is the worst.
     for name in ("cvar", "worst"):
         assert evaluate_objective(Objective(name, 2.0), errors) == pytest.approx(np.sqrt(2) * 0.03, rel=1e-14)
     assert evaluate_objective(Objective("worst"), np.array([0.1, np.nan])) == FAILED_CONTACT_ERROR
@@ -331,7 +331,7 @@ def test_error_metrics_of_known_errors_are_exact():
         replace(stated, chatter_weight=0.02), errors, excesses, 4.0, np.array([3.0, 1.0])
     )
     assert swings == pytest.approx(np.sqrt(whole**2 + 0.02**2 * 5), rel=1e-14)
-    # A command quieter than the measured force gains nothing.
+    # A noise amplification below 1 gives no benefit.
     assert evaluate_objective(stated, errors, None, 0.5) == 0.04
     assert alone(stated, errors, (), 0.5)[0][-1] == 0
 

@@ -239,7 +239,7 @@ def test_oracle_applies_sensor_effects_in_documented_order():
 def test_oracle_samples_position_before_step_of_ideal_zero_order_hold():
     case = mechanism(contact={"law": "linear", "stiffness": [1e5]}, command_hold="zoh")
     signals = simulate(case, record=True)[0]["signals"]
-    # Over [t_{n-1}, t_n) the drives hold x_d(n): the tick reads k x_d(n), not k x_d(n + 1).
+    # In [t_{n-1}, t_n) the drives hold x_d(n): the sensor at tick n reads k x_d(n), not k x_d(n + 1).
     expected = 1e5 * np.maximum(0.0, signals["x_desired"])
     assert np.allclose(signals["force_measured"], expected, rtol=0.0, atol=1e-12)
 
@@ -291,7 +291,7 @@ def test_oracle_uses_successive_stiffnesses_at_alternating_surfaces():
             force_delay=0.001,
             approach={"velocity": result["approach_velocity"]},
         )
-        # Another contact phase of otherwise the same contact.
+        # The contact phase is another, which changes the restitution slightly.
         assert result["restitution"] == pytest.approx(simulate(alone)[0]["restitution"], abs=4e-3)
     speeds = [r["restitution"] * r["approach_velocity"] for r in results]
     assert [r["approach_velocity"] for r in results[1:]] == pytest.approx(speeds[:-1], rel=1e-12)

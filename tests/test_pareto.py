@@ -68,9 +68,6 @@ def errors_of(loop, scenarios, gains):
     return outcome.error[outcome.wanted]
 
 
-# Evaluation of a point
-
-
 def test_pareto_weights_are_in_units_of_the_objective():
     light, heavy = LADDER_ENDS
     weights = build_weight_ladder(8, error=0.012, excess=3.0)
@@ -79,7 +76,7 @@ def test_pareto_weights_are_in_units_of_the_objective():
     assert 3.0 * weights[-1] == pytest.approx(heavy * 0.012)
     np.testing.assert_allclose(np.diff(np.log(weights[1:])), math.log(heavy / light) / 6, rtol=1e-12)
     assert build_weight_ladder(2, 0.012, 3.0) == pytest.approx([0, heavy * 0.004])
-    # With next to no noise to begin with, there are still weights, and finite ones.
+    # With almost no noise, weights still exist and are finite.
     assert np.isfinite(build_weight_ladder(8, 0.012, 0.0)).all()
 
 
@@ -106,7 +103,7 @@ def test_pareto_noise_amplification_equals_that_of_lead_filter(compensator):
     assert compute_noise_amplification(mechanism, compensator, gains) == pytest.approx(expected, rel=1e-10)
 
 
-# These pass the measured force on as it is.
+# These compensators return the measured force unchanged.
 NO_TRADE_OFF = ["none", "position_lead", "virtual_contact", "passivity", "impulse_ledger"]
 
 
@@ -210,4 +207,4 @@ def test_pareto_search_keeps_all_objective_settings_except_noise_weight(results,
     pareto_search.solve_weight_ladders(validation, results[:1], 3, settings)
     for objectives in seen:
         assert [dataclasses.replace(one, noise_weight=0.5) for one in objectives] == [objective] * 3
-    assert len(seen) == 2  # the second found nothing better
+    assert len(seen) == 2  # the second search has found no better gains

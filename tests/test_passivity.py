@@ -41,7 +41,7 @@ def check(forces, velocities, period):
         energy += taken
         moved += abs(taken)
         corrected += command != force
-        # The smallest numbers have no relative precision.
+        # Subnormal numbers have no relative precision.
         least += Fraction(5e-324) * (1 + abs(Fraction(force)) + abs(Fraction(velocity)))
         assert energy >= -moved * len(forces) * Fraction(2 * EPSILON) - 2 * least
     return corrected
@@ -70,7 +70,7 @@ def test_passivity_observer_energy_stays_nonnegative_for_hostile_readings(rows):
 def test_passivity_observer_resets_energy_that_overflows():
     law = ON_THE_RIG["passivity"]({}, 1e-3, math.inf)
     assert law.step(1e308, 0.0, 1e308, 0.0) == 1e308
-    # No energy was taken, so none is returned.
+    # No energy was received, so none is returned.
     assert law.step(5.0, 0.0, -1.0, 0.0) == 0.0
 
 

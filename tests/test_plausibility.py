@@ -83,7 +83,7 @@ def test_mechanism_summary_of_every_contact_law_matches_ideal_contact():
     laws = {
         "linear": ({}, *spring),
         "kelvin_voigt": ({}, *spring),
-        # At its largest depth one slope is as good as three equal ones.
+        # Up to the largest depth, three equal slopes equal one slope.
         "piecewise_linear": ({"stiffness": [[STIFFNESS] * 3], "depths": [1e-5, 2e-4]}, *spring),
         "hunt_crossley": ({"stiffness": [6e6]}, *power_law(6e6, 1.5)),
         "depth_damped": (
@@ -91,7 +91,7 @@ def test_mechanism_summary_of_every_contact_law_matches_ideal_contact():
             *power_law(4e8, 2.0),
         ),
         "squared_spring": ({"stiffness": [4e8]}, *power_law(4e8, 2.0)),
-        # With so large a depth it does not stiffen.
+        # With so large a reference depth the contact does not stiffen.
         "hardening": ({"reference_depth": 10.0}, *spring),
         "elastoplastic": ({"unloading_ratio": 4.0}, spring[0], 0.75 * spring[1]),
         "preloaded": ({}, *spring),
@@ -161,7 +161,7 @@ def test_ideal_simulator_has_no_bandwidth():
 @pytest.mark.parametrize(
     ("key", "plausible", "implausible", "said"),
     [
-        # Contact at 5 Hz of 300 kg, and similar values.
+        # Contact of 300 kg at 5 Hz, and similar mechanisms.
         ("rig.control_period", 0.03333, 0.03334, "contact.stiffness: found a contact frequency of 3 Hz"),
         (
             "contact.stiffness",
@@ -335,9 +335,6 @@ def test_tune_prints_mechanism_summary_on_request(capsys):
     line, warning, *_ = message.err.splitlines()
     assert line == summarise_mechanism(sensor).line("rig-300kg")
     assert warning == f"warning: rig-300kg: {summarise_mechanism(sensor).warnings[0]}"
-
-
-# The commands.
 
 
 def test_simulate_output_begins_with_mechanism_summary_line(jaxhil):

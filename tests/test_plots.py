@@ -163,7 +163,7 @@ def test_contact_plot_shows_contacts_side_by_side_with_units():
     figure = plot_contacts(pieces(), "title")
     force, _, position, _ = figure.axes
     assert "[N]" in force.get_ylabel() and "[mm]" in position.get_ylabel() and "[ms]" in position.get_xlabel()
-    # The speed of a curve's approach is stated where it differs visibly.
+    # The approach speed is stated for curves on which it differs visibly.
     assert force.get_title() == "contact 1, entered at 5 mm/s\n(before: 7 mm/s)"
     assert len(figure.legends) == 1
     assert "the first 4 of 6 contacts" in plot_contacts(pieces(6), "title").get_suptitle()

@@ -144,7 +144,7 @@ def runs(draw):
         *(NUMBERS, PLACES, NUMBERS, PLACES, st.floats(0.0, 1.0), st.just(0.0), PLACES, NUMBERS, NUMBERS),
     )
     rows = draw(st.lists(row, min_size=1, max_size=25))
-    if draw(st.booleans()):  # a rig that stands near the model, so that runs last long
+    if draw(st.booleans()):  # drives near the model, so that runs last long
         rows = [(*row[:4], row[2] - 1e-5, *row[5:7], row[2] + 1e-5, *row[8:]) for row in rows]
     return GainFile(law, gains, PERIOD, clearance, limits), np.array(rows)
 
@@ -167,7 +167,7 @@ def test_position_command_stays_near_drive_position_for_a_million_ticks(law):
         Reference(gain_file).follow(rows, made.run(rows, True))
 
 
-# Cases in which the drives once jumped
+# Past faults: cases in which the drives jumped.
 
 
 def plain(law: str = "none", **limits: float) -> GainFile:

@@ -169,9 +169,6 @@ def test_search_for_quiet_gains_runs_unless_another_objective_is_requested(optio
     assert settings.quiet is wanted and settings.objective.tolerance is None
 
 
-# The verdict
-
-
 def result_of(rms=0.005, silent=0.004, failed=0, unlike=0.0, peaks=(1.0, 1.2), gains=(0.0, 0.001)):
     """Return a tuning result with the fields that the verdict uses."""
 

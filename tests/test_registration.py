@@ -35,7 +35,7 @@ def test_user_registered_compensator_is_simulated(registered):
     filtered = jaxhil.simulate(mechanism, "phase_lead").contacts[0].error
     assert run.contacts[0].error == pytest.approx(filtered, abs=2e-3)
     assert run.contacts[0].error < none.contacts[0].error - 0.1
-    by = ["gains.toy_lead"] * len(KEYS)  # as many as the other tests use
+    by = ["gains.toy_lead"] * len(KEYS)  # the same number as in other tests, to share a program
     slope = jaxhil.jacobian(mechanism, "scaled_lead", by=by)["gains.toy_lead"]
     step = 1e-6
     high, low = (

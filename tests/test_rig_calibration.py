@@ -191,7 +191,7 @@ def test_rig_specific_limits_are_preserved_and_counted_as_false_alarms():
     small = {"force_limit": 1e-3, "command_lowest": -0.05}
     result = calibrate(ONE_SIDED, scenarios=64, limit=LIMIT, replaced=small)
     assert {name: result.limits[name] for name in small} == small
-    # A limit that no run satisfies stops the good ones too.
+    # A limit that no run satisfies also stops good runs.
     rate = result.rates["false_alarms"]
     assert rate["alarms"] == rate["runs"] > 0
 
@@ -305,7 +305,7 @@ def test_calibrated_watchdog_misses_no_bad_run_in_a_hundred_thousand_scenarios()
     assert false["runs"] + missed["runs"] > 60_000 and missed["runs"] > 10_000
     assert missed["alarms"] == 0 and missed["high"] < 5e-4
     assert false["high"] < 1e-4
-    # Compare verdicts by the controller itself, on other draws.
+    # Compare with verdicts of the controller itself on other draws.
     rules, distance = build_audit_rules(loaded)
     controller = limited_controller(loaded, build_limits_section(limits))
     (chunk,) = record_selection(loaded, ScenarioSelection("random", 1, 1024))

@@ -51,7 +51,7 @@ def effective_mass():
 def cases():
     """Return masses, moments, contact points, speeds, delays and friction of every lane, lanes last."""
     masses = np.tile(MASSES[:, None], LANES)
-    # Central contact whose equivalent mass is the effective mass of the one off the line.
+    # Central contact whose equivalent mass equals the effective mass of the off-centre contact.
     masses[:, LIGHT] *= effective_mass() / 350
     points, speeds = np.zeros((3, LANES)), np.tile([[0.0], [0.0], [-0.005]], LANES)
     points[:, OFF:LIGHT] = ARM[:, None]

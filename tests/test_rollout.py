@@ -144,8 +144,6 @@ def test_rollout_with_sensor_lag_agrees_with_oracle_at_every_control_period():
         assert restitution == pytest.approx(expected["restitution"], rel=0, abs=accuracy)
 
 
-# Signals of a lane's run, tick by tick
-
 RECORDED = ("response error", "late position", "dead zone", "quantum", "range", "velocity limit")
 
 
@@ -210,8 +208,6 @@ def test_recorded_rollout_signals_agree_with_metrics(recorded):
         assert velocity[-1] < 0 and force[-1] == 0
 
 
-# Lanes and programs
-
 STICKY = mechanism(
     {"damping": [2.4 * (STIFFNESS * MASS) ** 0.5], "tension": True},
     {**SECOND_ORDER, "natural_frequency": 100.0, "delay": 0.0},
@@ -250,7 +246,7 @@ def test_rollout_reports_a_contact_status_for_every_scenario(mixed):
         "padding": NOT_REACHED,
     }
     assert np.all(metrics.status[1:] == NOT_REACHED)
-    # A contact may last 10 s, and no run ends more than a segment later.
+    # A contact may last 10 s, and a run ends at most one segment later.
     sticks = batch.names.index("sticks")
     assert 0 <= metrics.ticks[0, sticks] * PERIOD - 10.0 < 0.2
     assert metrics.restitution[0, batch.names.index("runs away")] > 1e3

@@ -23,7 +23,7 @@ from jaxhil.sixdof.vectors import Vector, components, inverse, matrix, vector
 SEEDED = np.random.default_rng(5)
 AXES = SEEDED.normal(size=(3, 40))
 AXES /= np.linalg.norm(AXES, axis=0)
-# Both sides of the limit of the series, and as near to 0 and to half a turn as numbers allow.
+# Both sides of the limit of the series, and the smallest distances to 0 and to half a turn.
 ANGLES = np.r_[0.0, 1e-300, 1e-160, 1e-20, 1e-9, 1e-4, np.linspace(1e-3, 0.6, 17), np.linspace(0.7, 3.1, 15),
                np.pi - 1e-9, np.pi]  # fmt: skip
 THETA = AXES * ANGLES

@@ -95,7 +95,7 @@ def test_constant_force_in_contact_raises_force_stuck_fault(side):
             first = n
             break
     if side > 0:
-        # 7 N since tick 1: from there on the travel is 5 um a tick.
+        # The force is 7 N since tick 1; from then on the travel is 5 um per tick.
         assert controller.cause == FORCE_STUCK and first in (1 + 40, 1 + 41)
     else:
         assert first is None

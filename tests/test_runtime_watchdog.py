@@ -105,7 +105,7 @@ def test_watchdog_audits_every_contact_between_two_surfaces():
     _, _, velocities = bounce(controller, clearance=2e-3, late=1, ticks=6000)
     turns = sum(a * b < 0 for a, b in itertools.pairwise(velocities))
     assert turns > 5 and controller._watchdog.contacts in (turns - 1, turns)
-    # Each contact is 3 % faster; the first is stopped before the far surface is reached.
+    # Each contact is 3 % faster than the last; the first is stopped before the far surface.
     controller = watched(2e-3)
     _, positions, _ = bounce(controller, clearance=2e-3, late=1)
     assert controller.cause == RESTITUTION and controller._watchdog.contacts == 1

@@ -33,7 +33,7 @@ def test_gains_that_compensate_each_other_have_large_joint_tolerance():
 def test_loss_at_gain_tolerance_is_higher_by_the_stated_amount():
     generator = np.random.default_rng(7)
     jacobian, residuals = 40 * generator.standard_normal((9, 4)), generator.standard_normal(9)
-    # At the optimum of a linear least-squares problem, the residuals are orthogonal to J.
+    # At the optimum of linear least squares, the residuals are orthogonal to J.
     residuals -= jacobian @ np.linalg.lstsq(jacobian, residuals, rcond=None)[0]
     loss = np.sum(residuals**2) / 2
     result = compute_gain_tolerance(jacobian, loss)

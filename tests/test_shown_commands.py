@@ -20,7 +20,7 @@ COMMAND = re.compile(
     r"`(?:jaxhil|pytest|python3?) [^`]+`|^(?:\$ )?(?:jaxhil|pytest|python3?) |^```python", re.M
 )
 NUMBER = re.compile(r"\d+\.\d+|\d+")
-# Commands that take more than minutes, or need a rig's logs.
+# Commands that take many minutes, or need logs of a rig.
 LEFT_OUT = ("rig", "compare", "identify", "monitor")
 # Pages in reading order; each uses the files of the pages before.
 ORDER = ("first_ten_minutes", "tuning", "sweeps", "to_the_rig")

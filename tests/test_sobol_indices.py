@@ -90,7 +90,7 @@ def test_saltelli_design_consists_of_two_sample_sets_and_their_mixtures():
         others = [j for j in range(3) if j != i]
         np.testing.assert_array_equal(mixed[i][:, i], b[:, i])
         np.testing.assert_array_equal(mixed[i][:, others], a[:, others])
-    # One point in each of 64 equal parts, in every column of both.
+    # One point in each of 64 equal intervals, in every column of both sets.
     for column in (*a.T, *b.T):
         np.testing.assert_array_equal(np.sort(np.floor(64 * column)), np.arange(64))
     np.testing.assert_array_equal(saltelli_design(3, 64, seed=3), points.reshape(-1, 3))

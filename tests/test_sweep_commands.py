@@ -80,7 +80,7 @@ def test_sweep_verdict_is_good_without_failures(jaxhil, gains, tmp_path):
     code, out, _ = jaxhil("sweep", tmp_path / "best.json", *TINY, "--limit", "inf")
     assert code == 0 and "Good" in out and "Failure probability 0," in out
     assert (tmp_path / "best-sweep" / "manifest.json").is_file()
-    # A title stays on one line above a narrower table.
+    # The title stays on one line above a narrower table.
     assert "case, compensation: none, 100 scenarios (random, float64)\n" in out
 
 
@@ -180,7 +180,7 @@ def test_finished_sweep_studies_are_not_repeated(jaxhil, own_store, quick, monke
     second = jaxhil(*again, *STUDIES, "--json")
     assert second[1] == first[1]
     assert all(f"read from {folder / one}\n" in second[2] for one in KEPT)
-    # Nothing is saved for another argument.
+    # Results for other arguments are not reused.
     with pytest.raises(pytest.fail.Exception):
         jaxhil(*again, "--drivers", "32")
 

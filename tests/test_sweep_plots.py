@@ -99,7 +99,7 @@ def test_sweep_plots_prefer_stiffness_and_force_delay_as_axes(usual):
 def test_plotted_inputs_are_those_with_strongest_rank_correlation(lost):
     made, mechanism, rows = lost
     assert plan_statistics(made, mechanism, rows).per_scenario[1].columns == ("rig.force_sensor.range",)
-    # The plan gets other sensitivities of the error than the real ones.
+    # The plan is given sensitivities that differ from the true ones.
     size = rows["approach.phase_2"]
     made_up = {**rows, "worst_error": size, "outcome": np.zeros(NUMBER, int)}
     assert plan_statistics(made, mechanism, made_up).per_scenario[1].columns == ("approach.phase_2",)

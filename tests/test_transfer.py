@@ -158,9 +158,6 @@ def test_transferred_gains_are_within_the_bounds():
             assert gain.lower(target) <= transferred[gain.name] <= gain.upper(target)
 
 
-# Starts of the solver
-
-
 @pytest.fixture(scope="module")
 def task():
     return build_task(load("rig-300kg").mechanism, "phase_lead", 8, 0)
@@ -204,9 +201,6 @@ def test_tuning_from_user_gains_never_ends_worse_than_those_gains(task, validati
     assert best.gains["phase_lead"] == pytest.approx(upper, rel=1e-12)
     (again,) = solve_tasks([task], choose_starts(validation, 2, 0, first=[[best.gains]]), 1)
     assert again[-1].rms <= best.rms * (1 + 1e-12)
-
-
-# Blocks of mechanisms
 
 
 @pytest.fixture

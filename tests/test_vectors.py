@@ -99,7 +99,7 @@ def test_hostile_vectors_contain_every_kind_of_bad_reading(vectors):
     seen = 0
     for row in rows:
         seen |= row.faults
-    # Not finite: force, position, model; missed tick, clock; limits of force and velocity.
+    # Faults: non-finite force, position, model; missed tick, clock; limits of force and velocity.
     for bit in (0x1, 0x2, 0x4, 0x200, 0x400, 0x800, 0x4000):
         assert seen & bit, hex(bit)
     assert all(math.isfinite(row.force_command) and math.isfinite(row.position_command) for row in rows)
