@@ -32,7 +32,7 @@ CASES = {
 }
 
 
-def third(loaded):
+def error_that_a_third_exceed(loaded):
     """Return an error that about a third of the runs exceed, to two digits."""
     (chunk,) = record_selection(loaded, ScenarioSelection("random", 1, LANES))
     error = np.where(chunk.contacts.status == OK, np.abs(chunk.contacts.error), np.inf)
@@ -44,7 +44,7 @@ def test_alarm_rates_on_new_scenarios_lie_within_stated_intervals(case, tmp_path
     name, overrides, compensator = CASES[case]
     parsed = load(name, overrides).mechanism
     loaded = gains(parsed, literature_gains(parsed, compensator), compensator)
-    limit = third(loaded)
+    limit = error_that_a_third_exceed(loaded)
     gain_file, rates = export(loaded, limit, tmp_path, CALIBRATED, LANES)
     (count,) = counted(loaded, [gain_file], FRESH, LANES, in_python=2)
     print(f"\n{case}, {compensator}: limit {limit:g}, margin {rates['restitution_margin']:.2g}", end="")

@@ -22,7 +22,7 @@ pytestmark = [pytest.mark.users_options, pytest.mark.slow]
 MANY, STUDY = ("--scenarios", "20000", "--chunk", "512", "--limit", "1.5"), ("--drivers", "4096")
 
 
-def begin(*arguments, folder):
+def start(*arguments, folder):
     """Start a command as a user would."""
     command = [sys.executable, "-m", "tuning", *map(str, arguments), "--json"]
     ours = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "NPROC")}
@@ -32,7 +32,7 @@ def begin(*arguments, folder):
     )  # fmt: skip
 
 
-def ended(process):
+def result_of(process):
     """Return exit code, standard output, and standard error without progress lines."""
     out, err = process.communicate(timeout=600)
     messages = [line for line in err.splitlines() if not line.startswith(tuple("0123456789"))]
@@ -52,22 +52,22 @@ def same(first, second):
 def test_sweep_resumes_after_interrupt_and_lost_scheduler(tmp_path):
     write_gain_file(tmp_path / "gains.json", case())
     asked = "sweep", "gains.json", *MANY, *STUDY
-    code, out, _ = ended(begin(*asked, "-o", "here", folder=tmp_path))
+    code, out, _ = result_of(start(*asked, "-o", "here", folder=tmp_path))
     assert code == 1
     whole, store = json.loads(out), tmp_path / "store"
     with started(tmp_path) as cluster:
         cluster.worker()
         on = *asked, "-o", "store", "--scheduler", cluster.address
-        process = begin(*on, folder=tmp_path)
+        process = start(*on, folder=tmp_path)
         wait(process, store, "parts/*.parquet", 3)
         os.kill(process.pid, signal.SIGINT)
-        code, out, messages = ended(process)
+        code, out, messages = result_of(process)
         assert (code, out, messages) == (130, "", ["jaxhil: interrupted"])
         finished = {path: path.stat().st_mtime_ns for path in store.glob("parts/*.parquet")}
-        process = begin(*on, "--resume", folder=tmp_path)
+        process = start(*on, "--resume", folder=tmp_path)
         wait(process, store, ".pieces/*.piece", 2)
         cluster.kill(cluster.processes[0])
-        code, out, messages = ended(process)
+        code, out, messages = result_of(process)
         assert code == 2 and out == "" and len(messages) == 1
         assert messages[0].startswith(f"jaxhil: --scheduler: {cluster.address}: lost, ")
         assert messages[0].endswith("; finished results are cached, continue with --resume")
@@ -75,7 +75,7 @@ def test_sweep_resumes_after_interrupt_and_lost_scheduler(tmp_path):
     with started(tmp_path / "later") as cluster:
         cluster.worker()
         on = *asked, "-o", "store", "--scheduler", cluster.address, "--resume"
-        code, out, messages = ended(begin(*on, folder=tmp_path))
+        code, out, messages = result_of(start(*on, folder=tmp_path))
     assert code == 1 and messages == [] and same(json.loads(out), whole)
     assert {path: path.stat().st_mtime_ns for path in finished} == finished
 
@@ -85,20 +85,20 @@ def test_bootstrap_resumes_after_lost_scheduler(jaxhil, tmp_path):
     asked = "identify", *logs(tmp_path), "--map", "map.toml", "--law", "kelvin_voigt", "--bootstrap", 40
     guess = jaxhil("identify", "--guess", *logs(tmp_path)).out
     (tmp_path / "map.toml").write_text(guess.replace("# [b", "[b").replace("# equiv", "equiv"))
-    assert ended(begin(*asked, "-o", "here", folder=tmp_path))[0] == 0
+    assert result_of(start(*asked, "-o", "here", folder=tmp_path))[0] == 0
     with started(tmp_path) as cluster:
         cluster.worker()
-        process = begin(*asked, "-o", "there", "--scheduler", cluster.address, folder=tmp_path)
+        process = start(*asked, "-o", "there", "--scheduler", cluster.address, folder=tmp_path)
         wait(process, tmp_path / "there", ".pieces/*.piece", 2)
         cluster.kill(cluster.processes[0])
-        code, out, messages = ended(process)
+        code, out, messages = result_of(process)
     assert code == 2 and out == "" and len(messages) == 1
     assert messages[0].startswith(f"jaxhil: --scheduler: {cluster.address}: lost, ")
     number_finished = len([*tmp_path.glob("there/.pieces/*.piece")])
     assert 2 <= number_finished < 8 and not (tmp_path / "there" / "mechanism.toml").exists()
-    process = begin(*asked, "-o", "there", "--resume", folder=tmp_path)
+    process = start(*asked, "-o", "there", "--resume", folder=tmp_path)
     wait(process, tmp_path / "there", ".pieces/*.piece", number_finished + 1)
-    assert ended(process)[0] == 0 and not (tmp_path / "there" / ".pieces").exists()
+    assert result_of(process)[0] == 0 and not (tmp_path / "there" / ".pieces").exists()
     for name in ("mechanism.toml", "identification.json"):
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 

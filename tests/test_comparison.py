@@ -36,7 +36,7 @@ LIMIT, SEED, LANES = 0.01, 3, 16
 SPREAD = {"contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
 
 
-def evaluated(raw, law, gains=None, number=LANES):
+def evaluate_compensator(raw, law, gains=None, number=LANES):
     parsed = validated({**raw, "uncertainty": SPREAD})
     [(_, form)] = group_by_common_program([parsed])
     scene = build_scenario_set(parsed, form, number, SEED)
@@ -45,7 +45,7 @@ def evaluated(raw, law, gains=None, number=LANES):
 
 def test_ideal_rig_has_zero_error_and_full_transparency():
     """Without delay and for T -> 0: error 0, transparency 1, slope 1, peak ratio 1."""
-    figures = evaluated(mechanism({}, IDEAL, 0.0, period=5e-5), "none")
+    figures = evaluate_compensator(mechanism({}, IDEAL, 0.0, period=5e-5), "none")
     assert figures["rms"].value < 1e-3 and figures["worst"].value < 1e-3
     for name in ("early", "late", "slope", "peak"):
         assert figures[name].value == pytest.approx(1, abs=1e-3), name
@@ -90,7 +90,7 @@ def test_compensator_that_replays_the_reference_has_zero_transparency(monkeypatc
         return evaluate(loop, plant_values._asdict(), scenarios)
 
     monkeypatch.setattr("tuning.benchmark.runs.evaluate", evaluate_with_plant)
-    figures = evaluated(mechanism({}, period=2.5e-4), "played_back")
+    figures = evaluate_compensator(mechanism({}, period=2.5e-4), "played_back")
     assert figures["rms"].value < 1e-3
     assert figures["slope"].value == pytest.approx(1, abs=1e-3)
     assert abs(figures["early"].value) < 1e-6 and abs(figures["late"].value) < 1e-6
@@ -104,7 +104,7 @@ def test_uncompensated_delay_error_matches_closed_form():
     stiffness = draw(parsed, LANES, SEED)["contact.stiffness"][:, 0]
     omega = np.sqrt(stiffness / parsed.bodies.mass)
     expected = np.array([delayed_restitution(value * tau) for value in omega]) - 1
-    figures = evaluated(raw, "none")
+    figures = evaluate_compensator(raw, "none")
     assert figures["rms"].value == pytest.approx(np.sqrt(np.mean(expected**2)), abs=2e-3)
     assert figures["worst"].value == pytest.approx(np.max(expected), abs=2e-3)
     # Delay makes the loop more sensitive to disturbances than the contact itself.

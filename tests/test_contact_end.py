@@ -46,7 +46,7 @@ TICKS = 4000  # ticks of noise per run; same value as in noisy_plant.c
 PLANT = Path(__file__).with_name("noisy_plant.c")
 
 
-def heavy(**sensor: float) -> Mechanism:
+def heavy_mechanisms(**sensor: float) -> Mechanism:
     """Return mechanisms of 420 and 6500 kg with soft, damped contact and slow decay of the command."""
     raw = mechanism(
         {"stiffness": [18e3], "damping": [320.0]},
@@ -152,13 +152,15 @@ def test_mean_restitution_does_not_depend_on_noise_for_any_mechanism(built_in, n
 @pytest.mark.parametrize("name", ["phase_lead", "response_error", "smith_predictor"])
 def test_contact_end_is_declared_after_the_whole_impulse(name):
     """Without noise, the model's velocity no longer changes after the detected end."""
-    parsed = heavy()
+    parsed = heavy_mechanisms()
     gains = nominal_gains(parsed, name)
-    over, later = continued(parsed, name, gains, 10.0)
+    over, later = continue_contact(parsed, name, gains, 10.0)
     assert abs(later - over) < 2e-5
 
 
-def continued(parsed: Mechanism, name: str, gains: dict[str, float], factor: float) -> tuple[float, float]:
+def continue_contact(
+    parsed: Mechanism, name: str, gains: dict[str, float], factor: float
+) -> tuple[float, float]:
     """Return the first contact's restitution, and the value after `factor` times the longest wait."""
     law, plant, watch = controller(parsed, name, gains), RigHardware(parsed), ContactWatch(parsed)
     model = NumericalModel(to_plain_data(parsed))
@@ -179,7 +181,7 @@ def continued(parsed: Mechanism, name: str, gains: dict[str, float], factor: flo
 
 
 def test_exported_python_controller_has_mean_restitution_of_simulation():
-    parsed, seeds = heavy(noise_std=1.0), 200
+    parsed, seeds = heavy_mechanisms(noise_std=1.0), 200
     gains = nominal_gains(parsed, "response_error", **SLOW_END)
     (simulated,) = restitutions(parsed, "response_error", gains, seeds)
     result = [closed_loop(parsed, "response_error", gains, seed)[0][0].restitution for seed in range(40)]
@@ -191,15 +193,15 @@ def test_exported_python_controller_has_mean_restitution_of_simulation():
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler")
 def test_exported_c_controller_has_restitution_of_simulation(tmp_path):
     """Compare each run with equal noise, and the mean with the noiseless contact."""
-    parsed, seeds = heavy(noise_std=1.0), 16
+    parsed, seeds = heavy_mechanisms(noise_std=1.0), 16
     gains = nominal_gains(parsed, "response_error", **SLOW_END)
     (simulated,) = restitutions(parsed, "response_error", gains, seeds)
-    runs = run_in_c(tmp_path, parsed, exported(parsed, gains), seeds)
+    runs = run_in_c(tmp_path, parsed, export_gains(parsed, gains), seeds)
     # The C rig may detect the end a tick earlier or later, which includes one command more or less.
     assert np.median(np.abs(runs[:, 0] - simulated)) < 1e-6
     np.testing.assert_allclose(runs[:, 0], simulated, atol=1e-3)
-    longer = run_in_c(tmp_path, parsed, exported(parsed, gains), 400, 60)[:, 0]
-    (free,) = restitutions(heavy(), "response_error", gains, 1)[0]
+    longer = run_in_c(tmp_path, parsed, export_gains(parsed, gains), 400, 60)[:, 0]
+    (free,) = restitutions(heavy_mechanisms(), "response_error", gains, 1)[0]
     assert abs(np.mean(longer) - free) < 1e-3 + 3 * np.std(longer) / math.sqrt(len(longer))
 
 
@@ -207,8 +209,8 @@ def test_exported_c_controller_has_restitution_of_simulation(tmp_path):
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler")
 def test_exported_watchdog_false_alarms_lie_within_stated_interval(tmp_path):
     """Let the rig wait 60 ticks longer than the simulation."""
-    parsed = heavy(noise_std=1.0)
-    document = exported(parsed, nominal_gains(parsed, "response_error", **TUNED))
+    parsed = heavy_mechanisms(noise_std=1.0)
+    document = export_gains(parsed, nominal_gains(parsed, "response_error", **TUNED))
     result = calibrate(check_document(document), scenarios=1024, limit=0.02)
     document["limits"] = build_limits_section(result.limits)
     runs = run_in_c(tmp_path, parsed, sign(document), 1000, 60)
@@ -220,12 +222,13 @@ def test_exported_watchdog_false_alarms_lie_within_stated_interval(tmp_path):
 
 def test_tuning_time_limit_includes_wait_for_noisy_contact_end():
     noisy, free = (
-        build_task(heavy(noise_std=std), "phase_lead", 8, 0).scenarios.time_limit for std in (1.0, 0.0)
+        build_task(heavy_mechanisms(noise_std=std), "phase_lead", 8, 0).scenarios.time_limit
+        for std in (1.0, 0.0)
     )
     np.testing.assert_allclose(noisy - free, MAX_DECAY_WAIT)
 
 
-def exported(parsed: Mechanism, gains: dict[str, float]) -> dict[str, Any]:
+def export_gains(parsed: Mechanism, gains: dict[str, float]) -> dict[str, Any]:
     """Return the gain document of response_error with these gains."""
     return build_document("response_error", gains, parsed, "0" * 64, {}, {}, 0, {})
 

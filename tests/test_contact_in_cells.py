@@ -24,7 +24,7 @@ from jaxhil.simulation.scenario import build_scenarios
 PERIOD = 4e-3
 
 
-def fast(simulator, time_constant=2e-3, **contact):
+def fast_mechanism(simulator, time_constant=2e-3, **contact):
     """Return a mechanism at a control period of 4 ms with held command and fast motion simulator."""
     sensor = {"time_constant": time_constant}
     return mechanism(
@@ -42,11 +42,11 @@ def second_order(frequency):
 
 
 def test_lagging_sensor_restitution_converges_to_ideal_simulator():
-    cases = [fast(second_order(frequency)) for frequency in (300.0, 600.0, 1200.0)]
+    cases = [fast_mechanism(second_order(frequency)) for frequency in (300.0, 600.0, 1200.0)]
     parsed = [validated(case) for case in cases]
     scenarios = join(build_scenarios(member) for member in parsed)
     metrics = run_rollout(build_loop(parsed[0], "none", scenarios), {}, scenarios)
-    ideal = validated(fast({"model": "ideal"}))
+    ideal = validated(fast_mechanism({"model": "ideal"}))
     scenario = join([build_scenarios(ideal)])
     limit = run_rollout(build_loop(ideal, "none", scenario), {}, scenario)
     assert np.all(np.asarray(metrics.status)[0] == OK) and np.asarray(limit.status)[0, 0] == OK
@@ -58,7 +58,7 @@ def test_lagging_sensor_restitution_converges_to_ideal_simulator():
 
 
 def test_lagging_contact_derivatives_match_finite_differences():
-    parsed = validated(fast(second_order(60.0), law="kelvin_voigt", damping=[300.0]))
+    parsed = validated(fast_mechanism(second_order(60.0), law="kelvin_voigt", damping=[300.0]))
     loop = build_loop(parsed, "none", join([build_scenarios(parsed)]), energies=True)
     scenario = jax.tree.map(jax.numpy.asarray, join([build_scenarios(parsed)]))
 

@@ -91,23 +91,23 @@ TURNED, BOOST, MOVED = (
 HERE = LANES.index("elsewhere")
 
 
-def gathered(key, index=None):
+def collect(key, index=None):
     """Return one value of every lane, lanes last."""
     every = [CASES[name][key] if index is None else CASES[name][key][index] for name in LANES]
     return np.moveaxis(np.array(every, float), 0, -1)
 
 
-def both(key):
+def both_candidates(key):
     """Return a value of both candidates, (components, candidates, lanes)."""
-    return vector(jnp.asarray(np.moveaxis(gathered(key), 0, 1)))
+    return vector(jnp.asarray(np.moveaxis(collect(key), 0, 1)))
 
 
-def world():
+def initial_states():
     """Return the initial states: target at rest at the origin; last lane rotated and boosted."""
     zero = np.zeros((3, len(LANES)))
-    target_offset, chaser_offset = gathered("interfaces", 0), gathered("interfaces", 1)
-    position = target_offset + gathered("pose") - chaser_offset
-    velocity = gathered("velocity") - np.cross(gathered("angular"), chaser_offset, axis=0)
+    target_offset, chaser_offset = collect("interfaces", 0), collect("interfaces", 1)
+    position = target_offset + collect("pose") - chaser_offset
+    velocity = collect("velocity") - np.cross(collect("angular"), chaser_offset, axis=0)
     places, speeds = [zero.copy(), position], [zero.copy(), velocity]
     turns = np.tile([[1.0], [0.0], [0.0], [0.0]], len(LANES))
     x, y, z, w = TURNED.as_quat()
@@ -116,25 +116,27 @@ def world():
         start[:, HERE] = TURNED.apply(start[:, HERE]) + MOVED
         speed[:, HERE] = TURNED.apply(speed[:, HERE]) + BOOST
     attitude = Quaternion(jnp.asarray(turns[0]), vector(jnp.asarray(turns[1:])))
-    return places, speeds, attitude, (zero, gathered("angular"))
+    return places, speeds, attitude, (zero, collect("angular"))
 
 
 def group(law="regularised"):
     # One array per parameter, (candidates, lanes).
     same = {
-        key: np.tile(gathered(key), (2, 1)) for key in ("exponent", "damping", "friction", "slip", "radius")
+        key: np.tile(collect(key), (2, 1)) for key in ("exponent", "damping", "friction", "slip", "radius")
     }
-    numbers = gathered("stiffness"), same["damping"], same["exponent"]
+    numbers = collect("stiffness"), same["damping"], same["exponent"]
     parameters = springs(*map(jnp.asarray, numbers))
     points = vector(jnp.zeros((3, 2, len(LANES))))
     coefficient, slip = (jnp.asarray(same[key]) for key in ("friction", "slip"))
-    tangential = [jnp.asarray(np.tile(gathered("bristle", index), (2, 1))) for index in range(2)]
+    tangential = [jnp.asarray(np.tile(collect("bristle", index), (2, 1))) for index in range(2)]
     frictions = {
         "regularised": Regularised(coefficient, slip),
         "bristle": Bristle(coefficient, *tangential),
     }
     return ContactGroup(
-        ChaserSpheres(both("spheres"), jnp.asarray(same["radius"]), Plane(points, both("normals"))),
+        ChaserSpheres(
+            both_candidates("spheres"), jnp.asarray(same["radius"]), Plane(points, both_candidates("normals"))
+        ),
         CONTACT_LAWS["hunt_crossley"],
         parameters,
         frictions[law],
@@ -180,17 +182,17 @@ def simulate(pair, states, contact, step):
 def prepared(law="regularised"):
     """Return bodies, states, contact and step of every lane."""
     keys = ("masses", "inertias", "interfaces")
-    arguments = [[gathered(key, index) for index in range(2)] for key in keys]
-    places, speeds, attitude, angular = world()
+    arguments = [[collect(key, index) for index in range(2)] for key in keys]
+    places, speeds, attitude, angular = initial_states()
     pair, states = begin(*jax.tree.map(jnp.asarray, (*arguments, places, speeds)), attitude, angular)
-    return pair, states, group(law), jnp.asarray(gathered("duration") / STEPS)
+    return pair, states, group(law), jnp.asarray(collect("duration") / STEPS)
 
 
 @pytest.fixture(scope="module", params=["regularised", "bristle"])
 def run(request):
     pair, states, contact, step = prepared(request.param)
     _, seen = simulate(pair, states, contact, step)
-    at = [vector(jnp.asarray(part)) for part in (gathered("spheres", 0), gathered("normals", 0))]
+    at = [vector(jnp.asarray(part)) for part in (collect("spheres", 0), collect("normals", 0))]
     mass = np.asarray(effective_mass(pair, states, *at))
     seen = {
         name: {key: np.asarray(part[..., lane]).T for key, part in seen.items()}

@@ -28,7 +28,7 @@ def along_x(force, speed):
 
 
 @jax.jit
-def pulled(forces, speeds):
+def tangential_forces(forces, speeds):
     """Return the tangential force along x at every tick."""
 
     def tick(state, inputs):
@@ -43,7 +43,7 @@ def pulled(forces, speeds):
 def test_bristle_friction_sticks_then_slides_then_resets():
     speeds = np.r_[np.full(10, 1e-6), np.zeros(10), np.full(80, 1e-3), np.zeros(1), np.zeros(1)]
     forces = np.r_[np.full(100, 50.0), 0.0, 50.0]
-    result = np.asarray(pulled(jnp.asarray(forces), jnp.asarray(speeds)))
+    result = np.asarray(tangential_forces(jnp.asarray(forces), jnp.asarray(speeds)))
     # While sticking, the bristle is a spring, up to its share of the friction limit.
     stuck_force = STIFFNESS * 1e-6 * PERIOD * 10
     np.testing.assert_allclose(result[10:20], -stuck_force, rtol=stuck_force / (COEFFICIENT * 50))
@@ -55,7 +55,9 @@ def test_bristle_friction_sticks_then_slides_then_resets():
 def test_friction_force_stays_within_coulomb_cone():
     generator = np.random.default_rng(8)
     forces = generator.uniform(0, 80, 3000) * (generator.random(3000) > 0.1)
-    result = np.asarray(pulled(jnp.asarray(forces), jnp.asarray(generator.normal(size=3000) * 0.02)))
+    result = np.asarray(
+        tangential_forces(jnp.asarray(forces), jnp.asarray(generator.normal(size=3000) * 0.02))
+    )
     assert np.all(np.abs(result) <= COEFFICIENT * forces * (1 + 1e-12))
     slip = vector(jnp.asarray(generator.normal(size=(3, 1, 1)) * 10))
     force, _ = REGULARISED.step(along_x(of_one(50.0), of_one(0.0))._replace(slip=slip), ())
@@ -64,7 +66,7 @@ def test_friction_force_stays_within_coulomb_cone():
     np.testing.assert_allclose(components(force), opposite * np.asarray(components(slip)), rtol=1e-12)
 
 
-def touched(count, seed):
+def random_contacts(count, seed):
     """Return random forces, slips in random tangent planes, and deflections; every eleventh value is 0."""
     generator = np.random.default_rng(seed)
     normal = generator.normal(size=(3, count, 1))
@@ -81,7 +83,7 @@ def touched(count, seed):
 
 def test_regularised_friction_dissipates_expected_power():
     """-f_t.t = mu F |t|^2/sqrt(|t|^2 + v_s^2), never negative."""
-    touching, _ = touched(3000, 1)
+    touching, _ = random_contacts(3000, 1)
     force, _ = REGULARISED.step(touching, ())
     taken = np.asarray(-dot(force, touching.slip))
     slip = np.linalg.norm(components(touching.slip), axis=0)
@@ -92,7 +94,7 @@ def test_regularised_friction_dissipates_expected_power():
 
 def test_bristle_friction_never_generates_energy():
     """-f_t.t less the rate of k_t z^2/2 over a step is never negative, however large the deflection."""
-    touching, before = touched(3000, 2)
+    touching, before = random_contacts(3000, 2)
     force, (after,) = BRISTLE.step(touching, (before,))
     work = np.asarray(-PERIOD * dot(force, touching.slip))
     stored = [np.asarray(STIFFNESS / 2 * dot(bent, bent)) for bent in (before, after)]

@@ -16,7 +16,7 @@ from tuning.identification.identify import IdentificationOptions, identify
 from tuning.identification.rational import STRUCTURES, MotionModel
 
 
-def scattering(seed, share, speeds=campaigns.SPEEDS):
+def campaign_with_variation(seed, share, speeds=campaigns.SPEEDS):
     """Return a campaign whose stiffness and damping vary between contacts by this relative amount."""
     whole = campaigns.campaign("clean", seed, speeds=(), seconds=10.0)
     kind, rng = campaigns.KINDS["clean"], np.random.default_rng(seed)
@@ -62,7 +62,7 @@ def test_bootstrap_widens_parameter_draws_if_fits_scatter_more_than_predicted(fi
 
 @pytest.mark.slow
 def test_bootstrap_widens_intervals_if_contacts_differ_from_each_other():
-    campaign = scattering(0, 0.02, (0.012, 0.006) * 4)
+    campaign = campaign_with_variation(0, 0.02, (0.012, 0.006) * 4)
     stated, wide = of(campaign, 0), of(campaign, 20)
     assert any("intervals are the bootstrap's" in note for note in wide.notes)
     # 2 % variation over 8 contacts of unequal weight.
@@ -135,7 +135,7 @@ def test_bootstrap_rejects_too_few_contacts_and_too_few_repeats():
 def test_bootstrap_intervals_cover_stiffness_with_and_without_variation(share, repeats):
     inside, without, widened = [], [], 0
     for seed in range(repeats):
-        campaign = scattering(100 + seed, share)
+        campaign = campaign_with_variation(100 + seed, share)
         wide, stated = of(campaign, 40), of(campaign, 0)
         for flags, result in ((inside, wide), (without, stated)):
             stiffness = result["contact.stiffness.0"]

@@ -14,7 +14,9 @@ from tuning.identification.mechanism_check import check_against_mechanism
 DELAY = {"rig.force_sensor.delay": 0.0037}
 
 
-def day(seed=0, constant=0.005, rate=4e-5, every=120.0, kind="clean", speeds=(0.003, 0.006, 0.012) * 2):
+def contacts_with_clock_error(
+    seed=0, constant=0.005, rate=4e-5, every=120.0, kind="clean", speeds=(0.003, 0.006, 0.012) * 2
+):
     """Return contacts every `every` seconds; force time stamps have a constant delay [s] and a rate error."""
     whole, rng = campaigns.campaign(kind, seed, speeds=(), seconds=10.0), np.random.default_rng(seed)
     kind, runs = campaigns.KINDS[kind], list(whole.runs)
@@ -32,7 +34,7 @@ def day(seed=0, constant=0.005, rate=4e-5, every=120.0, kind="clean", speeds=(0.
     pytest.param(0.01, 5e-6, 600.0, marks=pytest.mark.slow),
 ))  # fmt: skip
 def test_identify_estimates_clock_rate_and_contact(constant, rate, every):
-    campaign = day(0, constant, rate, every)
+    campaign = contacts_with_clock_error(0, constant, rate, every)
     result = identify(campaign, options=IdentificationOptions(law="kelvin_voigt", fixed=DELAY, hold_out=0.0))
     drift = result.contact.drift
     assert abs(drift.rate - rate) < 4.0 * drift.std < 1e-6
@@ -48,7 +50,7 @@ def test_identify_estimates_clock_rate_and_contact(constant, rate, every):
 
 
 def test_identify_cannot_estimate_constant_clock_offset():
-    campaign = day(speeds=(0.012, 0.006, 0.012))
+    campaign = contacts_with_clock_error(speeds=(0.012, 0.006, 0.012))
     result = identify(campaign, options=IdentificationOptions(law="linear", hold_out=0.0))
     assert result.mechanism is None and "rig.force_sensor.delay (specify it with --fix" in result.verdict
     prior = jaxhil.load("rig-300kg")
@@ -57,7 +59,7 @@ def test_identify_cannot_estimate_constant_clock_offset():
 
 
 def test_identify_verdict_is_bad_for_undeclared_second_clock():
-    campaign = day(rate=1.6e-6)
+    campaign = contacts_with_clock_error(rate=1.6e-6)
     result = identify(
         replace(campaign, timing=replace(campaign.timing, two_clocks=False)),
         options=IdentificationOptions(law="kelvin_voigt", hold_out=0.0),
@@ -68,11 +70,14 @@ def test_identify_verdict_is_bad_for_undeclared_second_clock():
 
 
 def test_identify_rejects_unusable_logs_of_two_clocks():
-    together = day(every=0.0)
+    together = contacts_with_clock_error(every=0.0)
     with pytest.raises(jaxhil.InputError, match="6 contacts within 0 s, expected at least 3"):
         identify(together, options=IdentificationOptions(law="kelvin_voigt", fixed=DELAY, hold_out=0.0))
     with pytest.raises(jaxhil.InputError, match="forces that do not follow the motion"):
-        identify(day(constant=0.3), options=IdentificationOptions(law="linear", fixed=DELAY, hold_out=0.0))
+        identify(
+            contacts_with_clock_error(constant=0.3),
+            options=IdentificationOptions(law="linear", fixed=DELAY, hold_out=0.0),
+        )
     with pytest.raises(jaxhil.InputError, match='"separate", expected "stamps" or "index"'):
         check_against_mechanism(together, jaxhil.load("rig-300kg"))
 

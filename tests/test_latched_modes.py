@@ -37,7 +37,7 @@ def latch():
     return Latch(place([0, 0, 0], (1, 1)), number, number, number, stiffness, 0 * stiffness, number > 0)
 
 
-def started():
+def docked_bodies():
     """Return docked bodies that move in all six coordinates."""
     bodies = Pair(
         plain_body(1800.0, FULL[0], (0.05, -0.02, 1.2), BATCH),
@@ -52,7 +52,7 @@ def scenario(delays):
     late = lanes(delays, BATCH)
     free = late + jnp.inf
     simulator = MotionSimulatorBatch(jnp.zeros((0, 6, 1)), jnp.ones((1, 6, 1)), late, free, free)
-    bodies, start = started()
+    bodies, start = docked_bodies()
     return Scenario(
         bodies, start, (), (latch(),), simulator, TaskSpace(), ideal_sensor(jnp.zeros(1)),
         lanes(PERIOD, BATCH), lanes(TICKS * PERIOD, BATCH), jnp.zeros((2, 1), jnp.uint32),
@@ -83,7 +83,7 @@ def test_latched_vibration_modes_grow_under_delay_as_characteristic_roots(delays
 
 def test_response_error_with_true_stiffness_cancels_rig_dynamics_of_latched_bodies():
     """-K xi_a - K (xi_d - xi_a) = -K xi_d for six axes; the uncompensated run diverges."""
-    bodies, start = started()
+    bodies, start = docked_bodies()
     pose = Pose(vector(jnp.zeros((3, 1))), identity(jnp.zeros(1)))
     one, period = latch(), lanes(PERIOD, BATCH)
     simulator = second_order(lanes([14.0, 13.0, 12.0, 11.0, 10.0, 9.0], BATCH), 0.8, lanes(UNEQUAL, BATCH))

@@ -36,14 +36,14 @@ CONTACTS = 4
 RMS, PERCENTILE, LARGEST, TRANSPARENCY = 0.5, 1.5, 3.0, 0.75
 
 
-def within(path: str, low: float, high: float) -> str:
+def uniform_override(path: str, low: float, high: float) -> str:
     """Return an override that draws a number uniformly between two values."""
     return f'uncertainty."{path}"={{distribution="uniform",low={low},high={high}}}'
 
 
-PLANE = "rig.contact_plane=0.0", within("rig.contact_plane", -1e-3, 1e-3)
-BIAS = "rig.force_sensor.bias=0.0", within("rig.force_sensor.bias", -5.0, 5.0)
-FRICTION = "contact.friction=3.0", within("contact.friction", 0.0, 6.0)
+PLANE = "rig.contact_plane=0.0", uniform_override("rig.contact_plane", -1e-3, 1e-3)
+BIAS = "rig.force_sensor.bias=0.0", uniform_override("rig.force_sensor.bias", -5.0, 5.0)
+FRICTION = "contact.friction=3.0", uniform_override("contact.friction", 0.0, 6.0)
 
 
 def outcome_of(mechanism: Mechanism, gains: Mapping[str, Any], scenarios: Scenario) -> Outcome:

@@ -75,7 +75,7 @@ def gain_file(kind: Kind, limits: Mapping[str, float]) -> tuple[Mechanism, GainF
 
 
 @cache
-def ran(name: str, limits: str) -> tuple[Controller, Ran]:
+def run_kind(name: str, limits: str) -> tuple[Controller, Ran]:
     """Run a kind of contact under these limits; return the record and its controller."""
     mechanism, made = gain_file(KINDS[name], LIMITS[limits])
     law = Controller(made)
@@ -93,7 +93,7 @@ def ran(name: str, limits: str) -> tuple[Controller, Ran]:
 )
 def test_status_of_contact_is_most_frequent_status_of_its_ticks(name, limits):
     """The status is reported on one tick after the contact, without a trip, with and without energy audit."""
-    law, result = ran(name, limits)
+    law, result = run_kind(name, limits)
     record, wanted = law.last_contact, KINDS[name].status
     assert (record.number, record.status) == (1, wanted)
     assert law.status == "ok" and fault_names(law.seen) == (
@@ -164,7 +164,7 @@ def test_contact_status_counts_in_c_agree_with_python(counting_in_c):
 
 
 def test_sample_contacts_cover_every_status_of_impulse_ledger():
-    records = [ran(name, "no energies") for name in KINDS]
+    records = [run_kind(name, "no energies") for name in KINDS]
     statuses = {name for _, contact in records for name in contact.said}
     never = {"unstated", "not_reached"}
     assert statuses == {*STATUS_NAMES.values()} - never

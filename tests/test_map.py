@@ -128,10 +128,10 @@ def test_stability_map_of_uncompensated_contact_agrees_with_theory(ideal):
     assert np.array(document["restitution"]) == pytest.approx(theory, abs=1e-3)
     assert np.array(document["error"]) == pytest.approx(theory - 1, abs=1e-3)
     root = np.array(document["theory"]["characteristic_root"])
-    assert document["spectral_radius"]["values"] == pytest.approx(growing(result, root), abs=1e-5)
+    assert document["spectral_radius"]["values"] == pytest.approx(spectral_radius_of(result, root), abs=1e-5)
 
 
-def growing(e, restitution):
+def spectral_radius_of(e, restitution):
     """Return the spectral radius that corresponds to the restitution over half an oscillation."""
     stiffness, delay = np.meshgrid(e.x, e.y)
     frequency = np.sqrt(stiffness / 350.0)

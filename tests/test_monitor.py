@@ -31,7 +31,7 @@ def file_of(kind, stated=None):
     return from_plain_data(document | {"uncertainty": STATED if stated is None else stated}, "known")
 
 
-def quiet(kind):
+def noiseless(kind):
     """Return the rig without noise and quantisation."""
     sensors = ("force_sensor", "position_sensor")
     kept = {
@@ -52,7 +52,7 @@ def contacts(kind, seed=0, speeds=SPEEDS, name="monitored"):
         del campaigns.KINDS[name]
 
 
-def changed(kind, **sections):
+def changed_kind(kind, **sections):
     """Return the kind with changed numbers in its rig."""
     return replace(kind, rig=kind.rig | {one: kind.rig[one] | table for one, table in sections.items()})
 
@@ -65,7 +65,7 @@ RARER = ("clean", "third_order", "resonance", "hertz", "layered")
 @pytest.mark.parametrize("name", (*EVERY, *(pytest.param(one, marks=pytest.mark.slow) for one in RARER)))
 def test_monitor_reports_no_deviation_for_exact_file_without_noise(name):
     """Laws, lags, latencies and holds equal those of the simulator."""
-    kind = quiet(campaigns.KINDS[name])
+    kind = noiseless(campaigns.KINDS[name])
     stated = {k: v for k, v in STATED.items() if k == "rig.force_sensor.delay"}
     result = monitor_contacts(contacts(kind, speeds=(0.006, 0.012, 0.006)), file_of(kind, stated))
     value = np.array([contact.value for contact in result.contacts])
@@ -90,10 +90,10 @@ def test_monitor_deviations_of_matching_rig_scatter_as_predicted():
 CHANGES = {
     # changed value; the metric that shows it, by how much, and its tolerance
     "stiffness": (replace(CLEAN, contact=campaign_kinds.voigt((1.236e5,))), "stiffness", 0.03, 0.003),
-    "delay": (changed(CLEAN, force_sensor={"delay": 0.0043}), "apparent damping", -72.0, 12.0),
-    "motion": (changed(CLEAN, simulator={"delay": 0.0047}), "lag of motion", 4e-4, 6e-5),
-    "bias": (changed(CLEAN, force_sensor={"bias": 3.0}), "bias", 3.0, 0.1),
-    "noise": (changed(CLEAN, force_sensor={"noise_std": 1.0}), "noise", 1.0, 0.1),
+    "delay": (changed_kind(CLEAN, force_sensor={"delay": 0.0043}), "apparent damping", -72.0, 12.0),
+    "motion": (changed_kind(CLEAN, simulator={"delay": 0.0047}), "lag of motion", 4e-4, 6e-5),
+    "bias": (changed_kind(CLEAN, force_sensor={"bias": 3.0}), "bias", 3.0, 0.1),
+    "noise": (changed_kind(CLEAN, force_sensor={"noise_std": 1.0}), "noise", 1.0, 0.1),
 }
 DAILY = ("delay", "noise")
 
@@ -169,7 +169,7 @@ def test_monitor_command_prints_a_verdict_and_returns_its_exit_code(jaxhil, tmp_
         path.name for path in logs
     }
     assert ran.document["contacts"][0]["figures"].keys() == set(METRIC_NAMES)
-    other = changed(CLEAN, force_sensor={"delay": 0.0047})
+    other = changed_kind(CLEAN, force_sensor={"delay": 0.0047})
     ran = jaxhil("monitor", known, *written(tmp_path / "later", contacts(other, seed=3, speeds=SPEEDS[:3])))
     assert ran.code == 1 and "Bad: since contact 1 of 3 (00.csv): apparent damping" in ran.out
     assert "[N s/m]" in ran.out and ran.err == ""

@@ -20,26 +20,26 @@ LAWS = {
 
 
 @pytest.fixture(scope="module")
-def pieces():
+def segments():
     return compute_nominal_motion(MECHANISM, LAWS)
 
 
 @pytest.mark.slow
-def test_nominal_motion_of_several_compensators_equals_separate_simulations(pieces):
-    assert [list(piece.curves) for piece in pieces] == [["in space", *LAWS]] * 2
+def test_nominal_motion_of_several_compensators_equals_separate_simulations(segments):
+    assert [list(piece.curves) for piece in segments] == [["in space", *LAWS]] * 2
     for name in ("before", "literature", "tuned"):
-        for piece, alone in zip(pieces, compute_nominal_motion(MECHANISM, {name: LAWS[name]}), strict=True):
+        for piece, alone in zip(segments, compute_nominal_motion(MECHANISM, {name: LAWS[name]}), strict=True):
             np.testing.assert_allclose(
                 piece.curves[name].position, alone.curves[name].position, rtol=1e-9, atol=1e-12
             )
-    first = pieces[0].curves
+    first = segments[0].curves
     np.testing.assert_array_equal(first["before"].force, first["again"].force)
     assert np.max(first["before"].force) != pytest.approx(np.max(first["literature"].force), rel=0.01)
 
 
-def test_nominal_ideal_contact_motion_matches_closed_form(pieces):
+def test_nominal_ideal_contact_motion_matches_closed_form(segments):
     stiffness, mass = MECHANISM.contact.stiffness[0], MECHANISM.bodies.mass
-    space, velocity = pieces[0].curves["in space"], MECHANISM.approach.velocity
+    space, velocity = segments[0].curves["in space"], MECHANISM.approach.velocity
     assert np.max(space.force) == pytest.approx(velocity * math.sqrt(stiffness * mass), rel=1e-3)
     assert np.max(space.position) == pytest.approx(velocity * math.sqrt(mass / stiffness), rel=1e-3)
     assert space.velocity == velocity

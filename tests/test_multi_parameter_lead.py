@@ -52,7 +52,7 @@ def test_pole_placement_refuses_nonpositive_and_nonfinite_arguments(bad):
         pole_placement(*bad)
 
 
-def placed(phases):
+def place_poles(phases):
     """Return gains for every desired restitution and omega tau, one lane each, and omega tau."""
     phase, desired = grid(phases, DESIRED)
     gain, rate = np.transpose(
@@ -62,14 +62,14 @@ def placed(phases):
 
 
 def test_simulated_loop_has_the_pole_placed_by_lead():
-    gains, phase = placed([0.1, 0.3])
+    gains, phase = place_poles([0.1, 0.3])
     result = without_period("multi_parameter_lead", 1.6, gains, force_sensor__delay=phase / OMEGA)
     np.testing.assert_allclose(np.exp(result), np.tile(DESIRED, 2), rtol=0, atol=1e-5)
 
 
 def test_contact_under_placed_pole_has_the_desired_restitution():
     phases, periods = np.array([0.05, 0.1, 0.2, 0.4]), np.array([5e-4, 2.5e-4])
-    gains, phase = placed(phases)
+    gains, phase = place_poles(phases)
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, IDEAL, 0.0, period=periods[1]))
     period, lane, start = grid(periods, np.arange(len(phase)), PHASES)
     lane = lane.astype(int)

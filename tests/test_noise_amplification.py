@@ -27,7 +27,7 @@ def _amplified(compensator, gains, period):
     return value(gains), jax.jacfwd(value)(gains) if gains else {}
 
 
-def amplified(compensator, gains, period=1e-3):
+def amplify(compensator, gains, period=1e-3):
     """Return the noise amplification and its derivative by every gain."""
     gains = {name: np.asarray(value, float) for name, value in gains.items()}
     return _amplified(compensator, gains, np.asarray(period))
@@ -37,21 +37,21 @@ def amplified(compensator, gains, period=1e-3):
 def test_noise_amplification_equals_that_of_compensator_filter(compensator):
     for gains in GAINS:
         values = dict(zip(NAMES, gains, strict=True))
-        ours, slopes = amplified(compensator, values)
+        ours, slopes = amplify(compensator, values)
         np.testing.assert_allclose(ours, amplification(gains), rtol=1e-12)
         numerator, denominator = bilinear([sum(gains), 1], [gains[1], 1], 1e3)
         noise = np.random.default_rng(2).normal(size=1_000_000)
         np.testing.assert_allclose(ours, np.std(lfilter(numerator, denominator, noise)), rtol=4e-3)
         for gain in NAMES:
             step = 1e-5 * values[gain]
-            low, high = (amplified(compensator, {**values, gain: values[gain] + h})[0] for h in (-step, step))
+            low, high = (amplify(compensator, {**values, gain: values[gain] + h})[0] for h in (-step, step))
             np.testing.assert_allclose(slopes[gain], (high - low) / (2 * step), rtol=1e-7)
 
 
 def test_noise_amplification_is_1_without_compensation_or_lead():
-    assert amplified("none", {})[0] == 1
+    assert amplify("none", {})[0] == 1
     no_lead = {"phase_lead": 0, "lead_filter": 0.003}
-    np.testing.assert_allclose(amplified("phase_lead", no_lead)[0], 1, rtol=1e-14)
+    np.testing.assert_allclose(amplify("phase_lead", no_lead)[0], 1, rtol=1e-14)
 
 
 LEAD_ALONE = {"response_error": 0.0, "response_error_damping": 0.0}
@@ -84,7 +84,7 @@ def steady_contact(**values):
 def test_noise_amplification_matches_simulated_loop_in_steady_contact():
     gains, whole = steady_contact()
     _, lead = steady_contact(**LEAD_ALONE)
-    expected = amplified("response_error", gains)[0]
+    expected = amplify("response_error", gains)[0]
     assert expected > 3
     # 40000 samples, with anticorrelated neighbours.
     np.testing.assert_allclose(np.std(lead) / DEVIATION, expected, rtol=0.005)
@@ -104,7 +104,7 @@ def test_identification_increases_noise_amplification_early_in_contact():
         first = np.flatnonzero((force > 0).all(axis=1))[0]
         last = first + np.flatnonzero((force[first:] == 0).any(axis=1))[0]
         spans = np.array_split(np.std(command, axis=1)[first : last - 1], 10)
-        expected = amplified("response_error", gains)[0] * DEVIATION
+        expected = amplify("response_error", gains)[0] * DEVIATION
         return gains, np.array([np.sqrt(np.mean(span**2)) for span in spans]) / expected
 
     # tenths of the contact

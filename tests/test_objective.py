@@ -91,7 +91,7 @@ def stacked(objectives):
 
 
 @pytest.fixture(scope="module")
-def known(batch):
+def known_residuals(batch):
     return run(batch)
 
 
@@ -102,8 +102,8 @@ def outcomes(batch):
     return [evaluate(loop, dict(zip(NAMES, gains, strict=True)), scenarios) for gains in GAINS]
 
 
-def test_tuning_residuals_equal_errors_of_an_evaluation(outcomes, known):
-    for gains, outcome, row in zip(GAINS, outcomes, known[0], strict=True):
+def test_tuning_residuals_equal_errors_of_an_evaluation(outcomes, known_residuals):
+    for gains, outcome, row in zip(GAINS, outcomes, known_residuals[0], strict=True):
         good, wanted = outcome.good, outcome.wanted
         assert (wanted & ~good).sum() == 3 and not good[:, SHORT].any()
         count = wanted.sum()
@@ -152,8 +152,8 @@ def test_objective_terms_with_weight_zero_are_ignored():
     errors, excesses, swings, noise = [0.1, -0.2], [0.3, 0.4], [0.5, 0.6], 3.0
     terms = *map(padded, (errors, excesses, swings)), np.arange(SLOTS) < 2, np.asarray(noise)
     none = *[padded([])] * 3, np.asarray(0.0)
-    whole, _ = weighed(ObjectiveTerms("rms", True, True, True), stacked([Objective()]), terms, none)
-    plain, _ = weighed(ObjectiveTerms("rms", False, False, False), stacked([Objective()]), terms, none)
+    whole, _ = weigh(ObjectiveTerms("rms", True, True, True), stacked([Objective()]), terms, none)
+    plain, _ = weigh(ObjectiveTerms("rms", False, False, False), stacked([Objective()]), terms, none)
     assert len(whole) == 3 * len(plain) + 1 and not whole[len(plain) :].any()
     np.testing.assert_array_equal(whole[: len(plain)], plain)
 
@@ -187,8 +187,8 @@ def test_errors_within_tolerance_hardly_affect_objective(tolerance):
     assert evaluate_objective(objective, errors, excesses, 3.0) == pytest.approx(expected, rel=1e-13)
     assert sum_of_squares(objective, errors, excesses, 3.0) == pytest.approx(expected**2, rel=1e-12)
     # The derivative along the errors themselves equals their rms, which is homogeneous.
-    _, slopes = alone(objective, errors, excesses, 3.0, (), (errors, (), (), 0.0))
-    values, _ = alone(objective, errors, excesses, 3.0)
+    _, slopes = single_residuals(objective, errors, excesses, 3.0, (), (errors, (), (), 0.0))
+    values, _ = single_residuals(objective, errors, excesses, 3.0)
     grown = counted if counted <= TOLERATED_ERROR_FACTOR * size or tolerance == 0 else size
     assert RESIDUAL_SCALE**2 * np.sum(values * slopes) == pytest.approx(counted * grown, rel=1e-12)
 
@@ -198,8 +198,8 @@ def test_error_tolerance_of_zero_does_not_change_objective_in_shared_program():
     assert terms == join_terms([Objective(command_weight=0.1, noise_weight=0.2, tolerance=0.5)])
     assert terms == ObjectiveTerms("rms", True, True, False, tolerance=True)
     errors = np.random.default_rng(4).normal(size=45)
-    values, _ = alone(Objective(tolerance=0.0), errors, np.ones(45), 7.0)
-    plain, _ = alone(Objective(), errors)
+    values, _ = single_residuals(Objective(tolerance=0.0), errors, np.ones(45), 7.0)
+    plain, _ = single_residuals(Objective(), errors)
     np.testing.assert_array_equal(values[: len(plain)], plain)
     assert not values[len(plain) :].any()
 
@@ -217,7 +217,7 @@ def test_common_objective_terms_are_union_of_terms_of_all_objectives():
         join_terms([Objective("rms"), Objective("cvar")])
 
 
-def against_differences(batch, jacobian):
+def check_differences(batch, jacobian):
     """Compare derivatives (problem, gain, residual) with central differences."""
     jacobian_diagonal = np.stack([jacobian[i, :, i] for i in range(len(GAINS))])
     for gain in range(len(NAMES)):
@@ -231,23 +231,23 @@ def against_differences(batch, jacobian):
     return jacobian_diagonal
 
 
-def test_objective_derivatives_match_central_differences(batch, known):
-    jacobian_diagonal = against_differences(batch, known[1])
+def test_objective_derivatives_match_central_differences(batch, known_residuals):
+    jacobian_diagonal = check_differences(batch, known_residuals[1])
     parts = *np.split(jacobian_diagonal[..., :-1], 3, axis=-1), jacobian_diagonal[..., -1:]
     assert all((np.abs(part).max(axis=2) > 0).all() for part in parts)
 
 
-def test_sensor_noise_in_objective_is_the_same_for_all_gains(known):
+def test_sensor_noise_in_objective_is_the_same_for_all_gains(known_residuals):
     """Every call uses the same noise, so that residuals are differentiable by gains."""
     noisy = build_batch(["rig.force_sensor.noise_std=2.667", "rig.position_sensor.noise_std=1e-6"])
     value, jacobian = run(noisy)
-    assert np.all(np.max(np.abs(value - known[0]), axis=1) > 0.3)
+    assert np.all(np.max(np.abs(value - known_residuals[0]), axis=1) > 0.3)
     np.testing.assert_array_equal(run(noisy)[0], value)
-    against_differences(noisy, jacobian)
+    check_differences(noisy, jacobian)
 
 
-def test_tuning_problems_in_one_program_do_not_affect_each_other(batch, known):
-    value, jacobian = known
+def test_tuning_problems_in_one_program_do_not_affect_each_other(batch, known_residuals):
+    value, jacobian = known_residuals
     for mine in range(len(GAINS)):
         others = np.arange(len(GAINS)) != mine
         assert not jacobian[mine][:, others].any()
@@ -257,8 +257,8 @@ def test_tuning_problems_in_one_program_do_not_affect_each_other(batch, known):
     assert changed[1].any() and not changed[[0, 2]].any()
 
 
-def test_failed_contacts_increase_objective_with_zero_derivative(batch, known):
-    value, jacobian = known
+def test_failed_contacts_increase_objective_with_zero_derivative(batch, known_residuals):
+    value, jacobian = known_residuals
     slots = np.reshape(value[:, :-1], (len(GAINS), 3, -1, SCENARIOS))
     slopes = np.reshape(jacobian[..., :-1], (*GAINS.shape, len(GAINS), 3, -1, SCENARIOS))
     contacts = SCENARIOS * 3
@@ -271,7 +271,7 @@ def test_failed_contacts_increase_objective_with_zero_derivative(batch, known):
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
-def weighed(static, weights, terms, tangents):
+def weigh(static, weights, terms, tangents):
     """Return residuals and derivative of one problem from its errors, excesses, variation and noise."""
     *contacts, wanted, noise = terms
 
@@ -286,17 +286,17 @@ def padded(contacts):
     return np.pad(np.asarray(contacts, float), (0, SLOTS - len(contacts)))
 
 
-def alone(objective, errors, excesses=(), noise=1.0, chatter=(), tangents=((), (), (), 0.0)):
+def single_residuals(objective, errors, excesses=(), noise=1.0, chatter=(), tangents=((), (), (), 0.0)):
     """Return residuals and derivative of one problem with these contacts in more slots than needed."""
     wanted = np.arange(SLOTS) < len(errors)
     terms = padded(errors), padded(excesses), padded(chatter), wanted, np.asarray(noise)
     tangents = *map(padded, tangents[:-1]), np.asarray(tangents[-1])
     static = join_terms([objective])
-    return tuple(map(np.asarray, weighed(static, stacked([objective]), terms, tangents)))
+    return tuple(map(np.asarray, weigh(static, stacked([objective]), terms, tangents)))
 
 
 def sum_of_squares(*arguments):
-    return RESIDUAL_SCALE**2 * np.sum(alone(*arguments)[0] ** 2)
+    return RESIDUAL_SCALE**2 * np.sum(single_residuals(*arguments)[0] ** 2)
 
 
 @pytest.mark.parametrize("number, tail", [(1, 1), (19, 1), (20, 1), (21, 2), (40, 2), (41, 3), (140, 7)])
@@ -333,7 +333,7 @@ def test_error_metrics_of_known_errors_are_exact():
     assert swings == pytest.approx(np.sqrt(whole**2 + 0.02**2 * 5), rel=1e-14)
     # A noise amplification below 1 gives no benefit.
     assert evaluate_objective(stated, errors, None, 0.5) == 0.04
-    assert alone(stated, errors, (), 0.5)[0][-1] == 0
+    assert single_residuals(stated, errors, (), 0.5)[0][-1] == 0
 
 
 def test_high_order_norm_approximates_the_worst_error():
@@ -343,7 +343,7 @@ def test_high_order_norm_approximates_the_worst_error():
     np.testing.assert_allclose(sum_of_squares(Objective("worst"), errors), norm**2, rtol=1e-13)
     # Neither very large errors nor tiny ones overflow or underflow.
     for size in (1e100, 1e-100):
-        value = RESIDUAL_SCALE * alone(Objective("worst"), size * errors)[0]
+        value = RESIDUAL_SCALE * single_residuals(Objective("worst"), size * errors)[0]
         np.testing.assert_allclose(np.sqrt(np.sum((value / size) ** 2)), norm, rtol=1e-13)
 
 
@@ -356,9 +356,11 @@ def test_objective_derivatives_with_respect_to_errors_are_exact(name):
     for _ in range(3):
         way = generator.normal(size=45), np.where(excesses > 0, generator.normal(size=45), 0), 1.0
         way = *way, generator.normal(size=45)
-        _, slope = alone(objective, *terms, (way[0], way[1], way[3], way[2]))
+        _, slope = single_residuals(objective, *terms, (way[0], way[1], way[3], way[2]))
         up, down = (
-            alone(objective, *(term + h * along for term, along in zip(terms, way, strict=True)))[0]
+            single_residuals(objective, *(term + h * along for term, along in zip(terms, way, strict=True)))[
+                0
+            ]
             for h in (1e-6, -1e-6)
         )
         np.testing.assert_allclose(slope, (up - down) / 2e-6, rtol=1e-6, atol=1e-6)
@@ -370,7 +372,7 @@ def test_objective_without_any_error_has_a_finite_derivative(name):
     for largest in (0.0, 0.1):
         errors = np.where(np.arange(30) == 7, largest, 0)
         ones, zeros = np.ones((3, 30)), np.zeros(30)
-        value, slope = alone(objective, errors, zeros, 1.0, zeros, (*ones, 1.0))
+        value, slope = single_residuals(objective, errors, zeros, 1.0, zeros, (*ones, 1.0))
         assert np.isfinite(slope).all()
         assert value.any() == (largest > 0)
 

@@ -58,7 +58,7 @@ def tuned(settings, **options):
 
 
 @pytest.fixture(scope="module")
-def quiet():
+def quiet_gains():
     """Return the quietest gains, and the number of compiled programs."""
     cached_programs._programs.clear()
     result = tuned(SETTINGS)
@@ -74,16 +74,16 @@ def most_accurate(result):
     return min(result.starts, key=lambda start: start.rms)
 
 
-def test_quiet_gains_meet_error_limit_on_new_scenarios(quiet):
-    result = quiet[0][0]
+def test_quiet_gains_meet_error_limit_on_new_scenarios(quiet_gains):
+    result = quiet_gains[0][0]
     accurate = most_accurate(result)
     assert result.quiet and accurate.rms < compute_training_tolerance(LIMIT, SETTINGS.scenarios or 0)
     assert result.figures["tuned"].failed == 0 and result.figures["tuned"].rms <= LIMIT
     assert noise_of(result, result.gains) < 0.8 * noise_of(result, accurate.gains)
 
 
-def test_most_accurate_gains_are_kept_if_no_gains_meet_error_limit(quiet, validation):
-    result = quiet[0][1]
+def test_most_accurate_gains_are_kept_if_no_gains_meet_error_limit(quiet_gains, validation):
+    result = quiet_gains[0][1]
     accurate = most_accurate(result)
     assert not result.quiet and accurate.rms > compute_training_tolerance(LIMIT, SETTINGS.scenarios or 0)
     losses = validation.losses(Objective(), [1], validation.coordinates(1, [result.gains])[None])
@@ -97,13 +97,13 @@ def validation():
     return build_validation(tasks, SETTINGS.validation, SETTINGS.seed)
 
 
-def test_searches_for_quiet_gains_and_accurate_gains_share_one_program(quiet):
-    assert quiet[1] == 1
+def test_searches_for_quiet_gains_and_accurate_gains_share_one_program(quiet_gains):
+    assert quiet_gains[1] == 1
 
 
-def test_no_gains_on_a_grid_have_less_noise_within_the_error_tolerance(quiet, validation):
+def test_no_gains_on_a_grid_have_less_noise_within_the_error_tolerance(quiet_gains, validation):
     """Evaluate every pair of the two gains."""
-    result = quiet[0][0]
+    result = quiet_gains[0][0]
     accurate = most_accurate(result).gains
     side = np.linspace(0, 1, 24)
     grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
@@ -121,8 +121,8 @@ def test_no_gains_on_a_grid_have_less_noise_within_the_error_tolerance(quiet, va
     assert loudness[-2] <= 1.03 * loudness[:-2][errors[:-2] <= tolerance].min()
 
 
-def test_noise_free_metrics_equal_those_of_mechanism_without_noise(quiet):
-    for rig, result in zip(RIGS, quiet[0], strict=True):
+def test_noise_free_metrics_equal_those_of_mechanism_without_noise(quiet_gains):
+    for rig, result in zip(RIGS, quiet_gains[0], strict=True):
         silent = noisy(*rig[:-1], 0.0)
         seed = SETTINGS.seed + VALIDATION_SEED_OFFSET
         scenarios = build_scenarios(silent, draw(silent, SETTINGS.validation, seed), seed)
@@ -141,10 +141,10 @@ def test_quiet_option_has_no_effect_for_mechanisms_without_noise():
 
 
 @pytest.mark.slow
-def test_quiet_gains_from_cached_program_are_identical(quiet, tmp_path):
+def test_quiet_gains_from_cached_program_are_identical(quiet_gains, tmp_path):
     made = tuned(SETTINGS, pieces=Checkpoints(tmp_path))
     again = tuned(SETTINGS, pieces=Checkpoints(tmp_path, resume=True))
-    for one, other, reference in zip(made, again, quiet[0], strict=True):
+    for one, other, reference in zip(made, again, quiet_gains[0], strict=True):
         assert one.gains == other.gains == reference.gains
         assert one.quiet == other.quiet and one.without_noise == other.without_noise
 

@@ -23,7 +23,7 @@ def signed(document):
     return {**document, "sha256": digest(document)}
 
 
-def identified(name=HOSTILE, **others):
+def write_identification(name=HOSTILE, **others):
     """Write the result file of `jaxhil identify` with third-party texts."""
     estimate = {"key": name, "value": 1.0, "std": 0.1, "low": 0.8, "high": 1.2, "unit": name, "known": False}
     check = {"name": name, "finding": name, "where": name, "there": False, "effect": 0.001}
@@ -35,7 +35,7 @@ def identified(name=HOSTILE, **others):
     return signed({**document, **others})
 
 
-def mapped(name=HOSTILE):
+def write_map(name=HOSTILE):
     """Write the result file of `jaxhil map`."""
     error = [[0.1, -0.02, None], [0.3, 0.0, 0.01]]
     margin = {"low": None, "high": 4.0}
@@ -51,7 +51,7 @@ def mapped(name=HOSTILE):
     })  # fmt: skip
 
 
-def monitored(name=HOSTILE, **others):
+def write_monitor(name=HOSTILE, **others):
     """Write the output of `jaxhil monitor --json`."""
     figures = {one: {"value": 0.01, "predicted_std": 0.02, "z": 0.5} for one in ("stiffness", "noise", name)}
     figures["bias"] = {"value": None, "predicted_std": None, "z": None}
@@ -64,7 +64,7 @@ def monitored(name=HOSTILE, **others):
     return signed({**document, **others})
 
 
-def compared(name=HOSTILE):
+def write_comparison(name=HOSTILE):
     """Write the result file of `jaxhil compare`."""
     figures = {name: {"rms": {"value": 0.1, "low": 0.05, "high": None}, "noise": {"value": None}}}
     return signed({
@@ -86,10 +86,10 @@ def put(tmp_path):
 
 def test_mechanism_names_in_report_are_escaped(put):
     places = [
-        put(identified(), folder="a"),
-        put(mapped(), "map.json", "b"),
-        put(compared(), "compare.json", "c"),
-        put(monitored(), "monitor.json", "d") / "monitor.json",
+        put(write_identification(), folder="a"),
+        put(write_map(), "map.json", "b"),
+        put(write_comparison(), "compare.json", "c"),
+        put(write_monitor(), "monitor.json", "d") / "monitor.json",
     ]
     made = tuning.report(places)
     page = made.html.decode()
@@ -101,22 +101,22 @@ def test_mechanism_names_in_report_are_escaped(put):
 
 
 def test_report_verdict_follows_from_all_requirements(put):
-    made = tuning.report(put(identified(effect=0.02, verdict="bad")))
+    made = tuning.report(put(write_identification(effect=0.02, verdict="bad")))
     assert made.verdict == "bad" and "Bad: not every requirement is met." in made.html.decode()
     [one] = made.requirements
     assert one["margin"] == "-0.01" and one["result"] == "0.02" and one["verdict"] == "bad"
-    assert tuning.report(put(compared(), "compare.json", "c")).verdict == "unknown"
-    made = tuning.report(put(monitored(state="bad", since=4), "monitor.json", "d") / "monitor.json")
+    assert tuning.report(put(write_comparison(), "compare.json", "c")).verdict == "unknown"
+    made = tuning.report(put(write_monitor(state="bad", since=4), "monitor.json", "d") / "monitor.json")
     assert made.verdict == "bad" and made.requirements[0]["result"] == "bad since contact 4 of 80 contacts"
 
 
 @pytest.mark.parametrize(
     ("document", "said"),
     [
-        (identified() | {"effect": 0.0}, "the file was changed"),
-        (identified(estimates=[{"key": 1}]), "Expected `str`, got `int` - at `$.estimates[0].key`"),
-        (identified(schema="other/1"), "found the schema 'other/1'"),
-        (signed(mapped() | {"error": [[0.0]]}), "a table whose shape differs from its axes"),
+        (write_identification() | {"effect": 0.0}, "the file was changed"),
+        (write_identification(estimates=[{"key": 1}]), "Expected `str`, got `int` - at `$.estimates[0].key`"),
+        (write_identification(schema="other/1"), "found the schema 'other/1'"),
+        (signed(write_map() | {"error": [[0.0]]}), "a table whose shape differs from its axes"),
         ({"some": "thing"}, "no schema of jaxhil"),
         ([1, 2], "found no JSON object"),
         ('{"schema": NaN}', "found no JSON"),
@@ -131,7 +131,7 @@ def test_report_refuses_third_party_results_in_one_line(jaxhil, put, tmp_path, d
 
 
 def test_report_command_refuses_invalid_arguments(jaxhil, put, tmp_path):
-    one = put(identified())
+    one = put(write_identification())
     for arguments, message in (
         ([], "RESULT: found none"),
         ([one, one], "one of each kind"),

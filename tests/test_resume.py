@@ -42,7 +42,7 @@ def files(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def whole(files, tmp_path_factory):
+def uninterrupted_run(files, tmp_path_factory):
     """Return results of an uninterrupted run, and the number of checkpoints written."""
     from tuning import terminal
     from tuning.__main__ import main
@@ -99,8 +99,8 @@ def interrupted_and_resumed(jaxhil, files, folder, stop, after):
 
 
 @pytest.mark.slow
-def test_resumed_run_gives_result_of_uninterrupted_run(jaxhil, files, whole, tmp_path):
-    expected, every = whole
+def test_resumed_run_gives_result_of_uninterrupted_run(jaxhil, files, uninterrupted_run, tmp_path):
+    expected, every = uninterrupted_run
     # Checkpoints of search rounds, of the search, and one per result.
     assert every >= 2 + FILES
     for stop in (2, every):
@@ -113,8 +113,8 @@ def test_resumed_run_gives_result_of_uninterrupted_run(jaxhil, files, whole, tmp
 
 
 @pytest.mark.slow
-def test_run_resumes_after_interruption_at_any_checkpoint(jaxhil, files, whole, tmp_path):
-    expected, every = whole
+def test_run_resumes_after_interruption_at_any_checkpoint(jaxhil, files, uninterrupted_run, tmp_path):
+    expected, every = uninterrupted_run
     for stop in range(1, every + 1):
         for after in (False, True):
             folder = tmp_path / f"{stop} {after}"
@@ -222,7 +222,7 @@ def test_resumed_comparison_computes_only_missing_results(tmp_path, monkeypatch)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGINT])
-def test_killed_run_loses_no_finished_result(jaxhil, files, whole, tmp_path, signal_number):
+def test_killed_run_loses_no_finished_result(jaxhil, files, uninterrupted_run, tmp_path, signal_number):
     program = "import conftest, sys; from tuning.__main__ import main; sys.exit(main())"
     out = tmp_path / "out"
     command = [sys.executable, "-c", program, "tune", str(files), "-o", str(out), *TINY, "--resume"]
@@ -236,5 +236,5 @@ def test_killed_run_loses_no_finished_result(jaxhil, files, whole, tmp_path, sig
                 time.sleep(0.002)
             process.send_signal(signal_number)
     ran = jaxhil("tune", files, "-o", out, *TINY, "--resume")
-    assert ran.code == 0 and outputs(ran.out, out) == whole[0]
+    assert ran.code == 0 and outputs(ran.out, out) == uninterrupted_run[0]
     assert not [path for path in out.rglob("*") if path.name.endswith(".tmp")]

@@ -62,7 +62,7 @@ slow_if_seldom = [
 every_case = pytest.mark.parametrize("name", slow_if_seldom)
 
 
-def both(name):
+def contact_pairs(name):
     """Return (contact of the simulation, contact of the oracle) for every contact of a case."""
     return zip(cases.loop_contacts(name), cases.oracle_contacts(name), strict=True)
 
@@ -70,7 +70,7 @@ def both(name):
 @every_case
 def test_rollout_motion_agrees_with_oracle_in_every_contact(name):
     accuracy = ACCURACY.get(name, 1e-11)
-    for result, expected in both(name):
+    for result, expected in contact_pairs(name):
         assert result["status"] == OK and expected["status"] == "over"
         assert result["restitution"] == pytest.approx(expected["restitution"], rel=0, abs=accuracy)
         assert result["approach_velocity"] == pytest.approx(
@@ -98,13 +98,13 @@ def test_position_shortfall_is_zero_after_drives_have_caught_up():
 def test_rollout_peak_force_agrees_with_oracle(name):
     # Dry friction changes sign at the deepest point, which lies between samples.
     accuracy = 1e-3 if "preload" in name else 1e-4
-    for result, expected in both(name):
+    for result, expected in contact_pairs(name):
         assert result["peak_force"] == pytest.approx(expected["peak_force"], rel=accuracy)
 
 
 @every_case
 def test_rollout_mechanical_work_agrees_with_oracle(name):
-    for result, expected in both(name):
+    for result, expected in contact_pairs(name):
         accuracy = expected["work_in"] * WORK_ACCURACY.get(name, 3e-5)
         if CASES[name].mechanism["rig"]["simulator"]["model"] == "ideal" and name not in WORK_ACCURACY:
             accuracy = 1e-12 * expected["work_in"]
@@ -223,7 +223,7 @@ LANES = {
 
 
 @pytest.fixture(scope="module")
-def mixed():
+def mixed_batch():
     """Return a batch of the lanes above, the function that runs it, and its metrics."""
 
     def run_mixed(*arguments):
@@ -236,8 +236,8 @@ def mixed():
     return batch, run, jax.tree.map(np.asarray, run(batch.loop, batch.gains, batch.scenario))
 
 
-def test_rollout_reports_a_contact_status_for_every_scenario(mixed):
-    batch, _, metrics = mixed
+def test_rollout_reports_a_contact_status_for_every_scenario(mixed_batch):
+    batch, _, metrics = mixed_batch
     assert dict(zip(batch.names, metrics.status[0].tolist(), strict=True)) == {
         "plain": OK,
         "sticks": TIMEOUT,
@@ -270,8 +270,8 @@ def test_unused_position_reading_does_not_change_rollout(name):
     jax.tree.map(np.testing.assert_array_equal, metrics, run(True, scenario))
 
 
-def test_padding_elements_of_a_batch_do_not_affect_other_elements(mixed):
-    batch, run, metrics = mixed
+def test_padding_elements_of_a_batch_do_not_affect_other_elements(mixed_batch):
+    batch, run, metrics = mixed_batch
     lane = batch.names.index("padding")
     for name, values in metrics._asdict().items():
         if name == "status":
@@ -289,8 +289,8 @@ def test_padding_elements_of_a_batch_do_not_affect_other_elements(mixed):
         np.testing.assert_array_equal(np.asarray(result)[:, 0], expected[:, 0])
 
 
-def test_rollouts_of_similar_mechanisms_share_a_compiled_program(mixed):
-    batch, run, _ = mixed
+def test_rollouts_of_similar_mechanisms_share_a_compiled_program(mixed_batch):
+    batch, run, _ = mixed_batch
     other = validated(
         mechanism(
             {"stiffness": [2e5, 1e5], "damping": [100.0]},
@@ -342,8 +342,8 @@ def noise():
     """Return the noise added to force [N] and position [m], each (contacts, ticks, lanes)."""
     scenario = noisy_batch(6)[2]
     age = np.broadcast_to(np.arange(400)[:, None], (400, 6))
-    both = jax.jit(draw_noise, static_argnums=(0, 1), compiler_options=QUICK)
-    drawn = [both(True, True, scenario, np.full(6, contact), age) for contact in range(2)]
+    contact_pairs = jax.jit(draw_noise, static_argnums=(0, 1), compiler_options=QUICK)
+    drawn = [contact_pairs(True, True, scenario, np.full(6, contact), age) for contact in range(2)]
     return tuple(np.stack(values) for values in zip(*drawn, strict=True))
 
 

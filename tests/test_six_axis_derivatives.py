@@ -59,7 +59,7 @@ def bodies():
     )
 
 
-def drawn():
+def draw_touches():
     """Draw offsets (2), attitudes (3) and twists (6) at the first touch, (components, lanes)."""
     seeded = np.random.default_rng(7)
     offset = seeded.uniform(-0.04, 0.04, (2, LANES))
@@ -73,7 +73,7 @@ def drawn():
 
 
 @jax.jit
-def started(offset, theta, twist):
+def start_states(offset, theta, twist):
     """Return states shortly before the first touch."""
     height = touching_height(contact(np.ones(3)), *offset, exponential(vector(theta)))
     pose = jnp.concatenate([offset, height[None], theta])
@@ -112,7 +112,7 @@ def test_six_axis_error_derivatives_match_finite_differences():
 
     The other lanes have a known discrete event; no derivative is NaN.
     """
-    ones, start = jnp.ones(len(BY)), started(*drawn())
+    ones, start = jnp.ones(len(BY)), start_states(*draw_touches())
     static = {"integrator": "semi_implicit_euler", "hold": "linear", "latency": 0}
     loop = build_loop(scenario(ones, start), **static)
 

@@ -60,7 +60,7 @@ CASES = {
 }  # fmt: skip
 
 
-def started(case):
+def initial_bodies(case):
     """Return the initial states of the case: C off T, rotated, and approaching."""
     o1, o2 = (np.asarray(o) for o in case["interfaces"])
     apart = np.array([0.03, -0.025, case["height"]])
@@ -118,7 +118,7 @@ def close(states, expected, tolerance):
 
 @pytest.mark.parametrize("name", CASES)
 def test_six_axis_rig_agrees_with_independent_implementation(name):
-    case = started(CASES[name])
+    case = initial_bodies(CASES[name])
     case_scenario = as_scenario(case)
     loop = build_loop(
         case_scenario, integrator="semi_implicit_euler", hold="linear", latency=0,
@@ -136,7 +136,7 @@ def test_six_axis_rig_agrees_with_independent_implementation(name):
 
 @pytest.mark.parametrize("name", ["probe", "ring"])
 def test_six_axis_ideal_contact_agrees_with_independent_implementation(name):
-    case = started(CASES[name])
+    case = initial_bodies(CASES[name])
     case_scenario = as_scenario(case)
     time = lanes(TICKS * PERIOD, BATCH)
     result = jax.jit(reference_final)(case_scenario, time)

@@ -82,7 +82,7 @@ def test_six_axis_latches_and_robots_are_built_as_specified():
     assert "; ideal contact: held by a latch, peak force 1 N; rig: delay" in held.line("claw")
 
 
-def central(name):
+def central_contact(name):
     """Return one contact of a one-axis mechanism as two bodies with central impact."""
     one = load_any(name, {"approach.contacts": 1}).mechanism
     raw = to_plain_data(one)
@@ -115,7 +115,7 @@ def central(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in builtin_names() if name != "rattling"])
 def test_simulated_six_axis_central_contact_equals_one_axis_contact(name):
-    one, raw = central(name)
+    one, raw = central_contact(name)
     quiet = {"approach.contacts": 1, "rig.force_sensor.noise_std": 0.0, "rig.contact_plane": 0.0}
     expected = package.simulate(package.load(name, quiet), "none").contacts[0]
     [result] = simulate_six_axes(any_from_plain_data(raw, name)).episodes

@@ -38,7 +38,7 @@ def rows_of(folder, computer=None, label=MANIFEST, each=lambda tally: None):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def local_sweep(tmp_path_factory):
     """Return a sweep computed locally."""
     return rows_of(tmp_path_factory.mktemp("whole") / "store")
 
@@ -91,7 +91,7 @@ def test_cluster_worker_with_other_xla_flags_reports_correct_start_command(monke
 
 
 @pytest.mark.slow
-def test_cluster_sweep_rows_are_unchanged_if_a_worker_is_killed(whole, tmp_path):
+def test_cluster_sweep_rows_are_unchanged_if_a_worker_is_killed(local_sweep, tmp_path):
     with started(tmp_path) as cluster:
         first, _ = cluster.worker(), cluster.worker("--nthreads", "2")
 
@@ -101,11 +101,11 @@ def test_cluster_sweep_rows_are_unchanged_if_a_worker_is_killed(whole, tmp_path)
 
         rows, tally = rows_of(tmp_path / "store", on_cluster(cluster.address), each=kill_one)
         assert first.poll() is not None
-    assert list_different_columns(rows, whole[0]) == [] and tally == whole[1]
+    assert list_different_columns(rows, local_sweep[0]) == [] and tally == local_sweep[1]
 
 
 @pytest.mark.slow
-def test_cluster_worker_with_running_jax_is_refused_or_preloaded(whole, tmp_path):
+def test_cluster_worker_with_running_jax_is_refused_or_preloaded(local_sweep, tmp_path):
     (tmp_path / "early.py").write_text("def dask_setup(worker):\n    import jax\n    jax.devices()\n")
     with started(tmp_path) as cluster:
         wrong = cluster.worker("--preload", str(tmp_path / "early.py"))
@@ -114,7 +114,7 @@ def test_cluster_worker_with_running_jax_is_refused_or_preloaded(whole, tmp_path
         cluster.kill(wrong)
         cluster.worker("--preload", "tuning.caches.worker", "--preload", str(tmp_path / "early.py"))
         rows, _ = rows_of(tmp_path / "store", on_cluster(cluster.address))
-    assert list_different_columns(rows, whole[0]) == []
+    assert list_different_columns(rows, local_sweep[0]) == []
 
 
 @pytest.mark.slow
@@ -157,7 +157,7 @@ def test_sweep_without_workers_is_computed_locally(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_killed_scheduler_is_reported_in_one_line_and_finished_chunks_are_kept(whole, tmp_path):
+def test_killed_scheduler_is_reported_in_one_line_and_finished_chunks_are_kept(local_sweep, tmp_path):
     with started(tmp_path) as cluster:
         cluster.worker()
 
@@ -168,7 +168,7 @@ def test_killed_scheduler_is_reported_in_one_line_and_finished_chunks_are_kept(w
         with pytest.raises(InputError, match="--resume goes on"):
             rows_of(tmp_path / "store", on_cluster(cluster.address), each=kill_scheduler)
     assert len(list((tmp_path / "store").glob("parts/part-*"))) >= 1
-    assert list_different_columns(rows_of(tmp_path / "store")[0], whole[0]) == []
+    assert list_different_columns(rows_of(tmp_path / "store")[0], local_sweep[0]) == []
 
 
 @pytest.mark.slow

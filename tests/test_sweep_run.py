@@ -54,14 +54,14 @@ def all_rows(store):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def uninterrupted_sweep(tmp_path_factory):
     """Return rows, sweep and tally of a sweep without interruptions."""
     store, sweep, tally = Log().sweep(tmp_path_factory.mktemp("whole") / "store", resume=False)
     return store, all_rows(store), sweep, tally
 
 
-def test_sweep_tally_equals_tally_of_stored_rows(whole):
-    _, rows, _, tally = whole
+def test_sweep_tally_equals_tally_of_stored_rows(uninterrupted_sweep):
+    _, rows, _, tally = uninterrupted_sweep
     assert tally.scenarios == 300 and tally.failed == np.sum(rows["failed"])
     assert 0 < tally.failed < 300
     assert count_outcomes(tally) == {"good": 300 - tally.failed, "error beyond limit": tally.failed}
@@ -69,8 +69,8 @@ def test_sweep_tally_equals_tally_of_stored_rows(whole):
     np.testing.assert_array_equal([index for _, _, index in tally.worst], worst)
 
 
-def test_missing_or_damaged_sweep_chunks_are_computed_again(whole, tmp_path):
-    _, rows, _, tally = whole
+def test_missing_or_damaged_sweep_chunks_are_computed_again(uninterrupted_sweep, tmp_path):
+    _, rows, _, tally = uninterrupted_sweep
     store, _, _ = Log().sweep(tmp_path / "store")
     store.chunk_path(0).unlink()
     store.chunk_path(9).unlink()
@@ -84,8 +84,8 @@ def test_missing_or_damaged_sweep_chunks_are_computed_again(whole, tmp_path):
     assert len(list((tmp_path / "store" / "parts").iterdir())) == 10
 
 
-def test_interrupted_sweep_keeps_written_rows(whole, tmp_path):
-    _, rows, _, tally = whole
+def test_interrupted_sweep_keeps_written_rows(uninterrupted_sweep, tmp_path):
+    _, rows, _, tally = uninterrupted_sweep
     store = open_store(tmp_path / "store", MANIFEST, resume=False)
 
     def interrupted(number, tally):
@@ -100,8 +100,8 @@ def test_interrupted_sweep_keeps_written_rows(whole, tmp_path):
     assert list_different_columns(all_rows(store), rows) == [] and again == tally
 
 
-def test_killed_and_resumed_sweep_gives_store_of_uninterrupted_sweep(whole, tmp_path):
-    _, rows, _, _ = whole
+def test_killed_and_resumed_sweep_gives_store_of_uninterrupted_sweep(uninterrupted_sweep, tmp_path):
+    _, rows, _, _ = uninterrupted_sweep
     write_gain_file(tmp_path / "gains.json", case())
     folder = tmp_path / "store"
     program = "import conftest, sys; from tuning.__main__ import main; sys.exit(main())"
@@ -121,16 +121,16 @@ def test_killed_and_resumed_sweep_gives_store_of_uninterrupted_sweep(whole, tmp_
     assert list_different_columns(all_rows(store), rows) == []
 
 
-def test_any_sweep_row_replays_to_the_bit(whole):
-    store, rows, _, _ = whole
+def test_any_sweep_row_replays_to_the_bit(uninterrupted_sweep):
+    store, rows, _, _ = uninterrupted_sweep
     for index in np.random.default_rng(0).integers(0, 300, 6):
         result = replay_scenario(read_store(store.folder), int(index))
         assert result.different_columns == []
         np.testing.assert_array_equal(result.again["error_1"], rows["error_1"][index])
 
 
-def test_replay_detects_a_changed_sweep_row(whole, tmp_path):
-    store = read_store(shutil.copytree(whole[0].folder, tmp_path / "store"))
+def test_replay_detects_a_changed_sweep_row(uninterrupted_sweep, tmp_path):
+    store = read_store(shutil.copytree(uninterrupted_sweep[0].folder, tmp_path / "store"))
     changed = dict(read_chunk(store, 0))
     changed["peak_force_1"] = changed["peak_force_1"].copy()
     changed["peak_force_1"][5] = np.nextafter(changed["peak_force_1"][5], np.inf)
@@ -139,16 +139,16 @@ def test_replay_detects_a_changed_sweep_row(whole, tmp_path):
     assert replay_scenario(store, 6).different_columns == []
 
 
-def test_replayed_motion_equals_simulation_of_the_scenario(whole):
-    _, rows, sweep, _ = whole
+def test_replayed_motion_equals_simulation_of_the_scenario(uninterrupted_sweep):
+    _, rows, sweep, _ = uninterrupted_sweep
     (piece,) = compute_motion(sweep, 17)
     curve = piece.curves["rig"]
     rebound = -np.diff(curve.position)[-1] / 2e-3
     np.testing.assert_allclose(rebound / curve.velocity, rows["restitution_1"][17], rtol=1e-9)
 
 
-def test_float32_and_float64_are_compared_on_the_same_scenarios(whole):
-    _, rows, sweep, _ = whole
+def test_float32_and_float64_are_compared_on_the_same_scenarios(uninterrupted_sweep):
+    _, rows, sweep, _ = uninterrupted_sweep
     result = compare_precisions(sweep, 64)
     assert result.scenarios == 32 and result.failed_float64 == np.sum(rows["failed"][:32])
     assert result.largest_difference is not None and 0 < result.largest_difference < 1e-4
@@ -160,7 +160,7 @@ UNTIL = manifest(case(), scenarios=300, limit=1.5, until_width=WIDE)
 
 
 @pytest.fixture(scope="module")
-def stopped(tmp_path_factory):
+def stopped_sweep(tmp_path_factory):
     """Return store, chunks and tally of a sweep that stopped at a narrow interval."""
     store, _, tally = Log().sweep(tmp_path_factory.mktemp("until") / "store", resume=False, label=UNTIL)
     return store, parts_of(store), tally
@@ -170,9 +170,9 @@ def parts_of(store):
     return sorted(path.name for path in store.folder.glob("parts/part-*"))
 
 
-def test_sweep_stops_when_failure_interval_is_first_narrow_enough(whole, stopped):
-    _, rows, _, _ = whole
-    store, parts, tally = stopped
+def test_sweep_stops_when_failure_interval_is_first_narrow_enough(uninterrupted_sweep, stopped_sweep):
+    _, rows, _, _ = uninterrupted_sweep
+    store, parts, tally = stopped_sweep
     failed, running = rows["failed"], SequentialState()
     for looks in range(1, 11):
         part = failed[32 * (looks - 1) : 32 * looks]
@@ -193,8 +193,8 @@ def test_sweep_stops_when_failure_interval_is_first_narrow_enough(whole, stopped
         replay_scenario(store, 299)
 
 
-def test_sweep_that_reached_its_interval_width_is_not_continued(stopped):
-    store, parts, tally = stopped
+def test_sweep_that_reached_its_interval_width_is_not_continued(stopped_sweep):
+    store, parts, tally = stopped_sweep
     log = Log()
     _, _, again = log.sweep(store.folder, label=UNTIL)
     assert again == tally and parts_of(store) == parts
@@ -203,8 +203,8 @@ def test_sweep_that_reached_its_interval_width_is_not_continued(stopped):
         Log().sweep(store.folder, label=manifest(case(), scenarios=300, limit=1.5, until_width=0.1))
 
 
-def test_sweep_stop_does_not_depend_on_order_of_finished_chunks(stopped, tmp_path):
-    _, parts, tally = stopped
+def test_sweep_stop_does_not_depend_on_order_of_finished_chunks(stopped_sweep, tmp_path):
+    _, parts, tally = stopped_sweep
 
     def shuffled(sweep, missing):
         for part in np.random.default_rng(0).permutation(list(missing)):
@@ -220,8 +220,8 @@ def test_sweep_stop_does_not_depend_on_order_of_finished_chunks(stopped, tmp_pat
     assert (log.found, log.computed) == (tally.scenarios - 64, 64)
 
 
-def test_sweep_ends_at_its_largest_number_of_scenarios(whole, tmp_path):
-    _, rows, _, _ = whole
+def test_sweep_ends_at_its_largest_number_of_scenarios(uninterrupted_sweep, tmp_path):
+    _, rows, _, _ = uninterrupted_sweep
     label = manifest(case(), scenarios=300, limit=1.5, until_width=1e-6)
     store, _, tally = Log().sweep(tmp_path / "store", label=label)
     assert tally.scenarios == 300 and list_different_columns(all_rows(store), rows) == []

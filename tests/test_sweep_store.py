@@ -34,7 +34,7 @@ UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"  # no process has this number
 SLOTS = list_error_columns(("error",), 2)
 
 
-def made_up(part, label=MANIFEST, seed=0):
+def fake_rows(part, label=MANIFEST, seed=0):
     """Return artificial rows of a chunk, with missing values."""
     first, number = label.chunk_range(part)
     generator = np.random.default_rng([seed, part])
@@ -61,7 +61,7 @@ def made_up(part, label=MANIFEST, seed=0):
 def store(tmp_path):
     made = open_store(tmp_path / "store", MANIFEST, resume=False)
     for part in range(MANIFEST.parts):
-        write_chunk(made, part, made_up(part))
+        write_chunk(made, part, fake_rows(part))
     return made
 
 
@@ -73,8 +73,8 @@ def test_sweep_store_is_read_as_written(store):
     for part in range(MANIFEST.parts):
         result = read_chunk(store, part)
         assert result is not None and list(result) == [column.name for column in MANIFEST.columns]
-        assert list_different_columns(result, made_up(part)) == []
-    assert list_different_columns(read_row(store, 99), {k: v[3:4] for k, v in made_up(3).items()}) == []
+        assert list_different_columns(result, fake_rows(part)) == []
+    assert list_different_columns(read_row(store, 99), {k: v[3:4] for k, v in fake_rows(3).items()}) == []
 
 
 def test_sweep_store_is_a_parquet_dataset_with_names_units_and_nulls(store):
@@ -84,7 +84,7 @@ def test_sweep_store_is_a_parquet_dataset_with_names_units_and_nulls(store):
     assert table.num_rows == 100
     assert table.column("index").to_pylist() == list(range(100))
     assert table.schema.field("energy_in_2").metadata[b"unit"] == b"J"
-    expected = np.concatenate([made_up(part)["error_1"] for part in range(MANIFEST.parts)])
+    expected = np.concatenate([fake_rows(part)["error_1"] for part in range(MANIFEST.parts)])
     assert table.column("error_1").null_count == np.sum(np.isnan(expected)) > 0
     assert set(table.column("outcome").to_pylist()) <= set(SCENARIO_OUTCOMES)
 
@@ -106,7 +106,7 @@ def test_sweep_store_ignores_a_damaged_or_third_party_chunk_file(store, tmp_path
         path.write_bytes(store.chunk_path(0).read_bytes())
     else:
         other = open_store(tmp_path / "other", manifest(case(2), seed=1), resume=False)
-        write_chunk(other, 1, made_up(1))
+        write_chunk(other, 1, fake_rows(1))
         path.write_bytes(other.chunk_path(1).read_bytes())
     assert read_chunk(store, 1) is None
     assert read_chunk(store, 0) is not None
@@ -115,7 +115,7 @@ def test_sweep_store_ignores_a_damaged_or_third_party_chunk_file(store, tmp_path
 
 
 def test_sweep_store_detects_any_flipped_bit_of_a_chunk_file():
-    content = encode_chunk(MANIFEST, made_up(0))
+    content = encode_chunk(MANIFEST, fake_rows(0))
     assert decode_chunk(MANIFEST, 0, content) is not None
     for bit in np.random.default_rng(0).integers(0, 8 * len(content), 1000):
         harmed = bytearray(content)
@@ -138,7 +138,7 @@ def test_sweep_store_ignores_a_chunk_file_rewritten_by_another_program(store):
 def test_sweep_store_outcomes_follow_from_errors(store, column):
     good = {"status": 1, "error": 0.25, "position_shortfall": 0.0, "peak_force": 1.0, "duration": 1.0}
     good |= {f"reference_{name}": good[name] for name in ("peak_force", "duration")}
-    rows = made_up(0)
+    rows = fake_rows(0)
     for name, value in good.items():
         rows[f"{name}_1"][5] = rows[f"{name}_2"][5] = value
     rows = {
@@ -228,7 +228,7 @@ def test_full_disk_is_reported_in_one_line_and_sweep_store_keeps_its_chunks(stor
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
     try:
         with refused("part-000000.parquet: cannot be written: "):
-            write_chunk(store, 0, made_up(0, seed=1))
+            write_chunk(store, 0, fake_rows(0, seed=1))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert store.chunk_path(0).read_bytes() == before
@@ -245,7 +245,7 @@ def test_sweep_store_folder_that_cannot_be_created_is_reported_in_one_line(tmp_p
 def test_sweep_store_in_read_only_folder_is_reported_in_one_line(store):
     (store.folder / "parts").chmod(0o500)
     with refused("part-000000.parquet: cannot be written: Permission denied"):
-        write_chunk(store, 0, made_up(0))
+        write_chunk(store, 0, fake_rows(0))
 
 
 def test_sweep_store_is_resumed_only_by_the_same_source_code(tmp_path):
@@ -304,7 +304,7 @@ def test_sweep_store_chunk_must_be_a_plain_file(store, tmp_path, kind):
         path.symlink_to(tmp_path / "part")
     assert read_chunk(store, 2) is None
     with refused("part-000002.parquet: cannot be written: found a"):
-        write_chunk(store, 2, made_up(2))
+        write_chunk(store, 2, fake_rows(2))
     remove_chunks(store, 1)
     assert sorted(os.listdir(path.parent)) == ["part-000000.parquet", path.name]
 

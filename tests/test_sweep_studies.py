@@ -33,15 +33,15 @@ def sweep_of(document, **choices):
 
 
 @pytest.fixture(scope="module")
-def whole():
+def complete_sweep():
     """Return a sweep with an input that has no effect, and the rows of all its scenarios."""
     sweep = sweep_of(case(uncertainty=UNCERTAIN | IDLE))
     halves = [run_chunk(sweep, first, 1024) for first in (0, 1024)]
     return sweep, {name: np.concatenate([half[name] for half in halves]) for name in halves[0]}
 
 
-def test_input_without_effect_has_zero_sensitivity_index(whole):
-    sweep, _ = whole
+def test_input_without_effect_has_zero_sensitivity_index(complete_sweep):
+    sweep, _ = complete_sweep
     ran = []
     result = compute_error_indices(sweep, 128, PointRunSettings(ran.append))
     assert result.evaluations == sum(ran) == count_evaluations(4, 128) == 768
@@ -107,8 +107,8 @@ def test_sensor_noise_is_an_input_of_the_sensitivity_study():
 TIGHT = {"distribution": "uniform", "factor": [0.99999, 1.00001]}
 
 
-def test_sensitivity_study_replaces_errors_above_the_cap_by_the_cap(whole):
-    _, rows = whole
+def test_sensitivity_study_replaces_errors_above_the_cap_by_the_cap(complete_sweep):
+    _, rows = complete_sweep
     limit = float(np.quantile(np.abs(rows["worst_error"]), 0.5)) / 10
     limited = sweep_of(case(uncertainty=UNCERTAIN | IDLE), limit=limit)
     result = compute_error_indices(limited, 128)
@@ -117,8 +117,8 @@ def test_sensitivity_study_replaces_errors_above_the_cap_by_the_cap(whole):
 
 
 @pytest.mark.parametrize("share", [0.2, 0.05])
-def test_rare_failure_probability_agrees_with_sweep(whole, share):
-    sweep, rows = whole
+def test_rare_failure_probability_agrees_with_sweep(complete_sweep, share):
+    sweep, rows = complete_sweep
     limit = float(np.quantile(np.abs(rows["worst_error"]), 1 - share))
     rows = {**rows, "outcome": (np.abs(rows["worst_error"]) > limit).astype(np.int8)}
     counted = add_to_tally(build_empty_tally(1), {**rows, "failed": rows["outcome"] > 0})
@@ -131,8 +131,8 @@ def test_rare_failure_probability_agrees_with_sweep(whole, share):
     assert is_spread_beyond_formula(result._replace(coefficient_of_variation=0.9))
 
 
-def test_rare_failure_estimate_is_reproducible(whole):
-    sweep, rows = whole
+def test_rare_failure_estimate_is_reproducible(complete_sweep):
+    sweep, rows = complete_sweep
     limit = float(np.quantile(np.abs(rows["worst_error"]), 0.97))
     first, again = (estimate_rare_failure(sweep, limit, samples=50, replicates=2) for _ in range(2))
     np.testing.assert_array_equal(first.estimates, again.estimates)
@@ -144,8 +144,8 @@ def test_saturated_runs_count_as_failures_for_any_error_limit():
     assert estimate_rare_failure(sweep, 1e9, samples=20, replicates=2).probability == 1
 
 
-def test_study_point_results_do_not_depend_on_the_chunk(whole):
-    sweep, _ = whole
+def test_study_point_results_do_not_depend_on_the_chunk(complete_sweep):
+    sweep, _ = complete_sweep
     points = np.random.default_rng(1).random((40, 4))
     one = run_points(sweep, points, np.arange(40))
     other = run_points(sweep_of(case(uncertainty=UNCERTAIN | IDLE), chunk=16), points, np.arange(40))

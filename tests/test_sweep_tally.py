@@ -22,7 +22,7 @@ from tuning.sweeps.tally import (
 )
 
 
-def made_up(number, seed=0, share=0.3):
+def fake_rows(number, seed=0, share=0.3):
     generator = np.random.default_rng(seed)
     outcome = np.where(
         generator.random(number) < share, generator.integers(1, len(SCENARIO_OUTCOMES), number), 0
@@ -42,7 +42,7 @@ def piece(rows, part):
 
 
 def test_sweep_tally_does_not_depend_on_order_of_chunks():
-    rows = made_up(1000)
+    rows = fake_rows(1000)
     cuts = np.split(np.arange(1000), [10, 500, 501])
     whole = add_to_tally(build_empty_tally(16), rows)
     for order in ([0, 1, 2, 3], [3, 1, 0, 2]):
@@ -55,7 +55,7 @@ def test_sweep_tally_does_not_depend_on_order_of_chunks():
 
 
 def test_sweep_tally_lists_the_worst_scenarios_first():
-    rows = made_up(1000)
+    rows = fake_rows(1000)
     tally = add_to_tally(build_empty_tally(1), rows)
     assert len(tally.worst) == MAX_WORST_SCENARIOS
     outcomes = [SCENARIO_OUTCOMES[rows["outcome"][index]] for _, _, index in tally.worst]
@@ -67,14 +67,14 @@ def test_sweep_tally_lists_the_worst_scenarios_first():
 
 
 def test_sweep_tally_interval_without_failures_matches_closed_form():
-    rows = made_up(500, share=0.0)
+    rows = fake_rows(500, share=0.0)
     result = estimate_failure_probability(add_to_tally(build_empty_tally(1), rows))
     assert SCENARIO_OUTCOMES[0] == GOOD and result.value == 0 and result.low == 0
     assert result.high == pytest.approx(1 - 0.025 ** (1 / 500), rel=1e-12)
 
 
 def test_sweep_tally_interval_of_replicates_is_students_t_interval():
-    rows = made_up(16 * 64)
+    rows = fake_rows(16 * 64)
     result = estimate_failure_probability(add_to_tally(build_empty_tally(16), rows))
     means = rows["failed"].reshape(64, 16).mean(axis=0)
     half = 2.131449545559323 * np.std(means, ddof=1) / 4
@@ -83,7 +83,7 @@ def test_sweep_tally_interval_of_replicates_is_students_t_interval():
 
 
 def test_incomplete_last_block_of_sweep_tally_is_in_no_replicate():
-    rows = made_up(16 * 64 + 5)
+    rows = fake_rows(16 * 64 + 5)
     tally = add_to_tally(build_empty_tally(16, 16 * 64 + 5), rows)
     assert tally.scenarios == 16 * 64 + 5 and tally.left_out == 5
     whole = piece(rows, slice(16 * 64))
@@ -97,15 +97,15 @@ def test_incomplete_last_block_of_sweep_tally_is_in_no_replicate():
 
 
 def test_sweep_tally_has_no_interval_for_replicates_of_unequal_size():
-    tally = add_to_tally(build_empty_tally(16, 1600), made_up(100))
+    tally = add_to_tally(build_empty_tally(16, 1600), fake_rows(100))
     result = estimate_failure_probability(tally)
     assert (result.low, result.high) == (0, 1) and 0 < result.value < 1 and "yet" in result.method
     assert all((one.low, one.high) == (0, np.inf) for one in estimate_error_quantiles(tally))
-    assert estimate_failure_probability(add_to_tally(build_empty_tally(16, 10), made_up(10))).high == 1
+    assert estimate_failure_probability(add_to_tally(build_empty_tally(16, 10), fake_rows(10))).high == 1
 
 
 def test_sweep_tally_interval_of_repeated_looks_is_confidence_sequence():
-    rows = made_up(1000)
+    rows = fake_rows(1000)
     tally, running = build_empty_tally(1, 10**6, looked_at=True), SequentialState()
     for part in np.split(np.arange(1000), 10):
         tally = add_to_tally(tally, piece(rows, part))
@@ -126,7 +126,7 @@ def test_sweep_tally_interval_of_repeated_looks_is_confidence_sequence():
 
 @pytest.mark.parametrize("replicates", [1, 16])
 def test_sweep_tally_quantiles_equal_quantiles_of_errors(replicates):
-    rows = made_up(1600, share=0.01)
+    rows = fake_rows(1600, share=0.01)
     sizes = compute_error_sizes(rows)
     assert np.array_equal(np.isinf(sizes), rows["outcome"] > SCENARIO_OUTCOMES.index(SATURATED)) and np.any(
         np.isinf(sizes)

@@ -32,12 +32,12 @@ def claw(*overrides):
     return load("claw-350kg", overrides).mechanism
 
 
-def behind(simulator):
+def claw_behind(simulator):
     """Return the claw with another motion simulator."""
     return claw(f"rig.simulator={{delay=0.004, model={simulator}}}", "uncertainty={}")
 
 
-def anywhere(mechanism, compensator, seed=0):
+def random_gains(mechanism, compensator, seed=0):
     """Draw gains within their bounds."""
     generator, gains = np.random.default_rng(seed), {}
     for gain in COMPENSATORS[compensator].gains:
@@ -89,13 +89,13 @@ def test_mechanism_distance_weighs_each_property_by_effect_on_restitution(overri
 def test_mechanism_properties_do_not_depend_on_form_of_simulator_model():
     second = compute_traits(claw("rig.simulator.natural_frequency=10.0", "rig.simulator.damping_ratio=0.7"))
     omega = 2 * math.pi * 10
-    written = behind(
+    written = claw_behind(
         f"'transfer_function', numerator=[{omega**2}], denominator=[1.0, {1.4 * omega}, {omega**2}]"
     )
     assert compute_traits(written).simulator_delay == pytest.approx(second.simulator_delay, rel=1e-12)
-    leading = behind("'transfer_function', numerator=[0.01, 1.0], denominator=[0.0001, 0.03, 1.0]")
+    leading = claw_behind("'transfer_function', numerator=[0.01, 1.0], denominator=[0.0001, 0.03, 1.0]")
     assert compute_traits(leading).simulator_delay == pytest.approx(0.004 + 0.02, rel=1e-12)
-    assert compute_traits(behind("'ideal'")).simulator_delay == 0.004
+    assert compute_traits(claw_behind("'ideal'")).simulator_delay == 0.004
 
 
 def test_equivalent_damping_of_every_contact_law_matches_its_restitution():
@@ -123,7 +123,7 @@ def test_nearest_mechanism_has_least_distance_and_is_first_among_equals():
 @pytest.mark.parametrize("name", builtin_names())
 def test_gains_transferred_to_an_identical_mechanism_are_unchanged(compensator, name):
     mechanism = load(name).mechanism
-    gains = anywhere(mechanism, compensator)
+    gains = random_gains(mechanism, compensator)
     assert transfer_gains(compensator, gains, mechanism, load(name).mechanism) == gains
 
 
@@ -152,7 +152,7 @@ def test_transferred_gains_are_within_the_bounds():
     for seed, name in enumerate(names):
         source, target = load(name).mechanism, load(names[seed - 1], ["rig.control_period=0.003"]).mechanism
         transferred = transfer_gains(
-            "response_error", anywhere(source, "response_error", seed), source, target
+            "response_error", random_gains(source, "response_error", seed), source, target
         )
         for gain in COMPENSATORS["response_error"].gains:
             assert gain.lower(target) <= transferred[gain.name] <= gain.upper(target)

@@ -36,7 +36,7 @@ WEIGHED = Objective(command_weight=0.02, transparency_weight=0.7)
 SMALL = TuneSettings(scenarios=4, starts=2, steps=4, validation=15, objective=WEIGHED, polish=0, scanned=8)
 
 
-def kind(scenarios, number):
+def lanes_of_kind(scenarios, number):
     """Return one lane of each scenario: 0 plain, 1 early push, 2 late push, 3 damping perturbation."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., number::LANES_PER_SCENARIO], scenarios)
 
@@ -45,7 +45,7 @@ def test_contact_with_probe_push_has_restitution_of_pushed_ideal_contact():
     """Compare with SciPy under the push on the hardware."""
     probed = build_probed_scenarios(DAMPED, draw(DAMPED, 3, 0))
     for number, expected in ((1, probed.early), (2, probed.late)):
-        scenarios = kind(probed.scenarios, number)
+        scenarios = lanes_of_kind(probed.scenarios, number)
         assert (scenarios.contacts == 1).all()
         for lane in range(3):
             stiffness, damping = scenarios.contact.stiffness[0, lane], scenarios.contact.damping[0, lane]

@@ -33,7 +33,7 @@ CHOSEN = {
 }
 
 
-def coarse(contact: dict[str, Any], **parts: Any) -> LoadedGains:
+def coarse_mechanism(contact: dict[str, Any], **parts: Any) -> LoadedGains:
     """Return damped contacts at a coarse control period, with both good and bad runs."""
     contact = {"damping": [400.0], **contact}
     raw = mechanism(contact, {**SECOND_ORDER, "natural_frequency": 20.0}, **parts)
@@ -42,7 +42,7 @@ def coarse(contact: dict[str, Any], **parts: Any) -> LoadedGains:
 
 
 def test_c_watchdog_misses_no_bad_run_and_stops_no_good_run(tmp_path):
-    loaded = coarse({}, contacts=2)
+    loaded = coarse_mechanism({}, contacts=2)
     one, _ = export(loaded, 0.05, tmp_path, scenarios=256, lanes=128)
     (count,) = counted(loaded, [one], 384, lanes=128, in_python=12)
     assert count.lanes == 384 and not count.missed and not count.false, str(count)
@@ -56,7 +56,7 @@ def test_watchdog_for_noisy_contacts_at_two_surfaces_performs_as_calibrated(tmp_
     If this change exceeds the margin of the error limit, the margin is widened until good runs pass; here
     still no bad run is missed.
     """
-    loaded = coarse({"clearance": 0.001}, contacts=3, force_sensor=NOISY)
+    loaded = coarse_mechanism({"clearance": 0.001}, contacts=3, force_sensor=NOISY)
     both = [export(loaded, limit, tmp_path, scenarios=1024, lanes=128) for limit in (0.05, 0.1)]
     narrow, wide = counted(loaded, [one for one, _ in both], 1024, lanes=128, in_python=12)
     assert narrow.bad > 100 and wide.bad > 4
@@ -74,7 +74,7 @@ def test_watchdog_for_noisy_contacts_at_two_surfaces_performs_as_calibrated(tmp_
 
 def test_bad_run_that_is_not_stopped_in_time_is_counted_as_missed(tmp_path):
     """The largest margin misses every bad run; a margin of 0 stops every run."""
-    loaded = coarse({}, contacts=2)
+    loaded = coarse_mechanism({}, contacts=2)
     one, _ = export(loaded, 0.02, tmp_path, scenarios=256, lanes=128)
     margin = list(one.parameters).index(one.gain_file.limits["restitution_margin"])
     blind, strict = (one.parameters.copy() for _ in range(2))

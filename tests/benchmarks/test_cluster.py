@@ -28,7 +28,7 @@ THOUSAND, PIECES = 1000, 4000
 STUBS = Path(__file__).with_name("stub_workers.py")
 
 
-def swept(folder, manifest, computer=run_chunks):
+def run_timed_sweep(folder, manifest, computer=run_chunks):
     """Return the duration [s] of a sweep and its rows."""
     store = open_store(folder, manifest, resume=False)
     begin = time.perf_counter()
@@ -46,8 +46,8 @@ def test_cluster_sweep_is_at_least_half_as_fast_as_local_sweep(workers, tmp_path
             cluster.worker("--nthreads", "1")
         # In the first repetition every worker reads the program.
         for turn in range(1 + REPEATS):
-            local_time, rows = swept(tmp_path / f"here {turn}", manifest)
-            cluster_time, cluster_rows = swept(
+            local_time, rows = run_timed_sweep(tmp_path / f"here {turn}", manifest)
+            cluster_time, cluster_rows = run_timed_sweep(
                 tmp_path / f"there {turn}", manifest, on_cluster(cluster.address)
             )
             assert all(
@@ -78,11 +78,11 @@ def test_scheduler_serves_a_thousand_workers_without_becoming_the_bottleneck(tmp
             while client.scheduler_info(n_workers=0)["n_workers"] < THOUSAND:
                 assert stubs.poll() is None
                 time.sleep(1.0)
-        scheduler, ours, begin = spent(cluster.processes[0]), time.process_time(), time.perf_counter()
+        scheduler, ours, begin = cpu_seconds(cluster.processes[0]), time.process_time(), time.perf_counter()
         pieces = (WorkUnit(i, (-i,)) for i in range(PIECES))
         results = dict(run_on_workers(cluster.address, abs, pieces, None, "stubs"))
         took, ours = time.perf_counter() - begin, time.process_time() - ours
-        scheduler = spent(cluster.processes[0]) - scheduler
+        scheduler = cpu_seconds(cluster.processes[0]) - scheduler
     np.testing.assert_array_equal([results[i] for i in range(PIECES)], np.arange(PIECES))
     busy = THOUSAND * max(scheduler, ours) / PIECES
     with capsys.disabled():
@@ -94,7 +94,7 @@ def test_scheduler_serves_a_thousand_workers_without_becoming_the_bottleneck(tmp
     assert busy <= 10.0
 
 
-def spent(process):
+def cpu_seconds(process):
     """Return the CPU time [s] that a process has used."""
     fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

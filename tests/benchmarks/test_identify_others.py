@@ -27,7 +27,7 @@ CONTACT = 3.0  # Hz, frequency at which the lag is compared
 AT = np.concatenate([[CONTACT], np.linspace(5.0, 20.0, 301)])
 
 
-def by_hand(spectrum):
+def fit_response(spectrum):
     """Fit the response by unweighted least squares without a model of the command hold."""
 
     def residuals(parameters):
@@ -39,7 +39,7 @@ def by_hand(spectrum):
     return MotionModel(STRUCTURES[2], np.array([*solution[:2], 1e-3 * solution[2]]))
 
 
-def figures(response):
+def lag_and_bandwidth_errors(response):
     """Return the errors of the lag at the contact frequency [ms] and of the bandwidth [%]."""
 
     def lag(values):
@@ -61,7 +61,7 @@ def test_identify_is_more_accurate_than_other_identification_methods(tmp_path, c
         ("jaxhil", ours.model.response(2j * np.pi * AT), ours.model.delay, time.process_time() - begin)
     )
     begin = time.process_time()
-    hand = by_hand(ours.spectra[0])
+    hand = fit_response(ours.spectra[0])
     rows.append(
         ("least squares by hand", hand.response(2j * np.pi * AT), hand.delay, time.process_time() - begin)
     )
@@ -84,10 +84,10 @@ def test_identify_is_more_accurate_than_other_identification_methods(tmp_path, c
     with capsys.disabled():
         print("\nErrors of" + "".join(f"{one:>18s}" for one in headings))
         for name, values, delay, seconds in rows:
-            lag, width = figures(values)
+            lag, width = lag_and_bandwidth_errors(values)
             off = "none" if delay is None else f"{1e3 * (delay - 0.0043):+.4f}"
             print(f"{name:26s} {lag:+.4f} {width:+17.3f} {off:>17s} {seconds:17.2f}")
-    lag, width = figures(rows[0][1])
+    lag, width = lag_and_bandwidth_errors(rows[0][1])
     assert abs(lag) < 0.02 and abs(width) < 0.3 and abs(rows[0][2] - 0.0043) < 2e-5
     delays = [abs(delay - 0.0043) for _, _, delay, _ in rows if delay is not None]
     assert min(delays[1:]) > 5.0 * delays[0]

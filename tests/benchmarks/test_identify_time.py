@@ -24,7 +24,7 @@ TRUE = np.array([0.0037, 0.0, 1.2e5, 650.0])  # force delay, plane, stiffness, d
 UNITS = np.array([1e-3, 1e-6, 1e5, 100.0])
 
 
-def general(campaign, model):
+def fit_by_general_optimiser(campaign, model):
     """Fit the four parameters and the bias by a general optimiser."""
     runs = [run for run in campaign.runs if run.kind == "contact"]
     motion, readings = MotionResponse(model, runs, campaign.timing, 0.022), ForceReadings.of(runs, 0.5)
@@ -52,7 +52,7 @@ def test_identify_processes_logs_of_one_day_within_time_limit(capsys):
     identify(campaign)
     every = time.process_time() - begin
     begin = time.process_time()
-    numbers = general(campaign, result.motion.model)
+    numbers = fit_by_general_optimiser(campaign, result.motion.model)
     alone = time.process_time() - begin
     keys = "rig.force_sensor.delay", "contact.damping.0"
     ours = [abs(result[key].value - true) for key, true in zip(keys, TRUE[[0, 3]], strict=True)]

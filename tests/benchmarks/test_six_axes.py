@@ -42,7 +42,7 @@ class Problem(ctypes.Structure):
     ]
 
 
-def prepared():
+def build_loop_and_scenarios():
     """Return loop and random scenarios of probe-drogue, with an ideal sensor and a drogue without a rim."""
     mechanism = load_any("probe-drogue", ["rig.force_sensor.noise_std=0.0"]).mechanism
     scenario = build_scenarios(mechanism, draw(mechanism, LANES, 1))
@@ -107,7 +107,7 @@ def ticks(loop, rig, run):
     return jax.lax.map(one_tile, (rig, run))
 
 
-def tiled(tree):
+def split_into_tiles(tree):
     """Reshape (..., lanes) to (tiles, ..., lanes of a tile); repeat scalars."""
 
     def fold(leaf):
@@ -118,7 +118,7 @@ def tiled(tree):
 
 
 @partial(jax.jit, static_argnums=0)
-def touching(loop, rig, run):
+def share_in_contact(loop, rig, run):
     """Return the share of all ticks of all lanes at which the bodies touch."""
 
     def body(run, _):
@@ -134,13 +134,13 @@ def test_six_axis_simulation_speed_is_compared_with_cpp_and_mujoco(tmp_path, cap
     source = __file__.replace("test_six_axes.py", "six_axes.cpp")
     subprocess.run(["g++", *FLAGS, source, "-o", str(tmp_path / "six_axes.so")], check=True)
     library = compiled(tmp_path)
-    loop, scenario = prepared()
+    loop, scenario = build_loop_and_scenarios()
     rig = jax.jit(build_rig, static_argnums=0)(loop, {}, scenario)
     run = jax.jit(begin, static_argnums=0)(loop, rig, scenario.start)
     arrays = inputs(loop, rig, run)
     first = arrays["states"].copy()
     problem = Problem(LANES, loop.ring, *(arrays[name].ctypes.data for name in NUMBERS))
-    tiles = tiled(rig), tiled(run)
+    tiles = split_into_tiles(rig), split_into_tiles(run)
     final_states = np.stack(jax.tree.leaves(ticks(loop, *tiles))).reshape(len(first), LANES)
     library.run_ticks(ctypes.byref(problem), TICKS)
     np.testing.assert_allclose(
@@ -161,7 +161,7 @@ def test_six_axis_simulation_speed_is_compared_with_cpp_and_mujoco(tmp_path, cap
             f"\nsix axes: lane-steps/s over C++: {speed / cpp_speed:.2f} ({speed:.3g} over {cpp_speed:.3g})"
         )
     assert speed >= CPP * cpp_speed
-    share = float(touching(loop, rig, run))
+    share = float(share_in_contact(loop, rig, run))
     slow = mujoco_speed(pytest.importorskip("mujoco"), share)
     with capsys.disabled():
         print(f"six axes: lane-steps/s over MuJoCo's steps: {speed / slow:.0f} ({speed:.3g} over {slow:.3g})")

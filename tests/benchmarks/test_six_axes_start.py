@@ -44,7 +44,7 @@ def test_first_six_axis_simulate_command_is_within_time_limit(name, tmp_path, ca
 
 
 @pytest.fixture
-def nothing_kept():
+def no_compile_cache():
     """Disable the compile cache."""
     folder = jax.config.jax_compilation_cache_dir
     for now in (None, folder):
@@ -54,7 +54,7 @@ def nothing_kept():
             yield
 
 
-@pytest.mark.usefixtures("nothing_kept")
+@pytest.mark.usefixtures("no_compile_cache")
 def test_six_axis_program_of_twelve_contact_candidates_compiles_within_time_limit(capsys):
     """Use candidates of two kinds, first without, then with derivatives by six leads."""
     mechanism = load_any("petals", []).mechanism

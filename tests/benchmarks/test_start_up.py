@@ -59,7 +59,7 @@ def test_repeated_command_finishes_within_time_limit(name, tmp_path, capsys):
     assert took <= most
 
 
-def compiling(traced, values):
+def compile_seconds(traced, values):
     """Return the compile time [s] of a new program that calls the function `traced` once."""
     program = jax.jit(lambda values: traced(values), compiler_options=supported_options(TICK_OPTIONS))
     lowered = program.lower(values)
@@ -69,7 +69,7 @@ def compiling(traced, values):
 
 
 @pytest.fixture
-def nothing_kept():
+def no_compile_cache():
     """Disable the compile cache."""
     before = jax.config.values[KEEPING]
     jax.config.update(KEEPING, False)
@@ -80,7 +80,7 @@ def nothing_kept():
 
 
 @pytest.mark.parametrize("compensator", [name for name, law in COMPENSATORS.items() if law.gains])
-def test_rollouts_with_derivatives_compile_within_time_limit(compensator, nothing_kept, capsys):
+def test_rollouts_with_derivatives_compile_within_time_limit(compensator, no_compile_cache, capsys):
     """Compile the restitutions of a tile and their derivatives by all gains, as the solver does."""
     loop, gains, scenarios = case(compensator, LANES_PER_TILE)
     rig = jax.jit(build_rig_constants, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
@@ -95,7 +95,7 @@ def test_rollouts_with_derivatives_compile_within_time_limit(compensator, nothin
         return run_contacts(loop, dict(zip(gains, values.T, strict=True)), rig).restitution
 
     values = jnp.tile(jnp.array(list(gains.values())), (LANES_PER_TILE, 1))
-    (took,) = best(partial(compiling, jax.jit(with_derivatives), values), repeats=2)
+    (took,) = best(partial(compile_seconds, jax.jit(with_derivatives), values), repeats=2)
     with capsys.disabled():
         print(f"\n{PROCESSOR}, {compensator}, derivatives by {len(gains)} gains: compiled in {took:.1f} s")
     assert took <= COMPILING
