@@ -237,7 +237,6 @@ def test_c99_commands_equal_python_to_the_bit(law, kind, batch):
 
 
 def test_c99_impulse_ledger_contacts_equal_python_to_the_bit(batch):
-    """Use contacts that reach every status of the compensator."""
     law, statuses = "impulse_ledger", set()
     for n in range(12):
         rng = np.random.default_rng([11, n])
@@ -270,7 +269,6 @@ def test_c99_commands_equal_python_if_compared_values_are_equal(law, batch):
 
 
 def test_c99_random_test_ticks_raise_every_fault(batch):
-    """Exclude the fault of compensators with a status; include passed audits and changing stiffness."""
     made = batch("response_error")
     rng = np.random.default_rng(6)
     seen, audited, identified = 0, set(), set()
@@ -329,7 +327,6 @@ def test_c99_commands_equal_python_on_hypothesis_ticks(case, batch):
     "law", [pytest.param(law, marks=() if law in LONG_CODE else pytest.mark.slow) for law in LAWS]
 )
 def test_c99_has_no_undefined_behaviour_under_sanitizers(law, tmp_path):
-    """Run hostile rows with the address and undefined-behaviour sanitizers."""
     program = sanitized(tmp_path, law)
     rng = np.random.default_rng(7)
     for guarded in (True, False):

@@ -70,7 +70,6 @@ def replay(tmp_path_factory):
 
 
 def test_c99_test_program_replays_recorded_vectors(replay):
-    """Include non-finite readings, late ticks and ticks without a time."""
     lines = vectors("contact", "contact", "random", "hostile", "hostile")
     assert len({line.split(",")[12] for line in lines[1:]}) > 3
     assert replay(lines) == (0, "vectors.csv: 1000 ticks, the same bit for bit\n")

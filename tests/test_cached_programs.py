@@ -217,7 +217,6 @@ def phases(static, scenarios):
 
 @pytest.mark.parametrize("law", [Mine(), pytest.param(HuntCrossley(), marks=where_kept)])
 def test_program_with_user_registered_law_in_its_arguments_is_not_cached(tmp_path, monkeypatch, law):
-    """Six-axis scenarios contain laws in their arguments."""
     scenarios = six_axes_scenarios(load_any("petals").mechanism)
     groups = tuple(dataclasses.replace(group, law=law) for group in scenarios.groups)
     monkeypatch.setattr(cached_programs, "program_folder", lambda: tmp_path)

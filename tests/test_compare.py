@@ -95,7 +95,6 @@ def test_compare_tables_mark_the_best_compensator(capsys):
 
 
 def test_compare_leaderboard_lists_all_compensators_and_settings(capsys):
-    """Lines may exceed the page width; settings of a compensator are not ranked against it."""
     ours = LawMetrics("impulse_ledger", "m", {}, {"literature": figures(0.05), "gentle": figures(0.06)})
     many = [*FOUND, ours, *(LawMetrics(f"law_{n}", "m", {}, {"literature": figures(0.5)}) for n in range(12))]
     better = [*FOUND, LawMetrics("impulse_ledger", "n", {}, {"literature": figures(0.2)})]

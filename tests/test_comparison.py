@@ -80,7 +80,6 @@ class Known(NamedTuple):
 
 
 def test_compensator_that_replays_the_reference_has_zero_transparency(monkeypatch):
-    """Error 0 and slope 1 despite the delays; transparency 0."""
     monkeypatch.setitem(compensators.COMPENSATORS, "played_back", PlayedBack())
 
     def evaluate_with_plant(loop, gains, scenarios):

@@ -269,7 +269,6 @@ def test_compensator_state_is_cleared_when_a_run_starts(name):
 
 @pytest.mark.parametrize("name", LAWS)
 def test_compensator_noise_amplification_matches_prediction(name):
-    """Add white noise to the force readings of a static contact."""
     ticks, gains = 40_000, {gain: entry["value"] for gain, entry in GAINS[name].items()}
     law = COMPENSATORS[name]
     constants = KnownConstants(jnp.asarray(PERIOD), jnp.asarray(math.inf))

@@ -192,7 +192,6 @@ def test_exported_python_controller_has_mean_restitution_of_simulation():
 
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler")
 def test_exported_c_controller_has_restitution_of_simulation(tmp_path):
-    """Compare each run with equal noise, and the mean with the noiseless contact."""
     parsed, seeds = heavy_mechanisms(noise_std=1.0), 16
     gains = nominal_gains(parsed, "response_error", **SLOW_END)
     (simulated,) = restitutions(parsed, "response_error", gains, seeds)
@@ -208,7 +207,6 @@ def test_exported_c_controller_has_restitution_of_simulation(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler")
 def test_exported_watchdog_false_alarms_lie_within_stated_interval(tmp_path):
-    """Let the rig wait 60 ticks longer than the simulation."""
     parsed = heavy_mechanisms(noise_std=1.0)
     document = export_gains(parsed, nominal_gains(parsed, "response_error", **TUNED))
     result = calibrate(check_document(document), scenarios=1024, limit=0.02)

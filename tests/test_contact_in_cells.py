@@ -130,7 +130,6 @@ RUBBING = {"law": "preloaded", "stiffness": [8e5], "preload": 3.0, "friction": 2
     ],
 )
 def test_sampled_contact_of_slow_mechanism_agrees_with_exact_motion(contact, frequency, lag, hold):
-    """Use the error bounds of the guide near the fastest allowed values."""
     sensor = {"time_constant": lag}
     raw = mechanism(contact, second_order(frequency), period=1e-3, command_hold=hold, force_sensor=sensor)
     scenarios, *loops = loops_of(raw)

@@ -306,7 +306,6 @@ def test_six_axis_contact_combines_elastoplastic_contact_and_tether():
 
 
 def test_six_axis_contact_derivatives_match_finite_differences():
-    """Include a lane without slip, where the derivative must not be NaN."""
     pair, states, contact, step = prepared()
 
     @jax.jit

@@ -179,7 +179,6 @@ def limit(name):
 
 @pytest.mark.parametrize("name, order", list(zip(LAWS_ALONE, [2, 1, 1, 2, 1], strict=True)))
 def test_undelayed_contact_converges_to_ideal_contact(name, order):
-    """Compare with SciPy or the closed form, with the law's ideal contact, and W_out/W_in with e^2."""
     expected, expected_peak = limit(name)
     parsed = validated(mechanism(LAWS_ALONE[name], IDEAL, 0.0))
     period, phase = grid(PERIODS, (np.arange(16) + 0.5) / 16)

@@ -112,7 +112,6 @@ def tiled(scenarios):
 
 
 def test_batch_tiles_contain_scenarios_of_equal_delay_and_similar_duration():
-    """Exclude the last tile of each delay, and batches with few tiles per delay."""
     delays, durations = tiled(setting("none", lanes=4096)[2])
     assert np.sum(np.ptp(delays, axis=-1) > 0) < len(np.unique(delays)) == 2
     assert np.mean(np.ptp(durations, axis=-1)) < 0.1 * np.ptp(durations)

@@ -83,7 +83,6 @@ def test_force_stuck_fault_is_not_raised_by_position_noise_without_force(side, g
 @SIDES
 @pytest.mark.parametrize("bias", [0.0, -3.7])
 def test_force_stuck_fault_is_raised_if_sensor_never_reads_force(bias, side, gap):
-    """A disconnected sensor reads no force at large penetration."""
     position, force = contact(0.5, side, gap)
     depth = position if side > 0 else -gap - position
     stuck_tick = first_stuck(position, np.zeros_like(force), gap, bias)

@@ -270,7 +270,6 @@ def test_derivative_differs_from_finite_difference_only_if_discrete_event_moves(
 
 
 def test_derivative_equals_finite_difference_if_no_discrete_event_moves(study, disagreements):
-    """Check that events do not occur for all pairs."""
     step = STEPS[0]
     parted = {(p, s) for p, s in disagreements[step]}
     pairs = np.array([(p, s) for p in range(len(NAMES)) for s in range(SCENARIOS) if (p, s) not in parted])

@@ -71,7 +71,6 @@ def test_guide_has_no_broken_links(page):
 
 
 def test_guide_names_existing_files(page):
-    """Paths with NAME are placeholders."""
     result = FILE.findall(page.read_text(encoding="utf-8"))
     missing = [name for name in result if "NAME" not in name and not (ROOT / name).exists()]
     assert not missing
@@ -188,7 +187,6 @@ def test_guide_script_is_the_tested_interface_script():
     ids=lambda path: path.name,
 )
 def test_guide_examples_run(path, tmp_path):
-    """Run the runnable blocks of a page in order in a separate process."""
     blocks = RUNNABLE.findall(path.read_text(encoding="utf-8"))
     assert blocks
     inherited = os.environ.get("PYTHONPATH")

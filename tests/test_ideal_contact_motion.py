@@ -115,7 +115,6 @@ def pulse(start, length, height):
 
 
 def test_ideal_contact_with_external_push_agrees_with_scipy():
-    """Push before, at and after the turning point and the separation."""
     starts, length, height = np.linspace(0.0, 0.21, LANES), 0.02, 6.0
     damping = 0.05 * CRITICAL
     push = pulse(jnp.asarray(starts), length, height)
@@ -163,7 +162,6 @@ def test_external_push_after_ideal_contact_adds_the_push_impulse():
 
 
 def test_trajectory_of_linear_contact_matches_closed_form():
-    """Use x = v sin(omega t) / omega, then uniform motion."""
     times = np.linspace(-0.1, 0.4, 97)[::-1].copy()
     times = times[:, None] * np.ones(LANES)
     result, _ = integrated("linear", {}, times=jnp.asarray(times))
@@ -181,7 +179,6 @@ def test_trajectory_of_linear_contact_matches_closed_form():
     [("kelvin_voigt", 1e-3), pytest.param("piecewise_linear", 1e-3, marks=pytest.mark.slow)],
 )
 def test_integrated_contact_derivatives_match_those_of_closed_forms(case, tolerance):
-    """Allow an error for steps that contain a kink of the force."""
     name, values = CASES[case]
     law, parameters = CONTACT_LAWS[name], contact(**values)
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))

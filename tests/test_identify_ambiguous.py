@@ -45,7 +45,6 @@ def written(result, folder):
 
 @pytest.mark.parametrize(("name", "seed"), (("plain", 0), ("hidden", 1)))
 def test_identify_keeps_damping_in_the_model_while_delay_is_estimated(monkeypatch, tmp_path, name, seed):
-    """With these seeds the validation contacts do not reveal the damping."""
     campaign = ambiguous.campaign(monkeypatch, name, seed, seconds=10.0)
     result = identify(campaign, ambiguous.prior(name), IdentificationOptions(seed=seed))
     assert result.contact.law.name == "kelvin_voigt"
@@ -88,7 +87,6 @@ def test_identify_uncertainty_draws_include_undamped_contact(monkeypatch, name, 
 
 
 def test_identified_delay_interval_includes_delay_of_undamped_contact():
-    """Draws of damping lie on one side of 0, those of delay on one side of the true value."""
     rng = np.random.default_rng(0)
     damping = np.abs(rng.normal(0.0, 100.0, 4000))
     delay = 0.0037 + damping / 124355.0 + 2e-5 * rng.standard_normal(4000)
@@ -151,7 +149,6 @@ def test_identify_verdict_equals_check_of_written_file(monkeypatch, tmp_path, na
 
 @pytest.mark.parametrize("noise", (0.0, 0.5))
 def test_identify_accepts_log_of_one_contact(monkeypatch, noise):
-    """Include a log without noise."""
     rig = campaign_kinds.rig(noise=noise, position_noise=noise * 1e-5)
     monkeypatch.setitem(campaigns.KINDS, "one", campaign_kinds.Kind(rig, ambiguous.SOFT))
     campaign = campaigns.campaign("one", 0, speeds=(0.006,), seconds=0, rest=0)
@@ -197,7 +194,6 @@ GOOD_BUT_WRONG = 0.01
 @pytest.mark.users_options
 @pytest.mark.parametrize("name", ambiguous.KINDS)
 def test_identified_files_with_good_verdict_are_accurate(monkeypatch, name):
-    """Errors of e and e - e* are below the limit, and intervals have the stated coverage."""
     kind = ambiguous.KINDS[name]
     sensor, contact = kind.rig["force_sensor"], kind.contact
     true = {f"contact.{key}.0": contact[key][0] for key in ("stiffness", "damping")}

@@ -26,7 +26,6 @@ def lines_of(model, hold="linear", latency=0, period=0.001, shift=0, std=5e-7):
 
 @pytest.mark.parametrize("name", ("clean", "third_order", "resonance"))
 def test_motion_model_matches_exactly_sampled_simulator(name):
-    """Compare one steady-state period of the multisine with the oracle's matrices."""
     kind = campaigns.KINDS[name]
     T = kind.rig["control_period"]
     wave = campaigns.multisine(T)

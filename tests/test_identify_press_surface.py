@@ -65,7 +65,6 @@ def test_press_run_in_contact_is_rejected_without_bias_at_rest():
 
 
 def test_press_run_that_starts_out_of_contact_estimates_bias():
-    """A bias that has changed since the run at rest has no effect."""
     run = ramp(-1e-3)
     run = replace(run, force_measured=run.force_measured + 5.0)
     for noise in (rest(bias=0.0), None):

@@ -93,7 +93,6 @@ def test_impulse_ledger_status_is_unexplained_for_damped_contact_with_delay():
     [("noisy", 0.8, 0.3), ("hertz", 1.5, 0.3), ("hardening", 2.0, 0.5), ("damped", 1.6, 1.8)],
 )
 def test_impulse_ledger_error_falls_over_contacts_with_unknown_delay(suite, first, eighth, capsys):
-    """Simulate eight contacts, each at the rebound speed of the previous contact."""
     mechanism = load(f"suite-{suite}", ["approach.contacts=8", UNCERTAIN]).mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, 200, 77), 77)
     outcome = evaluate(build_loop(mechanism, LAW, scenarios), literature_gains(mechanism, LAW), scenarios)

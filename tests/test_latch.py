@@ -49,7 +49,6 @@ def test_latch_captures_and_holds_bodies_if_deep_enough_and_aligned():
 
 @pytest.mark.slow
 def test_wrench_of_several_latches_is_sum_of_separate_wrenches():
-    """Use different capture depths, springs and dampers."""
     one, share = latch(False, 0.01), jnp.array([[1.0], [2.0], [3.0]])
     points = place([[0.2, 0.2, 0.2], [-0.1, 0.0, 0.3], [0.0, 0.0, 0.0]], BATCH)
     all_three = Latch(

@@ -72,7 +72,6 @@ def copies_of(probed: ProbedScenarios, outcome: Outcome) -> Outcome:
 @pytest.mark.parametrize("noise", ["0.5 %", "none"])
 @pytest.mark.parametrize("suite", ["noisy", "damped", "hertz", "hardening", "layered"])
 def test_impulse_ledger_is_accurate_with_surface_within_1_mm(suite, noise):
-    """Run four contacts at 5 mm/s, with the surface at and near the specified position."""
     clean = ("rig.force_sensor.noise_std=0.0",) if noise == "none" else ()
     mechanism = load(f"suite-{suite}", [*PLANE, *clean, f"approach.contacts={CONTACTS}"]).mechanism
     probed = build_probed_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)
@@ -92,7 +91,6 @@ def test_impulse_ledger_is_accurate_with_surface_within_1_mm(suite, noise):
 @pytest.mark.parametrize("noise", ["none", "0.5 % of its own peak", "0.15 N"])
 @pytest.mark.parametrize("period", [2.5e-4, 1e-3, 4e-3])
 def test_impulse_ledger_is_accurate_for_contacts_of_1_to_8_s(period, noise):
-    """Check that commands stay below 3 times the ideal peak force plus 20 times the noise."""
     sensor = "rig.force_sensor.noise_std=0.15"
     for damped in (False, True):
         damping = [f"contact.damping=[{2 * 0.05 * np.sqrt(414.5 * 350):.6g}]"] if damped else []
@@ -123,7 +121,6 @@ OFFSETS = {
 
 @pytest.mark.parametrize("case", OFFSETS)
 def test_impulse_ledger_is_accurate_with_preload_friction_and_bias(case):
-    """Use up to 10 N, 6 N and 5 N of either sign, alone and together."""
     suite, changes = OFFSETS[case]
     mechanism = load(f"suite-{suite}", changes).mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)

@@ -136,7 +136,6 @@ def test_contact_with_status_identified_is_accurate_for_damper_with_unmodelled_l
 
 @pytest.mark.slow
 def test_slow_contacts_get_status_identified_by_impulse_ledger():
-    """Use contacts of 0.4 to 1.4 Hz."""
     changes = ("contact.stiffness=[8000.0]",)
     mechanism_known = load("suite-noisy", list(changes)).mechanism
     for index, mechanism in enumerate(contacts_of("noisy", 9, 25, changes)):

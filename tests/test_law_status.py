@@ -109,7 +109,6 @@ def test_status_of_contact_is_most_frequent_status_of_its_ticks(name, limits):
 
 @pytest.mark.parametrize("nearer", [1e-3, 4e-3])
 def test_contact_in_front_of_specified_surface_is_audited_by_watchdog(nearer):
-    """The audit begins when the compensator acts."""
     changes = (f"rig.contact_plane={-nearer}",)
     mechanism, made = gain_file(Kind("noisy", changes, {}, "identified"), {"settling": 0.02})
     law = Controller(made)
@@ -141,7 +140,6 @@ def counting_in_c(tmp_path_factory):
 
 
 def test_contact_status_counts_in_c_agree_with_python(counting_in_c):
-    """Use contacts of 40 ticks with one or two prevailing random statuses."""
     rng = np.random.default_rng(0)
     numbers = [status.number for status in STATUSES if status.number != NOT_REACHED]
     record_type, statuses = ctypes.c_longlong * 7, set()
@@ -227,7 +225,6 @@ def test_unfinished_contact_is_audited_when_next_contact_is_announced():
 
 
 def test_restitution_trip_reports_status_of_compensator():
-    """Both faults are raised on the same tick."""
     mechanism, made = gain_file(KINDS["8 Hz"], {**LIMITS["energies"], "restitution_margin": 1e-6})
     law = Controller(made)
     result = run(mechanism, law)

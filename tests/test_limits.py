@@ -83,7 +83,6 @@ def test_limited_command_does_not_overshoot_displaced_target(distance, speed):
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.integers(1, 30), st.floats(0, 1))
 def test_limited_command_reaches_displaced_target_in_fewest_periods(count, spare):
-    """Steps of q, 2 q, ..., q: at least 2 count - 1 steps are needed for count^2 q."""
     change = ACCELERATION_LIMIT * PERIOD**2
     distance = (count**2 - spare * (2 * count - 2 if count > 1 else 1)) * change
     targets = np.r_[0.0, 0.0, np.full(200, distance)]
@@ -123,7 +122,6 @@ def test_command_limits_that_are_not_reached_leave_commands_bit_identical(offset
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("origin", [0.0, 0.05])
 def test_command_limit_that_is_just_reached_does_not_change_the_command(origin, dtype):
-    """Move uniformly at the speed limit."""
     speed, period = np.array(VELOCITY_LIMIT, dtype), np.array(PERIOD, dtype)
     targets = np.full(400, origin - 0.004, dtype)
     for n in range(1, len(targets)):
@@ -142,7 +140,6 @@ def test_limited_command_equals_target_to_the_bit_after_reaching_the_target(dist
 
 @pytest.mark.parametrize("limits", [(0.0053, np.inf), (np.inf, 0.06), (0.0053, 0.06)])
 def test_command_limits_hold_over_a_whole_contact(limits):
-    """Use the ideal simulator without delay, whose position is the command."""
     names = ("velocity_limit", "acceleration_limit")
     simulator = {"model": "ideal"} | {n: x for n, x in zip(names, limits, strict=True) if np.isfinite(x)}
     batch = cases.build_batch({"": Case(mechanism({"law": "linear"}, simulator, 0.012, period=PERIOD))})

@@ -56,7 +56,6 @@ def test_sensor_noise_reveals_the_tick_of_readings_in_a_log_row(kind):
 
 
 def test_tick_of_log_readings_is_estimated_if_rig_moves_before_and_after_contact():
-    """Add a thousand rows before and after, with moving commands and noisy forces."""
     runs, _ = runs_of("noisy", -1)
     rng, path = np.random.default_rng(0), 1e-3 * np.cos(np.linspace(0.0, 3.0, 1000))
     for at, run in enumerate(runs):

@@ -207,7 +207,6 @@ OWN_CLOCKS = [
 @pytest.mark.parametrize(("name", "write"), OWN_CLOCKS)
 @pytest.mark.parametrize("late", [0.005, -0.007])
 def test_log_channels_that_begin_at_different_times_are_aligned(tmp_path, name, write, late):
-    """Each command has the force of the same tick."""
     path, columns = write(tmp_path / name, LOG, late)
     result = read(path, **columns)
     (run,) = result.runs

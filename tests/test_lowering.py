@@ -64,7 +64,6 @@ def test_rollout_batch_lowers_for_cuda_without_external_calls():
 
 
 def test_tuning_program_lowers_for_cuda(monkeypatch):
-    """Steps of the solver use the CUDA Cholesky decomposition."""
     programs = []
     monkeypatch.setattr(cached_programs, "compile_cached", lambda *program, options: programs.append(program))
     compile_solver([build_task(load_any("varying").mechanism, "phase_lead", 4, 0)], starts=1)
@@ -90,7 +89,6 @@ def test_every_compensator_and_derivatives_lower_for_cuda(name, compensator):
 @pytest.mark.slow
 @pytest.mark.parametrize("compensator", SIX_AXIS_COMPENSATORS)
 def test_six_axis_rollout_and_derivatives_lower_for_cuda(compensator):
-    """Six linear equations are solved by a CUDA routine."""
     assert batch("probe-drogue", compensator) <= LINEAR_EQUATIONS
     assert jacobian("probe-drogue", compensator) <= LINEAR_EQUATIONS
 

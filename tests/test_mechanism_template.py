@@ -50,7 +50,6 @@ def test_new_mechanism_file_is_equivalent_to_the_copied_mechanism(name, written)
 
 
 def test_new_mechanism_file_has_every_key_at_its_default(written):
-    """Uncommenting a default in the file changes nothing."""
     text = format_mechanism_file(load("rig-300kg").mechanism)
     defaults = {
         f"{table.path}.{key.name}".lstrip("."): key.default

@@ -64,7 +64,6 @@ RARER = ("clean", "third_order", "resonance", "hertz", "layered")
 
 @pytest.mark.parametrize("name", (*EVERY, *(pytest.param(one, marks=pytest.mark.slow) for one in RARER)))
 def test_monitor_reports_no_deviation_for_exact_file_without_noise(name):
-    """Laws, lags, latencies and holds equal those of the simulator."""
     kind = noiseless(campaigns.KINDS[name])
     stated = {k: v for k, v in STATED.items() if k == "rig.force_sensor.delay"}
     result = monitor_contacts(contacts(kind, speeds=(0.006, 0.012, 0.006)), file_of(kind, stated))
@@ -116,7 +115,6 @@ def test_monitor_detects_and_names_a_changed_parameter(what):
 
 
 def test_monitor_state_is_watch_if_change_lies_within_stated_uncertainty():
-    """Earlier contacts have narrowed a wide range; then a value changes within this range."""
     wide = STATED | {"contact.stiffness": {"distribution": "uniform", "factor": [0.8, 1.2]}}
     before = contacts(CLEAN, seed=4, speeds=SPEEDS)
     after = contacts(replace(CLEAN, contact=campaign_kinds.voigt((1.3e5,))), seed=5, speeds=SPEEDS[:2])

@@ -64,7 +64,6 @@ def test_monitor_raises_no_alarm_in_500_contacts_of_an_unchanged_rig(files):
 
 @pytest.mark.parametrize("number", (15, 60))
 def test_monitor_detects_drifts_early(files, number):
-    """Increase the stiffness by 15 %, or the force delay by 0.6 ms, over several contacts."""
     result = {"stiffness [%]": [], "force delay [ms]": []}
     for seed, mechanism in enumerate(files):
         speeds = np.repeat(SPEEDS, 5) if number == 15 else np.random.default_rng(seed).choice(SPEEDS, number)

@@ -39,7 +39,6 @@ def value(validation, index, start, objective=RMS_OBJECTIVE):
 
 @pytest.mark.slow
 def test_every_tuning_task_is_solved_with_its_own_objective(tasks, validation):
-    """Compare joint results with those of separate tasks."""
     several = [Objective(divergence_weight=weight) for weight in (1.0, 4.0, 16.0)]
     chosen = choose_starts(validation, 3, 0, several)
     polished = polish_best_starts(validation, solve_tasks(tasks, chosen, 2, several), 32, 0, several)
@@ -80,7 +79,6 @@ def test_scan_of_starting_gains_on_few_scenarios_chooses_same_points_as_full_sca
 
 @pytest.mark.slow
 def test_best_optimisation_result_is_refined_by_polishing_search(tasks, validation):
-    """Stop the solver early, so that no start reaches its minimum; failed starts are not refined."""
     early = solve_tasks(tasks, choose_starts(validation, 3, 0), 1)
     early[1] = [start._replace(rms=np.nan) for start in early[1]]
     polished = polish_best_starts(validation, early, 128, seed=0)
@@ -98,7 +96,6 @@ def test_best_optimisation_result_is_refined_by_polishing_search(tasks, validati
 
 
 def test_further_batches_of_starts_run_until_several_optima_agree(tasks, validation, monkeypatch):
-    """The starts of one task never agree, those of the others agree immediately."""
     asked = []
 
     def solve(tasks, starts, steps, objective, work):
@@ -150,7 +147,6 @@ def test_callback_runs_once_while_the_solver_compiles(validation, monkeypatch):
 
 @pytest.mark.slow
 def test_best_start_is_selected_by_true_objective_instead_of_surrogate_norm(tasks, validation):
-    """The solver minimises a norm; the objective is the mean of the worst contacts."""
     objective = Objective("cvar")
     for index, one in enumerate(find_gains(validation, searched(3, 4, 16, objective))):
         assert one.best is not None

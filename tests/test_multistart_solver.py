@@ -76,7 +76,6 @@ def test_failed_task_does_not_change_results_of_other_tasks(tasks, solved):
 
 
 def test_solver_reduces_the_requested_objective(tasks):
-    """A weight of 16 on squared divergence reduces the divergence."""
     objectives = [RMS_OBJECTIVE, Objective(divergence_weight=16.0)]
     plain, cautious = (
         min(starts, key=lambda start: start.rms)
@@ -119,6 +118,5 @@ def restitution_errors_of(task, gains):
 
 
 def test_tasks_with_long_simulations_are_spread_evenly_over_devices():
-    """Each device gets a contiguous part of the slots of a call."""
     np.testing.assert_array_equal(multistart_solver.assign_to_devices(8), [0, 2, 4, 6, 1, 3, 5, 7])
     np.testing.assert_array_equal(multistart_solver.assign_to_devices(3), [0, 1, 2])

@@ -224,7 +224,6 @@ def push_from_rest(pair, states, wrench, point, normal):
 
 @pytest.mark.slow
 def test_acceleration_under_contact_wrench_matches_relative_mass():
-    """Start at rest with a very short period; half of the lanes push along a normal."""
     pair, states = begin()
     states = States(*(state._replace(velocity=0 * state.velocity, spin=0 * state.spin) for state in states))
     wrench, point, normal = (SEEDED.normal(size=(size, LANES)) for size in (6, 3, 3))

@@ -138,11 +138,6 @@ def test_metrics_of_every_pareto_point_equal_those_of_an_evaluation(results, mad
 
 @pytest.mark.slow
 def test_each_pareto_point_is_best_for_its_own_noise_weight(results, made):
-    """Compare points on the training scenarios.
-
-    No other point and no earlier gains are better under a point's own weight, so larger weights give less
-    noise and larger errors.
-    """
     for mechanism, front in zip(MECHANISMS, made[0], strict=True):
         task = build_task(mechanism, "phase_lead", SETTINGS.scenarios, SETTINGS.seed)
         every = [*front.points, front.tuned, front.literature]

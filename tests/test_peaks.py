@@ -33,7 +33,6 @@ def test_peak_between_unequally_spaced_samples_is_interpolated_by_parabola():
 
 
 def test_peak_is_not_interpolated_across_a_jump():
-    """Include a peak that begins or ends at 0."""
     curve = np.array([[1.0, 1.0, 0.0], [1.1, 1.1, 3.0], [3.0, 3.0, 2.5], [2.5, 2.5, 0.0]])
     times = np.arange(1.0, 5.0)[:, None] + np.zeros(3)
     jumps = np.zeros_like(curve, bool)

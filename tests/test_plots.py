@@ -221,7 +221,6 @@ DRAWING = [
 
 @pytest.mark.parametrize("path", DRAWING, ids=lambda path: "/".join(path.parts[-2:]))
 def test_all_plots_use_the_same_colours_and_have_units(path):
-    """Only the colours of `plot_contacts` and greys occur; only counts have no unit."""
     counted = ("", "solver step", "contact")
     for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         for keyword in call.keywords if isinstance(call, ast.Call) else ():

@@ -204,7 +204,6 @@ def test_nonfinite_first_model_position_holds_the_drive_position(bad, drives):
 
 @pytest.mark.parametrize(("drives", "way", "rest"), [(0.02, -1.0, -5e-4), (-0.046, 1.0, -0.0295)])
 def test_retreat_from_position_outside_the_stroke_has_no_jump(drives, way, rest):
-    """Start beyond either end, and beyond either surface of a gap of 30 mm."""
     gain_file = plain()._replace(clearance=0.03)
     results = in_both(gain_file, rows_of(*[{"measured": drives, "x": math.nan}] * 4000))
     commands = results[:, POSITION]
@@ -214,10 +213,6 @@ def test_retreat_from_position_outside_the_stroke_has_no_jump(drives, way, rest)
 
 
 def test_next_run_begins_at_current_drive_position():
-    """Announce the run.
-
-    Before the first reading of the run, the model position is used if it is out of contact.
-    """
     controller = limited()
     for model, expected in ((-0.03, -0.03), (5e-4, -0.01 + STEP), (0.02, -0.01)):
         controller.reset()
@@ -276,7 +271,6 @@ def test_run_that_starts_away_from_drive_position_catches_up_within_velocity_lim
 
 
 def test_command_after_reset_continues_from_last_command():
-    """If the drives have been moved meanwhile, the run begins at their reading."""
     first_row, second_row = (
         {"desired": -0.01, "measured": -0.01, "x": -0.01},
         {"measured": -0.03, "desired": -0.03},

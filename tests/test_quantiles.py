@@ -43,7 +43,6 @@ def test_sequential_quantile_ranks_have_coverage_at_all_sample_sizes_together():
 
 @pytest.mark.parametrize("order", (0.5, 0.95, 0.99))
 def test_quantile_intervals_have_stated_coverage_over_repeated_sweeps(order, capsys):
-    """Draw half-normal |error|; use the values, and the bins of two halves."""
     truth = stats.halfnorm.ppf(order)
     rng = np.random.default_rng(1)
     exact, binned, widths = [], [], []
@@ -109,7 +108,6 @@ def test_quantile_of_replicates_without_results_has_no_bound():
 
 
 def test_quantile_intervals_have_stated_coverage_for_tied_values():
-    """The values are drawn from three numbers."""
     rng = np.random.default_rng(2)
     inside = []
     for _ in range(500):

@@ -102,7 +102,6 @@ def test_searches_for_quiet_gains_and_accurate_gains_share_one_program(quiet_gai
 
 
 def test_no_gains_on_a_grid_have_less_noise_within_the_error_tolerance(quiet_gains, validation):
-    """Evaluate every pair of the two gains."""
     result = quiet_gains[0][0]
     accurate = most_accurate(result).gains
     side = np.linspace(0, 1, 24)

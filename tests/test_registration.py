@@ -134,8 +134,6 @@ def test_unusable_compensator_or_contact_law_is_not_registered(registered):
 
 
 def test_redefined_compensator_replaces_the_earlier_definition():
-    """Programs compiled for the first definition are not reused."""
-
     def defined(share):
         class Share(ScaledLead):
             name = "share"

@@ -137,7 +137,6 @@ def test_checkpoints_of_other_files_and_options_are_not_used(jaxhil, files, tmp_
 
 @pytest.mark.parametrize("number", [1, pytest.param(FILES, marks=pytest.mark.slow)])
 def test_result_read_from_checkpoint_is_bit_identical(tmp_path, number):
-    """Include the data of plots."""
     mechanisms = [load("rig-300kg", [f"name=m{i}"]).mechanism for i in range(number)]
     made = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Checkpoints(tmp_path)))
     read = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Checkpoints(tmp_path, resume=True)))

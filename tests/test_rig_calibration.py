@@ -172,7 +172,6 @@ def test_long_approach_under_calibrated_limits_raises_no_fault(calibrated):
 
 
 def test_contacts_end_without_force_even_if_compensator_output_decays_slowly(calibrated):
-    """Free flight between contacts is shorter than the decay of the output."""
     limits = {name: value for name, value in calibrated[0].limits.items() if value is not None}
 
     def faults(output):
@@ -293,7 +292,6 @@ def test_calibration_repeats_the_runs_of_a_stored_sweep(tmp_path):
 
 @pytest.mark.slow
 def test_calibrated_watchdog_misses_no_bad_run_in_a_hundred_thousand_scenarios():
-    """Use the built-in claw with many good and many bad runs."""
     parsed = load("claw-350kg").mechanism
     law = literature_gains(parsed, "response_error")
     law |= {"response_error": 0.93 * law["response_error"], "phase_lead": 1.1 * law["phase_lead"]}

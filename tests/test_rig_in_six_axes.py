@@ -164,7 +164,6 @@ def test_six_axis_rig_central_contact_equals_one_axis_contact(integrator, hold, 
 
 
 def test_six_axis_rig_off_centre_contact_follows_effective_mass(seen):
-    """To first order in the rotation during the contact, the restitution is that of one axis."""
     mass = effective_mass()
     assert mass < 300
     expected = energy_error(seen, LIGHT, mass, 5e-3)

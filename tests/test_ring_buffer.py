@@ -24,7 +24,6 @@ def test_ring_buffer_returns_its_last_samples(extra, ticks):
 
 @given(st.integers(0, 40), st.integers(0, SAMPLES - 1), st.integers(0, SAMPLES - 1))
 def test_ring_buffer_returns_default_for_unknown_samples(newest, ticks, last):
-    """Include lanes with equal and with different delays."""
     ring = jnp.asarray(np.random.default_rng(newest).normal(size=(SAMPLES, LANES)))
     ticks, is_known = np.array([ticks, ticks, last], np.int32), np.array([True, False, True])
     otherwise = np.arange(LANES, dtype=float)

@@ -122,7 +122,6 @@ def test_rollout_first_contact_ends_at_same_tick_as_oracle(name):
 
 @pytest.mark.slow
 def test_rollout_with_sensor_lag_agrees_with_oracle_at_every_control_period():
-    """Use contact at 5 Hz, elastic and heavily damped, with the most sensitive compensator."""
     periods = (0.25e-3, 1e-3, 2e-3, 4e-3)
     lagged = {
         (ratio, period): Case(

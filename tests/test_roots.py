@@ -25,7 +25,6 @@ def root_of(height):
 
 @pytest.mark.parametrize("height", [0.9, 0.3, 0.1])
 def test_bracketed_roots_of_powers_match_closed_form(height):
-    """Include a contact whose force ends as a power of the depth, with a root near the surface."""
     result, slope = jax.jvp(root_of, (jnp.asarray(height),), (jnp.ones(()),))
     np.testing.assert_allclose(result, height ** (1 / POWERS), rtol=0, atol=ARGUMENT_TOLERANCE)
     np.testing.assert_allclose(slope, height ** (1 / POWERS - 1) / POWERS, rtol=1e-3, atol=1e-6)

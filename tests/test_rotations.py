@@ -83,7 +83,6 @@ def test_rotation_left_jacobian_equals_mean_of_intermediate_rotations(results):
 
 
 def test_rotations_of_many_radians_agree_with_scipy():
-    """Include the limits of the series and multiples of half a turn."""
     angles = np.r_[np.pi * np.arange(1, 9) + 1e-7, np.pi * np.arange(1, 9) - 1e-7, np.linspace(3, 400, 24)]
     results = [np.asarray(part) for part in everything(jnp.asarray(AXES * angles), jnp.asarray(RATE))]
     turns = Rotation.from_rotvec((AXES * angles).T)
@@ -118,7 +117,6 @@ def test_rotation_derivatives_at_zero_match_power_series():
 
 @pytest.mark.slow
 def test_rotation_derivatives_to_third_order_agree_along_a_ray():
-    """Compare with central differences on both sides of the limit of the series."""
     angles = jnp.asarray([0.0, 1e-8, 0.1, 0.19, 0.2, 0.21, 0.49, 0.5, 0.51, 1.5, 3.0])
     axis, rate = (vector(jnp.asarray(part)[:, :11]) for part in (AXES, RATE))
 

@@ -128,7 +128,6 @@ def test_no_compensation_returns_the_measured_force():
 
 
 def test_phase_lead_frequency_response_matches_tustin_transfer_function():
-    """Compare gain and phase of the steady response to a sine."""
     lead, lag, period, omega = 0.008, 0.001, 0.001, 40.0
     controller = Controller.from_dict(gain_document("phase_lead", phase_lead=lead, lead_filter=lag))
     output = [controller.step(math.sin(omega * n * period), 0.0, 0.0, 0.0) for n in range(400)]
@@ -226,7 +225,6 @@ def test_delay_line_refuses_excessive_delay():
 @given(seed=st.integers(0, 2**32 - 1), forgetting=st.floats(0.9, 1.0))
 @settings(max_examples=30, deadline=None)
 def test_runtime_identification_equals_weighted_recursive_least_squares(seed, forgetting):
-    """Include the bound on the covariance."""
     rng = np.random.default_rng(seed)
     identification = ContactIdentification(2.0, -1.0, 5.0, 0.5, forgetting)
     theta, covariance = np.array([2.0, -1.0]), np.diag([5.0, 0.5])

@@ -28,7 +28,6 @@ ORDER = ("first_ten_minutes", "tuning", "sweeps", "to_the_rig")
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_numbers_in_guide_stand_below_the_command_that_prints_them(page):
-    """Search for the command or script between a block of numbers and the heading above."""
     text = page.read_text(encoding="utf-8")
     for block in BLOCK.finditer(text):
         if block[1] == "text" and re.search(r"\d\.\d", block[2]):
@@ -73,7 +72,6 @@ def test_commands_in_guide_print_the_output_shown(tmp_path):
 
 @pytest.mark.slow
 def test_commands_of_guide_page_on_logs_print_the_output_shown(tmp_path):
-    """Use the rig that the page names."""
     (tmp_path / "day1").mkdir()
     write(tmp_path / "day1", campaigns.campaign("clean", 0))
     environment = {**os.environ, "COLUMNS": "110"}

@@ -112,7 +112,6 @@ def test_verify_with_key_refuses_invalid_signature(key, folder, size):
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl")
 def test_openssl_creates_keys_and_verifies_bundle_signature(tmp_path):
-    """Run the commands of the guide."""
     for command in (
         "openssl genpkey -algorithm ed25519 -out key.pem",
         "openssl pkey -in key.pem -pubout -out public.pem",

@@ -88,7 +88,6 @@ def test_command_options_named_in_the_guide_exist(reference):
 
 
 def test_documentation_build_fails_for_undocumented_options_and_gains(reference, monkeypatch):
-    """Use an option without help, and a gain without unit."""
     module = sys.modules["reference"]
 
     @dataclasses.dataclass
@@ -217,7 +216,6 @@ def test_browser_check_detects_errors_of_a_page(browser, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("width", WIDTHS)
 def test_documentation_pages_open_offline(site, browser, width):
-    """Check for no error, external request, missing picture, excess width or overlapping text."""
     for path in sorted(site.rglob("*.html")):
         name = str(path.relative_to(site))
         assert browser.open(path, width) == ([], [], []), name

@@ -88,7 +88,6 @@ def test_measured_six_axis_pose_has_noise_and_quantisation(poses):
 
 
 def test_six_axis_lag_lead_shifts_pose_command_along_its_motion():
-    """A lead by the lag of the axis makes hardware and model coincide."""
     mechanism = load_any("petals", FREE).mechanism
     gains = {**literature_gains(mechanism, "phase_lead"), "lead_filter": 1e-3}
     _, late = recorded({}, gains, "phase_lead")

@@ -112,7 +112,6 @@ def test_oblique_six_axis_episode_has_normal_tangential_and_rotational_errors(ev
 
 
 def test_six_axis_episode_does_not_depend_on_start_time_of_run(evaluated):
-    """The check for the end of an episode falls on other ticks."""
     for name, figure in evaluated.metrics._asdict().items():
         one, other = (figure[..., 0, lane] for lane in (ASIDE, EARLIER))
         # The ideal contact determines begin and end of a touch to 1 us.
@@ -153,7 +152,6 @@ def last_touches(touches):
 
 @pytest.mark.parametrize("lane", [CENTRAL, ASIDE, AGAIN])
 def test_six_axis_episode_ends_60_ms_after_last_touch_of_rig_and_ideal_contact(evaluated, ticks, lane):
-    """Search the end tick by tick."""
     rig, energy, ideal, expected = (part[:, lane] for part in ticks)
     since = [np.arange(TICKS) - last_touches(touches) for touches in (rig, ideal)]
     over = np.flatnonzero((np.minimum(*since) > QUIET / PERIOD) & np.isfinite(since[0] + since[1]))[0]
@@ -181,7 +179,6 @@ def test_six_axis_episode_with_sensor_bias_ends_after_longest_wait(evaluated, ti
 
 
 def test_six_axis_episode_does_not_end_after_contact_of_little_energy(evaluated):
-    """Such a contact is evaluated at the end of the run, relative to 5 % of the approach energy."""
     result = evaluated.metrics
     assert STATUS_NAMES[result.status[0, GRAZING]] == "timeout"
     assert result.touches[0, GRAZING] == result.reference_touches[0, GRAZING] == 1

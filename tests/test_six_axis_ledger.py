@@ -56,7 +56,6 @@ def check_good(metrics):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BARS)
 def test_six_axis_impulse_ledger_has_much_smaller_errors_than_lead(name):
-    """Compare with the best of several leads on the same draws."""
     mechanism = with_ranges(name)
     [ledger] = evaluated(mechanism, LAW)
     check_good(ledger)
@@ -102,7 +101,6 @@ def test_six_axis_impulse_ledger_is_accurate_with_wrong_rig_parameters():
 
 @pytest.mark.slow
 def test_six_axis_impulse_ledger_commands_zero_wrench_without_contact():
-    """Approach from afar, with noise, tool and gravity."""
     mechanism = with_ranges("probe-drogue", POSE_NOISE)
     with jax_context():
         scenarios = build_scenarios(mechanism, draw(mechanism, LANES, 2), seed=2)

@@ -38,7 +38,6 @@ def test_six_axis_contact_patterns_are_rotated_copies():
 
 
 def test_six_axis_parameter_draws_are_stored_along_last_array_axis():
-    """Draw lists, matrices and numbers of tables, different in each lane."""
     factor = {"distribution": "uniform", "factor": [0.9, 1.1]}
     uncertain = {
         key: factor for key in ("target.inertia", "contact.edge_left.chaser.from", "rig.simulator.delay")
@@ -239,7 +238,6 @@ def check_table(ticks, mechanism, final):
 
 @pytest.mark.slow
 def test_simulate_command_runs_a_six_axis_flight_without_contact(jaxhil, tmp_path):
-    """The chaser rotates about a principal axis."""
     state = "{{position=[0,0,{}], attitude=[1,0,0,0], velocity=[0,0,0], angular_velocity=[0,{},0]}}"
     start = f"start={{duration=0.2, target={state.format(0, 0)}, chaser={state.format(3, 0.5)}}}"
     overrides = [start, "contact={}", "latch={}", "uncertainty={}"]

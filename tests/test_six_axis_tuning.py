@@ -158,7 +158,6 @@ def test_six_axis_sweep_and_report_run_end_to_end(tuned, jaxhil, tmp_path):
 
 @pytest.mark.slow
 def test_six_axis_tuning_objective_derivatives_match_finite_differences():
-    """Compare derivatives of the tuning objective by both gains with central differences."""
     from jaxhil.mechanism.uncertainty import draw_quasi_random
     from jaxhil.simulation.jax_environment import jax_context
     from jaxhil.sixdof.six_axes import SIX_AXES

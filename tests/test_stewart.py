@@ -34,7 +34,6 @@ def poses():
 
 
 def test_hexapod_pose_survives_inverse_and_forward_kinematics():
-    """Include rates and accelerations."""
     rig, (at, rate, bend) = hexapod(), poses()
 
     def along(time):

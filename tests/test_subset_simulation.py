@@ -127,8 +127,6 @@ def test_subset_simulation_worst_scenarios_are_distinct_and_reproducible():
 
 @pytest.mark.parametrize("broken", (np.nan, np.inf, -np.inf))
 def test_subset_simulation_counts_nonfinite_performance_as_failure(broken):
-    """Diverge beyond 3.5 standard deviations, before the limit 1e9."""
-
     def performance(u):
         return np.where(u[:, 0] > 3.5, broken, u[:, 0])
 
@@ -155,7 +153,6 @@ def test_subset_simulation_works_for_stepwise_performance_function(quantum):
 
 @pytest.mark.parametrize("probability", (0.0, 0.02, 0.05, 0.3, 1.0))
 def test_subset_simulation_of_frequent_failures_uses_binomial_interval(probability):
-    """The performance has two values: passed and failed."""
     limit = stats.norm.isf(probability)
     inside = 0
     for seed in range(40):

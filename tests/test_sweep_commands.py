@@ -75,7 +75,6 @@ def test_sweep_verdict_depends_on_the_acceptable_probability(jaxhil, gains, stor
 
 
 def test_sweep_verdict_is_good_without_failures(jaxhil, gains, tmp_path):
-    """By default the store is beside the gain file."""
     shutil.copy(gains, tmp_path / "best.json")
     code, out, _ = jaxhil("sweep", tmp_path / "best.json", *TINY, "--limit", "inf")
     assert code == 0 and "Good" in out and "Failure probability 0," in out

@@ -127,7 +127,6 @@ JSON = st.recursive(
 @given(st.sampled_from(STUDIES), st.data())
 @settings(max_examples=300)
 def test_changed_study_file_with_valid_digest_is_read_as_written_or_ignored(study, data):
-    """Include wrong types and shapes."""
     request, result = study
     document = json.loads(encode_study(MANIFEST, request, result))
     place = data.draw(st.sampled_from([document, document["result"]]))

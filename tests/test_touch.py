@@ -78,7 +78,6 @@ def test_signed_distance_has_unit_slope_along_its_normal(name):
 
 @pytest.mark.slow
 def test_signed_distance_at_singular_points_is_not_nan():
-    """Points: the axis, a centre, a segment and the faces of a box."""
     singular = {
         "ball": (0.1, 0.2, 0.3), "cavity": (0.1, 0.2, 0.3), "drogue": (0, 0, -0.1), "rim": (0.5, 0, 0.1),
         "capsule": (-0.3, 0, 0), "box": (0.1, 0, 0),
@@ -131,7 +130,6 @@ def test_penetration_rate_is_derivative_of_depth_and_slip_is_tangential(name):
 
 @pytest.mark.slow
 def test_contact_is_unchanged_if_the_two_shapes_are_exchanged():
-    """Exchange the shape and the ball; the force then acts on the shape."""
     pose, _ = pose_and_twist()
     one = CANDIDATES["ball on sphere"].touch(pose)
     ball = Ball(place(0.1, 0.05, -0.4), *numbers(0.1))

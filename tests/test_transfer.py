@@ -195,7 +195,6 @@ def test_literature_gains_are_kept_beside_starting_gains_from_user(task, validat
 
 
 def test_tuning_from_user_gains_never_ends_worse_than_those_gains(task, validation, solved):
-    """Use gains that lie at a bound."""
     best = min(solved, key=lambda start: start.rms)
     upper = COMPENSATORS["phase_lead"].gains[0].upper(task.mechanism)
     assert best.gains["phase_lead"] == pytest.approx(upper, rel=1e-12)

@@ -42,7 +42,6 @@ def lanes_of_kind(scenarios, number):
 
 
 def test_contact_with_probe_push_has_restitution_of_pushed_ideal_contact():
-    """Compare with SciPy under the push on the hardware."""
     probed = build_probed_scenarios(DAMPED, draw(DAMPED, 3, 0))
     for number, expected in ((1, probed.early), (2, probed.late)):
         scenarios = lanes_of_kind(probed.scenarios, number)

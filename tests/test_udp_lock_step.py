@@ -84,7 +84,6 @@ def test_udp_rig_compensates_for_lost_and_late_packets(varying, drops, ticks):
 
 
 def test_contacts_without_status_identified_are_counted_over_udp():
-    """Use contacts that are too short."""
     mechanism = load("suite-fast", ["contact.stiffness=[884316.0]"]).mechanism
     gains = literature_gains(mechanism, "impulse_ledger")
     rig, task, answers = packets(mechanism, controller(mechanism, "impulse_ledger", gains), 900)

@@ -78,7 +78,6 @@ def test_run_waits_for_delayed_contact_of_hardware():
 
 @pytest.mark.slow
 def test_impulse_ledger_does_not_act_without_hardware_contact():
-    """The surface is beyond the reach of the run."""
     made = jaxhil.load("suite-noisy", {"rig.contact_plane": 0.1})
     result = jaxhil.simulate(made, "impulse_ledger")
     assert result.status in ("not reached", "timeout") and math.isnan(result.contacts[0].restitution)

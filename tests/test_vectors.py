@@ -143,7 +143,6 @@ def test_vector_comparison_with_simulation_ends_when_a_limit_acts(loaded):
 
 
 def test_trip_between_two_contacts_ends_vector_comparison(loaded):
-    """The audit waits for the force to decay, until the next contact."""
     limits = {"equivalent_mass": 300.0, "settling": 10.0, "restitution_margin": 1e-9}
     result = make_vectors(check_document(replace_limits(loaded.document, limits)), seed=3, draws=1)
     assert result.reasons == []

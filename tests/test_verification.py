@@ -202,7 +202,6 @@ def test_verification_comparison_ends_at_first_different_threshold_decision(gain
 
 
 def test_verification_ignores_onset_that_differs_by_rounding(gain_file):
-    """The onset is just before or just after a tick."""
     measured = np.arange(-20, 20) * 5e-6
     measured[20] = 3e-18
     force = np.where(np.arange(40) > 17, 50.0, 0.0)

@@ -32,7 +32,6 @@ def test_virtual_contact_has_an_imaginary_root_at_the_stability_limit(mass, freq
 
 
 def test_nominal_virtual_damping_is_stability_limit_for_total_delay():
-    """Include the delays of force measurement and motion simulator."""
     overrides = ["rig.force_sensor.delay=0.003", "rig.force_sensor.time_constant=0.002"]
     simulator = 'rig.simulator={model="first_order", time_constant=0.01, delay=0.004}'
     mechanism = load("rod-100n-mm", [*overrides, simulator, "uncertainty={}"]).mechanism

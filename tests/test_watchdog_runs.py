@@ -51,11 +51,6 @@ def test_c_watchdog_misses_no_bad_run_and_stops_no_good_run(tmp_path):
 
 @pytest.mark.slow
 def test_watchdog_for_noisy_contacts_at_two_surfaces_performs_as_calibrated(tmp_path):
-    """Noise changes the model's velocity in flight.
-
-    If this change exceeds the margin of the error limit, the margin is widened until good runs pass; here
-    still no bad run is missed.
-    """
     loaded = coarse_mechanism({"clearance": 0.001}, contacts=3, force_sensor=NOISY)
     both = [export(loaded, limit, tmp_path, scenarios=1024, lanes=128) for limit in (0.05, 0.1)]
     narrow, wide = counted(loaded, [one for one, _ in both], 1024, lanes=128, in_python=12)
@@ -73,7 +68,6 @@ def test_watchdog_for_noisy_contacts_at_two_surfaces_performs_as_calibrated(tmp_
 
 
 def test_bad_run_that_is_not_stopped_in_time_is_counted_as_missed(tmp_path):
-    """The largest margin misses every bad run; a margin of 0 stops every run."""
     loaded = coarse_mechanism({}, contacts=2)
     one, _ = export(loaded, 0.02, tmp_path, scenarios=256, lanes=128)
     margin = list(one.parameters).index(one.gain_file.limits["restitution_margin"])

@@ -76,7 +76,6 @@ def test_cpp_baseline_gives_same_first_contact_with_single_contact_mode(baseline
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the report is that of g++ on Linux")
 def test_cpp_baseline_is_vectorised_for_every_compensator():
-    """Read the compiler's report on the three instances of the loop over the lanes of a tick."""
     source = SOURCE.read_text().splitlines()
     (line,) = (n for n, text in enumerate(source, 1) if "const double x = b.position[l], v" in text)
     report = subprocess.run(

@@ -148,7 +148,6 @@ def jacobian(lanes, options):
 
 
 def test_jacobian_time_is_compared_for_compiler_options_and_tile_sizes(capsys):
-    """Use the tile size of tuning and twice that size."""
     tuned = best(
         jacobian(LANES_PER_TILE, supported_options(TICK_OPTIONS)),
         jacobian(2 * LANES_PER_TILE, supported_options(TICK_OPTIONS)),
