@@ -144,6 +144,20 @@ def test_excitation_design_predicts_scatter_over_many_campaigns():
     assert np.all(ratio < 1.6) and np.all(ratio > 0.45)
 
 
+@pytest.mark.parametrize("law", ["kelvin_voigt", "hunt_crossley"])
+def test_excitation_design_without_damping_predicts_lowest_detectable_damping(law):
+    exponent = {"contact__exponent": 1.5} if law == "hunt_crossley" else {}
+    mechanism = campaign_rigs.mechanism("clean", contact__law=law, contact__damping=[0.0], **exponent)
+    planned = design_excitation(mechanism, 0.002, lambda keys: SLOPES)
+    damping = planned.keys.index("contact.damping.0")
+    assert planned.values[damping] == 0.0
+    damped = campaign_rigs.mechanism(
+        "clean", contact__law=law, contact__damping=[float(planned.std[damping])], **exponent
+    )
+    at_detectable = design_excitation(damped, 0.002, lambda keys: SLOPES)
+    assert 0.5 < at_detectable.std[damping] / planned.std[damping] < 2.0
+
+
 PLASTIC = "elastoplastic", 2.0, [0.0]
 
 
@@ -165,6 +179,6 @@ def test_identify_design_command_writes_excitation_files(jaxhil, tmp_path):
         times, x = np.loadtxt(tmp_path / f"{name}.csv", delimiter=",", skiprows=1).T
         assert len(x) == ran.document["runs"][name]["rows"] and np.abs(x).max() <= 0.003
         np.testing.assert_allclose(np.diff(times), np.diff(times)[0], rtol=1e-6)
-    assert all(item["std"] > 0.0 for item in ran.document["predicted"])
+    assert all(item["std"] > 0.0 for item in ran.document["predicted"]) and ran.document["error"] < 0.01
     ran = jaxhil("identify", "--design", "--prior", "rig-300kg", "--stroke", "0.003", "-o", tmp_path)
     assert ran.code == 0 and "rig.force_sensor.delay" in ran.out and "crest factors" in ran.out

@@ -40,6 +40,8 @@ RELATIVE_ERROR_WEIGHT = 0.01
 CONTACT_PHASES = (0.0, 0.25, 0.5, 0.75)  # control periods, phases of the contacts for which e is evaluated
 ASSUMED_NOISE_STD = 5e-6, 0.5  # m and N, noise of position and force if the mechanism specifies none
 LIMIT_SHARE = 0.9  # share of the limits of speed, acceleration and force that a run may use
+DAMPING_KEY = "contact.damping.0"
+TRIAL_DAMPING_RATIO = 0.01  # damping ratio of the contact at which the resolution of damping is computed
 SIMULATOR_KEYS = {
     "ideal": (),
     "first_order": ("time_constant",),
@@ -118,10 +120,12 @@ def design_excitation(
         InputError: If the contact law or the simulator is not supported.
     """
     plan = _MultisinePlan(mechanism, stroke)
-    slopes = slopes_by(plan.keys)
+    slopes, values = slopes_by(plan.keys), plan.values
     effect = slopes.T @ slopes / len(slopes)
     relative = effect * np.outer(plan.scales, plan.scales)
     weight = effect + RELATIVE_ERROR_WEIGHT * np.trace(relative) / len(relative) * np.diag(plan.scales**-2.0)
+    if DAMPING_KEY in plan.keys and values[plan.keys.index(DAMPING_KEY)] == 0.0:
+        plan = _plan_with_detectable_damping(mechanism, stroke, plan, weight)
     groups = [plan.free, plan.press]
     best = powers.optimise_powers(groups, weight)
     even = [powers.make_flat_powers(group) for group in groups]
@@ -152,7 +156,7 @@ def design_excitation(
         free,
         press,
         plan.keys,
-        plan.values,
+        values,
         np.sqrt(np.diag(covariance)),
         slopes,
         covariance,
@@ -196,6 +200,31 @@ def differentiate_error(
     if not len(slopes):
         raise InputError(f"{mechanism.name}: found no completed contact with {compensator}, expected one")
     return slopes
+
+
+def _plan_with_detectable_damping(
+    mechanism: Mechanism, stroke: float, undamped: _MultisinePlan, weight: np.ndarray
+) -> _MultisinePlan:
+    """Return the plan for the lowest damping that the runs can detect, for a mechanism without damping.
+
+    Without damping, the derivatives of the force with respect to damping and force delay are proportional, so
+    a linear prediction of their uncertainty would be infinite. For a low damping, its standard deviation is
+    inversely proportional to the damping. The lowest detectable damping equals its own standard deviation.
+    """
+    stiffness, _ = _differentiate_force(mechanism, undamped.depth)
+    _, rate = _differentiate_force(_replace_damping(mechanism, 1.0), undamped.depth)
+    trial = 2.0 * TRIAL_DAMPING_RATIO * np.sqrt(stiffness * mechanism.bodies.mass) / rate
+    plan = _MultisinePlan(_replace_damping(mechanism, trial), stroke)
+    groups, index = [plan.free, plan.press], plan.keys.index(DAMPING_KEY)
+    information = powers.sum_information(groups, powers.optimise_powers(groups, weight))
+    std = np.sqrt(powers.invert_scaled(information)[index, index])
+    return _MultisinePlan(_replace_damping(mechanism, float(np.sqrt(trial * std))), stroke)
+
+
+def _replace_damping(mechanism: Mechanism, damping: float) -> Mechanism:
+    document = to_plain_data(mechanism)
+    set_value(document, DAMPING_KEY, damping)
+    return from_plain_data(document, mechanism.name)
 
 
 def _with_bracketed_indices(key: str) -> str:
@@ -259,7 +288,7 @@ class _MultisinePlan:
         keys = [*(f"rig.simulator.{name}" for name in SIMULATOR_KEYS[simulator]), "rig.simulator.delay"]
         keys += ["rig.force_sensor.delay", *_find_stiffness_key(mechanism, self.depth)]
         if find_contact_law(mechanism.contact.law).damped:
-            keys.append("contact.damping.0")
+            keys.append(DAMPING_KEY)
         return {key: _get_value(document, key) for key in keys}
 
     def _responses(self, mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
