@@ -9,7 +9,7 @@ calls reuse a compiled program.
 """
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple
 
@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.simulation import cached_programs
-from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS
+from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS, TICK_OPTIONS
 from jaxhil.simulation.outcome import Outcome
 
 TILE_SIZE = 64  # lanes per tile; more lanes do not fit into the first-level cache of a core
@@ -54,6 +54,7 @@ class RigModel(abc.ABC):
     # names of the errors of a run; an outcome contains all runs' first errors, then all runs' second errors
     errors: ClassVar[tuple[str, ...]]
     compiler_options: ClassVar[Mapping[str, int | str]] = ROLLOUT_OPTIONS  # compiler options for batches
+    derivative_options: ClassVar[Mapping[str, int | str]] = TICK_OPTIONS  # likewise with derivatives
 
     @abc.abstractmethod
     def scenarios(
@@ -107,6 +108,14 @@ class RigModel(abc.ABC):
     @abc.abstractmethod
     def compensator_name(self, loop: Any) -> str:
         """Return the name of a loop's compensator."""
+
+    def with_ideal_contacts(self, batches: Sequence[Any]) -> list[Any]:
+        """Return batches of scenarios with their ideal contacts, which runs with any gains then use.
+
+        Use it for scenarios that run with several gains. Batches whose ideal contacts are cheap are returned
+        unchanged.
+        """
+        return list(batches)
 
     def prepared(self, loop: Any, scenarios: Any) -> Any:
         """Compute the part of a run that does not depend on the gains; the result is passed to `outcome`."""
@@ -180,15 +189,7 @@ class RigModel(abc.ABC):
         placed = _place_leaves(common, PartitionSpec()), _place_leaves(per_lane, DEVICE_AXIS)
         outcome = wanted(self.run_tiles(loop, *placed, batch.scenarios))
 
-        def unfold(leaf):
-            # This changes (devices, tiles, ..., lanes of a tile) into (..., lanes), one device at a time.
-            devices, tiles, *slots, tile = leaf.shape
-            rows = np.empty((*slots, devices, tiles, tile), leaf.dtype)
-            for part in leaf.addressable_shards:
-                rows[..., part.index[0], :, :] = np.moveaxis(np.asarray(part.data), (0, 1), (-3, -2))
-            return np.take(rows.reshape(*slots, -1), batch.positions, axis=-1)
-
-        return lambda: jax.tree.map(unfold, outcome)
+        return lambda: unfold_tiles(batch, outcome)
 
     def shard(
         self, scenarios: Any, gains: Mapping[str, Any], at_least: int = 1
@@ -269,19 +270,40 @@ def run_tiles(static: tuple[RigModel, Any], common: Any, per_lane: Any, scenario
     """
     model, loop = static
 
-    def one_device(common, arguments):
-        def one_tile(arguments):
-            gains, scenario = arguments
-            return model.run(loop, {**common, **gains}, scenario)
+    def one_tile(common, arguments):
+        gains, scenario = arguments
+        return model.run(loop, {**common, **gains}, scenario)
 
-        tiles = jax.tree.map(lambda leaf: leaf[0], arguments)
-        return jax.tree.map(lambda leaf: leaf[None], jax.lax.map(one_tile, tiles))
+    return map_tiles(one_tile, common, (per_lane, scenarios))
+
+
+def map_tiles(function: Callable[[Any, Any], Any], common: Any, per_lane: Any) -> Any:
+    """Return `function(common, tile)` of all tiles of `per_lane`, (devices, tiles, ..., lanes of a tile)."""
+
+    def one_device(common, tiles):
+        tiles = jax.tree.map(lambda leaf: leaf[0], tiles)
+        results = jax.lax.map(lambda tile: function(common, tile), tiles)
+        return jax.tree.map(lambda leaf: leaf[None], results)
 
     # The devices exchange no data and do not wait for each other.
     specs = PartitionSpec(), DEVICE_AXIS
     return jax.shard_map(
         one_device, mesh=_build_device_mesh(), in_specs=specs, out_specs=DEVICE_AXIS, check_vma=False
-    )(common, (per_lane, scenarios))
+    )(common, per_lane)
+
+
+def unfold_tiles(batch: Batch, results: Any) -> Any:
+    """Return results (devices, tiles, ..., lanes of a tile) of a batch as NumPy arrays (..., lanes)."""
+
+    def unfold(leaf):
+        # One device at a time.
+        devices, tiles, *slots, tile = leaf.shape
+        rows = np.empty((*slots, devices, tiles, tile), leaf.dtype)
+        for part in leaf.addressable_shards:
+            rows[..., part.index[0], :, :] = np.moveaxis(np.asarray(part.data), (0, 1), (-3, -2))
+        return np.take(rows.reshape(*slots, -1), batch.positions, axis=-1)
+
+    return jax.tree.map(unfold, results)
 
 
 class _TileAssignment(NamedTuple):

@@ -43,6 +43,8 @@ TICK_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_copy_insertion_use_
 ROLLOUT_OPTIONS = {**TICK_OPTIONS, "xla_disable_hlo_passes": "cpu_multi_output_fusion"}
 # Compiler options for six axes, with hundreds of arrays: the older of XLA's two loop emitters is 10 % faster.
 SIX_AXIS_OPTIONS = {**ROLLOUT_OPTIONS, "xla_cpu_use_fusion_emitters": False}
+# The same with derivatives, where it also compiles in three quarters of the time.
+SIX_AXIS_DERIVATIVE_OPTIONS = {**TICK_OPTIONS, "xla_cpu_use_fusion_emitters": False}
 # Compiler options of short programs that run only once: these options halve the compile time.
 SINGLE_RUN_OPTIONS = {
     "xla_backend_optimization_level": 0,

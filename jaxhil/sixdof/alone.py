@@ -13,11 +13,10 @@ from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, jax_context, s
 from jaxhil.sixdof.building import build_scenarios
 from jaxhil.sixdof.metrics import Metrics, judge
 from jaxhil.sixdof.plausibility import check_scenario
-from jaxhil.sixdof.reference import follow_contact, past_at
-from jaxhil.sixdof.rollout import REBOUNDED, Episode
+from jaxhil.sixdof.reference import past_at
+from jaxhil.sixdof.rollout import REBOUNDED, Episode, compute_ideal_contact
 from jaxhil.sixdof.run import Final, check_followed, final_in_space
 from jaxhil.sixdof.scenario import Scenario
-from jaxhil.sixdof.space import Space
 from jaxhil.sixdof.watch import quiet_time
 
 
@@ -88,10 +87,9 @@ def simulate_in_space(mechanism: SixAxisMechanism) -> SpaceRun:
 def _ideal_metrics(scenario: Scenario) -> Metrics:
     """Return metrics whose fields of the ideal contact are valid; the fields of the rig are meaningless."""
     period = scenario.control_period
-    space = Space(scenario.bodies, scenario.groups, scenario.latches)
     until = jnp.round(scenario.duration / period) * period
     quiet = quiet_time(scenario.sensor, period)
-    reference = follow_contact(space, scenario.start, quiet, until, period)
+    reference = compute_ideal_contact(scenario)
     first = reference.gaps.begin.time[0]
     lasted = jnp.minimum(first + quiet, until)
     zero, none = jnp.zeros_like(until), jnp.zeros(until.shape, jnp.int32)

@@ -89,23 +89,27 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
         after, _ = lax.scan(one_tick, progress, None, stretch)
         return _turn_over(loop, rig, last, after)
 
-    start = _start(loop, rig, scenario.start, last)
+    reference = scenario.ideal_contact
+    if reference is None:
+        reference = compute_ideal_contact(scenario)
+    start = _start(loop, rig, scenario.start, reference)
     ended = lax.while_loop(lambda progress: jnp.any(progress.active), body, start)
     time = ended.lasted.astype(rig.period.dtype) * rig.period
     return Outcome(ended.episodes, ended.run.states, time)
 
 
-def ideal_contact(rig: Rig, states: States, ticks: Int[Array, "*batch"]) -> Reference:
-    """Integrate the ideal contact from the given states over a number of control periods (`ticks`)."""
-    space = Space(rig.bodies, rig.groups, rig.latches)
-    until = ticks.astype(rig.period.dtype) * rig.period
-    return follow_contact(space, states, quiet_time(rig.sensor, rig.period), until, rig.period)
+def compute_ideal_contact(scenario: Scenario) -> Reference:
+    """Return the ideal contact from the start of a batch of scenarios; it does not depend on the gains."""
+    period = scenario.control_period
+    until = jnp.round(scenario.duration / period) * period
+    space = Space(scenario.bodies, scenario.groups, scenario.latches)
+    return follow_contact(space, scenario.start, quiet_time(scenario.sensor, period), until, period)
 
 
-def _start(loop: Loop, rig: Rig, states: States, last: Array) -> EpisodeProgress:
+def _start(loop: Loop, rig: Rig, states: States, reference: Reference) -> EpisodeProgress:
     """Return the state of the rollout at the start of the runs."""
     none = jnp.zeros(rig.period.shape, jnp.int32)
-    beginning = Beginning(states, none, relative_energy(rig, states), ideal_contact(rig, states, last))
+    beginning = Beginning(states, none, relative_energy(rig, states), reference)
     watch = fresh_watch(rig, states, none)
     episode = _episode(rig, beginning, watch, none > 0, none, states)
     episodes: Any = jax.tree.map(
@@ -189,7 +193,9 @@ def _begin_next(rig: Rig, last: Array, progress: EpisodeProgress, begins: Array)
     states, age, watch = progress.run.states, progress.lasted, progress.watch
 
     def follow(beginning: Beginning) -> Beginning:
-        reference = ideal_contact(rig, states, jnp.where(begins, last - age, 0))
+        space = Space(rig.bodies, rig.groups, rig.latches)
+        until = jnp.where(begins, last - age, 0).astype(rig.period.dtype) * rig.period
+        reference = follow_contact(space, states, quiet_time(rig.sensor, rig.period), until, rig.period)
         following = Beginning(states, age, relative_energy(rig, states), reference)
         return select_lanes(begins, following, beginning)
 

@@ -11,6 +11,7 @@ from jaxhil.simulation.scenario import MotionSimulatorBatch
 from jaxhil.sixdof.forces import ContactGroup
 from jaxhil.sixdof.kinematics import Kinematics
 from jaxhil.sixdof.latch import Latch
+from jaxhil.sixdof.reference import Reference
 from jaxhil.sixdof.relative import Pair, States
 from jaxhil.sixdof.sensor import Sensor
 
@@ -28,3 +29,5 @@ class Scenario(NamedTuple):
     control_period: Float[Array, "*batch"]  # control period T [s]
     duration: Float[Array, "*batch"]  # maximum duration of the run [s], which is rounded to ticks
     key: UInt32[Array, "2 *batch"]  # key of the sensors' noise
+    # ideal contact from `start`; None: every run computes it
+    ideal_contact: Reference | None = None

@@ -5,24 +5,33 @@ twice: first with the energy errors, then with the twist errors.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.simulation import jax_environment
+from jaxhil.simulation import cached_programs, jax_environment
 from jaxhil.simulation import metrics as one_axis
 from jaxhil.simulation.contact_bounds import is_contact_out_of_bounds
-from jaxhil.simulation.evaluation import RigModel
+from jaxhil.simulation.evaluation import RigModel, count_lanes, map_tiles, unfold_tiles
 from jaxhil.simulation.outcome import Outcome
 from jaxhil.sixdof import building
 from jaxhil.sixdof.loop import Loop
 from jaxhil.sixdof.metrics import Metrics, evaluate
-from jaxhil.sixdof.rollout import CAPTURED, JAMMED, MISS, NON_FINITE, REBOUNDED, TIMEOUT
+from jaxhil.sixdof.rollout import (
+    CAPTURED,
+    JAMMED,
+    MISS,
+    NON_FINITE,
+    REBOUNDED,
+    TIMEOUT,
+    compute_ideal_contact,
+)
 from jaxhil.sixdof.scenario import Scenario
 
 # Statuses of six-axis episodes, with the corresponding one-axis statuses; other statuses become "diverged".
@@ -44,6 +53,7 @@ class SixAxes(RigModel):
     run_name: ClassVar[str] = "episode"
     errors: ClassVar[tuple[str, ...]] = ("energy_error", "twist_error")
     compiler_options: ClassVar[Mapping[str, int | str]] = jax_environment.SIX_AXIS_OPTIONS
+    derivative_options: ClassVar[Mapping[str, int | str]] = jax_environment.SIX_AXIS_DERIVATIVE_OPTIONS
 
     def scenarios(
         self,
@@ -62,6 +72,22 @@ class SixAxes(RigModel):
     def runs(self, mechanism: SixAxisMechanism) -> int:
         """Return the number of evaluated episodes in a scenario of the mechanism."""
         return mechanism.approach.episodes if mechanism.approach else 1
+
+    def with_ideal_contacts(self, batches: Sequence[Scenario]) -> list[Scenario]:
+        """Return batches of scenarios with their ideal contacts, integrated together on all devices."""
+        together = self.place_batch(jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *batches))
+        results = cached_programs.run_cached(
+            _compute_ideal_contacts, self, together.scenarios, options=self.compiler_options
+        )
+        shapes = jax.eval_shape(compute_ideal_contact, batches[0])
+        contacts = jax.tree.unflatten(jax.tree.structure(shapes), unfold_tiles(together, results))
+        complete, begin = [], 0
+        for batch in batches:
+            lanes = slice(begin, begin + count_lanes(batch))
+            contact = jax.tree.map(lambda leaf, lanes=lanes: leaf[..., lanes], contacts)
+            complete.append(batch._replace(ideal_contact=contact))
+            begin = lanes.stop
+        return complete
 
     def run(self, loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
         """Simulate a batch of scenarios, and compare the episodes with the ideal contacts."""
@@ -96,6 +122,11 @@ class SixAxes(RigModel):
 
 
 SIX_AXES = SixAxes()
+
+
+def _compute_ideal_contacts(_: SixAxes, scenarios: Any) -> tuple[Array, ...]:
+    """Return the leaves of the ideal contacts of scenarios in tiles, in tiles as well."""
+    return tuple(map_tiles(lambda _, tile: jax.tree.leaves(compute_ideal_contact(tile)), (), scenarios))
 
 
 def outcome_of(episodes: Metrics, scenario: Scenario) -> Outcome:

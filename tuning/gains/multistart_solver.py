@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxhil.simulation import cached_programs
-from jaxhil.simulation.jax_environment import TICK_OPTIONS
 from tuning.gains.objective import (
     RESIDUAL_SCALE,
     RMS_OBJECTIVE,
@@ -190,21 +189,22 @@ def compile_solver(
     problems = [_StartState(index, nothing, nothing) for index in range(len(tasks)) for _ in range(starts)]
     static, call = _build_call(tasks, names, bounds, list_objectives(objective, len(tasks)), len(problems))
     first = problems[: _choose_call_size(len(problems))]
-    cached_programs.compile_cached(_solve_call, static, call(first, 1), options=TICK_OPTIONS)
+    cached_programs.compile_cached(
+        _solve_call, static, call(first, 1), options=tasks[0].model.derivative_options
+    )
 
 
 def _build_stepper(tasks, names, bounds, objectives, number, work: SearchProgress):
     """Return a function that advances problems by up to `limit` solver steps and returns their new states."""
     static, call = _build_call(tasks, names, bounds, objectives, number)
     size, runs = _choose_call_size(number), count_step_runs(tasks, names)
+    options = tasks[0].model.derivative_options
 
     def advance(problems: list[_StartState], limit: int) -> list[_SolverState]:
         advanced = []
         for begin in range(0, len(problems), size):
             members = problems[begin : begin + size]
-            stepped = cached_programs.run_cached(
-                _solve_call, static, call(members, limit), options=TICK_OPTIONS
-            )
+            stepped = cached_programs.run_cached(_solve_call, static, call(members, limit), options=options)
             solution = jax.device_get(stepped)
             positions = np.argsort(assign_to_devices(size))[: len(members)]
             advanced += [_extract_state(solution, int(position)) for position in positions]

@@ -5,7 +5,7 @@ All calls have the same number of lanes, so that they share a compiled program o
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any
 
@@ -237,9 +237,15 @@ def _place_training_scenarios(
 def build_validation(
     tasks: list[TuneTask], scenarios: int, seed: int, work: SearchProgress | None = None
 ) -> Validation:
-    """Build the evaluator of tasks that share a program, with `scenarios` fresh scenarios for each task."""
+    """Build the evaluator of tasks that share a program, with `scenarios` fresh scenarios for each task.
+
+    Ideal contacts, which no gain changes, are computed here, once for all gains.
+    """
     drawn = [_draw_evaluation_lanes(task, scenarios, seed + VALIDATION_SEED_OFFSET) for task in tasks]
     fresh, probed, judged, loops = (list(column) for column in zip(*drawn, strict=True))
+    batches = tasks[0].model.with_ideal_contacts([*judged, *[task.scenarios for task in tasks]])
+    judged, training = batches[: len(tasks)], batches[len(tasks) :]
+    tasks = [replace(task, scenarios=batch) for task, batch in zip(tasks, training, strict=True)]
     names = list_tuned_gains(tasks)
     return Validation(
         tasks=tasks,
@@ -251,7 +257,7 @@ def build_validation(
         judged=join_batches(judged),
         training=jax.tree.map(
             lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]),
-            *[task.scenarios for task in tasks],
+            *training,
         ),
         lanes=count_evaluated_runs(scenarios, tasks[0].probed),
         work=work or SearchProgress(),
