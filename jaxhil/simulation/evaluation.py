@@ -53,6 +53,7 @@ class RigModel(abc.ABC):
     run_name: ClassVar[str]  # name of a run in messages: "contact" or "episode"
     # names of the errors of a run; an outcome contains all runs' first errors, then all runs' second errors
     errors: ClassVar[tuple[str, ...]]
+    verdict_error: ClassVar[str]  # name of the error that tuning minimises and to which limits apply
     compiler_options: ClassVar[Mapping[str, int | str]] = ROLLOUT_OPTIONS  # compiler options for batches
     derivative_options: ClassVar[Mapping[str, int | str]] = TICK_OPTIONS  # likewise with derivatives
 
@@ -129,10 +130,6 @@ class RigModel(abc.ABC):
         """Return the factor [1] by which the compensator amplifies force sensor noise; 1 if unknown."""
         return jnp.ones_like(rig.control_period)
 
-    def rows(self, mechanism: Any) -> int:
-        """Return the number of rows of an outcome: number of errors times number of runs."""
-        return len(self.errors) * self.runs(mechanism)
-
     def by_error(self, outcome: Outcome) -> dict[str, Outcome]:
         """Split an outcome into one outcome per error, by the name of the error."""
         runs = len(outcome.error) // len(self.errors)
@@ -140,6 +137,10 @@ class RigModel(abc.ABC):
             name: jax.tree.map(lambda leaf, first=first: leaf[first : first + runs], outcome)
             for name, first in zip(self.errors, range(0, len(outcome.error), runs), strict=True)
         }
+
+    def select_verdict_error(self, outcome: Outcome) -> Outcome:
+        """Return the rows of an outcome with the error that tuning minimises and to which limits apply."""
+        return self.by_error(outcome)[self.verdict_error]
 
     def evaluate(self, loop: Any, gains: Mapping[str, Any], scenarios: Any, at_least: int = 1) -> Outcome:
         """Run scenarios on all devices and return their outcome as NumPy arrays.

@@ -26,6 +26,7 @@ class OneAxis(RigModel):
     axes: ClassVar[int] = 1
     run_name: ClassVar[str] = "contact"
     errors: ClassVar[tuple[str, ...]] = ("error",)
+    verdict_error: ClassVar[str] = "error"
 
     def scenarios(
         self, mechanism: Mechanism, draws: Mapping[str, Any] | None = None, seed: int = 0, first: int = 0

@@ -52,6 +52,7 @@ class SixAxes(RigModel):
     axes: ClassVar[int] = 6
     run_name: ClassVar[str] = "episode"
     errors: ClassVar[tuple[str, ...]] = ("energy_error", "twist_error")
+    verdict_error: ClassVar[str] = "twist_error"  # where it is 0, so is the energy error
     compiler_options: ClassVar[Mapping[str, int | str]] = jax_environment.SIX_AXIS_OPTIONS
     derivative_options: ClassVar[Mapping[str, int | str]] = jax_environment.SIX_AXIS_DERIVATIVE_OPTIONS
 

@@ -77,6 +77,15 @@ LimitRange = AllowedValues(0.0, words="a number >= 0")
 Limit = Annotated[
     float, arg(metavar="NUMBER", help="Restitution error beyond which the verdict is bad."), LimitRange
 ]
+OptionalLimit = Annotated[
+    float | None,
+    text_option(
+        "NUMBER",
+        "Error beyond which the verdict is bad: the restitution error, by default 0.01; in six axes the "
+        "twist error, by default 0.05.",
+    ),
+    LimitRange,
+]
 SeedRange = AllowedValues(0)
 Json = Annotated[
     FlagCreatePairsOff[bool], text_option(None, "Print only one JSON document on standard output.")

@@ -180,8 +180,9 @@ def run_study(
         from tuning.sweeps.store import lock_store, open_store
         from tuning.sweeps.tally import estimate_failure_probability
 
-        choices = ManifestOptions(**{name: getattr(options, name) for name in ManifestOptions._fields})
         loaded = arguments.load_gains(path, any_axes=True)
+        options = options.with_limit(loaded.mechanism)
+        choices = ManifestOptions(**{name: getattr(options, name) for name in ManifestOptions._fields})
         unsupported = {"works": options.works, "precision": options.precision == "float32" and "float32"}
         arguments.check_one_axis_arguments(loaded.mechanism, **unsupported)
         mechanism_summary.check_can_be_simulated(loaded.mechanism)

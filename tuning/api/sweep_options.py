@@ -1,5 +1,6 @@
 """Options of `tuning.sweep` and `jaxhil sweep`."""
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -7,11 +8,12 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 from jaxhil.errors import format_value
+from jaxhil.mechanism.file import AnyMechanism
 from tuning.api import arguments
 from tuning.api.arguments import ArgumentError
 from tuning.api.options import (
     AllowedValues,
-    Limit,
+    OptionalLimit,
     Resume,
     Scheduler,
     check_options,
@@ -57,7 +59,7 @@ class SweepOptions:
             help="Also compute the mechanical work of the real force to 1e-6; this is tens of times slower.",
         ),
     ] = False
-    limit: Limit = 0.01
+    limit: OptionalLimit = None
     until_width: Annotated[
         float | None,
         text_option(
@@ -106,12 +108,23 @@ class SweepOptions:
             raise ArgumentError("until_width", f"sampling {self.sampling}", "sampling random")
         if self.drivers is not None and self.drivers & (self.drivers - 1):
             raise ArgumentError("drivers", str(self.drivers), f"a power of two, 2 to {MAX_SOBOL_SCENARIOS}")
-        if (rare := self.rare) is not None:
-            is_number = arguments.is_number(rare)
-            if not (is_number and (rare == 0 or (math.isfinite(rare) and rare >= self.limit))):
-                raise ArgumentError("rare", _format_value(rare), "a finite error, at least --limit")
-            if rare == 0 and not math.isfinite(self.limit):
-                raise ArgumentError("rare", "an infinite --limit", "a finite --limit")
+        if self.rare is not None:
+            self._check_rare(self.rare, 0.0 if self.limit is None else self.limit)
+
+    def with_limit(self, mechanism: AnyMechanism) -> "SweepOptions":
+        """Return the options with the limit for a mechanism, by default that of its number of axes."""
+        limit = arguments.choose_limit(self.limit, mechanism)
+        if self.rare is not None:
+            self._check_rare(self.rare, limit)
+        return dataclasses.replace(self, limit=limit)
+
+    def _check_rare(self, rare: float, limit: float) -> None:
+        """Raise `InputError` unless `rare` is 0 or an error of at least the limit."""
+        is_number = arguments.is_number(rare)
+        if not (is_number and (rare == 0 or (math.isfinite(rare) and rare >= limit))):
+            raise ArgumentError("rare", _format_value(rare), "a finite error, at least --limit")
+        if rare == 0 and not math.isfinite(limit):
+            raise ArgumentError("rare", "an infinite --limit", "a finite --limit")
 
 
 def _format_value(value: Any) -> str:

@@ -49,7 +49,7 @@ def run_subset_simulation(
     from tuning.sweeps.stored_studies import RareFailureRequest, read_study, study_path, write_study
     from tuning.sweeps.studies import count_most_scenarios, estimate_rare_failure
 
-    limit = float(options.rare or options.limit)
+    limit = float(options.rare or store.manifest.error_limit)
     request = RareFailureRequest(limit)
     estimate = read_study(store, request) if options.resume else None
     if estimate is not None:

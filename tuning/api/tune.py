@@ -113,4 +113,7 @@ def tune_each(
         scheduler=options.scheduler,
     )
     for index, result in results:
-        yield index, TunedGains(result, loaded[index].sha256, options.limit)
+        yield (
+            index,
+            TunedGains(result, loaded[index].sha256, arguments.choose_limit(options.limit, result.mechanism)),
+        )

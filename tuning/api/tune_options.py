@@ -14,7 +14,7 @@ from tuning.api import arguments, tune_pareto
 from tuning.api.arguments import ArgumentError
 from tuning.api.options import (
     AllowedValues,
-    Limit,
+    OptionalLimit,
     Scheduler,
     SeedRange,
     Setting,
@@ -131,7 +131,7 @@ class TuneOptions:
         ),
     ] = False
     seed: Annotated[int, number_option("Seed of scenarios and starts."), SeedRange] = 0
-    limit: Limit = 0.01
+    limit: OptionalLimit = None
     scheduler: Scheduler = None
 
     def check(self) -> None:
@@ -180,7 +180,11 @@ class TuneOptions:
         """
         weights = self.command_weight, self.noise_weight, self.chatter_weight, self.transparency_weight
         is_default = self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4
-        return is_default and 0 < self.limit < math.inf
+        return is_default and self._has_finite_limit
+
+    @property
+    def _has_finite_limit(self) -> bool:
+        return self.limit is None or 0 < self.limit < math.inf
 
     def _objective(self, axes: int) -> "Objective":
         """Return the objective, with the compensator's default weights where none are given."""
@@ -188,7 +192,8 @@ class TuneOptions:
         from tuning.transparency.probes import choose_default_weights
 
         # If the limit is 0 or infinite, the default limit is the unit of the weights.
-        limit = float(self.limit) if 0 < self.limit < math.inf else TuneOptions.limit
+        default = arguments.DEFAULT_LIMIT if axes == 1 else arguments.SIX_AXIS_DEFAULT_LIMIT
+        limit = default if self.limit is None or not self._has_finite_limit else float(self.limit)
         options = {name: getattr(self, name) for name in WEIGHT_FIELDS}
         user_weights = {name: weight for name, weight in options.items() if weight is not None}
         if not callable(self.objective):

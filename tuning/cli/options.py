@@ -11,8 +11,8 @@ from tuning.api.options import (
     Files,
     GainSource,
     Json,
-    Limit,
     OptionalFile,
+    OptionalLimit,
     Overrides,
     Resume,
     Setting,
@@ -92,7 +92,7 @@ class SimulateOptions:
     reference: Annotated[
         bool, arg(help="Six axes only: simulate the ideal contact of the two bodies, without the rig.")
     ] = False
-    limit: Limit = 0.01
+    limit: OptionalLimit = None
     seed: Annotated[int, number_option("Seed of the sensor noise.")] = 0
     json: Json = False
     timings: Timings = False

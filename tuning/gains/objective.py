@@ -214,6 +214,7 @@ def compute_residuals(
         return model.outcome(loop, values, rig)
 
     outcome = _map_over_tiles(run, (values, rig)) if terms.transparency else run((values, rig))
+    outcome = model.select_verdict_error(outcome)
 
     def by_problem(leaf):
         return jnp.moveaxis(leaf.reshape(-1, number, lanes), 1, 0).reshape(number, -1)

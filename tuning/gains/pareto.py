@@ -282,7 +282,7 @@ def _evaluate_point(
     with_probes: Outcome | None,
 ) -> ParetoPoint:
     task, probed = validation.tasks[index], validation.probed[index]
-    fresh, nominal = split_nominal(outcome)
+    fresh, nominal = split_nominal(task.model.select_verdict_error(outcome))
     noise = compute_noise_amplification(task.mechanism, task.compensator, gains)
     errors = np.asarray(compute_contact_terms(fresh)[0])[fresh.wanted]
     scenarios, probe_errors = fresh, None

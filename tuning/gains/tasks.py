@@ -63,8 +63,8 @@ class TuneTask:
 
     @property
     def contacts(self) -> int:
-        """Return the number of rows in a scenario's outcome: contacts, or two errors per six-axis episode."""
-        return self.model.rows(self.mechanism)
+        """Return the number of contacts in a scenario, or of episodes with six axes."""
+        return self.model.runs(self.mechanism)
 
     @property
     def model(self) -> RigModel:

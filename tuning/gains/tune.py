@@ -70,7 +70,8 @@ class TuneResult:
     mechanism: AnyMechanism  # mechanism for which the gains were tuned
     gains: dict[str, float]  # all gains of the compensator after tuning
     literature: dict[str, float]  # all gains by the literature's rule
-    figures: dict[str, ErrorMetrics]  # metrics on the fresh scenarios
+    # metrics, on the fresh scenarios, of the error that decides the verdict (`RigModel.verdict_error`)
+    figures: dict[str, ErrorMetrics]
     nominal: dict[str, ErrorMetrics]  # metrics of the nominal run
     starts: list[StartResult]  # results of all starts of the solver
     outcomes: dict[str, Outcome]  # outcomes of the fresh scenarios, for plots
@@ -130,28 +131,32 @@ def tune_group(
         clock.lap("certify")
     results = []
     for i, task in enumerate(tasks):
+        select = task.model.select_verdict_error
         split = {key: split_nominal(outcomes[i][0]) for key, outcomes in evaluated.items()}
         fresh = {key: outcome for key, (outcome, _) in split.items()}
+        decisive: dict[str, Any] = {key: select(outcome) for key, outcome in fresh.items()}
         result = TuneResult(
             compensator=task.compensator,
             mechanism=task.mechanism,
             gains=best[i],
             literature=task.literature,
-            figures={key: compute_error_metrics(outcome) for key, outcome in fresh.items()},
-            nominal={key: compute_error_metrics(nominal) for key, (_, nominal) in split.items()},
+            figures={key: compute_error_metrics(outcome) for key, outcome in decisive.items()},
+            nominal={key: compute_error_metrics(select(nominal)) for key, (_, nominal) in split.items()},
             starts=searched[i].starts,
             outcomes=fresh,
             scenarios=validation.fresh[i],
             settings=settings,
             timings=clock.laps,
-            intervals=compute_error_intervals(fresh["tuned"].error, fresh["tuned"].good),
+            intervals=compute_error_intervals(decisive["tuned"].error, decisive["tuned"].good),
             first=tuple(near[i]),
             freedom=_compute_tolerances(task, validation.names, searched[i].best),
             global_comparison=comparisons[i],
             transparency=_compute_transparency(
                 validation, i, {key: pairs[i][1] for key, pairs in evaluated.items()}
             ),
-            without_noise=compute_error_metrics(split_nominal(noiseless[i][0])[0]) if noisy[i] else None,
+            without_noise=compute_error_metrics(select(split_nominal(noiseless[i][0])[0]))
+            if noisy[i]
+            else None,
             quiet=searched[i].quiet is not None,
         )
         results.append(result)

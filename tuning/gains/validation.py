@@ -124,6 +124,7 @@ class Validation:
         ]
         for (rows, columns), result in zip(calls, running, strict=True):
             outcome, amplification = result()
+            outcome = self.tasks[0].model.select_verdict_error(outcome)
             shape, pairs = amplification.shape, amplification.size
             self.work.report_runs(pairs * number)
             # arrays (contacts, tasks, points, scenarios)

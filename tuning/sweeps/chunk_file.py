@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from tuning.sweeps.columns import Column, classify_outcomes, list_allowed_texts, list_contact_columns
+from tuning.sweeps.columns import Column, classify_outcomes, list_allowed_texts, list_verdict_columns
 from tuning.sweeps.manifest import Manifest, load_gains
 
 SWEEP_DIGEST_KEY = b"jaxhil.sweep.sha256"
@@ -85,7 +85,7 @@ def _check_rows(manifest: Manifest, part: int, table: Any) -> dict[str, np.ndarr
         force_range = rows.get(FORCE_RANGE_KEY, np.array(mechanism.rig.force_sensor.range))
     period = rows.get(CONTROL_PERIOD_KEY, np.array(mechanism.rig.control_period))
     evaluated = classify_outcomes(
-        rows, list_contact_columns(mechanism), force_range, period, manifest.error_limit
+        rows, list_verdict_columns(mechanism), force_range, period, manifest.error_limit
     )
     return None if list_different_columns(evaluated, rows) else rows
 

@@ -118,6 +118,12 @@ def list_contact_columns(mechanism: AnyMechanism) -> list[ContactColumns]:
     return list_error_columns(model.errors, model.runs(mechanism))
 
 
+def list_verdict_columns(mechanism: AnyMechanism) -> list[ContactColumns]:
+    """Return the slots of the error to which the limit applies, one per contact or episode."""
+    model = choose_rig_model(mechanism)
+    return list_error_columns([model.verdict_error], model.runs(mechanism))
+
+
 def list_error_columns(errors: Iterable[str], runs: int) -> list[ContactColumns]:
     """Return the column names of every error of `runs` contacts or episodes."""
     numbers = range(1, runs + 1)
@@ -136,7 +142,8 @@ def list_sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
         for path in count_dimensions(mechanism)
         for name in list_input_columns(mechanism, path)
     ]
-    run = choose_rig_model(mechanism).run_name
+    run, error = choose_rig_model(mechanism).run_name, choose_rig_model(mechanism).verdict_error
+    error = error.replace("_", " ")
     for number in sorted({slot.number for slot in list_contact_columns(mechanism)}):
         columns += [
             Column(f"{metric.name}_{number}", "number", metric.unit, f"{run} {number}: {metric.meaning}")
@@ -145,7 +152,7 @@ def list_sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
         columns.append(Column(f"status_{number}", "text", "", f"{run} {number}: how it ended"))
     return [
         *columns,
-        Column("worst_error", "number", "1", f"the error of largest magnitude of all {run}s that ended"),
+        Column("worst_error", "number", "1", f"the {error} of largest magnitude of all {run}s that ended"),
         Column(
             "outcome",
             "text",
@@ -242,7 +249,8 @@ def build_rows(
         rows[slot.error] = np.where(ended[index], outcome.error[index], np.nan)
         rows[slot.status] = codes[index]
     period = np.asarray(scenarios.control_period)
-    columns = {**rows, **classify_outcomes(rows, contacts, find_force_range(scenarios), period, limit)}
+    judged = list_verdict_columns(mechanism)
+    columns = {**rows, **classify_outcomes(rows, judged, find_force_range(scenarios), period, limit)}
     names = [column.name for column in list_sweep_columns(mechanism, works)]
     return {name: columns[name] for name in names if name in columns}
 
@@ -275,7 +283,7 @@ def classify_outcomes(
     Args:
         rows: columns by name. Stores of an earlier version lack the ideal contact's peak force and duration,
             so that no row becomes `UNLIKE_IDEAL`.
-        made: column names of the contacts or episodes.
+        made: column names of the contacts or episodes, with the error to which the limit applies.
         force_range: range of the force sensor [N], common to all rows or for each row.
         period: control period [s], common to all rows or for each row.
         limit: limit of the error [1].

@@ -53,7 +53,8 @@ def run(options: SimulateOptions) -> int:
     _check_simulation(mechanism, compensator, gains)
     mechanism_summary.report_summary(mechanism, None if options.json else terminal.emit_line)
     result = simulate(mechanism, compensator, gains, seed=options.seed)
-    reasons = result.reasons(options.limit)
+    limit = arguments.choose_limit(options.limit, mechanism)
+    reasons = result.reasons(limit)
     if options.plot is not None:
         result.plot(options.plot)
         terminal.note(f"wrote {options.plot}")
@@ -71,14 +72,14 @@ def run(options: SimulateOptions) -> int:
                 "status": result.status,
                 "reason": _explain_status(result.status),
                 "meaning": result.meaning,
-                "limit": options.limit,
+                "limit": limit,
                 "bounds": CONTACT_BOUNDS,
                 "reasons": reasons,
                 "verdict": "bad" if reasons else "good",
             }
         )
     else:
-        _print(options, result, contacts, reasons)
+        _print(options, limit, result, contacts, reasons)
     return 1 if reasons else 0
 
 
@@ -104,7 +105,11 @@ def _contact_entry(contact: "ContactResult") -> dict[str, Any]:
 
 
 def _print(
-    options: SimulateOptions, result: "Run", contacts: list[dict[str, Any]], reasons: list[str]
+    options: SimulateOptions,
+    limit: float,
+    result: "Run",
+    contacts: list[dict[str, Any]],
+    reasons: list[str],
 ) -> None:
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_TEXT
 
@@ -140,5 +145,5 @@ def _print(
     if reasons:
         lines += [f"Bad: {reason}." for reason in reasons]
     else:
-        lines.append(f"Good: every error is within {options.limit:g}, {CONTACT_BOUNDS_TEXT}.")
+        lines.append(f"Good: every error is within {limit:g}, {CONTACT_BOUNDS_TEXT}.")
     terminal.emit(terminal.build_table(title, headings, rows, texts=(len(headings) - 1,)), *lines)

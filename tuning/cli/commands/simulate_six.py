@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from jaxhil.errors import InputError, format_value
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from tuning import terminal
+from tuning.api import arguments
 from tuning.cli.commands import checks
 from tuning.cli.options import SimulateOptions
 
@@ -51,8 +52,8 @@ def _check_animation_path(path: str) -> None:
 def run(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
     """Simulate the episodes of contact, and print a table of episodes and the verdict.
 
-    Return the exit code: 0 if energy and twist errors are within the limit, and real peak force and time in
-    contact within their bounds, else 1.
+    Return the exit code: 0 if twist errors are within the limit, and real peak force and time in contact
+    within their bounds, else 1.
     """
     if options.reference:
         return _run_ideal_contact(options, mechanism)
@@ -60,17 +61,16 @@ def run(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
 
     gains = None if options.gains is None else Path(options.gains)
     result = simulate_six_axes(mechanism, options.compensator or "none", gains, seed=options.seed)
-    good = result.status in GOOD_STATUSES and all(
-        _worst_error(episode) <= options.limit for episode in result.episodes
-    )
+    limit = arguments.choose_limit(options.limit, mechanism)
+    good = result.status in GOOD_STATUSES and _worst_twist_error(result) <= limit
     good = good and not any(_is_unlike_ideal(result))
     terminal.warn(f"{mechanism.name}: {warning}" for warning in result.meaning.warnings)
     _write(options, result)
     if options.json:
-        terminal.emit_json(_build_document(options, result, good))
+        terminal.emit_json(_build_document(limit, result, good))
     else:
         terminal.emit_line(result.meaning.line(mechanism.name))
-        _print(options, result, good)
+        _print(options, limit, result, good)
     return 0 if good else 1
 
 
@@ -106,9 +106,9 @@ def _run_ideal_contact(options: SimulateOptions, mechanism: SixAxisMechanism) ->
     return 0 if episode.reference_touches else 1
 
 
-def _worst_error(episode: "Episode") -> float:
-    """Return the larger of an episode's |energy error| and twist error [1]."""
-    return max(abs(episode.energy_error), episode.twist_error)
+def _worst_twist_error(result: "SixAxisRun") -> float:
+    """Return the largest twist error of all episodes [1]."""
+    return max(episode.twist_error for episode in result.episodes)
 
 
 def _is_unlike_ideal(result: "SixAxisRun") -> list[bool]:
@@ -151,7 +151,7 @@ def _write(options: SimulateOptions, result: "SixAxisRun") -> None:
         terminal.note(f"wrote {options.log}")
 
 
-def _build_document(options: SimulateOptions, result: "SixAxisRun", good: bool) -> dict[str, Any]:
+def _build_document(limit: float, result: "SixAxisRun", good: bool) -> dict[str, Any]:
     return {
         "mechanism": result.mechanism.name,
         "axes": 6,
@@ -162,12 +162,12 @@ def _build_document(options: SimulateOptions, result: "SixAxisRun", good: bool) 
         "reference_final": result.reference_final._asdict(),
         "status": result.status,
         "meaning": result.meaning._asdict(),
-        "limit": options.limit,
+        "limit": limit,
         "verdict": "good" if good else "bad",
     }
 
 
-def _print(options: SimulateOptions, result: "SixAxisRun", good: bool) -> None:
+def _print(options: SimulateOptions, limit: float, result: "SixAxisRun", good: bool) -> None:
     rows = [
         [
             number,
@@ -192,7 +192,7 @@ def _print(options: SimulateOptions, result: "SixAxisRun", good: bool) -> None:
     terminal.emit(
         terminal.build_table(title, headings, rows, texts=(len(headings) - 1,)),
         *(_describe_twist_error(number, episode) for number, episode in enumerate(result.episodes, start=1)),
-        _verdict(options, result, good),
+        _verdict(limit, result, good),
     )
 
 
@@ -206,7 +206,7 @@ def _describe_twist_error(number: int, episode: "Episode") -> str:
     return f"Episode {number}: twist error {parts}; in space {space}; {touches}."
 
 
-def _verdict(options: SimulateOptions, result: "SixAxisRun", good: bool) -> str:
+def _verdict(limit: float, result: "SixAxisRun", good: bool) -> str:
     """Return the verdict on a six-axis run and its reason as a sentence."""
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_SHORT_TEXT, CONTACT_BOUNDS_TEXT
 
@@ -215,8 +215,8 @@ def _verdict(options: SimulateOptions, result: "SixAxisRun", good: bool) -> str:
     if result.status not in GOOD_STATUSES:
         return f"Bad: the run ended with status '{result.status}'."
     if good:
-        return f"Good: every energy and twist error is within {options.limit:g}, {CONTACT_BOUNDS_TEXT}."
-    if all(_worst_error(episode) <= options.limit for episode in result.episodes):
+        return f"Good: every twist error is within {limit:g}, {CONTACT_BOUNDS_TEXT}."
+    if _worst_twist_error(result) <= limit:
         number = _is_unlike_ideal(result).index(True)
         episode = result.episodes[number]
         force, time = (
@@ -225,6 +225,4 @@ def _verdict(options: SimulateOptions, result: "SixAxisRun", good: bool) -> str:
         )
         reason = f"real peak force {force:.3g} times, time in touch {time:.3g} times the ideal contact's"
         return f"Bad: episode {number + 1}: {reason}, expected {CONTACT_BOUNDS_SHORT_TEXT}."
-    worst = max(result.episodes, key=_worst_error)
-    errors = f"{worst.energy_error:+.4f} and {worst.twist_error:.4f}"
-    return f"Bad: the largest energy and twist errors are {errors}, limit {options.limit:g}."
+    return f"Bad: the largest twist error is {_worst_twist_error(result):.4f}, limit {limit:g}."

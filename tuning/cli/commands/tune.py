@@ -60,7 +60,7 @@ def run(options: Tune) -> int:
         terminal.emit_json(
             {
                 "compensator": options.compensator,
-                "limit": options.limit,
+                "limit": entries[0]["limit"] if entries else options.limit,
                 "mechanisms": entries,
                 "problems": problems,
                 "interrupted": interrupted,
@@ -208,11 +208,14 @@ def _tune_all(
         raise _TuningInterrupted(_sort_by_index(entries)) from None
     if len(loaded) > 1 and done:
         _show_overview(
-            options, [gains.found for gains in _sort_by_index(done)], _sort_by_index(entries), drawn
+            options,
+            [gains.found for gains in _sort_by_index(done)],
+            _sort_by_index(entries),
+            drawn,
         )
     if not options.json and drawn:
         for index in sorted(fronts):
-            tune_pareto.print_front(options, done[index].found, fronts[index], entries[index]["pareto"])
+            tune_pareto.print_front(options, done[index].found, fronts[index], entries[index])
     elif not options.json and fronts:
         terminal.emit(
             f"wrote {options.output}/NAME/pareto/NN/gains.json and {options.output}/NAME/pareto.png", ""
@@ -226,7 +229,7 @@ def _show_overview(options: Tune, results: list[Any], entries: list[dict[str, An
         from jaxhil.simulation.contact_plot import save_figure
         from tuning.plots.tuning_results import overview_plot
 
-        save_figure(overview_plot(results, options.limit), Path(options.output) / OVERVIEW_FILE)
+        save_figure(overview_plot(results, entries[0]["limit"]), Path(options.output) / OVERVIEW_FILE)
     if not options.json:
         print_overview(options, results, entries, drawn)
 
@@ -249,11 +252,12 @@ def _write_result(
     tuned, plots = result.found, []
     if drawn:
         say(f"{loaded.mechanism.name}: drawing")
-        plots = _draw(tuned, options, folder)
+        plots = _draw(tuned, options, result.limit, folder)
     return {
         "mechanism": loaded.mechanism.name,
         "file": loaded.label,
         "compensator": options.compensator,
+        "limit": result.limit,
         "meaning": result.meaning,
         "gain_file": str(folder / "gains.json"),
         "plots": plots,
@@ -323,7 +327,7 @@ def is_better(metrics, other) -> bool:
     return metrics.failed < other.failed or (metrics.failed == other.failed and metrics.rms < other.rms)
 
 
-def _draw(result, options: Tune, folder: Path) -> list[str]:
+def _draw(result, options: Tune, limit: float, folder: Path) -> list[str]:
     """Write the plots of one mechanism's tuning to a folder, and return their paths."""
     from jaxhil.simulation.contact_plot import plot_contacts, save_figure
     from jaxhil.simulation.motion_curves import compute_nominal_motion
@@ -335,11 +339,11 @@ def _draw(result, options: Tune, folder: Path) -> list[str]:
         before, tuned = remove_compensation(compensator, result.literature), (compensator, result.gains)
         motion = compute_nominal_motion(result.mechanism, {"before": before, "tuned": tuned})
         figures = {
-            "errors.png": errors_plot(result, options.limit),
+            "errors.png": errors_plot(result, limit),
             "contact.png": plot_contacts(motion, f"{name}: nominal run, {compensator}"),
         }
     else:
-        figures = {"errors.png": six_axis_errors_plot(result, options.limit)}
+        figures = {"errors.png": six_axis_errors_plot(result, limit)}
     if result.starts:
         figures["loss.png"] = loss_plot(result)
     for file, figure in figures.items():

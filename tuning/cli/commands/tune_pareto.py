@@ -65,23 +65,23 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
         rows,
         texts=(0, len(rows[0]) - 1),
     )
-    paths = [traded["gain_file"] for traded in entry["points"]]
-    lines = [f"wrote {paths[0]} to {paths[-1]}", f"wrote {entry['plot']}"]
+    paths, limit = [traded["gain_file"] for traded in entry["pareto"]["points"]], entry["limit"]
+    lines = [f"wrote {paths[0]} to {paths[-1]}", f"wrote {entry['pareto']['plot']}"]
     within_limit = [
         (point.place[1], number, point.figures.rms)
         for number, point in enumerate(front.points, start=1)
-        if point.figures.failed == 0 and point.figures.rms <= options.limit
+        if point.figures.failed == 0 and point.figures.rms <= limit
     ]
     if within_limit:
         cost, number, rms = min(within_limit)
         texts = {
-            "noise": f"Least noise within {options.limit:g}: point {number}, sensor noise x {cost:.4g}",
-            "peak": f"Least peak command within {options.limit:g}: point {number}, peak x {cost:.4g}",
-            "honesty": f"Best transparency within {options.limit:g}: point {number}, error {cost:.2g}",
+            "noise": f"Least noise within {limit:g}: point {number}, sensor noise x {cost:.4g}",
+            "peak": f"Least peak command within {limit:g}: point {number}, peak x {cost:.4g}",
+            "honesty": f"Best transparency within {limit:g}: point {number}, error {cost:.2g}",
         }
         lines.append(f"{texts[axis.name]}, rms {rms:.2g}.")
     else:
-        lines.append(f"No point has an rms error within {options.limit:g}.")
+        lines.append(f"No point has an rms error within {limit:g}.")
     terminal.emit(table, *lines, "")
 
 
@@ -102,7 +102,7 @@ def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[s
         entries.append({**point.traded, **gains, "figures": point.figures, "nominal": point.point.nominal})
     _remove_stale_points(folder / FRONT_FOLDER, len(entries))
     plot = folder / "pareto.png"
-    save_figure(front_plot(front, result, options.limit), plot)
+    save_figure(front_plot(front, result, points[0].tuned.limit), plot)
     axis = front.axis
     others = {
         name: {axis.cost: fixed.cost, "error": fixed.error, "figures": fixed.figures}

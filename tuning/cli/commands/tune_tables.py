@@ -49,14 +49,14 @@ def print_result(options: Tune, result: Any, entry: dict[str, Any]) -> None:
         tables = [_error_table(options, result, entry["better_than_literature"])]
     tables += [_transparency_table(result)] if result.transparency else []
     tables += [*_gain_tables(options, result), *([_start_table(options, result)] if result.starts else [])]
-    closing = [*_describe_aim(options, result)]
+    closing = [*_describe_aim(entry["limit"], result)]
     closing += [f"wrote {path}" for path in (entry["gain_file"], *entry["plots"])]
     if not entry["sensor_noise"]:
         noise = "'{force=0.5,torque=0.05}'" if "energy_error" in entry else "2.67"
         closing.append(f"No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std={noise}")
     closing.append("took: " + ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items()))
     terminal.emit(
-        *tables, *_describe_confidence(result), *closing, describe_verdict(result, options.limit), ""
+        *tables, *_describe_confidence(result), *closing, describe_verdict(result, entry["limit"]), ""
     )
 
 
@@ -128,7 +128,7 @@ def _gain_tables(options: Tune, result: Any) -> list[Any]:
     )
 
 
-def _describe_aim(options: Tune, result: Any) -> list[str]:
+def _describe_aim(limit: float, result: Any) -> list[str]:
     """Return a list with a sentence on the aim of the tuning, least noise or least error.
 
     The list is empty if the options fixed the aim.
@@ -136,9 +136,9 @@ def _describe_aim(options: Tune, result: Any) -> list[str]:
     if not result.settings.quiet or result.without_noise is None or not result.starts:
         return []
     if result.quiet:
-        return [f"Quietest gains found within {options.limit:g}; of least error: --noise-weight 0."]
+        return [f"Quietest gains found within {limit:g}; of least error: --noise-weight 0."]
     return [
-        f"Gains of least error: no gains were found well within {options.limit:g}, among which the quietest "
+        f"Gains of least error: no gains were found well within {limit:g}, among which the quietest "
         "would be chosen."
     ]
 
