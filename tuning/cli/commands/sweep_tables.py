@@ -55,7 +55,7 @@ def _summary_lines(document: dict[str, Any]) -> list[str]:
     lines = [
         f"Failure probability {probability['value']:.4g}, 95 % interval {probability['low']:.3g} to "
         f"{probability['high']:.3g} ({probability['method']}); {document['failed']} of {number} failed, "
-        f"{'energy and twist' if document['axes'] == 6 else 'restitution'} error allowed {within}, "
+        f"{'twist' if document['axes'] == 6 else 'restitution'} error allowed {within}, "
         f"real contact: {CONTACT_BOUNDS_SHORT_TEXT}."
     ]
     lines += _describe_interval_width(document)

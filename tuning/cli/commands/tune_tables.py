@@ -25,7 +25,7 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
     headings += ["not ended"] if some_failed else []
     headings += ["above best"] if results[0].global_comparison else []
     error = (
-        "e - e*, or of both errors in six axes,"
+        "e - e*, or of the twist error in six axes,"
         if any("energy_error" in entry for entry in entries)
         else "e - e*"
     )

@@ -35,12 +35,15 @@ def wrench_at_target(wrench: Array, pose: Array) -> Float[Array, "6 *batch"]:
 
 
 def look_back(
-    ring: Float[Array, "samples rows *batch"], tick: Int[Array, ""], ticks: Float[Array, "rows *batch"]
-) -> Float[Array, "rows *batch"]:
-    """Return each row of the ring `ticks` before `tick`, interpolated linearly; `ticks` <= `samples` - 2."""
+    ring: Float[Array, "samples rows *batch"],
+    rows: slice,
+    tick: Int[Array, ""],
+    ticks: Float[Array, "*batch"],
+) -> Float[Array, "some_rows *batch"]:
+    """Return rows of the ring `ticks` before `tick`, interpolated linearly; `ticks` <= `samples` - 2."""
     whole = lax.stop_gradient(jnp.floor(ticks))
-    newer, older = (_read(ring, tick - whole.astype(jnp.int32) - more) for more in (0, 1))
-    return newer + (ticks - whole) * (older - newer)
+    newer, older = (_read(ring, rows, tick - whole.astype(jnp.int32) - more) for more in (0, 1))
+    return newer + (ticks - whole)[None] * (older - newer)
 
 
 def running_mean(mean: Array, value: Array, count: Array, used: Bool[Array, "*batch"]) -> Array:
@@ -49,7 +52,11 @@ def running_mean(mean: Array, value: Array, count: Array, used: Bool[Array, "*ba
     return mean + share[None] * (value - mean)
 
 
-def _read(ring: Array, index: Int[Array, "rows *batch"]) -> Float[Array, "rows *batch"]:
-    """Return each row of the ring at its index, modulo the ring's length."""
-    index = index & (len(ring) - 1)
-    return jnp.take_along_axis(ring, index[None], axis=0, mode="promise_in_bounds")[0]
+def _read(ring: Array, rows: slice, index: Int[Array, "*batch"]) -> Float[Array, "some_rows *batch"]:
+    """Return rows of the ring at an index, modulo the ring's length."""
+    samples, number, *batch = ring.shape
+    numbers = jnp.arange(rows.start, rows.stop, dtype=jnp.int32).reshape(-1, *[1] * len(batch))
+    positions = (index & (samples - 1))[None] * number + numbers
+    # A slice of the rows would be a copy of the whole ring on every tick.
+    flat = ring.reshape(samples * number, *batch)
+    return jnp.take_along_axis(flat, positions, axis=0, mode="promise_in_bounds")

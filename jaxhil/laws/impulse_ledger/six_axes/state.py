@@ -8,7 +8,8 @@ from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import Estimat
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.laws.six_axis_base import Six, SixAxisConstants
 
-POSE, DESIRED, TWIST, IMPULSE = (slice(6 * part, 6 * part + 6) for part in range(4))  # rows of the ring
+# Rows of the ring: measured pose; pose, twist and impulse of the model.
+POSE, MODEL = slice(0, 6), slice(6, 24)
 
 
 class Prepared(NamedTuple):

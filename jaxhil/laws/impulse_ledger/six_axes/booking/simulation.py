@@ -7,9 +7,7 @@ from jaxhil.lanes import safe_sqrt, select_lanes
 from jaxhil.laws.impulse_ledger.six_axes import constants as fixed
 from jaxhil.laws.impulse_ledger.six_axes.simulation import dot, look_back, product
 from jaxhil.laws.impulse_ledger.six_axes.state import (
-    DESIRED,
-    IMPULSE,
-    TWIST,
+    MODEL,
     LedgerState,
     Prepared,
     Reading,
@@ -84,10 +82,8 @@ def follow(
     contact_now, estimate, begins = contact
     gains, period = prepared.gains, prepared.constants.control_period
     inverse_mass, is_contact = prepared.constants.inverse_mass, reading.is_contact
-    delay = jnp.broadcast_to(contact_now.delay, state.impulse.shape)
-    desired, twist, impulse = (
-        look_back(state.ring[:, rows], tick, delay) for rows in (DESIRED, TWIST, IMPULSE)
-    )
+    recalled = look_back(state.ring, MODEL, tick, contact_now.delay)
+    desired, twist, impulse = recalled[:6], recalled[6:12], recalled[12:]
     old = contact_now._replace(impulse=jnp.where(begins[None], impulse, contact_now.impulse))
     direction, mixed = _direction(prepared, old, reading, begins)
     # If the direction turns, the contact is at a different surface: restart the tangent model.

@@ -1,6 +1,7 @@
 """Sensor readings of a tick in JAX: pose filter, alignment, tool correction and contact detection."""
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.laws.impulse_ledger.six_axes import constants as fixed
@@ -43,7 +44,7 @@ def read(
     period, inverse_mass = constants.control_period, constants.inverse_mass
     pose = _aligned(prepared, state, signals, tick)
     last = jnp.where((signals.age == 0)[None], pose - period[None] * signals.twist_desired, state.aligned)
-    wrench = wrench_at_chaser(jnp.stack(signals.wrench), pose)
+    wrench = wrench_at_chaser(jnp.stack(_computed_once(signals.wrench, tick)), pose)
     # The hardware accelerates by M^-1 W, and the sensor reads (1 - M_t M^-1) W (a).
     corrected = product(constants.tool_correction, wrench)
     unbiased = corrected - state.flight.bias
@@ -69,6 +70,15 @@ def read(
     return reading, state._replace(aligned=pose, flight=flight)
 
 
+def _computed_once(components: tuple[Array, ...], tick: Int[Array, ""]) -> tuple[Array, ...]:
+    """Return the components, which the compiler then computes once instead of for each use.
+
+    It would merge the force sensor, which has hundreds of operations, into each entry of a matrix product. It
+    does not merge operations across a condition, and cannot know that ticks are not negative.
+    """
+    return lax.cond(tick >= 0, lambda values: values, lambda values: tuple(-v for v in values), components)
+
+
 def noise_variance(prepared: Prepared, pose: Six) -> Float[Array, "*batch"]:
     """Return the mean of |W|^2 for a wrench W that is only noise; `pose` moves its moment to frame C."""
     gains, inverse_mass = prepared.gains, prepared.constants.inverse_mass
@@ -81,7 +91,7 @@ def noise_variance(prepared: Prepared, pose: Six) -> Float[Array, "*batch"]:
 def _aligned(prepared: Prepared, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]) -> Six:
     """Return the filtered pose, delayed like the force; the motion before the first tick is uniform."""
     back = prepared.back
-    recalled = look_back(state.ring[:, POSE], tick, jnp.broadcast_to(back, state.first.shape))
+    recalled = look_back(state.ring, POSE, tick, back)
     ago = back - signals.age.astype(back.dtype)
     uniform = state.first - (prepared.constants.control_period * ago)[None] * signals.twist_desired
     return jnp.where((ago > 0)[None], uniform, recalled)
