@@ -406,14 +406,14 @@ def test_c99_access_to_replaced_list_through_old_alias_is_rejected(method, line,
         program.add(method, Aliasing)
     location = f"{__file__}:{inspect.getsourcelines(method)[1] + line}: "
     assert str(error.value).startswith(
-        f"{location}found another list or object than that of {name}, expected"
+        f"{location}found a new list or object while {name} uses the old one, expected"
     )
 
 
 def test_c99_list_alias_is_rejected_if_called_method_replaces_the_list():
     program = CProgram("t_")
     program.add(Aliasing.__init__, Aliasing)
-    with pytest.raises(SubsetError, match="found values, which replace_and_read replaces, expected a copy"):
+    with pytest.raises(SubsetError, match="found values as an argument of replace_and_read, which"):
         program.add(Aliasing.replaced_by_the_called, Aliasing)
 
 

@@ -106,7 +106,7 @@ def test_six_axis_values_may_be_given_as_one_or_two_numbers():
         ('uncertainty."contact.tip.stifness"={distribution="normal",std=1}', "did you mean contact.tip"),
         ('uncertainty."target.inertia"={distribution="normal",std=1,independent=true}', "are not symmetric"),
         ('uncertainty."approach.velocity"={distribution="uniform",low=-0.1,high=0.1,independent=true}',
-         "a z component as far as 0.1, expected draws below 0 m/s"),
+         "a z component of up to 0.1 m/s, expected only draws < 0 m/s"),
     ],
 )  # fmt: skip
 def test_unusable_six_axis_values_are_named_in_error(override, reason):

@@ -258,14 +258,14 @@ def test_normal_draws_are_truncated_to_allowed_values(path, nominal, std):
         (FREQUENCY, {"distribution": "uniform", "factor": [2, 1]}, ".factor: found [2.0, 1.0]"),
         (FREQUENCY, {"distribution": "uniform", "factor": [1, 2, 3]}, ".factor: found a list of 3"),
         (FREQUENCY, {"distribution": "uniform", "factor": [0, 2]}, ".factor[0]: found 0"),
-        (FREQUENCY, {"distribution": "uniform", "low": 0, "high": 1}, "found draws as far as 0"),
+        (FREQUENCY, {"distribution": "uniform", "low": 0, "high": 1}, "found a draw of 0"),
         (
             FREQUENCY,
             {"distribution": "uniform", "factor": [1, 1e99]},
-            "found draws as far as 3e+100",
+            "found a draw of 3e+100",
         ),
-        (PHASE_KEY, {"distribution": "uniform", "low": 0, "high": 1.5}, "found draws as far as 1.5"),
-        (DELAY, {"distribution": "uniform", "low": -0.1, "high": 1}, "found draws as far as -0.1"),
+        (PHASE_KEY, {"distribution": "uniform", "low": 0, "high": 1.5}, "found a draw of 1.5"),
+        (DELAY, {"distribution": "uniform", "low": -0.1, "high": 1}, "found a draw of -0.1"),
         (DELAY, {"distribution": "loguniform", "low": 0, "high": 1}, ".low: found 0.0"),
         ("rig.force_sensor.bias", {"distribution": "loguniform", "low": -1, "high": 1}, "found -1"),
     ],
@@ -304,7 +304,7 @@ def test_mechanism_rules_are_checked_over_the_whole_uncertain_range():
     assert "contact.clearance" in refusal("approach.velocity", fast, **start)
     assert "contact.clearance" in refusal("contact.clearance", factor, **start)
     mixed = {"contact__damping": [0.0, 2.0]}
-    assert "0 as the first entry" in refusal("contact.damping", damped, **mixed)
+    assert "a list that begins with 0" in refusal("contact.damping", damped, **mixed)
     independent = mechanism_with("contact.damping", damped | {"independent": True}, **mixed)
     assert np.all(draw(independent, 9, 0)["contact.damping"] >= 1.0)
 

@@ -93,7 +93,7 @@ class CallLowering(ListLowering):
         # C cannot reproduce the rounding of these functions.
         expected = "a loop or a product" if is_sum else "a function with source code"
         functions = ", ".join([*MATH_DOMAIN_ERRORS, *FLOAT_TESTS])
-        raise self.refuse(node, f"{name}(...)", f"{expected}, or a function of math: {functions}")
+        raise self.refuse(node, f"{name}(...)", f"{expected}, or a function of the module math ({functions})")
 
     def builtin_abs(self, node: ast.Call) -> CExpression:
         (value,) = self.operands(node.args, self.number)
@@ -211,7 +211,8 @@ class CallLowering(ListLowering):
         self.replace(node, called.replaced)
         for name in [name for name in called.parameters if values[name].type.kind in ("list", "object")]:
             if values[name].reads & called.replaced:
-                raise self.refuse(node, f"{name}, which {called.node.name} replaces", "a copy, `list(...)`")
+                found = f"{name} as an argument of {called.node.name}, which replaces it"
+                raise self.refuse(node, found, "a copy, `list(...)`")
         for name in called.changes:
             self.changed(values[name], True)
         for name in called.retained:

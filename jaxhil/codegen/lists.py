@@ -19,7 +19,7 @@ class LoopRange(NamedTuple):
     values: Callable[[str], list[CExpression]]  # function from the index to the values of the targets
     count: int | None = None  # number of iterations, if known at export
     step: int = 1  # increment of the index, 1 or -1
-    constants: tuple[Any, ...] = ()  # values of the target in all iterations, if known at export
+    constants: tuple[Any, ...] = ()  # value of the target in each iteration, if known at export
 
 
 def has_text(values: tuple[Any, ...]) -> bool:
@@ -43,7 +43,7 @@ class ListLowering(ExpressionLowering):
         return isinstance(node, (ast.List, ast.Tuple, ast.ListComp)) or is_product or called == "list"
 
     def array(self, node: ast.expr, target: CExpression | None, named: str = "") -> CExpression:
-        """Lower a list into the array `target`, or if it is None, into a new local array."""
+        """Lower a list into the array `target`, or into a new local array if `target` is None."""
         if target is not None and target.type.length is None:
             self._fill(target.text, node, target.type)
             return target
@@ -81,7 +81,7 @@ class ListLowering(ExpressionLowering):
 
     @contextmanager
     def _each(self, stop: str) -> Iterator[str]:
-        """Emit a loop around the lines that the context emits; yield the loop's index."""
+        """Context manager: emit a loop around the lines that the `with` body emits; yield its index."""
         index = self.fresh("i")
         self.emit(f"for (int64_t {index} = 0; {index} < {stop}; {index}++) {{")
         with self.captured() as lines:
@@ -153,7 +153,7 @@ class ListLowering(ExpressionLowering):
         return [target.id for target in targets if isinstance(target, ast.Name)]
 
     def loop(self, node: ast.expr) -> LoopRange:
-        """Return the index range and values of a loop `for ... in` the expression `node`."""
+        """Return the index range of a `for` loop over the expression `node`, and its targets' values."""
         called = node.func.id if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
         if called == "range" and isinstance(node, ast.Call):
             return self._range(node)

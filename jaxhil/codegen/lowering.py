@@ -24,15 +24,15 @@ if TYPE_CHECKING:
     from .program import CFunction, CProgram
 
 SIGN_IF_TRUE = {ast.Gt: "> 0", ast.GtE: ">= 0", ast.Lt: "not 0", ast.NotEq: "not 0"}  # sign of x if x OP 0
-SIGN_IF_FALSE = {ast.Lt: ">= 0", ast.LtE: "> 0", ast.Eq: "not 0"}  # sign of x if not x OP 0
+SIGN_IF_FALSE = {ast.Lt: ">= 0", ast.LtE: "> 0", ast.Eq: "not 0"}  # sign of x if x OP 0 is false
 
 
 class NumberFact(NamedTuple):
-    """Sign and range of a number that are certain at one position in the code."""
+    """Sign and range that a number certainly has at one position in the code."""
 
     sign: str
     reads: Locations = frozenset()  # locations on which the number depends
-    span: tuple[Any, Any] | None = None  # least and largest value; with a range, the number is not NaN
+    span: tuple[Any, Any] | None = None  # least and largest value, which exclude NaN
 
 
 class Lowering:
@@ -43,7 +43,7 @@ class Lowering:
         self.names: dict[str, CExpression] = {}  # C expressions of local names
         self.facts: dict[str, NumberFact] = {}  # facts about numbers, by their C code
         self.lines: list[str] = []
-        self.failures = 0  # number of emitted tests that may leave the function
+        self.failures = 0  # number of emitted tests that may return from the function
         self.effects: list[Locations] = []  # locations that the code so far has changed
         self.compared: list[ast.expr] = []  # sums that are only operands of comparisons
 
@@ -58,7 +58,7 @@ class Lowering:
 
     @contextmanager
     def captured(self) -> Iterator[list[str]]:
-        """Collect the lines that the context emits in a separate list; afterwards, restore the facts."""
+        """Context manager: collect the lines that the body of `with` emits; at its end, restore the facts."""
         before, facts, effects = self.lines, self.facts, len(self.effects)
         self.lines, self.facts = [], dict(facts)
         yield self.lines
@@ -80,12 +80,12 @@ class Lowering:
         return CExpression(name, value.type, sign=value.sign)
 
     def simple(self, value: CExpression, hint: str) -> CExpression:
-        """Return a value whose C code may occur several times; store other values in a local constant."""
+        """Return the value; if its C code must not be repeated, first store it in a local constant."""
         is_simple = value.text.replace("->", "").replace(".", "").replace("_", "").isalnum()
         return value if is_simple and not value.writes else self.temporary(value, hint)
 
     def check(self, value: CExpression) -> None:
-        """Emit a return from the function if the call that computed `value` has failed."""
+        """If the call that computes `value` may fail, emit a test of the error flag with a return."""
         if value.fails:
             self.fail_if("*error", None)
 
@@ -96,7 +96,7 @@ class Lowering:
         self.emit("}")
 
     def fail(self, node: ast.AST | None, reason: str) -> None:
-        """Emit a return from the function that sets the error flag; if `node` is None, it is already set."""
+        """Emit a return from the function; unless `node` is None, also emit code that sets the error flag."""
         self.failures += 1
         self.function.fails = True
         nothing = {"float": " 0.0", "int": " 0", "bool": " false"}.get(self.function.returns.kind, "")

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 MAX_LINE_LENGTH = 116
 # C functions that the output contains only if they are called; @ is replaced by the prefix.
 C_HELPERS = {
-    # Without volatile, a compiler may replace a power by products, which have different rounding errors.
+    # Without volatile, a compiler may replace a power with products, whose rounding errors differ.
     "power": """double @power(double base, double exponent) {
 const volatile double exact = exponent;
 return pow(base, exact);

@@ -50,7 +50,7 @@ class CFunction:
         self.changes: set[str] = set()  # list parameters that the function changes
         self.retained: dict[str, Locations] = {}  # list parameters that the function assigns to attributes
         self.shared: dict[Any, SubsetError] = {}  # errors for local lists that are also attributes
-        self.replaced: Locations = frozenset()  # attributes that get a different list or object
+        self.replaced: Locations = frozenset()  # attributes that get a new list or object
         self.fails, self.reason = False, ""  # whether the function may fail; file, line and reason
         self.name, self.error = "", "error"
         self.lines: list[str] = []
@@ -153,7 +153,7 @@ class CProgram(StructLowering):
         return next(text for text in (base, *alternatives) if text not in taken and not text.endswith("_"))
 
     def local_type(self, function: CFunction, node: ast.expr) -> ValueType | None:
-        """Return the type of a local variable's annotation, None if C has no equivalent."""
+        """Return the type of a local variable's annotation; None if C has no equivalent."""
         try:
             hint = eval(compile(ast.Expression(node), function.file, "eval"), function.namespace)
         except Exception:
@@ -161,7 +161,7 @@ class CProgram(StructLowering):
         return type_of_annotation(hint, self.bindings)
 
     def constant(self, value: Any) -> CExpression | None:
-        """Return the C expression for a constant, None if it is no number, bool, text or sequence."""
+        """Return the C expression for a constant; None if it is not a number, bool, text or sequence."""
         if isinstance(value, (str, tuple, list, frozenset)):
             return CExpression("", TEXT, constant=value)
         if isinstance(value, bool):
@@ -176,11 +176,11 @@ class CProgram(StructLowering):
         return CExpression(text, type_, rank, sign=sign_of(value), span=span, constant=value)
 
     def literal(self, value: Any) -> CExpression:
-        """Return the C expression for a constant; its code is empty if C has no equivalent."""
+        """Return the C expression for a constant, with empty code if C has no equivalent."""
         return self.constant(value) or CExpression("", TEXT, constant=value)
 
     def named_constant(self, name: str, namespace: dict[str, Any]) -> CExpression | None:
-        """Return the C name of a module's constant as an expression, None if C has no equivalent."""
+        """Return the C name of a module's constant as an expression; None if C has no equivalent."""
         value = namespace[name]
         result, named = self.constant(value), f"{self.prefix}{name}".upper()
         if result is not None and self.enumerators.get(name) == value:

@@ -51,7 +51,7 @@ def read_comment_before(file: str, statement: ast.stmt) -> str:
 
 
 def read_constant_comment(name: str, namespace: dict[str, Any]) -> str:
-    """Return the comment on the line of a module constant's assignment, "" if there is none."""
+    """Return the comment on the line of a module constant's assignment; "" if there is none."""
     file = getattr(sys.modules.get(namespace["__name__"]), "__file__", None)
     for node in parse_file(file).body if file else []:
         if isinstance(node, ast.ImportFrom) and any(alias.name == name for alias in node.names):

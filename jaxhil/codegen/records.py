@@ -52,7 +52,7 @@ class StructLowering:
         return f"{name}_" if name in C_RESERVED_WORDS else name
 
     def class_of(self, function: Any, node: ast.expr) -> type | None:
-        """Return the class whose constructor an expression calls, None if it calls no constructor."""
+        """Return the class whose constructor an expression calls; None if it calls no constructor."""
         called = node.func if isinstance(node, ast.Call) else None
         value = function.namespace.get(called.id) if isinstance(called, ast.Name) else None
         is_class = inspect.isclass(value) and not issubclass(value, tuple) and value.__module__ != "builtins"
@@ -86,7 +86,7 @@ class StructLowering:
         return self.local(plain if plain == name or plain not in taken else f"{plain}_")
 
     def _class_constant(self, class_: type, name: str) -> CExpression | None:
-        """Return a class attribute as a constant, None if it is no number or a method assigns it."""
+        """Return a class attribute as a constant; None if it is not a number, or if a method assigns it."""
         static = inspect.getattr_static(class_, name, None)
         if not isinstance(static, (bool, int, float)):
             return None
@@ -106,7 +106,7 @@ class StructLowering:
         return self.literal(static)
 
     def field_type(self, body: "Lowering", type_: ValueType, name: str, node: ast.AST) -> ValueType:
-        """Return the type of an attribute from its annotation. Raise SubsetError if there is none."""
+        """Return the type of an attribute from its annotation. Raise SubsetError if it has no annotation."""
         hints = typing.get_type_hints(type_.of, include_extras=True)
         hinted = type_of_annotation(hints.get(name, ...), self.bindings)
         if hinted is None:
@@ -115,7 +115,7 @@ class StructLowering:
         return self.fields.setdefault(type_.of, {}).setdefault(name, hinted)
 
     def known_field(self, body: "Lowering", owner: CExpression, target: ast.Attribute) -> CExpression | None:
-        """Return the C expression for an attribute, None if the type of the attribute is not yet known."""
+        """Return the C expression for an attribute; None if the type of the attribute is not yet known."""
         class_, name = owner.type.of, target.attr
         if owner.type.kind != "object":
             raise body.refuse(target, f"an attribute of a {owner.type.kind}", "an object")
@@ -125,7 +125,7 @@ class StructLowering:
     def new_field(
         self, body: "Lowering", owner: CExpression, target: ast.Attribute, type_: ValueType
     ) -> CExpression:
-        """Return the C expression for an attribute, whose type is `type_` unless it is already known."""
+        """Return the C expression for an attribute; if its type is not yet known, record it as `type_`."""
         field = self.known_field(body, owner, target)
         if field is not None:
             return field

@@ -59,7 +59,7 @@ class BodyLowering(CallLowering):
     def do_assign(self, node: ast.Assign) -> None:
         is_simple = isinstance(node.value, (ast.Constant, ast.Attribute, ast.Name))
         if len(node.targets) > 1 and not is_simple:
-            raise self.refuse(node, "several targets of an expression", "a separate assignment for each")
+            raise self.refuse(node, "one expression for several targets", "an assignment for each target")
         for target in reversed(node.targets):
             if isinstance(target, ast.Tuple):
                 self._unpack(node, target)
@@ -69,8 +69,8 @@ class BodyLowering(CallLowering):
     def do_annassign(self, node: ast.AnnAssign) -> None:
         required = self.program.local_type(self.function, node.annotation)
         if node.value is None or required is None:
-            expected = "a float, int, bool or class, and a value"
-            raise self.refuse(node, "this annotation, or no value", expected)
+            expected = "`name: TYPE = value`, where TYPE is float, int, bool or a class"
+            raise self.refuse(node, f"`{ast.unparse(node)}`", expected)
         self._assign(node, node.target, node.value, required)
 
     def do_augassign(self, node: ast.AugAssign) -> None:
@@ -87,11 +87,11 @@ class BodyLowering(CallLowering):
         else:
             value = self.expression(node.value)
             if value.type.kind != "list" or value.type.length is None:
-                raise self.refuse(node, f"names for a {value.type.kind}", "a list of fixed length")
+                raise self.refuse(node, f"a {value.type.kind} for several names", "a list of fixed length")
             values = [self.at(value, str(index)) for index in range(value.type.length)]
         if len(values) != len(target.elts):
             found = f"{len(target.elts)} targets for {len(values)} values"
-            raise self.refuse(node, found, "the same number")
+            raise self.refuse(node, found, "as many targets as values")
         for element, value in zip(target.elts, values, strict=True):
             if value.type.kind in ("object", "list") and isinstance(element, ast.Name):
                 self._alias(node, element, value)
@@ -139,16 +139,16 @@ class BodyLowering(CallLowering):
         self.names[target.id] = value
 
     def replace(self, node: ast.stmt | ast.expr, keys: Locations, of_element: bool = False) -> None:
-        """Record attributes that get a different list or object.
+        """Record attributes to which an assignment gives a new list or object.
 
-        Raise SubsetError if a local name of the old list or object is used later: in Python it keeps the old.
+        Raise SubsetError if a local name of the old one is used later: in Python it still means the old one.
         """
         self.function.replaced |= keys
         for name, value, last in self.aliases:
             is_outer = of_element and value.type.kind == "list" and value.type.of.kind == "list"
             if value.reads & keys and not is_outer and last > (node.end_lineno or 0):
                 expected = f"`[:] = ` in place, or a copy, `{name} = list(...)`"
-                raise self.refuse(node, f"another list or object than that of {name}", expected)
+                raise self.refuse(node, f"a new list or object while {name} uses the old one", expected)
 
     def _assign_list(self, node: ast.stmt, target: ast.expr, source: ast.expr) -> None:
         if isinstance(target, ast.Name):
@@ -308,8 +308,8 @@ class BodyLowering(CallLowering):
     def do_for(self, node: ast.For) -> None:
         loop = self.loop(node.iter)
         if node.orelse or not loop.stop or has_text(loop.constants):
-            found = "a loop through text, or a loop with else"
-            raise self.refuse(node, found, "a loop through numbers without else")
+            found = "a loop over text, or with else"
+            raise self.refuse(node, found, "a loop over numbers, without else")
         names = self.targets(node.target, len(loop.values("")))
         is_range = loop.values("i")[0].text == "i" and len(names) == 1 and names[0] != "_"
         index = self.program.local(names[0]) if is_range else self.fresh("i")
@@ -355,9 +355,9 @@ class BodyLowering(CallLowering):
         """Lower `try` around a single call with `except Exception`."""
         statement = node.body[0]
         if len(node.body + node.handlers) != 2 or node.orelse or node.finalbody:
-            raise self.refuse(node, "this try", "a single call and a single `except Exception`")
+            raise self.refuse(node, "this try", "`try` with a single call and a single `except Exception`")
         if not isinstance(statement, (ast.Assign, ast.Return)) or not isinstance(statement.value, ast.Call):
-            raise self.refuse(node, "this try", "`name = call(...)` or `return call(...)` inside")
+            raise self.refuse(node, "this try", "`try` with `name = call(...)` or `return call(...)`")
         function, failures, position = self.function, self.failures, len(self.lines)
         before = function.error, function.fails, function.reason
         flag = self.fresh("failed")

@@ -91,7 +91,7 @@ def refusal(file: str, line: int, found: str, expected: str) -> SubsetError:
 
 
 def type_of_annotation(hint: Any, bindings: Mapping[Any, Any]) -> ValueType | None:
-    """Return the `ValueType` of an annotation, None if C has no equivalent."""
+    """Return the `ValueType` of an annotation; None if C has no equivalent."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
         type_ = type_of_annotation(arguments[0], bindings)
@@ -130,7 +130,7 @@ def _apply_annotations(type_: ValueType, notes: Sequence[Any]) -> ValueType:
 
 
 def sign_of(value: Any) -> str:
-    """Return the sign of a constant, "" if the constant is not a number or is NaN."""
+    """Return the sign of a constant; "" if the constant is not a number or is NaN."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return ""
     return "> 0" if value > 0 else ">= 0" if value == 0 else "not 0" if value < 0 else ""
@@ -142,7 +142,7 @@ def implies_sign(sign: str, required: str) -> bool:
 
 
 def common_sign(signs: Sequence[str]) -> str:
-    """Return the strongest sign that every one of `signs` implies, "" if there is none."""
+    """Return the strongest sign that every one of `signs` implies; "" if there is none."""
     return next(
         (s for s in ("> 0", ">= 0", "not 0") if all(sign and implies_sign(sign, s) for sign in signs)), ""
     )

@@ -1,13 +1,13 @@
 """Interface of the contact laws, which compute the contact force from the penetration and its rate.
 
-A law defines its keys in a mechanism file, its force in the simulation and in Python floats, its ideal
+A law defines its keys in a mechanism file, its force (in JAX, and in Python floats for real time), its ideal
 contact, and functions for tuning, benchmarks and identification. To add a law, write a module with a subclass
 of `ContactLaw` and add an entry to `jaxhil.contact.laws`.
 
 In the simulation a law is a pure function of the penetration d [m], its rate d' [m/s] and the law's state
 (`init`, `step`); a law without memory has an empty state. The force is 0 for d <= 0 and, unless the law
 allows tension, never negative. All arguments broadcast to the batch shape; slopes and depths of a segmented
-law have a leading axis of segments. Arrays are `jax.numpy` arrays unless stated otherwise.
+(piecewise-linear) law have a leading axis of segments. Arrays are `jax.numpy` arrays unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class ContactLaw(abc.ABC):
     damped_as: ClassVar[str] = ""  # name of the same law with damping; empty: this law itself
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Make the subclass a frozen dataclass: laws must be hashable, as keys of compiled programs."""
+        """Make the subclass a frozen dataclass, so that a law can be a key of compiled programs."""
         super().__init_subclass__(**kwargs)
         dataclass(frozen=True)(cls)
 
@@ -68,26 +68,26 @@ class ContactLaw(abc.ABC):
 
     @property
     def jumps(self) -> bool:
-        """Return whether the force jumps when the motion reverses; a peak may then lie between samples."""
+        """Return whether the force jumps when the motion reverses; its peak may lie between two samples."""
         return False
 
     @property
     def arcs(self) -> bool:
-        """Return whether the force of a slow contact is nearly parabolic over a quarter of a control period.
+        """Return whether a slow contact has a nearly parabolic force in each quarter of a control period.
 
         This is false if the slope changes at a given depth, if the force jumps when the motion reverses, or
-        if the force approaches 0 like a power of the depth.
+        if the force near 0 is proportional to a power of the depth.
         """
         return False
 
     @property
     def closed_form(self) -> bool:
-        """Return whether the ideal contact has a closed form; otherwise the motion is integrated."""
+        """Return whether the ideal contact has a closed form; if not, it is integrated numerically."""
         return type(self).reference is not ContactLaw.reference
 
     @property
     def simulated(self) -> ContactLaw:
-        """Return the law that replaces this law in the simulation: laws with equal forces share a program."""
+        """Return the law to simulate instead of this law, so that laws with equal forces share a program."""
         return self
 
     def specialised(self, contact: Any, drawn: Callable[[str], bool]) -> ContactLaw:
@@ -127,7 +127,7 @@ class ContactLaw(abc.ABC):
     def reference(self, parameters: Any, mass: Any, velocity: Any) -> IdealContact:
         """Return the ideal contact for an equivalent `mass` [kg] and an approach `velocity` [m/s].
 
-        By default the motion is integrated (`jaxhil.contact.ideal_contact_motion`).
+        By default the motion is integrated numerically (`jaxhil.contact.ideal_contact_motion`).
         """
         from jaxhil.contact.ideal_contact import IdealContact
         from jaxhil.contact.ideal_contact_motion import integrate_contact
@@ -137,7 +137,7 @@ class ContactLaw(abc.ABC):
     # Magnitudes of the contact, from the parameters of scenarios as NumPy arrays
 
     def undamped_peak_force(self, parameters: Any, mass: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return the peak force [N] of the ideal contacts without damping, (contacts, batch)."""
+        """Return the peak force [N] of the ideal contacts without damping, as an array (contacts, batch)."""
         import jax
         import jax.numpy as jnp
 
@@ -150,14 +150,14 @@ class ContactLaw(abc.ABC):
         return np.asarray(motion.peak_force)
 
     def tangent_stiffness(self, parameters: Any, mass: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return the largest slope dF/dd [N/m] in the contact, (contacts, batch); by default the stiffness.
+        """Return the largest slope dF/dd [N/m] in each contact, an array (contacts, batch).
 
-        For a segmented law, `parameters` contain only the largest slope.
+        By default, the slope is `parameters.stiffness`; for a segmented law, this is the largest slope.
         """
         return parameters.stiffness
 
     def onset_damping(self, parameters: Any) -> np.ndarray:
-        """Return the damping constant dF/dd' [N s/m] at the onset of contact, (contacts, batch)."""
+        """Return the damping constant dF/dd' [N s/m] at the onset of contact, an array (contacts, batch)."""
         return parameters.damping
 
     # Magnitudes of the contact, from a mechanism file
@@ -178,7 +178,7 @@ class ContactLaw(abc.ABC):
     def perturb_damping(
         self, drawn: Callable[[str], np.ndarray], ratio: np.ndarray, mass: np.ndarray, velocity: np.ndarray
     ) -> tuple[str, np.ndarray]:
-        """Add the dissipation of a linear oscillator with the damping ratio zeta to the contacts.
+        """Add to the contacts the energy loss of a linear oscillator with the damping ratio zeta.
 
         Args:
             drawn: function that returns the random draws of a key, (draws, ...). For `stiffness` and
@@ -196,14 +196,14 @@ class ContactLaw(abc.ABC):
         raise self._missing_method_error("perturb_damping")
 
     def in_floats(self, contact: Any, stiffness: Any, damping: float) -> FloatLaw:
-        """Return the law as functions of Python floats, for one entry of `stiffness` and of `damping`.
+        """Return the law as functions of Python floats, for one entry of `stiffness` and one of `damping`.
 
         Raise `InputError` if the law does not define this method.
         """
         raise self._missing_method_error("in_floats")
 
     def regression(self, contact: Any) -> Regression:
-        """Return the law for linear regression. Raise `InputError` if the law does not define this method."""
+        """Return the law as a linear regression. Raise `InputError` if the law does not define it."""
         raise self._missing_method_error("regression")
 
     def families(self, deepest: float, entries: int) -> list[RegressionFamily]:

@@ -20,8 +20,8 @@ class DepthDamped(PowerLaw):
     `reference_depth` [m]. The force does not jump at the onset. During the outward motion the surfaces
     separate at a depth d > 0, where k d^(n-1) = b |d'|/d_0.
 
-    The ideal contact is integrated. Hunt and Crossley's law has the same ideal contact without damping, and
-    also for n = 1 with chi = 2 b/(3 k d_0).
+    The ideal contact is integrated numerically. It equals the ideal contact of Hunt and Crossley's law
+    without damping, and for n = 1 with chi = 2 b/(3 k d_0).
     """
 
     name: ClassVar[str] = "depth_damped"
@@ -46,7 +46,7 @@ class DepthDamped(PowerLaw):
         return parameters.stiffness * power + parameters.damping * rate / parameters.reference_depth
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add the b with the same damping force at the deepest point as Hunt and Crossley's chi = pi zeta/v.
+        """Add the b that damps the deepest point like Hunt and Crossley's law with chi = pi zeta/v.
 
         zeta is the damping ratio `ratio`, and v the approach speed.
         """

@@ -1,4 +1,4 @@
-"""Elastoplastic contact law: the slope of the force is steeper in unloading than in loading."""
+"""Elastoplastic contact law: in unloading, the force has a steeper slope than in loading."""
 
 from typing import ClassVar
 
@@ -11,12 +11,12 @@ from jaxhil.contact.keys import ContactKey
 
 
 class Elastoplastic(ContactLaw):
-    """Contact law F = max(0, k d_max - k_u (d_max - d)), k_u = r k, of a mechanism that yields.
+    """Contact law F = max(0, k d_max - k_u (d_max - d)), k_u = r k, with plastic deformation.
 
     k is `stiffness` [N/m], r is `unloading_ratio` >= 1, and the state d_max [m] is the deepest penetration so
     far. Loading beyond d_max follows F = k d. Unloading and reloading below d_max follow the slope k_u; the
-    force is 0 for d <= d_max (1 - 1/r). The mechanism takes up the energy k d_max^2/2 = M v^2/2 and
-    returns the fraction 1/r, so that e = 1/sqrt(r). The law has no damping.
+    force is 0 for d <= d_max (1 - 1/r). The mechanism absorbs the energy k d_max^2/2 = M v^2/2 and returns
+    the fraction 1/r of it, so that the restitution is e = 1/sqrt(r). The law has no damping.
 
     d_max is reset when the mechanism leaves the surface (d <= 0), so that every contact starts undeformed. It
     is not reset while F = 0 at d > 0.
@@ -66,7 +66,7 @@ class Elastoplastic(ContactLaw):
         return parameters.stiffness * deepest - jnp.where(above > 0, slope, parameters.stiffness) * above
 
     def reference(self, parameters, mass, velocity):
-        """Return the ideal contact: a quarter period of sqrt(k/M) inward, then one of sqrt(k_u/M) outward."""
+        """Return the ideal contact: a quarter period at sqrt(k/M) inward, then one at sqrt(k_u/M) outward."""
         from jaxhil.contact.ideal_contact import IdealContact
 
         frequency = jnp.sqrt(parameters.stiffness / mass)
@@ -84,7 +84,7 @@ class Elastoplastic(ContactLaw):
         return parameters.stiffness * parameters.unloading_ratio
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Multiply r by exp(2 pi zeta), where zeta is the damping ratio `ratio`, since e* = 1/sqrt(r)."""
+        """Multiply r by exp(2 pi zeta) with zeta = `ratio`, because the restitution is 1/sqrt(r)."""
         return "unloading_ratio", drawn("unloading_ratio") * np.exp(2 * np.pi * ratio[:, 0])
 
     def in_floats(self, contact, stiffness, damping):
@@ -92,7 +92,7 @@ class Elastoplastic(ContactLaw):
 
 
 def _in_floats(stiffness: float, unloading_ratio: float, deepest: float) -> FloatLaw:
-    """Return the law in Python floats, given the `deepest` penetration so far [m]."""
+    """Return the law in Python floats for a contact whose largest penetration so far is `deepest` [m]."""
 
     def spring(depth: float, rate: float) -> float:
         if depth >= deepest:

@@ -15,11 +15,11 @@ from jaxhil.contact.regression import Regression, RegressionFamily
 class Hardening(ContactLaw):
     """Contact law F = max(0, k d (1 + (d/d_0)^2) + b d'), a one-sided Duffing oscillator.
 
-    k is `stiffness` [N/m], the slope at the surface; at the depth d_0, `reference_depth` [m], the slope is
-    four times as large. b is `damping` [N s/m].
+    k is `stiffness` [N/m], d_0 is `reference_depth` [m], and b is `damping` [N s/m]. The slope of the
+    spring's force is k at the surface and 4 k at the depth d_0.
 
-    The ideal contact is integrated. Without damping e = 1, and k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 at the
-    deepest point, where the force is largest.
+    The ideal contact is integrated numerically. Without damping the restitution is 1, and the force is
+    largest at the deepest point, where k d^2/2 + k d^4/(4 d_0^2) = M v^2/2.
     """
 
     name: ClassVar[str] = "hardening"
@@ -70,7 +70,7 @@ class Hardening(ContactLaw):
         return clamp_force(spring, lambda rate: damping * rate)
 
     def regression(self, contact):
-        """Return the regression F = k d + k d^3/d_0^2 + b d' with the unknown k, k/d_0^2 and b."""
+        """Return the regression F = c_1 d + c_2 d^3 + c_3 d' with c_1 = k, c_2 = k/d_0^2 and c_3 = b."""
         names = ("stiffness", "cubic", "damping")
         return Regression("hardening", lambda d, v: [d, d**3], names, lambda d, v: [v])
 

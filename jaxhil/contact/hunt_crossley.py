@@ -57,7 +57,7 @@ class HuntCrossley(PowerLaw):
         return damping * velocity / np.pi
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add pi zeta/v to chi, where zeta is the damping ratio `ratio`, since e* is about 1 - chi v."""
+        """Add pi zeta/v to chi with zeta = `ratio`, because the restitution is about 1 - chi v."""
         return "damping", drawn("damping") + np.pi * ratio / velocity * np.ones_like(drawn("stiffness"))
 
     def in_floats(self, contact, stiffness, damping):

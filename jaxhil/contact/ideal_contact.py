@@ -39,11 +39,11 @@ def ideal_kelvin_voigt(
 ) -> IdealContact:
     """Return the ideal contact with F = k d + b d', at any damping ratio xi = b / (2 sqrt(k M)).
 
-    Without `tension`, F = max(0, k d + b d'). The bodies separate at F = 0, after 2 g(xi) / omega, with
-    e = exp(-2 xi g(xi)) and g(xi) = acos(xi) / sqrt(1 - xi^2), continued analytically through xi = 1.
-    With `tension`, the bodies separate at d = 0 with e = exp(-pi xi / sqrt(1 - xi^2)), or stick together
-    (e = 0, infinite duration) if xi >= 1. For xi >= 1/2 the peak force is b v, at the onset of contact.
-    Source: impulse response of the damped oscillator.
+    Without `tension`, F = max(0, k d + b d'). The bodies separate at F = 0, after 2 g(xi) / sqrt(k / M), with
+    e = exp(-2 xi g(xi)) and g(xi) = acos(xi) / sqrt(1 - xi^2), continued analytically through xi = 1. With
+    `tension`, the bodies separate at d = 0 with e = exp(-pi xi / sqrt(1 - xi^2)), or stick together (e = 0,
+    infinite duration) if xi >= 1. For xi >= 1/2 the peak force is b v, at the onset of contact. Source:
+    impulse response of the damped oscillator.
 
     Args:
         mass: equivalent mass M [kg].
@@ -164,7 +164,7 @@ _POTENTIAL_SERIES = _COTH_SERIES * (1 + 1 / (2 * _SERIES_ORDERS))
 
 
 def _langevin(s):
-    """Return 1 - L(s) / s and L'(s) for s >= 0, where L(s) / s = coth(s) - 1 / s is Langevin's function."""
+    """Return 1 - f(s) and L'(s) for s >= 0; f(s) = coth(s) - 1 / s is Langevin's function, L(s) = s f(s)."""
     small = s < _MAX_SERIES_ARGUMENT
     square = jnp.where(small, s, 0.0) ** 2
     value, slope = jnp.zeros_like(s), jnp.zeros_like(s)
@@ -183,14 +183,14 @@ def _langevin(s):
 
 @jax.custom_jvp
 def _hunt_crossley_shape(onset, exponent):
-    """Return e, peak force / (M v^2 / D) and duration / (D / v), where D^(n+1) = (n + 1) M v^2 / k."""
+    """Return e, F_max D / (M v^2) and duration v / D, all dimensionless; D^(n+1) = (n + 1) M v^2 / k."""
     half_span, at_peak = _solve_half_span(onset), _solve_peak(onset, exponent)
     return _shape_at_roots(half_span, at_peak, onset, exponent)
 
 
 @_hunt_crossley_shape.defjvp
 def _hunt_crossley_shape_jvp(primals, tangents):
-    # Two partial derivatives are enough for any number of tangents.
+    # All tangents are combinations of the two partial derivatives.
     onset, exponent = primals
     root, at_peak = _solve_half_span(onset), _solve_peak(onset, exponent)
     root_slope = 1 + _langevin(root)[1]

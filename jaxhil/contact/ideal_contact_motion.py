@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from jaxhil.contact.dormand_prince import StepEnd, interpolate_step, take_step
 from jaxhil.lanes import select_lanes
 
-STEP_TOLERANCE = 1e-10  # error of a step relative to approach velocity and deepest penetration
+STEP_TOLERANCE = 1e-10  # limit on a step's error, relative to approach velocity and deepest penetration
 FIRST_STEP = 1e-4  # s; first step that is tried
 MAX_CONTACT_DURATION = 10.0  # s; bodies in contact for longer count as sticking to each other
 MAX_STEPS = 1000  # limit on the number of steps, including rejected ones
@@ -87,8 +87,8 @@ def integrate_contact(
             1/50 of `push_duration`.
         push_duration: end of the push [s]; later p = 0.
         times: requested times since the first touch [s], in any order. Before 0 and after the end the motion
-            is uniform.
-        tolerance: relative error of each step, at least 32 times the rounding unit of the dtype.
+            is assumed to be uniform.
+        tolerance: limit on the relative error of each step, at least 32 times the rounding unit of the dtype.
     """
     shape = jnp.broadcast_shapes(jnp.shape(mass), jnp.shape(velocity))
     mass, velocity = jnp.broadcast_to(mass, shape), jnp.broadcast_to(velocity, shape)
@@ -116,7 +116,7 @@ class _Problem(NamedTuple):
     approach: Array  # approach speed v [m/s]
     push: Any  # function p(t) [N], or None
     push_end: Array  # end of the push [s]
-    tolerance: Float[Array, ""] | float  # relative error of a step
+    tolerance: Float[Array, ""] | float  # limit on the relative error of a step
 
 
 class _IntegrationState(NamedTuple):
@@ -207,7 +207,7 @@ def _initial_state(problem):
 
 
 def _integrate_phases(problem, records):
-    """Integrate all contacts; return the final state and, if `records`, the nodes (else None)."""
+    """Integrate all contacts; return the final state, and the nodes or, if `records` is false, None."""
     like = problem.approach
     dtype, zeros = like.dtype, jnp.zeros_like(like)
     rounding = float(np.finfo(dtype).eps)
@@ -263,7 +263,7 @@ def _integrate_phases(problem, records):
 
 
 def _propose_step(problem, state, search):
-    """Return the next step to try [s]: by false position if an event is bracketed, else by error control."""
+    """Return the next step to try [s]: by regula falsi if an event is bracketed, else by error control."""
     rise = search.at_high - search.at_low
     middle = search.high - search.at_high * (search.high - search.low) / jnp.where(rise < 0, rise, -1)
     # A step does not cross the end of the push, and is at most 1/50 of the duration of the push.
@@ -341,7 +341,7 @@ def _update_state(problem, state, step, trial, correction, is_located):
 
 
 def _interpolate_nodes(nodes, end, approach, times):
-    """Return position [m] and velocity [m/s] at `times`; the motion is uniform before and after the nodes."""
+    """Return position [m] and velocity [m/s] at `times`; outside the nodes, assume uniform motion."""
     columns = _Nodes(*(leaf.reshape(leaf.shape[0], -1) for leaf in nodes))
     last = [leaf.reshape(1, -1) for leaf in (end.time, end.depth, end.velocity)]
     requested = times.reshape(times.shape[0], -1)

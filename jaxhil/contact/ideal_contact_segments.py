@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-_NEWTON_STEPS = 80  # enough even for a turning point at a depth, where a step only halves the distance
+_NEWTON_STEPS = 80  # enough even if the motion turns at a depth: each step then only halves the error
 
 
 def solve_chained_oscillators(
@@ -25,7 +25,7 @@ def solve_chained_oscillators(
     damping: Float[Array, "*batch"],
     velocity: Float[Array, "*batch"],
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """Return restitution, peak force [N] and duration [s] as for `ideal_piecewise_linear`."""
+    """Return restitution, peak force [N] and duration [s] of the contact in `ideal_piecewise_linear`."""
     count = slopes.shape[0]
     zero = jnp.zeros_like(velocity)
     thicknesses = jnp.diff(depths, axis=0, prepend=zero[None])
@@ -157,7 +157,7 @@ def _traverse(decay, segment: _Segment, inward, state: _State) -> _State:
 
 
 def _compute_passage(decay, segment: _Segment, inward, state: _State, active) -> _SegmentPassage:
-    """Compute the motion of the `active` batch elements through a segment; the times have no derivative."""
+    """Compute the motion of the `active` batch elements through a segment; its times have no derivative."""
     stiffness, turns_here = segment.stiffness, state.segment == segment.number
     # The outward motion enters a segment at its upper depth, but the turning segment at the turning point.
     depth = jnp.where(inward, 0.0, jnp.where(turns_here, state.depth, segment.thickness))
@@ -166,8 +166,8 @@ def _compute_passage(decay, segment: _Segment, inward, state: _State, active) ->
     spring = segment.acceleration + stiffness * depth
     force = jnp.maximum(spring + 2 * decay * velocity, 0.0)
 
-    # Unless the motion crosses a depth, it ends at d' = 0 or at F = 0. Inward, F is largest at the start or
-    # at the end or, if F increases at the start, where F' = 0.
+    # If the motion does not cross the far depth, it ends at d' = 0 (inward) or F = 0 (outward). In the
+    # inward motion, F is largest at the start, at the end, or (if F increases at the start) where F' = 0.
     fixed = lax.stop_gradient((decay, stiffness, spring, velocity))
     growth = stiffness * velocity - 2 * decay * force
     grows = inward & (growth > 0)
@@ -181,7 +181,7 @@ def _compute_passage(decay, segment: _Segment, inward, state: _State, active) ->
     )
     farthest, _ = _free_motion(*fixed, event)
     boundary = jnp.where(inward, segment.thickness, -depth)
-    # The first segment always ends by separation: without damping, force and depth vanish together.
+    # In the first segment the bodies always separate: without damping, force and depth vanish together.
     crosses = jnp.where(inward, farthest > boundary, (farthest < boundary) & (segment.number > 0))
     target = jnp.where(crosses, boundary, 0.0)
     start = jnp.where(crosses & ~inward, event, 0.0)

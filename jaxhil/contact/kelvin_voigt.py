@@ -90,7 +90,7 @@ class Linear(KelvinVoigt):
 
 
 def _kelvin_voigt(pulls: bool) -> Regression:
-    """Return the regression F = k d + b d' with the unknown k and b; `pulls`: whether F may be negative."""
+    """Return the regression F = k d + b d' with unknown k and b; if `pulls`, F may be negative."""
     return Regression(
         "kelvin_voigt",
         lambda d, v: [d],

@@ -54,7 +54,7 @@ class PiecewiseLinear(ContactLaw):
         )
 
     def undamped_peak_force(self, parameters, mass, velocity):
-        """Return the peak force [N]: in each segment the stored energy E raises F to sqrt(F^2 + 2 k E)."""
+        """Return the peak force [N]: the energy E that a segment stores raises F to sqrt(F^2 + 2 k E)."""
         stiffness, depths = parameters.stiffness, parameters.depths
         slots, segments = stiffness.shape[:2]
         energy = np.broadcast_to(mass * velocity**2 / 2, (slots, stiffness.shape[-1]))
@@ -69,7 +69,7 @@ class PiecewiseLinear(ContactLaw):
         return force
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add 2 zeta sqrt(k M) to `damping`: zeta is the damping ratio `ratio`, and k the first slope."""
+        """Add 2 zeta sqrt(k M) to `damping`, with the damping ratio zeta = `ratio` and the first slope k."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
     def in_floats(self, contact, stiffness, damping):
@@ -83,7 +83,7 @@ class PiecewiseLinear(ContactLaw):
             for end, start, level, slope in segments:
                 if depth <= end:
                     return level + slope * (depth - start) + damping * rate
-            raise ValueError("the penetration is not a number")
+            raise ValueError("penetration: found NaN, expected a number")
 
         return clamp_force(spring, lambda rate: damping * rate)
 

@@ -77,7 +77,7 @@ class Preloaded(ContactLaw):
     def perturb_damping(self, drawn, ratio, mass, velocity):
         """Add friction that dissipates the fraction 1 - exp(-2 pi zeta) of the kinetic energy.
 
-        zeta is the damping ratio `ratio`. The friction acts over twice the deepest penetration, computed
+        zeta is the damping ratio `ratio`. The path of the friction is taken as twice the deepest penetration
         without friction.
         """
         preload, friction, stiffness = drawn("preload"), drawn("friction"), drawn("stiffness")[:, 0]

@@ -21,7 +21,7 @@ def _no_functions(depth: np.ndarray, rate: np.ndarray) -> list[np.ndarray]:
 class Regression:
     """Contact law F = sum_i c_i phi_i(d, d') with unknown coefficients c_i and known functions phi_i.
 
-    An exponent or depths, on which the functions depend nonlinearly, have fixed values (`shape`).
+    Parameters on which the functions depend nonlinearly (exponent, depths) have fixed values (`shape`).
     """
 
     name: str  # name of the law in mechanism files
@@ -42,7 +42,7 @@ class Regression:
 class RegressionFamily(NamedTuple):
     """Regressions of one contact law that differ in one nonlinear parameter, such as an exponent.
 
-    Identification chooses the value of the parameter, from `low` to `high`.
+    Identification chooses the value of this parameter between `low` and `high`.
     """
 
     make: Callable[[float], Regression]  # returns the regression for a value of the parameter

@@ -56,7 +56,7 @@ _type_info = functools.cache(inspect.type_info)
 
 
 class KeyProblem(Exception):
-    """Error for an invalid key: its path, the value found, and the expected (allowed) values in words."""
+    """Exception for an invalid key: its path, the value found, and the expected values in words."""
 
     def __init__(self, path: KeyPath, found: str, expected: str):
         super().__init__(path, found, expected)
@@ -113,7 +113,7 @@ def to_struct(kind: type[AnyStruct], raw: Mapping[str, Any]) -> AnyStruct:
 
 
 def find_member_type(kind: inspect.Type, part: str | int, path: KeyPath) -> inspect.Type:
-    """Return the type of the key or list index `part` within the type `kind`. Raise `KeyProblem`."""
+    """Return the type of the key or list index `part` of `kind`. Raise `KeyProblem` if there is none."""
     match kind:
         case inspect.Metadata(type=inner, extra={"six": names}) if part in names:
             return find_member_type(inner, 0, path)
@@ -194,7 +194,7 @@ def _unknown_key(kind: inspect.StructType, key: str, path: KeyPath) -> KeyProble
 
 
 def _convert(kind: inspect.Type, value: Any, path: KeyPath, extra: TypeMetadata) -> Any:
-    """Convert `value` to plain data of type `kind`, with numbers as floats. Raise `KeyProblem`."""
+    """Convert `value` to plain data of type `kind`, with numbers as floats. Raise `KeyProblem` if invalid."""
     if path in SCALAR_LIST_KEYS and isinstance(value, (int, float)) and not isinstance(value, bool):
         value = [value]
     match kind:
@@ -250,7 +250,7 @@ def _convert(kind: inspect.Type, value: Any, path: KeyPath, extra: TypeMetadata)
 
 
 def _convert_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: KeyPath) -> dict[str, Any]:
-    """Convert a table to plain data of the struct type `kind`. Raise `KeyProblem`."""
+    """Convert a table to plain data of the struct type `kind`. Raise `KeyProblem` for an invalid key."""
     names = {entry.encode_name for entry in kind.fields}
     for key in value:
         # Unknown keys are reported first, because a misspelt key also looks like a missing one.

@@ -6,11 +6,11 @@ Each key keeps its distribution; a Gaussian copula correlates the keys (Nelsen, 
     u'_i = Phi( sum_j L_ij Phi^-1(u_j) ),    L L^T = matrix,
 
 where i and j number the keys of the table. u'_i is uniform as well; the quantile function of the key converts
-u'_i to a value. If a key has no correlation with an earlier key, its numbers do not change by any bit.
+u'_i to a value. The numbers of a key that is not correlated with an earlier key stay exactly the same.
 
 Lists with a separate draw for each entry (``independent = true``) come last in the order of the keys. Entry i
 of such a list is correlated with entry i of every other such list (the last entry repeats), and with all keys
-that have a single draw. For given single draws, different entries are independent.
+that have a single draw. For given values of the keys with a single draw, different entries are independent.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from jaxhil.mechanism.structs import Correlation, Mechanism
 
 __all__ = ["check_correlation", "correlate", "find_correlated_groups", "fix_at_nominal", "remove_keys"]
 
-MIN_EIGENVALUE = 1e-10  # 1; below this, rounding may make the Cholesky factor undefined
+MIN_EIGENVALUE = 1e-10  # 1; minimum for the matrix: below it, rounding may prevent a Cholesky factor
 
 # Bounds of uniform numbers, so that normal numbers are finite.
 _MIN_UNIFORM, _MAX_UNIFORM = 2.0**-54, 1.0 - 2.0**-53
@@ -49,7 +49,7 @@ def correlate(mechanism: AnyMechanism, uniform: Mapping[str, np.ndarray]) -> dic
     for i, key in enumerate(keys):
         if np.any(factor[i, :i]):
             columns = np.arange(normal[i].shape[1])
-            # The rounding of a matrix product may depend on the number of draws; that of this sum does not.
+            # This sum, unlike a matrix product, has the same rounding errors for any number of draws.
             mixed = sum(
                 factor[i, j] * normal[j][:, np.minimum(columns, normal[j].shape[1] - 1)] for j in range(i + 1)
             )

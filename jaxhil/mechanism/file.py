@@ -1,6 +1,6 @@
-"""Reading of mechanism files: bytes, TOML, overrides and validation.
+"""Reader of mechanism files: bytes, TOML, overrides and validation.
 
-`load` makes a validated `Mechanism` from a file (or from the name of a built-in mechanism or suite), the
+`load` makes a validated `Mechanism` from a file (or from the name of a built-in mechanism), the
 ``PATH=VALUE`` overrides of ``--set`` and the keys that ``--unset`` removes; `load_any` also reads six-axis
 files. Every error raises `InputError` with a one-line message.
 """
@@ -48,7 +48,7 @@ DEFAULT_MECHANISM = "varying"
 Overrides = Sequence[str] | Mapping[str, Any]
 MechanismType = TypeVar("MechanismType", Mechanism, AnyMechanism)
 
-SUITE_PREFIX = "suite-"  # prefix of the names of the standard suites
+SUITE_PREFIX = "suite-"  # prefix of the names of the mechanisms for benchmarks
 
 _SIX_INFINITIES = [math.inf] * 6  # default of limits for six axes
 _file_hashes: dict[str, str] = {}  # SHA-256 of the files read, by the SHA-256 of the mechanism's content
@@ -151,20 +151,20 @@ def any_from_plain_data(
 def to_plain_data(mechanism: AnyMechanism) -> dict[str, Any]:
     """Convert a mechanism to plain data for JSON; `from_plain_data` converts the data back.
 
-    The data omit keys without a value and infinite numbers, because these are the defaults of their keys.
+    The data omit keys whose value is None or infinite, because None or infinity is their default.
     """
     return _drop_empty(msgspec.to_builtins(mechanism))
 
 
 def builtin_names() -> list[str]:
-    """Return the names of the built-in one-axis mechanisms, without the standard suites."""
+    """Return the names of the built-in one-axis mechanisms, except those of `suite_names`."""
     return [name for name in _builtin_paths() if not name.startswith(SUITE_PREFIX)]
 
 
 def suite_names() -> list[str]:
-    """Return the names of the standard suites.
+    """Return the names of the built-in mechanisms for comparing compensators.
 
-    Each suite is a built-in mechanism with the same rig and one difficulty, for comparing compensators.
+    All have the same rig; each adds one difficulty, such as a dead zone of the force sensor.
     """
     return [name for name in _builtin_paths() if name.startswith(SUITE_PREFIX)]
 
@@ -175,7 +175,7 @@ def six_axis_names() -> list[str]:
 
 
 def builtin_path(name: str) -> Path:
-    """Return the path of a built-in mechanism or suite. Raise `InputError` for an unknown name."""
+    """Return the path of a built-in mechanism. Raise `InputError` for an unknown name."""
     names = [*builtin_names(), *suite_names(), *six_axis_names()]
     if name not in names:
         raise InputError(
@@ -251,7 +251,7 @@ def _find_problem(raw: Mapping[str, Any]) -> str:
 
 
 def _requested_changes(overrides: Overrides, unset: Sequence[str]) -> dict[str, list[Any]]:
-    """Return the requested changes under the name of the option, or of the argument, that messages show."""
+    """Return the requested changes by the option or argument that requests them, as named in messages."""
     is_mapping = isinstance(overrides, Mapping)
     return {
         "overrides" if is_mapping else "--set": list(overrides.items() if is_mapping else overrides),

@@ -1,6 +1,7 @@
 """JSON Schema of mechanism files, for completion, descriptions and error marks in editors.
 
-The schema contains the allowed values of each key. Only the reader of files checks rules for several keys.
+The schema contains the allowed values of each key. Rules that involve several keys are checked only when a
+file is read.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ def _clean_schema(node: Any) -> Any:
 
 
 def _add_short_forms(node: dict[str, Any]) -> dict[str, Any]:
-    """Extend the schema of six numbers or of a matrix by the short forms with one or two numbers."""
+    """Extend the schema of six numbers, or of a matrix, by the short forms with one or two numbers."""
     full = _clean_schema(
         {key: value for key, value in node.items() if key not in ("six", "square", "description")}
     )

@@ -119,7 +119,7 @@ def _find_descriptions(kind: inspect.Type) -> Iterator[str]:
 
 
 def _unit(kind: inspect.Type, path: str, extra: Mapping[str, Any] | None = None) -> str | None:
-    """Return the unit of a number or of a list's entries, or None for other types. Raise ValueError."""
+    """Return the unit of a number or a list of numbers, else None. Raise ValueError if it is missing."""
     match kind:
         case inspect.Metadata(type=inner, extra=metadata):
             return _unit(inner, path, metadata)
@@ -136,7 +136,7 @@ def _unit(kind: inspect.Type, path: str, extra: Mapping[str, Any] | None = None)
 
 
 def _find_users(path: str) -> tuple[str, ...]:
-    """Return the contact laws or the simulator models that use the key at a path, or () if all use it."""
+    """Return the contact laws or simulator models that use the key at a path; () if all of them use it."""
     table, _, name = path.rpartition(".")
     if table == "contact":
         if name == "damping":

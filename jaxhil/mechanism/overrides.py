@@ -35,7 +35,7 @@ _MAX_OVERRIDE_LENGTH = 100_000
 
 
 def parse_override(override: str | tuple[object, Any]) -> tuple[KeyPath, Any]:
-    """Parse a ``PATH=VALUE`` text, or a pair (PATH, value), into path and value. Raise `KeyProblem`."""
+    """Parse a ``PATH=VALUE`` text or a pair (PATH, value). Raise `KeyProblem` if it is malformed."""
     if not isinstance(override, str):
         key, value = override
         return parse_key(key), _to_python(value)
@@ -43,7 +43,7 @@ def parse_override(override: str | tuple[object, Any]) -> tuple[KeyPath, Any]:
 
 
 def parse_key(key: object) -> KeyPath:
-    """Parse a dotted key, such as ``contact.stiffness[1]``, into its path. Raise `KeyProblem`."""
+    """Parse a dotted key, such as ``contact.stiffness[1]``. Raise `KeyProblem` if it is malformed."""
     if isinstance(key, str):
         path, end = _parse_path(f"{key}=", key)
         if end == len(key) + 1:
@@ -70,7 +70,7 @@ def _parse_text(text: str) -> tuple[KeyPath, Any]:
     try:
         table = tomllib.loads(f"value = {value_text}")
     except RecursionError:
-        raise KeyProblem(path, "values nested too deeply", "a TOML value") from None
+        raise KeyProblem(path, "values nested too deeply", "fewer levels of brackets") from None
     except ValueError:
         if _WORD_PATTERN.fullmatch(value_text):
             return path, value_text
@@ -112,7 +112,7 @@ def _numeric_keys(raw: Mapping[str, Any]) -> dict[str, Range]:
 
 
 def _parse_path(text: str, key: str | None = None) -> tuple[KeyPath, int]:
-    """Return the path before ``=`` and the position after ``=``; messages show `key`, or else `text`."""
+    """Return the path before ``=`` and the position after ``=``; messages show `key` or, if None, `text`."""
     source, example = (text, _EXAMPLE) if key is None else (key, _EXAMPLE_KEY)
     path: list[str | int] = []
     position = 0
@@ -137,7 +137,7 @@ def _parse_path(text: str, key: str | None = None) -> tuple[KeyPath, int]:
 
 
 def _replace_value(node: Any, path: KeyPath, depth: int, value: Any) -> Any:
-    """Return a copy of `node`, at `path[:depth]`, with a new value at `path`. Raise `KeyProblem`."""
+    """Return a copy of `node` (the data at `path[:depth]`) with a new value at `path`."""
     if depth == len(path):
         return value
     part = path[depth]
@@ -183,10 +183,10 @@ def _remove_correlations(raw: dict[str, Any], certain: list[str]) -> dict[str, A
 
 
 def _remove_from_table(node: Any, path: KeyPath, depth: int) -> dict[str, Any]:
-    """Return a copy of the table `node`, at `path[:depth]`, without the key at `path`. Raise `KeyProblem`."""
+    """Return a copy of `node` (the table at `path[:depth]`) without the key at `path`."""
     part = path[depth]
     if isinstance(path[-1], int):
-        raise KeyProblem(path, "an entry of a list", "a key: set the whole list instead")
+        raise KeyProblem(path, "an entry of a list", "a key (set the whole list instead)")
     if not isinstance(node, Mapping) or part not in node:
         raise KeyProblem(path, "no such key", "a key that the mechanism has")
     others = {name: value for name, value in node.items() if name != part}

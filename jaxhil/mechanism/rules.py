@@ -2,7 +2,7 @@
 
 Each rule raises a `KeyProblem` that names the key to change. `jaxhil.mechanism.conversion` has checked the
 types and ranges of single keys before. A key with a value is rejected if the chosen law or model does not use
-the key, because the value would have no effect. A user-registered law without a list of its keys may use any.
+the key, because the value would have no effect. A user-registered law that lists no keys may use any key.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ def check_mechanism_rules(mechanism: Mechanism) -> None:
 def is_hurwitz(polynomial: Sequence[float]) -> bool:
     """Return whether all roots of a real polynomial (descending powers) have negative real parts.
 
-    This holds if the first column of the Routh array, in exact rational arithmetic, has one sign and no zero
-    (Routh 1877; Gantmacher, The Theory of Matrices, vol. 2, ch. XV).
+    This is true if and only if the first column of the Routh array, in exact rational arithmetic, has one
+    sign and no zero (Routh 1877; Gantmacher, The Theory of Matrices, vol. 2, ch. XV).
     """
     coefficients = [Fraction(value) for value in polynomial]
     if coefficients[0] < 0:
@@ -84,7 +84,7 @@ def is_hurwitz(polynomial: Sequence[float]) -> bool:
 
 
 def check_texts(mechanism: Any) -> None:
-    """Check that the keys `name` and `source` are printable texts. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless the keys `name` and `source` are printable texts."""
     if not mechanism.name.isprintable():
         raise KeyProblem(("name",), format_value(mechanism.name), "printable characters")
     if not mechanism.source.replace("\n", "").replace("\t", "").isprintable():
@@ -92,7 +92,7 @@ def check_texts(mechanism: Any) -> None:
 
 
 def _check_bodies(mechanism: Mechanism) -> None:
-    """Check that the bodies have one equivalent mass, or two masses. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless the bodies have one equivalent mass, or two masses."""
     bodies = mechanism.bodies
     either = "either equivalent_mass, or both chaser_mass and target_mass"
     has_both = bodies.chaser_mass is not None and bodies.target_mass is not None
@@ -111,7 +111,7 @@ def _check_bodies(mechanism: Mechanism) -> None:
 def check_contact_law(
     path: KeyPath, contact: Any, uncertainties: Mapping[str, Uncertainty], keys: Collection[ContactKey]
 ) -> None:
-    """Check that a contact has the keys that its contact law requires. Raise `KeyProblem`.
+    """Raise `KeyProblem` unless a contact has the keys that its contact law requires.
 
     Args:
         path: path of the contact's table.
@@ -136,7 +136,7 @@ def check_contact_law(
 
 
 def _check_depths(path: KeyPath, law: ContactLaw, depths: Sequence[float]) -> None:
-    """Check that a segmented law has depths, in increasing order. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless a segmented law has depths, in increasing order."""
     if law.segmented and not depths:
         expected = f"a list of at least one depth (law {law.name} needs it)"
         raise KeyProblem((*path, "depths"), "no entries", expected)
@@ -150,7 +150,7 @@ def _check_depths(path: KeyPath, law: ContactLaw, depths: Sequence[float]) -> No
 def _check_keys(
     path: KeyPath, law: ContactLaw, contact: Any, uncertain: Collection[str], keys: Collection[ContactKey]
 ) -> None:
-    """Check that a contact has the `keys` of its law and no `keys` of other laws. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless a contact has the `keys` of its law and no `keys` of other laws."""
     for key in keys:
         value = getattr(contact, key.name)
         laws = laws_with_key(key)
@@ -175,7 +175,7 @@ def is_damped(
 
 
 def check_simulator_model(simulator: Any) -> None:
-    """Check that the motion simulator has the keys of its model, and is stable. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless the motion simulator has the keys of its model, and is stable."""
     path = ("rig", "simulator")
     for key in KEYS_OF_MODELS[simulator.model]:
         if getattr(simulator, key) is None:
@@ -197,7 +197,7 @@ def check_simulator_model(simulator: Any) -> None:
 
 
 def _check_transfer_function(numerator: list[float], denominator: list[float]) -> None:
-    """Check that G(s) is strictly proper and stable, with G(0) = 1. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless G(s) is strictly proper and stable, with G(0) = 1."""
     path = ("rig", "simulator")
     if len(numerator) >= len(denominator):
         found = f"degree {len(numerator) - 1}, and degree {len(denominator) - 1} of the denominator"
@@ -214,7 +214,7 @@ def _check_transfer_function(numerator: list[float], denominator: list[float]) -
 
 
 def _check_hold(mechanism: Mechanism) -> None:
-    """Check that no ideal simulator with zero-order hold has a damped contact. Raise `KeyProblem`."""
+    """Raise `KeyProblem` if an ideal simulator with zero-order hold has a damped contact."""
     # Such a simulator jumps at the ticks and has no velocity between the ticks.
     rig, contact = mechanism.rig, mechanism.contact
     law, arguments = find_contact_law(contact.law), (("contact",), contact, mechanism.uncertainty)
@@ -225,9 +225,9 @@ def _check_hold(mechanism: Mechanism) -> None:
 
 
 def _build_extreme_function(mechanism: Mechanism, spans: Mapping[str, Span]) -> Callable[[str, int], Any]:
-    """Return a function `extreme(path, end)` of a key's smallest (`end` 0) or largest (1) value in all draws.
+    """Return a function `extreme(path, end)`: a key's smallest (`end` = 0) or largest (1) possible draw.
 
-    For a normal distribution, whose bounds are not useful, the function returns the nominal value.
+    For a normal distribution, which may have no bounds, the function returns the nominal value.
     """
 
     def extreme(path: str, end: int) -> Any:
@@ -239,7 +239,7 @@ def _build_extreme_function(mechanism: Mechanism, spans: Mapping[str, Span]) -> 
 
 
 def _check_velocity_limit(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    """Check that the velocity limit of the drives is at least the approach speed. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless the velocity limit of the drives is at least the approach speed."""
     # Drives that are slower than the approach have no steady state from which a run could start.
     extreme, path = _build_extreme_function(mechanism, spans), "rig.simulator.velocity_limit"
     fastest, limit = float(extreme("approach.velocity", 1)), float(extreme(path, 0))
@@ -253,8 +253,8 @@ def format_allowed_velocity_limit(approach: float) -> str:
 
 
 def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    """Check that the start of the approach lies between the two surfaces. Raise `KeyProblem`."""
-    # The approach starts at x_d = min(plane, 0) - v (0.02 s + phase T); x_a lags behind by the motion
+    """Raise `KeyProblem` unless the start of the approach lies between the two surfaces."""
+    # The model starts at min(plane, 0) - v (0.02 s + phase T). The hardware lags behind it by the motion
     # simulator's delay and lag and by the command latency.
     extreme = _build_extreme_function(mechanism, spans)
     clearance = float(extreme("contact.clearance", 0))
@@ -274,7 +274,7 @@ def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
 
 
 def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> float:
-    """Return the largest lag -G'(0) [s] of the motion simulator in uniform motion, without its delay."""
+    """Return the largest lag -G'(0) [s] of the motion simulator in uniform motion, excluding its delay."""
     path = "rig.simulator."
     if simulator.model == "first_order":
         return extreme(path + "time_constant", 1)

@@ -96,7 +96,7 @@ class RigidBody(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Approach in free flight: motion of C relative to T at the first touch, in T axes."""
+    """Approach in free flight: motion of frame C relative to frame T at the first touch, along T's axes."""
 
     offset: Annotated[
         list[Metre], Meta(min_length=2, max_length=2, description="x and y of the origin of C")
@@ -188,7 +188,7 @@ class Pattern(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class TargetPattern(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Additional rotation of the pattern on the target about z."""
+    """Rotation of the target's copies about z, in addition to the pattern's angle."""
 
     phase: Annotated[float, key_metadata("angle about z", "rad")]
 

@@ -38,7 +38,7 @@ KEYS_OF_FRICTION: Mapping[str, tuple[str, ...]] = {
 
 
 def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> None:
-    """Check the pair of shapes of a contact, and the keys of its shapes and laws. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless a contact's shapes form a supported pair and have the keys that they need."""
     path: KeyPath = ("contact", name)
     for body in ("chaser", "target"):
         _check_shape((*path, body), getattr(contact, body))
@@ -55,7 +55,7 @@ def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> N
 
 
 def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
-    """Check that a latch has exactly one stiffness, and conditions for catching. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless a latch has exactly one stiffness, and conditions for catching."""
     path: KeyPath = ("latch", name)
     if latch.latched and mechanism.approach is not None:
         expected = "false: an approach starts without a latch that holds (use [start] instead)"
@@ -77,7 +77,7 @@ def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
 
 
 def _check_shape(path: KeyPath, shape: Shape) -> None:
-    """Check that a shape has the keys of its kind, with valid values. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless a shape has the keys of its kind, with valid values."""
     required, optional = KEYS_OF_SHAPES[shape.shape]
     for key, value in _file_values(shape).items():
         if key in required and value is None:
@@ -88,7 +88,7 @@ def _check_shape(path: KeyPath, shape: Shape) -> None:
                 (*path, key), format_value(value), f"nothing ({shape.shape} does not use it: unset it)"
             )
     if shape.shape == "plane" and not np.any(shape.normal):
-        raise KeyProblem((*path, "normal"), format_value(shape.normal), "a direction, outwards from the body")
+        raise KeyProblem((*path, "normal"), format_value(shape.normal), "a nonzero outward vector")
     if shape.shape == "capsule" and shape.start == shape.end:
         raise KeyProblem((*path, "to"), "the same point as from", "a different point, or the shape sphere")
     if shape.shape == "sphere" and shape.inside and not shape.radius:
@@ -110,7 +110,7 @@ def _check_pair(path: KeyPath, contact: Contact) -> None:
     chaser, target = contact.chaser, contact.target
     if chaser.shape == "drogue":
         raise KeyProblem(
-            (*path, "chaser", "shape"), "drogue", "a drogue only on the target, with its opening along +z"
+            (*path, "chaser", "shape"), "drogue", "another shape (only the target can be a drogue)"
         )
     is_ball = [shape.shape == "sphere" and not shape.inside for shape in (chaser, target)]
     if not any(is_ball) and not chaser.shape == target.shape == "capsule":
@@ -129,7 +129,7 @@ def _check_pair(path: KeyPath, contact: Contact) -> None:
 
 
 def _check_friction(path: KeyPath, friction: Friction) -> None:
-    """Check that a table `friction` has the keys of its friction law. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless a table `friction` has the keys of its friction law."""
     for law, keys in KEYS_OF_FRICTION.items():
         for key in keys:
             value = getattr(friction, key)

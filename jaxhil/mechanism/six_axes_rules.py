@@ -61,7 +61,7 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
 
 
 def check_contact_names(raw: Mapping[str, Any]) -> None:
-    """Check that all contacts and latches in a parsed table have names. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless all contacts and latches in a parsed table have names."""
     for key, kind in (("contact", Contact), ("latch", Latch)):
         table = raw.get(key)
         entries = table.items() if isinstance(table, Mapping) else ()
@@ -73,7 +73,7 @@ def check_contact_names(raw: Mapping[str, Any]) -> None:
 
 
 def check_leg_values(raw: Mapping[str, Any]) -> None:
-    """Check that a hexapod has values for legs, not for translation and rotation. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless a hexapod has values for legs, not for translation and rotation."""
     simulator = raw["rig"]["simulator"]
     for key in PER_AXIS_KEYS:
         if simulator.get("space") == "stewart" and isinstance(simulator.get(key), Mapping):
@@ -89,7 +89,7 @@ def inertia_matrix(inertia: Inertia) -> np.ndarray:
 
 
 def _check_body(name: str, body: RigidBody) -> None:
-    """Check the inertia and the interface rotation of a body. Raise `KeyProblem`."""
+    """Raise `KeyProblem` if the inertia or the interface rotation of a body is invalid."""
     _check_inertia((name, "inertia"), body.inertia)
     angle = float(np.linalg.norm(body.interface_rotation))
     if not angle < np.pi:
@@ -128,7 +128,7 @@ def _check_inertia(path: KeyPath, inertia: Inertia, *, massless: bool = False) -
 
 
 def _check_start(mechanism: SixAxisMechanism) -> None:
-    """Check that there is either a valid approach or a valid start. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless there is either a valid approach or a valid start."""
     approach, start = mechanism.approach, mechanism.start
     if (approach is None) == (start is None):
         if start is None:
@@ -153,7 +153,7 @@ def _check_start(mechanism: SixAxisMechanism) -> None:
 
 
 def _check_states(start: Start) -> None:
-    """Check that the attitudes at the start are unit quaternions. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless the attitudes at the start are unit quaternions."""
     for name, state in (("target", start.target), ("chaser", start.chaser)):
         norm = float(np.linalg.norm(state.attitude))
         if not abs(norm - 1) <= QUATERNION_TOLERANCE:
@@ -183,7 +183,7 @@ def _rotate(rotation: list[float], vector: np.ndarray) -> np.ndarray:
 
 
 def _check_space(simulator: Simulator) -> None:
-    """Check that the motion simulator has the keys of its `space`, with valid values. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless the motion simulator has the keys of its `space`, with valid values."""
     path: KeyPath = ("rig", "simulator")
     required, optional = KEYS_OF_SPACES[simulator.space]
     for key in sorted({key for pair in KEYS_OF_SPACES.values() for keys in pair for key in keys}):
@@ -205,7 +205,7 @@ def _check_space(simulator: Simulator) -> None:
 
 
 def _check_hold(mechanism: SixAxisMechanism) -> None:
-    """Check that no ideal simulator with zero-order hold has damping or friction. Raise `KeyProblem`."""
+    """Raise `KeyProblem` if an ideal simulator with zero-order hold has damping or friction."""
     # Such a simulator jumps at the ticks and has no velocity between the ticks.
     rig = mechanism.rig
     dissipates = any(contact.damping or contact.friction or contact.dry_friction
@@ -216,7 +216,7 @@ def _check_hold(mechanism: SixAxisMechanism) -> None:
 
 
 def _check_sensor(rig: Rig) -> None:
-    """Check the crosstalk of the force sensor, and its tool and gravity. Raise `KeyProblem`."""
+    """Raise `KeyProblem` if the crosstalk of the force sensor, its tool or gravity is invalid."""
     sensor, path = rig.force_sensor, ("rig", "force_sensor")
     mixing = np.eye(6) + np.asarray(sensor.crosstalk)
     if not np.linalg.cond(mixing) < 100:
@@ -239,7 +239,7 @@ def _check_sensor(rig: Rig) -> None:
 
 
 def _check_uncertainty(mechanism: SixAxisMechanism, path: str) -> None:
-    """Check that all draws of an uncertain key are valid. Raise `KeyProblem`."""
+    """Raise `KeyProblem` unless all draws of an uncertain key are valid."""
     low, high = check_uncertainty(mechanism, path)
     where, uncertainty = ("uncertainty", path), mechanism.uncertainty[path]
     if path.endswith((".inertia", ".inertia_assumed")) and uncertainty.independent and low.ndim == 2:
@@ -248,6 +248,6 @@ def _check_uncertainty(mechanism: SixAxisMechanism, path: str) -> None:
     if path.endswith(".stiffness_matrix") and uncertainty.independent:
         raise KeyProblem((*where, "independent"), "true", "false: independent entries are not symmetric")
     if path == "rig.simulator.stroke" and uncertainty.independent and not high[0] < low[1]:
-        raise KeyProblem((*where, "independent"), "true", "false, or strokes that keep their order")
+        raise KeyProblem((*where, "independent"), "true", "false (draws may reverse the strokes' order)")
     if path == "approach.velocity" and uncertainty.distribution != "normal" and not high[2] < 0:
-        raise KeyProblem(where, f"a z component as far as {high[2]:g}", "draws below 0 m/s")
+        raise KeyProblem(where, f"a z component of up to {high[2]:g} m/s", "only draws < 0 m/s")

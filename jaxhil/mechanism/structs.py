@@ -104,7 +104,7 @@ class Bodies(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Approach of the two bodies: speed, number of contacts, and phase of the first contact."""
+    """Approach of the two bodies: speed, number of contacts, and phase of the first contact in its period."""
 
     velocity: Annotated[float, key_metadata("speed of the first approach", "m/s", gt=0.0)]
     contacts: Annotated[
@@ -197,7 +197,7 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Force sensor: delay and lag, then noise and bias, rounding to the quantum, dead zone and range."""
+    """Force sensor. Its effects, in order: delay, lag, noise and bias, rounding, dead zone, saturation."""
 
     delay: Annotated[float, key_metadata("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
     time_constant: Annotated[
@@ -346,7 +346,7 @@ def numeric_keys() -> dict[str, Range]:
 def ranges_of(kind: msgspec.inspect.Type, names: Mapping[str, Sequence[str]]) -> dict[str, Range]:
     """Return the allowed values of every real-valued key of a struct type, by dotted path.
 
-    `names` lists the tables of each dictionary by the path of the dictionary, such as ``contact``.
+    `names` contains, for the path of each dictionary (such as ``contact``), the names of its tables.
     """
     keys: dict[str, Range] = {}
 

@@ -13,7 +13,7 @@ from jaxhil.files import open_input
 __all__ = ["parse_toml", "read_bytes"]
 
 MAX_BYTES = 1 << 20  # 1 MiB, far more than a mechanism file needs
-MAX_KEY_PARTS = 64  # the memory of the parser grows with the square of this number
+MAX_KEY_PARTS = 64  # limit, because the parser's memory grows with the square of the number of parts
 
 # Tokens of a TOML text that delimit dotted keys. An unclosed string extends to the end of its line or of the
 # text, so that the scan takes linear time.
@@ -25,8 +25,8 @@ _TOKENS = re.compile(
 )
 
 
-def read_bytes(path: Path, label: str, what: str) -> bytes:
-    """Read the bytes of a file; `what` names the content in messages, for example "a mechanism".
+def read_bytes(path: Path, label: str, content: str) -> bytes:
+    """Read the bytes of a file, named `content` in messages, for example "a mechanism".
 
     Raise FileNotFoundError, or `InputError` for any other problem.
     """
@@ -36,7 +36,7 @@ def read_bytes(path: Path, label: str, what: str) -> bytes:
     except FileNotFoundError:
         raise
     except IsADirectoryError:
-        raise InputError(f"{label}: found a directory, expected {what} file") from None
+        raise InputError(f"{label}: found a directory, expected {content} file") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{label}: cannot be read: {to_one_line(str(reason), 100)}") from None
@@ -45,23 +45,23 @@ def read_bytes(path: Path, label: str, what: str) -> bytes:
     return data
 
 
-def parse_toml(data: bytes, label: str, what: str) -> dict[str, Any]:
-    """Parse the bytes of a TOML file; `what` names the content in messages. Raise `InputError`."""
+def parse_toml(data: bytes, label: str, content: str) -> dict[str, Any]:
+    """Parse the bytes of a TOML file, named `content` in messages. Raise `InputError` if they are invalid."""
     if not data.strip():
-        raise InputError(f"{label}: found an empty file, expected {what} in TOML")
+        raise InputError(f"{label}: found an empty file, expected {content} in TOML")
     try:
         # Some editors write a byte-order mark at the start.
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{label}: found bytes that are not UTF-8 at byte {error.start}, expected {what} in TOML"
+            f"{label}: found bytes that are not UTF-8 at byte {error.start}, expected {content} in TOML"
         ) from None
     if _longest_key(text) > MAX_KEY_PARTS:
-        raise InputError(f"{label}: found a key of more than {MAX_KEY_PARTS} parts, expected TOML keys")
+        raise InputError(f"{label}: found too many parts in a key, expected at most {MAX_KEY_PARTS}")
     try:
         return tomllib.loads(text)
     except RecursionError:
-        raise InputError(f"{label}: found values nested too deeply, expected plain TOML") from None
+        raise InputError(f"{label}: found values nested too deeply, expected fewer nested brackets") from None
     except ValueError as error:
         # An integer with thousands of digits raises a ValueError instead of a TOMLDecodeError.
         reason = to_one_line(str(error).split(";")[0], 120)

@@ -8,10 +8,10 @@ The distribution of a number with the nominal value m is:
 
 One draw scales a whole list: by the drawn factor or, for a distribution in the unit of the number, by the
 ratio of the draw to the first entry. If all entries are equal, the draw is their common value. With
-``independent = true`` every entry has its own draw. Each contact also has a random phase within a control
-period, because the phase changes the restitution and cannot be controlled. The phase is uniform from 0 to 1,
-unless the table has an entry for it. With six axes, only the phase of the first touch is drawn, and no phase
-if the file has a ``[start]``.
+``independent = true`` every entry has its own draw. Each contact also begins at a random phase of a control
+period, because the phase changes the restitution and cannot be controlled. Unless the table specifies
+otherwise, the phase is uniform from 0 to 1. With six axes, only the phase of the first touch is drawn, and no
+phase if the file has a ``[start]``.
 
 Draw i of a key depends on the seed, on i, on the key's entry in the table, and on the earlier keys in
 ``[correlation]`` (`jaxhil.mechanism.correlation`). The draw does not depend on the number of draws made at
@@ -52,10 +52,10 @@ _UNIFORM_PHASE = Uncertainty(distribution="uniform", low=0.0, high=1.0)
 def draw(mechanism: AnyMechanism, number: int, seed: int, first: int = 0) -> dict[str, np.ndarray]:
     """Return random draws of every uncertain key, from draw number `first` on.
 
-    The result contains an array for each key by its dotted path, in the unit of the key: (number,) for a
-    number, and (number, *entries) for a list. With one axis, ``approach.phase`` is (number, contacts). For
-    each key and every 1024 draws a Philox generator draws uniform numbers, which the quantile function of the
-    key's distribution converts. Raise ValueError for a negative argument.
+    The result contains an array for each key by its dotted path, in the unit of the key. Its shape is
+    (number,) for a scalar, and (number, *entries) for a list. With one axis, ``approach.phase`` is (number,
+    contacts). For each key and every 1024 draws a Philox generator draws uniform numbers, which the quantile
+    function of the key's distribution converts. Raise ValueError for a negative argument.
     """
     if number < 0 or seed < 0 or first < 0:
         raise ValueError(f"number, seed, first: found {number}, {seed}, {first}, expected >= 0")
@@ -83,10 +83,10 @@ def draw_quasi_random(mechanism: AnyMechanism, number: int, seed: int) -> dict[s
 
 
 def draw_at_points(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the draws for points of the unit box, (number, dimensions), in the format of `draw`.
+    """Return the draws for points (number, dimensions) of the unit box, in the format of `draw`.
 
-    Each key has the columns that `count_dimensions` states. The coordinates are correlated as the mechanism
-    states, then converted by the quantile function of each key.
+    `count_dimensions` returns the number of columns of each key. The coordinates are correlated as the
+    mechanism states, then converted by the quantile function of each key.
     """
     return _compute_values(mechanism, correlate(mechanism, _split_by_key(mechanism, points)))
 
@@ -103,7 +103,7 @@ def draw_extremes(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
 
 
 def count_dimensions(mechanism: AnyMechanism) -> dict[str, int]:
-    """Return the number of uniform numbers in a draw of each key, sorted by path, with phases last."""
+    """Return how many random numbers a draw of each key needs; keys are sorted by path, phases are last."""
     columns = {}
     for path in sorted(set(mechanism.uncertainty) - {PHASE_KEY}):
         independent = mechanism.uncertainty[path].independent

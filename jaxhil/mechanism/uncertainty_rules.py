@@ -1,4 +1,4 @@
-"""Validation rules of the table ``[uncertainty]``, and the smallest and largest draws of uncertain keys."""
+"""Validation rules for the table ``[uncertainty]``, and smallest and largest draws of its keys."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ def check_uncertainty(mechanism: AnyMechanism, path: str) -> Span:
     if uncertainty.distribution != "normal":
         disallowed = [end for end in ends if not (key_ranges[path].allows(end) and math.isfinite(end))]
         if disallowed:
-            raise KeyProblem(where, f"draws as far as {disallowed[0]:g}", str(key_ranges[path]))
+            raise KeyProblem(where, f"a draw of {disallowed[0]:g}", str(key_ranges[path]))
         extreme = [end for end in ends if not is_computable(end)]
         if extreme:
-            raise KeyProblem(where, f"draws as far as {extreme[0]:g}", add_magnitude_limits(key_ranges[path]))
+            raise KeyProblem(where, f"a draw of {extreme[0]:g}", add_magnitude_limits(key_ranges[path]))
     if path.endswith(".depths") and uncertainty.independent and np.any(high[:-1] >= low[1:]):
-        raise KeyProblem((*where, "independent"), "true", "false, or depths that keep their order")
+        raise KeyProblem((*where, "independent"), "true", "false (draws may reverse the depths' order)")
     if path == "rig.simulator.coefficients" and mechanism.rig.simulator.model == "third_order":
         largest = high[2] if uncertainty.independent else low[2]
         if not low[0] * low[1] > largest:
             expected = "a stable motion simulator for all draws: a1 a2 > a3"
-            raise KeyProblem(where, "draws with an unstable motion simulator", expected)
+            raise KeyProblem(where, "draws that make the motion simulator unstable", expected)
     return low, high
 
 
@@ -68,7 +68,7 @@ def _compute_span(
         raise KeyProblem(where, found, f"{needed} for {kind}")
     is_unscaled = uncertainty.independent or np.all(nominal == nominal.flat[0])
     if not is_unscaled and nominal.flat[0] == 0.0 and uncertainty.factor is None:
-        raise KeyProblem(where, f"0 as the first entry of {path}", "a factor, or independent = true")
+        raise KeyProblem(where, f"{path} as a list that begins with 0", "factor, or independent = true")
     if kind == "normal":
         return np.full_like(nominal, allowed.low), np.full_like(nominal, allowed.high)
     bounds = uncertainty.factor or [uncertainty.low or 0.0, uncertainty.high or 0.0]
