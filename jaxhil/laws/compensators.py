@@ -25,7 +25,7 @@ SIX_AXIS_COMPENSATORS: dict[str, SixAxisCompensator] = _load_compensators(6)
 def get_compensator(name: str, axes: int = 1) -> Compensator | SixAxisCompensator:
     """Return the compensator with this name. Raise KeyError if there is none.
 
-    For 6 axes, or if it has no version for 1 axis, return the version for 6 axes.
+    If `axes` is 6, or if the compensator has no version for 1 axis, return the version for 6 axes.
     """
     return SIX_AXIS_COMPENSATORS[name] if axes == 6 or name not in COMPENSATORS else COMPENSATORS[name]
 
@@ -38,13 +38,13 @@ def axes_of(mechanism: Mechanism | SixAxisMechanism) -> int:
 def literature_gains(
     mechanism: Mechanism | SixAxisMechanism, compensator: str, setting: str | None = None
 ) -> dict[str, float]:
-    """Return a compensator's gains for a mechanism by the rules of the literature, or from a setting.
+    """Return a compensator's gains for a mechanism, by the rules of the literature.
 
     Args:
         mechanism: mechanism with its rig.
         compensator: name of the compensator.
-        setting: name of one of the compensator's settings. The gains of the setting, clipped to their bounds
-            for the mechanism, replace the gains of the literature.
+        setting: name of one of the compensator's settings, or None. The gains of the setting, clipped to
+            their bounds for the mechanism, replace the gains of the literature.
 
     Raises:
         KeyError: if there is no such compensator or setting.

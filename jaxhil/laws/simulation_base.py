@@ -33,7 +33,8 @@ class Gain(NamedTuple):
         logarithmic: whether tuning searches on a logarithmic scale.
         neutral: value that makes the gain ineffective, or None. If all gains are neutral, the force command
             is the measured force.
-        tuned: returns whether tuning changes the gain for a mechanism; otherwise it keeps its nominal value.
+        tuned: function that returns whether tuning changes the gain for a mechanism; if not, the gain keeps
+            its nominal value.
         begins: initial value for tuning, as a function of the mechanism; None for any value within the
             bounds. Tuning also starts from the nominal value.
     """
@@ -130,7 +131,7 @@ class Compensator(eqx.Module):
         return ()
 
     def restart(self, gains: Gains, state: Any, begins: Array, fresh: Array) -> Any:
-        """Return the state with filters and delay lines restarted on the lanes `begins`; by default zeros.
+        """Return the state with restarted filters and delay lines (default: zeros) on the lanes `begins`.
 
         Args:
             gains: gains by name.
@@ -155,7 +156,7 @@ class Compensator(eqx.Module):
     def position_command(
         self, gains: Gains, state: Any, position: Array, velocity: Array, acceleration: Array
     ) -> tuple[Array, Any]:
-        """Return the position command [m] and the state; by default, command the model's position.
+        """Return the position command [m] and the state; the default command is the model's position.
 
         Args:
             gains: gains by name.
@@ -167,9 +168,9 @@ class Compensator(eqx.Module):
         return position, state
 
     def noise_amplification(self, gains: Gains, constants: KnownConstants) -> Float[Array, "*batch"]:
-        """Return the ratio of standard deviations, F_c in steady contact to white noise of the force [1].
+        """Return the standard deviation of F_c in steady contact if F has unit white noise [1].
 
-        The default is 1, for F_c = F. The ratio is differentiable with respect to the gains.
+        The default is 1, for F_c = F. The value is differentiable with respect to the gains.
         """
         return jnp.ones_like(constants.control_period)
 

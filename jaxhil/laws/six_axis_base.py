@@ -46,7 +46,7 @@ class SixAxisConstants(NamedTuple):
 
     @property
     def of_channel(self) -> KnownConstants:
-        """Constants for a single-axis compensator that acts on one channel of the wrench."""
+        """Constants of the rig for a single-axis compensator that acts on one channel of the wrench."""
         return KnownConstants(self.control_period, jnp.full_like(self.control_period, jnp.inf))
 
 

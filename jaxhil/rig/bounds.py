@@ -8,7 +8,7 @@ The bounds admit every rig with these properties:
     approach speed              10 um/s to 10 m/s
     delays                      at most 1 s in the force measurement, and 1 s in the motion simulator
     force, noise and dead zone  together below 1 MN
-    positions                   within 50 m of the surface; rails of rendezvous rigs are half as long
+    positions                   within 50 m of the surface (rendezvous rigs have rails of about 25 m)
     speed of position command   below 10 m/s
 
 The bounds are slightly wider than the gains that published rules, tuning and the shipped settings yield for

@@ -213,14 +213,14 @@ class InputGuard:
         return fault
 
     def _same_position(self, travel: float) -> int:
-        """Add to the model's travel [m] since the position reading last changed; return the fault bit."""
+        """Update the model's travel since the position reading last changed [m]; return the fault bit."""
         self._position_travel += travel
         fault = POSITION_STUCK if self._position_travel > self._position_stuck else 0
         self.fatal |= fault
         return fault
 
     def _same_force(self, deeper: float) -> int:
-        """Add to the travel in contact [m] since the force reading last changed; return the fault bit."""
+        """Update the travel in contact since the force reading last changed [m]; return the fault bit."""
         if abs(self.force) <= TARE_ROUNDING * abs(self._force_reading):
             # Without a force, a damped mechanism may move out of contact, but no mechanism moves deeper.
             travel = self._force_travel + deeper

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from jaxhil.rig.types import SmallInt
 
-MAX_DOUBTFUL_SHARE = 0.4  # share of the ticks on which the compensator acts
+MAX_DOUBTFUL_SHARE = 0.4  # limit on the share of ticks with a doubtful status
 
 
 class Status(NamedTuple):

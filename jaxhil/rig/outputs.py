@@ -63,7 +63,7 @@ class ForceGuard:
         return FORCE_SLEW
 
     def fade(self) -> None:
-        """Move the output towards 0 by one period's step at `force_slew`."""
+        """Move the output towards 0 by the largest step that `force_slew` allows in one period."""
         self.output = _move_towards(self.output, 0.0, self._max_change)
 
 
@@ -104,7 +104,7 @@ class PositionGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the faults; until the output first reaches a command, limited changes do not trip."""
+        """Forget the faults; until the output first reaches a command, a limited change does not trip."""
         self._limited_ticks = 0
         self._engaged = False
         self._rate = 0.0

@@ -2,7 +2,7 @@
 
 
 def deflection(position: float, clearance: float) -> float:
-    """Return the penetration [m] at position x: x if x > 0, x + clearance if that is < 0, otherwise 0."""
+    """Return the penetration [m] at position x: x if x > 0, x + clearance if x < -clearance, otherwise 0."""
     if position > 0.0:
         return position
     beyond = position + clearance

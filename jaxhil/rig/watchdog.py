@@ -1,12 +1,12 @@
 """Watchdog: energy audit of every contact, from the motion of the numerical model.
 
 A contact begins on the first tick on which the model's or the measured position is beyond a specified
-surface, or on which the compensator acts (it may detect a nearer surface). When none of these conditions has
-held for `settling`, the model moves away and the force has decayed, the watchdog audits the contact. It waits
-for the decay for at most `MAX_DECAY_WAIT`. No threshold depends on the noise, because a noisy force can be
-small by chance before it has given its whole impulse. The audit takes place at the latest in the middle of
-the gap or at the call of `next_contact`. With v_in and v, the model's velocities on the tick before the
-contact and on the present tick, the audit checks three conditions:
+surface, or on which the compensator acts (it may detect a nearer surface). The watchdog audits the contact as
+soon as none of these conditions has been true for the time `settling`, the model moves away and the force has
+decayed. It waits for the decay for at most `MAX_DECAY_WAIT`. No threshold depends on the noise, because a
+noisy force can be small by chance before it has given its whole impulse. The audit takes place at the latest
+in the middle between two surfaces, or at the call of `next_contact`. With v_in and v, the model's velocities
+on the tick before the contact and on the present tick, the audit checks three conditions:
 
 - Energy: M (v^2 - v_in^2)/2 equals the work -T sum F_c(n) (v(n) + v(n+1))/2 of the controller's force. This
   is an identity for every integrator with v(n+1) = v(n) - T F_c(n)/M.
@@ -43,7 +43,7 @@ from jaxhil.rig.surfaces import deflection
 from jaxhil.rig.types import Limits, Positive
 
 MAX_DECAY_WAIT = 0.1  # s; longest wait for the force to decay
-FORCE_DECAY_RATIO = 1e-6  # [1]; of the peak force, or of the approach momentum divided by `MAX_DECAY_WAIT`
+FORCE_DECAY_RATIO = 1e-6  # [1]; force below this share of its peak or of momentum/MAX_DECAY_WAIT has decayed
 
 
 class Watchdog:

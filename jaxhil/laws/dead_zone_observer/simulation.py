@@ -1,16 +1,17 @@
 """Phase lead with an observer of the force that the force sensor's dead zone removes.
 
-    F_c = lead(F + Q(s) clip(k_n d, -dz, dz)),     d the penetration of x_a, delayed like F
+    F_c = lead(F + Q(s) clip(k_n d, -dz, dz)),     Q(s) = 1/(1 + s/(2 pi f))
 
-After Li et al. 2026 (phase lead and a disturbance observer, |Q| near 1 below 15 Hz). The source states no
-details; the realisation here is our own. A disturbance observer adds Q (F_n - F), where F_n is the force of a
-nominal model. A dead zone is known more exactly: it removes F - sign(F) max(0, |F| - dz) = clip(F, -dz, dz).
-The nominal model k_n d therefore replaces F only in this expression. If k_n is correct, both observers are
-equal. If k_n is wrong, the error occurs only for |F| < dz; for larger forces the observer adds exactly dz.
+F is the measured force, dz the half-width of the dead zone, d the measured penetration, delayed like F, and
+k_n the nominal stiffness. Li et al. 2026 combine a phase lead with a disturbance observer (|Q| near 1 below
+15 Hz) but state no details. A general disturbance observer adds Q (F_n - F), where F_n is the force of a
+nominal model. This observer uses the known effect of a dead zone, which subtracts clip(F, -dz, dz) from the
+force F; the nominal model k_n d replaces F in this expression. If k_n is wrong, the observer has an error
+only for |F| < dz; for larger forces it adds exactly dz.
 
-Q = 1/(1 + s/(2 pi f)) by Tustin's rule. |Q| >= 0.9 up to 15 Hz needs f >= 15 Hz/sqrt(1/0.81 - 1) = 31 Hz. Q
-lags by 1/(2 pi f). To compensate for this lag, the delay of x_a (`identification_delay`) is shorter by the
-same time; this requires f >= 1/(2 pi tau_f), where tau_f is the force delay.
+Q is discretised by Tustin's rule. |Q| >= 0.9 up to 15 Hz needs f >= 15 Hz/sqrt(1/0.81 - 1) = 31 Hz. Q lags by
+1/(2 pi f). To compensate for this lag, the delay of d (`identification_delay`) is shorter than the force
+delay tau_f by the same time; this requires f >= 1/(2 pi tau_f).
 
 A dead zone moves the surface of a linear contact by dz/k. The restitution does not change, but the hardware
 moves deeper into the mechanism, and its force is larger by dz. The observer corrects this.
@@ -54,7 +55,7 @@ PASSBAND = 15.0, 0.9  # [Hz], [1]; up to this frequency, |Q| is at least this ga
 
 
 def _max_bandwidth(mechanism: Mechanism) -> float:
-    """Return the bandwidth [Hz] at which Q's pole is 0; a wider Q has an output of alternating sign."""
+    """Return the bandwidth [Hz] at which Q's pole is 0; above it, Q's output would alternate in sign."""
     return 1 / (math.pi * mechanism.rig.control_period)
 
 

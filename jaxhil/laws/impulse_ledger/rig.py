@@ -18,8 +18,8 @@ before the onset is detected (`onset_detection`), F_c = 0. If a run begins in co
 unknown, and F_c is the measured force.
 
 If the force delay is uncertain (`delay_spread` > 0), the compensator estimates the delay when the hardware
-leaves the surface. The estimate corrects the speed at which this contact ends. In the following contacts it
-also aligns positions with readings, so that D includes it.
+leaves the surface. The estimate corrects the speed at which this contact ends. In the following contacts the
+estimate also aligns positions with readings, so that D includes it.
 """
 
 from collections.abc import Mapping
@@ -38,20 +38,20 @@ from jaxhil.rig.surfaces import deflection
 RELEASE_TIME = 0.03  # s; the compensator continues to act for this time after the hardware leaves the surface
 LEAST_MOMENTUM = 1e-9  # kg m/s; with less momentum, forces cannot be scaled
 LONGEST_LAG = 0.2  # s; upper bound of the lag D
-ONSET_PLACE = -0.5  # periods of travel; depth of the hardware at the last reading of free flight
-MISFIT = 0.005  # [1]; relative error of the contact model's force, averaged over `MISFIT_TIME`
+ONSET_PLACE = -0.5  # periods of travel; assumed depth of the hardware at the last reading of free flight
+MISFIT = 0.005  # [1]; standard deviation of the contact model's relative error, averaged for `MISFIT_TIME`
 MISFIT_TIME = 0.001  # s
-SLOWEST = 1e-9  # [1]; a speed below this value is a rounding error
+SLOWEST = 1e-9  # [1]; minimum speed, divided by the approach speed; a lower speed is a rounding error
 SHALLOW = 0.001  # s; lower bound of the depth by which the secant stiffness is divided
-LEAST_PEAK = 0.3  # 1/s; peak force of the softest contact, with 0.05 Hz
+LEAST_PEAK = 0.3  # 1/s; minimum of peak force / (mass x approach speed), for a contact at 0.05 Hz
 FEW_READINGS = 5  # readings in contact; with fewer readings the status is `unsure`
-LATE = 0.8  # [1]; if a larger share of the contact has passed at the onset, the status is `too_short`
-UNCERTAIN = 0.006  # [1]; with a larger standard deviation of the reference speed the status is `noisy`
-MOST_GAIN = 0.01  # [1]; largest energy that a contact may gain compared with the contact model
-MOST_LOSS = 0.014  # [1]; largest energy that a contact may lose compared with the contact model
-USUAL_PRELOAD = 1.0  # 1/s; standard deviation of the preload that is added to the specified one
-LARGEST_DELAY_SPREAD = 0.004  # s; for a larger uncertainty, a first-order correction is not accurate
-MOST_SPREADS = 3.0  # standard deviations; largest difference between estimated and specified delay
+LATE = 0.8  # [1]; if the lag D is a larger share of the contact's duration, the status is `too_short`
+UNCERTAIN = 0.006  # [1]; if the reference speed has a larger standard deviation, the status is `noisy`
+MOST_GAIN = 0.01  # [1]; limit on the energy gain beyond the contact model, divided by M v^2
+MOST_LOSS = 0.014  # [1]; limit on the energy loss beyond the contact model, divided by M v^2
+USUAL_PRELOAD = 1.0  # 1/s; standard deviation of preload/(mass x approach speed), added to the specified one
+LARGEST_DELAY_SPREAD = 0.004  # s; limit, because a first-order correction of more is not accurate
+MOST_SPREADS = 3.0  # standard deviations; limit on the difference of estimated and specified delay
 ONSET_TICKS = 0.3  # periods; standard deviation of the time of the onset, 1/sqrt(12)
 ONSET_MEAN = 0.25  # [1]; mean force at the onset, divided by the force at which the onset is detected
 ONSET_SPREAD = 0.4  # [1]; standard deviation of the force at the onset, divided by the same force
@@ -231,9 +231,10 @@ class ImpulseLedger(Compensator):
         return side * weight * (push + correction)
 
     def _learn(self, phi: Vector, depth: float, rate: float, reading: float, noise: float) -> None:
-        """Update contact model and estimated delay with one `reading` [1/s] of noise variance `noise`.
+        """Update contact model and estimated delay with one `reading` [1/s] and its noise variance `noise`.
 
-        `phi` is the regressor; `depth` [s] and `rate` [1] are depth and speed of the hardware.
+        `phi` is the regressor; `depth` [s] and `rate` [1] are the hardware's depth and speed, divided by the
+        approach speed.
         """
         model, period, floor = self._model, self._period, self._floor
         model_error = MISFIT * reading
@@ -250,9 +251,10 @@ class ImpulseLedger(Compensator):
             model.conclude(self._estimate[0] if ended else 0.0)
 
     def _evaluate(self, peak: float, noise: float, free: bool) -> int:
-        """Return the compensator's status during a contact; `free`: the correction is within its limits.
+        """Return the compensator's status during a contact; `free` is true if the correction is not limited.
 
-        `peak` [1/s] is the estimated peak force, and `noise` [1/s^2] the noise variance of a reading.
+        `peak` [1/s] is the estimated peak force, divided by mass and approach speed, and `noise` [1/s^2] the
+        noise variance of a reading.
         """
         reference, model = self._reference, self._model
         if model.count < FEW_READINGS:

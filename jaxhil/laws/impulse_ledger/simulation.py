@@ -86,8 +86,8 @@ class LedgerContact(NamedTuple):
     speed: Float[Array, "*batch"]  # approach speed [m/s]; 0 if unknown
     origin: Float[Array, "*batch"]  # position of the surface, in the direction of `side` [m]
     lag: Float[Array, "*batch"]  # lag D of hardware and force behind the model [s]
-    deepest: Float[Array, "*batch"]  # largest depth of the hardware [s]
-    peak: Float[Array, "*batch"]  # largest force reading so far [1/s]
+    deepest: Float[Array, "*batch"]  # largest depth of the hardware, divided by `speed` [s]
+    peak: Float[Array, "*batch"]  # largest force reading so far, divided by mass and `speed` [1/s]
     outside: Float[Array, "*batch"]  # number of ticks since the hardware left the surface
     estimate: ContactModelEstimate
     reference: ReferenceTrajectory

@@ -4,7 +4,7 @@ The present reading is the wrench that should have acted on the numerical model 
 the delay of the whole loop. The compensator adds the impulse of every reading to a reference that is delayed
 by D. It predicts the impulse from t - D to the present with a scalar model of the contact. The command then
 corrects the difference between the reference's impulse and the impulse commanded so far. `six_axes/README.md`
-states the equations; comments refer to them by a letter in brackets.
+states the equations (a) to (e).
 """
 
 from typing import ClassVar

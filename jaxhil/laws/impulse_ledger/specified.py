@@ -10,7 +10,7 @@ DELAY = "rig.force_sensor.delay"
 
 
 def delay_spread(mechanism: Mechanism) -> float:
-    """Return the force delay's standard deviation [s] in the file, at most 4 ms; 0 if there is none."""
+    """Return the force delay's standard deviation [s] in the file, at most 4 ms; 0 if it is certain."""
     uncertainty = mechanism.uncertainty.get(DELAY)
     is_range = uncertainty is not None and uncertainty.std is None
     spread = _spread(mechanism, DELAY)
@@ -45,7 +45,7 @@ def _scaled(mechanism: Mechanism, path: str) -> float:
 
 
 def _spread(mechanism: Mechanism, path: str) -> float:
-    """Return the standard deviation of a number in the file, or the half-width of its range; else 0."""
+    """Return a number's `std` in the file, or the distance of its farther bound; 0 if it is certain."""
     uncertainty = mechanism.uncertainty.get(path)
     if uncertainty is None:
         return 0.0

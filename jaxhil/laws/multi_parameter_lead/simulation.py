@@ -6,8 +6,8 @@ s^2 + omega^2 (a + b s) e^(-s tau) = 0. The rule of the literature places one of
 damped oscillation with the desired restitution (notebooks/guide/model.md section 6, item 16).
 
 For the nominal gains, the desired restitution is 1, and tau is the delay of the force measurement plus the
-lag of the motion simulator. These gains compensate for the loop; the mechanism's own damping still acts,
-because the equation does not contain it.
+lag of the motion simulator. These gains compensate for the delay of the loop; the mechanism's own damping
+still acts, because the equation does not contain it.
 """
 
 import cmath

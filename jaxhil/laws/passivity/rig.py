@@ -1,4 +1,4 @@
-"""Time-domain passivity control (De Stefano et al.): the contact never returns more energy than it took."""
+"""Time-domain passivity control (De Stefano et al.): a contact returns at most the energy it absorbed."""
 
 from collections.abc import Mapping
 from math import inf
@@ -11,7 +11,8 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 class Passivity(Compensator):
     """Compensator F_c = F, or F_c = -E_before/(T v_d) if E = E_before + T F v_d would be negative.
 
-    The second force makes E = 0; it corresponds to a virtual damping alpha = -E/(T v_d^2). Because
+    E is the energy that the numerical model has given to the contact, v_d its velocity, and T the control
+    period. The second force makes E = 0; it corresponds to a virtual damping alpha = -E/(T v_d^2). Because
     E_before >= 0, the divisor T v_d is then not 0, and F_c is between 0 and F.
     """
 

@@ -1,12 +1,12 @@
-"""Time-domain passivity control (De Stefano et al.): the contact never returns more energy than it took.
+"""Time-domain passivity control (De Stefano et al.): a contact returns at most the energy it absorbed.
 
     E(n) = E(n-1) + T F(n) v_d(n),     if E < 0:  F_c = F + alpha v_d,  alpha = -E/(T v_d^2)
 
-E is the energy that the numerical model has given to the contact. The virtual damping alpha dissipates -E, so
-that E returns to 0. Then F_c = -E(n-1)/(T v_d), which is between 0 and F for any small v_d. The compensator
-needs no gain and no knowledge of the rig. Two limitations remain: later contacts of the run can gain the
-energy that an earlier, damped contact has dissipated, and energy that the sampling adds is not observed
-(notebooks/guide/model.md section 6, item 17).
+E is the energy that the numerical model has given to the contact, v_d its velocity, and T the control period.
+The virtual damping alpha dissipates -E, so that E returns to 0. Then F_c = -E(n-1)/(T v_d), which is between
+0 and F for any small v_d. The compensator needs no gain and no knowledge of the rig. Two limitations remain:
+later contacts of the run can gain the energy that an earlier, damped contact has dissipated, and energy that
+the sampling adds is not observed (notebooks/guide/model.md section 6, item 17).
 """
 
 from typing import ClassVar

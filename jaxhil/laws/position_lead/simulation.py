@@ -1,11 +1,11 @@
 """Position lead (Chang et al.): the position command leads the model by the motion simulator's lag.
 
-    F_c = F,  command (1 + a_1 s + a_2 s^2) x_d = x + a_1 v + a_2 a,
+    F_c = F,     position command = x + a_1 v + a_2 a
 
-Velocity v and acceleration a = -F_c/M come from the numerical model, so that no signal is differentiated.
-With a_1 and a_2 of the simulator's inverse, 1/G(s) = 1 + a_1 s + a_2 s^2 + ..., x_a follows x_d. For a
-second-order simulator without transport delay, the inverse has no further terms. The remaining error is of
-first order in the control period, because v and a are half a period old.
+Position x, velocity v and acceleration a = -F_c/M come from the numerical model, so that no signal is
+differentiated. With a_1 and a_2 of the simulator's inverse, 1/G(s) = 1 + a_1 s + a_2 s^2 + ..., the simulator
+follows the model. For a second-order simulator without transport delay, the inverse has no further terms. The
+remaining error is of first order in the control period, because v and a are half a period old.
 
 The nominal gains are the first two coefficients of the series of e^(s tau)/G(s), where tau is the transport
 delay plus the delay of the command. The compensator does not correct the delay of the force measurement.
@@ -24,7 +24,7 @@ class PositionLead(Compensator):
     knows: ClassVar[tuple[str, ...]] = (SIMULATOR_DYNAMICS,)
     waits_for_contact: ClassVar[bool] = True
     reads_position: ClassVar[bool] = False
-    # The coefficients may be negative: for an ideal simulator with zero-order hold, or a simulator with
+    # The coefficients are negative for an ideal simulator with zero-order hold, and may be for one with
     # zeros.
     gains: ClassVar[tuple[Gain, ...]] = (
         rig_gain(

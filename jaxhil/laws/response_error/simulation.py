@@ -2,11 +2,12 @@
 
     F_c = lead(F) + gate (g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a))
 
-The phase lead compensates for the delay of the force measurement. The response error compensates for the
-dynamics of the motion simulator without a model of the simulator (Qi et al. 2016; notebooks/guide/model.md
-section 5). k_hat and b_hat are a recursive least-squares fit of the measured force to the measured position.
-For the fit, the position is delayed like the force (`identification_delay`); without this alignment, k_hat
-and b_hat are biased (section 6, item 6). v_a is a filtered difference, s/(1 + T_v s) by Tustin's rule.
+x_d and v_d are the motion of the numerical model, x_a and v_a the measured motion. The phase lead compensates
+for the delay of the force measurement. The response error compensates for the dynamics of the motion
+simulator without a model of the simulator (Qi et al. 2016; notebooks/guide/model.md section 5). k_hat and
+b_hat are a recursive least-squares fit of the measured force to the measured position. For the fit, the
+position is delayed like the force (`identification_delay`); without this alignment, k_hat and b_hat are
+biased (section 6, item 6). v_a is a filtered difference, s/(1 + T_v s) by Tustin's rule.
 
 `gate` is 1 while the aligned position is in contact and 0 outside. It opens and closes smoothly within two
 periods, depending on the time between two ticks at which the position crosses the surface
@@ -51,12 +52,12 @@ from jaxhil.laws.simulation_base import Compensator, Gain, Gains, clear_lanes, r
 
 
 def _stiffness_covariance(mechanism) -> float:
-    """Return the initial covariance [1/m^2] that gives a first sample at 3 % of the peak depth weight 1/2."""
+    """Return the initial covariance [1/m^2]: a first sample at 3 % of the peak depth has weight 1/2."""
     return 1 / (0.03 * peak_force(mechanism) / typical_stiffness(mechanism)) ** 2
 
 
 def _damping_covariance(mechanism) -> float:
-    """Return the initial covariance [s^2/m^2] that gives a first sample at the approach speed weight 1/2."""
+    """Return the initial covariance [s^2/m^2]: a first sample at the approach speed has weight 1/2."""
     return 1 / mechanism.approach.velocity**2
 
 

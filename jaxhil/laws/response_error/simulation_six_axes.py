@@ -81,7 +81,7 @@ def _never(mechanism: Any) -> bool:
 
 
 def _covariance(name: str, size: Any) -> Gain:
-    """Return the gain of an initial covariance; `size(mechanism)` is its nominal value."""
+    """Create the gain that sets an initial covariance; `size(mechanism)` is its nominal value."""
     return rig_gain(
         name, lambda m: 1e-3 * size(m), lambda m: 1e1 * size(m), size, logarithmic=True, tuned=_never
     )

@@ -1,4 +1,4 @@
-"""Delay line of the measured position, with linear interpolation and uniform motion before the run."""
+"""Delay line of the measured position, with linear interpolation; assumes uniform motion before the run."""
 
 from typing import NamedTuple
 

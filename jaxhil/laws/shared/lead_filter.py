@@ -59,10 +59,10 @@ def apply_lead_filter(filter_: LeadFilter, state: LeadState, force: Array) -> tu
 
 
 def lead_amplification(filter_: LeadFilter) -> Array:
-    """Return the filter's noise amplification [1]: output over input standard deviation for white noise.
+    """Return the filter's noise amplification [1]: the output's standard deviation for unit white noise.
 
     For y(n) = p y(n-1) + a F(n) + b F(n-1) with F of unit variance, the stationary variance is the sum of the
-    squared impulse response a, pa + b, p(pa + b), ..., which is (a^2 + b^2 + 2 a b p)/(1 - p^2).
+    squared impulse response a, p a + b, p (p a + b), ..., which is (a^2 + b^2 + 2 a b p)/(1 - p^2).
     """
     pole, now, before = filter_
     return jnp.sqrt((now**2 + before**2 + 2 * now * before * pole) / (1 - pole**2))

@@ -66,7 +66,7 @@ def write_samples(rings: Any, tick: Int[Array, ""], values: Any) -> Any:
 
 
 def depend_on(value: Float[Array, "*batch"], *reads: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return `value`, or NaN where one of `reads` is NaN: to the compiler it depends on `reads`."""
+    """Return `value` so that it depends on `reads` for the compiler; NaN where one of `reads` is NaN."""
     for read in reads:
         value = jnp.where(read == read, value, read)
     return value

@@ -1,10 +1,11 @@
 """Virtual contact (EPOS; Zebenay, Boge): a virtual spring and damper act on the numerical model.
 
-    F_c = F + k_v d + b_v d' while x_d is in contact,     d the penetration of x_d, d' = v_d
+    F_c = F + k_v d + b_v d'  while d > 0,     otherwise F_c = F
 
-The virtual forces have no delay. The operators of the EPOS rig chose k_v and b_v by experiment. The nominal
-b_v is the stability limit (notebooks/guide/model.md section 6, item 15), at which the contact neither gains
-nor loses energy; damping of the mechanism is neglected.
+d is the penetration of the numerical model, and d' its rate. The virtual forces have no delay. The operators
+of the EPOS rig chose k_v and b_v by experiment. The nominal b_v is the stability limit
+(notebooks/guide/model.md section 6, item 15), at which the contact neither gains nor loses energy; damping of
+the mechanism is neglected.
 """
 
 import math

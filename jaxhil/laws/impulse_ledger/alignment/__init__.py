@@ -1,1 +1,1 @@
-"""Alignment: measured position and velocity, delayed like the force measurement."""
+"""Alignment: delays the measured position and velocity by the delay of the force measurement."""

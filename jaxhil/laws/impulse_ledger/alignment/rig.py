@@ -1,4 +1,4 @@
-"""Alignment: measured position and velocity, delayed like the force measurement."""
+"""Alignment: delays the measured position and velocity by the delay of the force measurement."""
 
 from typing import Annotated
 
@@ -24,7 +24,8 @@ class Alignment:
     def step(self, position: float, velocity: float, begins: bool) -> tuple[float, float]:
         """Return the delayed position [m] and velocity [m/s] for the `position` measured on this tick [m].
 
-        If a run `begins` on this tick, the motion before it is uniform, with the model's `velocity` [m/s].
+        If a run `begins` on this tick, the motion before it is assumed to be uniform, with the model's
+        `velocity` [m/s].
         """
         period = self._period
         if begins:

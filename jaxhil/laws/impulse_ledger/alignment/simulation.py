@@ -1,4 +1,4 @@
-"""Alignment in JAX: measured position and velocity, delayed like the force measurement."""
+"""Alignment in JAX: delays the measured position and velocity by the delay of the force measurement."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from jaxhil.laws.simulation_base import Signals
 
 
 class Aligned(NamedTuple):
-    """State of the alignment: two delayed positions; tau is the force delay."""
+    """State of the alignment: two delayed positions. tau is the force delay."""
 
     middle: Float[Array, "*batch"]  # on the next tick, the position measured tau ago [m]
     last: Float[Array, "*batch"]  # on the next tick, the position measured tau + T ago [m]
@@ -20,7 +20,7 @@ def align(
 ) -> tuple[Array, Array, Aligned]:
     """Return the measured position [m] and velocity [m/s], delayed like the force, and the next state.
 
-    `newest` [m] is the measured position with a delay that is shorter by one tick.
+    `newest` [m] is the measured position, delayed by one tick less than the force.
     """
     begins = signals.age == 0
     stride = period * signals.velocity_desired

@@ -4,13 +4,13 @@
                    + (damping + depth_damping x/REACH) v - unloading (x_m - x)
                    + friction v/sqrt(v^2 + SLOW^2)                              at x > 0, else 0
 
-x is the depth, v the speed and x_m the largest depth so far. All values are scaled by the approach speed v0
-and the equivalent mass M: depth x/v0 [s], speed v/v0 [1], force F/(M v0) [1/s]. The slope at a depth is the
-sum of all hinges whose knots kappa_j are smaller. Changes of the slope at the knots are a priori independent,
-so that the prior covariance of the hinges is diagonal. Recursive least squares estimates the parameters
-theta.
+f is the force, divided by mass and approach speed [1/s]. x is the depth and x_m the largest depth so far,
+divided by the approach speed [s]. v is the speed, divided by the approach speed [1]. The slope at a depth x
+is the sum of the hinges with knots kappa_j < x. Changes of the slope at the knots are assumed to be
+independent, so that the prior covariance of the hinges is diagonal. Recursive least squares estimates the
+parameters theta.
 
-The last parameter is d, the delay of the force beyond the specified delay. It adds d k(x) (1 - v) to the
+The last parameter is d, the true minus the specified delay of the force. It adds d k(x) (1 - v) to the
 readings, where k is the slope. Because damping has a similar effect with the opposite sign, d is estimated
 only after the contact (`estimate_delay`). Then the posterior is a mixture of two models, with and without
 dissipation, weighted by prior odds and evidence. Large squared innovations reduce the weight of the readings.
@@ -28,16 +28,16 @@ from typing import Annotated
 
 from jaxhil.rig.types import Count, Positive
 
-KNOTS = (0.0, 0.003, 0.008, 0.015, 0.024, 0.034, 0.046, 0.06, 0.076, 0.1, 0.12)  # s; depths of slope changes
+KNOTS = (0.0, 0.003, 0.008, 0.015, 0.024, 0.034, 0.046, 0.06, 0.076, 0.1, 0.12)  # s; depths / approach speed
 HINGES = len(KNOTS)
 PARAMETERS = HINGES + 6
 DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION, PRELOAD, DELAY = range(HINGES, PARAMETERS)
-DISSIPATIVE = (DAMPING, DEPTH_DAMPING, UNLOADING)  # indices of parameters that are zero or positive
+DISSIPATIVE = (DAMPING, DEPTH_DAMPING, UNLOADING)  # indices of parameters that are >= 0
 CONCLUDED = (*DISSIPATIVE, DELAY)  # indices of parameters that `conclude` constrains
-DELAY_PARAMETERS = (*CONCLUDED, 0, PRELOAD)  # indices of parameters in the estimate of the delay
-WANDER = 0.03  # s; depth over which the slope changes by one prior standard deviation
-REACH = 0.03  # s; depth at which depth_damping and damping have the same effect
-SLOW = 0.03  # [1]; speed below which friction changes its sign smoothly
+DELAY_PARAMETERS = (*CONCLUDED, 0, PRELOAD)  # indices of the parameters that `estimate_delay` uses
+WANDER = 0.03  # s; depth / approach speed in which the slope changes by one prior standard deviation
+REACH = 0.03  # s; depth / approach speed at which damping and an equal depth_damping have the same effect
+SLOW = 0.03  # [1]; speed, divided by the approach speed, below which friction changes sign smoothly
 # The prior variance of a parameter (except the delay) is a squared entry of `Spreads`, selected by
 # `SPREAD_INDICES`, times the parameter's entry of `FACTORS`.
 SPREAD_INDICES = (0, *[1] * (HINGES - 1), 2, 3, 4, 5, 6)
@@ -45,8 +45,8 @@ FACTORS = (1.0, *[(deeper - depth) / WANDER for depth, deeper in pairwise(KNOTS)
 ZERO_PROBABILITY = 0.75  # [1]; prior probability that a dissipative parameter is zero
 ODDS = ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi)
 ELASTIC_ODDS = 19.0  # [1]; prior odds of a contact without dissipation
-WIDE_STIFFNESS = (200.0, 300.0)  # 1/s^2; prior mean and deviation of the first slope in `estimate_delay`
-SURPLUS = 1.4  # [1]; increases the readings' variance, because errors of the model are correlated
+WIDE_STIFFNESS = (200.0, 300.0)  # 1/s^2; prior mean and standard deviation of hinge 0 in `estimate_delay`
+SURPLUS = 1.4  # [1]; factor on the readings' variance, because the model's errors are correlated
 EXACT = 1e18  # 1/variance of a parameter that is known exactly
 LEAST_VARIANCE = 1e-12  # lower bound of a parameter's variance, avoids division by 0
 Vector = Annotated[list[float], PARAMETERS]
@@ -55,7 +55,7 @@ Spreads = Annotated[list[float], 7]
 
 
 def features(depth: float, speed: float, deepest: float, delay_effect: float) -> Vector:
-    """Return the regressor phi of the contact model, whose force is phi.theta; zeros out of contact.
+    """Return the regressor phi; the contact model's force is the product phi.theta. Out of contact, phi = 0.
 
     `delay_effect` [1/s^2] is the derivative k (1 - v) of the force with respect to the delay.
     """
@@ -68,7 +68,7 @@ def features(depth: float, speed: float, deepest: float, delay_effect: float) ->
 
 
 def force(theta: Sequence[float], depth: float, speed: float, deepest: float) -> float:
-    """Return the force [1/s] of the contact model with parameters `theta` and no delay."""
+    """Return the contact model's force, divided by mass and approach speed [1/s], without the delay."""
     if not depth > 0.0:
         return 0.0
     total = theta[PRELOAD]
@@ -84,7 +84,7 @@ def force(theta: Sequence[float], depth: float, speed: float, deepest: float) ->
 
 
 def slope(theta: Sequence[float], depth: float) -> float:
-    """Return the contact model's slope [1/s^2] at a depth [s], at least 0."""
+    """Return the contact model's stiffness per unit mass [1/s^2], at least 0."""
     total = 0.0
     for hinge, knot in zip(theta, KNOTS, strict=False):
         if not depth > knot:
@@ -99,7 +99,7 @@ class ContactModel:
     Attributes:
         mean: posterior mean without constraints.
         covariance: posterior covariance without constraints.
-        theta: posterior mean with dissipative parameters that are zero or positive.
+        theta: posterior mean with dissipative parameters constrained to be >= 0.
         count: number of readings in the estimate.
     """
 
@@ -109,11 +109,11 @@ class ContactModel:
     theta: Vector
 
     def restart(self, stiffness: float, spreads: Spreads, delay_variance: float) -> None:
-        """Set the estimate to the prior.
+        """Set the estimate to the prior, with all forces divided by mass and approach speed.
 
         Args:
             stiffness: prior mean of the slope at depth 0 [1/s^2].
-            spreads: prior standard deviations of the slope at depth 0 [1/s^2], the change of the slope over
+            spreads: prior standard deviations of the slope at depth 0 [1/s^2], the change of the slope per
                 `WANDER` [1/s^2], damping [1/s], depth damping [1/s], unloading [1/s^2], friction [1/s] and
                 preload [1/s].
             delay_variance: prior variance of the delay [s^2].
@@ -136,7 +136,7 @@ class ContactModel:
         self.count = 0.0
 
     def learn(self, phi: Vector, force: float, variance: float) -> None:
-        """Update the estimate with one force reading [1/s] with the noise variance `variance` [1/s^2]."""
+        """Update the estimate with one scaled force reading [1/s] and its noise variance [1/s^2]."""
         covariance = self.covariance
         column = [dot(row, phi) for row in covariance]
         total = variance + dot(phi, column)
@@ -164,7 +164,8 @@ class ContactModel:
     def estimate_delay(self, preload: float, preload_spread: float) -> tuple[float, float]:
         """Estimate the delay d after a contact; return its mean [s] and variance [s^2].
 
-        `preload` and `preload_spread` [1/s] are prior mean and deviation of the force at the onset.
+        `preload` and `preload_spread` [1/s] are the prior mean and standard deviation of the force at the
+        onset, divided by mass and approach speed.
         """
         mean = [self.mean[j] for j in DELAY_PARAMETERS]
         rows = [[self.covariance[i][j] for j in DELAY_PARAMETERS] for i in DELAY_PARAMETERS]
@@ -201,7 +202,7 @@ class ContactModel:
         return weakened * delay / variance / (excess * excess), weakened
 
     def _dissipate(self, mean: list[float], rows: list[list[float]], first: Count, certain: bool) -> None:
-        """Constrain the dissipative parameters to zero or positive values, in place.
+        """Constrain the dissipative parameters to be >= 0, in place.
 
         Args:
             mean: mean of some parameters.
@@ -242,7 +243,7 @@ def observe(
 
 
 def zero_or_positive(mean: float, variance: Positive, prior_variance: float) -> tuple[float, float]:
-    """Return posterior mean and variance of a parameter that is zero with `ZERO_PROBABILITY` or positive.
+    """Return posterior mean and variance of a parameter >= 0 that is 0 with the prior `ZERO_PROBABILITY`.
 
     The arguments are posterior mean, posterior variance and prior variance without this constraint. Boyd's
     bound of Mills' ratio, pi/((pi - 1) t + sqrt(t^2 + 2 pi)), approximates the tail of the normal

@@ -42,7 +42,7 @@ def begin(mean: Array, variances: Array) -> ContactModelEstimate:
 
 
 def features(depth: Array, speed: Array, deepest: Array, delay_effect: Array) -> Array:
-    """Return the regressor phi of the contact model, whose force is phi.theta; zeros out of contact."""
+    """Return the regressor phi; the contact model's force is phi.theta. Out of contact, phi is 0."""
     hinges = [jnp.where(depth > knot, depth - knot, 0) for knot in rig.KNOTS]
     turning = speed / jnp.sqrt(speed * speed + rig.SLOW * rig.SLOW)
     losses = [speed, depth * speed / rig.REACH, jnp.where(depth < deepest, depth - deepest, 0), turning]
@@ -50,12 +50,12 @@ def features(depth: Array, speed: Array, deepest: Array, delay_effect: Array) ->
 
 
 def force(theta: Array, depth: Array, speed: Array, deepest: Array) -> Float[Array, "*batch"]:
-    """Return the force [1/s] of the contact model with parameters `theta` and no delay."""
+    """Return the contact model's force, divided by mass and approach speed [1/s], without the delay."""
     return dot(theta, features(depth, speed, deepest, jnp.zeros_like(depth)))
 
 
 def slope(theta: Array, depth: Array) -> Float[Array, "*batch"]:
-    """Return the contact model's slope [1/s^2] at a depth [s], at least 0."""
+    """Return the contact model's stiffness per unit mass [1/s^2], at least 0."""
     total = reduce(
         add, (jnp.where(depth > knot, hinge, 0) for hinge, knot in zip(theta, rig.KNOTS, strict=False))
     )
@@ -65,7 +65,7 @@ def slope(theta: Array, depth: Array) -> Float[Array, "*batch"]:
 def learn(
     old: ContactModelEstimate, phi: Array, force: Array, variance: Array, used: Bool[Array, "*batch"]
 ) -> ContactModelEstimate:
-    """Update the estimate on the lanes `used` with a force reading [1/s] and its noise variance [1/s^2]."""
+    """Update the estimate on the lanes `used` with a scaled force reading [1/s] and its variance [1/s^2]."""
     column = reduce(add, (old.covariance[j] * phi[j][None] for j in range(PARAMETERS)))
     total = variance + dot(phi, column)
     used = used & (total > 0)  # false if the covariance is not positive because of rounding
@@ -131,7 +131,7 @@ def estimate_delay(
 def _dissipate(
     mean: Array, rows: list[Array], first: int, prior_variances: Array, certain: bool
 ) -> tuple[Array, list[Array]]:
-    """Return mean and covariance rows with the dissipative parameters constrained to zero or positive."""
+    """Return mean and covariance rows with the dissipative parameters constrained to be >= 0."""
     for row in range(len(DISSIPATIVE)):
         index = first + row
         variance = _above(rows[row][index], rig.LEAST_VARIANCE)
@@ -153,7 +153,7 @@ def _observe(
 
 
 def zero_or_positive(mean: Array, variance: Array, prior_variance: Array) -> tuple[Array, Array]:
-    """Return posterior mean and variance of a parameter that is zero with `ZERO_PROBABILITY` or positive."""
+    """Return posterior mean and variance of a parameter >= 0 that is 0 with the prior `ZERO_PROBABILITY`."""
     spread = jnp.sqrt(variance)
     ratio = mean / spread
     size = jnp.abs(ratio)

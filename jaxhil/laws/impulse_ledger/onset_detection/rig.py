@@ -3,18 +3,18 @@
     S = max(0, S + (y - bias)/sigma - DRIFT),    contact is detected if S > LEVEL
 
 y is the force reading; the surface pushes in its positive direction. The readings of this run with S = 0 give
-the bias and the standard deviation sigma. The onset is after the last reading with S = 0.
+the bias and the standard deviation sigma. The contact begins after the last reading with S = 0.
 
 Source: Page, "Continuous inspection schemes", Biometrika 41 (1954).
 """
 
 from math import sqrt
 
-DRIFT = 2.0  # standard deviations; only a reading with a larger excess over the bias increases S
-LEVEL = 8.0  # standard deviations; contact is detected when S exceeds this level
+DRIFT = 2.0  # standard deviations; a reading increases S only if it exceeds the bias by more than this
+LEVEL = 8.0  # standard deviations; contact is detected if S exceeds this level
 SETTLING = 0.004  # s; no detection during this time after the start of a run
 LONGEST_MEAN = 2000.0  # readings; limits the memory of the bias, which may drift slowly
-FEW = 9.0  # readings; with fewer, sigma is the specified noise
+FEW = 9.0  # readings in free flight; with fewer, sigma is the specified noise
 
 
 class OnsetDetector:
@@ -41,7 +41,7 @@ class OnsetDetector:
 
     @property
     def variance(self) -> float:
-        """Return the noise variance of a force reading [N^2]: specified, or if larger, from free flight."""
+        """Return the noise variance of a force reading [N^2]: the larger of specified and measured value."""
         return max(self._known, self._square) if self._count > FEW else self._known
 
     def watch(self, force: float, side: float, floor: float, settled: bool) -> None:

@@ -19,7 +19,7 @@ class FreeFlight(NamedTuple):
 
 
 def variance(flight: FreeFlight, noise: Array) -> Float[Array, "*batch"]:
-    """Return the noise variance of a force reading [N^2]: specified, or if larger, from free flight."""
+    """Return the noise variance of a force reading [N^2]: the larger of specified and measured value."""
     specified = noise**2
     return jnp.where((flight.count > FEW) & (flight.square > specified), flight.square, specified)
 

@@ -2,9 +2,9 @@
 
     x_r'' = -F_r,    F_r = max(f(x_r, v_r) + y - f(X, V), min(0, y))
 
-f is the contact model, and (X, V) is the motion of the hardware, delayed like the reading y. The trajectory
-is integrated once, from the onset on. When the estimate of the contact model's parameters changes by d theta,
-the sensitivities s = d x_r/d theta correct the trajectory:
+y is the force reading, f the contact model with the regressor phi, and (X, V) the motion of the hardware,
+delayed like y. The trajectory is integrated once, from the onset on. When the estimate of the contact model's
+parameters changes by d theta, the sensitivities s = d x_r/d theta correct the trajectory:
 
     x_r += s.d theta,   v_r += s'.d theta,   s'' = -[phi(x_r, v_r) - phi(X, V) + k s + b s']
 
@@ -32,18 +32,18 @@ from jaxhil.laws.impulse_ledger.contact_model.rig import (
 )
 
 STEPS = 12  # number of integration steps from the last reading to the present
-FASTEST = 2.0  # [1]; limits the speed, which without added energy is at most 1
-FARTHEST = 10.0  # s; limits the depth; three times the depth of a contact with 0.05 Hz
+FASTEST = 2.0  # [1]; limit on the speed, divided by the approach speed; at most 1 without added energy
+FARTHEST = 10.0  # s; limit on the depth, divided by the approach speed: 3 times the depth at 0.05 Hz
 
 
 class ReferenceTrajectory:
-    """Reference trajectory with its sensitivities, at the time of the last reading.
+    """Reference trajectory at the time of the last reading, with its sensitivities.
 
     Attributes:
-        depth: depth x_r [s].
-        speed: speed v_r [1].
-        force: force F_r [1/s].
-        deepest: largest depth so far [s].
+        depth: depth x_r, divided by the approach speed [s].
+        speed: speed v_r, divided by the approach speed [1].
+        force: force F_r, divided by mass and approach speed [1/s].
+        deepest: largest depth so far, divided by the approach speed [s].
         released: whether the trajectory has left the surface.
     """
 
@@ -53,7 +53,7 @@ class ReferenceTrajectory:
         self.begin(0.0, [0.0] * PARAMETERS)
 
     def begin(self, depth: float, theta: Vector) -> None:
-        """Start the trajectory at the onset with a depth [s], the speed 1 and the parameters `theta`."""
+        """Start the trajectory at the onset, with the approach speed and a depth, divided by it [s]."""
         self.depth = depth
         self.speed = 1.0
         self.force = 0.0
@@ -65,7 +65,7 @@ class ReferenceTrajectory:
         self._losses = [0.0] * (PRELOAD - DAMPING)  # mechanical work per unit of each dissipative parameter
 
     def correct(self, theta: Vector) -> None:
-        """Correct the trajectory to first order for new parameters `theta` of the contact model."""
+        """Correct the trajectory to first order for the contact model's new parameters `theta`."""
         changes = [new - old for new, old in zip(theta, self._theta, strict=True)]
         self._theta = theta
         if not self.released:
@@ -77,7 +77,7 @@ class ReferenceTrajectory:
 
         Args:
             period: control period [s].
-            reading: force reading y [1/s].
+            reading: force reading y, divided by mass and approach speed [1/s].
             measured: regressor phi(X, V) of the hardware's motion.
         """
         theta = self._theta
@@ -100,7 +100,7 @@ class ReferenceTrajectory:
         self.force = push
 
     def spread(self, covariance: Matrix, delay_variance: float) -> float:
-        """Return the standard deviation of the speed [1], sqrt(s' P s').
+        """Return the standard deviation of the speed, divided by the approach speed [1]: sqrt(s' P s').
 
         Args:
             covariance: covariance P of the contact model's parameters.
@@ -114,12 +114,12 @@ class ReferenceTrajectory:
         return sqrt(total) if total > 0.0 else 0.0
 
     def imbalance(self) -> float:
-        """Return the energy loss of the trajectory minus the dissipation of the contact model [1]."""
+        """Return the trajectory's energy loss minus the contact model's dissipation, divided by M v^2 [1]."""
         dissipated = dot(self._losses, self._theta[DAMPING:PRELOAD])
         return 0.5 * (1.0 - self.speed * self.speed) - dissipated
 
     def bridge(self, duration: float) -> tuple[float, float]:
-        """Predict force [1/s] and speed [1] with the contact model, `duration` [s] after the last reading."""
+        """Predict scaled force [1/s] and speed [1] at the time `duration` [s] after the last reading."""
         theta = self._theta
         step = duration / STEPS
         depth, speed, push = self.depth, self.speed, self.force

@@ -12,7 +12,7 @@ from jaxhil.laws.impulse_ledger.reference_trajectory.rig import FARTHEST, FASTES
 
 
 class ReferenceTrajectory(NamedTuple):
-    """Reference trajectory with its sensitivities, at the time of the last reading."""
+    """Reference trajectory at the time of the last reading, with its sensitivities to theta."""
 
     depth: Float[Array, "*batch"]  # x_r [s]
     speed: Float[Array, "*batch"]  # v_r [1]
@@ -24,7 +24,7 @@ class ReferenceTrajectory(NamedTuple):
 
 
 def begin(depth: Array, like: Array) -> ReferenceTrajectory:
-    """Return the trajectory at the onset with a depth [s], the speed 1, and sensitivities shaped `like`."""
+    """Return the trajectory at the onset, with a scaled depth [s] and sensitivities shaped like `like`."""
     zeros = jnp.zeros_like(depth)
     return ReferenceTrajectory(
         depth, zeros + 1, zeros, depth, zeros > 0, jnp.zeros_like(like), jnp.zeros_like(like)
@@ -32,7 +32,7 @@ def begin(depth: Array, like: Array) -> ReferenceTrajectory:
 
 
 def correct(old: ReferenceTrajectory, changes: Array) -> ReferenceTrajectory:
-    """Correct the trajectory to first order for `changes` of the contact model's parameters."""
+    """Correct the trajectory to first order for the `changes` of the contact model's parameters."""
     moved = jnp.where(old.released, 0, dot(old.depths, changes))
     speed = jnp.clip(old.speed + dot(old.speeds, changes), -FASTEST, FASTEST)
     return old._replace(depth=jnp.clip(old.depth + moved, -FARTHEST, FARTHEST), speed=speed)
@@ -41,7 +41,7 @@ def correct(old: ReferenceTrajectory, changes: Array) -> ReferenceTrajectory:
 def advance(
     old: ReferenceTrajectory, theta: Array, period: Array, reading: Array, measured: Array
 ) -> ReferenceTrajectory:
-    """Advance by one period to the next reading y [1/s]; `measured` is the hardware's phi(X, V)."""
+    """Advance by one period to the next reading y (scaled, [1/s]); `measured` is the hardware's phi(X, V)."""
     depth = old.depth + period * old.speed - 0.5 * (period * period) * old.force
     speed = old.speed - period * old.force
     deepest = jnp.where(depth > old.deepest, depth, old.deepest)
@@ -64,7 +64,7 @@ def advance(
 
 
 def bridge(now: ReferenceTrajectory, theta: Array, duration: Array) -> tuple[Array, Array]:
-    """Predict force [1/s] and speed [1] with the contact model, `duration` [s] after the last reading."""
+    """Predict scaled force [1/s] and speed [1] at the time `duration` [s] after the last reading."""
     step = duration / STEPS
 
     def advanced(_, old):

@@ -1,8 +1,8 @@
 """Gains of the impulse ledger in six axes: units, bounds and nominal values.
 
-No gain depends on the contact. Tuning changes only `velocity_gain` and `position_gain`, because the objective
-is insensitive to the other gains near their optimum. The last gains of the list follow from the mechanism
-file.
+No nominal value depends on the contact. Tuning changes only `velocity_gain` and `position_gain`, because the
+objective is insensitive to the other gains near their optimum. The gains from `identification_delay` on
+follow from the mechanism file.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ def reading_delay(mechanism: Any) -> float:
 
 
 def noise(mechanism: Any, part: slice) -> float:
-    """Return the largest standard deviation of noise plus rounding in the force sensor's channels `part`."""
+    """Return the largest standard deviation of noise plus rounding in channels `part` of the force sensor."""
     sensor = mechanism.rig.force_sensor
     pairs = zip(sensor.noise_std[part], sensor.quantum[part], strict=True)
     return max((deviation**2 + quantum**2 / 12) ** 0.5 for deviation, quantum in pairs)

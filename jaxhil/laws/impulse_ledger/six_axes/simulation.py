@@ -25,12 +25,12 @@ def cross(left: Array, right: Array) -> Float[Array, "3 *batch"]:
 
 
 def wrench_at_chaser(wrench: Array, pose: Array) -> Float[Array, "6 *batch"]:
-    """Move a wrench's reference point from the origin of frame T to that of C; `pose` is C relative to T."""
+    """Move a wrench's reference point from the target's origin to the chaser's origin (at `pose`)."""
     return jnp.concatenate([wrench[:3], wrench[3:] - cross(pose[:3], wrench[:3])])
 
 
 def wrench_at_target(wrench: Array, pose: Array) -> Float[Array, "6 *batch"]:
-    """Move a wrench's reference point from the origin of frame C to that of T; `pose` is C relative to T."""
+    """Move a wrench's reference point from the chaser's origin (at `pose`) to the target's origin."""
     return jnp.concatenate([wrench[:3], wrench[3:] + cross(pose[:3], wrench[:3])])
 
 

@@ -27,7 +27,7 @@ class FreeFlightState(NamedTuple):
 
     bias: Six  # mean of the wrench readings [N, N m]
     readings: Float[Array, "*batch"]  # number of readings in `bias`
-    lag: Six  # mean of the model's pose minus the hardware's pose, which is delayed like the force [m, rad]
+    lag: Six  # mean of the model's pose minus the hardware's delayed pose (`Reading.pose`) [m, rad]
     twist: Six  # mean twist of the model [m/s, rad/s]
     ticks: Float[Array, "*batch"]  # number of ticks in `lag` and `twist`
     ticks_since_contact: Float[Array, "*batch"]  # large before the first contact
@@ -40,11 +40,11 @@ class SixAxisContact(NamedTuple):
     speed: Float[Array, "*batch"]  # v_0, approach speed along the contact's direction
     impulse: Six  # I_r, impulse of the reference up to t - D [N s, N m s]
     drift: Six  # eps, pose of the model at t - D minus the reference's pose [m, rad]
-    direction: Six  # filtered wrench, which does not change its sign [N, N m]
+    direction: Six  # filtered wrench; a pulling force does not reverse it [N, N m]
     modelled: Six  # contact's direction when the tangent model was last restarted
     path: Float[Array, "*batch"]  # X, depth of the hardware along the direction since the onset
     peak: Float[Array, "*batch"]  # largest force so far, per unit mass
-    tool: Float[Array, "*batch"]  # largest |W|^2 of the tool's inertia in a reading
+    tool: Float[Array, "*batch"]  # largest |W|^2 so far of the tool's inertia force
 
 
 class LedgerState(NamedTuple):
@@ -65,7 +65,7 @@ class Reading(NamedTuple):
     """Sensor readings of one tick, corrected and aligned."""
 
     wrench: Six  # W, wrench of the contact about the origin of frame C [N, N m]
-    variance: Float[Array, "*batch"]  # mean of |W|^2 by noise alone
+    variance: Float[Array, "*batch"]  # mean of |W|^2 if W is only noise
     pose: Six  # xi_a, pose of the hardware, delayed like the force [m, rad]
     twist: Six  # rate of `pose` [m/s, rad/s]
     pose_change: Six  # change of `pose` since the last tick [m, rad]

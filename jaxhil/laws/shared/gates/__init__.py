@@ -1,1 +1,1 @@
-"""Gates that open and close smoothly when a threshold is crossed."""
+"""Gates: factors that change smoothly between 0 and 1 after a signal crosses a threshold."""

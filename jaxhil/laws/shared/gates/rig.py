@@ -1,4 +1,4 @@
-"""Gates that open and close smoothly, depending on the time between two ticks of a threshold crossing."""
+"""Gates: factors from 0 to 1 that depend smoothly on the time at which a signal crosses a threshold."""
 
 
 def share_beyond(excess: float, excess_before: float, moved: float) -> float:
@@ -22,7 +22,7 @@ def share_beyond(excess: float, excess_before: float, moved: float) -> float:
 
 
 def gate(share: float, share_before: float) -> float:
-    """Return the gate [1], 0 to 1: the time above the threshold, weighted with a triangle of two periods.
+    """Return the gate, from 0 to 1: the time above the threshold, weighted with a triangle of two periods.
 
     The result is exact if the reading crossed the threshold once. The sum of the gate over all ticks is the
     time above the threshold in periods, and the mean delay of the gate is one period.

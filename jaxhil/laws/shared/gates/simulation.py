@@ -1,11 +1,11 @@
-"""Gates that open and close smoothly, depending on the time between two ticks of a threshold crossing.
+"""Gates: factors from 0 to 1 that depend smoothly on the time at which a signal crosses a threshold.
 
 A reading is assumed to be linear between two ticks. `share_beyond` returns the share of a control period in
 which the reading exceeds a threshold. `gate` weights the shares of the last two periods with a triangle of
 two periods. It is 1 above the threshold, 0 below, and once differentiable with respect to the time of the
 crossing. If crossings are at least two periods apart, the sum of the gate over all ticks is the time above
-the threshold in periods, and the mean delay of the gate is one period. A switch that waits for the next tick
-would have an error of up to half a period, which is a sawtooth function of every delay.
+the threshold in periods, and the mean delay of the gate is one period. A gate that switches at the next tick
+would have an error of up to half a period, which would be a sawtooth function of every delay.
 """
 
 import jax.numpy as jnp

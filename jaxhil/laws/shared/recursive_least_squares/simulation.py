@@ -32,13 +32,12 @@ def update_estimate(
     force: Array,
     weight: Array,
 ) -> ContactEstimate:
-    """Update the estimate with one reading: deflection [m], rate [m/s], force [N] and weight [1].
+    """Update the estimate with one reading: deflection [m], rate [m/s], force F [N] and weight w [1].
 
-    With weight w, phi = (deflection, rate) and lambda_w = 1 - w (1 - lambda) the recursion is K = w P
-    phi/(lambda_w + w phi'P phi), theta += K (F - phi'theta), P = (P - K phi'P)/lambda_w. The recursion
-    minimises the sum of w (F - phi'theta)^2, where every reading multiplies the earlier terms by its
-    lambda_w. A weight of 1 gives the textbook recursion; a weight of 0 changes nothing. `initial_variances`
-    are the upper bounds of d_1 and d_2.
+    With phi = (deflection, rate) and lambda_w = 1 - w (1 - `forgetting`), the recursion is K = w P
+    phi/(lambda_w + w phi'P phi), theta += K (F - phi'theta), P = (P - K phi'P)/lambda_w. It minimises the sum
+    of all w (F - phi'theta)^2; each new reading multiplies the earlier terms by its lambda_w. With w = 0,
+    nothing changes. `initial_variances` are the upper bounds of d_1 and d_2 (P = U diag(d_1, d_2) U^T).
     """
     factor = 1 - weight * (1 - forgetting)
     f_1 = deflection

@@ -26,9 +26,9 @@ from jaxhil.laws.six_axis_base import Six, SixAxisSignals
 def onset(
     prepared: Prepared, state: LedgerState, reading: Reading, signals: SixAxisSignals
 ) -> SixAxisContact:
-    """Return the state of a contact that begins with this reading (b).
+    """Return the state of a contact that begins with this reading (equation b of README.md).
 
-    Its impulse is 0 here; `follow` sets it from the delay line.
+    Its impulse is 0 here; `follow` sets the impulse from the delay line.
     """
     period, mass = prepared.constants.control_period, prepared.constants.mass_matrix
     flight, last = state.flight, state.contact
@@ -40,7 +40,7 @@ def onset(
     least = fixed.LEAST_SHARE * safe_sqrt(whole) + fixed.LEAST_TWIST
     is_closing = closing > least
     slowest = fixed.LEAST_SPEED * safe_sqrt(whole) + fixed.LEAST_TWIST
-    # If the contact's direction is perpendicular to the motion, use the mean delay over all directions.
+    # If the contact's direction is perpendicular to the motion, use the mean delay of all directions.
     mean = dot(lag, product(mass, twist)) / (whole + fixed.LEAST_TWIST**2)
     delay = jnp.where(is_closing, -dot(direction, lag) / jnp.where(is_closing, closing, 1), mean) / period
     longest = len(state.ring) - 2.0
@@ -77,7 +77,8 @@ def follow(
         tick: number of this tick.
 
     Returns:
-        Command wrench about the origin of frame C [N, N m], contact, and estimate of the tangent model.
+        Command wrench about the origin of the chaser's frame C [N, N m], contact, and estimate of the tangent
+        model.
     """
     contact_now, estimate, begins = contact
     gains, period = prepared.gains, prepared.constants.control_period
@@ -95,7 +96,7 @@ def follow(
     force = dot(reading.wrench, product(inverse_mass, direction))
     estimate, tangent = _update_estimate(prepared, old, reading, estimate, (direction, path, force))
 
-    # Advance the reference, at the time t - D (c).
+    # Advance the reference, which is at the time t - D (equation c of README.md).
     missing = product(inverse_mass, impulse - old.impulse)
     drift = old.drift + period[None] * missing
     deeper = -dot(direction, reading.pose - (desired - drift))
@@ -105,7 +106,7 @@ def follow(
     corrected = jnp.where(is_contact, corrected, force)
     booked = old.impulse + period[None] * (reading.wrench + (corrected - force)[None] * direction)
 
-    # Predict from t - D to the middle of the command's period (d).
+    # Predict from t - D to the middle of the command's period (equation d).
     velocity = -dot(direction, twist - product(inverse_mass, impulse - booked))
     ahead = (old.delay + fixed.AHEAD) * period
     touches = is_contact & (corrected != 0)
@@ -118,7 +119,7 @@ def follow(
     rest = jnp.where(is_contact[None], reading.wrench - force[None] * direction, 0)
     unpaid = state.impulse - booked - bridged[None] * direction - ahead[None] * rest
 
-    # Compute the command (e).
+    # Compute the command wrench (equation e).
     pulled = unpaid + jnp.where(touches, gains["position_gain"], 0)[None] * product(
         prepared.constants.mass_matrix, drift
     )
@@ -142,7 +143,7 @@ def _correction(
 
 
 def _norm(prepared: Prepared, wrench: Six) -> Float[Array, "*batch"]:
-    """Return the norm |W| = sqrt(W . M^-1 W) of a wrench, or 1 for a wrench of 0."""
+    """Return the norm |W| = sqrt(W . M^-1 W) of a wrench W, with the mass matrix M; 1 if W is 0."""
     square = dot(wrench, product(prepared.constants.inverse_mass, wrench))
     return jnp.where(square > 0, safe_sqrt(square), 1)
 

@@ -1,1 +1,1 @@
-"""Sensor readings of a tick: corrected wrench, aligned pose, contact detection, means over free flight."""
+"""Sensor readings of a tick: corrected wrench, aligned pose, contact detection, means of free flight."""

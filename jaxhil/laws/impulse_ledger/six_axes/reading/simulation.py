@@ -39,13 +39,13 @@ def record(
 def read(
     prepared: Prepared, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]
 ) -> tuple[Reading, LedgerState]:
-    """Return the corrected readings of this tick, and the state with updated means over free flight."""
+    """Return the corrected readings of this tick, and the state with updated means of free flight."""
     constants, gains = prepared.constants, prepared.gains
     period, inverse_mass = constants.control_period, constants.inverse_mass
     pose = _aligned(prepared, state, signals, tick)
     last = jnp.where((signals.age == 0)[None], pose - period[None] * signals.twist_desired, state.aligned)
     wrench = wrench_at_chaser(jnp.stack(_computed_once(signals.wrench, tick)), pose)
-    # The hardware accelerates by M^-1 W, and the sensor reads (1 - M_t M^-1) W (a).
+    # The hardware accelerates by M^-1 W, and the sensor reads (1 - M_t M^-1) W (equation a of README.md).
     corrected = product(constants.tool_correction, wrench)
     unbiased = corrected - state.flight.bias
     variance = noise_variance(prepared, pose)
@@ -80,7 +80,7 @@ def _computed_once(components: tuple[Array, ...], tick: Int[Array, ""]) -> tuple
 
 
 def noise_variance(prepared: Prepared, pose: Six) -> Float[Array, "*batch"]:
-    """Return the mean of |W|^2 for a wrench W that is only noise; `pose` moves its moment to frame C."""
+    """Return the mean |W|^2 of a wrench W that is only noise; `pose` moves its torque to the frame C."""
     gains, inverse_mass = prepared.gains, prepared.constants.inverse_mass
     force, torque = gains["force_noise"] ** 2, gains["torque_noise"] ** 2
     moment = torque + force * jnp.sum(pose[:3] ** 2, axis=0)
@@ -89,7 +89,7 @@ def noise_variance(prepared: Prepared, pose: Six) -> Float[Array, "*batch"]:
 
 
 def _aligned(prepared: Prepared, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]) -> Six:
-    """Return the filtered pose, delayed like the force; the motion before the first tick is uniform."""
+    """Return the filtered pose, delayed like the force; assume uniform motion before the first tick."""
     back = prepared.back
     recalled = look_back(state.ring, POSE, tick, back)
     ago = back - signals.age.astype(back.dtype)
