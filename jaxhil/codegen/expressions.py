@@ -146,7 +146,7 @@ class ExpressionLowering(Lowering):
         return value
 
     def _helped(self, node: ast.BinOp, left: CExpression, right: CExpression, kind: str) -> CExpression:
-        """Lower a floor division, a remainder or a power to a helper function."""
+        """Lower a floor division, a remainder or a power to a call of a helper function."""
         name = HELPER_OPERATORS[type(node.op)] + ("_int" if kind == "int" else "")
         if name != "power":
             right = self._divisor(node, right)

@@ -76,7 +76,7 @@ class CProgram(StructLowering):
         structs: signs of the fields of structs such as `jaxhil_gains`, by struct and field.
         names: C names of classes, without the prefix, if they differ from the names in Python.
         public: functions that the header declares, with their C names.
-        bindings: classes that replace a type in annotations, such as a compensator its protocol.
+        bindings: classes that replace types in annotations; for example, a compensator replaces its protocol.
         enumerators: constants that the header already defines, by name.
     """
 

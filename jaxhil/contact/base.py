@@ -40,7 +40,7 @@ class ContactLaw(abc.ABC):
     """
 
     name: ClassVar[str] = ""  # name in mechanism files
-    # Keys of `[contact]` that this law uses beyond those of all laws; None: the law may use any key.
+    # Keys of `[contact]` that this law uses in addition to the keys of all laws; None: it may use any key.
     keys: ClassVar[tuple[ContactKey, ...] | None] = None
     stiffness_unit: ClassVar[str] = "N/m"
     damping_unit: ClassVar[str] = "N s/m"
@@ -163,7 +163,7 @@ class ContactLaw(abc.ABC):
     # Magnitudes of the contact, from a mechanism file
 
     def nominal_peak_force(self, contact: Any, stiffness: list[float], mass: float, velocity: float) -> float:
-        """Estimate the largest peak force [N] of a mechanism's contacts, by default with a linear law."""
+        """Estimate the largest peak force [N] of a mechanism's contacts, by default as for a linear law."""
         return velocity * math.sqrt(max(stiffness) * mass)
 
     def damping_ratio(self, damping: float, mass: float, velocity: float, frequency: float) -> float:

@@ -120,8 +120,6 @@ class _Problem(NamedTuple):
 
 
 class _IntegrationState(NamedTuple):
-    """State of the integrated motion."""
-
     time: Array  # time since the first touch [s]
     depth: Array  # penetration [m]
     velocity: Array  # rate of the penetration [m/s]

@@ -90,10 +90,10 @@ class _Segment(NamedTuple):
 class _State(NamedTuple):
     """State of the motion at the boundary between two segments."""
 
-    depth: Float[Array, "*batch"]  # distance from the lower depth of its segment to the turning point [m]
+    depth: Float[Array, "*batch"]  # depth of the turning point minus the lower depth of its segment [m]
     velocity: Float[Array, "*batch"]  # [m/s]
     time: Float[Array, "*batch"]  # time since the first touch [s]
-    peak: Float[Array, "*batch"]  # largest force so far divided by mass [m/s^2]
+    peak: Float[Array, "*batch"]  # largest force so far, divided by mass [m/s^2]
     segment: Int[Array, "*batch"]  # index of the deepest segment reached
     # inward: whether the turning point is reached; outward: whether the bodies have separated
     ended: Bool[Array, "*batch"]
@@ -102,7 +102,7 @@ class _State(NamedTuple):
 class _SegmentPassage(NamedTuple):
     """Motion of the bodies through one segment, inward or outward."""
 
-    spring: Array  # spring force divided by mass at the start [m/s^2]
+    spring: Array  # spring force at the start, divided by mass [m/s^2]
     velocity: Array  # velocity at the start [m/s]
     crosses: Array  # whether the motion crosses the far depth of the segment, instead of ending within it
     target: Array  # distance to the far depth [m]; 0 if it is not reached

@@ -81,7 +81,6 @@ class LawMixture(ContactLaw):
         return per_law
 
     def _choose(self, parameters: ContactParameters, values: Sequence[Array]) -> Array:
-        """Select each batch element's value among the `values` of all laws."""
         chosen = jnp.asarray(values[0])
         for kind, value in enumerate(values[1:], start=1):
             chosen = jnp.where(parameters.kind == kind, value, chosen)

@@ -1,4 +1,4 @@
-"""Interface of all compensators in JAX: a force before the integration, a position command after it.
+"""Interface of all compensators in JAX: a force before the model's integration step, a command after it.
 
 A compensator object does not change. Its methods take and return the state, a pytree of arrays of the batch
 shape; ring buffers have an additional leading axis of samples. Gains are a dict of arrays, scalar or of the
@@ -33,8 +33,7 @@ class Gain(NamedTuple):
         logarithmic: whether tuning searches on a logarithmic scale.
         neutral: value that makes the gain ineffective, or None. If all gains are neutral, the force command
             is the measured force.
-        tuned: function that returns whether tuning changes the gain for a mechanism; if not, the gain keeps
-            its nominal value.
+        tuned: function that returns whether tuning changes the gain for a mechanism, instead of keeping it.
         begins: initial value for tuning, as a function of the mechanism; None for any value within the
             bounds. Tuning also starts from the nominal value.
     """

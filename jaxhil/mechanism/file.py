@@ -66,7 +66,7 @@ class LoadedMechanism(NamedTuple):
 
 
 class LoadedAnyMechanism(NamedTuple):
-    """Validated one-axis or six-axis mechanism; the fields are those of `LoadedMechanism`."""
+    """Validated one-axis or six-axis mechanism, with the fields of `LoadedMechanism`."""
 
     mechanism: AnyMechanism
     sha256: str
@@ -98,7 +98,7 @@ def load(
 def load_any(
     path_or_name: str | os.PathLike[str] | None = None, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> LoadedAnyMechanism:
-    """Load and validate a one-axis or six-axis mechanism; the arguments are those of `load`."""
+    """Load and validate a one-axis or six-axis mechanism; for the arguments, see `load`."""
     raw, sha256, label = _read_table(path_or_name)
     return LoadedAnyMechanism(
         _store_file_hash(any_from_plain_data(raw, label, overrides, unset), sha256), sha256, label
@@ -116,8 +116,8 @@ def from_plain_data(
 ) -> Mechanism:
     """Convert plain data, such as a parsed TOML or JSON table, to a validated one-axis mechanism.
 
-    `label` names the source in messages; `overrides` and `unset` are those of `load`. Raise `InputError` if
-    the data are invalid or describe a six-axis mechanism.
+    `label` names the source in messages; for `overrides` and `unset`, see `load`. Raise `InputError` if the
+    data are invalid or describe a six-axis mechanism.
     """
     if is_six_axes(raw):
         expected = f"{SCHEMA}: only init, mechanisms, simulate, tune, sweep and report support six axes"

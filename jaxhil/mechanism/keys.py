@@ -68,7 +68,6 @@ def _describe_tables(kind: inspect.Type, path: str) -> Iterator[TableDescription
 
 
 def _first_paragraph(kind: inspect.StructType) -> str:
-    """Return the first paragraph of a struct type's docstring, on one line."""
     return " ".join((kind.cls.__doc__ or "").split("\n\n")[0].split())
 
 

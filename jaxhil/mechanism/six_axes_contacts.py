@@ -106,7 +106,7 @@ def _check_shape(path: KeyPath, shape: Shape) -> None:
 
 
 def _check_pair(path: KeyPath, contact: Contact) -> None:
-    """Check that a pair of shapes is supported, and that a sphere fits into a hollow shape."""
+    """Raise `KeyProblem` unless a pair of shapes is supported, and a sphere fits into a hollow shape."""
     chaser, target = contact.chaser, contact.target
     if chaser.shape == "drogue":
         raise KeyProblem(

@@ -19,7 +19,7 @@ from jaxhil.mechanism.structs import Mechanism
 
 __all__ = ["format_mechanism_file"]
 
-MAX_LINE_LENGTH, COMMENT_COLUMN = 110, 36  # in characters; column: where comments begin
+MAX_LINE_LENGTH, COMMENT_COLUMN = 110, 36  # limit on the length, and column of the comments
 FILE_HEADER = """\
 Mechanism file of jaxhil: one docking mechanism on one rig. Numbers are in SI units, natural frequencies
 in Hz. A line such as "#key = value" is a key at its default: remove the "#" to change it."""

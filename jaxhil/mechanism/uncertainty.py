@@ -185,7 +185,7 @@ def _compute_key_values(
 def _build_quantile_function(
     uncertainty: Uncertainty, nominal: np.ndarray, allowed: Range
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the quantile function of a distribution; uniform numbers broadcast against `nominal`."""
+    """Return the quantile function of a distribution; its argument broadcasts against `nominal`."""
     if uncertainty.distribution == "normal":
         assert uncertainty.std is not None
         return _truncated_normal(nominal, uncertainty.std, allowed)

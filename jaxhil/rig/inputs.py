@@ -19,7 +19,7 @@ from jaxhil.rig.faults import (
 )
 from jaxhil.rig.types import Count, Limits, Positive
 
-TARE_ROUNDING = 1e-9  # relative; largest rounding error of the mean of 1e6 equal readings
+TARE_ROUNDING = 1e-9  # relative; limit on the rounding error of the mean of 1e6 equal readings
 
 
 class Tare:

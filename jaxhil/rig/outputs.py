@@ -157,7 +157,7 @@ class PositionGuard:
         return VELOCITY_LIMIT
 
     def retreat(self, measured: float, position: float) -> None:
-        """Move the output by one period's step towards rest out of contact.
+        """Move the output by one period's step towards a standstill out of contact.
 
         Args:
             measured: last measured position of the drives [m]; NaN if there is none.

@@ -14,9 +14,9 @@ on the tick before the contact and on the present tick, the audit checks three c
 - Status: the compensator reports that it identified the contact (`law_status`). Without `equivalent_mass`
   the audit checks only this condition. A contact with no force reading above `fading` is `not_reached`.
 
-The expected restitution depends on stiffness k and damping b of this contact. They are the least-squares fit
-of the measured force to the measured position, delayed by `alignment`, and its rate, over the whole contact.
-If the delay is wrong by delta, k changes only by a factor cos(omega delta) with any compensator. But b
+The expected restitution depends on stiffness k and damping b of this contact. They are the least-squares fit,
+during the whole contact, of the measured force to the measured position (delayed by `alignment`) and its
+rate. If the delay is wrong by delta, k changes only by a factor cos(omega delta) with any compensator. But b
 changes by -k delta, which on the rig is indistinguishable from damping. The polynomial therefore has terms in
 z only if they improve the fit (`tuning.watchdog.expectation`):
 

@@ -6,7 +6,7 @@ compensator has four steps:
 
 1. Fit a contact model to the readings (`contact_model`).
 2. Advance a reference trajectory at the time of the readings (`reference_trajectory`).
-3. Predict the trajectory over the time D to the present with the fitted model.
+3. Predict the trajectory from this time to the present, D later, with the fitted model.
 4. Control the numerical model's velocity to follow the prediction:
 
     F_c = f_p + clip(c (v_d - T f_p/2 - v_p), -limit p, (1 + limit) p - f_p)
@@ -233,8 +233,8 @@ class ImpulseLedger(Compensator):
     def _learn(self, phi: Vector, depth: float, rate: float, reading: float, noise: float) -> None:
         """Update contact model and estimated delay with one `reading` [1/s] and its noise variance `noise`.
 
-        `phi` is the regressor; `depth` [s] and `rate` [1] are the hardware's depth and speed, divided by the
-        approach speed.
+        `phi` is the regressor; `depth` [s] and `rate` [1] are the hardware's depth and speed / approach
+        speed.
         """
         model, period, floor = self._model, self._period, self._floor
         model_error = MISFIT * reading
@@ -253,8 +253,7 @@ class ImpulseLedger(Compensator):
     def _evaluate(self, peak: float, noise: float, free: bool) -> int:
         """Return the compensator's status during a contact; `free` is true if the correction is not limited.
 
-        `peak` [1/s] is the estimated peak force, divided by mass and approach speed, and `noise` [1/s^2] the
-        noise variance of a reading.
+        `peak` [1/s] is the estimated scaled peak force, and `noise` [1/s^2] the noise variance of a reading.
         """
         reference, model = self._reference, self._model
         if model.count < FEW_READINGS:

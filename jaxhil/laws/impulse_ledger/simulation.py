@@ -84,7 +84,7 @@ class LedgerContact(NamedTuple):
 
     side: Float[Array, "*batch"]  # direction of the approach, 1 or -1
     speed: Float[Array, "*batch"]  # approach speed [m/s]; 0 if unknown
-    origin: Float[Array, "*batch"]  # position of the surface, in the direction of `side` [m]
+    origin: Float[Array, "*batch"]  # position of the surface, multiplied by `side` [m]
     lag: Float[Array, "*batch"]  # lag D of hardware and force behind the model [s]
     deepest: Float[Array, "*batch"]  # largest depth of the hardware, divided by `speed` [s]
     peak: Float[Array, "*batch"]  # largest force reading so far, divided by mass and `speed` [1/s]
@@ -205,7 +205,7 @@ class ImpulseLedger(Compensator):
         )
 
     def _prior(self, gains, variance):
-        """Return prior means and variances of the contact model; `variance` [s^2] is that of the delay."""
+        """Return prior means and variances of the contact model; `variance` is the delay's variance [s^2]."""
         spreads = [gains[name] for name in rig.SPREADS]
         spreads[-1] = jnp.sqrt(spreads[-1] ** 2 + rig.USUAL_PRELOAD**2)
         return contact_model.prior(gains["prior_stiffness"], spreads, variance)

@@ -1,6 +1,6 @@
 """Ring buffer of past samples, updated in place; each lane may read a sample of a different age.
 
-The first axis of the array is that of the samples; its length is a power of two. All lanes have the same
+The first axis of the array contains the samples; its length is a power of two. All lanes have the same
 `tick`. XLA updates the array in place only if the write depends on all reads; otherwise it copies the array.
 `depend_on` creates this dependence.
 """

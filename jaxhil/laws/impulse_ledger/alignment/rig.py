@@ -24,8 +24,7 @@ class Alignment:
     def step(self, position: float, velocity: float, begins: bool) -> tuple[float, float]:
         """Return the delayed position [m] and velocity [m/s] for the `position` measured on this tick [m].
 
-        If a run `begins` on this tick, the motion before it is assumed to be uniform, with the model's
-        `velocity` [m/s].
+        If a run `begins` on this tick, assume uniform motion before it, with the model's `velocity` [m/s].
         """
         period = self._period
         if begins:

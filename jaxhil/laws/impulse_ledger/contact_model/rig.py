@@ -164,8 +164,7 @@ class ContactModel:
     def estimate_delay(self, preload: float, preload_spread: float) -> tuple[float, float]:
         """Estimate the delay d after a contact; return its mean [s] and variance [s^2].
 
-        `preload` and `preload_spread` [1/s] are the prior mean and standard deviation of the force at the
-        onset, divided by mass and approach speed.
+        `preload` and `preload_spread` [1/s] are prior mean and standard deviation of the scaled onset force.
         """
         mean = [self.mean[j] for j in DELAY_PARAMETERS]
         rows = [[self.covariance[i][j] for j in DELAY_PARAMETERS] for i in DELAY_PARAMETERS]
@@ -192,7 +191,7 @@ class ContactModel:
         share = ELASTIC_ODDS * odds / (1.0 + ELASTIC_ODDS * odds)
         difference = mean[last] - lossy[last]
         delay = lossy[last] + share * difference
-        share = odds / (1.0 + odds)  # the variance shall not depend on the prior odds
+        share = odds / (1.0 + odds)  # without the prior odds, which must not affect the variance
         variance = lossy_rows[last][last] + share * (rows[last][last] - lossy_rows[last][last])
         variance += share * (1.0 - share) * (difference * difference)
         prior_variance = self._variances[DELAY]

@@ -1,6 +1,6 @@
 """Contact model in JAX: batched version of `rig.py` in this folder.
 
-`rig.py` states model, equations, arguments and sources. The first axis of an array is that of the parameters.
+`rig.py` states model, equations, arguments and sources. The first axis of an array contains the parameters.
 """
 
 import math
@@ -118,7 +118,7 @@ def estimate_delay(
     share = rig.ELASTIC_ODDS * odds / (1 + rig.ELASTIC_ODDS * odds)
     difference = mean[last] - lossy[last]
     delay = lossy[last] + share * difference
-    share = odds / (1 + odds)  # the variance shall not depend on the prior odds
+    share = odds / (1 + odds)  # without the prior odds, which must not affect the variance
     variance = lossy_rows[last][last] + share * (rows[last][last] - lossy_rows[last][last])
     variance = variance + share * (1 - share) * difference**2
     usable = (variance > 0) & (variance < variances[DELAY])
@@ -167,7 +167,7 @@ def zero_or_positive(mean: Array, variance: Array, prior_variance: Array) -> tup
 
 
 def dot(left: Array, right: Array) -> Array:
-    """Return the sum of products over the first axis, added term by term.
+    """Return the sum of products along the first axis, added term by term.
 
     XLA fuses these additions with the loop over the lanes; a reduction would be a separate loop.
     """
@@ -175,5 +175,4 @@ def dot(left: Array, right: Array) -> Array:
 
 
 def _above(value: Array, least: float) -> Array:
-    """Return the larger of `value` and `least`."""
     return jnp.where(value > least, value, least)

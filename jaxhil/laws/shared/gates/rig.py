@@ -24,8 +24,8 @@ def share_beyond(excess: float, excess_before: float, moved: float) -> float:
 def gate(share: float, share_before: float) -> float:
     """Return the gate, from 0 to 1: the time above the threshold, weighted with a triangle of two periods.
 
-    The result is exact if the reading crossed the threshold once. The sum of the gate over all ticks is the
-    time above the threshold in periods, and the mean delay of the gate is one period.
+    The result is exact if the reading crossed the threshold once. The gates of all ticks add up to the time
+    above the threshold in periods, and the mean delay of the gate is one period.
 
     Args:
         share: share of the last period in which the reading exceeded the threshold.

@@ -3,8 +3,8 @@
 A reading is assumed to be linear between two ticks. `share_beyond` returns the share of a control period in
 which the reading exceeds a threshold. `gate` weights the shares of the last two periods with a triangle of
 two periods. It is 1 above the threshold, 0 below, and once differentiable with respect to the time of the
-crossing. If crossings are at least two periods apart, the sum of the gate over all ticks is the time above
-the threshold in periods, and the mean delay of the gate is one period. A gate that switches at the next tick
+crossing. If crossings are at least two periods apart, the gates of all ticks add up to the time above the
+threshold in periods, and the mean delay of the gate is one period. A gate that switches at the next tick
 would have an error of up to half a period, which would be a sawtooth function of every delay.
 """
 
@@ -32,8 +32,8 @@ def share_beyond(
 def gate(share: Float[Array, "*batch"], share_before: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Return the gate (s^2 + l^2)/2 + s l (2 - s - l) of the last period's share s and the previous share l.
 
-    If the reading crossed the threshold once, the gate is the integral of a triangle over the time above the
-    threshold. At the age u [periods], the triangle is u for u < 1 and 2 - u for 1 <= u < 2. After an upward
-    crossing the gate is s^2/2, then 1/2 + l - l^2/2; it increases with s and l.
+    If the reading crossed the threshold once, the gate is a triangle, integrated while the reading was above
+    the threshold. At the age u [periods], the triangle is u for u < 1 and 2 - u for 1 <= u < 2. After an
+    upward crossing the gate is s^2/2, then 1/2 + l - l^2/2; it increases with s and l.
     """
     return (share**2 + share_before**2) / 2 + share * share_before * (2 - share - share_before)

@@ -77,8 +77,7 @@ def follow(
         tick: number of this tick.
 
     Returns:
-        Command wrench about the origin of the chaser's frame C [N, N m], contact, and estimate of the tangent
-        model.
+        Command wrench about the chaser's origin C [N, N m], contact, and estimate of the tangent model.
     """
     contact_now, estimate, begins = contact
     gains, period = prepared.gains, prepared.constants.control_period

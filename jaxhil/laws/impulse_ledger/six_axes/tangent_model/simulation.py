@@ -97,7 +97,7 @@ def bridge(
         duration: time from the last reading to the present [s].
 
     Returns:
-        Impulse of the force over the duration, and force at its end.
+        Impulse of the force in this time, and force at its end.
     """
     step = duration / BRIDGE_STEPS
     start = restoring(tangent, -deeper)
