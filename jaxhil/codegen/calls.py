@@ -138,7 +138,7 @@ class CallLowering(ListLowering):
         return CExpression(value.length, INT, sign=">= 0") if length is None else self.program.literal(length)
 
     def builtin_int(self, node: ast.Call, form: str = "{}") -> CExpression:
-        """Lower a conversion to int; emit a failure for values that are not finite or exceed 2^53."""
+        """Lower a conversion to int; the C code fails for values that are not finite or exceed 2^53."""
         value = self.number(node.args[0])
         if value.type.kind == "int" or len(node.args) > 1:
             return value if len(node.args) == 1 else self._no_call(node, "round to digits")
@@ -196,7 +196,7 @@ class CallLowering(ListLowering):
     def invoke(
         self, function: Callable[..., Any], receiver: CExpression | None, node: ast.Call
     ) -> CExpression:
-        """Lower a call of a function, or of a method of `receiver`, that has source code."""
+        """Lower a call of a function with source code, or of a method of `receiver`."""
         owner = receiver.type.of if receiver else None
         types_ = self.program.parameters(function, owner)
         arguments = self._arguments(function, node)

@@ -61,10 +61,10 @@ class ExpressionLowering(Lowering):
     def lower_constant(self, node: ast.Constant) -> CExpression:
         return self.program.constant(node.value) or self.unknown(node, repr(node.value))
 
-    def unknown(self, node: ast.AST, what: str) -> CExpression:
+    def unknown(self, node: ast.AST, found: str) -> CExpression:
         """Raise SubsetError for a name or constant that has no equivalent in C."""
         expected = "a number, a bool, a list of numbers, or a class or function with source code"
-        raise self.refuse(node, what, expected)
+        raise self.refuse(node, found, expected)
 
     def lower_name(self, node: ast.Name) -> CExpression:
         if node.id in self.names:
@@ -87,7 +87,7 @@ class ExpressionLowering(Lowering):
         if "float" in (left.type.kind, right.type.kind) or op in (ast.Div, ast.Pow):
             left, right, kind = as_float(left), as_float(right), "float"
         if op in HELPER_OPERATORS:
-            return self._helped(node, left, right, kind)
+            return self._call_helper(node, left, right, kind)
         if op not in ARITHMETIC:
             raise self.refuse(node, op.__name__, "+, -, *, /, //, % or ** of numbers, &, | or ^ of ints")
         mark, rank, compute = ARITHMETIC[op]
@@ -145,7 +145,7 @@ class ExpressionLowering(Lowering):
         self.facts[value.text] = NumberFact("> 0" if value.sign else "not 0", value.reads)
         return value
 
-    def _helped(self, node: ast.BinOp, left: CExpression, right: CExpression, kind: str) -> CExpression:
+    def _call_helper(self, node: ast.BinOp, left: CExpression, right: CExpression, kind: str) -> CExpression:
         """Lower a floor division, a remainder or a power to a call of a helper function."""
         name = HELPER_OPERATORS[type(node.op)] + ("_int" if kind == "int" else "")
         if name != "power":
@@ -217,7 +217,7 @@ class ExpressionLowering(Lowering):
             writes = left.writes | right.writes
             text = f"{left.at(SUM)} {text} {right.at(SUM)}"
             parts_.append(CExpression(text, BOOL, rank, left.reads | right.reads, writes))
-        return self._together(parts_, True)
+        return self._join_conditions(parts_, True)
 
     def _identity(self, node: ast.Compare, is_same: bool, comparator: ast.expr) -> CExpression:
         value = node.left
@@ -231,7 +231,7 @@ class ExpressionLowering(Lowering):
             raise self.refuse(node, "`is`", "`is None` of a parameter `float | None`")
         return CExpression(f"{parameter.text.lstrip('*')} {'==' if is_same else '!='} NULL", BOOL, EQUALITY)
 
-    def _together(self, parts: list[CExpression], is_and: bool) -> CExpression:
+    def _join_conditions(self, parts: list[CExpression], is_and: bool) -> CExpression:
         """Join conditions with C's `&&` or `||`; evaluate constant conditions."""
         decided = [i for i, part in enumerate(parts) if part.constant is not None and part.constant != is_and]
         if decided:
@@ -253,14 +253,14 @@ class ExpressionLowering(Lowering):
                 value = self.truth(operand)
             if lines and parts:
                 flag = self.fresh("holds")
-                self.emit(f"bool {flag} = {self._together(parts, is_and).text};")
+                self.emit(f"bool {flag} = {self._join_conditions(parts, is_and).text};")
                 self.emit(f"if ({flag if is_and else f'!{flag}'}) {{", *lines, f"{flag} = {value.text};", "}")
                 parts = [CExpression(flag, BOOL)]
             else:
                 self.emit(*lines)
                 parts.append(value)
             facts |= self.facts_of(operand, is_and)
-        return self._together(parts, is_and)
+        return self._join_conditions(parts, is_and)
 
     def lower_ifexp(self, node: ast.IfExp) -> CExpression:
         test = self.truth(node.test)

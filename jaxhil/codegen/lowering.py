@@ -85,7 +85,7 @@ class Lowering:
         return value if is_simple and not value.writes else self.temporary(value, hint)
 
     def check(self, value: CExpression) -> None:
-        """If the call that computes `value` may fail, emit a test of the error flag with a return."""
+        """If the call that computes `value` may fail, emit a return from the function for this case."""
         if value.fails:
             self.fail_if("*error", None)
 
@@ -170,7 +170,7 @@ class Lowering:
         return values
 
     def hint_of(self, node: ast.expr) -> str:
-        """Return a base for the name of a local constant that holds the value of `node`."""
+        """Return a hint for the name of a local constant that contains the value of `node`."""
         called = node.func if isinstance(node, ast.Call) else node
         name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "value")
         return name.lstrip("_")
@@ -188,7 +188,7 @@ class Lowering:
             self.emit(f"/* {escape_comment(text)} */")
 
     def facts_of(self, node: ast.expr, truth: bool) -> dict[str, NumberFact]:
-        """Return the facts about numbers that follow from a condition with the value `truth`."""
+        """Return the facts about numbers that are certain if a condition has the value `truth`."""
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
             return self.facts_of(node.operand, not truth)
         if isinstance(node, ast.BoolOp) and isinstance(node.op, ast.And) == truth:

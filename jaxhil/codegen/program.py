@@ -110,8 +110,8 @@ class CProgram(StructLowering):
             type_ = type_of_annotation(hints.get(name, None if name == "return" else ...), self.bindings)
             if type_ is None and name != "self":
                 node, file = find_definition(function)
-                what = f"no type in C for {name} of {function.__name__}"
-                raise refusal(file, node.lineno, what, "an annotation such as float, int or bool")
+                found = f"no type in C for {name} of {function.__name__}"
+                raise refusal(file, node.lineno, found, "an annotation such as float, int or bool")
             if name != "self" and type_ is not None:
                 types[name] = type_
         return types

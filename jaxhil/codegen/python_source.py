@@ -65,7 +65,7 @@ def read_constant_comment(name: str, namespace: dict[str, Any]) -> str:
 
 
 def find_name_lines(function: ast.FunctionDef) -> dict[str, list[tuple[int, bool]]]:
-    """Return for each local name its occurrences: line, and whether the occurrence is an assignment."""
+    """Return the occurrences of each local name: line number, and whether it is an assignment."""
     targets = [loop.target for loop in ast.walk(function) if isinstance(loop, (ast.For, ast.comprehension))]
     loops = {id(name) for target in targets for name in ast.walk(target)}
     result: dict[str, list[tuple[int, bool]]] = {}

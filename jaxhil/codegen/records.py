@@ -110,8 +110,8 @@ class StructLowering:
         hints = typing.get_type_hints(type_.of, include_extras=True)
         hinted = type_of_annotation(hints.get(name, ...), self.bindings)
         if hinted is None:
-            what = f"{name} of {type_.of.__name__}, which has no known type"
-            raise body.refuse(node, what, "an assignment in `__init__`, or an annotation in the class")
+            found = f"{name} of {type_.of.__name__}, which has no known type"
+            raise body.refuse(node, found, "an assignment in `__init__`, or an annotation in the class")
         return self.fields.setdefault(type_.of, {}).setdefault(name, hinted)
 
     def known_field(self, body: "Lowering", owner: CExpression, target: ast.Attribute) -> CExpression | None:

@@ -1,7 +1,7 @@
 """Correlation of uncertain numbers: the ``[correlation]`` table of a mechanism file.
 
 Each key keeps its distribution; a Gaussian copula correlates the keys (Nelsen, "An Introduction to Copulas",
-2006, 2.3.6). The uniform number u_i of a key becomes
+2006, 2.3.6). The uniform random number u_i of a key becomes
 
     u'_i = Phi( sum_j L_ij Phi^-1(u_j) ),    L L^T = matrix,
 
@@ -35,7 +35,7 @@ _MIN_UNIFORM, _MAX_UNIFORM = 2.0**-54, 1.0 - 2.0**-53
 
 
 def correlate(mechanism: AnyMechanism, uniform: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Apply the mechanism's correlation to the uniform numbers (draws, columns) of every key."""
+    """Apply the mechanism's correlation to the uniform random numbers (draws, columns) of every key."""
     table = mechanism.correlation
     if table is None:
         return dict(uniform)
@@ -93,7 +93,7 @@ def remove_keys(
 def check_correlation(mechanism: AnyMechanism) -> None:
     """Check the table ``[correlation]``.
 
-    Raise `KeyProblem` unless all keys are uncertain and different, and the matrix is a correlation matrix.
+    Raise `KeyProblem` unless every key is uncertain and occurs once, and the matrix is a correlation matrix.
     """
     table = mechanism.correlation
     if table is None:

@@ -161,7 +161,7 @@ def _compute_key_values(
     uniform: np.ndarray,
     per_contact: bool,
 ) -> np.ndarray:
-    """Convert the uniform numbers (number, columns) of one key to values of the key."""
+    """Convert the uniform random numbers (number, columns) of one key to values of the key."""
     number = uniform.shape[0]
     # The quantile at 0 would be outside an open range.
     uniform = np.maximum(uniform, _MIN_UNIFORM)

@@ -45,7 +45,7 @@ def _scaled(mechanism: Mechanism, path: str) -> float:
 
 
 def _spread(mechanism: Mechanism, path: str) -> float:
-    """Return a number's `std` in the file, or the distance of its farther bound; 0 if it is certain."""
+    """Return a number's `std` in the file, or its distance from the farther bound; 0 if it is certain."""
     uncertainty = mechanism.uncertainty.get(path)
     if uncertainty is None:
         return 0.0

@@ -13,7 +13,7 @@ class PhaseLead(Compensator):
     """Compensator F_c = (1 + T_1 s)/(1 + T_2 s) F by Tustin's rule.
 
     T_1 = phase_lead + lead_filter, T_2 = lead_filter: the net lead is `phase_lead`. The rule of the
-    literature sets it to the delay of the force measurement.
+    literature sets the net lead to the delay of the force measurement.
     """
 
     __slots__ = ("_lead",)

@@ -2,7 +2,7 @@
 
 
 def share_beyond(excess: float, excess_before: float, moved: float) -> float:
-    """Return the share [1] of the last period in which a reading, linear between ticks, exceeded a threshold.
+    """Return the share [1] of the last period in which a reading exceeded a threshold, if it moved linearly.
 
     Args:
         excess: reading minus threshold, 0 if the reading does not exceed it; negative beyond a lower

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 def share_beyond(
     excess: Float[Array, "*batch"], excess_before: Float[Array, "*batch"], moved: Float[Array, "*batch"]
 ) -> Float[Array, "*batch"]:
-    """Return the share [1] of the last period in which a reading, linear between ticks, exceeded a threshold.
+    """Return the share [1] of the last period in which a reading exceeded a threshold, if it moved linearly.
 
     Args:
         excess: reading minus threshold, 0 if the reading does not exceed it; negative beyond a lower

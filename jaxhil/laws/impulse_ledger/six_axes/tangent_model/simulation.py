@@ -86,11 +86,11 @@ def restoring(tangent: Tangent, change: Array) -> Float[Array, "*batch"]:
 def bridge(
     tangent: Tangent, force: Array, least: Array, deeper: Array, velocity: Array, duration: Array
 ) -> tuple[Array, Array]:
-    """Predict the motion of a unit mass against the tangent model from the last reading to the present.
+    """Predict a unit mass's motion under the tangent model's force, from the last reading to the present.
 
     Args:
         tangent: tangent model at the depth of the last reading.
-        force: force on the reference at the last reading.
+        force: force per unit mass on the reference at the last reading.
         least: lower bound of the force, 0 or negative.
         deeper: depth of the hardware minus depth of the reference at the last reading.
         velocity: speed of the reference into the surface at the last reading.
