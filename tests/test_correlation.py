@@ -189,7 +189,7 @@ def test_unset_removes_keys_from_correlation_table():
         (
             [DELAY, SPEED],
             [[1], [0.1]],
-            "matrix[1]: found 1 entries, expected 2: the row up to the diagonal",
+            "matrix[1]: found 1 entries, expected 2, up to the diagonal",
         ),
         ([DELAY, SPEED], [[1, 0], [0, 1]], "matrix[0]: found 2 entries, expected 1"),
         ([DELAY, SPEED], [[1], [0, 0.9]], "matrix[1][1]: found 0.9, expected 1 on the diagonal"),

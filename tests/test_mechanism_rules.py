@@ -172,7 +172,7 @@ def test_contact_plane_beyond_starting_position_is_refused(side):
     assert from_plain_data(changed(changes | {"rig.contact_plane": 0.99 * plane}), "f")
     message = refusal(changed(changes | {"rig.contact_plane": plane}))
     assert ": rig.contact_plane: found " in message
-    assert "expected a number > -0.0197427 and < 0.0197427 m, the clearance less" in message
+    assert "expected a number > -0.0197427 and < 0.0197427 m, the clearance minus" in message
     assert from_plain_data(changed({"contact.clearance": math.inf, "rig.contact_plane": plane}), "f")
 
 

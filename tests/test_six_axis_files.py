@@ -122,7 +122,7 @@ LEGS = "hydraulic-hexapod"
     ("name", "changes", "reason"),
     [
         ("ring-capture", {"latch.hooks.depth": None}, "found nothing, expected a number >= 0 m, or latched"),
-        ("ring-capture", {"latch.hooks.latched": True}, "latched: found true, expected false: an approach"),
+        ("ring-capture", {"latch.hooks.latched": True}, "latched: found true, expected false, because an approach"),
         ("ring-capture", {"latch.hooks.stiffness": None}, "stiffness: found nothing, expected six numbers"),
         ("ring-capture", {"latch.hooks.stiffness_matrix": SPRING}, "stiffness_matrix as well, expected"),
         ("ring-capture",
@@ -212,7 +212,7 @@ def test_all_six_axis_values_including_lists_and_inertias_may_be_uncertain():
 
 def test_one_axis_commands_refuse_six_axis_mechanism_files():
     with pytest.raises(
-        InputError, match=r"^petals: schema: found jaxhil/mechanism/2, six axes, expected jaxhil"
+        InputError, match=r"^petals: schema: found jaxhil/mechanism/2 \(six axes\), expected jaxhil"
     ):
         load("petals")
 

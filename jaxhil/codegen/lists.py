@@ -53,7 +53,7 @@ class ListLowering(ExpressionLowering):
             type_ = self._fill(name, node, target and target.type)
         reads, self.function.reads = self.function.reads, self.function.reads | reads_before
         if target is not None and target.type.length != type_.length:
-            raise self.refuse(node, f"{type_.length} elements", f"a list of {target.type.length}")
+            raise self.refuse(node, f"a list of {type_.length} elements", f"{target.type.length} elements")
         if target is not None and self.failures == failures and not target.reads & reads:
             # Write to the target directly: no element reads the old list, and no failure leaves it
             # incomplete.
@@ -70,8 +70,8 @@ class ListLowering(ExpressionLowering):
         """Emit code that copies the elements of `source` to `target`."""
         length = source.type.length
         if length is None or target.type.length != length:
-            found = f"{length or 'any number of'} elements"
-            raise self.refuse(node, found, f"a list of {target.type.length}")
+            found = f"a list of {length or 'any number of'} elements"
+            raise self.refuse(node, found, f"{target.type.length} elements")
         with self._each(str(length)) as index:
             left, right = (CExpression(f"{value.text}[{index}]", value.type.of) for value in (target, source))
             if left.type.kind == "list":
@@ -177,7 +177,7 @@ class ListLowering(ExpressionLowering):
         if has_text(constants):
             return LoopRange("0", "", lambda index: [], len(constants), constants=constants)
         if value.type.kind != "list":
-            raise self.refuse(node, f"a loop through a {value.type.kind}", "a list, range, zip or enumerate")
+            raise self.refuse(node, f"a loop over a {value.type.kind}", "a list, range, zip or enumerate")
         count = value.type.length
         stop = str(count or value.length)
         return LoopRange("0", stop, lambda i: [self.at(value, i)], count, constants=constants)

@@ -113,7 +113,7 @@ def check_correlation(mechanism: AnyMechanism) -> None:
     for index, row in enumerate(table.matrix):
         path = ("correlation", "matrix", index)
         if len(row) != index + 1:
-            expected = f"{index + 1}: the row up to the diagonal"
+            expected = f"{index + 1}, up to the diagonal"
             raise KeyProblem(path, f"{len(row)} entries", expected)
         if row[-1] != 1.0:
             raise KeyProblem((*path, index), format_value(row[-1]), "1 on the diagonal")

@@ -122,7 +122,7 @@ def from_plain_data(
     if is_six_axes(raw):
         expected = f"{SCHEMA}: only init, mechanisms, simulate, tune, sweep and report support six axes"
         raise InputError(
-            f"{to_one_line(label)}: schema: found {SIX_AXIS_SCHEMA}, six axes, expected {expected}"
+            f"{to_one_line(label)}: schema: found {SIX_AXIS_SCHEMA} (six axes), expected {expected}"
         )
     mechanism = any_from_plain_data(raw, label, overrides, unset)
     assert isinstance(mechanism, Mechanism)

@@ -187,7 +187,7 @@ def check_simulator_model(simulator: Any) -> None:
             expected = f"nothing ({simulator.model} does not use it: unset it)"
             raise KeyProblem((*path, key), format_value(value), expected)
     if simulator.model == "first_order" and not np.all(simulator.time_constant):
-        raise KeyProblem((*path, "time_constant"), "0.0", "a number > 0 (first_order), or ideal")
+        raise KeyProblem((*path, "time_constant"), "0.0", 'a number > 0, or model = "ideal"')
     if simulator.model == "third_order" and simulator.coefficients is not None:
         if not is_hurwitz([*reversed(simulator.coefficients), 1.0]):
             expected = "a stable motion simulator: a1 a2 > a3"
@@ -201,7 +201,7 @@ def _check_transfer_function(numerator: list[float], denominator: list[float]) -
     path = ("rig", "simulator")
     if len(numerator) >= len(denominator):
         found = f"degree {len(numerator) - 1}, and degree {len(denominator) - 1} of the denominator"
-        expected = "a degree below that of the denominator (a strictly proper transfer function)"
+        expected = "a lower degree than the denominator (a strictly proper transfer function)"
         raise KeyProblem((*path, "numerator"), found, expected)
     if not is_hurwitz(denominator):
         expected = "a stable motion simulator: every pole in the open left half plane"
@@ -220,7 +220,7 @@ def _check_hold(mechanism: Mechanism) -> None:
     law, arguments = find_contact_law(contact.law), (("contact",), contact, mechanism.uncertainty)
     dissipates = (law.damped and is_damped(*arguments)) or is_damped(*arguments, "friction")
     if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and dissipates:
-        expected = '"linear" for an ideal simulator with contact damping (or another model)'
+        expected = '"linear", because the model ideal with "zoh" does not support contact damping'
         raise KeyProblem(("rig", "command_hold"), format_value(rig.command_hold), expected)
 
 
@@ -269,7 +269,7 @@ def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
     limit = clearance - start
     for plane in (float(extreme("rig.contact_plane", end)) for end in (0, 1)):
         if not abs(plane) < limit:
-            expected = f"a number > {-limit:g} and < {limit:g} m, the clearance less the start's distance"
+            expected = f"a number > {-limit:g} and < {limit:g} m, the clearance minus the start's distance"
             raise KeyProblem(("rig", "contact_plane"), format_value(plane), expected)
 
 

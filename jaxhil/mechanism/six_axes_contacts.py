@@ -58,7 +58,7 @@ def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
     """Raise `KeyProblem` unless a latch has exactly one stiffness, and conditions for catching."""
     path: KeyPath = ("latch", name)
     if latch.latched and mechanism.approach is not None:
-        expected = "false: an approach starts without a latch that holds (use [start] instead)"
+        expected = "false, because an approach begins unlatched (use [start] instead)"
         raise KeyProblem((*path, "latched"), "true", expected)
     for key in ("depth", "angle"):
         if not latch.latched and getattr(latch, key) is None:

@@ -211,7 +211,7 @@ def _check_hold(mechanism: SixAxisMechanism) -> None:
     dissipates = any(contact.damping or contact.friction or contact.dry_friction
                      for contact in mechanism.contact.values())  # fmt: skip
     if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and dissipates:
-        expected = '"linear" for an ideal simulator with contact damping or friction (or another model)'
+        expected = '"linear", because the model ideal with "zoh" supports neither damping nor friction'
         raise KeyProblem(("rig", "command_hold"), format_value(rig.command_hold), expected)
 
 

@@ -58,7 +58,7 @@ def draw(mechanism: AnyMechanism, number: int, seed: int, first: int = 0) -> dic
     function of the key's distribution converts. Raise ValueError for a negative argument.
     """
     if number < 0 or seed < 0 or first < 0:
-        raise ValueError(f"number, seed, first: found {number}, {seed}, {first}, expected >= 0")
+        raise ValueError(f"number, seed, first: found {number}, {seed}, {first}, expected integers >= 0")
     columns = count_dimensions(mechanism)
     uniform = {path: _draw_uniform(path, count, number, seed, first) for path, count in columns.items()}
     return _compute_values(mechanism, correlate(mechanism, uniform))

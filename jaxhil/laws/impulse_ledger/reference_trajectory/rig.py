@@ -53,7 +53,7 @@ class ReferenceTrajectory:
         self.begin(0.0, [0.0] * PARAMETERS)
 
     def begin(self, depth: float, theta: Vector) -> None:
-        """Start the trajectory at the onset with `depth`, divided by the approach speed [s], and the speed 1."""
+        """Start the trajectory at the onset, with the approach speed and `depth`/(approach speed) [s]."""
         self.depth = depth
         self.speed = 1.0
         self.force = 0.0
