@@ -122,7 +122,7 @@ LEGS = "hydraulic-hexapod"
     ("name", "changes", "reason"),
     [
         ("ring-capture", {"latch.hooks.depth": None}, "found nothing, expected a number >= 0 m, or latched"),
-        ("ring-capture", {"latch.hooks.latched": True}, "latched: found true, expected false, because an approach"),
+        ("ring-capture", {"latch.hooks.latched": True}, "latched: found true, expected false, because an"),
         ("ring-capture", {"latch.hooks.stiffness": None}, "stiffness: found nothing, expected six numbers"),
         ("ring-capture", {"latch.hooks.stiffness_matrix": SPRING}, "stiffness_matrix as well, expected"),
         ("ring-capture",

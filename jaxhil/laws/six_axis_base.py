@@ -1,4 +1,4 @@
-"""Interface of compensators in six axes in JAX: a wrench before the integration, a pose command after it.
+"""Interface of six-axis compensators in JAX: a wrench before the model's integration, a pose after it.
 
 As on one axis (`jaxhil.laws.simulation_base`), a compensator object does not change. Its methods take and
 return the state, a pytree of arrays whose last axes are the lanes. Gains are a dict of arrays, scalar or of
