@@ -1,9 +1,10 @@
 """Bootstrap over contacts: repeated fits of the contact law to contacts drawn with replacement (Efron 1979).
 
-The likelihood accounts only for the noise of the readings. If the contacts differ by more than this noise,
-the intervals of the likelihood are too narrow. The scatter of the bootstrap fits includes all differences
-between contacts. Contacts are drawn separately for each entry of the contact lists. The fits are independent
-of each other, so that the workers of a cluster can compute them. Finished chunks of fits are checkpointed.
+The likelihood of a single fit accounts only for the noise of the readings. If the contacts differ by more
+than this noise, the intervals of such a fit are too narrow. The scatter of the bootstrap fits includes all
+differences between contacts. Contacts are drawn separately for each entry of the mechanism's contact lists.
+The fits are independent of each other, so that the workers of a cluster can compute them. Finished chunks of
+fits are saved as checkpoints.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from tuning.identification.force_readings import ForceReadings
 
 MIN_CONTACTS_FOR_BOOTSTRAP = 6  # minimum number of contacts for a bootstrap
 FITS_PER_CHUNK = 5  # number of fits that one worker computes and saves as one checkpoint
-# Ratio of the bootstrap's standard deviation to the posterior's; above it, the bootstrap's intervals are
-# used.
+# Maximum ratio of the bootstrap's standard deviation to the posterior's; above it, the bootstrap's intervals
+# are used.
 MIN_STD_RATIO = 1.5
 
 
@@ -37,7 +38,7 @@ def bootstrap(
     checkpoints: Checkpoints = NO_CHECKPOINTS,
     say: Callable[[str], None] = lambda text: None,
 ) -> ContactFit:
-    """Widen the posterior draws of a fit if bootstrap fits scatter much more than the posterior.
+    """Widen the posterior draws of a fit if the bootstrap fits scatter much more than these draws.
 
     Args:
         fit: Fit to all contacts.
@@ -48,7 +49,8 @@ def bootstrap(
         say: Function that receives a progress message after every chunk except the last one.
 
     Returns:
-        The fit with the same draws or wider ones; its field `resampled` summarizes the bootstrap in words.
+        The fit, with wider draws if the bootstrap requires it; its field `resampled` summarises the bootstrap
+        in words.
     """
     posterior, readings = fit.posterior, fit.readings
     lanes = readings.force.shape[1]
@@ -84,7 +86,7 @@ def bootstrap(
 def _factorise_regularised(covariance: np.ndarray) -> np.ndarray:
     """Return the Cholesky factor of a covariance matrix after a small increase of its diagonal.
 
-    The matrix is singular if there are fewer bootstrap fits than parameters.
+    The increase is needed if the matrix is singular: if there are fewer bootstrap fits than parameters.
     """
     return np.linalg.cholesky(covariance + 1e-9 * np.max(np.diag(covariance)) * np.eye(len(covariance)))
 
@@ -131,10 +133,10 @@ def fit_resampled_contacts(
     seed: int,
     near: tuple[float, float],
 ) -> np.ndarray:
-    """Fit the law to sets of contacts and return the posterior means, shape (fits, parameters).
+    """Fit the law to several sets of contacts and return the posterior means, shape (fits, parameters).
 
     Args:
-        drawn: For each fit, the indices of its contacts; an index may repeat.
+        drawn: Indices of the contacts in each fit; an index may occur several times.
         problem: Problem with the motion and the law of all contacts.
         readings: Force readings of all contacts.
         seed: Seed of the random numbers.
@@ -150,11 +152,11 @@ def fit_resampled_contacts(
 
 
 def _find_contact_entries(fit: ContactFit) -> np.ndarray:
-    """Return the index into the contact lists for each contact."""
+    """Return the index of each contact into the mechanism's contact lists."""
     return np.max(fit.readings.entry, axis=0)
 
 
 def _describe_problem(problem: ContactProblem) -> Any:
-    """Return the data that define the problem, without its readings."""
+    """Return the data that define the problem, except its readings."""
     law = problem.law
     return law.name, law.names, law.pulls, law.shape, problem.plane, vars(problem.motion)

@@ -1,10 +1,11 @@
 """Drift between a separate force clock and the drives' clock, estimated from contacts at different times.
 
-A constant offset between the two clocks cannot be distinguished from a delay of the force sensor. A drift
-can: the time from the motion to the force changes from contact to contact. After some hours, the clocks
-differ by more than `MAX_FORCE_DELAY`, the longest delay that a fit searches. The drift is therefore estimated
-in two steps. The first step uses, for each contact, the time from the deepest point to the mean time of the
-force. The second step uses the residuals of a contact law that is fitted to all contacts.
+A constant offset between the two clocks cannot be distinguished from a delay of the force sensor. A drift can
+be distinguished from it, because a drift changes the time from the motion to the force from contact to
+contact. After some hours, the clocks differ by more than `MAX_FORCE_DELAY`, the longest delay in the search
+range of a fit. The drift is therefore estimated in two steps. The first step uses the time from the deepest
+point of each contact to the mean time of its force. The second step uses the residuals of a contact law that
+is fitted to all contacts.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from tuning.identification.rational import MotionModel
 from tuning.identification.records import CampaignTiming, LoggedRun
 
 MIN_CONTACTS_FOR_DRIFT = 3  # contacts
-FORCE_DETECTION_SIGMAS = 5.0  # standard deviations of the noise; a larger force indicates contact
+FORCE_DETECTION_SIGMAS = 5.0  # minimum force in contact, in standard deviations of the noise
 # s; the data are shifted to this delay, the middle of the search range, because the clock offset is
 # arbitrary.
 CENTRAL_DELAY = 0.5 * MAX_FORCE_DELAY
 DELAY_DIFFERENCE_STEP = 2.5e-4  # s, step of the finite differences with respect to the delay
-DRIFT_ITERATIONS = 6  # alternating estimates of the contact law and of the drift
-DRIFT_TOLERANCE = 1e-6  # s, change of the delay over all contacts; a smaller change ends the iteration
+DRIFT_ITERATIONS = 6  # maximum number of alternating estimates of the contact law and of the drift
+DRIFT_TOLERANCE = 1e-6  # s; the iteration ends if the delays of all contacts change by less
 SEPARATE_CLOCK_MESSAGE = (
     'timing.clock: found "separate", expected "stamps" or "index" to compare logs with a mechanism'
 )
@@ -60,7 +61,7 @@ def estimate_clock_drift(
     law: Law | str | None,
     plane: float | None,
 ) -> ClockDrift:
-    """Estimate the drift of the force clock from the trend of the force delay over all contacts.
+    """Estimate the drift of the force clock from the change of the force delay between the contacts.
 
     Args:
         runs: Runs in contact.
@@ -71,8 +72,8 @@ def estimate_clock_drift(
         plane: Position of the surface [m], or None to estimate it.
 
     Raises:
-        InputError: If there are too few contacts, if all contacts are at one time, or if the forces do not
-            follow the motion.
+        InputError: If there are too few contacts, if all contacts have the same time stamp, or if the forces
+            do not follow the motion.
     """
     period, longest = timing.control_period, MAX_FORCE_DELAY + timing.control_period
     time = np.array([run.begin + period * run.tick[len(run.tick) // 2] for run in runs])
@@ -130,7 +131,7 @@ def _estimate_run_delays(
 def estimate_residual_delays(
     problem: ContactProblem, delay: float, plane: float, coefficients: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return each run's force delay in excess of `delay` [s], and the variance of this estimate [s^2].
+    """Return the force delay of each run minus `delay` [s], and the variance of this estimate [s^2].
 
     Readings near the onset of contact are not used, because the force of a damped contact jumps there.
 
@@ -155,7 +156,7 @@ def estimate_residual_delays(
 
 
 def fit_weighted_slope(values: np.ndarray, weight: np.ndarray, position: np.ndarray) -> tuple[float, float]:
-    """Return the weighted least-squares slope of `values` over `position`, and its standard error.
+    """Return the weighted least-squares slope of `values` against `position`, and its standard error.
 
     The standard error is inflated if the reduced chi-square exceeds 1.
     """

@@ -1,12 +1,12 @@
-"""Combination of the logs with further knowledge: fixed parameters and the normal marginals of a prior.
+"""Combination of the logs with further knowledge: fixed parameters, and a prior's normal distributions.
 
 The logs give draws theta_i of the parameters, with the covariance C. Assume that H theta is also known to be
 normal with mean p and covariance P. This knowledge moves each draw theta_i by
 
     K (p_i - H theta_i),    K = C H^T (H C H^T + P)^-1,
 
-where p_i is drawn from the normal distribution of H theta (Matheron's rule, a Kalman update of each draw).
-The result is exact for normal draws. A fixed parameter has P = 0.
+where p_i is drawn from this known normal distribution (Matheron's rule, a Kalman update of each draw). The
+result is exact for normal draws. A fixed parameter has P = 0.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from tuning.identification import mechanism_models
 
 DrawsByKey = dict[str, np.ndarray]
 
-CONTRADICTION_SIGMAS = 4.0  # standard deviations; a fixed value further from the logs causes a note
+CONTRADICTION_SIGMAS = 4.0  # maximum distance of a fixed value from the logs without a note, in std
 FORCE_DELAY_KEY, SIMULATOR_PREFIX = "rig.force_sensor.delay", "rig.simulator."
 
 
 def split_lists(fixed: Mapping[str, Any], keys: Sequence[str]) -> dict[str, float]:
-    """Return the fixed parameters with one key per list entry.
+    """Return the values of the fixed parameters, with one key per list entry.
 
-    A scalar value for a list applies to each entry of the list.
+    A scalar value of a list parameter applies to every entry of the list.
 
     Args:
-        fixed: Fixed values by key; the value of a list may be a list or a scalar.
+        fixed: Fixed values by key; the value of a list parameter may be a list or a scalar.
         keys: Keys of the parameters that the logs determine.
 
     Raises:
@@ -81,20 +81,20 @@ def condition_on_fixed(draws: DrawsByKey, fixed: Mapping[str, float]) -> tuple[D
 
 
 def condition_on_prior(draws: DrawsByKey, prior: Mechanism, frequency: float, seed: int = 0) -> DrawsByKey:
-    """Combine posterior draws with the normal marginals of a prior and their correlation.
+    """Combine posterior draws with a prior's normal distributions and their correlation.
 
     The result also contains parameters that only the prior determines: those of the simulator, and those in
     the prior's `[correlation]`.
 
     Args:
         draws: Draws from the logs, by key.
-        prior: Mechanism with `[uncertainty]`.
+        prior: Mechanism with the table `[uncertainty]`.
         frequency: Contact frequency [Hz]. An error of the simulator's phase delay at this frequency changes
             the estimated force delay.
         seed: Seed of the random numbers.
 
     Raises:
-        InputError: If the prior has a normal marginal for none of the parameters that the logs determine.
+        InputError: If the prior has no normal distribution for any parameter that the logs determine.
     """
     marginals = _draw_normal_marginals(prior, len(next(iter(draws.values()), ())), seed)
     common = [key for key in marginals if key in draws]
@@ -122,7 +122,8 @@ def condition_on_prior(draws: DrawsByKey, prior: Mechanism, frequency: float, se
     select[np.arange(len(common)), [keys.index(key) for key in common]] = 1.0
     values = np.array([marginals[key] for key in common])
     if prior_only:
-        # Condition the marginals on the parameters that only the prior determines.
+        # The prior correlates these parameters with others that only the prior determines: use the residuals
+        # of a linear regression on the others.
         prior_values = np.array([marginals[key] for key in prior_only])
         covariance, split = np.cov(values, prior_values), len(common)
         follow = covariance[:split, split:] @ _invert_scaled(covariance[split:, split:])
@@ -144,7 +145,7 @@ def _update_draws(
         draws: Draws theta_i, shape (parameters, draws).
         select: Matrix H, shape (rows, parameters).
         values: Draws p_i, shape (rows, draws).
-        exact: Whether P is 0; otherwise P is the covariance of `values`.
+        exact: True if P is 0; False if P is the covariance of `values`.
     """
     covariance = np.atleast_2d(np.cov(draws))
     across = covariance @ select.T
@@ -153,7 +154,7 @@ def _update_draws(
 
 
 def _invert_scaled(covariance: np.ndarray) -> np.ndarray:
-    """Return the pseudoinverse of a covariance matrix whose parameters have different units."""
+    """Return the pseudoinverse of a covariance matrix of parameters with different units."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     return np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-12, hermitian=True) / np.outer(
         scale, scale
@@ -161,7 +162,7 @@ def _invert_scaled(covariance: np.ndarray) -> np.ndarray:
 
 
 def _draw_normal_marginals(prior: Mechanism, number: int, seed: int) -> DrawsByKey:
-    """Draw the prior's parameters that have a normal marginal, with one key per list entry."""
+    """Draw the parameters to which the prior gives a normal distribution; return one key per list entry."""
     normal = {key for key, entry in prior.uncertainty.items() if entry.distribution == "normal"}
     result: DrawsByKey = {}
     for key, values in draw(prior, number, seed).items():
@@ -172,7 +173,7 @@ def _draw_normal_marginals(prior: Mechanism, number: int, seed: int) -> DrawsByK
 
 
 def _differentiate_lag(prior: Mechanism, keys: Sequence[str], frequency: float) -> dict[str, float]:
-    """Return the derivatives of the motion's phase delay [s] with respect to the simulator parameters.
+    """Return the derivatives of the motion simulator's phase delay [s] with respect to its parameters.
 
     The phase delay is evaluated at `frequency` [Hz].
     """

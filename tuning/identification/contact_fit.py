@@ -1,10 +1,10 @@
-"""Fit of the contact to runs in contact: contact law, its coefficients, surface position and force delay.
+"""Fit of the contact model to runs in contact: contact law, coefficients, surface position and force delay.
 
-A dead zone of the force sensor hides small forces. Therefore only readings are used whose predicted force is
-well above the dead zone; the difference between predicted and measured force is the dead zone. A surface that
-is further away reduces the force like a dead zone. The fit can distinguish the two only if the dead zone is
-known: specified, or estimated from noise at rest that exceeds it. Otherwise the surface must be specified, or
-it is assumed at 0.
+A dead zone of the force sensor hides small forces. A reading is therefore used only if its predicted force is
+well above the dead zone. In such readings, the measured force is smaller than the predicted force by the dead
+zone. A surface that is further away reduces the force like a dead zone. The fit can distinguish the two only
+if the dead zone is known: specified, or estimated from noise at rest that exceeds it. If neither is the case
+and the user does not specify the surface position, it is assumed to be 0.
 """
 
 from __future__ import annotations
@@ -34,25 +34,26 @@ from tuning.identification.sensor_lag import (
     estimate_sensor_lag,
 )
 
-SETTLING_TIME = 0.5  # s, settling time of a motion simulator
+SETTLING_TIME = 0.5  # s, settling time that is assumed for a motion simulator
 SEGMENT_LENGTH = 1.0  # s, length of the segments of a long run
 MEMORY_TIME_CONSTANTS = 10.0  # time constants of the motion simulator; older commands have no effect
-SPEED_ROWS = 5  # rows between two positions that give a speed
-MAX_SPEED_CHANGE = 0.01  # largest relative change of the speed in uniform motion
+SPEED_ROWS = 5  # a speed is the difference of two positions that are this many rows apart
+MAX_SPEED_CHANGE = 0.01  # maximum relative change of the speed in a motion that counts as uniform
 SPECIFIED_DEAD_ZONE_STD = 1e-3  # relative standard deviation of a specified dead zone
 UNKNOWN_SURFACE_STD = 5e-5  # m; standard deviation of a surface position that is assumed to be 0
-DEAD_ZONE_MARGIN = 4.0  # standard deviations above the dead zone; readings of smaller forces are not used
-COARSE_GRID_SIZE = 21, 5  # numbers of delays and surface positions in the grid of bootstrap and test fits
+DEAD_ZONE_MARGIN = 4.0  # minimum distance of a used force above the dead zone, in standard deviations
+COARSE_GRID_SIZE = 21, 5  # numbers of delays and of surface positions in the grid of bootstrap and test fits
 ASSUMED_NOISE_SHARE = 0.01  # standard deviation of unknown noise, relative to the largest force
-MIN_NOISE_SHARE = 1e-6  # minimum noise relative to the largest force; simulated logs may have none
-MIN_DEAD_ZONE_SIGMAS = 3.0  # standard deviations; a dead zone this far above 0 is significant
-MAX_REDUCED_CHI_SQUARE = 1.3  # chi-squared per degree of freedom; above it, the intervals are widened
+MIN_NOISE_SHARE = 1e-6  # minimum noise as a share of the largest force; simulated logs may be noise-free
+MIN_DEAD_ZONE_SIGMAS = 3.0  # minimum size of a significant dead zone, in standard deviations
+MAX_REDUCED_CHI_SQUARE = 1.3  # maximum chi-squared per degree of freedom without wider intervals
 
 
 def split_long_run(run: LoggedRun, period: float) -> list[LoggedRun]:
     """Divide a long run into segments of about one second, so that all runs have a similar length.
 
-    Each segment begins with additional rows in which the motion simulator settles; fits do not use them.
+    Each segment begins with additional rows, in which the motion simulator settles. Fits do not use these
+    rows.
     """
     settling, length = round(SETTLING_TIME / period), round(SEGMENT_LENGTH / period)
     if len(run.tick) <= settling + 2 * length:
@@ -70,7 +71,7 @@ def split_long_run(run: LoggedRun, period: float) -> list[LoggedRun]:
 
 
 def exclude_rows_after_gaps(runs: Sequence[LoggedRun], model: MotionModel, period: float) -> list[LoggedRun]:
-    """Mark the rows after a gap in the log as not valid if lost commands affect their motion.
+    """Mark the rows after a gap in the log as not valid if the lost commands affect the motion in these rows.
 
     The lost commands affect the motion for ten time constants of the motion simulator plus all delays. If a
     run begins in uniform motion, the motion is assumed to have been uniform during the gap, and all rows
@@ -91,7 +92,7 @@ def exclude_rows_after_gaps(runs: Sequence[LoggedRun], model: MotionModel, perio
 
 
 def _is_uniform_motion(position: np.ndarray) -> bool:
-    """Return whether the speed is constant in the first rows."""
+    """Return whether the speed is constant in the first rows of a run."""
     first, second = np.diff(position[: 2 * SPEED_ROWS + 1 : SPEED_ROWS])
     return bool(abs(second - first) <= MAX_SPEED_CHANGE * abs(first))
 
@@ -108,7 +109,7 @@ class ContactFit:
     freedom: int  # degrees of freedom: number of readings minus number of parameters
     noise_error: float  # relative standard error of the noise level that weights the residuals
     dead_zone: bool  # whether the sensor has a dead zone; the parameter "bias" is then minus the dead zone
-    drift: ClockDrift | None = None  # drift of a separate force clock; the delay then includes its offset
+    drift: ClockDrift | None = None  # drift of a separate force clock, whose offset is part of the delay
     has_specified_surface: bool = False  # whether the user specified the surface position
     resampled: str = ""  # summary of the bootstrap in words; empty without a bootstrap
 
@@ -122,7 +123,7 @@ class ContactFit:
         return self.posterior.best[2].misfit / self.freedom
 
     def draws(self) -> np.ndarray:
-        """Return the posterior draws, shape (draws, parameters), widened if chi-squared exceeds the noise."""
+        """Return posterior draws, shape (draws, parameters), widened if the residuals exceed the noise."""
         values = self.posterior.draws
         if self.left <= MAX_REDUCED_CHI_SQUARE or self.resampled:
             return values
@@ -146,10 +147,12 @@ def fit_contact(
         model: Model of the motion simulator.
         timing: Timing of commands and readings.
         noise: Noise of the force sensor at rest, or None if it is unknown.
-        law: Contact law, the name of a law whose shape is fitted too, or None to choose among all laws.
+        law: Contact law; or the name of a law, whose shape parameters are then fitted too; or None to choose
+            the law.
         plane: Position of the surface [m], or None to estimate it.
         seed: Seed of the random numbers.
-        dead_zone: Specified dead zone [N], or 0. It is used only if readings at rest show a dead zone.
+        dead_zone: Dead zone [N] that the user specified, or 0. It is ignored if readings at rest show no dead
+            zone.
     """
     drift = _estimate_clock_drift(runs, model, timing, noise, law, plane) if timing.two_clocks else None
     motion = MotionResponse(
@@ -167,11 +170,12 @@ def fit_contact(
     problem, posterior = _fit_laws(motion, readings, laws, plane, near, noise_is_hidden, seed)
     law = problem.law
     if noise_is_hidden and not _has_dead_zone(posterior) and not _is_silent_outside(runs, problem, posterior):
-        # Without a dead zone, readings of 0 at rest do not show the noise: estimate it from the contacts.
+        # There is no dead zone, so readings of 0 at rest do not show the noise: estimate it from the
+        # contacts.
         return fit_contact(runs, model, timing, None, law, plane_option, seed)
     if noise_is_hidden and readings.bias is None and plane_option is None:
-        # The surface is only assumed, so readings near onset and release must not determine delay and
-        # damping.
+        # The surface position is only an assumption, so readings near onset and release must not determine
+        # delay and damping.
         readings = _drop_readings_near_edges(problem, posterior)
         problem, posterior = _fit_laws(motion, readings, (law,), plane, None, noise_is_hidden, seed)
         posterior = _add_surface_uncertainty(posterior, seed)
@@ -190,9 +194,9 @@ def _prepare_readings(
     plane: float | None,
     dead_zone: float,
 ) -> tuple[ForceReadings, float | None]:
-    """Return the readings with their noise and the prior of the bias, and the surface position for the fit.
+    """Return the readings with their noise and bias prior, and the surface position [m] for the fit.
 
-    The surface position [m] is None if it is to be estimated.
+    The surface position is None if the fit must estimate it.
     """
     prior, noise_is_hidden = None, noise is not None and noise.silent
     if noise is not None and noise_is_hidden:
@@ -204,7 +208,7 @@ def _prepare_readings(
         plane = plane if prior else usual
     else:
         readings = _make_readings(runs, noise)
-    # With a dead zone, the parameter "bias" represents the force that the dead zone removes.
+    # If there is a dead zone, the parameter "bias" represents the force that the dead zone removes.
     bias = (
         find_bias_prior(runs, motion, noise, plane)
         if not noise_is_hidden
@@ -222,7 +226,7 @@ def _fit_laws(
     noise_is_hidden: bool,
     seed: int,
 ) -> tuple[ContactProblem, Posterior]:
-    """Fit the law with the largest evidence; average its posterior over models with and without damping.
+    """Fit the candidate laws; average the best posterior over models with and without damping.
 
     Args:
         motion: Motion of the mechanism in all runs.
@@ -236,7 +240,7 @@ def _fit_laws(
     Returns:
         The contact problem of the chosen law and the posterior.
     """
-    # A sensor lag that is not modelled looks like a contact that pulls, so each law is fitted with a lag.
+    # An unmodelled sensor lag looks like a contact that pulls, so each law is fitted together with a lag.
     fits = [(_fit_law(motion, readings, law, plane, near, noise_is_hidden, seed), law) for law in laws]
     (problem, posterior, lag, evidence), law = max(reversed(fits), key=lambda fit: fit[0][3])
     if lag is not None:
@@ -251,7 +255,7 @@ def _fit_laws(
 
 
 def _drop_readings_near_edges(problem: ContactProblem, posterior: Posterior) -> ForceReadings:
-    """Exclude readings that are out of contact for a surface position within two standard deviations."""
+    """Exclude readings that would be out of contact with a surface two standard deviations further away."""
     position, _ = problem.motion.at(posterior.best[0])
     readings = problem.readings
     return replace(
@@ -262,8 +266,8 @@ def _drop_readings_near_edges(problem: ContactProblem, posterior: Posterior) -> 
 def _add_surface_uncertainty(posterior: Posterior, seed: int) -> Posterior:
     """Add the uncertainty of an assumed surface position to the posterior.
 
-    A surface that is further away reduces the force like a dead zone. The readings determine only the sum of
-    both effects.
+    A surface that is further away reduces the force like a dead zone does. The readings determine only the
+    sum of both effects.
     """
     names, draws = posterior.names, posterior.draws.copy()
     # The first coefficient of every law is its stiffness at the surface.
@@ -286,7 +290,7 @@ def _fit_law(
     noise_is_hidden: bool,
     seed: int,
 ) -> tuple[ContactProblem, Posterior, SensorLag | None, float]:
-    """Fit one law, with a sensor lag unless a dead zone hides the onset; return the log evidence last."""
+    """Fit one law, with a sensor lag unless a dead zone hides the onset of contact."""
     problem = summarise_deep_lanes(ContactProblem(motion, readings, law, plane), near)
     posterior = compute_posterior(problem, seed, near)
     lag = None if noise_is_hidden else estimate_sensor_lag(problem, posterior, seed)
@@ -312,7 +316,7 @@ def _estimate_clock_drift(
     law: Law | str | None,
     plane,
 ) -> ClockDrift:
-    """Estimate the drift of the force clock; if the noise is unknown, assume a share of the largest force."""
+    """Estimate the drift of the force clock; assume unknown noise to be a share of the largest force."""
     if noise is None or noise.silent:
         readings = ForceReadings.of(runs, 1.0)
         readings = replace(readings, std=ASSUMED_NOISE_SHARE * float(np.abs(readings.force).max()))
@@ -322,15 +326,15 @@ def _estimate_clock_drift(
 
 
 def _has_dead_zone(posterior: Posterior) -> bool:
-    """Return whether the measured force is significantly smaller than predicted, as with a dead zone."""
+    """Return whether a dead zone makes the measured force significantly smaller than predicted."""
     missing_force = -posterior.draws[:, posterior.names.index("bias")]
     return bool(missing_force.mean() > MIN_DEAD_ZONE_SIGMAS * missing_force.std())
 
 
 def _is_silent_outside(runs: Sequence[LoggedRun], problem: ContactProblem, posterior: Posterior) -> bool:
-    """Return whether most readings before and after the contacts are exactly 0, as with a dead zone.
+    """Return whether most readings before and after the contacts are exactly 0, as a dead zone makes them.
 
-    A fit does not show a dead zone if the surface is nearer than assumed, because the greater penetration
+    A fit alone may not show a dead zone: if the surface is nearer than assumed, the greater penetration
     replaces the force that the dead zone removes.
     """
     delay, plane, _ = posterior.best
@@ -349,16 +353,16 @@ def _estimate_noise_from_contact(
 ) -> ForceReadings:
     """Estimate the noise of the force readings from the residuals of a Kelvin-Voigt fit.
 
-    With a dead zone, only readings of forces well above the dead zone are used.
+    If there is a dead zone, only readings of forces well above it are used.
 
     Args:
         motion: Motion of the mechanism in all runs.
         readings: Force readings.
         plane: Position of the surface [m], or None to estimate it.
-        at_rest: Noise at rest [N] if it exceeds the dead zone, or 0.
+        at_rest: Noise at rest [N]; 0 if it is unknown or a dead zone hides it.
 
     Returns:
-        The readings with their noise level and flags of the readings that fits use.
+        The readings, with their noise level and with flags that mark the readings for fits.
     """
     counts = readings.counts
     if readings.threshold:
@@ -383,7 +387,7 @@ def _estimate_noise_from_contact(
 
 
 def estimate_contact_frequency(contact: ContactFit, mass: float) -> float:
-    """Return the contact frequency [Hz] of the stiffest contact, from the secant stiffness at full depth."""
+    """Return the contact frequency [Hz] of the stiffest contact, from its secant stiffness at full depth."""
     delay, plane, coefficient_fit = contact.posterior.best
     position, _ = contact.problem.motion.at(delay)
     depth = np.where(contact.readings.counts, position - plane, 0.0)
@@ -392,7 +396,7 @@ def estimate_contact_frequency(contact: ContactFit, mass: float) -> float:
     )
     deepest, lanes = np.argmax(depth, axis=0), np.arange(depth.shape[1])
     peak = force[deepest, lanes]
-    # In a contact with a very small force, noise dominates the secant stiffness.
+    # If the force of a contact is very small, noise dominates its secant stiffness.
     secant = np.where(peak > 0.2 * peak.max(), peak / np.maximum(depth[deepest, lanes], 1e-9), 0.0)
     return float(np.sqrt(max(secant.max(), 1e-9) / mass) / (2.0 * np.pi))
 
@@ -404,9 +408,9 @@ def compute_force_lag(contact: ContactFit, model: MotionModel, frequency: float)
 
 
 def refit_without(fit: ContactFit, held_out: np.ndarray, seed: int = 0) -> ContactFit:
-    """Fit the same law again without the contacts that `held_out` flags.
+    """Fit the same law again, without the contacts that `held_out` flags.
 
-    The result keeps the readings of all contacts, so that it can be evaluated on the omitted contacts.
+    The result contains the readings of all contacts, so that checks can compare it with the omitted contacts.
     """
     readings, problem = fit.readings, fit.problem
     rest = replace(readings, counts=readings.counts & ~held_out)

@@ -1,8 +1,8 @@
 """Linear least-squares fit of a contact law at a given force delay and surface position.
 
 The logged commands determine the motion of the mechanism (`motion`). For a given force delay and surface
-position ("plane"), the predicted force is linear in the coefficients: stiffness, damping and the bias of the
-sensor. The factors of the coefficients in this linear combination are the functions of the contact law.
+position ("plane"), the predicted force is a linear combination of the regressors of the contact law
+(functions of depth and rate). The coefficients are stiffness, damping and the bias of the sensor.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from tuning.identification.sensor_filter import (
     compute_onset_weights,
 )
 
-MAX_FORCE_DELAY = 0.02  # s, longest force delay in a search
+MAX_FORCE_DELAY = 0.02  # s, longest force delay in the search range of a fit
 COARSE_DELAY_STEP = 0.0005  # s, step between the delays of a first search
 MAX_NEWTON_STEPS = 6  # largest number of Newton steps in the search of a surface position
-MIN_LIKELIHOOD_GAIN = 2.0  # gain of log likelihood; a Newton step with a smaller gain is the last one
+MIN_LIKELIHOOD_GAIN = 2.0  # the search ends with a Newton step that increases the log likelihood by less
 STEP = 1e-7  # m, step of finite differences with respect to the surface position
-FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants; then the response of a filter is below rounding errors
+FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants after which a filter's response is below rounding errors
 
 
 class _NearbyRows(NamedTuple):
@@ -49,26 +49,26 @@ class _NearbyRows(NamedTuple):
     rows: np.ndarray  # (rows,), indices of the rows
     depth: np.ndarray  # m, (planes, rows), penetration; 0 out of contact
     rate: np.ndarray  # m/s, (rows,), rate of the penetration
-    columns: np.ndarray  # (planes, coefficients, rows), functions of the law, without the bias
+    columns: np.ndarray  # (planes, coefficients, rows), regressors of the law, without the bias
 
 
 class _Onsets(NamedTuple):
-    """Onsets of contact within control periods, with the weights of the forces in a lagged reading."""
+    """Onsets of contact between two rows, with the weights of the force in the next lagged reading."""
 
     plane: np.ndarray  # (onsets,), index of the surface position
     row: np.ndarray  # (onsets,), index into `_NearbyRows.rows` of the row after the onset
-    columns: np.ndarray  # (coefficients, onsets), functions of the law just after the onset
+    columns: np.ndarray  # (coefficients, onsets), regressors of the law just after the onset
     after: np.ndarray  # (onsets,), weight of the force just after the onset (`compute_onset_weights`)
     end: np.ndarray  # (onsets,), weight of the force at the end of the period
 
 
 class ContactProblem:
-    """Least-squares problem that fits a contact law to force readings, for known motion of the mechanism.
+    """Least-squares problem: fit of a contact law to force readings, for a known motion of the mechanism.
 
     The surface position `plane` [m] is None if the fit estimates it. Readings out of contact depend only on
-    the bias. Three sums therefore represent all these readings, and the functions of the law are computed
-    only near contact. If the sensor has a lag (`time_constant` [s]) or coloured noise, the functions are
-    filtered in the same way as the readings.
+    the bias. Their number, sum and sum of squares therefore represent them, and the regressors of the law are
+    computed only near contact. If the sensor has a lag (`time_constant` [s]), the regressors pass through the
+    same lag. If its noise is coloured, regressors and readings are whitened.
     """
 
     def __init__(
@@ -85,24 +85,24 @@ class ContactProblem:
         self.min_delay = -COARSE_DELAY_STEP * float(np.floor(max(motion.delay, 0.0) / COARSE_DELAY_STEP))
         self.is_unfiltered = len(readings.whitening) == 1 and time_constant == 0.0
         self.used_rows = np.flatnonzero(readings.counts)
-        # Index of each row among the used rows, or -1 for an unused row. The additional last entry is -1,
-        # for the row index -1.
+        # Index of each row among the used rows, or -1 for an unused row. The additional last entry serves the
+        # row index -1.
         self.used_indices = np.full(readings.counts.size + 1, -1)
         self.used_indices[self.used_rows] = np.arange(len(self.used_rows))
-        # Filters also need the rows that fits do not use.
+        # A filter also needs the rows that fits do not use.
         self.needed_rows = self.used_rows if self.is_unfiltered else np.arange(readings.counts.size)
         self.target = self.whiten(readings.force).ravel()[self.used_rows] / readings.std
         self.damping_indices = [i for i, name in enumerate(self.names) if name.startswith("damping")]
         # A dead zone changes only the readings in contact; a bias changes all readings.
         self.has_dead_zone = bool(readings.threshold)
-        # Whitened and normalized reading out of contact for a bias of 1 N.
+        # Reading out of contact for a bias of 1 N, whitened and divided by the noise.
         self.bias_alone = 0.0 if self.has_dead_zone else float(np.sum(readings.whitening)) / readings.std
         self.sums = sum_and_squares(self.target)
         self.memory = len(readings.whitening) + int(
             np.ceil(FILTER_MEMORY_TIME_CONSTANTS * time_constant / motion.period)
         )
-        # Times at which the force is computed, in periods before a row; a lag integrates the force between
-        # rows.
+        # Times at which the force is computed, in periods before a row. A lag integrates the force between
+        # two rows, so it also needs the force in the middle.
         self.periods_before = (0.0,) if time_constant == 0.0 else (0.0, 0.5)
         self._cached_motion: tuple[float, list[tuple[np.ndarray, np.ndarray]]] | None = None
         self._guess: np.ndarray | None = None
@@ -119,14 +119,14 @@ class ContactProblem:
         return _whiten(values.swapaxes(-1, -2), self.readings.whitening).swapaxes(-1, -2)
 
     def changed(self, law: Law, time_constant: float) -> ContactProblem:
-        """Return the same problem with another contact law and another time constant of the sensor [s]."""
+        """Return the same problem with this contact law and this time constant of the sensor [s]."""
         return ContactProblem(self.motion, self.readings, law, self.plane, time_constant)
 
     def at(self, delay: float, plane: float, pseudo: PseudoRows | None = None) -> CoefficientFit:
         """Fit the coefficients at one force delay [s] and surface position [m].
 
-        `pseudo` adds rows that represent further readings. Rows in which the force of the law would be
-        negative are treated as out of contact.
+        `pseudo` adds rows that replace the readings of other runs. Rows in which the force of the law would
+        be negative are treated as out of contact.
         """
         near, flags, fit = self._fit_until_consistent(delay, np.array([plane]), pseudo)
         (inner,) = self._make_fits(fit)
@@ -144,11 +144,11 @@ class ContactProblem:
     def fit_surfaces(
         self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None = None
     ) -> list[CoefficientFit]:
-        """Fit the coefficients at several surface positions [m], without derivatives by the position."""
+        """Fit the coefficients at several surface positions [m]; do not differentiate by the position."""
         return self._make_fits(self._fit_until_consistent(delay, planes, pseudo)[2])
 
     def _fit_until_consistent(self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None):
-        """Fit the coefficients at each surface position, and update the rows in contact until both agree.
+        """Fit the coefficients at each surface position; repeat until the rows in contact no longer change.
 
         Returns:
             The rows near contact, flags of the rows in contact, and the fit for each surface position.
@@ -178,30 +178,30 @@ class ContactProblem:
         ]
 
     def _get_motion(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position [m] and velocity [m/s] in `needed_rows`, for each of `periods_before`."""
+        """Return position [m] and velocity [m/s] in `needed_rows`, at each of the times `periods_before`."""
         if self._cached_motion is None or self._cached_motion[0] != delay:
             moved, rows = self.motion_at(delay), self.needed_rows
             self._cached_motion = delay, [(x.ravel()[rows], v.ravel()[rows]) for x, v in moved]
         return self._cached_motion[1]
 
     def motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position [m] and velocity [m/s] in all rows, for each of `periods_before`."""
+        """Return position [m] and velocity [m/s] in all rows, at each of the times `periods_before`."""
         return [self.motion.at(delay + part * self.motion.period) for part in self.periods_before]
 
     def onsets_between(self, delay: float, low: float, high: float) -> np.ndarray:
-        """Return the surface positions [m] from `low` to `high` at which the rows in contact change."""
+        """Return the surface positions [m] between `low` and `high` at which another row is in contact."""
         position, rate = self._get_motion(delay)[0]
         return np.unique(position[(rate > 0.0) & (position > low) & (position < high)])
 
     def _find_nearby_rows(self, position, rate, where, planes: np.ndarray) -> _NearbyRows:
         """Return the rows that are in contact for at least one of the surface positions `planes` [m]."""
-        # Finite differences also need the rows that are in contact with a slightly nearer surface.
+        # Finite differences also need the rows that would be in contact with a slightly nearer surface.
         rows = np.flatnonzero(position > planes.min() - (STEP if self.time_constant else 0.0))
         depth, rate = np.maximum(position[rows] - planes[:, None], 0.0), rate[rows]
         return _NearbyRows(rows, depth, rate, self._tabulate(depth, rate, where[rows]))
 
     def _tabulate(self, depth: np.ndarray, rate: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Evaluate the functions of the law in the given rows, shape (planes, coefficients, rows)."""
+        """Evaluate the regressors of the law in the given rows, shape (planes, coefficients, rows)."""
         own_columns, entries = self.law.entry_functions(depth, rate), self.readings.entries
         if len(entries) > 1:
             entry = self.readings.entry.ravel()[rows]
@@ -213,7 +213,7 @@ class ContactProblem:
         return columns
 
     def _flag_rows_in_contact(self, near: _NearbyRows, coefficients: np.ndarray | None) -> np.ndarray:
-        """Return flags of the rows in contact, except rows in which the force of the law is negative."""
+        """Return flags that mark the rows in contact in which the force of the law is not negative."""
         inside = near.depth > 0.0
         if coefficients is None or self.law.pulls or not self.damping_indices:
             return inside
@@ -226,9 +226,9 @@ class ContactProblem:
     def _find_onsets(
         self, near: _NearbyRows, positions: list[np.ndarray], planes: np.ndarray
     ) -> _Onsets | None:
-        """Find the onsets of contact within control periods; return None if the sensor has no lag.
+        """Find the onsets of contact between two rows; return None if the sensor has no lag.
 
-        `positions` holds the positions [m] in all rows, at the rows and half a period earlier.
+        `positions` contains the positions [m] at all rows and half a period before all rows.
         """
         if self.time_constant == 0.0:
             return None
@@ -242,17 +242,17 @@ class ContactProblem:
         return _Onsets(plane, row, columns, *compute_onset_weights(rate, left[plane, row]))
 
     def _pack_nearby_rows(self, near: list[_NearbyRows]) -> PackedRows:
-        """Return the rows in which filtered values depend on the rows near contact."""
+        """Return the rows near contact and the later rows that depend on them through the filters."""
         return pack_rows([part.rows for part in near], self.readings.force.shape, self.memory)
 
     def _filter(self, near, tables: list[np.ndarray], onsets, first, where: PackedRows, whitening):
-        """Apply the lag of the sensor and the whitening filter to the functions of the law.
+        """Apply the lag of the sensor and the whitening filter to the regressors of the law.
 
         Args:
-            near: Rows near contact, for each of `periods_before`.
-            tables: Values of the functions in these rows, for each of `periods_before`.
+            near: Rows near contact, at each of the times `periods_before`.
+            tables: Values of the regressors in these rows, at each of the times `periods_before`.
             onsets: Onsets of contact, or None if the sensor has no lag.
-            first: Values of the functions just after the onsets, shape (functions, onsets), or None.
+            first: Values of the regressors just after the onsets, shape (regressors, onsets), or None.
             where: Rows of the result.
             whitening: Coefficients of the whitening filter.
         """
@@ -272,7 +272,7 @@ class ContactProblem:
         return lagged
 
     def inside(self, delay: float, planes: np.ndarray) -> np.ndarray:
-        """Return the design matrix (planes, coefficients, used rows) of lanes that are always in contact."""
+        """Return the design matrix, shape (planes, coefficients, used rows), if all rows are in contact."""
         tables, shape = [], self.readings.force.shape
         rows = np.arange(self.readings.force.size).reshape(shape).T.ravel()
         for position, rate in self.motion_at(delay):
@@ -296,7 +296,7 @@ class ContactProblem:
     def _build_design(
         self, near: list[_NearbyRows], flags: list[np.ndarray], onsets: _Onsets | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return design (planes, coefficients, rows) and readings near contact, in units of the noise."""
+        """Return design (planes, coefficients, rows) and readings near contact, both divided by the noise."""
         std, tables, first = self.readings.std, [], None
         for rows_near, flag in zip(near, flags, strict=True):
             # The last column belongs to the bias. It is 1 in all rows or, if there is a dead zone, only in
@@ -318,9 +318,9 @@ class ContactProblem:
         return design, self.target[used[used >= 0]]
 
     def _solve(self, near, flags, onsets, pseudo: PseudoRows | None) -> LeastSquaresFit:
-        """Fit the coefficients at each surface position, with the rows in contact that `flags` marks."""
+        """Fit the coefficients at each surface position, for the rows in contact that `flags` marks."""
         design, target = self._build_design(near, flags, onsets)
-        # number, sum and sum of squares of the readings that depend on the bias alone
+        # Number, sum and sum of squares of the readings that depend on the bias alone.
         count, total, square = (
             full - part for full, part in zip(self.sums, sum_and_squares(target), strict=True)
         )
@@ -332,7 +332,7 @@ class ContactProblem:
     def _differentiate_by_plane(
         self, delay: float, plane: float, coefficients, near: list[_NearbyRows], flag: np.ndarray
     ) -> np.ndarray:
-        """Return the derivative of the predicted readings by the surface position, divided by the noise."""
+        """Differentiate the predicted readings with respect to the surface position; divide by the noise."""
         scale = 2.0 * STEP * self.readings.std
         if self.time_constant:
             shifted = self._all_rows_near_contact(
@@ -355,7 +355,7 @@ class ContactProblem:
         return table[0, 0, self.used_indices[where.rows] >= 0]
 
     def force(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
-        """Return the predicted force readings [N], including the bias, (rows, lanes)."""
+        """Return the predicted force readings [N], including the bias, shape (rows, lanes)."""
         moved = [(position.ravel(), rate.ravel()) for position, rate in self.motion_at(delay)]
         near, flags, onsets = self._all_rows_near_contact(moved, np.array([plane]), coefficients)
         where = self._pack_nearby_rows(near)
@@ -365,7 +365,7 @@ class ContactProblem:
         return force if self.has_dead_zone else force + coefficients[-1]
 
     def _predict(self, near, flags, onsets, coefficients, where: PackedRows, whitening) -> np.ndarray:
-        """Return the predicted and whitened force readings [N], (planes, rows), without a constant bias."""
+        """Return the whitened predicted force readings [N] without a constant bias, shape (planes, rows)."""
         offset, first = self.has_dead_zone * coefficients[-1], None
         tables = [
             ((compute_force(coefficients, part.columns) + offset) * flag)[:, None]
@@ -385,10 +385,10 @@ class ContactProblem:
         return flags
 
     def _all_rows_near_contact(self, moved, planes: np.ndarray, coefficients: np.ndarray):
-        """Search all rows for contact; return rows near contact, flags of rows in contact, and onsets.
+        """Search all rows; return the rows near contact, flags of those in contact, and the onsets.
 
         Args:
-            moved: Position [m] and velocity [m/s] in all rows, for each of `periods_before`.
+            moved: Position [m] and velocity [m/s] in all rows, at each of the times `periods_before`.
             planes: Surface positions [m].
             coefficients: Coefficients of the law.
         """
@@ -400,15 +400,15 @@ class ContactProblem:
         return near, flags, onsets
 
     def find_best_surface(self, delay: float, plane: float) -> tuple[float, CoefficientFit, float]:
-        """Search the surface position of least misfit at one force delay by Newton's method.
+        """Find the surface position with the smallest misfit at one force delay by Newton's method.
 
         Args:
             delay: Force delay [s].
             plane: Starting value of the surface position [m].
 
         Returns:
-            The best surface position [m], the fit before the last Newton step, and the gain of log likelihood
-            by the last Newton step.
+            The best surface position [m], the fit before the last Newton step, and the increase of the log
+            likelihood in this step.
         """
         inner = self.at(delay, plane)
         for _ in range(MAX_NEWTON_STEPS):

@@ -2,9 +2,9 @@
 
 At each delay and surface position of the grid, linear least squares determine the coefficients. The
 likelihood is not approximated by its derivatives with respect to the delay: during contact, a change of the
-delay acts like a change of the damping, and at the onset of contact the likelihood has kinks. The prior is
-flat in delay and surface position, and excludes negative damping. All results, such as means, intervals and
-correlations, come from draws of the posterior.
+delay acts like a change of the damping, and the likelihood has kinks where a row comes into contact. The
+prior is flat in delay and surface position, and excludes negative damping. All results, such as means,
+intervals and correlations, come from draws of the posterior.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from tuning.identification.normal_draws import factorise_covariance
 
 FINE_DELAY_STEP = 2e-5  # s, step between the delays of the second grid
 SMOOTHING_DELAYS = 7  # number of delays of the second grid over which the surface position is averaged
-FINAL_GRID_DROP = 30.0  # the final grid covers all delays with a smaller drop of twice the log posterior
-# The same for the second grid; it is larger, because the coarse log posterior is less accurate near onsets.
+FINAL_GRID_DROP = 30.0  # maximum of twice the drop of the log posterior from its peak in the final grid
+# The same for the second grid. It is larger, because the log posterior of the coarse grid is less accurate.
 COARSE_GRID_DROP = 400.0
 SECOND_GRID_SURFACES = 15  # number of surface positions at each delay of the second grid
-MAX_CELL_EDGES = 1000  # maximum number of cell edges, for surfaces that the readings do not determine
-COARSE_STD_FACTOR = 2.0  # factor on the surface's standard deviation that the coarse grid gives
+MAX_CELL_EDGES = 1000  # maximum number of cell edges; a surface that is hardly determined would need more
+COARSE_STD_FACTOR = 2.0  # the coarse grid's standard deviation of the surface is multiplied by this factor
 FINAL_GRID_DELAYS, FINAL_GRID_SURFACES = 61, 13  # numbers of delays and surface positions of the final grid
 DELAY_SEARCH_HALF_WIDTH = 0.003  # s, half width of the search around an approximate delay
 SURFACE_HALF_WIDTH_SIGMAS = 3.2  # half width of the grid at a delay, in standard deviations of the surface
@@ -42,9 +42,9 @@ class Posterior:
     names: list[str]  # "delay", "plane", then the coefficients
     draws: np.ndarray  # (draws, names)
     delays: np.ndarray  # s, the final grid
-    log_posterior: np.ndarray  # of the delay at the final grid, minus its maximum
-    best: tuple[float, float, CoefficientFit]  # delay, plane and fit of greatest posterior density
-    evidence: float = 0.0  # logarithm of the posterior's integral, up to a constant of the readings
+    log_posterior: np.ndarray  # log posterior at each of `delays`, minus its maximum
+    best: tuple[float, float, CoefficientFit]  # delay, plane and fit with the greatest posterior density
+    evidence: float = 0.0  # log evidence, up to a constant that is the same for all models of these readings
 
     @property
     def mean(self) -> np.ndarray:
@@ -66,8 +66,8 @@ def compute_posterior(
     Args:
         problem: Readings, motion and contact law.
         seed: Seed of the random numbers.
-        near: Approximate delay [s] and surface position [m], or None. All delays are searched without an
-            approximate delay, or if the best delay may be far from the approximate one.
+        near: Approximate delay [s] and surface position [m]. All delays are searched if it is None, or if the
+            best delay may be far from the approximate one.
         size: Numbers of delays and surface positions of the final grid.
     """
     delays, start = (
@@ -104,7 +104,8 @@ def compute_posterior(
     heights, planes, spreads = _marginalise_over_surface(places, cells, len(finer))
     low, high = _find_likely_delays(problem, finer, heights, FINAL_GRID_DROP)
     delays = np.linspace(low, high, size[0])
-    # If one cell contains the whole posterior of a delay, the surface jumps from delay to delay: smooth it.
+    # If one cell contains the whole posterior of a delay, the surface position jumps between delays: smooth
+    # it.
     planes = uniform_filter1d(planes, SMOOTHING_DELAYS, mode="nearest")
     surface = np.interp(delays, finer, planes), np.interp(delays, finer, np.maximum(spreads, surface[1]))
     places, cells = _fit_grid(problem, delays, surface, size[1])
@@ -112,9 +113,9 @@ def compute_posterior(
 
 
 def estimate_surface_from_onset(problem: ContactProblem, delay: float) -> float:
-    """Return the position [m] at which the force first exceeds its noise: the median over all runs.
+    """Return the position [m] at which the force first exceeds its noise, as the median of all runs.
 
-    If a prior of the bias is known, the surface comes from the forces of a press instead (`press_bias`).
+    If the readings have a prior of the bias, the result comes from the forces of a press run (`press_bias`).
     """
     position, _ = problem.motion.at(delay)
     readings = problem.readings
@@ -132,7 +133,7 @@ def estimate_surface_from_onset(problem: ContactProblem, delay: float) -> float:
 def _scan_delays(
     problem: ContactProblem, delays: np.ndarray, start: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the best surface position, its standard deviation and the log posterior at each delay."""
+    """Return, at each delay, the best surface position, its standard deviation and the log posterior."""
     planes, stds, heights = [], [], []
     for delay in delays:
         plane, inner, gain = problem.find_best_surface(delay, start)
@@ -145,7 +146,7 @@ def _scan_delays(
 def _find_likely_delays(
     problem: ContactProblem, delays: np.ndarray, heights: np.ndarray, reach: float
 ) -> tuple[float, float]:
-    """Return the range of delays [s] in which twice the log posterior is within `reach` of its maximum.
+    """Return the range of delays [s] in which twice the log posterior is at most `reach` below its maximum.
 
     The range is extended by one step on each side.
     """
@@ -157,21 +158,20 @@ def _find_likely_delays(
 def _fit_grid(
     problem: ContactProblem, delays: np.ndarray, surface: tuple[np.ndarray, np.ndarray], across: int
 ) -> tuple[np.ndarray, list[CoefficientFit]]:
-    """Fit the coefficients on a grid of delays and, at each delay, of plausible surface positions.
+    """Fit the coefficients on a grid of delays and of the plausible surface positions at each delay.
 
     The force of damped contact jumps at the onset. The likelihood is therefore smooth in the surface position
-    only between positions at which another row enters the contact. These positions are the edges of the grid
-    cells.
+    only between two positions at which another row comes into contact. These positions are the edges of the
+    grid cells.
 
     Args:
         problem: Readings, motion and contact law.
         delays: Delays [s].
-        surface: Mean and standard deviation of the surface position [m] at each delay.
+        surface: Means and standard deviations of the surface position [m], one per delay.
         across: Number of surface positions (cells) at each delay.
 
     Returns:
-        For each cell, its delay [s], its centre [m] and its width [m]; and the fit at the centre of each
-        cell.
+        Delay [s], centre [m] and width [m] of each cell; and the fit at the centre of each cell.
     """
     places, cells = [], []
     for delay, centre, std in zip(delays, *surface, strict=True):
@@ -190,8 +190,8 @@ def _fit_grid(
 def divide_into_cells(low: float, high: float, at: np.ndarray, number: int) -> np.ndarray:
     """Divide the interval from `low` to `high` into `number` cells with edges at the positions `at`.
 
-    If there are too few positions, the widest cells are halved. If there are too many, the positions between
-    the smallest cells are dropped.
+    If there are too few positions, the widest cells are halved. If there are too many, the smallest adjacent
+    cells are merged.
     """
     if len(at) > MAX_CELL_EDGES:
         at = at[np.linspace(0, len(at) - 1, MAX_CELL_EDGES).astype(int)]
@@ -207,7 +207,7 @@ def divide_into_cells(low: float, high: float, at: np.ndarray, number: int) -> n
 def _marginalise_over_surface(
     places: np.ndarray, cells: list[CoefficientFit], count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the log posterior of each delay, and mean and std of the surface position at this delay."""
+    """Return, for each delay, the log posterior, and the surface position's mean and standard deviation."""
     heights, planes = (
         _compute_cell_posteriors(places, cells).reshape(count, -1),
         places[:, 1].reshape(count, -1),
@@ -229,7 +229,7 @@ def _compute_cell_posteriors(places: np.ndarray, cells: list[CoefficientFit]) ->
 def _draw_from_grid(
     problem: ContactProblem, places: np.ndarray, cells: list[CoefficientFit], delays: np.ndarray, seed: int
 ) -> Posterior:
-    """Draw from the posterior: a cell by its probability, a point in the cell, and normal coefficients."""
+    """Draw from the posterior: a cell with its probability, a point in the cell, and normal coefficients."""
     heights = _compute_cell_posteriors(places, cells)
     weights = np.exp(heights - heights.max())
     weights /= weights.sum()
@@ -266,7 +266,7 @@ def _draw_from_grid(
 
 
 def _draw_coefficients(cell: CoefficientFit, positive: list[int], count: int, rng) -> np.ndarray:
-    """Return normal draws of the coefficients; those with a negative damping are drawn again."""
+    """Return normal draws of the coefficients; draws with a negative damping are repeated."""
     root = factorise_covariance(cell.covariance)
     draws = cell.coefficients + rng.standard_normal((count, len(root))) @ root.T
     for _ in range(50):

@@ -17,22 +17,22 @@ class CoefficientFit:
     misfit: float  # chi-squared: sum of squared residuals divided by the variance of the noise
     evidence: float  # log posterior density of force delay and surface position, up to a constant
     slope: float = 0.0  # 1/m, derivative of misfit / 2 with respect to the surface position
-    curvature: float = 0.0  # 1/m^2, second derivative of misfit / 2, with refitted coefficients
+    curvature: float = 0.0  # 1/m^2, second derivative of misfit / 2, for coefficients that are fitted again
     plane: float = 0.0  # m, surface position of the fit
     # derivative of the coefficients with respect to the surface position; None if the position is specified
     by_plane: np.ndarray | None = None
 
 
 class PseudoRows(NamedTuple):
-    """Few rows with the same sum of squares as many readings, divided by the noise's standard deviation."""
+    """A few rows with the same sums of squares as many readings, which they replace; divided by the noise."""
 
     design: np.ndarray  # (planes, coefficients, rows), design matrix
-    target: np.ndarray  # (rows,), values to fit
+    target: np.ndarray  # (rows,), readings
     by_plane: np.ndarray  # 1/m, derivative of `design` with respect to the surface position
 
 
 class LeastSquaresFit(NamedTuple):
-    """Least-squares fit at several surface positions, to readings in units of the noise's std."""
+    """Least-squares fits at several surface positions to readings that are divided by the noise."""
 
     coefficients: np.ndarray  # (planes, coefficients)
     covariance: np.ndarray  # (planes, coefficients, coefficients), covariance of the coefficients
@@ -51,10 +51,10 @@ def fit_coefficients(
     """Fit the coefficients of a contact law by least squares at each surface position.
 
     Args:
-        design: Design matrix: functions of the law, then the bias, (planes, coefficients, rows).
-        target: Readings to fit, (rows,).
-        rest: Number, sum and sum of squares of further readings, which depend on the bias alone.
-        bias_alone: Value of such a further reading for a bias of 1 N.
+        design: Design matrix, shape (planes, coefficients, rows): regressors of the law, then the bias.
+        target: Readings, shape (rows,).
+        rest: Number, sum and sum of squares of the other readings, which depend on the bias alone.
+        bias_alone: Value of these other readings for a bias of 1 N.
         bias_prior: Mean and standard deviation of the bias [N] from runs at rest, or None.
     """
     count, total, square = rest
@@ -80,7 +80,7 @@ def fit_coefficients(
 
 
 def compute_force(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the force [N] of the contact law without the bias, (planes, rows)."""
+    """Return the force [N] of the contact law without the bias, shape (planes, rows)."""
     return (coefficients[..., None, :-1] @ columns)[:, 0]
 
 

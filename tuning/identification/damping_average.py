@@ -1,12 +1,12 @@
 """Bayesian average over contact models with and without damping.
 
-A damping b has nearly the same effect on a contact as a force delay that is shorter by b over the stiffness.
-Only readings at the onset of contact distinguish the two. Under a flat prior, zero damping has no
-probability, so that noise at a few onsets can look like damping with a small standard deviation. The draws
-therefore come from both models, in proportion to their posterior probabilities (spike-and-slab prior,
-Mitchell and Beauchamp, "Bayesian variable selection in linear regression", 1988). The prior probability of
-zero damping is one half. The other half is uniform in damping over stiffness, from 0 to
-`MAX_DAMPING_OVER_STIFFNESS`.
+A damping b has nearly the same effect on a contact as a force delay that is shorter by b / k (k: stiffness).
+Only readings at the onset of contact distinguish the two. Under a flat prior, the probability that the
+damping is exactly zero vanishes, and noise at a few onsets can look like a small damping with a small
+standard deviation. The draws therefore come from both models, in proportion to their posterior probabilities
+(spike-and-slab prior, Mitchell and Beauchamp, "Bayesian variable selection in linear regression", 1988). The
+prior probability of zero damping is one half. The other half is uniform in the ratio of damping to stiffness,
+from 0 to `MAX_DAMPING_OVER_STIFFNESS`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from tuning.identification.contact_profile import Posterior
 from tuning.identification.law_choice import search_coarsely
 
 DAMPING_NAME, TIME_CONSTANT_NAME = "damping", "time_constant"
-MAX_DAMPING_OVER_STIFFNESS = 0.01  # s, upper bound of damping over stiffness in the prior
-MIN_UNDAMPED_PROBABILITY = 1e-4  # the undamped model is ignored if its posterior probability is smaller
-# Largest gain of log evidence that the undamped model has because it has one parameter less.
+MAX_DAMPING_OVER_STIFFNESS = 0.01  # s, upper bound of the ratio of damping to stiffness in the prior
+MIN_UNDAMPED_PROBABILITY = 1e-4  # minimum posterior probability of an undamped model that is not ignored
+# Largest increase of the log evidence that the undamped model has because it has one parameter less.
 MAX_OCCAM_GAIN = 7.0
 
 # Function that fits a law and returns the posterior and the log evidence.
@@ -33,7 +33,7 @@ FitLaw = Callable[[Law], tuple[Posterior, float]]
 
 
 def drop_damping_term(law: Law) -> Law:
-    """Return the law without the damping term that all entries of the contact lists share."""
+    """Return the law without its damping term, which all entries of the contact lists have in common."""
     names = tuple(name for name in law.names if name != DAMPING_NAME)
     return replace(law, names=names, shared=lambda depth, rate: [], pulls=False)
 
@@ -48,12 +48,12 @@ def average_over_damping(
     Args:
         problem: Contact problem with the damped law.
         posterior: Posterior of this problem.
-        evidence: Log evidence of the damped law under a flat prior on the damping.
+        evidence: Log evidence of the damped law under a flat prior of the damping.
         fit: Function that fits a law and returns its posterior and log evidence.
 
     Returns:
-        The posterior with mixed draws; unchanged if zero damping is improbable or the law has no damping
-        term.
+        The posterior with draws of both models. If zero damping is improbable, or the law has no damping
+        term, the posterior is unchanged.
     """
     law = problem.law
     own_count = len(law.entry_functions(np.zeros(1), np.zeros(1)))

@@ -1,11 +1,12 @@
-"""Replacement of long press runs by a few pseudo-rows, which makes fits faster but not less accurate.
+"""Replacement of the rows of long press runs by a few pseudo-rows, for faster fits of the same accuracy.
 
-A slow press has tens of thousands of readings, but its motion has few degrees of freedom. A lane (run, or
-segment of a run) that always stays well below the surface is deep. Its readings are smooth functions of
-force delay and surface position. The functions of the contact law are therefore computed at a few delays and
-surface positions (Chebyshev nodes), and interpolated by polynomials. A matrix factorisation of these
-functions and of the readings gives pseudo-rows with the same sums of squares as all rows (Golub and Van Loan,
-"Matrix Computations", section 5.3).
+A slow press run has tens of thousands of readings, but its motion has few degrees of freedom. Arrays have one
+lane (column) per run or segment of a run. A lane is deep if it always stays well below the surface. Its
+predicted readings are then smooth functions of force delay and surface position. The regressors of the
+contact law are therefore computed at a few delays and surface positions (Chebyshev nodes), and interpolated
+by polynomials. A matrix factorisation of these regressors and of the readings gives pseudo-rows: a few rows
+that lead to the same sum of squared residuals as all rows (Golub and Van Loan, "Matrix Computations", section
+5.3).
 """
 
 from __future__ import annotations
@@ -21,45 +22,45 @@ from tuning.identification.contact_profile import estimate_surface_from_onset
 from tuning.identification.contact_regression import CoefficientFit, PseudoRows, compute_force
 from tuning.identification.motion import MotionResponse
 
-MIN_DEEP_LANES = 6  # smallest number of deep lanes for which pseudo-rows save time
+MIN_DEEP_LANES = 6  # minimum number of deep lanes for which pseudo-rows save time
 LANES_FOR_LAW_CHOICE = 8  # number of deep lanes that suffice to fit the shape of a contact law
-MIN_DEPTH_SHARE = 0.1  # in a deep lane, the smallest depth exceeds this fraction of the median depth
-DELAY_RANGE = 0.002  # s, range of delays that one interpolation covers
+MIN_DEPTH_SHARE = 0.1  # minimum ratio of the smallest depth of a deep lane to its median depth
+DELAY_RANGE = 0.002  # s, range of delays that one table covers
 DELAY_NODES = 8  # number of delays at which the interpolation is exact
-# number of surface positions at which the interpolation is exact: for a linear force, and for other forces
+# numbers of surface positions at which the interpolation is exact: first for a linear force, then for others
 SURFACE_NODES = 2, 4
-# range of surface positions that one interpolation of a nonlinear force covers, relative to the least depth
+# range of surface positions that one table of a nonlinear force covers, relative to the smallest depth
 SURFACE_RANGE_SHARE = 0.1
-# largest norm of the interpolation errors of all readings, in standard deviations of the noise
+# maximum norm of the interpolation errors of all readings, in standard deviations of the noise
 MAX_INTERPOLATION_ERROR = 0.01
-LANES_PER_BLOCK = 50  # number of lanes whose functions are computed together, to limit the memory
-MAX_TABLES = 60  # largest number of interpolations; a search that needs more is faster without them
-MIN_SINGULAR_VALUE = 1e-8  # pseudo-rows with a smaller relative singular value contain only rounding errors
+LANES_PER_BLOCK = 50  # maximum number of lanes that are computed together, to limit the memory
+MAX_TABLES = 60  # maximum number of tables; a search that needs more is faster without tables
+MIN_SINGULAR_VALUE = 1e-8  # minimum relative singular value of a pseudo-row; smaller ones are rounding errors
 
 
 def find_deep_lanes(motion: MotionResponse, plane: float) -> np.ndarray:
-    """Return which lanes stay deep in contact with a surface at `plane` [m], for all force delays."""
+    """Return flags of the lanes that stay well below the surface at `plane` [m] for every force delay."""
     depths = [motion.at(delay)[0] - plane for delay in (0.0, MAX_FORCE_DELAY / 2.0, MAX_FORCE_DELAY)]
     least = np.min([depth.min(axis=0) for depth in depths], axis=0)
     return least > MIN_DEPTH_SHARE * np.maximum(np.median(depths[1], axis=0), 0.0)
 
 
 def summarise_deep_lanes(problem: ContactProblem, near: tuple[float, float] | None) -> ContactProblem:
-    """Replace the deep lanes of a contact problem by pseudo-rows, if the problem has enough deep lanes.
+    """Replace the deep lanes of a contact problem by pseudo-rows if there are enough deep lanes.
 
     Args:
         problem: Problem with all rows.
-        near: Force delay [s] and surface position [m] near which most fits will be, or None if unknown.
+        near: Approximate force delay [s] and surface position [m] of the later fits, or None if unknown.
     """
     delay, plane = near or (MAX_FORCE_DELAY / 4.0, _approximate_surface(problem))
     deep = find_deep_lanes(problem.motion, plane) & problem.readings.counts.any(axis=0)
-    # The problem of the other lanes needs at least one lane.
+    # At least one lane must remain in the problem of the other lanes.
     deep[-1] = False
     return SummarisedProblem(problem, deep, delay) if deep.sum() >= MIN_DEEP_LANES else problem
 
 
 def select_representative_lanes(problem: ContactProblem) -> np.ndarray:
-    """Return all lanes that are not deep, and `LANES_FOR_LAW_CHOICE` of the deep lanes, which are similar."""
+    """Return all lanes that are not deep, and `LANES_FOR_LAW_CHOICE` of the deep lanes."""
     deep = np.flatnonzero(find_deep_lanes(problem.motion, _approximate_surface(problem)))
     dropped = np.delete(
         deep, np.linspace(0, len(deep) - 1, min(LANES_FOR_LAW_CHOICE, len(deep))).round().astype(int)
@@ -68,7 +69,7 @@ def select_representative_lanes(problem: ContactProblem) -> np.ndarray:
 
 
 def _approximate_surface(problem: ContactProblem) -> float:
-    """Return the specified surface position [m], or the best one for a typical force delay."""
+    """Return the specified surface position [m]; if there is none, fit it for a typical force delay."""
     if problem.plane is not None:
         return problem.plane
     return problem.find_best_surface(
@@ -77,10 +78,10 @@ def _approximate_surface(problem: ContactProblem) -> float:
 
 
 class SummarisedProblem(ContactProblem):
-    """Contact problem that replaces its deep lanes by pseudo-rows wherever these are accurate enough."""
+    """Contact problem that uses pseudo-rows instead of its deep lanes wherever they are accurate enough."""
 
     def __init__(self, problem: ContactProblem, deep: np.ndarray, delay: float):
-        """Split the lanes of a problem; `deep` marks the deep lanes, and `delay` [s] is a likely delay."""
+        """Split the lanes of a problem; `deep` marks the deep lanes, and `delay` [s] is approximate."""
         motion, readings, law = problem.motion, problem.readings, problem.law
         super().__init__(motion, readings, law, problem.plane, problem.time_constant)
         self.deep, self.delay = deep, delay
@@ -118,13 +119,13 @@ class SummarisedProblem(ContactProblem):
         return super().fit_surfaces(delay, planes, pseudo)
 
     def _is_pushing(self, table: _DesignTable, fits: list[CoefficientFit]) -> bool:
-        """Return whether all fits have a positive force in every row of the deep lanes."""
+        """Return whether the force is positive in every row of the deep lanes for all fits."""
         if self.law.pulls or not self.damping_indices:
             return True
         return all(np.all(compute_force(fit.coefficients[None], table.extreme) > 0.0) for fit in fits)
 
     def _find_table(self, delay: float, planes: np.ndarray) -> _DesignTable | None:
-        """Find or compute an interpolation for a delay and surface positions; None if it is not accurate."""
+        """Find or compute a table for a delay and surface positions; return None if it is not accurate."""
         for table in self.tables:
             if table.covers(delay, planes):
                 return table
@@ -137,7 +138,7 @@ class SummarisedProblem(ContactProblem):
         return None
 
     def _build_table(self, delay: float, plane: float, count: int) -> _DesignTable:
-        """Compute an interpolation around a delay and a surface position, with `count` positions as nodes."""
+        """Compute a table around a delay and a surface position, with `count` surface positions as nodes."""
         low = (
             self.delay + DELAY_RANGE * np.floor((delay - self.delay) / DELAY_RANGE + 0.5) - DELAY_RANGE / 2.0
         )
@@ -149,7 +150,7 @@ class SummarisedProblem(ContactProblem):
         lowest -= DELAY_RANGE / DELAY_NODES * max(float(np.abs(v).max()) for _, v in moved)
         half = 0.5 * SURFACE_RANGE_SHARE * max(lowest - plane, 1e-9)
         planes = _chebyshev_nodes(plane - half, plane + half, count)
-        # A law becomes negative first in the row with the fastest retraction relative to the depth.
+        # The force first becomes negative in the row with the fastest retraction relative to the depth.
         rate, depth = min(
             ((v.ravel()[row], x.ravel()[row] - plane) for x, v in moved
              for row in [int(np.argmin(v / np.maximum(x - plane, 1e-9)))]),
@@ -163,16 +164,16 @@ class SummarisedProblem(ContactProblem):
 
 @dataclass(frozen=True)
 class _DesignTable:
-    """Interpolation table of pseudo-rows, over force delay and surface position."""
+    """Table from which pseudo-rows are interpolated for any force delay and surface position in its range."""
 
     delays: np.ndarray  # s, delays of the nodes
     planes: np.ndarray  # m, surface positions of the nodes
     ends: tuple[float, float]  # s, smallest and largest delay that the table covers
     limit: tuple[float, float]  # m, smallest and largest surface position that the table covers
-    extreme: np.ndarray  # functions of the law in the row whose force becomes negative first
-    # (rows, delays x planes x functions + 2), functions of the law at all nodes, then bias and readings
+    extreme: np.ndarray  # regressors of the law in the row whose force first becomes negative
+    # (rows, delays x planes x regressors + 2), regressors of the law at all nodes, then bias and readings
     factor: np.ndarray
-    check: np.ndarray  # (rows, functions), functions of the law between the nodes, to test the accuracy
+    check: np.ndarray  # (rows, regressors), regressors of the law between the nodes, to test the accuracy
 
     def covers(self, delay: float, planes: np.ndarray) -> bool:
         """Return whether a delay [s] and all surface positions [m] lie within the range of the table."""
@@ -195,7 +196,7 @@ class _DesignTable:
         )
 
     def is_accurate(self) -> bool:
-        """Return whether the interpolated force of the best fit is accurate enough between the nodes."""
+        """Return whether the interpolated force is accurate enough between the nodes, for the best fit."""
         delay, plane = _point_between_nodes(self.delays, self.planes)
         rows = self.rows(delay, np.array([plane]))
         best = np.linalg.lstsq(rows.design[0].T, rows.target, rcond=None)[0]
@@ -204,7 +205,7 @@ class _DesignTable:
 
 
 def _split_into_blocks(problem: ContactProblem, lanes: np.ndarray) -> list[ContactProblem]:
-    """Split the deep lanes into problems with at most `LANES_PER_BLOCK` lanes, without unneeded rows."""
+    """Split the deep lanes into problems of at most `LANES_PER_BLOCK` lanes, without unused first rows."""
     counts = problem.readings.counts[:, lanes]
     begin = max(int(np.argmax(counts.any(axis=1))) - problem.memory, 0)
     parts = np.array_split(lanes, -(-len(lanes) // LANES_PER_BLOCK))
@@ -223,10 +224,10 @@ def _split_into_blocks(problem: ContactProblem, lanes: np.ndarray) -> list[Conta
 def _factorise_columns(
     blocks: list[ContactProblem], delays: np.ndarray, planes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute pseudo-rows from the functions of the law in all rows.
+    """Compute pseudo-rows from the regressors of the law in all rows.
 
-    Return two arrays with the same rows: functions at the nodes, bias and readings; and functions between the
-    nodes.
+    Return two arrays with one row per pseudo-row. The first contains the regressors at the nodes, the bias
+    and the readings; the second contains the regressors between the nodes.
     """
     total, count = 0.0, 0
     delay, plane = _point_between_nodes(delays, planes)
@@ -254,5 +255,5 @@ def _chebyshev_nodes(low: float, high: float, count: int) -> np.ndarray:
 
 
 def _interpolator(nodes: np.ndarray) -> BarycentricInterpolator:
-    """Return a function that computes the weight of each node in the polynomial interpolation at a point."""
+    """Return a function that computes the weights of the nodes for polynomial interpolation at a point."""
     return BarycentricInterpolator(nodes, np.eye(len(nodes)))

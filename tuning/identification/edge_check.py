@@ -1,10 +1,10 @@
 """Check of the force readings near the edges of contact (onset and release).
 
-These readings distinguish damping from force delay. A higher-order filter, a dead zone or a resampled force
-changes the readings for some milliseconds after a jump of the force. In one contact, the noise hides this
-change. The mean residual over all contacts, aligned at the edge and weighted by the approach speeds, reveals
-the change. The estimates are then assumed to be wrong by the same number of standard deviations as the mean
-residuals.
+These readings distinguish damping from force delay. An unmodelled sensor filter, an unmodelled dead zone or a
+resampled force changes the readings for some milliseconds after a jump of the force. In one contact, the
+noise hides this change. The mean residual of all contacts reveals it. The mean is computed for rows at the
+same distance from the edge, with the approach speeds as weights. If it is n standard deviations from 0, the
+estimates are assumed to be wrong by n standard deviations, too.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tuning.identification.records import LoggedRun
 from tuning.identification.uncertainty_effect import EFFECT_PROBABILITY, UncertaintyEffect
 from tuning.identification.validation import DEFECT_P_VALUE, CheckResult, flag_certain_rows
 
-# number of rows on either side of an edge that are evaluated
+# numbers of evaluated rows outside and inside the contact at each edge
 ROWS_OUTSIDE_CONTACT, ROWS_INSIDE_CONTACT = 3, 15
 MIN_CONTACTS_FOR_MEAN = 3  # minimum number of contacts for a mean
 
@@ -35,8 +35,8 @@ def check_contact_edges(
         effect: Effect of the parameters' uncertainty on e and on e - e*.
 
     Returns:
-        One check. There is none if no parameter is uncertain, or if fewer than `MIN_CONTACTS_FOR_MEAN` runs
-        contain both edges.
+        A list with one check. It is empty if no parameter is uncertain, or if fewer than
+        `MIN_CONTACTS_FOR_MEAN` runs contain both edges.
     """
     means = average_edge_residuals(contact, runs)
     if not effect.parts or not len(means):
@@ -55,7 +55,7 @@ def check_contact_edges(
 
 
 def average_edge_residuals(contact: ContactFit, runs: Sequence[LoggedRun]) -> np.ndarray:
-    """Return the weighted mean residual divided by its standard deviation, at each row near the two edges."""
+    """Return the weighted mean residual at each row near the two edges, divided by its standard deviation."""
     delay, plane, coefficient_fit = contact.posterior.best
     problem, readings = contact.problem, contact.readings
     predicted = problem.force(delay, plane, coefficient_fit.coefficients)
@@ -64,7 +64,7 @@ def average_edge_residuals(contact: ContactFit, runs: Sequence[LoggedRun]) -> np
     inside = problem.motion.at(delay)[0] > plane
     speed = np.array([(run.speed or 0.0) if run.kind == "contact" else 0.0 for run in runs])
     begins = np.argmax(inside, axis=0)
-    # If a contact begins or ends together with its run, there are no rows outside the contact.
+    # If a run begins or ends in contact, it lacks an edge.
     ends = len(inside) - np.argmax(inside[::-1], axis=0) - 1
     has_both_edges = (
         (begins > ROWS_OUTSIDE_CONTACT)

@@ -13,12 +13,12 @@ from tuning.identification.contact_fit import ContactFit
 from tuning.identification.result import ParameterEstimate
 
 DAMPING_KEY, FORCE_DELAY_KEY = "contact.damping", "rig.force_sensor.delay"
-# Draws accumulate at 0 if more than this share of them lies within this number of standard deviations of 0.
+# Draws accumulate at 0 if more than this share of them is below this number of their standard deviations.
 MAX_SHARE_AT_ZERO, ZERO_WIDTH_SIGMAS = 0.005, 0.1
 
 
 def make_estimates(draws_by_key, motion, contact, force, position, fixed) -> tuple[ParameterEstimate, ...]:
-    """Return the estimates of all parameters: those with draws, the sensors' noise, and the fixed parameters.
+    """Return the estimates of all parameters: drawn parameters, sensor noise, and fixed parameters.
 
     Args:
         draws_by_key: Posterior draws of each parameter.
@@ -64,12 +64,12 @@ def make_estimates(draws_by_key, motion, contact, force, position, fixed) -> tup
 
 
 def accumulates_at_zero(values: np.ndarray) -> bool:
-    """Return whether draws of a parameter that cannot be negative accumulate at 0."""
+    """Return whether the draws accumulate at 0, the lower bound of the parameter."""
     return bool(np.mean(values <= ZERO_WIDTH_SIGMAS * values.std()) > MAX_SHARE_AT_ZERO)
 
 
 def select_dampings_at_zero(draws_by_key: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the draws of those damping coefficients [N s/m] whose draws accumulate at 0, by key."""
+    """Return the draws of the damping coefficients [N s/m] that accumulate at 0, by key."""
     return {
         key: values
         for key, values in draws_by_key.items()
@@ -78,11 +78,11 @@ def select_dampings_at_zero(draws_by_key: Mapping[str, np.ndarray]) -> dict[str,
 
 
 def shift_to_zero_damping(values: np.ndarray, at_bound: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the draws of a parameter, extrapolated to zero damping by linear regression.
+    """Shift the draws of a parameter to the values for zero damping, by linear regression on the damping.
 
     Args:
         values: Draws of the parameter.
-        at_bound: Draws of the damping coefficients that are set to zero, by key.
+        at_bound: Draws of the damping coefficients that are assumed to be zero, by key.
     """
     damping = np.column_stack(list(at_bound.values()))
     slope = np.linalg.lstsq(damping - damping.mean(axis=0), values - values.mean(), rcond=None)[0]
@@ -100,9 +100,9 @@ def find_shortest_interval(values: np.ndarray) -> tuple[float, float]:
 def _estimate_from_draws(
     key: str, values: np.ndarray, at_bound: Mapping[str, np.ndarray] = {}
 ) -> ParameterEstimate:
-    """Return the estimate of a parameter from its draws.
+    """Return the estimate of a parameter from its posterior draws.
 
-    `at_bound` holds the draws of the damping coefficients that accumulate at 0. The interval of such a
+    `at_bound` contains the damping coefficients whose draws accumulate at 0. The interval of such a
     coefficient is one-sided. The logs hardly distinguish damping from force delay. The interval of the force
     delay therefore also includes the delays that zero damping would imply.
     """
@@ -134,9 +134,9 @@ def get_unit(key: str) -> str:
 def estimate_combinations(
     draws_by_key: Mapping[str, np.ndarray], contact: ContactFit | None
 ) -> tuple[ParameterEstimate, ...]:
-    """Return estimates of parameter combinations that the logs determine better than the single parameters.
+    """Return estimates of parameter combinations that the logs determine better than single parameters.
 
-    The combinations are sums of delays, and damping minus stiffness times force delay ("apparent damping").
+    The combinations are sums of delays, and the "apparent damping" (damping - stiffness * force delay).
     """
     combined, at_bound = [], select_dampings_at_zero(draws_by_key)
     motion, force = (draws_by_key.get(key) for key in ("rig.simulator.delay", "rig.force_sensor.delay"))

@@ -25,7 +25,7 @@ class ForceReadings:
     entries: tuple[int, ...]  # indices that occur in `entry`
     std: float  # N, standard deviation of the noise after whitening
     whitening: tuple[float, ...] = (1.0,)  # coefficients of the filter that whitens the noise
-    threshold: float = 0.0  # N; smaller predicted forces are not used, because a dead zone hides them
+    threshold: float = 0.0  # N, smallest predicted force at which a reading is used; a dead zone hides others
     bias: tuple[float, float] | None = None  # N, prior mean and standard deviation of the sensor's bias
 
     @classmethod
@@ -38,7 +38,7 @@ class ForceReadings:
             runs: Runs with a measured force.
             std: Standard deviation of the noise after whitening [N].
             whitening: Coefficients of the whitening filter.
-            threshold: Predicted force [N] below which readings are not used.
+            threshold: Smallest predicted force [N] at which a reading is used.
         """
         rows = max(len(run.tick) for run in runs)
 
@@ -62,16 +62,15 @@ class ForceReadings:
         return cls(force, counts, entry, entries, std, tuple(whitening), threshold)
 
     def select_lanes(self, lanes: np.ndarray, begin: int = 0) -> ForceReadings:
-        """Return the readings of the given lanes, each as often as it occurs, from row `begin` on."""
+        """Return the readings of the given lanes, which may repeat, from row `begin` on."""
         force, counts, entry = (array[begin:, lanes] for array in (self.force, self.counts, self.entry))
         return replace(self, force=force, counts=counts, entry=entry)
 
 
 def _assign_contact_entries(run: LoggedRun) -> np.ndarray:
-    """Return the index into the contact lists for each row.
+    """Return the index of each row into the mechanism's contact lists.
 
-    Rows out of contact get the index of the previous contact, or of the first contact if there is none
-    before.
+    Rows out of contact get the index of the previous contact. Rows before the first contact get its index.
     """
     index = np.full(len(run.tick), -1) if run.contact_index is None else run.contact_index
     if not np.any(index >= 0):

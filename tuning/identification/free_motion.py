@@ -1,4 +1,4 @@
-"""Identification of the motion simulator from runs without contact: order, parameters and delay.
+"""Identification of the motion simulator (order, parameters and delay) from runs without contact.
 
 The identified delay is the sum of the delays of the motion and of the position sensor. Neither a log nor a
 compensator with fixed gains can distinguish the two delays.
@@ -25,8 +25,8 @@ from tuning.identification.structure_choice import (
 
 SETTLING_TIME_CONSTANTS = 10.0  # duration of a transient, in time constants
 ASSUMED_TIME_CONSTANT = 0.05  # s, time constant of the motion simulator that is assumed before the fit
-MAX_REDUCED_CHI_SQUARE = 1.3  # chi-squared per degree of freedom; above it, the intervals are widened
-# p-value of the residual; below it, a model error is added. It is low, because a model error widens the
+MAX_REDUCED_CHI_SQUARE = 1.3  # maximum chi-squared per degree of freedom without wider intervals
+# Minimum p-value of the residual without a model error. It is low, because a model error widens the
 # intervals.
 MODEL_ERROR_P_VALUE = 1e-6
 MODEL_ERROR_BANDS = 10  # number of frequency bands; the model error is constant in each band
@@ -36,7 +36,7 @@ MODEL_ERROR_ITERATIONS = 3  # alternating estimates of the parameters and of the
 
 @dataclass(frozen=True)
 class FreeMotion:
-    """Model of the motion simulator, fitted to runs without contact or compared with them."""
+    """Model of the motion simulator that was fitted to runs without contact, or compared with them."""
 
     lines: SpectralLines  # spectra of all runs, with the measured noise
     spectra: tuple[Spectrum, ...]  # spectrum of each run
@@ -56,30 +56,30 @@ class FreeMotion:
 
     @property
     def left(self) -> float:
-        """Return chi-squared per degree of freedom: the residual power over the noise power."""
+        """Return chi-squared per degree of freedom: the ratio of residual power to noise power."""
         error, noise = self.misfit()
         return float(2.0 * np.sum(np.abs(error / noise) ** 2)) / max(self.fit.freedom, 1)
 
     @property
     def covariance(self) -> np.ndarray:
-        """Return the covariance of the model's parameters, inflated if the residual exceeds the noise."""
+        """Return the covariance of the model's parameters, increased if the residual exceeds the noise."""
         unexplained = self.fit.chi2 / max(self.fit.freedom, 1)
         return self.fit.covariance * (unexplained if unexplained > MAX_REDUCED_CHI_SQUARE else 1.0)
 
     @property
     def noise_std(self) -> float:
-        """Return the noise of a position reading [m], the rms over all runs."""
+        """Return the noise of a position reading [m], as the rms of all runs."""
         return float(np.sqrt(np.mean([spectrum.noise_std**2 for spectrum in self.spectra])))
 
     def lag(self, frequency: float) -> tuple[float, float]:
-        """Return the phase delay from command to reading at a frequency [Hz], and its std [s]."""
+        """Return phase delay [s] from command to reading at a frequency [Hz], and its standard deviation."""
         s = np.array([2j * np.pi * frequency])
         slopes = np.imag(self.model.slopes(s)[:, 0]) / (2.0 * np.pi * frequency)
         phase = np.angle(self.model.response(s)[0])
         return float(-phase / (2.0 * np.pi * frequency)), float(np.sqrt(slopes @ self.covariance @ slopes))
 
     def misfit(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the complex error over the model's output at each line, and the noise over this output."""
+        """Return the complex error and the noise at each line, both divided by the model's output."""
         predicted = self.model.predict(self.lines)
         return (self.lines.output - predicted) / predicted, self.lines.std / np.abs(predicted)
 
@@ -121,13 +121,13 @@ def fit_free_motion(
 
 
 def estimate_model_error(model: MotionModel, lines: SpectralLines) -> float:
-    """Return the rms relative error of the model at a line, or 0 if noise explains the residual.
+    """Return the relative error of the model at a frequency line (rms), or 0 if noise explains the residual.
 
-    A model error varies slowly with frequency, so all lines of a frequency band share the same error. The
-    error is therefore estimated from the mean residual of each band and multiplied by the square root of the
-    number of lines per band. Otherwise, a band with little noise would determine the error of the other
-    bands. The error is relative to the predicted output, because the measured output is only noise where the
-    response is small.
+    A model error varies slowly with frequency, so all lines of a frequency band are assumed to have the same
+    error. The error is therefore estimated from the mean residual of each band and multiplied by the square
+    root of the number of lines per band. Without this factor, a band with little noise would determine the
+    error of the other bands. The error is relative to the predicted output, because the measured output is
+    mainly noise where the response is small.
     """
     expected = model.predict(lines)
     size = np.abs(expected)
@@ -154,7 +154,7 @@ def estimate_model_error(model: MotionModel, lines: SpectralLines) -> float:
 def compare_free_motion(
     runs: Sequence[LoggedRun], timing: CampaignTiming, model: MotionModel
 ) -> FreeMotion | None:
-    """Compare the free runs with a known model, without a fit; return None if no run is long enough."""
+    """Compare the free runs with a known model without fitting it; return None if no run is long enough."""
     spectra = compute_spectra(runs, timing)
     if not spectra:
         return None
@@ -186,7 +186,7 @@ def compute_spectra(runs: Sequence[LoggedRun], timing: CampaignTiming) -> list[S
 
 
 def concatenate_lines(spectra: Sequence[Spectrum], timing: CampaignTiming) -> SpectralLines:
-    """Return the spectral lines of several runs in one record."""
+    """Return one record with the spectral lines of several runs."""
     return SpectralLines(
         np.concatenate([spectrum.frequency for spectrum in spectra]),
         np.concatenate([spectrum.command for spectrum in spectra]),
@@ -202,8 +202,8 @@ def concatenate_lines(spectra: Sequence[Spectrum], timing: CampaignTiming) -> Sp
 def estimate_static_gain(fit: SpectrumFit, lines: SpectralLines) -> tuple[float, float]:
     """Estimate the static gain of the motion simulator, which the model fixes at 1.
 
-    The estimate is one Newton step from the fit, with the gain as an additional parameter. Return the gain
-    and its standard deviation.
+    The estimate is one Newton step that starts at the fit and has the gain as an additional parameter. The
+    result is the gain and its standard deviation.
     """
     s, command = lines.images
     scale = np.sqrt(2.0) / lines.std

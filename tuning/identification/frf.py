@@ -1,11 +1,11 @@
 """Spectra of command and measured position in free motion, with the noise estimated from the data.
 
-If the command is periodic (a multisine), its periods are averaged. Differences between periods are noise.
-Power at frequency lines without excitation is nonlinear distortion: friction and dead bands appear at odd
-lines, and asymmetry appears at even lines (Pintelon and Schoukens, System Identification: A Frequency Domain
+The periods of a periodic command (a multisine) are averaged. The differences between the periods give the
+noise. Power at frequency lines without excitation indicates nonlinear distortion: friction and dead bands at
+odd lines, asymmetry at even lines (Pintelon and Schoukens, System Identification: A Frequency Domain
 Approach, 2012). For any other command, the local polynomial method separates the response from the transient
-and the noise. Around each line, the method fits response and transient by polynomials of degree 2 over 13
-lines (Schoukens et al. 2009). Readings of lost rows are omitted.
+and the noise. It approximates response and transient by polynomials of degree 2 in a window of 13 frequency
+lines (Schoukens et al. 2009). Lost rows are omitted.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-VARIANCE_SMOOTHING_LINES = 15  # number of lines over which the noise variance is averaged
+VARIANCE_SMOOTHING_LINES = 15  # number of adjacent lines whose noise variance is averaged
 SIDE_LINES = 6  # local polynomial method: lines on either side of the estimated line
 POLYNOMIAL_DEGREE = 2  # local polynomial method: degree of response and transient
-# Variance of the estimated transient over the noise variance; a line with a larger ratio is omitted.
+# Maximum ratio of the transient's variance to the noise variance; other lines are omitted.
 MAX_TRANSIENT_VARIANCE_RATIO = 20.0
-MIN_POWER_SHARE = 3e-3  # share of the largest power; with less, a non-periodic command does not excite a line
-# share of the largest amplitude; with less, a periodic command does not excite a line
+MIN_POWER_SHARE = 3e-3  # minimum power of an excited line as a share of the largest (non-periodic command)
+# minimum amplitude of an excited line as a share of the largest amplitude (periodic command)
 MIN_AMPLITUDE_SHARE = 1e-3
 
 
@@ -33,19 +33,20 @@ class Spectrum:
     command: np.ndarray  # m, complex amplitude of the commanded position
     output: np.ndarray  # m, complex amplitude of the measured position, without the transient
     std: np.ndarray  # m, standard deviation of the complex noise of `output`
-    response: np.ndarray  # complex, output over command; smoothed over adjacent lines if not periodic
+    response: np.ndarray  # complex frequency response, smoothed if the command is not periodic
     coherence: np.ndarray  # 0..1, share of the output's power that the command causes
     noise_std: float  # m, standard deviation of the noise of a single position reading
-    # odd distortion: rms output at odd lines without excitation, over that at excited lines
+    # odd distortion: ratio of the rms output at odd lines without excitation to the rms output at excited
+    # lines
     odd: float | None
-    # even distortion: rms output at even lines without excitation, over that at excited lines
+    # even distortion: the same ratio for even lines without excitation
     even: float | None
-    excess: tuple[float, float]  # output power over noise power at odd and at even lines without excitation
+    excess: tuple[float, float]  # ratio of output to noise power at odd and at even lines without excitation
     periods: int  # number of averaged periods; 0 for a non-periodic command
 
 
 def find_repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100) -> tuple[int, slice] | None:
-    """Find the period of a command, and the rows in which the command repeats after one period.
+    """Find the period of a command, and the range of rows in which the command is periodic.
 
     The command need not be periodic from its first row, because a multisine usually fades in.
 
@@ -55,8 +56,7 @@ def find_repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100)
         shortest: Shortest period to search for, in rows.
 
     Returns:
-        The number of rows in one period and the range of repeating rows, or None if the command is not
-        periodic.
+        The number of rows per period, and the range of rows; or None if the command is not periodic.
     """
     rows = len(command)
     centred = np.where(valid, command - command[valid].mean(), 0.0)
@@ -90,14 +90,14 @@ def _find_longest_run(flags: np.ndarray) -> tuple[int, int]:
 def compute_spectrum(
     command: np.ndarray, output: np.ndarray, valid: np.ndarray, period: float, rest: int
 ) -> Spectrum | None:
-    """Compute the spectra of one run, from averaged periods or else by the local polynomial method.
+    """Compute the spectra of one run: average the periods or, without periods, fit local polynomials.
 
     Args:
         command: Commanded position of each row [m].
         output: Measured position of each row [m].
         valid: Flags of the rows that were not lost.
         period: Control period [s].
-        rest: Number of rows after a lost row that a transient disturbs.
+        rest: Number of rows that the transient after a lost row disturbs.
 
     Returns:
         The spectra, or None if the run is too short.
@@ -120,7 +120,7 @@ def compute_spectrum(
 
 
 def _flag_rows_after_gaps(valid: np.ndarray, rest: int) -> np.ndarray:
-    """Return flags of the lost rows and of the `rest` rows after each of them."""
+    """Return flags that mark every lost row and the `rest` rows that follow it."""
     last = np.maximum.accumulate(np.where(~valid, np.arange(len(valid)), -rest - 1))
     return np.arange(len(valid)) - last <= rest
 
@@ -150,7 +150,7 @@ def average_periods(command: np.ndarray, output: np.ndarray, valid: np.ndarray, 
 
 
 def _add_distortion(U, Y, variance, excited, frequency, noise, count) -> Spectrum:
-    """Return the spectrum with the nonlinear distortion, measured at the lines without excitation."""
+    """Add the nonlinear distortion, which the lines without excitation show, to the spectrum."""
     number = np.arange(len(U))
     last = number[excited].max()
     rms = np.sqrt(np.mean(np.abs(Y[excited]) ** 2))
@@ -192,7 +192,7 @@ def fit_local_polynomials(command: np.ndarray, output: np.ndarray, period: float
     power = _smooth(np.abs(U) ** 2)
     middle = np.arange(SIDE_LINES, len(U) - SIDE_LINES)
     middle = middle[power[middle] > MIN_POWER_SHARE * power[1:].max()]
-    # If a periodic command has too few periods to average, every second line has no power.
+    # If a periodic command has too few periods for an average, every second line has no power.
     middle = middle[np.abs(U[middle]) ** 2 > MIN_POWER_SHARE * power[middle]]
     width = 2 * SIDE_LINES + 1
     r = np.arange(-SIDE_LINES, SIDE_LINES + 1) / SIDE_LINES

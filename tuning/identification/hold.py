@@ -1,7 +1,7 @@
 """Frequency response of the command hold, which converts sampled commands to a continuous drive input.
 
-A command is one number per tick. The drives hold it (`zoh`) or interpolate linearly between commands
-(`linear`). The spectrum of the sampled command repeats at every multiple of the tick rate. The hold
+A command is one number per tick. The drives either hold it (`zoh`) or interpolate linearly between two
+commands (`linear`). The spectrum of the sampled command repeats at every multiple of the tick rate. The hold
 attenuates these spectral images. The spectrum of the sampled readings is the sum of all images, each
 multiplied by the response of the rig at the frequency of the image:
 
@@ -18,7 +18,7 @@ SPECTRAL_IMAGES = 3  # number of spectral images on either side of the base band
 
 
 def compute_image_frequencies(frequency: np.ndarray, period: float) -> np.ndarray:
-    """Return the frequencies f + m / T [Hz] of the spectral images m of each line, shape (images, lines)."""
+    """Return the frequencies f + m / T [Hz] of the spectral images m of all lines, shape (images, lines)."""
     return frequency + np.arange(-SPECTRAL_IMAGES, SPECTRAL_IMAGES + 1)[:, None] / period
 
 

@@ -34,7 +34,7 @@ def make_mechanism(
     Args:
         campaign: Logs of the identification.
         prior: Mechanism with the values that the logs do not determine, or None.
-        model: Model of the motion simulator, or None if it is unknown.
+        model: Model of the motion simulator, or None if no model is known.
         contact: Fit of the contact, or None if the prior's contact is used.
         estimates: Estimates of all parameters.
         draws_by_key: Posterior draws of the identified parameters.
@@ -95,7 +95,7 @@ def make_mechanism(
 
 
 def compute_bound_excess(key: str, draws: np.ndarray) -> float:
-    """Return by how much the lower bound 0 of the file raises a parameter above the mean of its draws."""
+    """Return the value in the file minus the mean of the draws, if the mean is below the bound 0."""
     bounded = key.endswith(".delay") or key.startswith("contact.damping")
     return max(-float(draws.mean()), 0.0) if bounded else 0.0
 
@@ -103,9 +103,9 @@ def compute_bound_excess(key: str, draws: np.ndarray) -> float:
 def _merge_uncertainty(
     document, draws_by_key: Mapping[str, np.ndarray], options: IdentificationOptions
 ) -> dict[str, Any]:
-    """Return the tables `[uncertainty]` and `[correlation]` of the identified parameters.
+    """Return the tables `[uncertainty]` and `[correlation]` of the mechanism file.
 
-    Parameters that were not identified keep the prior's uncertainty.
+    The tables contain the identified parameters, and the prior's uncertainty of the others.
     """
     # A damping that is 0 in every draw has no uncertainty.
     keys = [key for key, draws in draws_by_key.items() if np.ptp(draws) > 0.0]

@@ -1,9 +1,9 @@
 """Identification of a rig and its mechanism in four stages: rest, free motion, contact, validation.
 
 Each stage uses the results of the previous stages. If the campaign has no runs for a stage, the prior's
-values are used. The logs cannot determine the command hold, the command latency, the row convention and the
-mass. They also determine only the sum of the delays of the motion and of the position sensor. The user must
-specify these values.
+values are used. The user must specify what the logs cannot determine: the command hold, the command latency,
+the row convention (which ticks the command and the readings in a row belong to), the mass, and the position
+sensor's delay, because the logs determine only its sum with the delay of the motion.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from tuning.identification.structure_choice import MAX_RELATIVE_STD
 
 MIN_REST_ROWS = 200  # minimum number of rows at rest for an estimate of the noise
 ASSUMED_CONTACT_FREQUENCY = 3.0  # Hz, contact frequency that is assumed if the logs have no contact
-STAGE_COUNT = 3  # progress messages: free motion, contact, validation; a bootstrap adds one per chunk of fits
+STAGE_COUNT = 3  # number of progress messages without a bootstrap, which adds one per chunk of fits
 ReportProgress = Callable[[str], None]  # receives the name of each stage when it begins
 FORCE_DELAY_KEY, DEAD_ZONE_KEY = "rig.force_sensor.delay", "rig.force_sensor.dead_zone"
 STIFFNESS_PREFIX, POSITION_DELAY_KEY = "contact.stiffness.", "rig.position_sensor.delay"
-MIN_DELAY_SIGMAS = 2.0  # standard deviations above 0 to which a negative force delay is raised
+MIN_DELAY_SIGMAS = 2.0  # a negative force delay is increased to this number of standard deviations above 0
 
 
 def _ignore_progress(text: str) -> None:
@@ -56,12 +56,12 @@ def identify(
         campaign: Runs and their timing.
         prior: Mechanism with the values that the logs do not determine, or None.
         options: Options of the identification, or None for the defaults.
-        say: Function that receives a progress message at the start of each stage and after each bootstrap
-            chunk.
+        say: Function that receives a progress message at the start of each stage and after each chunk of
+            bootstrap fits.
 
     Returns:
-        Estimates, posterior draws, checks and the mechanism. The verdict is bad, without a mechanism, if a
-        required value is unknown.
+        Estimates, posterior draws, checks and the mechanism. If a required value is unknown, there is no
+        mechanism and the verdict is bad.
 
     Raises:
         InputError: If the options are invalid.
@@ -127,7 +127,7 @@ def _select_runs_in_contact(campaign: Campaign, model: MotionModel) -> list[Logg
 
 
 def _estimate_frequency(contact: ContactFit | None, mass: float) -> float:
-    """Return the contact frequency [Hz], or an assumed value if the logs have no contact."""
+    """Return the contact frequency [Hz]; without contacts in the logs, return an assumed value."""
     return (
         ASSUMED_CONTACT_FREQUENCY if contact is None else contacts.estimate_contact_frequency(contact, mass)
     )
@@ -144,14 +144,14 @@ def _condition_draws(
 
     Args:
         draws: Posterior draws by key.
-        used_keys: Keys of the fixed parameters that the fits have used.
+        used_keys: Keys of the fixed parameters whose values the fits have already used.
         frequency: Contact frequency [Hz].
         prior: Prior mechanism, or None.
         options: Options of the identification.
 
     Returns:
-        The draws without those of fixed parameters, the values that were conditioned on by key, and notes on
-        fixed values that contradict the logs.
+        The draws of the parameters that are not fixed; the values (by key) on which the draws were
+        conditioned; and notes on fixed values that contradict the logs.
     """
     if options.bayes and prior is not None:
         draws = conditioning.condition_on_prior(draws, prior, frequency, options.seed)
@@ -181,7 +181,7 @@ def _drop_undetermined_entries(
             for key, draws in draws_by_key.items()
             if vague == [] or key.startswith(SIMULATOR_PREFIX)
         }, vague
-    # If all entries share one damping, the remaining entries determine it.
+    # If all entries have one common damping, the remaining entries determine it.
     shared = sum(key.startswith("contact.damping.") for key in draws_by_key) == 1
     lists = (STIFFNESS_PREFIX,) if shared else (STIFFNESS_PREFIX, "contact.damping.")
     dropped = tuple(f"{name}{entry}" for name in lists for entry in entries)
@@ -196,9 +196,9 @@ def _drop_undetermined_entries(
 def _list_missing_parameters(
     prior: Mechanism | None, model: MotionModel | None, contact: ContactFit | None, delay_is_unknown: bool
 ) -> tuple[str, ...]:
-    """Return the parameters that neither the logs nor the prior determine, each with a remedy in words.
+    """Return the parameters that neither the logs nor the prior determine, each with advice in words.
 
-    `delay_is_unknown` states that the logs do not determine the force delay and the user did not fix it.
+    `delay_is_unknown` is True if the logs do not determine the force delay and the user did not fix it.
     """
     missing = ["rig.simulator (add a run of kind free)"] if model is None else []
     if prior is None and delay_is_unknown:
@@ -215,9 +215,9 @@ def _make_prior_model(prior: Mechanism | None) -> MotionModel | None:
 def _estimate_sensor_noise(
     runs: Mapping[str, Sequence[LoggedRun]],
 ) -> tuple[NoiseEstimate | None, NoiseEstimate | None]:
-    """Return the noise of the force sensor and of the position sensor from runs at rest, or None.
+    """Return the noise of the force sensor and that of the position sensor at rest; each may be None.
 
-    If no run is at rest, the noise of the force sensor comes from free motion.
+    Without a run at rest, the noise of the force sensor is estimated from free motion.
     """
     force = position = None
     for run in (*runs["rest"], *runs["free"]):
@@ -245,10 +245,10 @@ def _fit_and_check_contact(
     options: IdentificationOptions,
     say: ReportProgress,
 ) -> tuple[ContactFit | None, list[validation.CheckResult]]:
-    """Fit the contact law to all contacts, and test a fit to some contacts on the others.
+    """Fit the contact law to all contacts; check a second fit on the contacts that it omits.
 
     Returns:
-        The fit to all contacts, or None if there are none; and the checks of the test.
+        The fit to all contacts, or None if there are no contacts; and the checks of the second fit.
     """
     if model is None or not runs:
         return None, []
@@ -269,7 +269,7 @@ def _fit_and_check_contact(
 
 
 def _note_clipped_values(draws_by_key: Mapping[str, np.ndarray]) -> list[str]:
-    """Return a note for each parameter whose estimate is negative and therefore 0 in the file."""
+    """Return a note for each parameter that is 0 in the file because its estimate is negative."""
     notes = []
     for key, draws in draws_by_key.items():
         if compute_bound_excess(key, draws) > 0.0:
@@ -281,7 +281,7 @@ def _note_clipped_values(draws_by_key: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def select_held_out_contacts(runs: Sequence[LoggedRun], share: float) -> np.ndarray:
-    """Select the contacts that a test fit does not use: about a `share` of those at each approach speed.
+    """Select the contacts that a test fit omits: about a `share` of the contacts at each approach speed.
 
     If there are at least three contacts at a speed, at least one of them is selected.
 
@@ -293,7 +293,7 @@ def select_held_out_contacts(runs: Sequence[LoggedRun], share: float) -> np.ndar
     for speed in set(speeds) - {-1}:
         members = [i for i, speed_of_run in enumerate(speeds) if speed_of_run == speed]
         count = max(1, round(share * len(members))) if share > 0.0 and len(members) >= 3 else 0
-        # Regular intervals leave contacts with every entry of the contact lists in the fit.
+        # Contacts are selected at regular intervals, so that the fit keeps contacts of every list entry.
         for i in members[1 :: max(1, len(members) // max(count, 1))][:count]:
             flags[i] = True
     return flags
@@ -314,7 +314,7 @@ def _draw_parameters(
         contact: Fit of the contact, or None.
         model: Model of the motion simulator, or None.
         frequency: Contact frequency [Hz].
-        share: Delay of the position sensor [s], which is part of the fitted delays.
+        share: Delay of the position sensor [s], which the fitted delays include.
         seed: Seed of the random numbers.
     """
     result, lag = {}, np.zeros(POSTERIOR_DRAWS)
@@ -341,7 +341,7 @@ def _draw_parameters(
 def _select_fixed_before_fit(
     keys: Sequence[str], share: float, prior: Mechanism | None, options: IdentificationOptions
 ) -> dict[str, float]:
-    """Return the fixed parameters among `keys`, and a position sensor delay that differs from the prior."""
+    """Return the fixed parameters in `keys`, and the position sensor's delay if it differs from the prior."""
     fixed = {key: options.fixed[key] for key in keys if key in options.fixed}
     if share != (0.0 if prior is None else prior.rig.position_sensor.delay):
         fixed[POSITION_DELAY_KEY] = share
@@ -354,7 +354,7 @@ def _choose_position_delay(
     prior: Mechanism | None,
     options: IdentificationOptions,
 ) -> float:
-    """Return the position sensor's delay [s]: as specified, but increased if the force delay is negative."""
+    """Return the specified delay of the position sensor [s], increased if the force delay is negative."""
     if POSITION_DELAY_KEY in options.fixed:
         return options.fixed[POSITION_DELAY_KEY]
     specified = 0.0 if prior is None else prior.rig.position_sensor.delay

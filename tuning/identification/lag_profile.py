@@ -1,4 +1,4 @@
-"""Posterior of the contact parameters for a force sensor with a first-order lag.
+"""Posterior of the contact parameters if the force sensor has a first-order lag.
 
 The lag smooths the jump of the force at the onset of damped contact. The likelihood therefore has no steps,
 unlike in `contact_profile`. At each force delay, linear least squares give a normal distribution of the
@@ -16,12 +16,12 @@ from tuning.identification.contact_problem import ContactProblem
 from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
 from tuning.identification.normal_draws import factorise_covariance
 
-MAX_SURFACE_STD = 0.01  # m, largest standard deviation of the surface position
-MAX_REDRAWS = 50  # repetitions of draws that contain a negative damping coefficient
+MAX_SURFACE_STD = 0.01  # m, upper limit of the surface position's standard deviation
+MAX_REDRAWS = 50  # maximum number of repetitions of draws with a negative damping coefficient
 
 
 def compute_posterior_near(problem: ContactProblem, delays: np.ndarray, plane: float, seed: int) -> Posterior:
-    """Compute the posterior over a grid of force delays, starting from an approximate surface position.
+    """Compute the posterior on a grid of force delays, from an approximate surface position.
 
     Args:
         problem: Contact problem with the lag of the sensor.

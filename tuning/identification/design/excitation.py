@@ -1,10 +1,11 @@
-"""Optimal design of two identification runs: a multisine in free motion and a multisine in a press.
+"""Optimal design of two identification runs: a multisine in free motion, and one in contact (press run).
 
-The design minimizes the error e - e* that wrong parameters cause in a compensated contact. The derivatives of
-this error come from the simulated loop. The power spectra of both runs are optimized together (`powers`),
-because the free run determines the motion simulator, and the press run then determines stiffness, damping and
-force delay. A share of the power is distributed evenly over all frequency lines, so that the runs also reveal
-a wrong model order or a nonlinearity.
+The design minimises the error e - e* of the restitution that wrong parameters cause in a compensated contact
+(e on the rig, e* in the ideal contact). The derivatives of this error come from the simulated loop. A press
+run keeps the mechanism pressed against the surface. The free run determines the motion simulator, and the
+press run then determines stiffness, damping and force delay. The power spectra of both runs are therefore
+optimised together (`powers`). A share of the power is distributed evenly among all frequency lines, so that
+the runs also reveal a wrong model order or a nonlinearity.
 """
 
 from __future__ import annotations
@@ -28,18 +29,18 @@ from tuning.identification.mechanism_file import set_value
 MULTISINE_PERIOD = 5.0  # s
 MULTISINE_PERIODS = 12  # number of periods; the first period of the free run is not evaluated
 FADE_TIME = 1.0  # s, duration of the fade-in and of the fade-out
-APPROACH_TIME = 2.0  # s, duration of the motion to the preload of a press, and back
-START_CLEARANCE = 0.001  # m, distance to the surface at the start of a press
-MIN_TOP_FREQUENCY = 45.0  # Hz, highest frequency line; 3 times the bandwidth for a faster motion simulator
+APPROACH_TIME = 2.0  # s, duration of the approach to the preload of a press run, and of the retraction
+START_CLEARANCE = 0.001  # m, distance to the surface at the start of a press run
+MIN_TOP_FREQUENCY = 45.0  # Hz, minimum of the highest frequency line, which is usually 3 times the bandwidth
 FLAT_POWER_SHARE = 0.2  # share of the power that is distributed evenly over the frequency lines
-ASSUMED_CREST_FACTOR = 1.6  # crest factor that is assumed when powers are compared with limits
-PRELOAD_SHARE = 0.45  # mean force of a press over the largest allowed force
-SWING_SHARE = 0.4  # amplitude of the force about its mean, over the largest allowed force
-# Weight of the parameters' relative errors, in addition to their effect on e - e*.
+ASSUMED_CREST_FACTOR = 1.6  # assumed crest factor for the comparison of powers with limits
+PRELOAD_SHARE = 0.45  # mean force of a press run as a share of the largest allowed force
+SWING_SHARE = 0.4  # amplitude of the force about its mean, as a share of the largest allowed force
+# Weight of the parameters' relative errors, which is added to the weight of their effect on e - e*.
 RELATIVE_ERROR_WEIGHT = 0.01
-CONTACT_PHASES = (0.0, 0.25, 0.5, 0.75)  # control periods, phases of the contacts for which e is evaluated
+CONTACT_PHASES = (0.0, 0.25, 0.5, 0.75)  # control periods between a tick and the onset of contact
 ASSUMED_NOISE_STD = 5e-6, 0.5  # m and N, noise of position and force if the mechanism specifies none
-LIMIT_SHARE = 0.9  # share of the limits of speed, acceleration and force that a run may use
+LIMIT_SHARE = 0.9  # maximum used share of the limits of speed, acceleration and force
 DAMPING_KEY = "contact.damping.0"
 TRIAL_DAMPING_RATIO = 0.01  # damping ratio of the contact at which the resolution of damping is computed
 SIMULATOR_KEYS = {
@@ -52,14 +53,14 @@ SIMULATOR_KEYS = {
 
 @dataclass(frozen=True)
 class Excitation:
-    """Position command of one run, and the multisine in it.
+    """Position command of one run, and the multisine that it contains.
 
     Attributes:
-        position: Position command in each control period [m]; relative to the start in a free run, absolute
-            in a press.
+        position: Position command in each control period [m]; relative to the start position in a free run,
+            absolute in a press run.
         frequency: Frequency lines of the multisine [Hz].
         amplitude: Amplitude at each line [m].
-        crest: Crest factor (peak over rms) of the signal that is closest to its limit.
+        crest: Crest factor (ratio of peak to rms) of the signal that is closest to its limit.
     """
 
     position: np.ndarray
@@ -78,9 +79,10 @@ class ExcitationDesign:
         keys: Keys of the identified parameters.
         values: Values of the parameters in the mechanism, in SI units.
         std: Predicted standard deviation of each parameter.
-        slopes: Derivatives of e - e* with respect to the parameters, shape (contacts and phases, keys).
+        slopes: Derivatives of the restitution error e - e* with respect to the parameters; one row per
+            contact and phase, one column per key.
         covariance: Predicted covariance of the parameters.
-        flat: Error of e - e* for equal powers at all lines, over the error for this design.
+        flat: Error e - e* for equal powers at all lines, divided by the error for this design.
     """
 
     free: Excitation
@@ -94,7 +96,7 @@ class ExcitationDesign:
 
     @property
     def error(self) -> float:
-        """Return the rms error e - e* that parameter errors with the predicted covariance cause."""
+        """Return the rms of the restitution error e - e* that parameter errors with this covariance cause."""
         return float(np.sqrt(np.mean(np.sum(self.slopes @ self.covariance * self.slopes, axis=1))))
 
 
@@ -104,7 +106,7 @@ SlopeFunction = Callable[[Sequence[str]], np.ndarray]
 def design_excitation(
     mechanism: Mechanism, stroke: float, slopes_by: SlopeFunction, seed: int = 0
 ) -> ExcitationDesign:
-    """Design a free run and a press run for a rig with approximately known parameters.
+    """Design a free run and a press run (in contact) for a rig with approximately known parameters.
 
     Speed and acceleration stay within the limits of `rig.simulator`. The force stays within the range of the
     sensor and below the peak force of a contact at the nominal approach speed.
@@ -112,8 +114,8 @@ def design_excitation(
     Args:
         mechanism: Mechanism with the approximate parameters.
         stroke: Largest excursion of the multisine in either direction [m].
-        slopes_by: Function that returns the derivatives of e - e* with respect to given keys, shape
-            (contacts, keys), for example `differentiate_error`.
+        slopes_by: Function that returns the derivatives of e - e* with respect to the given keys, shape
+            (contacts, keys); for example, a call of `differentiate_error`.
         seed: Seed of the random phases.
 
     Raises:
@@ -167,7 +169,7 @@ def design_excitation(
 def differentiate_error(
     mechanism: Mechanism, compensator: str, gains: dict[str, float], keys: Sequence[str]
 ) -> np.ndarray:
-    """Return the derivatives of e - e* with respect to parameters, simulated without noise.
+    """Differentiate the restitution error e - e* with respect to parameters, in simulations without noise.
 
     Args:
         mechanism: Mechanism with the approximate parameters.
@@ -176,10 +178,10 @@ def differentiate_error(
         keys: Keys of the parameters.
 
     Returns:
-        Derivatives of shape (contacts and phases, keys).
+        Derivatives; one row per contact and phase, one column per key.
 
     Raises:
-        InputError: If no contact ends with finite derivatives.
+        InputError: If no contact is completed with finite derivatives.
     """
     document, rows = to_plain_data(mechanism), []
     for key in ("noise_std", "quantum", "dead_zone", "bias"):
@@ -228,12 +230,12 @@ def _replace_damping(mechanism: Mechanism, damping: float) -> Mechanism:
 
 
 def _with_bracketed_indices(key: str) -> str:
-    """Return a dotted key with the indices of list entries in brackets: `a.0` becomes `a[0]`."""
+    """Return a dotted key with its list indices in brackets: `a.0` becomes `a[0]`."""
     return "".join(f"[{part}]" if part.isdigit() else f".{part}" for part in key.split("."))[1:]
 
 
 class _MultisinePlan:
-    """Frequency lines of both runs, with their Fisher information and the limits of the signals."""
+    """Plan of both multisines: frequency lines, Fisher information per line, and limits of the signals."""
 
     def __init__(self, mechanism: Mechanism, stroke: float):
         rig = mechanism.rig
@@ -260,12 +262,12 @@ class _MultisinePlan:
         ]
         parameters = self._list_parameters(mechanism)
         self.keys, self.values = tuple(parameters), np.array(list(parameters.values()))
-        # Relative errors of parameters that are 0 refer to these values.
+        # The relative error of a parameter that is 0 refers to these values.
         small = [self.period if key.endswith("delay") else 10.0 for key in parameters]
         self.scales = np.maximum(np.abs(self.values), small)
-        motion, force = self._responses(mechanism)
+        motion, force = self._compute_responses(mechanism)
         self.free, self.press = (
-            self._group(mechanism, index, response, std, response_limits, periods)
+            self._compute_run_lines(mechanism, index, response, std, response_limits, periods)
             for index, response, std, response_limits, periods in (
                 (0, motion, stds[0], self._limits(rig, stroke), MULTISINE_PERIODS - 1),
                 (
@@ -283,7 +285,7 @@ class _MultisinePlan:
         )
 
     def _list_parameters(self, mechanism: Mechanism) -> dict[str, float]:
-        """Return the values of the parameters that the runs identify, by key."""
+        """Return the parameters that the runs identify: a dictionary from key to value."""
         document, simulator = to_plain_data(mechanism), mechanism.rig.simulator.model
         keys = [*(f"rig.simulator.{name}" for name in SIMULATOR_KEYS[simulator]), "rig.simulator.delay"]
         keys += ["rig.force_sensor.delay", *_find_stiffness_key(mechanism, self.depth)]
@@ -291,8 +293,8 @@ class _MultisinePlan:
             keys.append(DAMPING_KEY)
         return {key: _get_value(document, key) for key in keys}
 
-    def _responses(self, mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
-        """Return the frequency responses from the command to the position and force readings in a press."""
+    def _compute_responses(self, mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
+        """Return the frequency responses of the position and force readings to the command, in a press run."""
         sensor, position = mechanism.rig.force_sensor, mechanism.rig.position_sensor
         motion = mechanism_models.make_motion_model(mechanism).response(self.s) * self.hold
         delay_exponent = self.s * (sensor.delay - position.delay)
@@ -301,22 +303,22 @@ class _MultisinePlan:
             1.0 + self.s * sensor.time_constant
         )
 
-    def _group(self, mechanism, index, response, std, limits, periods) -> powers.RunLines:
-        """Return, for unit power at each line, the Fisher information and the used share of each limit.
+    def _compute_run_lines(self, mechanism, index, response, std, limits, periods) -> powers.RunLines:
+        """Return the Fisher information and the used share of each limit, for unit power at each line.
 
         Args:
             mechanism: Mechanism with the approximate parameters.
             index: 0 for the position reading, 1 for the force reading.
             response: Frequency response from the command to this reading.
             std: Noise of the reading.
-            limits: Response and limit of each limited signal.
+            limits: Frequency response and limit of each limited signal.
             periods: Number of evaluated periods.
         """
         slopes = []
         for key, scale in zip(self.keys, self.scales, strict=True):
             document, step = to_plain_data(mechanism), 1e-6 * scale
             set_value(document, key, _get_value(document, key) + step)
-            slopes.append((self._responses(from_plain_data(document, key))[index] - response) / step)
+            slopes.append((self._compute_responses(from_plain_data(document, key))[index] - response) / step)
         jacobian = np.array(slopes)
         fisher = np.einsum("il,jl->lij", jacobian.conj(), jacobian).real * periods * self.rows / std**2
         use = np.array(
@@ -337,11 +339,11 @@ class _MultisinePlan:
         return waveform.synthesise_multisine(amplitude, self.lines, self.rows, angle)
 
     def repeated(self, wave: np.ndarray) -> np.ndarray:
-        """Return the command of all periods, with fade-in and fade-out."""
+        """Return the command of all periods of the multisine, with fade-in and fade-out."""
         return waveform.repeat_with_fades(wave, MULTISINE_PERIODS, round(FADE_TIME / self.period))
 
     def pressed(self, wave: np.ndarray) -> np.ndarray:
-        """Return the command of a press: approach to the preload, multisine, and retraction."""
+        """Return the command of a press run: approach to the preload, multisine, and retraction."""
         low, high = self.plane - START_CLEARANCE, self.plane + self.depth
         rows = round(APPROACH_TIME / self.period)
         approach = waveform.ramp(low, high, rows)
@@ -356,7 +358,7 @@ def _get_value(document: dict, key: str) -> float:
 
 
 def _find_stiffness_key(mechanism: Mechanism, depth: float) -> list[str]:
-    """Return, as a list, the key of the stiffness that acts at a depth [m]."""
+    """Return a list of one key: that of the stiffness at a depth [m]."""
     contact = mechanism.contact
     if not find_contact_law(contact.law).segmented:
         return ["contact.stiffness.0"]
@@ -372,7 +374,7 @@ def _compute_force(mechanism: Mechanism, depth: np.ndarray, rate: float = 0.0) -
 
 
 def _differentiate_force(mechanism: Mechanism, depth: float) -> tuple[float, float]:
-    """Return the derivatives of the force at a depth [m]: by depth [N/m] and by rate [N s/m]."""
+    """Differentiate the force at a depth [m] with respect to depth [N/m] and to rate [N s/m]."""
     step = 1e-3 * depth
     low, high = _compute_force(mechanism, np.array([depth - step, depth + step]))
     back, forth = (float(_compute_force(mechanism, np.array([depth]), rate)[0]) for rate in (-step, step))
@@ -380,7 +382,7 @@ def _differentiate_force(mechanism: Mechanism, depth: float) -> tuple[float, flo
 
 
 def _find_preload(mechanism: Mechanism) -> tuple[float, float]:
-    """Return the depth of the preload [m] and the largest allowed force [N].
+    """Return the depth at the preload [m] and the largest allowed force [N] of a press run.
 
     The force must not exceed the range of the sensor, or the peak force of a contact at the approach speed.
     """

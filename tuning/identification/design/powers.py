@@ -1,9 +1,9 @@
 """Optimal distribution of a multisine's power over its frequency lines.
 
-Lines with the powers p_l give the Fisher information I = sum_l p_l M_l on the parameters theta. The criterion
-is trace(A I^-1) with A = J^T J and J = d e / d theta. It is the variance of the errors e due to the errors of
-the parameters (Silvey, Optimal Design, 1980). The limits on stroke, speed, acceleration and force are linear
-in the powers: sum_l g_il p_l <= 1. At the optimum, all lines with p_l > 0 satisfy
+Lines with the powers p_l give the Fisher information matrix I = sum_l p_l M_l of the parameters theta. The
+criterion is trace(A I^-1) with A = J^T J and J = d e / d theta. It is the variance of the errors e that
+parameter errors cause (Silvey, Optimal Design, 1980). The limits on stroke, speed, acceleration and force are
+linear in the powers: sum_l g_il p_l <= 1. At the optimum, all lines with p_l > 0 satisfy
 
     trace(A I^-1 M_l I^-1) = sum_i lambda_i g_il,
 
@@ -23,14 +23,14 @@ POWER_ITERATIONS = 400  # number of multiplicative updates
 
 @dataclass(frozen=True)
 class RunLines:
-    """Fisher information and use of the limits for each frequency line of one run."""
+    """Fisher information of each frequency line of one run, and its share of each limit."""
 
     information: np.ndarray  # (lines, parameters, parameters), Fisher information M_l per unit power
-    use: np.ndarray  # (limits, lines), share g_il of each limit per unit power
+    use: np.ndarray  # (limits, lines), share g_il of each limit that a line uses per unit power
 
 
 def optimise_powers(groups: Sequence[RunLines], weight: np.ndarray) -> list[np.ndarray]:
-    """Return the powers of the lines of each run that minimize trace(A I^-1) within the limits of the run.
+    """Return the powers that minimise trace(A I^-1), with the Fisher information I, within the limits.
 
     Args:
         groups: Lines of each run.
@@ -64,6 +64,6 @@ def sum_information(groups: Sequence[RunLines], powers: Sequence[np.ndarray]) ->
 
 
 def invert_scaled(matrix: np.ndarray) -> np.ndarray:
-    """Return the pseudoinverse of a symmetric matrix whose parameters have different units."""
+    """Return the pseudoinverse of a symmetric matrix of parameters with different units."""
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     return np.linalg.pinv(matrix / np.outer(size, size), rcond=1e-14, hermitian=True) / np.outer(size, size)

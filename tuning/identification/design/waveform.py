@@ -1,8 +1,8 @@
 """Multisines with a low crest factor, and commands that begin and end at rest.
 
-The phases are optimized from starting values: those of Schroeder (1970), and random phases. The optimization
-minimizes the L8 norm and then the L32 norm of the signal, which approximate the signal's peak (Guillaume,
-Schoukens, Pintelon and Kollar 1991).
+The optimisation of the phases starts from the phases of Schroeder (1970) and from random phases. It minimises
+the L8 norm and then the L32 norm of the signal, which approximate the signal's peak (Guillaume, Schoukens,
+Pintelon and Kollar 1991).
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from scipy import optimize
 LimitedSignal = tuple[np.ndarray | complex, float]
 UNLIMITED_SIGNAL: LimitedSignal = (1.0 + 0.0j, 1.0)
 
-RANDOM_STARTS = 1  # number of optimizations that start from random phases
-NORM_POWER_LOG2 = 3, 5  # base-2 logarithms of the order of the norms: 8, then 32
-MAX_SOLVER_ITERATIONS = 40  # iterations of the solver for each norm
+RANDOM_STARTS = 1  # number of optimisations that start from random phases
+NORM_POWER_LOG2 = 3, 5  # base-2 logarithms of the orders of both norms, 8 and 32
+MAX_SOLVER_ITERATIONS = 40  # maximum number of iterations of the solver for each norm
 
 
 def optimise_phases(
@@ -29,10 +29,10 @@ def optimise_phases(
     limited: Sequence[LimitedSignal] = (UNLIMITED_SIGNAL,),
     seed: int = 0,
 ) -> np.ndarray:
-    """Return the phases [rad] of a multisine that minimize the largest ratio of a signal's peak to its limit.
+    """Return the phases [rad] of a multisine that minimise the largest ratio of a signal's peak to its limit.
 
     Args:
-        amplitude: Amplitude at each line.
+        amplitude: Amplitude at each frequency line.
         lines: Harmonic number of each line: its number of cycles per period of the multisine.
         rows: Number of samples in one period of the multisine.
         limited: Frequency response and limit of each limited signal.
@@ -58,7 +58,7 @@ def _reduce_peak(amplitude, lines, rows, limited, angle) -> np.ndarray:
     )
 
     def mean(angle, doublings):
-        """Return the logarithm of the norm of order 2**`doublings`, and its derivative by the phases."""
+        """Return the logarithm of the norm of order 2**`doublings`, and its gradient in the phases."""
         power, total, slope = 2**doublings, 0.0, np.zeros(len(lines))
         for (response, limit), signal in zip(
             limited, make_limited_signals(amplitude, lines, rows, angle, limited), strict=True
@@ -105,7 +105,7 @@ def crest_factor(values: np.ndarray) -> float:
 
 
 def repeat_with_fades(period: np.ndarray, times: int, fade: int) -> np.ndarray:
-    """Return `times` periods of a signal, with `fade` additional samples of fade-in and of fade-out."""
+    """Return `times` periods of a signal between `fade` samples of fade-in and `fade` of fade-out."""
     signal = np.concatenate([period[-fade:], np.tile(period, times), period[:fade]])
     rise = np.sin(0.5 * np.pi * np.arange(fade) / fade) ** 2
     signal[:fade] *= rise
