@@ -1,15 +1,16 @@
-"""Choice of the contact law: the simplest law that predicts the contacts which were not used to fit it.
+"""Choice of the contact law: the simplest law that predicts contacts which its fit did not use.
 
 Each law is fitted to the odd contacts and evaluated on the even contacts, and vice versa (cross-validation).
-The measure is the log likelihood of each contact. A law is acceptable if its total log likelihood is within
-two standard errors of that of the best law. The law with the best Bayesian information criterion is
-acceptable, too. Among the acceptable laws, the law with the fewest parameters is chosen. With fewer than four
+The measure is the log likelihood of each contact. A law is acceptable if its total log likelihood is at most
+two standard errors below the best total. The law with the best Bayesian information criterion is acceptable,
+too. Of the acceptable laws, the one with the fewest parameters is chosen. If there are fewer than four
 contacts, the information criterion replaces cross-validation.
 
-A law without damping is chosen only if the user names it. To first order, a contact determines only damping
-minus stiffness times force delay. A law without damping attributes this whole difference to the delay, whose
-interval is then much too narrow. The Kelvin-Voigt law includes the linear law. For the same reason, a law
-whose damping is zero at zero depth is chosen only if the contacts exclude damping at the onset.
+A law without damping is chosen only if the user names it. To first order, a contact determines only the
+difference damping - stiffness * force delay. A law without damping attributes the whole difference to the
+delay, whose interval is then much too narrow. The linear law is not needed, because the Kelvin-Voigt law
+includes it. For the same reason, a law whose damping is zero at zero depth is chosen only if the contacts
+exclude damping at the onset.
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
 
 MIN_CONTACTS_FOR_CROSS_VALIDATION = 4  # minimum number of contacts for cross-validation
-# Standard errors of the difference in log likelihood; laws within it are equally good.
+# Maximum deficit of an acceptable law in log likelihood, in standard errors of the deficit.
 MAX_LIKELIHOOD_DEFICIT_ERRORS = 2.0
-ONSET_DAMPING_EXCLUSION_ERRORS = 4.0  # standard errors; a larger deficit excludes damping at the onset
-ONSET_MARGIN = 1e-3  # s, time before and after an onset or a release that the evaluation omits
+ONSET_DAMPING_EXCLUSION_ERRORS = 4.0  # minimum deficit that excludes onset damping, in standard errors
+ONSET_MARGIN = 1e-3  # s; the evaluation omits rows that are closer to an onset or a release
 
 
 @dataclass(frozen=True)
 class EvaluatedLaw:
-    """Contact law with its best fit and its log likelihood in cross-validation."""
+    """Contact law with its best fit, and its log likelihood in the cross-validation."""
 
     law: Law
     delay: float  # s, force delay of the best fit
@@ -55,7 +56,8 @@ def choose_contact_law(
 ) -> list[EvaluatedLaw]:
     """Fit and evaluate all contact laws or the named laws; return them with the chosen law first.
 
-    The segments of a long press are similar, so that exponents and depths are fitted to a few segments.
+    The segments of a long press run are similar. Shape parameters (such as exponents) are therefore fitted to
+    a few segments only.
     """
     evaluated = []
     lanes = select_representative_lanes(ContactProblem(motion, readings, kelvin_voigt(), plane))
@@ -80,9 +82,9 @@ def choose_contact_law(
         results.append(EvaluatedLaw(law, delay, at, misfit, likelihood, (float(behind.sum()), error)))
     rows = np.log(max(readings.counts.sum(), 2))
     preferred = min(results, key=lambda fit: fit.misfit + rows * fit.law.complexity)
-    # Without damping in the law the delay absorbs it, so such a law is chosen only if the user names it.
+    # The delay absorbs the damping that a law omits, so such a law is chosen only if the user names it.
     damped = [fit for fit in results if "damping" in fit.law.names] or results
-    # The delay also replaces damping at the onset if the damping of the law is zero at zero depth.
+    # If the damping of a law is zero at zero depth, the delay also absorbs the damping at the onset.
     least = min(fit.misfit for fit in results)
     damped_at_onset = [fit for fit in damped if has_onset_damping(fit.law)]
     if any(
@@ -98,7 +100,7 @@ def choose_contact_law(
         or fit.likelihood_deficit[0] <= MAX_LIKELIHOOD_DEFICIT_ERRORS * fit.likelihood_deficit[1] + 1e-9
     ]
     good = good or [min(damped, key=lambda fit: fit.likelihood_deficit[0])]
-    # Among laws of equal complexity, the first one is chosen; the misfits would depend on noise.
+    # Of laws with equal complexity, the first one is chosen, because their misfits differ only by noise.
     chosen = min(good, key=lambda fit: fit.law.complexity)
     others = [fit for fit in results if fit is not chosen]
     if not is_same and chosen.law.shape:
@@ -126,19 +128,19 @@ FITTABLE_LAW_NAMES = tuple(name for name, law in CONTACT_LAWS.items() if law.fam
 def list_law_families(
     deepest: float, entries: int, names: Sequence[str] | None = None
 ) -> list[RegressionFamily]:
-    """Return the families of all laws that can be fitted to logs, or of the named laws.
+    """Return families of laws (each with a free shape parameter): those of the named laws, or all.
 
     Args:
         deepest: Largest depth of all contacts [m].
-        entries: Number of entries in the contact lists.
-        names: Names of the laws, or None for all laws.
+        entries: Number of entries in the mechanism's contact lists.
+        names: Names of the laws, or None for all laws that can be fitted to logs.
     """
     laws = [CONTACT_LAWS[name] for name in FITTABLE_LAW_NAMES if names is None or name in names]
     return [family for law in laws for family in law.families(deepest, entries)]
 
 
 def _fit_shape(family: RegressionFamily, fit: Callable[[Law], CoarseFit]) -> tuple[Law, CoarseFit]:
-    """Return the best-fitting law of a family with a free shape parameter, and its fit."""
+    """Fit the shape parameter of a family of laws; return the best law and its fit."""
     if family.low == family.high:
         law = family.make(family.low)
         return law, fit(law)
@@ -148,25 +150,25 @@ def _fit_shape(family: RegressionFamily, fit: Callable[[Law], CoarseFit]) -> tup
         method="bounded",
         options={"xatol": 0.001 * (family.high - family.low)},
     )
-    # A common value of the shape parameter is preferred if it fits nearly as well as the best value.
+    # A usual value of the shape parameter is preferred if it fits nearly as well as the best value.
     as_good = (value for value in family.preferred if fit(family.make(value))[2] - optimum.fun < 4.0)
     law = family.make(next(as_good, float(optimum.x)))
     return law, fit(law)
 
 
 def _fit_coarsely(motion, readings, law, plane, guess: CoarseFit | None) -> CoarseFit:
-    """Fit a law near a guess, or over all delays without a guess (see `search_coarsely`)."""
+    """Fit a law near a guess; without a guess, search all delays (see `search_coarsely`)."""
     problem = ContactProblem(motion, readings, law, plane)
     return search_coarsely(problem, guess)
 
 
 def search_coarsely(problem: ContactProblem, guess: CoarseFit | None = None, reach: int = 4) -> CoarseFit:
-    """Return the force delay [s], surface position [m] and chi-squared of the best fit in a coarse search.
+    """Search the best fit in coarse steps; return its force delay [s], surface position [m] and chi-squared.
 
     Args:
         problem: Contact problem.
         guess: Approximate delay and surface position, or None to search all delays.
-        reach: Number of coarse delay steps on either side of the guess.
+        reach: Number of coarse delay steps that are searched on either side of the guess.
     """
     if guess is None:
         start = (
@@ -192,7 +194,7 @@ def search_coarsely(problem: ContactProblem, guess: CoarseFit | None = None, rea
 
 
 def flag_rows_near_edges(motion: MotionResponse, readings: ForceReadings, guess: CoarseFit) -> np.ndarray:
-    """Return flags of the rows within `ONSET_MARGIN` of an onset or a release, shape (rows, lanes).
+    """Flag the rows that are at most `ONSET_MARGIN` from an onset or a release, shape (rows, lanes).
 
     The force of a damped contact jumps there. These rows are not used to compare laws, because their
     residuals depend on the exact time of the jump.
@@ -208,7 +210,7 @@ def flag_rows_near_edges(motion: MotionResponse, readings: ForceReadings, guess:
 def _cross_validate(motion, readings, tested: ForceReadings, law, plane, start: CoarseFit) -> np.ndarray:
     """Return the log likelihood of each odd contact under a fit to the even contacts, and vice versa.
 
-    With too few contacts, the result is one value: minus half the information criterion.
+    If there are too few contacts, the result is a single value: minus half the information criterion.
     """
     lanes = readings.force.shape[1]
     if lanes < MIN_CONTACTS_FOR_CROSS_VALIDATION:
@@ -229,6 +231,6 @@ def _cross_validate(motion, readings, tested: ForceReadings, law, plane, start: 
 def compute_contact_misfits(
     problem: ContactProblem, readings: ForceReadings, delay, plane, coefficients
 ) -> np.ndarray:
-    """Return chi-squared of each contact: the sum of its squared residuals, whitened and normalized."""
+    """Return chi-squared of each contact: the sum of its squared residuals, whitened and divided by the noise."""
     left = problem.whiten(readings.force - problem.force(delay, plane, coefficients)) / readings.std
     return np.sum(np.where(readings.counts, left, 0.0) ** 2, axis=0)

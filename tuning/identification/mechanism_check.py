@@ -39,19 +39,20 @@ ASSUMED_CONTACT_FREQUENCY = 3.0  # Hz, contact frequency that is assumed if the 
 def check_against_mechanism(
     campaign: Campaign, mechanism: Mechanism, limit: float = 0.01, fitted: FreeMotion | None = None
 ) -> Identification:
-    """Check whether a mechanism explains the logs of a rig, without estimating any parameter.
+    """Check whether a mechanism agrees with the logs of a rig, without estimating any parameter.
 
     The noise of the force sensor is taken from runs at rest or in free motion, or else from the mechanism.
 
     Args:
         campaign: The logs.
         mechanism: Mechanism that the logs are compared with.
-        limit: Largest allowed effect of all defects on the restitution e, and on its error e - e*.
-        fitted: Motion simulator fitted to the free runs without a specified order, if available. Only a fit
-            reveals a wrong hold or latency for which the mechanism's delay compensates.
+        limit: Largest allowed effect of all defects on the restitution e, and on the error e - e* (e*: ideal
+            contact).
+        fitted: Motion simulator that was fitted to the free runs without a specified order, or None. Only
+            such a fit reveals a wrong command hold or latency for which the mechanism's delay compensates.
 
     Returns:
-        An identification with checks and a verdict but without estimates.
+        An identification that contains checks and a verdict, but no estimates.
 
     Raises:
         InputError: If the logs have neither free motion nor contact, or the contact law cannot be compared
@@ -104,7 +105,7 @@ def check_against_mechanism(
 
 
 def _has_uncertain_dead_zone(mechanism: Mechanism) -> bool:
-    """Return whether the dead zone's standard deviation exceeds the noise.
+    """Return whether the dead zone's standard deviation exceeds the noise of the force sensor.
 
     The readings at the onset and release of contact are then unpredictable.
     """
@@ -113,14 +114,14 @@ def _has_uncertain_dead_zone(mechanism: Mechanism) -> bool:
 
 
 def check_file_uncertainty(effect: UncertaintyEffect, pressed: bool) -> list[validation.CheckResult]:
-    """Check the effect of the parameters' uncertainty in a mechanism file on the restitution.
+    """Check how much the parameters' uncertainty in a mechanism file affects the restitution.
 
     Args:
         effect: Effect of the uncertainty on e and on e - e*.
         pressed: Whether the logs contain a press run.
 
     Returns:
-        One check that recommends a further experiment; none if the file has no identified parameters.
+        A list with one check, which recommends a further experiment; empty if no parameter was identified.
     """
     if not effect.parts:
         return []
@@ -139,7 +140,7 @@ def check_file_uncertainty(effect: UncertaintyEffect, pressed: bool) -> list[val
 def _make_contact_fit(
     runs: Sequence[LoggedRun], model: MotionModel, campaign: Campaign, mechanism: Mechanism
 ) -> ContactFit:
-    """Return the mechanism's contact model as a `ContactFit`, so that the checks of fits apply to it."""
+    """Return the mechanism's contact model as a `ContactFit`, so that the same checks apply to it."""
     rig, contact, period = mechanism.rig, mechanism.contact, campaign.timing.control_period
     law = mechanism_models.make_regression_law(contact)
     delay = rig.force_sensor.delay - rig.position_sensor.delay
@@ -169,7 +170,7 @@ def _make_contact_fit(
     problem = ContactProblem(motion, readings, law, plane, lag)
     inner = CoefficientFit(values, np.zeros((len(values), len(values))), 0.0, 0.0, 0.0, 0.0)
     delays, planes = _draw_delay_and_surface(mechanism)
-    # The motion is computed only up to the longest delay of the search.
+    # `motion` is available only up to the longest delay in the search range of fits.
     delays = np.clip(delays, problem.min_delay, max(MAX_FORCE_DELAY, delay))
     posterior = Posterior(
         ["delay", "plane", *problem.names],
@@ -183,9 +184,9 @@ def _make_contact_fit(
 
 
 def _estimate_force_noise(runs: Sequence[LoggedRun]) -> NoiseEstimate | None:
-    """Return the force sensor's noise from the first run at rest, or else in free motion, with 200 readings.
+    """Return the force sensor's noise from the first long enough run at rest or, without one, in free motion.
 
-    Returns None if no run has as many readings.
+    Returns None if no run is long enough.
     """
     for kind in ("rest", "free"):
         for run in runs:
@@ -197,7 +198,7 @@ def _estimate_force_noise(runs: Sequence[LoggedRun]) -> NoiseEstimate | None:
 
 
 def _estimate_row_noise(problem: ContactProblem, delay: float, plane: float, values: np.ndarray) -> float:
-    """Return the noise of the force readings [N], estimated from differences of successive residuals."""
+    """Estimate the noise of the force readings [N] from the differences of successive residuals."""
     residual = problem.readings.force - problem.force(delay, plane, values)
     steps = np.diff(residual, axis=0)[problem.readings.counts[1:] & problem.readings.counts[:-1]]
     return max(1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0), 1e-9)

@@ -1,4 +1,4 @@
-"""Text of a mechanism file with the uncertainty and correlation of identified parameters."""
+"""Text of a mechanism file: values, uncertainty and correlation of identified parameters."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-# least eigenvalue of the correlation matrix in the file, so that rounding does not make it singular
+# minimum eigenvalue of the correlation matrix in the file; it prevents a singular matrix after rounding
 MIN_CORRELATION_EIGENVALUE = 1e-6
-FILE_DIGITS = 12  # significant digits of numbers in the file
+FILE_DIGITS = 12  # number of significant digits in the file
 
 
 def make_uncertainty_tables(
@@ -18,13 +18,14 @@ def make_uncertainty_tables(
 ) -> dict[str, Any]:
     """Return the tables `[uncertainty]` and `[correlation]` of a mechanism file from posterior draws.
 
-    All entries of a list have the same standard deviation and one common row in the correlation matrix.
+    All entries of a list parameter have the same standard deviation and one common row in the correlation
+    matrix.
 
     Args:
         keys: Dotted keys of the parameters; the key of a list entry ends in its index.
         draws: Draws of the parameters, shape (draws, keys).
         floors: Minimum standard deviation of each parameter.
-        off: Value in the file minus the mean of the draws, for each key. It increases the uncertainty.
+        off: For each key, the value in the file minus the mean of the draws. It increases the uncertainty.
     """
     covariance = np.atleast_2d(np.cov(draws.T))
     covariance = covariance if off is None else covariance + np.outer(off, off)
@@ -34,7 +35,7 @@ def make_uncertainty_tables(
     groups = [[i for i, key in enumerate(keys) if _strip_index(key) == name] for name in names]
     std = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(std, std)
-    # The correlation of a list is the mean over its entries.
+    # The correlation of a list parameter is the mean of the correlations of its entries.
     joined = np.array(
         [[np.mean(correlation[np.ix_(first, second)]) for second in groups] for first in groups]
     )
@@ -75,7 +76,7 @@ def set_value(document: dict[str, Any], key: str, value: float) -> None:
 
 
 def to_toml(document: dict[str, Any], comment: str = "") -> str:
-    """Return the TOML text of a mechanism in nested tables (`to_plain_data`), after an optional comment."""
+    """Convert nested tables of a mechanism (`to_plain_data`) to TOML text, after an optional comment."""
     lines = [f"# {line}" for line in comment.splitlines()]
     tables: list[tuple[str, dict[str, Any]]] = []
 

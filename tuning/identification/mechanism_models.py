@@ -1,4 +1,4 @@
-"""Conversion of a mechanism file to the models of motion and contact that are compared with logs."""
+"""Conversion of a mechanism file to models of motion and contact, which are compared with logs."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from jaxhil.mechanism.structs import Contact, Mechanism, Simulator
 from tuning.identification.contact_laws import Law
 from tuning.identification.rational import MotionModel, SimulatorStructure
 
-# imaginary part over magnitude; a pole with a smaller ratio is real except for rounding
+# minimum ratio of imaginary part to magnitude of a complex pole; other poles are real except for rounding
 REAL_POLE_TOLERANCE = 1e-9
 
 
 def make_motion_model(mechanism: Mechanism) -> MotionModel:
-    """Return the model from the commanded to the measured position, including the position sensor's delay."""
+    """Return the model from commanded to measured position, with the delay of the position sensor."""
     simulator, delay = mechanism.rig.simulator, mechanism.rig.simulator.delay
     numerator, denominator = _get_transfer_function(simulator)
     poles = np.roots(denominator)
@@ -47,12 +47,12 @@ def _get_transfer_function(simulator: Simulator) -> tuple[list[float], list[floa
 
 
 def make_regression_law(contact: Contact) -> Law:
-    """Return the contact law as a linear regression on functions of depth and rate.
+    """Return the contact law as a linear combination of regressors (functions of depth and rate).
 
     Each entry of the contact lists has separate coefficients.
 
     Raises:
-        InputError: If the law's force is not a linear combination of known functions of depth and rate.
+        InputError: If the law's force is not a linear combination of functions of depth and rate.
     """
     chosen = laws.find_contact_law(contact.law)
     fitted = [

@@ -1,11 +1,11 @@
 """Motion of the mechanism at the times of the sensor readings, computed from the logged commands.
 
 The response of a linear motion simulator to held or linearly interpolated commands is known exactly at any
-time. Within a control period it is a linear function of the state and of the commands at both ends of the
-period (Van Loan 1978). The position at any delay, also at a fraction of a period, is therefore exact and
-without noise. The loop's simulation uses the same method (`jaxhil.simulation.motion_curves`). All runs are
-computed together, one per lane (column of the arrays). The command of each run is assumed to move uniformly
-before its first row.
+time. Within a control period, it is a linear function of the state and of the commands at both ends of the
+period (Van Loan 1978). The position at any time, even between two ticks, is therefore exact and without
+noise. The simulation of the loop uses the same method (`jaxhil.simulation.motion_curves`). All runs are
+computed together, one per lane (column of the arrays). The command is assumed to move uniformly before the
+first row of a run.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ TICK_TOLERANCE = 1e-9  # periods; a time this close to a tick is treated as the 
 
 
 class MotionResponse:
-    """Position and velocity of the mechanism in several runs, predicted from the commands by one model."""
+    """Position and velocity of the mechanism in several runs, which a model predicts from the commands."""
 
     def __init__(
         self,
@@ -38,9 +38,9 @@ class MotionResponse:
             model: Model of the motion simulator.
             runs: Runs, one per lane.
             timing: Timing of commands and readings.
-            longest: Longest sensor delay [s] that `at` must accept, in addition to the model's delay.
-            late: Delay that a separate clock adds to the readings of each run [s], or None. The mean of
-                `LoggedRun.force_late` is subtracted from it.
+            longest: Longest sensor delay [s] that `at` must support. The model's delay is not part of it.
+            late: Delay [s] that a separate clock adds to the readings of each run, minus the mean of
+                `LoggedRun.force_late`; or None.
         """
         self.delay, self.period = model.delay, timing.control_period
         if any(run.force_late is not None for run in runs):
@@ -55,7 +55,8 @@ class MotionResponse:
         self.A, self.B, self.C = _make_companion_form(numerator, denominator, self.period)
         longest = max(self.delay, 0.0) + longest + most
         self.history = int(np.ceil(longest / self.period)) + timing.command_latency + 4
-        # If rows contain readings of later ticks, or a delay is negative, commands of later ticks are needed.
+        # If readings in a row belong to later ticks, or a delay is negative, commands of later ticks are
+        # needed.
         ahead = max(1, -self.shift) + int(np.ceil((max(-self.delay, 0.0) - least) / self.period))
         command = self._commands(runs, ahead)
         latency = timing.command_latency
@@ -66,7 +67,7 @@ class MotionResponse:
         self.states = self._advance(timing.command_hold)
 
     def at(self, delay: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the position [m] and velocity [m/s] that a sensor with this delay [s] reads.
+        """Return the position [m] and velocity [m/s] that a sensor with a delay of `delay` [s] measures.
 
         Both have the shape (rows, lanes).
         """
@@ -101,13 +102,13 @@ class MotionResponse:
         return x, v
 
     def at_row_times(self) -> MotionResponse:
-        """Return the motion at the times of the log's rows instead of the times of the force readings."""
+        """Return the motion at the times of the rows, which may differ from those of the force readings."""
         rows = copy(self)
         rows.late = None
         return rows
 
     def of(self, lanes: np.ndarray, begin: int = 0) -> MotionResponse:
-        """Return the motion of the given lanes, each as often as it occurs, from row `begin` on."""
+        """Return the motion of the given lanes, which may repeat, from row `begin` on."""
         result = copy(self)
         result.offset, result.rows = self.offset + begin, self.rows - begin
         result.start, result.end = self.start[:, lanes], self.end[:, lanes]
@@ -134,7 +135,7 @@ class MotionResponse:
         return np.array(lanes).T
 
     def _after(self, fraction: float):
-        """Return the matrices that advance the state by a fraction of a period.
+        """Return the three matrices that advance the state by a fraction of a period.
 
         They multiply the state, the input at the start of the period and the input at its end.
         """
@@ -154,7 +155,8 @@ class MotionResponse:
         drive = from_start[:, None] * self.start[:, None] + from_end[:, None] * self.end[:, None]
         closed = np.eye(self.order) - state
         from_both = from_start + from_end
-        # In uniform motion, the input grows by one step per period and the state is z = alpha + beta n.
+        # In uniform motion, the input increases by the same step in each period n, and the state is alpha +
+        # beta n.
         step = self.end[1] - self.end[0]
         beta = np.linalg.solve(closed, np.outer(from_both, step))
         ahead = from_both if hold == "zoh" else from_end
@@ -166,7 +168,7 @@ class MotionResponse:
 
 
 def _make_companion_form(numerator: np.ndarray, denominator: np.ndarray, period: float):
-    """Return the companion form (A, B, C) of a transfer function, with time in periods.
+    """Return the companion form (A, B, C) of a transfer function; the unit of time is the control period.
 
     The coefficients are in descending powers of s. For order 0 the matrices are empty.
     """
@@ -186,7 +188,7 @@ def _make_companion_form(numerator: np.ndarray, denominator: np.ndarray, period:
 def compute_matrix_exponential(matrix: np.ndarray) -> np.ndarray:
     """Return the matrix exponential by scaling, Taylor series and squaring, accurate to rounding.
 
-    For hundreds of small matrices this is faster than SciPy's routine, which first chooses a method.
+    For hundreds of small matrices, it is faster than SciPy's routine, which must choose a method first.
     """
     halvings = max(6, int(np.ceil(np.log2(np.abs(matrix).sum(axis=0).max(initial=1.0)))))
     scaled, total = matrix / 2.0**halvings, np.eye(len(matrix))

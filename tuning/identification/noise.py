@@ -1,10 +1,10 @@
 """Noise statistics of a sensor at rest: mean, standard deviation, quantum, dead zone and autocorrelation.
 
-A reading that is rounded to a quantum determines only an interval of the signal. The mean and the standard
-deviation therefore maximize the likelihood of the number of readings at each multiple of the quantum. This
-remains correct if the noise is smaller than the quantum. Coloured noise is modelled as an autoregression
-(Yule-Walker equations, order by the Bayesian information criterion); the inverse of the model whitens the
-residuals.
+A reading that is rounded to a quantum determines only an interval that contains the signal. The estimates of
+mean and standard deviation therefore maximise the likelihood of the number of readings at each multiple of
+the quantum. They remain correct even if the noise is smaller than the quantum. Coloured noise is modelled as
+an autoregression (Yule-Walker equations, order by the Bayesian information criterion); the inverse of the
+model whitens the residuals.
 """
 
 from __future__ import annotations
@@ -15,19 +15,18 @@ import numpy as np
 from scipy import linalg, optimize, special
 from scipy.signal import lfilter
 
-MAX_AUTOREGRESSION_ORDER = 8  # highest order of the autoregression
+MAX_AUTOREGRESSION_ORDER = 8  # maximum order of the autoregression
 MIN_READINGS_BEYOND_DEAD_ZONE = 20  # minimum number of nonzero readings to estimate a dead zone
-MAX_DISTINCT_SHARE = 0.2  # distinct values per reading; readings with more distinct values are not rounded
-MIN_EXCESS_ZERO_SHARE = 0.02  # share of exact zeros, beyond those from rounding, that indicates a dead zone
-# Smallest over mean magnitude of the nonzero readings; a larger ratio excludes a dead zone that is
-# subtracted.
+MAX_DISTINCT_SHARE = 0.2  # maximum number of distinct values per reading in rounded readings
+MIN_EXCESS_ZERO_SHARE = 0.02  # minimum share of exact zeros, without those from rounding, with a dead zone
+# Maximum ratio of smallest to mean magnitude of nonzero readings with a dead zone that is subtracted.
 MAX_LEAST_TO_MEAN_RATIO = 0.3
-MIN_ZERO_SHARE = 0.5  # share of exact zeros that indicates a dead zone without further tests
+MIN_ZERO_SHARE = 0.5  # minimum share of exact zeros that indicates a dead zone without further tests
 
 
 @dataclass(frozen=True)
 class NoiseEstimate:
-    """Noise statistics of one sensor, estimated from readings at rest and in the unit of the readings."""
+    """Noise statistics of one sensor, estimated from readings at rest, in the unit of the readings."""
 
     mean: float  # mean of the readings; 0 if a dead zone hides it
     std: float  # standard deviation of the noise before rounding
@@ -66,7 +65,7 @@ def estimate_noise(readings: np.ndarray) -> NoiseEstimate:
     # The standard error of the mean of correlated readings follows from the noise spectrum at 0 Hz.
     at_zero = np.sqrt(compute_whitened_share(whitening)) / abs(np.sum(whitening))
     effective = 1.0 + 2.0 * np.sum(_autocorrelate(whitening) ** 2)
-    # Rounding adds to the scatter of the readings.
+    # Rounding increases the scatter of the readings.
     width = np.hypot(std, quantum / np.sqrt(12.0))
     return NoiseEstimate(
         float(mean),
@@ -87,19 +86,19 @@ def _has_excess_zeros(readings: np.ndarray, quantum: float) -> bool:
     if np.mean(zero) > MIN_ZERO_SHARE and (quantum == 0.0 or np.ptp(readings) < 1.5 * quantum):
         return True
     size = float(np.sqrt(np.mean(readings[~zero] ** 2))) if not zero.all() else 0.0
-    # Rounding turns at most a share of 0.4 quantum / std of normal readings into 0.
+    # Rounding changes at most a share 0.4 quantum / std of normal readings to 0.
     return size > 0.0 and float(np.mean(zero)) > MIN_EXCESS_ZERO_SHARE + quantum / size
 
 
 def _fit_dead_zone(readings: np.ndarray) -> tuple[float, tuple[float, float] | None]:
     """Estimate the noise and the dead zone of a sensor from readings at rest, assuming a bias of 0.
 
-    The sensor is assumed to read a normal value n as sign(n) max(|n| - D, 0). The dead zone D and the
-    standard deviation maximize the likelihood.
+    For a normally distributed signal n, the sensor is assumed to read sign(n) max(|n| - D, 0). The dead zone
+    D and the standard deviation of n are maximum likelihood estimates.
 
     Returns:
-        The standard deviation, and the dead zone with its standard error. They are 0 and None if too few
-        readings differ from 0, or if a gap around 0 shows a dead zone that is not subtracted.
+        The standard deviation, and the dead zone with its standard error; or 0 and None if too few readings
+        differ from 0, or if a gap around 0 shows that the dead zone is not subtracted from larger values.
     """
     size = np.abs(readings[readings != 0.0])
     zeros, number = len(readings) - len(size), len(size)
@@ -135,7 +134,7 @@ def _estimate_drift(readings: np.ndarray) -> float:
 
 
 def detect_quantum(readings: np.ndarray) -> float:
-    """Return the quantum to which readings are rounded, or 0 for readings that are not rounded."""
+    """Return the quantum to which the readings are rounded, or 0 if they are not rounded."""
     values = np.unique(readings[np.isfinite(readings)])
     if len(values) < 2 or len(values) > MAX_DISTINCT_SHARE * len(readings):
         return 0.0
@@ -153,7 +152,7 @@ def detect_quantum(readings: np.ndarray) -> float:
 
 
 def _fit_rounded_normal(readings: np.ndarray, quantum: float) -> tuple[float, float]:
-    """Return the maximum likelihood mean and standard deviation of normal values that were rounded."""
+    """Estimate mean and standard deviation of rounded normal values by maximum likelihood."""
     values, counts = np.unique(np.round(readings / quantum), return_counts=True)
     middle, spread = np.average(values, weights=counts), readings.std() / quantum
 
@@ -192,7 +191,7 @@ def fit_whitening_filter(values: np.ndarray) -> tuple[float, ...]:
 
 
 def _autocorrelate(whitening: tuple[float, ...], longest: int = 200) -> np.ndarray:
-    """Return the autocorrelation at lags 1 to `longest` of the noise with this whitening filter."""
+    """Return the autocorrelation, at lags 1 to `longest`, of the noise that this filter whitens."""
     if len(whitening) == 1:
         return np.zeros(1)
     impulse = np.zeros(4 * longest)
@@ -204,7 +203,7 @@ def _autocorrelate(whitening: tuple[float, ...], longest: int = 200) -> np.ndarr
 
 
 def compute_whitened_share(whitening: tuple[float, ...]) -> float:
-    """Return the variance of the noise after its whitening filter, divided by the variance before it."""
+    """Return the variance of the noise after whitening, divided by the variance before whitening."""
     if len(whitening) == 1:
         return 1.0
     rho = np.concatenate([[1.0], _autocorrelate(whitening)])[: len(whitening)]

@@ -1,4 +1,4 @@
-"""Factor of a covariance matrix that may be singular, for normal draws."""
+"""Factorisation of a covariance matrix for normal draws; the matrix may be singular."""
 
 import numpy as np
 

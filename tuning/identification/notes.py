@@ -1,4 +1,4 @@
-"""Notes on an identification: assumptions, and observations that no estimate expresses."""
+"""Notes on an identification: assumptions, and observations that the estimates do not show."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def collect_notes(
     Args:
         motion: Fit of the motion simulator, or None.
         contact: Fit of the contact, or None.
-        used: Fit of the contact if the mechanism file uses it, or None.
+        used: Fit of the contact if its values are in the mechanism file, or None.
         force: Noise of the force sensor at rest, or None.
         vague: Keys of the stiffness entries that the logs hardly determine.
     """

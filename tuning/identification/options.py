@@ -15,25 +15,26 @@ from tuning.identification.rational import STRUCTURES
 
 @dataclass(frozen=True)
 class IdentificationOptions:
-    """Options of an identification that the caller sets."""
+    """Options of an identification."""
 
-    # order of the motion simulator; None: the smallest order that explains the spectra
+    # order of the motion simulator, or None to choose the smallest order that explains the spectra
     order: int | None = None
-    law: str | None = None  # name of the contact law; None: the simplest law that predicts the contacts
+    law: str | None = None  # name of the contact law, or None to choose the simplest law
     fixed: Mapping[str, Any] = field(default_factory=dict)  # fixed parameters by key: numbers or lists
-    bayes: bool = False  # whether to combine the logs with the normal marginals of the prior
-    hold_out: float = 0.2  # share of the contacts that a test fit omits and is evaluated on
+    bayes: bool = False  # whether to combine the logs with the normal distributions of the prior
+    hold_out: float = 0.2  # share of the contacts that a test fit omits; they test this fit
     bootstrap: int = 0  # number of bootstrap fits; 0: no bootstrap
     limit: float = 0.01  # largest allowed effect of all defects on the restitution
     calibration: float = 0.001  # relative standard uncertainty of the force sensor's scale
-    clock: float = 2e-5  # s, minimum standard uncertainty of a delay: no log reveals an error of its clock
+    clock: float = 2e-5  # s, minimum standard uncertainty of a delay, because logs do not show clock errors
     seed: int = 0  # seed of the random numbers
     scheduler: str | None = None  # address of a cluster's scheduler for the bootstrap
     checkpoints: Checkpoints = NO_CHECKPOINTS  # checkpoints of the bootstrap
 
 
-MIN_BOOTSTRAP_FITS = 20  # minimum number of fits that determine the scatter
-# If these parameters are fixed, the first fit uses their values; all others are conditioned on afterwards.
+MIN_BOOTSTRAP_FITS = 20  # minimum number of fits for an estimate of their scatter
+# The fits use the fixed values of these parameters. The draws are conditioned on all other fixed values
+# later.
 KEYS_FIXED_BEFORE_FIT = ("rig.contact_plane", "rig.position_sensor.delay")
 
 

@@ -1,7 +1,8 @@
-"""Single sequence of the rows near contact of all lanes, so that one call filters all lanes.
+"""Sequence of the rows near contact of all lanes (runs), so that a single call filters all lanes.
 
-For each lane, the sequence holds the rows from the first to the last contact, and further rows in which the
-response of the filters decays. The filtered values of a lane therefore do not depend on other lanes.
+For each lane, the sequence contains the rows from the first to the last contact, and the following rows, in
+which the response of the filters decays. The filtered values of a lane therefore do not depend on other
+lanes.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ import numpy as np
 
 
 class PackedRows(NamedTuple):
-    """Rows of several lanes, one lane after the other in a single sequence."""
+    """Rows of several lanes in a single sequence, one lane after the other."""
 
     rows: np.ndarray  # flat index into an array (rows, lanes) for each element; -1 after the end of a lane
-    starts: np.ndarray  # (lanes,), index in the sequence of row 0 of each lane, even if it is not included
+    starts: np.ndarray  # (lanes,), index in the sequence that row 0 of each lane has, or would have
 
     def places(self, rows: np.ndarray) -> np.ndarray:
         """Convert flat indices into an array (rows, lanes) to indices in the sequence."""
@@ -28,7 +29,7 @@ def pack_rows(near: Sequence[np.ndarray], shape: tuple[int, int], memory: int) -
     """Build the sequence of rows near contact.
 
     Args:
-        near: Arrays of rows near contact, as sorted flat indices into an array (rows, lanes).
+        near: Arrays of rows near contact; each contains sorted flat indices into an array (rows, lanes).
         shape: Numbers of rows and lanes.
         memory: Number of rows until the response of the filters has decayed.
     """
@@ -36,7 +37,7 @@ def pack_rows(near: Sequence[np.ndarray], shape: tuple[int, int], memory: int) -
     first, last = np.full(lanes, length), np.full(lanes, -1)
     for rows in near:
         row, lane = np.divmod(rows, lanes)
-        # If an index occurs several times, NumPy keeps the last assigned value.
+        # If an index occurs several times, NumPy keeps the value that was assigned last.
         lasting, beginning = last.copy(), first.copy()
         lasting[lane], beginning[lane[::-1]] = row, row[::-1]
         first, last = np.minimum(first, beginning), np.maximum(last, lasting)

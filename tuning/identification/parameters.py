@@ -47,8 +47,8 @@ def draw_simulator_parameters(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Draw the parameters of the motion simulator from a normal distribution.
 
-    For first- and second-order models, all parameters are drawn. For other models, only the delay is drawn;
-    it takes the whole deviation of the phase delay at the contact frequency.
+    The draws of a first- or second-order model contain all its parameters. Those of other models contain only
+    the delay, which then includes the whole deviation of the phase delay at the contact frequency.
 
     Args:
         model: Fitted model.
@@ -58,7 +58,7 @@ def draw_simulator_parameters(
         rng: Random number generator.
 
     Returns:
-        Draws by key, and the deviation of the phase delay at the contact frequency in each draw [s].
+        Draws by key, and each draw's deviation of the phase delay at the contact frequency [s].
     """
     deviations = rng.standard_normal((count, len(covariance))) @ factorise_covariance(covariance).T
     s = np.array([2j * np.pi * frequency])
@@ -98,7 +98,7 @@ def convert_contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
     if "damping" in draws_by_name:
         result["contact.damping.0"] = draws_by_name["damping"]
     if contact.dead_zone:
-        # Adding 0.0 turns -0.0, which would be printed as such, to 0.0.
+        # Adding 0.0 changes -0.0, which would be printed with its sign, to 0.0.
         result["rig.force_sensor.dead_zone"] = np.maximum(-draws_by_name["bias"], 0.0) + 0.0
     return result
 
@@ -115,7 +115,7 @@ def make_contact_section(law: Law, values: dict[str, float]) -> dict[str, Any]:
 
 
 def _collect_entries(values: dict[str, float], prefix: str) -> list[list[float]]:
-    """Return the list entries whose keys begin with `prefix`; a missing entry repeats the previous entry."""
+    """Return the list entries whose keys begin with `prefix`; a missing entry equals the previous one."""
     entries: dict[int, list[float]] = {}
     for key in sorted(key for key in values if key.startswith(prefix)):
         entries.setdefault(int(key[len(prefix) :].split(".")[0]), []).append(values[key])

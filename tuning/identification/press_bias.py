@@ -1,8 +1,8 @@
-"""Surface position from a press run that never leaves the contact, by means of the force sensor's bias.
+"""Surface position from the bias of the force sensor, for press runs that never leave the contact.
 
-In such a run, a bias b has the same effect on the readings as a surface that is closer by b / K, with the
-stiffness K. The surface position is therefore observable only if a run at rest or in free motion determines
-the bias.
+In such a run (slow motion while pressed against the surface), a bias b has the same effect on the readings as
+a surface that is closer by b / K, with the stiffness K. The surface position is therefore observable only if
+a run at rest or in free motion determines the bias.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from tuning.identification.motion import MotionResponse
 from tuning.identification.noise import NoiseEstimate
 from tuning.identification.records import LoggedRun
 
-TYPICAL_FORCE_DELAY = 0.005  # s, typical delay of a force sensor; accurate enough to detect a release
-SHALLOW_ROW_SHARE = 0.01  # share of the rows with the smallest depth, at which a press may leave the contact
+TYPICAL_FORCE_DELAY = 0.005  # s, assumed delay of the force sensor; accurate enough to detect a release
+SHALLOW_ROW_SHARE = 0.01  # share of the rows, those with the smallest depth, that may be out of contact
 MIN_MEAN_ROWS = 20  # minimum number of rows for a mean
-# Force above the line through deeper readings, over the range of the force; a larger ratio shows a release.
+# Minimum mean excess of these rows' force above the line through deeper readings that shows a release, as a
+# share of the range of the force.
 RELEASE_FORCE_SHARE = 0.2
-MIN_BIAS_STD_RATIO = 0.1  # minimum standard deviation of the bias between runs, over that of the noise
+MIN_BIAS_STD_RATIO = 0.1  # minimum standard deviation of the bias between runs, as a share of the noise
 
 
 def find_bias_prior(
@@ -36,11 +37,11 @@ def find_bias_prior(
         plane: Position of the surface [m], if it is specified.
 
     Returns:
-        Mean and standard deviation of the bias [N]; or None if a run leaves the contact or the surface is
-        specified, so that the readings determine the bias.
+        Mean and standard deviation of the bias [N]; or None if the readings determine the bias, because a run
+        leaves the contact or the surface is specified.
 
     Raises:
-        InputError: If neither the runs nor readings at rest determine the bias.
+        InputError: If neither the runs in contact nor readings at rest determine the bias.
     """
     if plane is not None or any(run.kind != "press" for run in runs) or _has_release(runs, motion):
         return None
@@ -57,7 +58,7 @@ def find_bias_prior(
 def find_surface_of_press(
     position: np.ndarray, force: np.ndarray, counts: np.ndarray, bias: tuple[float, float]
 ) -> float | None:
-    """Return the surface position [m] at which the line through the forces of a press reaches the bias.
+    """Return the surface position [m], at which a line through the forces of a press run reaches the bias.
 
     Returns None if the force does not increase with the position.
     """
@@ -67,7 +68,7 @@ def find_surface_of_press(
 
 
 def _has_release(runs: Sequence[LoggedRun], motion: MotionResponse) -> bool:
-    """Return whether a press leaves the contact, so that forces at small depths exceed the linear trend."""
+    """Return whether a press run leaves the contact, so that its smallest forces exceed the linear trend."""
     position, _ = motion.at(TYPICAL_FORCE_DELAY)
     x, f = [], []
     for lane, run in enumerate(runs):

@@ -3,9 +3,9 @@
     H(s) = N(s) e^{-s tau} / (prod (1 + T s) prod (1 + 2 zeta s/w + s^2/w^2)),  N = 1 + c1 s + c2 s^2
 
 The logarithms of time constants, natural frequencies and damping ratios are fitted, so that the model remains
-stable. The maximum likelihood fit weights every spectral line by its noise (Pintelon and Schoukens, System
+stable. The maximum likelihood fit weights every spectral line with its noise (Pintelon and Schoukens, System
 Identification: A Frequency Domain Approach, 2012). The model includes the command hold, so that the fitted
-parameters are those of the rig itself. The starting values come from linear fits over a grid of delays
+parameters are those of the rig itself. The starting values come from linear fits at several delays
 (Sanathanan and Koerner 1963).
 """
 
@@ -21,17 +21,17 @@ from scipy import optimize
 
 from tuning.identification import hold as holds
 
-MIN_TIME_CONSTANT = 1e-6  # s; faster poles cannot be resolved
+MIN_TIME_CONSTANT = 1e-6  # s, minimum time constant; logs cannot resolve faster poles
 
 
 @dataclass(frozen=True)
 class SimulatorStructure:
-    """Structure of a model: number of first-order sections, second-order sections and zeros."""
+    """Structure of a model: numbers of first-order sections, second-order sections and zeros."""
 
     name: str
-    first: int  # number of sections 1 + T s
-    second: int  # number of sections 1 + 2 zeta s/w + s^2/w^2
-    zeros: int  # degree of N(s)
+    first: int  # number of denominator sections 1 + T s
+    second: int  # number of denominator sections 1 + 2 zeta s/w + s^2/w^2
+    zeros: int  # number of zeros: degree of the numerator N(s)
 
     @property
     def order(self) -> int:
@@ -56,7 +56,7 @@ STRUCTURES = (
 
 @dataclass(frozen=True)
 class SpectralLines:
-    """Measured spectra of command and position at the excited frequency lines, with the command timing."""
+    """Measured spectra of command and position at the excited frequencies, with the command timing."""
 
     frequency: np.ndarray  # Hz
     command: np.ndarray  # complex amplitude of the commanded position
@@ -69,7 +69,7 @@ class SpectralLines:
 
     @cached_property
     def images(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return s = 2 pi j f and the drive input at every spectral image of each line, (images, lines)."""
+        """Return s = 2 pi j f and the drives' input at the spectral images of all lines, (images, lines)."""
         frequencies = holds.compute_image_frequencies(self.frequency, self.period)
         return 2j * np.pi * frequencies, self.command * holds.compute_hold_response(
             frequencies, self.period, self.hold, self.latency, self.shift
@@ -104,7 +104,7 @@ class MotionModel:
 
     @cached_property
     def sections(self) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Return the coefficients of N and of each denominator section, in ascending powers of s."""
+        """Return the coefficients of N(s) and of each denominator section, in ascending powers of s."""
         many, values = self.structure, np.asarray(self.parameters, float)
         parts = [np.array([1.0, time]) for time in np.exp(values[: many.first])]
         for w, zeta in np.exp(values[many.first : many.order]).reshape(-1, 2):
@@ -113,7 +113,7 @@ class MotionModel:
 
     @cached_property
     def fraction(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the coefficients of numerator and denominator in descending powers of s."""
+        """Return the coefficients of the numerator and of the denominator, in descending powers of s."""
         numerator, parts = self.sections
         denominator = np.array([1.0])
         for part in parts:
@@ -139,7 +139,7 @@ class MotionModel:
         return np.array([*rows, -s])
 
     def predict(self, lines: SpectralLines) -> np.ndarray:
-        """Return the predicted complex amplitude of the measured position at each line."""
+        """Return the predicted complex amplitude of the measured position at each frequency line."""
         s, command = lines.images
         return np.sum(self.response(s) * command, axis=0)
 
@@ -166,11 +166,11 @@ class SpectrumFit:
 
     model: MotionModel
     covariance: np.ndarray  # covariance of the parameters, from the curvature of the likelihood
-    residual: np.ndarray  # complex residual r at each line over its noise: E|r|^2 = 1
+    residual: np.ndarray  # complex residual r at each line, divided by its noise: E|r|^2 = 1
 
     @property
     def chi2(self) -> float:
-        """Return chi-squared: the sum of squares of real and imaginary residuals of unit variance."""
+        """Return chi-squared: the sum of squares of real and imaginary residuals, scaled to unit variance."""
         return float(2.0 * np.sum(np.abs(self.residual) ** 2))
 
     @property
@@ -183,11 +183,11 @@ class SpectrumFit:
 
 
 def fit_structure(structure: SimulatorStructure, lines: SpectralLines) -> SpectrumFit:
-    """Fit a structure to spectra by maximum likelihood (Levenberg-Marquardt from the best linear fit)."""
+    """Fit a structure to spectra by maximum likelihood (Levenberg-Marquardt method)."""
     candidates = sorted(
         (_fit_linear_start(structure, lines, delay) for delay in _make_delay_grid(lines)), key=lambda c: c[0]
     )
-    # Starting values with similar delays converge to the same minimum, so the second one has a distant delay.
+    # Fits from similar delays converge to the same minimum, so the second fit starts from a distant delay.
     fits = [_refine_fit(structure, candidates[0][1], lines)]
     for _, start in candidates[1:]:
         if structure.order > 1 and abs(start[-1] - candidates[0][1][-1]) > 2.0 * lines.period:
@@ -228,13 +228,13 @@ def _refine_fit(structure: SimulatorStructure, start: np.ndarray, lines: Spectra
 
 
 def _limit_fast_poles(structure: SimulatorStructure, parameters: np.ndarray) -> np.ndarray:
-    """Return the parameters with all poles limited to a magnitude of 1 / `MIN_TIME_CONSTANT`."""
+    """Return the parameters after limiting the magnitude of all poles to 1 / `MIN_TIME_CONSTANT`."""
     first, order = structure.first, structure.order
     times = np.maximum(parameters[:first], np.log(MIN_TIME_CONSTANT))
     sections = []
     fastest = -np.log(MIN_TIME_CONSTANT)
     for frequency, ratio in parameters[first:order].reshape(-1, 2):
-        if ratio > 0.0:  # damping ratio above 1: two real poles, as logarithms
+        if ratio > 0.0:  # damping ratio above 1: the section has two real poles; return their logarithms
             slower = frequency - ratio - np.log1p(np.sqrt(1.0 - np.exp(-2.0 * ratio)))
             faster, slower = min(2.0 * frequency - slower, fastest), min(slower, fastest)
             frequency = 0.5 * (slower + faster)
@@ -245,7 +245,7 @@ def _limit_fast_poles(structure: SimulatorStructure, parameters: np.ndarray) -> 
 
 
 def _make_delay_grid(lines: SpectralLines) -> np.ndarray:
-    """Return a grid of delays [s] from 0 to the largest delay that the phase of the lowest lines allows."""
+    """Return a grid of delays [s] from 0 to the largest delay that the phase at low frequencies allows."""
     s, command = lines.images
     middle = len(s) // 2
     phase = np.unwrap(np.angle(lines.output / command[middle]))
@@ -260,7 +260,7 @@ def _make_delay_grid(lines: SpectralLines) -> np.ndarray:
 def _fit_linear_start(
     structure: SimulatorStructure, lines: SpectralLines, delay: float
 ) -> tuple[float, np.ndarray]:
-    """Fit a structure with a given delay by linear least squares; return chi-squared and the parameters.
+    """Fit a structure with a fixed delay by linear least squares; return chi-squared and the parameters.
 
     The fit neglects the spectral images.
     """
@@ -297,7 +297,7 @@ def _convert_sections(structure: SimulatorStructure, denominator: np.ndarray, un
 
     Args:
         structure: Structure of the model.
-        denominator: Coefficients in ascending powers of s times `unit`.
+        denominator: Coefficients in ascending powers of the product of s and `unit`.
         unit: Unit of time of the coefficients [s].
     """
     roots = polynomial.polyroots(denominator)

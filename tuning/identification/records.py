@@ -16,7 +16,7 @@ RunKind = Literal["free", "press", "tap", "contact", "rest"]
 CONTACT_KINDS: tuple[RunKind, ...] = "contact", "press", "tap"
 CommandHold = Literal["zoh", "linear"]
 RowConvention = Literal["tick", "sent", "after"]
-DEFAULT_MECHANISM_NAME = "identified"  # name of an identified mechanism without a prior
+DEFAULT_MECHANISM_NAME = "identified"  # name of the mechanism if there is no prior
 # Number of ticks by which the readings of a row are older than its command. A "sent" row contains the command
 # of the next tick; an "after" row contains the readings of the next tick.
 ROW_SHIFT = {"tick": 0, "sent": 1, "after": -1}
@@ -24,19 +24,19 @@ ROW_SHIFT = {"tick": 0, "sent": 1, "after": -1}
 
 @dataclass(frozen=True)
 class StampClock:
-    """Accuracy of the time stamps of a log; a log without time stamps has a perfect clock."""
+    """Accuracy of the time stamps of a log; without time stamps, the clock is assumed to be perfect."""
 
     period: float  # s, control period measured by the time stamps
-    drift: float  # ppm, relative excess of the measured period over the nominal control period
+    drift: float  # ppm, relative difference of the measured period from the nominal control period
     jitter: float  # s, standard deviation of the time stamps about the ticks
     lost: int  # number of missing rows
 
 
 @dataclass(frozen=True)
 class LoggedRun:
-    """Part of a log with one kind of experiment and at most one contact.
+    """Part of a log that contains a single kind of experiment and at most one contact.
 
-    Arrays have one entry per control period, lost rows included.
+    Arrays have one entry per control period, including lost rows.
     """
 
     kind: RunKind  # kind of experiment
@@ -57,7 +57,10 @@ class LoggedRun:
 
 @dataclass(frozen=True)
 class CampaignTiming:
-    """Timing of the logged commands and readings, as the user specifies it; no part of it is estimated."""
+    """Timing of the logged commands and readings.
+
+    It is specified by the user, not estimated.
+    """
 
     control_period: float  # s
     command_hold: CommandHold  # drives' input between two ticks: held or interpolated
@@ -70,9 +73,9 @@ class CampaignTiming:
 
     @property
     def shift(self) -> int:
-        """Return the number of periods by which a row's readings are older than its command.
+        """Return by how many periods the readings of a row are older than its command.
 
-        A computing delay is subtracted, because it acts on the loop like a motion that starts later.
+        The computing delay is subtracted, because it has the same effect on the loop as a later motion.
         """
         return ROW_SHIFT[self.row] - self.computing_delay
 
@@ -86,4 +89,4 @@ class Campaign:
     equivalent_mass: float  # kg, equivalent mass of the numerical model
     sources: dict[str, str] = field(default_factory=dict)  # hexadecimal SHA-256 of each log, by file name
     notes: tuple[str, ...] = ()  # remarks of the reader on the logs
-    integrator: str | None = None  # integrator of the numerical model; None if unknown
+    integrator: str | None = None  # integrator of the numerical model, or None if unknown

@@ -13,7 +13,7 @@ from tuning.identification.noise import NoiseEstimate
 from tuning.identification.validation import CheckResult
 
 UNCERTAINTY_CHECK = "uncertainty of the numbers"  # name of the check of the parameters' uncertainty
-MIN_CONFOUNDED_CORRELATION = 0.95  # magnitude of the correlation; above it, two parameters are confounded
+MIN_CONFOUNDED_CORRELATION = 0.95  # minimum magnitude of the correlation of two confounded parameters
 
 PRESS_EXPERIMENT = "a press run with a multisine to 45 Hz"
 WIDER_MULTISINE = "a multisine to 1.5 times the bandwidth or more"
@@ -69,9 +69,10 @@ class Identification:
             separates the parameters.
         lines: Results of the checks.
         mechanism: Content of a mechanism file, or None if a value is missing or invalid.
-        limit: Largest allowed sum of the defects' effects, on the restitution e and on its error e - e*.
-        notes: Remarks in words.
-        missing: Parameters that neither the logs nor the prior determine, each with a remedy.
+        limit: Largest allowed sum of the defects' effects on the restitution e, and on its error e - e* (e*:
+            ideal contact).
+        notes: Further remarks.
+        missing: Parameters that neither the logs nor the prior determine, each with advice.
         motion: Fit of the motion simulator, or None.
         contact: Fit of the contact, or None.
         force_noise: Noise of the force sensor at rest, or None.
@@ -104,13 +105,16 @@ class Identification:
 
     @property
     def good(self) -> bool:
-        """Return whether both effects are below the limit and logs were compared with the model."""
+        """Return True if both effects are below the limit and the logs were compared with the model."""
         is_small = max(self.effect, self.effect_on_error) < self.limit
         return not self.missing and self.is_compared and is_small
 
     @property
     def is_compared(self) -> bool:
-        """Return whether a check compares logs with the model; the file's own uncertainty does not."""
+        """Return whether any check compares the logs with the model.
+
+        The check of the uncertainty does not.
+        """
         return any(line.name != UNCERTAINTY_CHECK for line in self.lines)
 
     @property
@@ -159,7 +163,7 @@ def find_confounded_pairs(keys: list[str], draws: np.ndarray) -> tuple[tuple[str
         draws: Posterior draws of the parameters, shape (draws, keys).
 
     Returns:
-        For each pair, the two keys, their correlation, and the experiment that separates them.
+        For each pair, the two keys, their correlation, and an experiment that separates the parameters.
     """
     varying = np.ptp(draws, axis=0) > 0.0
     keys, draws = [key for key, varies in zip(keys, varying, strict=True) if varies], draws[:, varying]
@@ -177,7 +181,7 @@ def find_confounded_pairs(keys: list[str], draws: np.ndarray) -> tuple[tuple[str
 
 
 def suggest_experiment(first: str, other: str) -> str:
-    """Return the experiment, in words, that separates two confounded parameters, given by their keys."""
+    """Return a description of an experiment that separates two confounded parameters, given by their keys."""
     first, other = (key.rstrip("0123456789").rstrip(".") for key in (first, other))
     return EXPERIMENTS.get((first, other)) or EXPERIMENTS.get(
         (other, first), "longer runs, or a wider range of speeds and frequencies"

@@ -1,4 +1,4 @@
-"""Checks of an identification: its file against the logs, as `identify --check` does, or else the fits."""
+"""Checks of an identification: of its mechanism file or, if there is no valid file, of its fits."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def check_result(
     frequency: float,
     options: IdentificationOptions,
 ) -> tuple[dict[str, Any] | None, list[validation.CheckResult]]:
-    """Check the mechanism file or, if none can be checked, the fits.
+    """Check the mechanism file as `identify --check` does; if this is impossible, check the fits.
 
     Returns:
-        The mechanism, or None if its file would be invalid; and the checks.
+        The mechanism (None if its file would be invalid), and the checks.
     """
     written, errors = _parse_written_mechanism(mechanism)
     lines = _check_written_file(campaign, written, motion if options.order is None else None)
@@ -69,7 +69,7 @@ def _check_written_file(
         motion: Fit of the motion simulator without a specified order, or None.
 
     Returns:
-        The checks, or None if there is no file or the logs cannot be compared with it.
+        The checks; or None if there is no file, or if the logs cannot be compared with it.
     """
     if written is None or campaign.timing.two_clocks:
         return None

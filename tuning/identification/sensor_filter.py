@@ -1,8 +1,8 @@
 """Response of a force sensor with a first-order lag over one control period, in closed form.
 
-The sensor's lag integrates the force between two readings. A smooth force is approximated by the parabola
-through its values at the beginning, in the middle and at the end of the period. At the onset of damped
-contact, the force jumps from 0.
+A sensor with a lag integrates the force between two readings. A smooth force is approximated by the parabola
+through its values at the beginning, in the middle and at the end of the period. At the onset of a damped
+contact, the force jumps, which requires other weights.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 def compute_lag_weights(rate: float) -> tuple[float, tuple[float, float, float]]:
     """Return the pole of a sampled first-order lag, and the weights of the force during a control period.
 
-    The new reading is the pole times the previous reading, plus the weighted sum of three forces. The result
-    is exact if the force is a parabola in time.
+    The new reading is pole * previous reading + weighted sum of three forces. It is exact if the force is a
+    parabola in time.
 
     Args:
         rate: Control period divided by the time constant.
@@ -51,7 +51,7 @@ def compute_onset_weights(rate: float, left: np.ndarray) -> tuple[np.ndarray, np
 def compute_onset_shares(
     last: np.ndarray, half: np.ndarray, now: np.ndarray, plane: np.ndarray
 ) -> np.ndarray:
-    """Return the share of a control period after the onset of contact; 0 without an onset.
+    """Return the share of a control period that lies after the onset of contact; 0 without an onset.
 
     The motion is linear in each half of the period.
 

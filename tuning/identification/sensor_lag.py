@@ -1,11 +1,11 @@
 """Estimation of a first-order lag of the force sensor, in addition to its delay.
 
-To first order, a lag acts like a delay. Slow contacts therefore determine only the sum of lag and delay,
-which also determines the effect on the loop. A lag is estimated if it improves the Bayesian information
-criterion by at least 6. If the contacts neither require nor exclude a lag, it is treated as part of the
-delay. The draws of delay and damping then average over the models with and without a lag (Bayesian model
-averaging, Hoeting et al. 1999). The average is needed because a lag smooths the force at the onset of
-contact, and only the onset distinguishes delay from damping.
+To first order, a lag acts like a delay. Slow contacts therefore determine only the sum of lag and delay. This
+sum also determines the effect on the loop. A separate lag is estimated if it improves the Bayesian
+information criterion by at least 6. If the contacts neither require nor exclude a lag, it is treated as part
+of the delay. The draws of delay and damping then average over the models with and without a lag (Bayesian
+model averaging, Hoeting et al. 1999). The average is needed because only the onset of contact distinguishes
+delay from damping, and a lag smooths the force at the onset.
 """
 
 from __future__ import annotations
@@ -24,16 +24,15 @@ from tuning.identification.law_choice import CoarseFit, search_coarsely
 
 MAX_TIME_CONSTANT = 0.005  # s, longest time constant of a lag
 TRIAL_TIME_CONSTANTS = 0.0005, 0.0015, 0.004  # s, time constants of a first search
-MIN_CRITERION_GAIN = 6.0  # improvement of the Bayesian information criterion that is required for a lag
-# Number of time constants in the grid, and half width of the grid in standard deviations of the time
-# constant.
+MIN_CRITERION_GAIN = 6.0  # minimum improvement of the Bayesian information criterion by a lag
+# Number of time constants in the grid, and half width of this grid in standard deviations.
 LAG_GRID_SIZE, LAG_HALF_WIDTH_SIGMAS = 9, 3.5
-# Number of delays at each time constant, and half width of this range in standard deviations of the delay.
+# Number of delays at each time constant, and half width of this grid in standard deviations.
 DELAY_GRID_SIZE, DELAY_HALF_WIDTH_SIGMAS = 21, 5.0
-MIN_DELAY_STD = 5e-5  # s, minimum standard deviation of the delay for the width of the grid
-SMALL_LAG_GRID_SIZE, SMALL_DELAY_GRID_SIZE = 7, 15  # size of the grid if the readings do not require a lag
+MIN_DELAY_STD = 5e-5  # s, minimum standard deviation of the delay that determines the width of the grid
+SMALL_LAG_GRID_SIZE, SMALL_DELAY_GRID_SIZE = 7, 15  # sizes of both grids if the lag is uncertain
 PRIOR_LAG_PROBABILITY = 0.8  # prior probability of a lag: nearly every amplifier has a filter
-# Drop of the log likelihood below its maximum; a lag with a larger drop is excluded.
+# Maximum drop of the log likelihood from its maximum; a lag with a larger drop is excluded.
 EXCLUSION_LIKELIHOOD_DROP = 8.0
 
 # Function that returns the problem with a lag [s] and its best delay, surface and misfit.
@@ -47,11 +46,11 @@ class SensorLag:
     value: float  # s, most probable time constant; 0 if the lag is treated as part of the delay
     # if value > 0, the last parameter is "time_constant", and `best` is the fit at `value`
     posterior: Posterior
-    evidence: float  # log evidence of the models with and without a lag together
+    evidence: float  # log evidence of the average of the models with and without a lag
 
 
 def estimate_sensor_lag(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> SensorLag | None:
-    """Estimate the sensor's lag, or average over models with and without a lag if it is uncertain.
+    """Estimate the sensor's lag; if a lag is uncertain, average over models with and without a lag.
 
     Args:
         problem: Contact problem without a lag.
@@ -104,8 +103,8 @@ def _average_over_lag(
 ) -> SensorLag | None:
     """Average over the models with and without a lag; return None if the readings exclude a lag.
 
-    The prior of the time constant is uniform up to `MAX_TIME_CONSTANT`. In the result, it is added to the
-    delay.
+    The prior of the time constant is uniform up to `MAX_TIME_CONSTANT`. The delays in the result include the
+    time constant.
     """
     heights = (
         np.array([posterior.best[2].misfit, *(at(value)[1][2] for value in TRIAL_TIME_CONSTANTS)]) / -2.0
@@ -128,7 +127,7 @@ def _average_over_lag(
 
 
 def _weigh_lag(posterior: Posterior, posteriors: list[Posterior], step: float) -> tuple[float, float]:
-    """Return the posterior probability of a lag, and the log evidence of both models together.
+    """Return the posterior probability of a lag, and the log evidence of the average of both models.
 
     Args:
         posterior: Posterior without a lag.
@@ -144,19 +143,20 @@ def _weigh_lag(posterior: Posterior, posteriors: list[Posterior], step: float) -
 def _compute_posteriors(
     posterior: Posterior, at: FitAt, nodes: np.ndarray, count: int, seed: int
 ) -> list[Posterior]:
-    """Return the posterior at each lag, over `count` delays."""
+    """Return the posterior at each time constant in `nodes`, on a grid of `count` delays."""
     return [compute_posterior_at_lag(*at(lag), posterior, seed, count) for lag in nodes]
 
 
 def compute_posterior_at_lag(
     problem: ContactProblem, best: CoarseFit, like: Posterior, seed: int, count: int = SMALL_DELAY_GRID_SIZE
 ) -> Posterior:
-    """Compute the posterior for a given lag, over a grid of delays around a best fit.
+    """Compute the posterior for a given lag, on a grid of delays around the best fit.
 
     Args:
         problem: Contact problem with the lag.
         best: Best fit with this lag.
-        like: Similar posterior; the standard deviation of its delay determines the width of the grid.
+        like: Posterior of a similar problem; the standard deviation of its delay determines the width of the
+            grid.
         seed: Seed of the random numbers.
         count: Number of delays in the grid.
     """
@@ -168,10 +168,10 @@ def compute_posterior_at_lag(
 def _draw_between_lags(
     nodes: np.ndarray, posteriors: list[Posterior], seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return draws from the posteriors at evenly spaced time constants, and each draw's time constant [s].
+    """Draw from the posteriors at evenly spaced time constants; return draws and their time constants [s].
 
-    The number of draws at a time constant is proportional to its posterior probability. The draws are then
-    interpolated between the time constants.
+    Each posterior gives a number of draws in proportion to its probability. Each draw then gets a random time
+    constant near that of its posterior, and its parameters follow by linear interpolation.
     """
     evidence = np.array([node.evidence for node in posteriors])
     weights = np.exp(evidence - evidence.max())

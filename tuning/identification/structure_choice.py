@@ -1,9 +1,9 @@
 """Choice of the motion simulator's model structure: the smallest one that explains the measured spectra.
 
 The Bayesian information criterion (Schwarz 1978) compares the candidates. If even the best candidate has a
-chi-squared per degree of freedom above 1, the noise variance of all candidates is multiplied by this value,
-because additional poles would otherwise fit nonlinear friction. A candidate is excluded if a zero cancels a
-pole, or if the spectra hardly determine a parameter, because a smaller structure is then equivalent.
+chi-squared per degree of freedom above 1, the noise variance is multiplied by this value for all candidates.
+Otherwise, additional poles would fit nonlinear friction. A candidate is excluded if a smaller structure is
+equivalent: if a zero cancels a pole, or if the spectra hardly determine a parameter.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from scipy import stats
 
 from tuning.identification.rational import STRUCTURES, SpectralLines, SpectrumFit, fit_structure
 
-POLE_ZERO_TOLERANCE = 0.05  # distance over the pole's magnitude; a closer zero cancels the pole
-MAX_RELATIVE_STD = 0.3  # relative standard deviation; a parameter with a larger one is not determined
-NOISE_P_VALUE = 0.01  # p-value; above it, noise explains the residual, and no larger structure is fitted
-NEGATIVE_DELAY_SIGMAS = 3.0  # standard deviations; a delay further below 0 is significantly negative
-# Difference of the criterion from its best value; the smallest structure within it is chosen.
+POLE_ZERO_TOLERANCE = 0.05  # maximum distance of a zero that cancels a pole, divided by the pole's magnitude
+MAX_RELATIVE_STD = 0.3  # maximum relative standard deviation of a parameter that the spectra determine
+NOISE_P_VALUE = 0.01  # minimum p-value of a residual that noise explains; no larger structure is then fitted
+NEGATIVE_DELAY_SIGMAS = 3.0  # minimum distance of a significantly negative delay from 0, in std
+# Maximum difference of an acceptable structure's criterion from the best value; the smallest one is chosen.
 MAX_CRITERION_DEFICIT = 2.0
 
 
 @dataclass(frozen=True)
 class StructureCandidate:
-    """Fit of one model structure, with its information criterion and the reason to exclude it."""
+    """Fit of one model structure, with its information criterion and, if it is excluded, the reason."""
 
     fit: SpectrumFit
     criterion: float  # Bayesian information criterion
@@ -40,7 +40,7 @@ def choose_structure(
     Args:
         lines: Measured spectra.
         order: Order of the structures to fit, or None for all orders.
-        highest: Highest order to fit if `order` is None, or None for no limit.
+        highest: Highest order to fit if `order` is None; None for no limit.
 
     Returns:
         The chosen candidate, and all candidates.
@@ -64,17 +64,17 @@ def choose_structure(
 
 
 def compute_residual_ratio(candidates: list[StructureCandidate]) -> float:
-    """Return the smallest chi-squared per degree of freedom of all candidates, at least 1."""
+    """Return the smallest chi-squared per degree of freedom of all candidates, but at least 1."""
     return max(1.0, min(candidate.fit.chi2 / max(candidate.fit.freedom, 1) for candidate in candidates))
 
 
 def compute_criterion(fit: SpectrumFit, inflation: float) -> float:
-    """Return the Bayesian information criterion after multiplying the noise variance by `inflation`."""
+    """Return the Bayesian information criterion for a noise variance that is multiplied by `inflation`."""
     return fit.chi2 / inflation + fit.model.structure.size * float(np.log(2 * len(fit.residual)))
 
 
 def find_fault(fit: SpectrumFit, inflation: float = 1.0) -> str:
-    """Return the reason to exclude a fit in favour of a smaller structure, or an empty string.
+    """Return the reason why a smaller structure is preferred to this fit, or an empty string.
 
     The noise variance is multiplied by `inflation`.
     """

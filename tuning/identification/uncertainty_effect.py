@@ -1,7 +1,8 @@
 """Effect of a mechanism file's uncertainty on the restitution e and on its error e - e*.
 
-e* is the restitution of the ideal contact, and e is the restitution on the rig. To first order, the
-mechanical work of a change dF of the contact force changes the restitution by
+e* is the restitution of the ideal contact (without delays), and e is the restitution on the rig. M is the
+equivalent mass, v the speed, v_0 the approach speed, w the contact frequency [rad/s]. To first order, a
+change dF of the contact force changes the restitution by
 
     d e* = -(integral of dF v dt) / (M v_0^2 e*).
 
@@ -10,10 +11,10 @@ An additional delay tau of the force adds the energy tau times the integral of F
     e = e* + J tau,    J = (integral of F^2 dt) / (M^2 v_0^2 e*).
 
 For a linear spring, J tau is (pi/2) w tau. Errors of damping and force delay can cancel in e, but not in e -
-e*: gains that are tuned with too little damping reproduce a contact with too little damping.
+e*: the tuning assumes the wrong e*.
 
 Without compensation, the rebound on the rig is faster by the factor c = 1 + J tau / e*, and d e = c (d e* + J
-d tau). With gains that compensate for the delay, c = 1. The larger effect is stated.
+d tau). With gains that compensate for the delay, c = 1. The result is the larger of both effects.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ from tuning.identification import mechanism_models
 from tuning.identification.contact_laws import Law
 
 EFFECT_DRAWS = 1024  # number of draws from the uncertainty of the file
-EFFECT_PROBABILITY = 0.99  # probability that the effect is smaller than stated
-CONTACT_STEPS = 400  # integration steps within the estimated duration of a contact
-# simulated time over the estimated duration; a longer contact has no rebound
+EFFECT_PROBABILITY = 0.99  # probability that an effect is below its bound
+CONTACT_STEPS = 400  # number of integration steps in the estimated duration of a contact
+# maximum duration of a contact, divided by the estimate; a longer contact is assumed to have no rebound
 MAX_CONTACT_DURATION_RATIO = 4.0
 RELATIVE_DIFFERENCE_STEP = 1e-4  # relative step of finite differences for a parameter of the motion simulator
-MAX_DEPTH = 1.0  # m; a deeper contact is treated as a contact without rebound
+MAX_DEPTH = 1.0  # m, maximum depth; a deeper contact is assumed to have no rebound
 FORCE_DELAY_KEY, SIMULATOR_PREFIX = "rig.force_sensor.delay", "rig.simulator."
 IDENTIFIED_SOURCE_PREFIX = "identified from"  # beginning of the `source` of an identified file
 FORCE_DELAY_KEYS = (FORCE_DELAY_KEY, "rig.force_sensor.time_constant")
@@ -47,7 +48,7 @@ CONTACT_KEYS = (
 
 
 class UncertaintyEffect(NamedTuple):
-    """Bounds on the effects of uncertain parameters, which the effects exceed with a probability of 1 %."""
+    """Bounds that the effects of uncertain parameters exceed with a probability of 1 %."""
 
     restitution: float  # bound on the change of e
     error: float  # bound on the change of e - e*
@@ -63,15 +64,14 @@ class _IdealContact(NamedTuple):
 
 
 def compute_uncertainty_effect(mechanism: Mechanism) -> UncertaintyEffect:
-    """Compute how much the uncertainty of identified parameters can change e and e - e*.
+    """Compute how much the uncertainty of identified parameters changes the restitution e and e - e*.
 
-    The identified parameters are those in the file's `[correlation]` or, without this table, the normal
-    entries of `[uncertainty]`. Other entries of `[uncertainty]` describe variations, not the uncertainty of
-    an identification.
+    The identified parameters are those in the file's `[correlation]` or, without this table, those with a
+    normal distribution in `[uncertainty]`. Others in `[uncertainty]` vary, but were not identified.
 
     Returns:
-        The 99 % quantiles of the effects, for the entry of the contact lists with the largest effects. They
-        are 0 if the file does not come from an identification.
+        The 99 % quantiles of the effects, for the entry of the mechanism's contact lists with the largest
+        effects; or 0 if the file does not come from an identification.
     """
     keys = _list_identified_keys(mechanism)
     if not keys:
@@ -230,7 +230,7 @@ def _simulate_ideal_contact(mechanism: Mechanism, law: Law, entry: int) -> tuple
 
 
 def _find_max_depth(force: Any, energy: float) -> float | None:
-    """Return the depth [m] at which the undamped force has absorbed `energy` [J]; None above `MAX_DEPTH`."""
+    """Return the depth [m] at which the elastic force has absorbed `energy` [J]; None above `MAX_DEPTH`."""
     depth, work = 1e-9, 0.0
     while work < energy:
         work += force(1.005 * depth, 0.0) * 0.01 * depth

@@ -1,10 +1,10 @@
 """Checks of the model against the logs; every defect is expressed as its effect on the restitution.
 
-With thousands of readings, a significance test rejects every model. Therefore each check states how much the
-defect can change the restitution e; the test only decides whether the defect is present. The effects are
-first-order formulas. A phase error phi of the motion at the contact frequency w is a delay of phi/w, and a
-delay tau changes e by (pi/2) w tau. An unexplained force r changes the rebound speed by -(integral of r v
-dt)/(M v_0 e), according to the balance of momentum and energy during the contact.
+With thousands of readings, a significance test rejects every model. Therefore, each check estimates how much
+the defect changes the restitution e. The significance test only decides whether the defect is present. The
+effects are first-order formulas. A phase error phi of the motion at the contact frequency w is a delay of
+phi/w, and a delay tau changes e by (pi/2) w tau. An unexplained force r changes the rebound speed by
+-(integral of r v dt)/(M v_0 e), according to the balance of momentum and energy during the contact.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from tuning.identification.free_motion import FreeMotion
 from tuning.identification.law_choice import compute_contact_misfits
 from tuning.identification.records import LoggedRun
 
-MIN_HOLD_CRITERION_GAIN = 2.0  # decrease of the information criterion that shows a wrong command hold
-DEFECT_P_VALUE = 1e-3  # p-value; below it, a defect is present
-MAX_FREQUENCY_RATIO = 4.0  # multiple of the contact frequency; the motion at higher frequencies is irrelevant
-CONTACT_STATE_DRAWS = 40  # number of posterior draws that must agree on whether a row is in contact
-MAX_DELAY_SHARE = 0.93  # share of the search range of the force delay; a longer delay fails the check
+MIN_HOLD_CRITERION_GAIN = 2.0  # minimum decrease of the information criterion that shows a wrong command hold
+DEFECT_P_VALUE = 1e-3  # maximum p-value of a significant defect
+MAX_FREQUENCY_RATIO = 4.0  # highest evaluated frequency, divided by the contact frequency
+CONTACT_STATE_DRAWS = 40  # number of posterior draws that must agree whether a row is in contact
+MAX_DELAY_SHARE = 0.93  # maximum force delay that passes the check, as a share of the longest in the search
 MIN_CONTACTS_FOR_DEAD_ZONE = 5  # minimum number of contacts for the check of small readings
-MAX_NONZERO_SHARE = 0.8  # share of nonzero readings; above it, there is no dead zone
-CUTTING_DEAD_ZONE_P_VALUE = 0.01  # p-value; below it, a dead zone that is not subtracted is present
-# standard deviations of the noise; a smaller reading excludes such a dead zone
+MAX_NONZERO_SHARE = 0.8  # maximum share of nonzero readings with a dead zone
+CUTTING_DEAD_ZONE_P_VALUE = 0.01  # maximum p-value that shows a dead zone which is not subtracted
+# minimum size of the smallest reading with such a dead zone, in standard deviations of the noise
 MIN_SMALL_READING_SIGMAS = 3.0
-MISFIT_SMOOTHING_LINES = 5  # number of frequency lines over which the misfit of the motion is averaged
+MISFIT_SMOOTHING_LINES = 5  # number of adjacent frequency lines whose misfit is averaged
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of checking the model or the logs for one kind of defect.
+    """Result of a check of the model or the logs for one kind of defect.
 
     Attributes:
         name: Name of the check.
         finding: Result in words and numbers.
         there: Whether the defect is statistically significant.
         effect: Effect of the defect on the restitution e.
-        where: Frequency of the largest error, or log file and time of the worst contact.
-        on_error: Effect of the defect on e - e*, or None if it equals `effect`.
+        where: Where the error is largest: the frequency, or the log file and the time of the contact.
+        on_error: Effect of the defect on the error e - e* (e*: ideal contact), or None if it equals `effect`.
         counts: Whether the verdict includes this check.
     """
 
@@ -58,18 +58,18 @@ class CheckResult:
 
     @property
     def counted(self) -> float:
-        """Return the defect's effect on e in the verdict: 0 if the defect is absent or not included."""
+        """Return the effect on e for the verdict: 0 if the defect is absent or the verdict ignores it."""
         return self.effect if self.there and self.counts else 0.0
 
     @property
     def counted_error(self) -> float:
-        """Return the defect's effect on e - e* in the verdict: 0 if the defect is absent or not included."""
+        """Return the effect on e - e* for the verdict: 0 if the defect is absent or the verdict ignores it."""
         effect = self.effect if self.on_error is None else self.on_error
         return effect if self.there and self.counts else 0.0
 
 
 def check_motion_model(motion: FreeMotion, frequency: float) -> list[CheckResult]:
-    """Check the model of the motion simulator for defects that matter at a contact frequency [Hz]."""
+    """Check the model of the motion simulator for defects that affect contacts of a frequency [Hz]."""
     lines = [
         _check_motion_misfit(motion, frequency),
         _check_position_gain(motion),
@@ -154,7 +154,7 @@ def _check_distortion(motion: FreeMotion) -> list[CheckResult]:
 def check_contact_model(
     contact: ContactFit, runs: list[LoggedRun], mass: float, frequency: float, lag: float, flags: np.ndarray
 ) -> list[CheckResult]:
-    """Check a contact model against the contacts that `flags` selects.
+    """Compare a contact model with the contacts that `flags` selects.
 
     Args:
         contact: Contact model.
@@ -180,9 +180,9 @@ def check_contact_model(
 def check_held_out_contacts(
     contact: ContactFit, runs: list[LoggedRun], mass: float, held_out: np.ndarray
 ) -> list[CheckResult]:
-    """Check a fit against the contacts that it did not use, which `held_out` flags.
+    """Compare a fit with the contacts that it did not use, which `held_out` flags.
 
-    The verdict excludes these checks, because the mechanism file comes from a fit to all contacts.
+    The verdict ignores these checks, because the mechanism file comes from another fit, to all contacts.
     """
     residual_check = _check_law_residual(contact, runs, held_out)
     lines = [replace(residual_check, name="contact law, touches not fitted", counts=False)]
@@ -203,7 +203,7 @@ def _check_law_residual(contact: ContactFit, runs: list[LoggedRun], chosen: np.n
     ]
     count = np.maximum(readings.counts.sum(axis=0)[chosen], 1)
     ratio = float(misfit.sum() / count.sum())
-    # The effect on e is at most the rms error of the force over the rms force.
+    # The effect on e is at most the ratio of the force's rms error to the rms force.
     force = np.where(readings.counts, readings.force, 0.0)[:, chosen]
     excess = max(ratio - 1.0, 0.0) * readings.std**2 * count.sum() / max(float(np.sum(force**2)), 1e-300)
     return CheckResult(
@@ -219,10 +219,11 @@ def _check_law_residual(contact: ContactFit, runs: list[LoggedRun], chosen: np.n
 
 
 def flag_certain_rows(contact: ContactFit) -> np.ndarray:
-    """Return flags of the rows whose contact state is certain, shape (rows, lanes).
+    """Return flags of the rows that are certainly in or out of contact, shape (rows, lanes).
 
-    A row is certain if it is in contact in all posterior draws of delay and surface position, or in none. An
-    uncertain row does not show an error of the law, because the force of damped contact jumps at the onset.
+    A row is certain if it is in contact for all posterior draws of delay and surface position, or for none.
+    Residuals in other rows do not show an error of the law, because the force of a damped contact jumps at
+    the onset.
     """
     count = len(contact.problem.names)
     flags = [
@@ -256,11 +257,11 @@ def _check_delay_in_search_range(contact: ContactFit) -> list[CheckResult]:
 
 
 def _check_cutting_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list[CheckResult]:
-    """Check for a dead zone that passes large forces unchanged.
+    """Check for a dead zone of the force sensor that does not change large forces.
 
-    Only contacts with readings of 0 out of contact are evaluated. If no other reading is small, the sensor
-    replaces small forces by 0. The dead zone of mechanism files differs: it is also subtracted from larger
-    forces.
+    Only runs with readings of 0 out of contact are evaluated. If all their other readings are large, the
+    sensor replaces small forces by 0. The dead zone in mechanism files is another kind: it is also subtracted
+    from larger forces.
     """
     smallest, steps, peaks = [], [], []
     for lane, run in enumerate(runs):
@@ -274,7 +275,8 @@ def _check_cutting_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list
         return []
     least, std = min(smallest), contact.readings.std
     quantum = np.diff(np.unique(contact.readings.force)).min(initial=np.inf)
-    # During a smooth release, the last reading is uniformly distributed between 0 and the last step.
+    # In a smooth release, the last reading is assumed to be uniformly distributed between 0 and the last
+    # step.
     probability = np.prod(np.maximum(1.0 - least / (np.array(steps) + 2.0 * std + 1e-300), 0.0))
     if least <= max(MIN_SMALL_READING_SIGMAS * std, 2.5 * quantum) or probability > CUTTING_DEAD_ZONE_P_VALUE:
         return []
@@ -285,10 +287,10 @@ def _check_cutting_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list
 def estimate_restitution_errors(
     contact: ContactFit, runs: list[LoggedRun], mass: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the error of e in each contact due to the unexplained force, and its standard deviation.
+    """Return each contact's error of e due to the unexplained force, and its standard deviation.
 
-    The standard deviation is due to the noise. Both are NaN if the numerical model is not a free body or does
-    not rebound, or if the log of the contact is incomplete.
+    The standard deviation comes from the noise of the force. Both are NaN if the numerical model is not a
+    free body or does not rebound, or if the log of the contact is incomplete.
     """
     delay, plane, coefficient_fit = contact.posterior.best
     predicted = contact.problem.force(delay, plane, coefficient_fit.coefficients)
@@ -314,7 +316,7 @@ def estimate_restitution_errors(
         residual = (readings.force[:rows, lane] - predicted[:rows, lane]) * touching
         scale = mass * before * abs(after / before)
         errors[lane] = -float(np.sum(residual * speed)) * period / scale / before
-        # The impulse depends only on the low-frequency part of coloured noise.
+        # Of coloured noise, only the low-frequency part affects the impulse.
         slow = readings.std / abs(float(np.sum(readings.whitening)))
         stds[lane] = slow * period * float(np.sqrt(np.sum((speed * touching) ** 2))) / scale / before
     return errors, stds
@@ -335,7 +337,7 @@ def _check_restitution(
 
 
 def _locate_worst(contact: ContactFit, runs: list[LoggedRun], chosen: np.ndarray, values: np.ndarray) -> str:
-    """Return log file and time of the chosen run with the largest of `values`."""
+    """Return the log file and the time of that chosen run that has the largest of `values`."""
     run = runs[int(np.flatnonzero(chosen)[np.argmax(values)])]
     first = run.tick[int(np.argmax(run.valid))]
     return f"{run.source} from {run.begin + first * contact.problem.motion.period:.1f} s on"

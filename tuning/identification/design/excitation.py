@@ -38,7 +38,7 @@ PRELOAD_SHARE = 0.45  # mean force of a press run as a share of the largest allo
 SWING_SHARE = 0.4  # amplitude of the force about its mean, as a share of the largest allowed force
 # Weight of the parameters' relative errors, which is added to the weight of their effect on e - e*.
 RELATIVE_ERROR_WEIGHT = 0.01
-CONTACT_PHASES = (0.0, 0.25, 0.5, 0.75)  # control periods between a tick and the onset of contact
+CONTACT_PHASES = (0.0, 0.25, 0.5, 0.75)  # evaluated phases of the contact within a control period
 ASSUMED_NOISE_STD = 5e-6, 0.5  # m and N, noise of position and force if the mechanism specifies none
 LIMIT_SHARE = 0.9  # maximum used share of the limits of speed, acceleration and force
 DAMPING_KEY = "contact.damping.0"
@@ -294,7 +294,7 @@ class _MultisinePlan:
         return {key: _get_value(document, key) for key in keys}
 
     def _compute_responses(self, mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
-        """Return the frequency responses of the position and force readings to the command, in a press run."""
+        """Return the frequency responses of the position and force readings to the command in a press run."""
         sensor, position = mechanism.rig.force_sensor, mechanism.rig.position_sensor
         motion = mechanism_models.make_motion_model(mechanism).response(self.s) * self.hold
         delay_exponent = self.s * (sensor.delay - position.delay)
