@@ -126,7 +126,7 @@ def test_bootstrap_checkpoints_of_another_problem_are_rejected(fit, tmp_path, mo
 def test_bootstrap_rejects_too_few_contacts_and_too_few_repeats():
     few = campaigns.campaign("clean", 0, speeds=(0.006, 0.012, 0.006), seconds=5.0)
     assert "no bootstrap: 3 contacts, 6 are needed" in of(few, 20).notes
-    with pytest.raises(jaxhil.InputError, match="bootstrap: found 5, expected 0, or 20 or more"):
+    with pytest.raises(jaxhil.InputError, match="bootstrap: found 5, expected 0 or at least 20"):
         of(few, 5)
 
 

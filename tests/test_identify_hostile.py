@@ -81,7 +81,7 @@ REFUSED = {
         lambda day: changed(day, COMMAND, held(4), ("contact",), reveals=True), "a new command every 4 rows",
     ),
     "time backwards": (
-        lambda day: changed(day, TIME, lambda values: values[::-1]), "expected time that increases",
+        lambda day: changed(day, TIME, lambda values: values[::-1]), "expected an increasing time",
     ),
     "noise over all forces": (lambda day: changed(day, FORCE, noise(0.05)), "with a contact where there is"),
     "a force range of 5 N": (

@@ -116,7 +116,7 @@ def test_fixed_list_values_are_assigned_entry_by_entry():
 
 def test_prior_without_uncertainty_is_rejected():
     with pytest.raises(
-        InputError, match=r"prior: \[uncertainty\]: found no normal entry for a parameter that"
+        InputError, match=r"prior: \[uncertainty\]: found no normal distribution of a parameter that"
     ):
         conditioning.condition_on_prior(logs_say(KEYS), campaign_rigs.mechanism("clean"), 3.0)
     with pytest.raises(InputError, match="bayes: found no prior"):

@@ -60,7 +60,9 @@ def test_surface_is_estimated_from_press_run_in_contact_and_bias_at_rest(run, no
 
 def test_press_run_in_contact_is_rejected_without_bias_at_rest():
     for run in (multisine(), ramp(2e-4), multisine(noise=10.0)):
-        with pytest.raises(InputError, match=r"^press.csv: force_measured: found a press that never leaves"):
+        with pytest.raises(
+            InputError, match=r"^press.csv: force_measured: found a press run that never leaves"
+        ):
             fit(run, None)
 
 

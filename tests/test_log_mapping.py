@@ -136,6 +136,7 @@ def test_value_missing_from_both_mapping_and_prior_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"free_1.csv: found no line of column names"):
         read_campaign([log], parse_mapping(bare, "map"), prior)
     with pytest.raises(
-        InputError, match=r"x.csv: found a name that no run matches, expected 'free_\*.csv', 'day1"
+        InputError,
+        match=r"x.csv: found a name that no \[\[runs\]\] entry matches, expected 'free_\*.csv', 'day1",
     ):
         read_campaign([tmp_path / "x.csv"], parse_mapping(FULL, "map"))

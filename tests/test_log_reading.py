@@ -150,7 +150,7 @@ def edit(path: Path, row: int, cell: int, text: str) -> Path:
         (30, 1, "12,5", "Row #31: Expected 6 columns, got 7"),
         (30, 1, "abc", "Row #31: CSV conversion error to double: invalid value 'abc'"),
         (1, 1, "abc", "column 'xd': found 'abc', expected numbers"),
-        (30, 0, "0.001", "row 30: time: found 0.001 s after 0.028 s, expected time that increases"),
+        (30, 0, "0.001", "row 30: time: found 0.001 s after 0.028 s, expected an increasing time"),
         (30, 0, "0.028", "row 30: time: found 0.028 s after 0.028 s"),
         (0, 1, "xdd", "found no column with this name, expected t, xdd, xm, F, vd, Fc (did you mean xdd?)"),
         (0, 2, "xd", "column 'xd': found 2 columns, expected one"),

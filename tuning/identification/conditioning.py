@@ -101,8 +101,8 @@ def condition_on_prior(draws: DrawsByKey, prior: Mechanism, frequency: float, se
     if not common:
         expected = ", ".join(draws) or "logs that determine a parameter"
         raise InputError(
-            "prior: [uncertainty]: found no normal entry for a parameter that the logs determine, expected "
-            f"one of {expected}"
+            "prior: [uncertainty]: found no normal distribution of a parameter that the logs determine, "
+            f"expected one of {expected}"
         )
     linked = () if prior.correlation is None else prior.correlation.keys
     prior_only = [

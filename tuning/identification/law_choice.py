@@ -231,6 +231,6 @@ def _cross_validate(motion, readings, tested: ForceReadings, law, plane, start: 
 def compute_contact_misfits(
     problem: ContactProblem, readings: ForceReadings, delay, plane, coefficients
 ) -> np.ndarray:
-    """Return chi-squared of each contact: the sum of its squared residuals, whitened and divided by the noise."""
+    """Return chi-squared of each contact: the sum of its squared whitened residuals, divided by the noise."""
     left = problem.whiten(readings.force - problem.force(delay, plane, coefficients)) / readings.std
     return np.sum(np.where(readings.counts, left, 0.0) ** 2, axis=0)

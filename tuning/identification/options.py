@@ -48,7 +48,7 @@ def check_options(options: IdentificationOptions, prior: Mechanism | None) -> No
     if options.law is not None and options.law not in FITTABLE_LAW_NAMES:
         raise InputError(f"law: found {format_value(options.law)}, expected {', '.join(FITTABLE_LAW_NAMES)}")
     if 0 < options.bootstrap < MIN_BOOTSTRAP_FITS:
-        raise InputError(f"bootstrap: found {options.bootstrap}, expected 0, or {MIN_BOOTSTRAP_FITS} or more")
+        raise InputError(f"bootstrap: found {options.bootstrap}, expected 0 or at least {MIN_BOOTSTRAP_FITS}")
     orders = sorted({structure.order for structure in STRUCTURES})
     if options.order is not None and options.order not in orders:
         raise InputError(f"order: found {options.order}, expected {', '.join(map(str, orders))}")

@@ -48,9 +48,9 @@ def find_bias_prior(
     if noise is None:
         names = ", ".join(dict.fromkeys(to_one_line(run.source) for run in runs))
         raise InputError(
-            f"{names}: force_measured: found a press that never leaves the contact, which cannot distinguish "
-            "the sensor's bias from the surface position, expected also contacts, a run of kind rest or free "
-            "with this channel, or --fix rig.contact_plane=..."
+            f"{names}: force_measured: found a press run that never leaves the contact, which does not "
+            "distinguish the sensor's bias from the surface position, expected further contacts, a run of "
+            "kind rest or free with this channel, or --fix rig.contact_plane=..."
         )
     return noise.mean, float(np.hypot(np.hypot(noise.mean_std, noise.drift), MIN_BIAS_STD_RATIO * noise.std))
 

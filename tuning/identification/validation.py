@@ -58,12 +58,12 @@ class CheckResult:
 
     @property
     def counted(self) -> float:
-        """Return the effect on e for the verdict: 0 if the defect is absent or the verdict ignores it."""
+        """Return the effect on e for the verdict: 0 if the defect is absent or not in the verdict."""
         return self.effect if self.there and self.counts else 0.0
 
     @property
     def counted_error(self) -> float:
-        """Return the effect on e - e* for the verdict: 0 if the defect is absent or the verdict ignores it."""
+        """Return the effect on e - e* for the verdict: 0 if the defect is absent or not in the verdict."""
         effect = self.effect if self.on_error is None else self.on_error
         return effect if self.there and self.counts else 0.0
 

@@ -1,8 +1,8 @@
-"""Reading of a campaign from log files and their mapping, with checks and one row per tick.
+"""Reading and checks of a campaign: from log files and their mapping to runs with one row per tick.
 
-A run has at most one contact: a log with several contacts is divided in the middle between successive
-contacts. If the log has no channel `contact_index`, the contacts of a file are numbered in their order. The
-number of a contact is the index into the contact lists of a mechanism file.
+A run has at most one contact. A log with several contacts is therefore divided in the middle between
+successive contacts. If the log has no channel `contact_index`, the contacts of a file are numbered in their
+order. The number of a contact is its index into the contact lists of a mechanism file.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from tuning.identification.records import Campaign, CampaignTiming, LoggedRun, R
 
 KINDS_SPLIT_AT_CONTACTS = ("tap", "contact")
 MIN_SEGMENT_ROWS = 50  # minimum number of rows in a segment between gaps
-MIN_VELOCITY_JUMP = 0.5  # velocity jump that shows a new simulated run, over the 95 % quantile of the speed
+MIN_VELOCITY_JUMP = 0.5  # minimum velocity jump between simulated runs, over the 95 % quantile of the speed
 
 
 def read_campaign(
@@ -45,9 +45,9 @@ def read_campaign(
 ) -> Campaign:
     """Read all runs of a campaign from log files and check them.
 
-    The runs are in the order of the `[[runs]]` entries of the mapping; the runs of one entry are in the order
-    of the files. Without a mapping, the columns must have the names of `jaxhil simulate --log`, and every
-    file must contain contacts. The prior provides the timing and the mass if the mapping omits them.
+    The runs have the order of the `[[runs]]` entries in the mapping and, within an entry, the order of the
+    files. Without a mapping, the columns must have the names of `jaxhil simulate --log`, and every file must
+    contain contacts. If the mapping omits the timing or the mass, the prior provides them.
 
     Args:
         logs: Paths of the log files.
@@ -73,7 +73,7 @@ def read_campaign(
         if not any(entry.names(path) for entry in mapping.runs):
             patterns = ", ".join(format_value(pattern) for entry in mapping.runs for pattern in entry.files)
             raise InputError(
-                f"{to_one_line(str(path))}: found a name that no run matches, expected {patterns}"
+                f"{to_one_line(str(path))}: found a name that no [[runs]] entry matches, expected {patterns}"
             )
     runs: list[LoggedRun] = []
     notes: dict[str, list[str]] = {}  # for each note, the names of the logs that it concerns
@@ -95,7 +95,7 @@ def read_campaign(
 
 
 def _merge_notes(notes: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Return each note once, with the name of its first log and the number of further logs."""
+    """Return every note once, with the name of its first log and the number of the other logs."""
     lines = []
     for note, labels in notes.items():
         more = len(set(labels)) - 1
@@ -104,7 +104,7 @@ def _merge_notes(notes: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
 
 
 class _RunsOfFile:
-    """Runs that one log file contains according to one `[[runs]]` entry of the mapping."""
+    """Runs in one log file, according to one `[[runs]]` entry of the mapping."""
 
     def __init__(
         self,
@@ -118,10 +118,11 @@ class _RunsOfFile:
         self.label, self.notes = to_one_line(str(path)) or "''", list[str]()
         self.kind: RunKind = entry.kind
         self._path, self._timing, self._mass = path, timing, mass
-        # Number of contacts so far; last tick and resting force of a contact that a gap interrupts.
+        # Number of contacts so far; last tick of a contact that a gap interrupts; force without contact
+        # before it.
         self._contact_count, self._open_contact = 0, None
         self._integrator = "semi_implicit_euler" if prior is None else prior.rig.integrator
-        # Later contacts use the last entry of the contact lists.
+        # If there are more contacts than list entries, the other contacts use the last entry.
         lists = () if prior is None else (prior.contact.stiffness, prior.contact.damping)
         self._last = max(map(len, lists)) - 1 if lists else sys.maxsize
         log = open_log(path, mapping.text)
@@ -169,7 +170,7 @@ class _RunsOfFile:
             runs += self._make_runs(segment, kind)
         if not runs:
             expected = (
-                f"{MIN_SEGMENT_ROWS} successive rows or more; for kinds contact and tap, with a contact"
+                f"at least {MIN_SEGMENT_ROWS} successive rows; for the kinds contact and tap, with a contact"
             )
             raise InputError(f"{self.label}: found no run in {len(tick)} rows, expected {expected}")
         return runs
@@ -182,7 +183,7 @@ class _RunsOfFile:
         if kind not in ("press", *KINDS_SPLIT_AT_CONTACTS):
             return [self._make_run(segment, kind, slice(None), None, None)]
         if force is None:
-            raise InputError(f"{self.label}: force_measured: found no such channel, expected one for {kind}")
+            raise InputError(f"{self.label}: force_measured: found no such channel, needed for kind {kind}")
         contacts = self._detect_contacts(segment.tick, force)
         holds = kind == "contact" and self._is_command_valid(segment, contacts)
         self.notes += checks.check_force(self.label, kind, segment, contacts, period, self._mass, holds)
@@ -199,7 +200,7 @@ class _RunsOfFile:
         ]
 
     def _is_command_valid(self, segment: LogSegment, contacts: list[tuple[int, int]]) -> bool:
-        """Return whether the force command explains the motion; if not, remove the channel with a note."""
+        """Return whether the force command explains the motion; if not, remove its channel with a note."""
         if segment.channels["force_command"] is None:
             return False
         timing = self._timing
@@ -213,13 +214,13 @@ class _RunsOfFile:
         return holds
 
     def _ignore_channel(self, segment: LogSegment, channel: str, note: str | None) -> None:
-        """Remove a channel from a segment and keep the note with the reason; do nothing without a note."""
+        """Remove a channel from a segment for the reason in `note`; do nothing if there is no note."""
         if note is not None:
             self.notes.append(note)
             segment.channels[channel] = None
 
     def _detect_contacts(self, tick: np.ndarray, force: np.ndarray) -> list[tuple[int, int]]:
-        """Return the row ranges of the contacts in a segment, and count the contacts of the file.
+        """Return the row ranges of the contacts in a segment; count the contacts of the file.
 
         A contact that a gap interrupts is counted once.
         """
@@ -248,7 +249,7 @@ class _RunsOfFile:
         contact: tuple[int, int] | None,
         number: int | None,
     ) -> LoggedRun:
-        """Convert a part of a segment to a run; `number` is the contact index if no channel contains it."""
+        """Convert a part of a segment to a run; `number` is the contact index if no channel has it."""
         channels = {
             name: None if values is None else values[part] for name, values in segment.channels.items()
         }
@@ -307,7 +308,7 @@ def _select_rows(stamps: np.ndarray | None, entry: RunFiles, period: float) -> s
 def _classify_rows(
     values: np.ndarray | None, mapping: LogMapping, kind: RunKind, label: str
 ) -> np.ndarray | None:
-    """Return the kind of experiment in each row as an index into `KINDS`, or None without a mode channel."""
+    """Return, for each row, the index of its kind of experiment into `KINDS`; None without a mode channel."""
     channel = mapping.channels.mode
     if values is None or channel is None:
         return None
@@ -325,7 +326,7 @@ def _classify_rows(
 
 
 def _find_restarts(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
-    """Return the rows at which the motion restarts with the next contact, as in simulated logs."""
+    """Return the rows at which the motion jumps to the start of the next contact, as in simulated logs."""
     if index is None:
         return np.empty(0, int)
     rows = np.flatnonzero(index[1:] != index[:-1]) + 1
@@ -335,8 +336,8 @@ def _find_restarts(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
 
 
 def _estimate_approach_speed(x: np.ndarray, begin: int, period: float) -> float | None:
-    """Return the approach speed of a contact [m/s], or None if the log begins too late."""
-    # The contact begins some ticks before the force exceeds the noise.
+    """Return the approach speed of a contact [m/s], or None if the log does not contain the approach."""
+    # A contact begins some ticks before its force exceeds the noise.
     before = begin - SPEED_SPAN_TICKS
     if before < SPEED_SPAN_TICKS:
         return None
@@ -344,7 +345,7 @@ def _estimate_approach_speed(x: np.ndarray, begin: int, period: float) -> float 
 
 
 def _hash_log(path: Path) -> str:
-    """Return the SHA-256 of a log file, or of the names and contents of all files in a log folder."""
+    """Return the SHA-256 of a log file; for a log folder, of the names and contents of all its files."""
     if path.is_file():
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

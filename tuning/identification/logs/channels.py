@@ -1,4 +1,4 @@
-"""Channels of a log according to its mapping: in SI units, and at the times of the desired position."""
+"""Channels of a log according to its mapping, in SI units and at the times of the desired position."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STAMP_COLUMN_PATTERN = re.compile(r"^t$|^time$|stamp", re.IGNORECASE)  # names o
 def read_channels(
     log: OpenLog, mapping: LogMapping, period: float
 ) -> tuple[ColumnsByName, np.ndarray | None, float, list[str]]:
-    """Read the channels of a log that the mapping names.
+    """Read those channels of a log that its mapping names.
 
     Args:
         log: Open log.
@@ -35,8 +35,8 @@ def read_channels(
         period: Control period [s].
 
     Returns:
-        The available channels in SI units; the time stamps of the rows relative to the first one [s], or
-        None; the first time stamp [s]; and notes.
+        The available channels in SI units; the time stamps of the rows minus the first one [s], or None if
+        there are none; the first time stamp [s]; and notes.
     """
     channels = mapping.channels
     wanted: dict[str, str] = {}
@@ -96,9 +96,9 @@ def _read_channel_stamps(
 
 
 def _check_stamps_in_groups(log: OpenLog, mapping: LogMapping, wanted: Mapping[str, str]) -> None:
-    """Raise `InputError` if the mapping ignores time stamps of a group that differ from those of the rows.
+    """Raise `InputError` if the mapping ignores different time stamps of a group of columns.
 
-    In HDF5, MAT and TDMS files, the names of the columns define the groups.
+    In HDF5, MAT and TDMS files, the column names contain the group names.
     """
     time = mapping.channels.time
     if time.column is None or log.stamps:
@@ -112,7 +112,7 @@ def _check_stamps_in_groups(log: OpenLog, mapping: LogMapping, wanted: Mapping[s
             step, group_step = float(np.median(np.diff(rows))), float(np.median(np.diff(times)))
             if not (step > 0.0 and group_step > 0.0):
                 continue
-            # The time stamps of the group may have another unit.
+            # The group's time stamps may have another unit.
             power = round(float(np.log10(group_step / step)) / 3.0)
             times = times * 1000.0**-power
             if abs(group_step * 1000.0**-power / step - 1.0) > clock.MAX_RATE_ERROR:
@@ -130,7 +130,7 @@ def _check_stamps_in_groups(log: OpenLog, mapping: LogMapping, wanted: Mapping[s
 
 
 def _find_other_stamps(column: str, time: str, names: Sequence[str]) -> list[str]:
-    """Return the time stamp columns in the groups that contain `column` but not the column `time`."""
+    """Return the columns of time stamps in those groups that contain `column` but not the column `time`."""
     result = []
     for candidate in names:
         name = re.split(r"[/.]", candidate)[-1]
@@ -150,7 +150,7 @@ def _read_mapped_stamps(
 ) -> dict[str, np.ndarray | None]:
     """Read the time stamps [s] of each channel from the columns that the mapping names.
 
-    The origin of all time stamps is the earliest first stamp of all columns.
+    All time stamps are relative to the earliest stamp.
     """
     time = mapping.channels.time
     if mapping.timing.clock == "index":

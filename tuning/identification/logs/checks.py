@@ -1,8 +1,9 @@
 """Checks of the mapping of each channel: unit, sign and row convention.
 
-With a wrong sign, unit or row convention, the model may fit the logs well but describe another rig. The
-numerical model is known exactly and reveals such errors: by Newton's law, the force command determines the
-position commands, and the measured force determines the change of speed in a contact.
+With a wrong sign, unit or row convention (the ticks that a row's command and readings belong to), the model
+may fit the logs well but describe another rig. The numerical model is known exactly and reveals such errors.
+According to Newton's law, the force command determines the position commands, and the measured force
+determines the change of speed in a contact.
 """
 
 from __future__ import annotations
@@ -21,22 +22,22 @@ from tuning.identification.logs.scales import (
 
 MIN_LOG_ROWS = 200  # minimum number of rows in a log
 MIN_FAR_SIDE_CONTACT_GAP = 0.01  # s, minimum time between two contacts at the second surface of a clearance
-MIN_FAR_SIDE_IMPULSE_SHARE = 0.3  # impulse over change of momentum that shows a contact at the second surface
-MIN_CLIPPED_READINGS = 10  # number of successive largest readings that shows clipping
-MAX_ABSOLUTE_VALUE = 1e30  # largest valid number; nanoseconds since an epoch are about 1e18
+MIN_FAR_SIDE_IMPULSE_SHARE = 0.3  # minimum impulse of such a contact as a share of the change of momentum
+MIN_CLIPPED_READINGS = 10  # minimum number of successive readings at the maximum that shows clipping
+MAX_ABSOLUTE_VALUE = 1e30  # largest valid number; time stamps in nanoseconds are about 1e18
 MAX_STROKE = 1.0  # m, largest plausible range of positions
 MIN_STROKE = 1e-5  # m, smallest plausible range of positions
 MAX_SPEED = 5.0  # m/s, largest plausible speed
-MAX_POSITION_LAG = 400  # ticks, longest delay of a position reading relative to its command
-MAX_REPEATED_SHARE = 0.4  # share of repeated readings; above it, a note warns of held readings
-MAX_HOLD_ROWS = 20  # rows, longest time that a reading is held
-MIN_REGULAR_SHARE = 0.9  # share of changes with the most common distance that shows held readings
-MIN_SPEED_CORRELATION = 0.3  # correlation of desired and measured speed; below it, a note warns the user
-MAX_EVALUATED_ROWS = 200_000  # number of rows that is sufficient
+MAX_POSITION_LAG = 400  # ticks, longest delay between position command and reading in the search
+MAX_REPEATED_SHARE = 0.4  # maximum share of repeated readings without a note
+MAX_HOLD_ROWS = 20  # maximum number of rows for which a reading is held
+MIN_REGULAR_SHARE = 0.9  # minimum share of equal intervals between changes that shows held readings
+MIN_SPEED_CORRELATION = 0.3  # minimum correlation of desired and measured speed without a note
+MAX_EVALUATED_ROWS = 200_000  # maximum number of evaluated rows; more are not needed
 
 
 def check_values(label: str, name: str, values: np.ndarray) -> None:
-    """Raise `InputError` if a value is not finite or is larger than any sensor reading or time stamp."""
+    """Raise `InputError` if a value is not finite, or too large for a sensor reading or a time stamp."""
     bad = np.flatnonzero(~(np.abs(values) <= MAX_ABSOLUTE_VALUE))
     if len(bad):
         row, value = int(bad[0]) + 1, float(values[bad[0]])
@@ -45,7 +46,7 @@ def check_values(label: str, name: str, values: np.ndarray) -> None:
 
 
 def check_motion(label: str, kind: str, segment: LogSegment, period: float, hold: str) -> list[str]:
-    """Check the desired and measured positions of a segment, and return notes.
+    """Check the desired and measured positions of a segment; return notes.
 
     The positions must have plausible strokes and speeds, and the measured position must follow the desired
     position. With the command hold "linear", the desired position must change in every row.
@@ -67,7 +68,7 @@ def check_motion(label: str, kind: str, segment: LogSegment, period: float, hold
         return []
     if np.ptp(x) == 0.0:
         raise InputError(
-            f"{label}: position_desired: found {x[0]:g} m in every row, expected a motion, or kind rest"
+            f'{label}: position_desired: found {x[0]:g} m in every row, expected a motion (or kind = "rest")'
         )
     if np.ptp(measured) == 0.0:
         raise InputError(
@@ -91,10 +92,10 @@ def check_force(
     mass: float,
     mass_is_verified: bool = False,
 ) -> list[str]:
-    """Check the sign and unit of the measured force in a segment, and return notes.
+    """Check the sign and unit of the measured force in a segment; return notes.
 
-    In contacts, the force must explain the model's change of speed. In a press, it must increase with the
-    position.
+    In contacts, the force must explain the change of the numerical model's speed. In a press run, it must
+    increase with the position.
 
     Args:
         label: Name of the log in messages.
@@ -103,7 +104,7 @@ def check_force(
         contacts: For each contact, its first row and the row after its last row.
         period: Control period [s].
         mass: Equivalent mass of the numerical model [kg].
-        mass_is_verified: Whether the force command moves the model with this mass.
+        mass_is_verified: Whether the logged motion has shown that the force command moves this mass.
 
     Returns:
         Notes, for example that the log does not have a new force reading in every row.
@@ -140,9 +141,9 @@ def check_force(
 
 
 def _check_one_side(label: str, pull: np.ndarray, x: np.ndarray, period: float, mass: float) -> None:
-    """Raise `InputError` if the log contains contacts at the second surface of a clearance.
+    """Raise `InputError` if the log contains contacts at the second (far) surface of a clearance.
 
-    Such a contact pulls (F < 0) and reverses a retracting motion.
+    In such a contact, the force pulls (F < 0) and reverses a retraction.
 
     Args:
         label: Name of the log in messages.
@@ -177,20 +178,20 @@ def _note_slow_readings(label: str, force: np.ndarray) -> list[str]:
 
 
 def find_change_interval(values: np.ndarray) -> int:
-    """Return the number of rows for which each value is held, or 1 if the values do not change regularly."""
+    """Return the number of rows after which the value changes, or 1 if it does not change regularly."""
     steps = np.diff(values[:MAX_EVALUATED_ROWS])
     apart = np.diff(np.flatnonzero(steps))
     if len(apart) < MIN_LOG_ROWS // 10:
         return 1
     usual = int(np.median(apart))
-    # In a steady motion, rounded values also change regularly, by one unit of their last digit.
+    # Rounded values of a uniform motion also change regularly, by one unit of their last digit.
     coarse = np.median(np.abs(steps[steps != 0.0])) <= 4 * _detect_resolution(values)
     is_held = 1 < usual <= MAX_HOLD_ROWS and np.mean(apart == usual) > MIN_REGULAR_SHARE and not coarse
     return usual if is_held else 1
 
 
 def _detect_resolution(values: np.ndarray) -> float:
-    """Return the resolution, of which all differences of rounded values are multiples; 0 without rounding."""
+    """Return the step to whose multiples the values are rounded, or 0 if they are not rounded."""
     steps = np.diff(np.unique(values[np.isfinite(values)][:MAX_EVALUATED_ROWS]))
     least = float(np.min(steps, initial=np.inf))
     return least if np.median(np.abs(steps / least - np.rint(steps / least))) < 0.01 else 0.0
@@ -213,12 +214,12 @@ def _check_size(label: str, x: np.ndarray, measured: np.ndarray, period: float) 
     if not 0.02 <= ratio <= 50:
         stroke_text = f"{ratio:.3g} times the stroke of position_desired"
         raise InputError(
-            f"{label}: position_measured: found {stroke_text}, expected 0.02 to 50 times (is its unit right?)"
+            f"{label}: position_measured: found {stroke_text}, expected a factor of 0.02 to 50 (wrong unit?)"
         )
 
 
 def _check_following(label: str, kind: str, x: np.ndarray, measured: np.ndarray) -> list[str]:
-    """Check that the measured position follows the desired position with the same sign, and return notes."""
+    """Check that the measured position follows the desired one with the same sign; return notes."""
     command, reading = (
         (values[SPEED_SPAN_TICKS:] - values[:-SPEED_SPAN_TICKS])[:MAX_EVALUATED_ROWS]
         for values in (x, measured)
@@ -238,7 +239,7 @@ def _check_following(label: str, kind: str, x: np.ndarray, measured: np.ndarray)
         return [f"{label}: position_measured: hardly follows position_desired (correlation {strength:.2g})"]
     if strength < 0:
         raise InputError(
-            f"{label}: position_measured: found a motion against position_desired, expected the other sign"
+            f"{label}: position_measured: found a motion against position_desired, expected the same sign"
         )
     if lag <= -2:
         finding = f"a motion {-lag} ticks earlier than position_desired"
@@ -250,7 +251,7 @@ def _check_following(label: str, kind: str, x: np.ndarray, measured: np.ndarray)
 
 
 def _note_held_readings(label: str, x: np.ndarray, measured: np.ndarray) -> list[str]:
-    """Return a note if position readings are often repeated although the command moves."""
+    """Return a note if many position readings equal the previous one although the command changes."""
     moving = np.abs(np.diff(x)) > _detect_resolution(measured)
     if np.count_nonzero(moving) < MIN_LOG_ROWS // 2:
         return []

@@ -1,12 +1,14 @@
-"""Assignment of the rows of a log to control periods (ticks), from time stamps with jitter.
+"""Assignment of log rows to control periods (ticks) from time stamps with jitter.
 
-The samples are taken exactly at the ticks, but the time stamps scatter. A time stamp t is modelled as
+The samples are assumed to be taken exactly at the ticks, whereas the time stamps scatter. A time stamp t is
+modelled as
 
     t = t_0 + phase(t) + n T + error,
 
-with the unknown tick n and the specified control period T. The phase [s] changes slowly if the clock of the
-stamps is faster or slower than the control loop. It is estimated for chunks of successive rows, from the
-angle of the mean of e^(2 pi i t / T). The tick n is (t - t_0 - phase) / T, rounded.
+with the unknown tick n and the specified control period T. The phase [s] is a slow change of the offset,
+which occurs if the clock of the stamps is faster or slower than the control loop. It is estimated for chunks
+of successive rows, from the angle of the mean of e^(2 pi i t / T). The tick n is (t - t_0 - phase) / T,
+rounded.
 """
 
 from __future__ import annotations
@@ -20,20 +22,20 @@ from jaxhil.errors import InputError, format_value
 from tuning.identification.records import StampClock
 
 PHASE_CHUNK_ROWS = 256  # number of rows for one estimate of the phase
-MIN_ROW_DISTANCE = 1e-6  # periods, smallest valid time between rows
-MAX_LOG_PERIODS = 1e12  # periods, longest log; the ticks of a longer log would lose digits
-MAX_RATE_ROWS = 20_000  # number of rows that is sufficient for estimates of the row rate
-MAX_RATE_ERROR = 0.1  # largest relative difference between row rate and control rate
+MIN_ROW_DISTANCE = 1e-6  # periods, minimum valid time between rows
+MAX_LOG_PERIODS = 1e12  # periods, maximum length of a log; the ticks of a longer log would lose digits
+MAX_RATE_ROWS = 20_000  # maximum number of rows for an estimate of the row rate; more are not needed
+MAX_RATE_ERROR = 0.1  # maximum relative difference between row rate and control rate
 # Largest relative difference between mean row rate and control rate; otherwise the phase changes too much per
 # chunk.
 MAX_MEAN_RATE_ERROR = 1.5e-3
-# periods, largest scatter of the time between rows from which a rate can be estimated
+# periods, maximum scatter of the time between rows for an estimate of the row rate
 MAX_STEP_SCATTER = 0.15
-MAX_STAMP_SCATTER = 0.25  # periods, largest scatter of time stamps from which ticks can be identified
+MAX_STAMP_SCATTER = 0.25  # periods, maximum scatter of time stamps for an identification of ticks
 
 
 class RowTicks(NamedTuple):
-    """Tick of each row of a log, counted from the first row, and the accuracy of the time stamps."""
+    """Ticks of the rows of a log, counted from the first row, and the accuracy of the time stamps."""
 
     tick: np.ndarray  # int64, (rows,)
     clock: StampClock
@@ -67,8 +69,9 @@ def assign_ticks(stamps: np.ndarray, period: float, label: str, column: str = "t
 def remove_stamp_jitter(stamps: np.ndarray, period: float, label: str, column: str) -> np.ndarray:
     """Return the sampling times [s] of rows: their time stamps without jitter.
 
-    The rows are assumed to have a steady rate, which is estimated from the stamps. If the stamps scatter too
-    much for an estimate, `period` [s] is assumed. Time stamps without a steady rate are returned unchanged.
+    The rows are assumed to have a constant rate, which is estimated from the stamps. If the stamps scatter
+    too much for an estimate, `period` [s] is assumed. If the rate is not constant, the stamps are returned
+    unchanged.
     """
     _compute_row_distances(stamps, period, label, column)
     first, measured = float(stamps[0]), estimate_row_period(stamps)
@@ -78,14 +81,14 @@ def remove_stamp_jitter(stamps: np.ndarray, period: float, label: str, column: s
     relative, phase, tick = _round_to_ticks(stamps, period, label, column)
     times = phase + period * tick
     if np.std(relative - times) > MAX_STAMP_SCATTER * period:
-        return stamps  # The rows are logged at events, not at a steady rate.
+        return stamps  # The rows are logged at events, not at a constant rate.
     return first + times + float(np.mean(relative - times))
 
 
 def estimate_row_period(stamps: np.ndarray) -> float | None:
-    """Estimate the time between successive rows [s], robustly against lost rows.
+    """Estimate the time between successive rows [s]; lost rows do not affect the estimate.
 
-    Returns None if the time stamps scatter too much.
+    Returns None if the time stamps scatter too much for an estimate.
     """
     steps = np.diff(stamps[:MAX_RATE_ROWS])
     period, rows = float(np.median(steps)), 1
@@ -96,7 +99,7 @@ def estimate_row_period(stamps: np.ndarray) -> float | None:
         stride = len(stamps) // MAX_RATE_ROWS + 1
         apart = stamps[rows::stride] - stamps[:-rows:stride]
         ticks = np.rint(apart / period)
-        # If rows were lost, the number of ticks exceeds the number of rows.
+        # If rows are lost, the number of ticks exceeds the number of rows.
         period = float(np.median(apart[ticks > 0] / ticks[ticks > 0])) if np.any(ticks > 0) else period
     return period
 
@@ -120,18 +123,18 @@ def _compute_row_distances(stamps: np.ndarray, period: float, label: str, column
     """Return the times between successive rows [s].
 
     Raises:
-        InputError: If the time stamps do not increase, or a time is too short or too long for a log.
+        InputError: If the time stamps do not increase, or if the rows are too close or the log is too long.
     """
     steps = np.diff(stamps)
     bad = np.flatnonzero(~(steps > 0))
     if len(bad):
         row, text = int(bad[0]) + 2, f"{stamps[bad[0] + 1]:.9g} s after {stamps[bad[0]]:.9g} s"
-        raise InputError(f"{label}: row {row}: {column}: found {text}, expected time that increases")
+        raise InputError(f"{label}: row {row}: {column}: found {text}, expected an increasing time")
     if not stamps[-1] - stamps[0] < MAX_LOG_PERIODS * period:
         row = int(np.argmax(steps)) + 2
         text = f"{stamps[row - 1]:.9g} s after {stamps[row - 2]:.9g} s"
         raise InputError(
-            f"{label}: row {row}: {column}: found {text}, expected at most {MAX_LOG_PERIODS:g} periods"
+            f"{label}: row {row}: {column}: found {text}, expected at most {MAX_LOG_PERIODS:g} periods in all"
         )
     usual = float(np.median(steps[:MAX_RATE_ROWS])) if len(steps) else period
     if not usual > MIN_ROW_DISTANCE * period:
@@ -146,7 +149,7 @@ def number_rows(rows: int, period: float) -> RowTicks:
 
 
 def parse_stamps(stamps: np.ndarray, time_format: str, label: str) -> tuple[np.ndarray, float]:
-    """Convert date texts to seconds.
+    """Convert time stamps from text to seconds.
 
     Args:
         stamps: Texts of the time stamps.
@@ -170,7 +173,7 @@ def parse_stamps(stamps: np.ndarray, time_format: str, label: str) -> tuple[np.n
 
 
 def _check_rate(stamps: np.ndarray, steps: np.ndarray, period: float, label: str, column: str) -> None:
-    """Raise `InputError` if any part of the log has another row rate than the control rate."""
+    """Raise `InputError` if the row rate differs from the control rate in any part of the log."""
     usual = float(np.median(steps))
     if abs(usual / period - 1.0) > MAX_RATE_ERROR:
         finding = f"rows {usual:.4g} s apart"
@@ -214,7 +217,7 @@ def _estimate_phase(stamps: np.ndarray, period: float) -> np.ndarray:
 
 
 def _correct_outliers(tick: np.ndarray) -> np.ndarray:
-    """Return ticks that increase strictly from row to row; outliers are corrected by a median filter."""
+    """Return strictly increasing ticks; a median filter corrects outliers."""
     lost = tick - np.arange(len(tick))
     if np.all(np.diff(lost) >= 0):
         return tick

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-CONTACT_THRESHOLD_SIGMAS = 5.0  # standard deviations of the force noise; a larger force indicates contact
-MIN_CONTACT_TICKS = 3  # number of successive ticks above the threshold with which a contact begins
+CONTACT_THRESHOLD_SIGMAS = 5.0  # minimum force in contact, in standard deviations of the force noise
+MIN_CONTACT_TICKS = 3  # minimum number of successive ticks above the threshold at the beginning of a contact
 MIN_CONTACT_GAP = 0.1  # s, minimum time between two contacts
 MAX_REST_ROWS = 200  # maximum number of first rows that determine the force without contact
 
@@ -13,11 +13,11 @@ MAX_REST_ROWS = 200  # maximum number of first rows that determine the force wit
 def detect_contacts(
     force: np.ndarray, period: float, rest: float | None = None, apart: float = MIN_CONTACT_GAP
 ) -> list[tuple[int, int]]:
-    """Detect contacts as intervals in which the force exceeds its noise.
+    """Detect contacts: intervals in which the force exceeds its noise.
 
     Args:
-        force: Measured force [N]; NaN in lost rows. The first rows must be without contact unless `rest` is
-            given.
+        force: Measured force [N]; NaN in lost rows. If `rest` is None, the first rows must be without
+            contact.
         period: Control period [s].
         rest: Force reading without contact [N], or None to estimate it.
         apart: Minimum time between two contacts [s]; closer contacts are merged.
@@ -35,7 +35,7 @@ def detect_contacts(
     starts = np.flatnonzero(is_sustained)
     if not len(starts):
         return []
-    # A short excursion above the threshold belongs to a contact only if it is close to that contact.
+    # Fewer ticks above the threshold belong to a contact only if they are close to it.
     inside = np.flatnonzero(is_above)
     inside = inside[inside >= starts[0]]
     breaks = np.flatnonzero(np.diff(inside) > round(apart / period))
@@ -50,7 +50,7 @@ def estimate_resting_force(force: np.ndarray) -> float:
 
 
 def estimate_contact_threshold(force: np.ndarray) -> float:
-    """Return the force [N] above which there is contact, from the noise of the readings."""
+    """Return the force [N] above which contact is assumed, from the noise of the readings."""
     steps = np.diff(force[np.isfinite(force)])
     sigma = max(
         1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2), float(np.nanstd(_select_first_readings(force)))

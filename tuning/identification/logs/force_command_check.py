@@ -1,9 +1,9 @@
 """Check that the logged force command explains the logged motion of the numerical model.
 
 The numerical model moves by M x_d'' = -F_c. The logs satisfy this equation exactly, except for rounding,
-jitter of the time stamps and lost rows. In a log without rounding, second differences of successive rows test
-the equation. If rounding or jitter hides the acceleration, second differences over several rows are used:
-they increase with the square of the number of rows, but the disturbance does not.
+jitter of the time stamps and lost rows. In a log without rounding, the second differences of successive rows
+test the equation. If rounding or jitter hides the acceleration, the second differences of rows that are n
+rows apart test it: the acceleration increases them by the factor n^2, but the disturbance does not increase.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from tuning.identification.logs.lost_rows import LogSegment, detect_integrator
 from tuning.identification.logs.scale_fit import ScaleFit, fit_scale
 from tuning.identification.logs.scales import TOLERANCE_SIGMAS, ask_for_unit, make_triangular_weights
 
-DIFFERENCE_SPANS = 1, 2, 4, 8, 16, 32  # rows between the positions of a second difference
+DIFFERENCE_SPANS = 1, 2, 4, 8, 16, 32  # numbers of rows between the positions in a second difference
 MIN_FIT_ROWS = 50  # minimum number of rows for a fit
 ROWS_BESIDE_CONTACT = 40  # number of rows before and after a contact that are included
-MAX_CONTACT_ROWS = 20_000  # number of rows in contact that is sufficient
-MAX_UNEXPLAINED_SHARE = 0.1  # largest share of the motion that the force command may leave unexplained
+MAX_CONTACT_ROWS = 20_000  # maximum number of evaluated rows; more are not needed
+MAX_UNEXPLAINED_SHARE = 0.1  # maximum share of the motion that the force command does not explain
 MASS_TOLERANCE = 0.01  # relative tolerance of the mass
-MIN_ROW_ERROR_RATIO = 1.2  # ratio of the fit errors of two row conventions that rejects one of them
-MIN_LOG_LIKELIHOOD_RATIO = 10.0  # log likelihood ratio of two row conventions that rejects one of them
-ROUNDING_ERROR = 1e-12  # m, rounding error of a log with all digits
-ROW_CONVENTIONS = "tick", "sent"  # conventions that differ in the motion of the model
+MIN_ROW_ERROR_RATIO = 1.2  # minimum ratio of two row conventions' fit errors that rejects one of them
+MIN_LOG_LIKELIHOOD_RATIO = 10.0  # minimum log likelihood ratio that rejects one of two row conventions
+ROUNDING_ERROR = 1e-12  # m, rounding error in a log with all digits
+ROW_CONVENTIONS = "tick", "sent"  # row conventions that the motion of the model distinguishes
 
-FitsByConvention = dict[tuple[str, str], ScaleFit]  # by row convention and integrator
+FitsByConvention = dict[tuple[str, str], ScaleFit]  # keys: row convention, integrator
 
 
 def check_command(
@@ -38,7 +38,7 @@ def check_command(
     row: str,
     integrator: str,
 ) -> tuple[bool, str | None]:
-    """Check that the force command moves the numerical model as the desired position shows.
+    """Check that the force command moves the numerical model in agreement with the desired position.
 
     Args:
         label: Name of the log in messages.
@@ -48,13 +48,14 @@ def check_command(
         period: Control period [s].
         mass: Equivalent mass of the numerical model [kg].
         row: Row convention of the mapping.
-        integrator: Integrator of the numerical model if the logged velocity does not determine it.
+        integrator: Integrator of the numerical model; it is used if the logged velocity does not determine
+            one.
 
     Returns:
-        Whether the force command can be used, and a note or None.
+        True if the force command can be used, and a note or None.
 
     Raises:
-        InputError: If the force command moves the model with another mass, sign or row convention.
+        InputError: If the force command explains the motion only with another mass, sign or row convention.
     """
     x, v, force = (segment.channels[key] for key in ("position_desired", "velocity_desired", "force_command"))
     assert x is not None and force is not None
@@ -87,7 +88,7 @@ def check_command(
 
 
 def _check_mass(label: str, fits: dict[int, FitsByConvention], mass: float) -> None:
-    """Raise `InputError` if the force command moves the model with another mass or with the wrong sign."""
+    """Raise `InputError` if the force command explains the motion only with another mass or sign."""
     fit = min(
         (_select_best_fit(by_way)[1] for by_way in fits.values()), key=lambda candidate: candidate.error
     )
@@ -107,13 +108,13 @@ def _check_mass(label: str, fits: dict[int, FitsByConvention], mass: float) -> N
 
 
 def _check_row(label: str, fits: dict[int, FitsByConvention], mass: float, row: str) -> str | None:
-    """Raise `InputError` for another row convention; return a note if the log does not determine it."""
+    """Raise `InputError` if the log shows another row convention; return a note if it does not show any."""
     clearest, choice = 0.0, None
     for by_way in fits.values():
         way, best = _select_best_fit(by_way)
         other_rms = max(fit.rms for fit in by_way.values()) + ROUNDING_ERROR
         likelihood_ratio = best.rows * np.log(other_rms / (best.rms + ROUNDING_ERROR))
-        # Nearly equal errors of both conventions come from rounding, and carry no information.
+        # Nearly equal errors of both conventions come from rounding and contain no information.
         if other_rms >= MIN_ROW_ERROR_RATIO * (best.rms + ROUNDING_ERROR) and likelihood_ratio > clearest:
             clearest, choice = likelihood_ratio, way
     if choice is not None and clearest > MIN_LOG_LIKELIHOOD_RATIO:
@@ -133,7 +134,7 @@ def _select_best_fit(fits: FitsByConvention) -> tuple[tuple[str, str], ScaleFit]
 
 
 def _select_contact_rows(rows: int, contacts: list[tuple[int, int]]) -> list[slice]:
-    """Return the ranges of rows in and near the contacts, up to a sufficient number of rows."""
+    """Return the ranges of rows in and near the contacts, with at most `MAX_CONTACT_ROWS` rows."""
     parts, count = [], 0
     for begin, end in contacts:
         parts.append(
@@ -149,7 +150,7 @@ def _select_contact_rows(rows: int, contacts: list[tuple[int, int]]) -> list[sli
 
 
 def _interpolate_gaps(values: np.ndarray) -> np.ndarray:
-    """Return the values after linear interpolation in lost rows, which are NaN."""
+    """Replace NaN in lost rows by linear interpolation."""
     finite = np.isfinite(values)
     if finite.all() or not finite.any():
         return np.nan_to_num(values)
@@ -160,11 +161,11 @@ def _interpolate_gaps(values: np.ndarray) -> np.ndarray:
 def _fit_conventions(
     moves: list[tuple[np.ndarray, np.ndarray, np.ndarray]], width: int, ways: list[tuple[str, str]]
 ) -> FitsByConvention:
-    """Fit the second differences of the positions by the second differences that the force command causes.
+    """Fit the second differences of the positions as a multiple of those that the force command causes.
 
     Args:
-        moves: For each contact, the positions, the second difference that the force of each row causes, and
-            the flags of valid rows.
+        moves: For each contact: the positions, the second differences that the forces of the rows cause, and
+            flags of the valid rows.
         width: Number of rows between the positions of a second difference.
         ways: Pairs of row convention and integrator.
 
@@ -193,7 +194,7 @@ def _fit_conventions(
 
 
 def compute_force_displacement(unit: np.ndarray, integrator: str, sent: bool) -> np.ndarray:
-    """Return the second differences x(n+1) - 2 x(n) + x(n-1) of the positions due to the force command.
+    """Return the second differences x(n+1) - 2 x(n) + x(n-1) of the positions that the force command causes.
 
     Args:
         unit: Second difference that the force of each row causes, -T^2 F_c / M.

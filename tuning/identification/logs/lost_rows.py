@@ -6,9 +6,9 @@ The numerical model
     x(n+1) = x(n) + T v(n+1),   v(n+1) = v(n) - T F_c(n) / M        (semi-implicit Euler)
 
 gives the first and the last lost command from the adjacent rows, with the precision of the log. A cubic
-polynomial gives the commands between them, or all commands if velocity or force command are not logged.
-Sensor readings are not reconstructed: they are NaN, and the row is marked as not valid. At longer gaps, the
-log is divided.
+polynomial gives the commands between them; if the velocity or the force command is not logged, it gives all
+lost commands. Sensor readings are not reconstructed: they are NaN, and the row is marked as not valid. The
+log is divided at longer gaps.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ import numpy as np
 
 from tuning.identification.logs.scale_fit import fit_scale
 
-MAX_RECONSTRUCTED_ROWS = 3  # rows, longest gap in which commands are reconstructed
-INTEGRATOR_SPAN_ROWS = 32  # rows, span of differences that show the integrator despite rounding and jitter
-# half periods, largest difference between the estimate and an integrator's value
+MAX_RECONSTRUCTED_ROWS = 3  # maximum number of rows in a gap whose commands are reconstructed
+INTEGRATOR_SPAN_ROWS = 32  # number of rows in which the motion shows the integrator despite rounding
+# half periods, maximum distance of the estimate from an integrator's value
 MAX_INTEGRATOR_DISTANCE = 0.2
-MIN_INTEGRATOR_SIGMAS = 4.0  # standard errors that must separate the estimate from the other integrators
-# share of the largest change of velocity; rows with a smaller change are not used
+MIN_INTEGRATOR_SIGMAS = 4.0  # minimum distance from the other integrators' values, in standard errors
+# minimum change of velocity in a used row, as a share of the largest change
 MIN_VELOCITY_CHANGE_SHARE = 0.1
 
 ChannelValues = Mapping[str, np.ndarray | None]
@@ -43,7 +43,7 @@ class LogSegment(NamedTuple):
 def split_at_gaps(
     tick: np.ndarray, channels: ChannelValues, cuts: np.ndarray, period: float, mass: float
 ) -> list[LogSegment]:
-    """Divide a log at long gaps and before given rows; fill shorter gaps.
+    """Divide a log at long gaps and before the rows `cuts`; fill shorter gaps.
 
     Args:
         tick: Tick of each row.
@@ -79,7 +79,8 @@ def detect_integrator(x: np.ndarray, v: np.ndarray | None, period: float) -> str
     step = np.diff(x)
     by = {"semi_implicit_euler": v[1:], "explicit_euler": v[:-1], "zoh": (v[1:] + v[:-1]) / 2}
     errors = {name: np.abs(step - period * velocity) for name, velocity in by.items()}
-    # Omit rows without force, where all integrators agree, and jumps due to a reset of the rig.
+    # Omit rows without force, in which all integrators agree, and velocity jumps that a reset of the rig
+    # causes.
     pulled = np.abs(np.diff(v))
     usable = np.isfinite(step) & (pulled > 0)
     usable &= pulled <= 10 * np.nanmedian(pulled[usable]) if np.any(usable) else False
@@ -89,9 +90,10 @@ def detect_integrator(x: np.ndarray, v: np.ndarray | None, period: float) -> str
 
 
 def _detect_integrator_over_span(x: np.ndarray, v: np.ndarray, period: float) -> str | None:
-    """Detect the integrator from the motion over `INTEGRATOR_SPAN_ROWS` rows, despite rounding or jitter.
+    """Detect the integrator from the motion in `INTEGRATOR_SPAN_ROWS` rows, despite rounding or jitter.
 
-    Integrators differ in the velocity of a step: at the start, at the end, or the mean of both.
+    The integrators multiply the period by different velocities: at its start, at its end, or the mean of
+    both.
     """
     finite = np.isfinite(v)
     summed = np.cumsum(np.where(finite, v, 0.0))
@@ -114,7 +116,7 @@ def _detect_integrator_over_span(x: np.ndarray, v: np.ndarray, period: float) ->
 
 
 def _fill_lost_ticks(tick: np.ndarray, channels: ChannelValues, period: float, mass: float) -> LogSegment:
-    """Return a segment with one row per tick: insert lost rows and reconstruct their commands."""
+    """Insert the lost rows and reconstruct their commands; return a segment with one row per tick."""
     index = tick - tick[0]
     rows = int(index[-1]) + 1
     valid = np.zeros(rows, bool)

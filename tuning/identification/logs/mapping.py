@@ -7,8 +7,8 @@
     [text]                      # skip_rows, delimiter, decimal, of text files
     [[runs]]                    # files (patterns), kind
 
-A prior mechanism file provides the values that `[timing]` and `[bodies]` omit. The value of a channel is sign
-* (scale * number + offset) in the given unit, where number is the entry of the column.
+A prior mechanism file provides the values that `[timing]` and `[bodies]` omit. The value of a channel, in its
+unit, is sign * (scale * number + offset), where number is the entry of the column.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Channel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     column: ColumnName  # name of the column
     unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # SI unit if not specified
-    # Factor, in the given unit; with the unit "counts", the value of one count in SI units.
+    # Factor; if the unit is "counts", the value of one count in SI units.
     scale: Annotated[float, key_metadata("of the column's number", "")] = 1.0
     sign: Annotated[int, key_metadata("of the whole", "", ge=-1, le=1)] = 1
     offset: Annotated[float, key_metadata("added to the scaled number", "")] = 0.0  # in the given unit
@@ -89,14 +89,14 @@ class TimingSection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     computing_delay: Annotated[
         int, key_metadata("periods from a reading to the command that answers it", ge=0, le=4)
     ] = 0
-    clock: Literal["stamps", "index", "separate"] = "stamps"  # "separate": another clock for the forces
+    clock: Literal["stamps", "index", "separate"] = "stamps"  # "separate": the forces have another clock
 
 
 class TextFormat(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Table `[text]`: format of text files."""
 
     skip_rows: Annotated[int, key_metadata("lines above that of the columns' names", ge=0, le=10_000)] = 0
-    # If not specified, the delimiter is detected in the line of column names.
+    # If it is not specified, the delimiter is detected in the line of column names.
     delimiter: Annotated[str, Meta(min_length=1, max_length=1)] | None = None
     decimal: Literal[".", ","] = "."
 
@@ -140,7 +140,7 @@ def load_mapping(path: str | os.PathLike[str]) -> LogMapping:
 
 
 def parse_mapping(raw: Mapping[str, Any], label: str) -> LogMapping:
-    """Convert parsed TOML tables to a mapping; `label` is its name in messages.
+    """Convert parsed TOML tables to a mapping; `label` is the name of the mapping in messages.
 
     Raises:
         InputError: If the table is invalid.
@@ -173,7 +173,7 @@ def get_si_conversion(channel: Channel, name: str) -> tuple[float, float]:
 
 
 def _expand_shorthand(raw: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tables without shorthand: column names become tables, single patterns become lists."""
+    """Expand shorthand in the tables: a column name becomes a table, a single pattern becomes a list."""
     tables = dict(raw)
     if isinstance(channels := tables.get("channels"), Mapping):
         named = {
@@ -212,7 +212,7 @@ def _check_mapping(mapping: LogMapping) -> None:
     time = channels.time
     if (time.column is None) == (time.rate is None):
         finding = "neither" if time.rate is None else "both"
-        raise KeyProblem(("channels", "time"), finding, "either a column of stamps or the rate of the rows")
+        raise KeyProblem(("channels", "time"), finding, "either a column of stamps or a rate of rows")
     if time.column is None or time.time_format is not None:
         for name in channels.__struct_fields__:
             stamps_column = getattr(getattr(channels, name), "time", None)
@@ -237,7 +237,7 @@ def _check_rest(mapping: LogMapping) -> None:
 
 
 def find_equivalent_mass(mapping: LogMapping, prior: Mechanism | None) -> float | None:
-    """Return the equivalent mass of the numerical model [kg] from the mapping, or else from the prior."""
+    """Return the equivalent mass of the numerical model [kg] from the mapping; if omitted, from the prior."""
     if mapping.bodies is not None:
         return mapping.bodies.mass
     return None if prior is None else prior.bodies.mass

@@ -1,8 +1,8 @@
 """Draft of a mapping file from the names and values of a log's columns, for the user to check.
 
 The name of a column indicates the channel and, in brackets or after an underscore, the unit. If a unit is
-missing, it is guessed from the values. The signs also follow from the values: positions increase where the
-force is large, and a force that pushes the bodies apart is positive.
+missing, it is guessed from the values. The signs are also guessed from the values, for the convention that
+positions increase towards contact and that a force which pushes the bodies apart is positive.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tuning.identification.logs.mapping import KINDS, SCHEMA
 from tuning.identification.logs.readers import ColumnsByName, OpenLog, open_log
 from tuning.identification.logs.units import UNITS_OF_CHANNEL
 
-# Patterns of column names for each channel, in order of priority: a column belongs to the first match.
+# Patterns of column names for each channel. A column belongs to the first channel whose pattern matches.
 CHANNEL_PATTERNS = {
     "time": r"^t$|time|stamp|clock",
     "velocity_desired": r"^v_?d$|vel\w*_?(des|cmd|com|ref)|(des|cmd|com|ref)\w*_?vel",
@@ -35,10 +35,10 @@ CHANNEL_PATTERNS = {
     "position_measured": r"^x_?m$|^x_?a$|pos|meas|actual|feedback|disp|lvdt|encoder|^x$",
 }
 REQUIRED_CHANNELS = ("position_desired", "position_measured")
-# Largest plausible range of a channel in SI units; a larger range indicates mm or um.
+# Maximum plausible range of a channel in SI units; a larger range indicates mm or um.
 TYPICAL_MAXIMUM = {"position_desired": 0.5, "position_measured": 0.5, "velocity_desired": 1.0}
 MAX_SAMPLED_ROWS = 200_000  # maximum number of rows that are read
-# Hz, common control rates.
+# Common control rates [Hz].
 COMMON_CONTROL_RATES = (
     100,
     125,
@@ -64,7 +64,7 @@ _UNIT_SUFFIXES = {unit for units in UNITS_OF_CHANNEL.values() for unit in units 
 
 
 class ChannelGuess(NamedTuple):
-    """Guess of a channel's column, unit and sign, with the reason."""
+    """Guess of a channel's column, unit and sign, with the reason for the guess."""
 
     column: str
     unit: str | None  # None for the SI unit
@@ -90,7 +90,7 @@ def draft_mapping(paths: Sequence[Path]) -> str:
                 f"{first.label}: found no column with a name like {name}, expected one; columns: {names}"
             )
     kinds = {path: _guess_kind(path, log, columns) for path, log in logs.items()}
-    # Only a log with contact shows the signs.
+    # Only a log of kind contact shows the signs.
     best = next((path for path, kind in kinds.items() if kind == "contact"), paths[0])
     guesses = _guess_channels(logs[best], columns)
     return "\n".join(
@@ -99,7 +99,7 @@ def draft_mapping(paths: Sequence[Path]) -> str:
 
 
 def _match_columns(names: Sequence[str]) -> dict[str, str]:
-    """Return the column of each channel according to `CHANNEL_PATTERNS`."""
+    """Return the column of each channel, by the patterns of names in `CHANNEL_PATTERNS`."""
     result: dict[str, str] = {}
     for name in names:
         bare = _strip_unit(name)
@@ -111,7 +111,7 @@ def _match_columns(names: Sequence[str]) -> dict[str, str]:
 
 
 def _strip_unit(name: str) -> str:
-    """Return a column name in lower case and without its unit."""
+    """Return the name of a column in lower case and without its unit."""
     bare = re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", name).strip().lower().replace(" ", "_").replace("-", "_")
     head, _, tail = bare.rpartition("_")
     return head if head and any(tail == unit.lower() for unit in _UNIT_SUFFIXES) else bare
@@ -130,7 +130,7 @@ def _find_unit(name: str, channel: str) -> str | None:
 
 
 def _guess_kind(path: Path, log: OpenLog, columns: Mapping[str, str]) -> str:
-    """Guess the kind of experiment from the file name, or else from the values."""
+    """Guess the kind of experiment from the file name or, if it contains none, from the values."""
     named = [kind for kind in KINDS if kind in path.stem.lower()]
     if named:
         return named[0]
@@ -198,7 +198,7 @@ def _guess_channels(log: OpenLog, columns: Mapping[str, str]) -> dict[str, Chann
 
 
 def _guess_signs(read: ColumnsByName, columns: Mapping[str, str]) -> dict[str, int]:
-    """Return the signs with which positions increase in contact and contact forces are positive."""
+    """Return the signs for which positions increase towards contact and contact forces are positive."""
 
     def of(channel: str) -> np.ndarray | None:
         values = read.get(columns.get(channel, ""))
@@ -206,7 +206,7 @@ def _guess_signs(read: ColumnsByName, columns: Mapping[str, str]) -> dict[str, i
 
     force, x, measured = of("force_measured"), of("position_desired"), of("position_measured")
     if x is None or measured is None:
-        return {}  # Columns of texts are rejected when the mapping is used.
+        return {}  # The reader of the mapping rejects columns of texts.
     signs = {}
     towards = 1
     if force is not None:

@@ -24,17 +24,17 @@ from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.mechanism.conversion import suggest_names
 from tuning.identification.logs.mapping import TextFormat
 
-# Values of each column: float64, text objects, or time stamps in s relative to the first one.
+# Values of each column: float64, text objects, or time stamps [s] relative to the first one.
 ColumnsByName = dict[str, np.ndarray]
 
-# Function that returns the time stamps [s] of given columns, or None for columns without separate stamps.
+# Function that returns the time stamps [s] of given columns; None for a column without separate stamps.
 StampsOfColumns = Callable[[Sequence[str]], Mapping[str, np.ndarray | None]]
 
 DEFAULT_TEXT_FORMAT = TextFormat()
-DELIMITERS = "\t;,"  # the first of these that occurs in the line of column names is the delimiter
-PARSE_BLOCK_BYTES = 1 << 22  # bytes that are parsed at once
-GROWTH_ROWS = 1 << 19  # rows by which an array is enlarged when it is full
-MAX_LINE_BYTES = 1 << 20  # bytes, longest line of column names
+DELIMITERS = "\t;,"  # candidates; the first one that occurs in the line of column names is the delimiter
+PARSE_BLOCK_BYTES = 1 << 22  # number of bytes that are parsed at once
+GROWTH_ROWS = 1 << 19  # number of rows by which a full array is enlarged
+MAX_LINE_BYTES = 1 << 20  # maximum number of bytes in the line of column names
 MAX_NAMES_IN_MESSAGE = 12  # maximum number of column names in a message
 
 _TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log")
@@ -52,7 +52,7 @@ _THIRD_PARTY_FORMATS = {
 
 
 class OpenLog(NamedTuple):
-    """Open log file: the names of its columns, and functions that read columns and their time stamps."""
+    """Log file that was opened: its column names, and functions that read columns and their time stamps."""
 
     label: str  # name of the log in messages
     names: list[str]
@@ -105,7 +105,7 @@ def open_log(path: Path, text: TextFormat = DEFAULT_TEXT_FORMAT) -> OpenLog:
 
 @contextmanager
 def convert_reader_errors(label: str) -> Iterator[None]:
-    """Convert every exception inside the `with` block to an `InputError` with a message of one line."""
+    """Convert every exception in the `with` block to an `InputError` whose message has one line."""
     try:
         yield
     except InputError:
@@ -127,7 +127,7 @@ def _wrap_stamp_reader(label: str, clocks: StampsOfColumns | None) -> StampsOfCo
 
 
 def _wrap_reader(label: str, names: Sequence[str], read: Callable[[Sequence[str]], ColumnsByName]):
-    """Return a reading function that raises `InputError` for missing or ambiguous columns."""
+    """Return a function that reads columns and raises `InputError` if a column is missing or ambiguous."""
 
     def checked(wanted: Sequence[str]) -> ColumnsByName:
         for name in wanted:
@@ -158,7 +158,7 @@ def _open_text_log(path: Path, label: str, text: TextFormat) -> OpenLog:
         raw = file.readline(MAX_LINE_BYTES)
         second = file.readline(MAX_LINE_BYTES)
     if not raw.strip():
-        raise InputError(f"{label}: found no line of column names, expected one after {text.skip_rows} lines")
+        raise InputError(f"{label}: found no line of column names, expected it after {text.skip_rows} lines")
     line, following = (
         _decode_line(raw_line, text.skip_rows == 0).strip("\r\n") for raw_line in (raw, second)
     )
@@ -181,7 +181,7 @@ def _open_text_log(path: Path, label: str, text: TextFormat) -> OpenLog:
 
 
 def _is_numeric_column(line: str, names: Sequence[str], name: str, delimiter: str, text: TextFormat) -> bool:
-    """Return whether the column contains a number, or nothing, in this line."""
+    """Return whether the column is empty or contains a number in this line."""
     cells = next(csv.reader(io.StringIO(line), delimiter=delimiter), [])
     index = list(names).index(name)
     return index >= len(cells) or not cells[index].strip() or _is_number(cells[index], text.decimal)
@@ -208,7 +208,7 @@ def _read_text(
             strings_can_be_null=False,
         ),
     )
-    # Arrays that grow with each batch save memory: a whole table takes three times the memory of its numbers.
+    # Arrays that grow with each batch save memory: a whole table needs three times the memory of its numbers.
     # A single thread parses the file, so that error messages name the invalid row.
     columns: ColumnsByName = {name: np.empty(0, object if name in texts else float) for name in chosen}
     rows = 0
@@ -227,7 +227,7 @@ def _open_parquet_log(path: Path, label: str) -> OpenLog:
     names = list(parquet.read_schema(path).names)
 
     def read(wanted: Sequence[str]) -> ColumnsByName:
-        # Read one column at a time: a whole table together with its arrays takes twice the memory.
+        # Read one column at a time: a whole table together with its arrays needs twice the memory.
         columns = (parquet.read_table(path, columns=[name]).column(0) for name in wanted)
         return {name: _column_to_array(column, name) for name, column in zip(wanted, columns, strict=True)}
 

@@ -1,11 +1,11 @@
-"""Resampling of channels with separate time stamps to the rows of the desired position.
+"""Resampling of channels with separate time stamps to the rows (times) of the desired position.
 
 In some log formats, each channel or group of channels has its own time stamps. Such a channel may begin
 later, have a higher rate, or lose other rows than the desired position. All channels are resampled to the
-times of the desired position. A reading at exactly this time is used unchanged; otherwise, readings are
-interpolated linearly. Interpolation would smooth the jump of the force at the onset of contact. If forces are
-logged at the rate of the desired position, the nearest reading is therefore used, and its time offset is
-returned. Rows in which any channel has no reading are removed.
+times of the desired position. A reading at exactly such a time is used unchanged; otherwise, readings are
+interpolated linearly. Forces are an exception, because interpolation would smooth the jump of the force at
+the onset of contact. If they are logged at the rate of the desired position, the nearest reading is used, and
+its time offset is returned. Rows in which any channel has no reading are removed.
 """
 
 from __future__ import annotations
@@ -18,17 +18,20 @@ from jaxhil.errors import InputError, format_value
 from tuning.identification.logs import clock
 
 MASTER_CHANNEL = "position_desired"  # channel whose times define the rows
-MAX_READING_PERIOD = 1.5  # control periods, longest time between readings; a slower channel is rejected
-MIN_GAP_RATIO = 1.5  # time between readings over its median; above it, a reading was lost
-SIMULTANEITY_TOLERANCE = 0.02  # periods; a reading this close to a row is at the time of the row
-HELD_CHANNELS = "contact_index", "mode"  # channels whose value holds until the next reading
+MAX_READING_PERIOD = 1.5  # control periods, maximum time between readings; a slower channel is rejected
+MIN_GAP_RATIO = 1.5  # minimum ratio of the time between two readings to its median if a reading was lost
+SIMULTANEITY_TOLERANCE = 0.02  # control periods, maximum distance of readings that count as simultaneous
+HELD_CHANNELS = "contact_index", "mode"  # channels whose values are valid until the next reading
 NEAREST_READING_CHANNEL = "force_measured"  # channel with jumps, which is not interpolated
 FORCE_LATE_CHANNEL = "force_late"  # s, time from a row to the force reading that is used for it
-EQUAL_RATE_TOLERANCE = 0.01  # relative difference; two rates with a smaller difference are equal
+EQUAL_RATE_TOLERANCE = 0.01  # maximum relative difference of two rates that count as equal
 
 
 def has_same_stamps(first: np.ndarray | None, other: np.ndarray | None) -> bool:
-    """Return whether two channels have the same time stamps; None means that there are no stamps."""
+    """Return whether two channels have the same time stamps.
+
+    None stands for a channel without stamps.
+    """
     if first is None or other is None:
         return first is other
     return first is other or np.array_equal(first, other)
@@ -56,12 +59,12 @@ def resample_to_rows(
         label: Name of the log in messages.
         columns: Values of each channel.
         clocks: Time stamps of each channel [s], with a common origin.
-        named: Name of each channel's column, for messages.
+        named: Name of each channel's column in messages.
         period: Control period [s].
 
     Returns:
-        The values of each channel, including `FORCE_LATE_CHANNEL` if the nearest force readings are used; the
-        time stamps of the rows [s]; and notes.
+        The values of each channel, with `FORCE_LATE_CHANNEL` if the nearest force readings are used; the time
+        stamps of the rows [s]; and notes.
 
     Raises:
         InputError: If a channel has no valid time stamps, or no row has readings of all channels.
@@ -122,12 +125,12 @@ def _check_clock(label: str, column: str, stamps: np.ndarray | None, rows: int) 
         row = int(bad[0]) + 2
         finding = f"{stamps[row - 1]:.9g} s after {stamps[row - 2]:.9g} s"
         raise InputError(
-            f"{label}: row {row}: {_label_stamps(column)}: found {finding}, expected time that increases"
+            f"{label}: row {row}: {_label_stamps(column)}: found {finding}, expected an increasing time"
         )
 
 
 class _RowsAmongReadings:
-    """Assignment of a channel's readings to the rows, by their time stamps."""
+    """Assignment of a channel's readings to the rows by time stamps."""
 
     def __init__(self, label: str, column: str, stamps: np.ndarray, times: np.ndarray, period: float):
         self._column = column
@@ -138,7 +141,7 @@ class _RowsAmongReadings:
                 f"expected the control period, {period:g} s, or less"
             )
         self._rate, self._period = usual, period
-        # The samples are equidistant; only their time stamps scatter.
+        # The samples are assumed to be equidistant; only their time stamps scatter.
         stamps = clock.remove_stamp_jitter(stamps, period, label, _label_stamps(column))
         self._begins = float(stamps[0] - times[0])
         index = np.interp(times, stamps, np.arange(len(stamps), dtype=float))
@@ -163,15 +166,15 @@ class _RowsAmongReadings:
 
     @property
     def has_row_rate(self) -> bool:
-        """Return whether the readings have the rate of the rows but are taken at other times."""
+        """Return whether the readings have the same rate as the rows, but other times."""
         return not self._exact and abs(self._rate / self._period - 1.0) < EQUAL_RATE_TOLERANCE
 
     def nearest(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the reading nearest to each row, and the time from the row to this reading [s]."""
+        """Return, for each row, the nearest reading and the time from the row to this reading [s]."""
         return values[self._nearest], self._late
 
     def of(self, values: np.ndarray, steps: bool) -> np.ndarray:
-        """Return the values at the rows, interpolated linearly, or held until the next reading if `steps`."""
+        """Interpolate the values linearly at the rows; if `steps`, hold each value until the next one."""
         if self._exact:
             return values[self._before]
         if steps:
@@ -179,7 +182,7 @@ class _RowsAmongReadings:
         return values[self._before] * (1.0 - self._share) + values[self._before + 1] * self._share
 
     def note(self, master: str) -> str:
-        """Return a note, in words, on how the channel was resampled."""
+        """Return a note that describes how the channel was resampled."""
         how = "used unchanged" if self._exact else "interpolated"
         how += ", but the nearest forces are used" if self.has_row_rate else ""
         begins = f"{abs(1e3 * self._begins):.4g} ms {'after' if self._begins >= 0 else 'before'} those"

@@ -1,13 +1,14 @@
-"""Check of the row convention (the ticks of command and readings in a row) by the force sensor's noise.
+"""Check of the row convention (ticks of a row's command and readings) by means of the force sensor's noise.
 
 The force command depends on the force reading, including its noise, and moves the numerical model:
 
     M (x(n+1) - 2 x(n) + x(n-1)) / T^2 = -F_c(n).
 
-The right-hand side contains the noise of the reading F(n), but not of later readings. If rows contain the
-next tick's command, the commands seem to depend on the noise of the following row. If rows contain the next
-tick's readings, the response seems to be one row late. A regression finds the latest reading on which the
-second differences of the commands depend. All signals are differenced twice, so that mainly noise remains.
+The right-hand side depends on the noise of the reading F(n), but not on that of later readings. If a row
+contains the next tick's command, the commands seem to depend on the noise of the following row. If a row
+contains the next tick's readings, the response seems to be one row late. A regression finds the latest
+reading on which the second differences of the commands depend. All signals are differenced twice before, so
+that mainly noise remains.
 """
 
 from __future__ import annotations
@@ -21,21 +22,21 @@ from tuning.identification.logs.contact_detection import estimate_contact_thresh
 from tuning.identification.logs.lost_rows import detect_integrator
 from tuning.identification.records import CampaignTiming, LoggedRun
 
-# Readings from this many rows after a command to this many rows before it enter the regression.
+# The regression contains readings from this many rows after a command to this many rows before it.
 ROWS_AFTER_COMMAND, ROWS_BEFORE_COMMAND = 2, 6
-MIN_COEFFICIENT_SIGMAS = 6.0  # standard deviations; a larger coefficient may be significant
-MIN_COEFFICIENT_SHARE = 0.3  # minimum size of a significant coefficient, relative to the largest coefficient
-# Maximum size of the coefficient before the first significant one, relative to the largest coefficient. If it
-# is larger, a slow filter hides the latest reading.
+MIN_COEFFICIENT_SIGMAS = 6.0  # minimum size of a significant coefficient in standard deviations
+MIN_COEFFICIENT_SHARE = 0.3  # minimum size of a significant coefficient as a share of the largest coefficient
+# Maximum size of the coefficient before the first significant one, as a share of the largest coefficient. If
+# it is larger, a slow filter hides the latest reading.
 MAX_PRECEDING_SHARE = 0.12
-# Correlation of successive readings after two differences: -2/3 for white noise. If it is larger, the
-# readings are not dominated by noise.
+# Maximum correlation of successive second differences of readings that noise dominates; it is -2/3 for white
+# noise.
 MAX_NEIGHBOUR_CORRELATION = -0.4
 MIN_REGRESSION_ROWS = 100  # minimum number of rows for a regression
-OUTLIER_RATIO = 8.0  # residual over the median residual; rows with a larger ratio are excluded
+OUTLIER_RATIO = 8.0  # maximum ratio of a residual to the median residual; other rows are excluded
 MIN_AGREEING_SHARE = 0.7  # minimum share of the conclusive runs that must agree
 ROWS_BESIDE_CONTACT = 50  # number of rows before and after a contact that are included
-OUTLIER_ITERATIONS = 6  # iterations that exclude rows
+OUTLIER_ITERATIONS = 6  # maximum number of iterations that exclude rows
 MAX_RUNS = 50  # maximum number of evaluated runs
 MAX_COMPUTING_DELAY = 4  # ticks, longest computing delay
 # Number of ticks by which the readings of a row are older than its command.
@@ -46,10 +47,10 @@ EXPLICIT_INTEGRATOR = "explicit_euler"  # integrator that responds to a reading 
 def check_row_convention(
     runs: Sequence[LoggedRun], timing: CampaignTiming, integrator: str | None = None
 ) -> None:
-    """Check that the row convention `timing.row` agrees with the noise in the commands.
+    """Check the row convention `timing.row` with the sensor noise that the commands contain.
 
-    A command depends on the force reading of its tick, or of a tick that is `timing.computing_delay` ticks
-    earlier. With the explicit Euler integrator, the reading is one tick older.
+    A command depends on the force reading `timing.computing_delay` ticks earlier (0: same tick). With the
+    explicit Euler integrator, the reading is one tick older.
 
     Args:
         runs: Runs of the campaign.
@@ -57,7 +58,7 @@ def check_row_convention(
         integrator: Integrator of the numerical model, or None if it is unknown.
 
     Raises:
-        InputError: If the noise shows another row convention.
+        InputError: If the noise indicates another row convention.
     """
     offset = detect_reading_offset(runs)
     delay = timing.computing_delay + (integrator == EXPLICIT_INTEGRATOR)
@@ -79,17 +80,17 @@ def check_row_convention(
 
 
 def detect_common_integrator(runs: Sequence[LoggedRun], period: float) -> str | None:
-    """Return the integrator of the numerical model that most contacts show, or None if most show none."""
+    """Return the integrator of the numerical model that most contacts indicate, or None if unclear."""
     contacts = [run for run in runs if run.kind == "contact"][:MAX_RUNS]
     integrators = [detect_integrator(run.position_desired, run.velocity_desired, period) for run in contacts]
     return max(set(integrators), key=integrators.count, default=None)
 
 
 def detect_reading_offset(runs: Sequence[LoggedRun]) -> int | None:
-    """Return the row offset from a command to the latest force reading that affects it, from all contacts.
+    """Return the row offset from a command to the latest force reading that affects it.
 
-    The offset is positive if the reading is in a later row. It is None if the noise is not conclusive in at
-    least two runs, or if the runs disagree.
+    The offset is positive if the reading is in a later row. It is None if the runs disagree, or if fewer than
+    two runs are conclusive.
     """
     contacts = [run for run in runs if run.kind == "contact"]
     contacts = contacts[:: -(-len(contacts) // MAX_RUNS) or 1]
@@ -107,7 +108,7 @@ def _find_latest_reading(commands: np.ndarray, columns: np.ndarray) -> int | Non
     """Return the row offset from a command to the latest reading that affects the command; None if unclear.
 
     Args:
-        commands: Twice differenced second differences of the commands.
+        commands: Second differences of the commands, differenced twice more.
         columns: Regressors. The first regressor is the reading `ROWS_AFTER_COMMAND` rows after the command;
             each further regressor is the reading of the previous row.
     """
@@ -117,7 +118,7 @@ def _find_latest_reading(commands: np.ndarray, columns: np.ndarray) -> int | Non
     columns = columns / np.where(scale > 0, scale, 1.0)
     solution, error = np.zeros(columns.shape[1]), commands
     for _ in range(OUTLIER_ITERATIONS):
-        # Exclude rows with large residuals, because onsets and limits are nonlinear.
+        # Exclude rows with large residuals: at onsets and limits, the response is not linear.
         used = np.abs(error) <= OUTLIER_RATIO * np.median(np.abs(error))
         solution, _, rank, _ = np.linalg.lstsq(columns[used], commands[used], rcond=1e-10)
         if rank < columns.shape[1]:
@@ -162,7 +163,7 @@ def _make_regression_columns(run: LoggedRun) -> tuple[np.ndarray, np.ndarray] | 
     readings = [force[rows + ahead] for ahead in range(ROWS_AFTER_COMMAND, -ROWS_BEFORE_COMMAND - 1, -1)]
     table = np.stack([second[rows - 1], *readings, x[rows], x[rows] - x[rows - 1]], axis=1)
     table = np.diff(table, n=2, axis=0)
-    # Exclude rows without acceleration and jumps due to a reset of the rig.
+    # Exclude rows without acceleration, and velocity jumps that a reset of the rig causes.
     acceleration = np.abs(second[rows - 1])
     median_acceleration = np.median(acceleration[acceleration > 0]) if np.any(acceleration > 0) else 0.0
     usable = (acceleration > 0) & (acceleration < 20 * median_acceleration) & run.valid[rows]
@@ -175,7 +176,7 @@ def _make_regression_columns(run: LoggedRun) -> tuple[np.ndarray, np.ndarray] | 
 
 
 def _correlate_neighbours(columns: np.ndarray) -> float:
-    """Return the correlation of successive readings after two differences; 1 if it is undefined."""
+    """Return the correlation of successive second differences of the readings, or 1 if it is undefined."""
     reading, next_reading = columns[:, ROWS_AFTER_COMMAND], columns[:, ROWS_AFTER_COMMAND + 1]
     size = float(np.sqrt(np.dot(reading, reading) * np.dot(next_reading, next_reading)))
     return float(np.dot(reading, next_reading)) / size if size else 1.0

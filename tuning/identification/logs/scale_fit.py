@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-OUTLIER_RATIO = 6.0  # error over the median error; rows with a larger ratio are excluded
-MIN_USED_SHARE = 0.7  # minimum share of the rows in a fit
-OUTLIER_ITERATIONS = 4  # iterations that exclude rows
+OUTLIER_RATIO = 6.0  # maximum ratio of an error to the median error; other rows are excluded
+MIN_USED_SHARE = 0.7  # minimum share of the rows that a fit must use
+OUTLIER_ITERATIONS = 4  # maximum number of iterations that exclude rows
 
 
 class ScaleFit:
-    """Fit of one signal as a multiple of another signal, with the residual and its standard error."""
+    """Fit of one signal as a multiple of another signal: factor (slope), its standard error, and residual."""
 
     def __init__(self, slope: float, left: float, rms: float, error: float, rows: float):
         self.slope = slope
-        self.left = left  # rms of the residual over rms of the signal
+        self.left = left  # ratio of the residual's rms to the signal's rms
         self.rms = rms  # rms of the residual, in the unit of the signal
         self.error = error  # standard error of the slope
         self.rows = rows  # effective number of rows; correlated errors reduce it
@@ -26,7 +26,7 @@ def fit_scale(signal: np.ndarray, unit: np.ndarray, width: int = 1) -> ScaleFit 
     Args:
         signal: Signal to fit.
         unit: Signal that is multiplied by the slope.
-        width: Half the number of rows over which errors may be correlated.
+        width: Half the maximum number of rows between correlated errors.
 
     Returns:
         The fit, or None if one of the signals is 0 in all rows.

@@ -1,8 +1,8 @@
 """Checks of the units of forces, positions and velocities, from the momentum of the numerical model.
 
-During a contact, the numerical model is a free body. Its change of momentum is therefore exactly the impulse
-of the force command. The impulse of the measured force differs from it because of the compensator, but much
-less than by the factor between two units. Velocities are checked against the differences of positions.
+During a contact, the numerical model is a free body. Its change of momentum therefore equals the impulse of
+the force command. The impulse of the measured force differs from it because of the compensator, but by a much
+smaller factor than a wrong unit causes. Velocities are compared with the differences of positions.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from jaxhil.errors import InputError
 from tuning.identification.logs.lost_rows import LogSegment
 from tuning.identification.logs.scale_fit import fit_scale
 
-SPEED_SPAN_TICKS = 10  # ticks, time between two positions that give a speed
-# Allowed impulse of the measured force over the change of momentum; the compensators of jaxhil reach 0.97 to
+SPEED_SPAN_TICKS = 10  # number of ticks between the two positions that give a speed
+# Allowed ratio of the measured force's impulse to the change of momentum; jaxhil's compensators cause 0.97 to
 # 1.45.
 IMPULSE_RATIO_RANGE = 0.5, 2.0
 UNIT_FACTOR_TOLERANCE = 0.25  # relative tolerance of a unit's factor, because compensators change the impulse
-# Allowed impulse ratio if readings are clipped or the numerical model may not be a free body.
+# The same if readings are clipped, or if the numerical model may not be a free body.
 WIDE_IMPULSE_RATIO_RANGE = 0.2, 5.0
-TOLERANCE_SIGMAS = 5.0  # number of standard errors that are added to a tolerance
-VELOCITY_TOLERANCE = 0.02  # relative tolerance between the velocity and the differences of positions
-MAX_RELATIVE_RESIDUAL = 0.3  # largest relative residual of a fit that can be evaluated
+TOLERANCE_SIGMAS = 5.0  # this number of standard errors is added to a tolerance
+VELOCITY_TOLERANCE = 0.02  # maximum relative deviation of the velocity from the differences of positions
+MAX_RELATIVE_RESIDUAL = 0.3  # maximum relative residual of a fit that is evaluated
 POSITION_GAIN_RANGE = 0.5, 2.0  # allowed ratio of measured to desired position in slow motion
-MAX_EVALUATED_ROWS, MAX_GAIN_ROWS = 50_000, 10_000  # numbers of rows that are sufficient
-MAX_EVALUATED_CONTACTS = 500  # number of contacts that is sufficient
-MAX_SLOW_MOTION_LAG = 100  # rows, longest delay of a slow motion relative to its command
+MAX_EVALUATED_ROWS, MAX_GAIN_ROWS = 50_000, 10_000  # maximum numbers of evaluated rows; more are not needed
+MAX_EVALUATED_CONTACTS = 500  # maximum number of evaluated contacts; more are not needed
+MAX_SLOW_MOTION_LAG = 100  # rows, longest delay between command and motion in the search
 ROWS_BESIDE_CONTACT = 60  # number of rows before and after a contact that determine the force without contact
 
 # Factors by which a wrong unit multiplies the force.
@@ -63,27 +63,27 @@ _LENGTH_FACTORS = {
 
 
 def ask_for_unit(factors: tuple[float, ...], tolerance: float, momentum: bool = True) -> str:
-    """Return a question for a message that names wrong units with which a force would have a wrong value.
+    """Return a question that names confusions of units, which explain the wrong size of a force.
 
     Args:
-        factors: Estimates of the ratio of the force to its expected value, the best estimate first.
-        tolerance: Relative tolerance of the factor between two units.
-        momentum: Whether positions or the mass may have a wrong unit instead.
+        factors: Estimates of the ratio of the force to its expected value; the best estimate comes first.
+        tolerance: Relative tolerance between a ratio and the factor of two units.
+        momentum: Whether the question may also name units of positions and mass.
 
     Returns:
-        Text such as " (force in lbf, read as N?)", with the closest units first; "" if no unit fits.
+        Text such as " (force in lbf, read as N?)", with the most similar factors first; "" if none fits.
     """
     factors_of_units = [*_FORCE_FACTORS.items(), *(_MOMENTUM_FACTORS.items() if momentum else ())]
     return _ask_for_units(factors_of_units, factors, tolerance)
 
 
 def ask_for_length_unit(factor: float, tolerance: float) -> str:
-    """Return a question for a message that names wrong units with which lengths are wrong by a factor."""
+    """Return a question that names confusions of length units, which explain a wrong factor."""
     return _ask_for_units(list(_LENGTH_FACTORS.items()), (factor,), tolerance)
 
 
 def _ask_for_units(units: list[tuple[float, str]], factors: tuple[float, ...], tolerance: float) -> str:
-    """Return a question that names the units with the closest factors, or an empty string."""
+    """Return a question that names the confusions of units with the closest factors, or ""."""
     texts: list[str] = []
     for factor in factors:
         distances = sorted(
@@ -112,12 +112,12 @@ def check_impulse(
         contacts: For each contact, its first row and the row after its last row.
         period: Control period [s].
         mass: Equivalent mass of the numerical model [kg].
-        mass_is_verified: Whether the force command moves the model with this mass, so that positions and mass
-            have the right units.
+        mass_is_verified: Whether the force command is known to move this mass, so that the units of positions
+            and mass are right.
         clipped: Whether force readings are clipped, so that part of the impulse is missing.
 
     Raises:
-        InputError: If the impulse has another sign or magnitude.
+        InputError: If the impulse has the wrong sign or magnitude.
     """
     force, x = segment.channels["force_measured"], segment.channels["position_desired"]
     assert force is not None and x is not None
@@ -137,7 +137,8 @@ def check_impulse(
     low, high = low - TOLERANCE_SIGMAS * error, high + TOLERANCE_SIGMAS * error
     if low <= ratio <= high:
         return
-    # Damping by the compensator and a dead zone change the impulse, but not the slope of force over position.
+    # A damping compensator and a dead zone change the impulse, but hardly the slope of force against
+    # position.
     slope = _estimate_force_ratio(force, x, contacts, period, mass) or ratio
     if kind == "contact" and low <= slope <= high:
         return
@@ -180,7 +181,7 @@ def estimate_force_beside_contacts(force: np.ndarray, contacts: list[tuple[int, 
 
 
 def _estimate_impulse_error(force: np.ndarray, period: float, contacts: list[tuple[int, int]]) -> float:
-    """Return the standard deviation of the total impulse of all contacts due to noise [N s]."""
+    """Return the standard deviation [N s] of the total impulse of all contacts that the noise causes."""
     steps = np.abs(np.diff(force[:MAX_EVALUATED_ROWS]))
     std = 1.4826 * float(np.nanmedian(steps)) / np.sqrt(2.0)
     rows = sum(end - begin + 2 * SPEED_SPAN_TICKS for begin, end in contacts)
@@ -190,9 +191,9 @@ def _estimate_impulse_error(force: np.ndarray, period: float, contacts: list[tup
 def _estimate_force_ratio(
     force: np.ndarray, x: np.ndarray, contacts: list[tuple[int, int]], period: float, mass: float
 ) -> float | None:
-    """Return the ratio of the measured force to -M x_d'' in contact, or None if it cannot be determined.
+    """Return the ratio of the measured force to -M x_d'' in contact, or None if it is undetermined.
 
-    Constant and rate-dependent parts of the force are excluded by regression.
+    A regression excludes the constant and the rate-dependent part of the force.
     """
     rows = [
         np.arange(max(begin, SPEED_SPAN_TICKS), min(end, len(x) - SPEED_SPAN_TICKS))
@@ -217,18 +218,20 @@ def _estimate_force_ratio(
 
 
 def make_triangular_weights(width: int) -> np.ndarray:
-    """Return the weights with which second differences of adjacent rows add up to one over `width` rows."""
+    """Return the weights with which adjacent second differences add up to that of rows `width` apart."""
     return width - np.abs(np.arange(1.0 - width, width))
 
 
 def check_velocity(label: str, segment: LogSegment, period: float) -> str | None:
-    """Check that the desired velocity is the rate of the desired position.
+    """Check that the desired velocity is the derivative of the desired position.
 
     Returns:
-        None, or a note if the velocity is not proportional to the rate of the position and must be ignored.
+        A note if the velocity must be ignored, because it is not proportional to the derivative of the
+        position; otherwise None.
 
     Raises:
-        InputError: If the velocity is proportional to the rate of the position with a factor other than 1.
+        InputError: If the velocity is proportional to the derivative of the position, but with a factor other
+            than 1.
     """
     x, v = segment.channels["position_desired"], segment.channels["velocity_desired"]
     if x is None or v is None or len(x) <= 2 * SPEED_SPAN_TICKS:
@@ -262,7 +265,7 @@ def _sum_windows(values: np.ndarray) -> np.ndarray:
 
 
 def check_gain(label: str, kind: str, x: np.ndarray, measured: np.ndarray) -> None:
-    """Raise `InputError` if the gain from desired to measured position in slow motion is far from 1."""
+    """Raise `InputError` if the static gain from desired to measured position is far from 1."""
     if kind not in ("contact", "tap"):
         return
     x, measured = (

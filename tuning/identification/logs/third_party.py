@@ -1,8 +1,8 @@
 """Readers of third-party log formats; the library of a format is imported when a log is opened.
 
-Every public function takes a path and returns a `LogReader`. The column name of a field in a structure
-contains a dot (`log.force`). The columns of a matrix are numbered from 1 (`log.signals_2`). Time stamps
-relative to an epoch are converted to seconds from the first time stamp of the log.
+Every public function takes a path and returns a `LogReader`. A field of a structure becomes a column whose
+name contains a dot (`log.force`). The columns of a matrix are numbered from 1 (`log.signals_2`). Time stamps
+relative to an epoch are converted to seconds after the first time stamp of the log.
 """
 
 # The libraries are optional.
@@ -22,7 +22,7 @@ ColumnsByName = dict[str, np.ndarray]
 
 
 class LogReader(NamedTuple):
-    """Open log: the names of its columns, and functions that read columns and their time stamps."""
+    """Log that was opened: its column names, and functions that read columns and their time stamps."""
 
     names: list[str]  # names of the columns
     read: Callable[[Sequence[str]], ColumnsByName]
@@ -87,7 +87,7 @@ def hdf5(path: Path) -> LogReader:
 def bag(path: Path) -> LogReader:
     """Open a ROS 2 bag (sqlite3 or MCAP).
 
-    The columns are `/topic.field`, and `/topic.time` with the recording time of the messages.
+    The columns are named `/topic.field`; `/topic.time` is the recording time of the messages.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -119,7 +119,7 @@ def bag(path: Path) -> LogReader:
 
 
 def mdf(path: Path) -> LogReader:
-    """Open an ASAM MDF file; the column `time` contains the time stamps of the first channel that is read."""
+    """Open an ASAM MDF file; the column `time` contains the time stamps of the first requested channel."""
     from asammdf import MDF
 
     with MDF(path) as file:
@@ -149,7 +149,7 @@ def mdf(path: Path) -> LogReader:
 def tdms(path: Path) -> LogReader:
     """Open an NI TDMS file.
 
-    The columns are `group/channel`, and `group/channel.time` for channels with a sampling rate.
+    The columns are named `group/channel`; channels with a sampling rate also have `group/channel.time`.
     """
     from nptdms import TdmsFile
 
@@ -221,7 +221,7 @@ def _join_fields(
 
 
 def _split_columns(name: str, value: Any) -> ColumnsByName:
-    """Return the columns of a numeric vector or matrix by name; none for other values."""
+    """Return the columns of a numeric vector or matrix by name; an empty dictionary for other values."""
     try:
         array = np.asarray(value)
     except ValueError:

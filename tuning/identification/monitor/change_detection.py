@@ -1,7 +1,7 @@
 """Detection of a change in the mean by the generalised likelihood ratio (Siegmund and Venkatraman 1995).
 
-Let z_1 ... z_n be the normalized deviations of a metric in all contacts. Without a change, they are
-independent and standard normal. For a change of the mean at contact c to an unknown value, twice the log
+Let z_1 ... z_n be the normalised deviations of a metric from its prediction in n contacts. Without a change,
+they are independent and standard normal. If the mean changes at contact c to an unknown value, twice the log
 likelihood ratio is
 
     sum(z_c ... z_n)^2 / (n - c + 1).
@@ -15,17 +15,17 @@ from __future__ import annotations
 
 import numpy as np
 
-CONTACTS_PER_FALSE_ALARM = 2000  # mean number of contacts between false alarms of any of the seven metrics
-# Threshold of twice the log likelihood ratio; it gives the rate of `CONTACTS_PER_FALSE_ALARM`.
+CONTACTS_PER_FALSE_ALARM = 2000  # mean number of contacts between two false alarms of all metrics together
+# Threshold for twice the log likelihood ratio; it gives the rate of `CONTACTS_PER_FALSE_ALARM`.
 ALARM_THRESHOLD = 19.55
-CHANGE_WINDOW = 200  # number of latest contacts among which a change is searched
+CHANGE_WINDOW = 200  # number of the latest contacts in which a change is searched
 
 
 def detect_changes(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest likelihood ratio of a change for each metric, and the contact of the change.
+    """Return, for each metric, the largest likelihood ratio of a change, and the contact of this change.
 
     Args:
-        z: Normalized deviations, shape (contacts, metrics); NaN marks a missing value.
+        z: Normalised deviations, shape (contacts, metrics); NaN marks a missing value.
 
     Returns:
         Twice the log likelihood ratio, and the index of the first contact after the change, shape (metrics,).

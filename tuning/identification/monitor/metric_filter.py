@@ -1,10 +1,10 @@
-"""Kalman filter that predicts the metrics of the next contact from those of all earlier contacts.
+"""Kalman filter that predicts the metrics of a contact from the metrics of all earlier contacts.
 
-The metrics are linear in the parameters of the rig. The parameters are constant; before the first contact,
-they are normally distributed with the values and uncertainties of the mechanism file. Each contact reduces
-their uncertainty (Kalman 1960). As long as the rig does not change, the normalized deviations from the
-prediction are independent with mean 0 and variance 1. This holds even if the file's values are wrong within
-their uncertainty.
+The metrics are assumed to be linear in the parameters of the rig, which are assumed to be constant. Before
+the first contact, the parameters are normally distributed with the values and uncertainties of the mechanism
+file. Each contact reduces their uncertainty (Kalman 1960). As long as the rig does not change, the deviations
+from the prediction, divided by their predicted standard deviation, are independent with mean 0 and variance
+1. This holds even if the file's values are wrong within their uncertainty.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from scipy import stats
 
 from tuning.identification.monitor.metrics import BIAS_INDEX, METRIC_NAMES, NOISE_INDEX
 
-NOISE_LEVEL_STD = 0.1  # relative standard deviation of the noise level from day to day
-COVERAGE_PROBABILITY = 0.99  # probability of the region in which metrics agree with the file's uncertainty
+NOISE_LEVEL_STD = 0.1  # relative standard deviation of the force noise from day to day
+COVERAGE_PROBABILITY = 0.99  # probability that metrics which agree with the file's uncertainty are covered
 
 
 class MetricFilter:
-    """Kalman filter of the rig's parameters, with the metrics of each contact as the measurement.
+    """Kalman filter of the rig's parameters; the metrics of each contact are the measurement.
 
-    The state contains the deviations of the parameters from the file, in units of their standard deviations;
+    The state contains the deviations of the parameters from the file, divided by their standard deviations;
     the bias of the force sensor [N]; and the relative increase of the sensor's noise.
     """
 
@@ -29,7 +29,7 @@ class MetricFilter:
         number = len(correlation)
         self.initial_covariance = np.zeros((number + 2, number + 2))
         self.initial_covariance[:number, :number] = correlation
-        # After taring, the bias is about as large as the noise.
+        # After taring, the bias is assumed to be about as large as the noise.
         self.initial_covariance[number:, number:] = np.diag([noise_std**2, NOISE_LEVEL_STD**2])
         self.mean, self.covariance = np.zeros(number + 2), self.initial_covariance
 
@@ -58,7 +58,7 @@ class MetricFilter:
         self.covariance = remainder @ self.covariance @ remainder.T + gain @ noise @ gain.T
 
     def covers(self, value: np.ndarray, slopes: np.ndarray, noise: np.ndarray) -> bool:
-        """Return whether the initial uncertainty, that of the mechanism file, explains the metrics."""
+        """Return whether the initial uncertainty (that in the mechanism file) explains the metrics."""
         finite, slopes = np.isfinite(value), _append_sensor_columns(slopes)
         slopes, noise = slopes[finite], noise[np.ix_(finite, finite)]
         spread = slopes @ self.initial_covariance @ slopes.T + noise
@@ -70,14 +70,14 @@ class MetricFilter:
 
 
 def _append_sensor_columns(slopes: np.ndarray) -> np.ndarray:
-    """Append the columns of the sensor's bias and noise to the derivatives of the metrics."""
+    """Append the derivatives with respect to the sensor's bias and noise to those of the metrics."""
     sensor_columns = np.zeros((len(METRIC_NAMES), 2))
     sensor_columns[BIAS_INDEX, 0] = sensor_columns[NOISE_INDEX, 1] = 1.0
     return np.concatenate([slopes, sensor_columns], axis=1)
 
 
 def _solve_normalised(spread: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve a linear system whose matrix is the covariance of metrics with different magnitudes."""
+    """Solve a linear system with a covariance matrix, after scaling the metrics to similar magnitudes."""
     size = np.sqrt(np.diag(spread))
     scaled = right / (size[:, None] if right.ndim > 1 else size)
     solution = np.linalg.solve(spread / np.outer(size, size), scaled)

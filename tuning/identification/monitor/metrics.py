@@ -1,7 +1,7 @@
-"""Metrics that compare one contact with the mechanism file: seven values, 0 if the file is correct.
+"""Seven metrics that compare one contact with the mechanism file; their mean is 0 if the file is correct.
 
-All metrics except the noise are weighted sums of the differences between measured and predicted readings. The
-variance of the metrics and their sensitivity to each parameter are therefore known. Readings near the onset
+All metrics except the noise metric are weighted sums of the differences between measured and predicted
+readings. Their variance and their sensitivity to each parameter are therefore known. Readings near the onset
 of contact are not used, because the force of damped contact jumps there, and the time of the jump is
 uncertain.
 """
@@ -18,8 +18,8 @@ from tuning.identification.records import LoggedRun
 
 # Name, displayed unit, and factor that converts SI units to the displayed unit.
 METRICS = (
-    ("stiffness", "%", 100.0),  # relative change of the force in phase with the depth
-    ("apparent damping", "N s/m", 1.0),  # force change in phase with the rate: by damping or by force delay
+    ("stiffness", "%", 100.0),  # relative change of the force that is in phase with the depth
+    ("apparent damping", "N s/m", 1.0),  # change of the force in phase with the rate: damping or force delay
     ("mean force", "N", 1.0),  # change of the mean force in contact
     ("restitution", "1", 1.0),  # measured minus predicted restitution, for the same commands
     ("bias", "N", 1.0),  # change of the mean force reading out of contact
@@ -29,24 +29,24 @@ METRICS = (
 METRIC_NAMES = tuple(name for name, _, _ in METRICS)
 BIAS_INDEX, NOISE_INDEX, LAG_INDEX = (METRIC_NAMES.index(name) for name in ("bias", "noise", "lag of motion"))
 FORCE_METRICS = slice(0, NOISE_INDEX)  # metrics that are weighted sums of force readings
-MIN_METRIC_ROWS = 20  # minimum number of rows for a metric
-MAX_NOISE_ROWS = 2000  # number of latest rows at rest that determine the autocorrelation of the noise
-MIN_MODEL_ERROR = 1e-3  # minimum error of the predicted readings, relative to the largest force or depth
-ONSET_MARGIN_SIGMAS = 3.0  # standard deviations of delays and surface position within which an onset may lie
-DEEP_CONTACT_SHARE = 0.1  # share of the largest depth; deeper rows are used in any case
+MIN_METRIC_ROWS = 20  # minimum number of readings for a metric
+MAX_NOISE_ROWS = 2000  # maximum number of readings that determine the autocorrelation of the noise
+MIN_MODEL_ERROR = 1e-3  # assumed minimum error of predicted readings as a share of the largest force or depth
+ONSET_MARGIN_SIGMAS = 3.0  # width of the omitted range at an onset, in std of delays and surface position
+DEEP_CONTACT_SHARE = 0.1  # maximum depth of omitted rows as a share of the largest depth
 
 
 @dataclass(frozen=True)
 class MetricWeights:
-    """Weights with which the readings of one contact add up to its metrics."""
+    """Weights of the readings of one contact in the weighted sums that are its metrics."""
 
-    # (metrics, rows), weights of the force readings in the first five metrics; NaN: no metric
+    # (metrics, rows), weights of the force readings in the first five metrics; NaN for a missing metric
     force: np.ndarray
-    position: np.ndarray  # (rows,), weights of the position readings in the lag of motion
+    position: np.ndarray  # (rows,), weights of the position readings in the metric "lag of motion"
     rest: np.ndarray  # bool, (rows,), rows out of contact
 
     def shift(self, force: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return the change of each metric due to changes of the force [N] and position [m] readings."""
+        """Return the change of each metric that changes of the force [N] and position [m] readings cause."""
         result = np.zeros(len(METRIC_NAMES))
         result[FORCE_METRICS] = self.force @ force
         result[LAG_INDEX] = self.position @ position
@@ -73,7 +73,7 @@ def compute_weights(
     mass: float,
     period: float,
 ) -> MetricWeights:
-    """Return the weights of the readings of a run in its metrics.
+    """Compute the weights of a run's readings in the metrics of its contact.
 
     Args:
         run: The run.
@@ -90,7 +90,7 @@ def compute_weights(
     measured = np.asarray(run.force_measured, float)
     read = run.valid & np.isfinite(measured)
     speed = np.max(np.abs(np.gradient(depth, period)))
-    # The lag of the sensor extends the onset by some time constants.
+    # A lag of the sensor prolongs the onset by some time constants.
     margin = (
         ONSET_MARGIN_SIGMAS * (slack[0] + sensors.time_constant) + period
     ) * speed + ONSET_MARGIN_SIGMAS * slack[1]
@@ -110,16 +110,17 @@ def compute_weights(
         table[:2, used] = np.linalg.pinv((columns / size[:, None]).T) / size[:, None]
         table[2, used] = 1.0 / used.sum()
         table[3] = _compute_restitution_weights(run, used, mass, period)
-        # All metrics in contact refer to the mean reading out of contact.
+        # All metrics of readings in contact refer to the mean reading out of contact.
         table[:BIAS_INDEX] -= table[:BIAS_INDEX].sum(axis=1, keepdims=True) * tare
     return MetricWeights(table, _compute_delay_weights(run, expected, lane), rest)
 
 
 def _compute_restitution_weights(run: LoggedRun, used: np.ndarray, mass: float, period: float) -> np.ndarray:
-    """Return the weights of the force readings in the restitution; NaN if there is no rebound.
+    """Return the weights of the force readings in the metric "restitution"; NaN if there is no rebound.
 
-    According to the balance of momentum and energy, an additional force r changes e by -(sum of r v T)/(M v_0
-    |v_1|), with the speeds v_0 before and v_1 after the contact.
+    According to the balance of momentum and energy, an additional force r changes the restitution by -(sum of
+    r v T) / (M v_0 |v_1|), with the speed v, the period T, the mass M, and the speeds v_0 before and v_1
+    after the contact.
     """
     x = run.position_desired
     speed = np.gradient(x, period) if run.velocity_desired is None else run.velocity_desired
@@ -130,7 +131,7 @@ def _compute_restitution_weights(run: LoggedRun, used: np.ndarray, mass: float, 
 
 
 def _compute_delay_weights(run: LoggedRun, expected: PredictedReadings, lane: int) -> np.ndarray:
-    """Return the weights of the position readings in the lag of motion; a constant offset has no effect."""
+    """Return the weights of the position readings in the metric "lag of motion"."""
     velocity = expected.velocity[: len(run.tick), lane]
     read = run.valid & np.isfinite(run.position_measured)
     varied = np.where(read, velocity - velocity[read].mean(), 0.0)
@@ -140,12 +141,12 @@ def _compute_delay_weights(run: LoggedRun, expected: PredictedReadings, lane: in
 
 @dataclass
 class NoiseColour:
-    """Autocorrelation of a sensor's noise, estimated from readings of the contacts so far."""
+    """Autocorrelation of a sensor's noise, estimated from the latest readings."""
 
     rows: np.ndarray  # latest readings, without their mean
 
-    def factor(self, more: np.ndarray) -> float:
-        """Add readings, and return by which factor the autocorrelation increases the error of a mean."""
+    def extend(self, more: np.ndarray) -> float:
+        """Add readings; return the factor by which autocorrelation increases the standard error of a mean."""
         self.rows = np.concatenate([self.rows, more - more.mean()])[-MAX_NOISE_ROWS:]
         filter_ = fit_whitening_filter(self.rows)
         return float(np.sqrt(compute_whitened_share(filter_)) / abs(np.sum(filter_)))
@@ -155,7 +156,7 @@ def compute_metrics(
     run: LoggedRun, expected: PredictedReadings, lane: int, weights: MetricWeights, sensors: ForceSensorSpec,
     colours: tuple[NoiseColour, NoiseColour],
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the metrics of a contact and their covariance due to noise; NaN marks a missing metric.
+    """Return the metrics of a contact, and their covariance due to noise; NaN marks a missing metric.
 
     Args:
         run: Run with the contact.
@@ -173,7 +174,7 @@ def compute_metrics(
     value = weights.shift(force_error, position_error)
     value[NOISE_INDEX], noise_std, std = _compute_noise_metric(force_error[weights.rest], sensors, colours[0])
     residual = position_error - position_error.mean() + value[LAG_INDEX] * (velocity - velocity.mean())
-    scatter = float(residual.std()) * colours[1].factor(residual) if np.isfinite(value[LAG_INDEX]) else np.nan
+    scatter = float(residual.std()) * colours[1].extend(residual) if np.isfinite(value[LAG_INDEX]) else np.nan
     covariance = np.zeros((len(METRIC_NAMES), len(METRIC_NAMES)))
     covariance[FORCE_METRICS, FORCE_METRICS] = (
         max(std, MIN_MODEL_ERROR * np.abs(force).max()) ** 2 * weights.force @ weights.force.T
@@ -188,9 +189,9 @@ def compute_metrics(
 def _compute_noise_metric(
     rest: np.ndarray, sensors: ForceSensorSpec, colour: NoiseColour
 ) -> tuple[float, float, float]:
-    """Return the noise metric, its standard deviation, and the noise level [N] for weighted sums.
+    """Return the noise metric, its standard deviation, and the noise [N] for the variance of weighted sums.
 
-    The noise level includes the effect of the autocorrelation.
+    This noise includes the effect of the autocorrelation.
     """
     stated = float(np.hypot(sensors.std, sensors.quantum / np.sqrt(12.0)))
     if len(rest) < MIN_METRIC_ROWS:
@@ -198,7 +199,7 @@ def _compute_noise_metric(
     noise = estimate_noise(rest)
     if noise.silent:
         return np.nan, np.nan, stated
-    spread = float(np.hypot(noise.std, noise.quantum / np.sqrt(12.0))) * colour.factor(rest)
+    spread = float(np.hypot(noise.std, noise.quantum / np.sqrt(12.0))) * colour.extend(rest)
     if sensors.std == 0.0:
         return np.nan, np.nan, spread
     return noise.std / sensors.std - 1.0, noise.std_std / sensors.std, spread

@@ -1,4 +1,4 @@
-"""Monitor of a rig: detects when the contacts begin to deviate from the mechanism file."""
+"""Monitor of a rig: detection of the contact after which the rig deviates from its mechanism file."""
 
 from __future__ import annotations
 
@@ -44,8 +44,9 @@ class ContactDeviation:
         source: Name of the log file.
         value: Metrics relative to the mechanism file; NaN if the log does not determine a metric.
         predicted_std: Predicted standard deviation of each metric.
-        z: Normalized deviation: (value - predicted value) / `predicted_std`.
-        state: "good"; "watch" after a change that the file's uncertainty covers; "bad" after a larger change.
+        z: Normalised deviation: (value - predicted value) / `predicted_std`.
+        state: "good" without a change; "watch" after a change that the file's uncertainty explains; "bad"
+            after a larger change.
     """
 
     source: str
@@ -57,7 +58,7 @@ class ContactDeviation:
 
 @dataclass(frozen=True)
 class MetricChange:
-    """Change of one metric that raised an alarm, averaged over the contacts since the change.
+    """Change of a metric that raised an alarm, as the mean of the contacts since the change.
 
     Attributes:
         name: Name of the metric.
@@ -76,9 +77,9 @@ class MonitorResult:
 
     Attributes:
         contacts: Metrics of each contact.
-        alarm: Index of the contact that raised the alarm, or None.
+        alarm: Index of the contact at which the alarm was raised, or None.
         since: Index of the contact at which the change probably began, or None.
-        changes: Metrics that raised an alarm, the most significant metric first.
+        changes: Changes of the metrics that raised an alarm; the most significant one comes first.
     """
 
     contacts: tuple[ContactDeviation, ...]
@@ -137,7 +138,7 @@ def monitor_contacts(campaign: Campaign, mechanism: Mechanism) -> MonitorResult:
 def _compute_run_metrics(
     runs: Sequence[LoggedRun], mechanism: Mechanism, campaign: Campaign, numbers: Sequence[UncertainParameter]
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield the metrics of each run, their derivatives by the parameters, and their covariance."""
+    """Yield the metrics of each run, their derivatives (one column per parameter), and their covariance."""
     rig, timing = mechanism.rig, campaign.timing
     sensor = rig.force_sensor
     sensors = ForceSensorSpec(
@@ -166,7 +167,7 @@ def _predict_with_sensitivities(
     timing: CampaignTiming,
     numbers: Sequence[UncertainParameter],
 ) -> tuple[PredictedReadings, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return the predicted readings, and their changes for an increase of each parameter by its std."""
+    """Return the predicted readings, and their changes if a parameter increases by its standard deviation."""
     slack = max(number.std for number in numbers if number.path in SENSOR_DELAY_KEYS)
     motion, differences = simulate_motion(mechanism, runs, timing, slack), []
     expected = predict_readings(mechanism, runs, motion)
@@ -183,7 +184,10 @@ def _predict_with_sensitivities(
 
 
 class _MonitorState:
-    """State of the monitor after the contacts so far; an alarm ends the updates of the prediction."""
+    """State of the monitor after the contacts so far.
+
+    After an alarm, the prediction is not updated.
+    """
 
     def __init__(self, prediction: MetricFilter):
         self.prediction = prediction
@@ -203,7 +207,7 @@ class _MonitorState:
             self.prediction.learn(value, slopes, noise)
             return
         if self.alarm is None:
-            # Keep the first estimate: during a drift, a later estimate would be the time of the steepest
+            # Keep the first estimate: if the rig drifts, a later estimate would be the time of the steepest
             # change.
             self.alarm, self.since = len(self.contacts) - 1, int(first_contact[np.argmax(ratio)])
         covered = self.prediction.covers(*self._mean())
@@ -219,7 +223,7 @@ class _MonitorState:
         return MonitorResult(tuple(self.contacts), self.alarm, self.since, result)
 
     def _mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return metrics, derivatives and covariance, averaged over the contacts since the change."""
+        """Return the means of metrics, derivatives and covariance of the contacts since the change."""
         values, slopes, noises = (
             np.array(part) for part in zip(*self.measurements[self.since :], strict=True)
         )

@@ -1,4 +1,4 @@
-"""Sensor readings that a mechanism file predicts for the logged commands, without any fit."""
+"""Prediction of the sensor readings from a mechanism file and the logged commands, without a fit."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class PredictedReadings:
     """
 
     force: np.ndarray  # N, force reading, including bias and dead zone
-    elastic: np.ndarray  # N, part of the force that does not depend on the rate of the depth
-    rate: np.ndarray  # m/s, rate of the depth as the force sensor experiences it; 0 out of contact
-    # 1 in contact, 0 out of contact; between 0 and 1 near an edge if the sensor has a lag
+    elastic: np.ndarray  # N, force reading for a depth with rate 0
+    rate: np.ndarray  # m/s, rate of the depth after the delay and lag of the force sensor; 0 out of contact
+    # 1 in contact, 0 out of contact; a lag of the sensor gives values between 0 and 1 at onset and release
     touching: np.ndarray
     depth: np.ndarray  # m, penetration at the time of the force reading; negative out of contact
     position: np.ndarray  # m, position reading
@@ -49,17 +49,17 @@ def simulate_motion(
         mechanism: Mechanism with the motion simulator.
         runs: Runs, one per lane.
         timing: Timing of commands and readings.
-        slack: Time [s] by which a sensor delay may later exceed that of the mechanism.
+        slack: Time [s] by which sensor delays in later predictions may exceed those of the mechanism.
 
     Raises:
-        InputError: If the transfer function G(s) of the motion simulator has direct feedthrough.
+        InputError: If the motion simulator's transfer function G(s) has direct feedthrough.
     """
     rig, model = mechanism.rig, make_motion_model(mechanism)
     above, below = model.fraction
     if len(above) == len(below) > 1:
         expected = "fewer coefficients than in the denominator"
         raise InputError(f"rig.simulator.numerator: found {len(above)} coefficients, expected {expected}")
-    # Exclude the position sensor's delay, which has no effect on the force.
+    # Exclude the delay of the position sensor, which does not affect the force.
     model = MotionModel(model.structure, np.append(model.parameters[:-1], rig.simulator.delay))
     longest = max(rig.force_sensor.delay, rig.position_sensor.delay) + slack + timing.control_period
     return MotionResponse(model, runs, timing, longest)
@@ -76,7 +76,7 @@ def predict_readings(
         motion: Motion of the mechanism in these runs.
 
     Raises:
-        InputError: If the contact law is not supported, or there are two surfaces.
+        InputError: If the contact law is not supported, or if there are two surfaces (finite clearance).
     """
     rig, sensor, period = mechanism.rig, mechanism.rig.force_sensor, motion.period
     law = make_regression_law(mechanism.contact)
@@ -86,7 +86,7 @@ def predict_readings(
     table = np.array(
         [get_regression_coefficients(mechanism.contact, find_contact_entry(run)) for run in runs]
     ).T
-    # A sensor lag integrates the force, which is therefore also computed half a period before each row.
+    # A lag integrates the force between two rows, so it also needs the force half a period before each row.
     parts = (0.0,) if sensor.time_constant == 0.0 else (0.0, 0.5)
     moved = [motion.at(sensor.delay + part * period) for part in parts]
     columns = [_compute_force_columns(law, table, x - rig.contact_plane, v) for x, v in moved]
@@ -100,14 +100,14 @@ def predict_readings(
 
 
 def find_contact_entry(run: LoggedRun) -> int:
-    """Return the index into the contact lists for the contact of a run."""
+    """Return the index of a run's contact into the mechanism's contact lists."""
     if run.contact_index is None or run.force_measured is None:
         return 0
     return max(int(run.contact_index[np.argmax(np.abs(np.nan_to_num(run.force_measured)))]), 0)
 
 
 def _compute_force_columns(law: Law, table: np.ndarray, depth: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Return the force, the force at zero rate, the rate, and a contact flag; all are 0 out of contact.
+    """Return the force, the force for rate 0, the rate, and a contact flag; all are 0 out of contact.
 
     Args:
         law: Contact law.
@@ -129,7 +129,7 @@ def _apply_sensor_lag(columns: list[np.ndarray], period: float, time_constant: f
     """Apply the first-order lag of the force sensor to signals.
 
     Args:
-        columns: Signals at every row and, with a lag, half a period before every row.
+        columns: Signals at every row and, if there is a lag, half a period before every row.
         period: Control period [s].
         time_constant: Time constant of the lag [s]; 0 for none.
     """

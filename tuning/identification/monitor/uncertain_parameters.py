@@ -10,7 +10,7 @@ import numpy as np
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.mechanism.uncertainty import draw
 
-UNCERTAINTY_DRAWS = 4096  # number of draws for standard deviations and correlations
+UNCERTAINTY_DRAWS = 4096  # number of draws that determine standard deviations and correlations
 # Prefixes of the parameters that affect the sensor readings.
 READING_PREFIXES = (
     "contact.",
@@ -19,16 +19,16 @@ READING_PREFIXES = (
     "rig.position_sensor.",
     "rig.contact_plane",
 )
-# Minimum standard deviations: of a delay [s], because of the clock, and of the force sensor's scale [1].
+# Minimum standard deviations of a delay [s], because of clock errors, and of the force sensor's scale [1].
 MIN_DELAY_STD, MIN_SCALE_STD = 2e-5, 1e-3
 DELAY_KEYS, STIFFNESS_KEY = ("rig.simulator.delay", "rig.force_sensor.delay"), "contact.stiffness"
 
 
 class UncertainParameter(NamedTuple):
-    """Uncertain parameter of a mechanism file, or entry of a list parameter, with its standard deviation."""
+    """Uncertain parameter of a mechanism file (or entry of a list parameter) with its standard deviation."""
 
     path: str  # dotted key
-    entry: tuple[int, ...] | None  # index of the list entry; None: a scalar, or all entries together
+    entry: tuple[int, ...] | None  # index of the list entry; None for a scalar or for all entries together
     std: float  # in the key's unit; for all entries together, the standard deviation of the first entry
 
     def step_parameter(self, mechanism: Mechanism) -> Mechanism:
@@ -45,7 +45,7 @@ class UncertainParameter(NamedTuple):
 def list_uncertain_parameters(mechanism: Mechanism) -> tuple[list[UncertainParameter], np.ndarray]:
     """Return the uncertain parameters that affect the sensor readings, and their correlation matrix.
 
-    These are entries of the file's `[uncertainty]`. The delays and the stiffness are always included.
+    The parameters are those in the file's `[uncertainty]`, and always the delays and the stiffness.
     """
     result, columns = [], []
     drawn = draw(mechanism, UNCERTAINTY_DRAWS, 0)
@@ -70,14 +70,14 @@ def list_uncertain_parameters(mechanism: Mechanism) -> tuple[list[UncertainParam
 
 
 def get_min_std(mechanism: Mechanism, path: str) -> float:
-    """Return the minimum standard deviation that is assumed for a parameter."""
+    """Return the minimum standard deviation that the monitor assumes for a parameter."""
     if path in DELAY_KEYS:
         return MIN_DELAY_STD
     return MIN_SCALE_STD * float(np.ravel(value_at(mechanism, path))[0]) if path == STIFFNESS_KEY else 0.0
 
 
 def _step_value(value: Any, entry: tuple[int, ...] | None, step: float) -> Any:
-    """Return a scalar or list after an increase of one entry, or of all entries if `entry` is None."""
+    """Increase a scalar, an entry of a list or, if `entry` is None, all entries of a list."""
     table = np.array(value, float)
     if entry is not None and table.ndim:
         table[entry] += step
