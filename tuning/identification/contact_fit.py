@@ -52,8 +52,7 @@ MAX_REDUCED_CHI_SQUARE = 1.3  # maximum chi-squared per degree of freedom withou
 def split_long_run(run: LoggedRun, period: float) -> list[LoggedRun]:
     """Divide a long run into segments of about one second, so that all runs have a similar length.
 
-    Each segment begins with additional rows, in which the motion simulator settles. Fits do not use these
-    rows.
+    Each segment begins with additional rows, in which the motion simulator settles. Fits omit these rows.
     """
     settling, length = round(SETTLING_TIME / period), round(SEGMENT_LENGTH / period)
     if len(run.tick) <= settling + 2 * length:
@@ -147,12 +146,10 @@ def fit_contact(
         model: Model of the motion simulator.
         timing: Timing of commands and readings.
         noise: Noise of the force sensor at rest, or None if it is unknown.
-        law: Contact law; or the name of a law, whose shape parameters are then fitted too; or None to choose
-            the law.
+        law: Contact law; or name of a law whose shape parameters are fitted, too; or None to choose a law.
         plane: Position of the surface [m], or None to estimate it.
         seed: Seed of the random numbers.
-        dead_zone: Dead zone [N] that the user specified, or 0. It is ignored if readings at rest show no dead
-            zone.
+        dead_zone: Specified dead zone [N], or 0. It is ignored if readings at rest do not show one.
     """
     drift = _estimate_clock_drift(runs, model, timing, noise, law, plane) if timing.two_clocks else None
     motion = MotionResponse(
@@ -170,8 +167,7 @@ def fit_contact(
     problem, posterior = _fit_laws(motion, readings, laws, plane, near, noise_is_hidden, seed)
     law = problem.law
     if noise_is_hidden and not _has_dead_zone(posterior) and not _is_silent_outside(runs, problem, posterior):
-        # There is no dead zone, so readings of 0 at rest do not show the noise: estimate it from the
-        # contacts.
+        # Without a dead zone, readings of 0 at rest hide the noise: estimate it from the contacts.
         return fit_contact(runs, model, timing, None, law, plane_option, seed)
     if noise_is_hidden and readings.bias is None and plane_option is None:
         # The surface position is only an assumption, so readings near onset and release must not determine

@@ -38,7 +38,7 @@ from tuning.identification.sensor_filter import (
 MAX_FORCE_DELAY = 0.02  # s, longest force delay in the search range of a fit
 COARSE_DELAY_STEP = 0.0005  # s, step between the delays of a first search
 MAX_NEWTON_STEPS = 6  # largest number of Newton steps in the search of a surface position
-MIN_LIKELIHOOD_GAIN = 2.0  # the search ends with a Newton step that increases the log likelihood by less
+MIN_LIKELIHOOD_GAIN = 2.0  # a Newton step that increases the log likelihood by less is the last one
 STEP = 1e-7  # m, step of finite differences with respect to the surface position
 FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants after which a filter's response is below rounding errors
 
@@ -144,7 +144,7 @@ class ContactProblem:
     def fit_surfaces(
         self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None = None
     ) -> list[CoefficientFit]:
-        """Fit the coefficients at several surface positions [m]; do not differentiate by the position."""
+        """Fit the coefficients at several surface positions [m], without derivatives."""
         return self._make_fits(self._fit_until_consistent(delay, planes, pseudo)[2])
 
     def _fit_until_consistent(self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None):
@@ -189,7 +189,7 @@ class ContactProblem:
         return [self.motion.at(delay + part * self.motion.period) for part in self.periods_before]
 
     def onsets_between(self, delay: float, low: float, high: float) -> np.ndarray:
-        """Return the surface positions [m] between `low` and `high` at which another row is in contact."""
+        """Return the surface positions [m] from `low` to `high` at which a row enters or leaves contact."""
         position, rate = self._get_motion(delay)[0]
         return np.unique(position[(rate > 0.0) & (position > low) & (position < high)])
 

@@ -23,7 +23,7 @@ from tuning.identification.normal_draws import factorise_covariance
 
 FINE_DELAY_STEP = 2e-5  # s, step between the delays of the second grid
 SMOOTHING_DELAYS = 7  # number of delays of the second grid over which the surface position is averaged
-FINAL_GRID_DROP = 30.0  # maximum of twice the drop of the log posterior from its peak in the final grid
+FINAL_GRID_DROP = 30.0  # twice the maximum drop of the log posterior from its peak in the final grid
 # The same for the second grid. It is larger, because the log posterior of the coarse grid is less accurate.
 COARSE_GRID_DROP = 400.0
 SECOND_GRID_SURFACES = 15  # number of surface positions at each delay of the second grid
@@ -104,8 +104,7 @@ def compute_posterior(
     heights, planes, spreads = _marginalise_over_surface(places, cells, len(finer))
     low, high = _find_likely_delays(problem, finer, heights, FINAL_GRID_DROP)
     delays = np.linspace(low, high, size[0])
-    # If one cell contains the whole posterior of a delay, the surface position jumps between delays: smooth
-    # it.
+    # If a cell contains the whole posterior of a delay, the surface jumps between delays: smooth it.
     planes = uniform_filter1d(planes, SMOOTHING_DELAYS, mode="nearest")
     surface = np.interp(delays, finer, planes), np.interp(delays, finer, np.maximum(spreads, surface[1]))
     places, cells = _fit_grid(problem, delays, surface, size[1])
@@ -190,8 +189,8 @@ def _fit_grid(
 def divide_into_cells(low: float, high: float, at: np.ndarray, number: int) -> np.ndarray:
     """Divide the interval from `low` to `high` into `number` cells with edges at the positions `at`.
 
-    If there are too few positions, the widest cells are halved. If there are too many, the smallest adjacent
-    cells are merged.
+    If there are too few positions, the widest cells are halved. If there are too many, small cells are
+    merged.
     """
     if len(at) > MAX_CELL_EDGES:
         at = at[np.linspace(0, len(at) - 1, MAX_CELL_EDGES).astype(int)]

@@ -24,7 +24,7 @@ class CoefficientFit:
 
 
 class PseudoRows(NamedTuple):
-    """A few rows with the same sums of squares as many readings, which they replace; divided by the noise."""
+    """Rows that replace many readings (`tuning.identification.deep_contact`), divided by the noise."""
 
     design: np.ndarray  # (planes, coefficients, rows), design matrix
     target: np.ndarray  # (rows,), readings

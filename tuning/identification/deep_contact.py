@@ -81,7 +81,7 @@ class SummarisedProblem(ContactProblem):
     """Contact problem that uses pseudo-rows instead of its deep lanes wherever they are accurate enough."""
 
     def __init__(self, problem: ContactProblem, deep: np.ndarray, delay: float):
-        """Split the lanes of a problem; `deep` marks the deep lanes, and `delay` [s] is approximate."""
+        """Split the lanes of a problem; `deep` marks deep lanes, `delay` [s] is the approximate delay."""
         motion, readings, law = problem.motion, problem.readings, problem.law
         super().__init__(motion, readings, law, problem.plane, problem.time_constant)
         self.deep, self.delay = deep, delay
@@ -110,7 +110,7 @@ class SummarisedProblem(ContactProblem):
     def fit_surfaces(
         self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None = None
     ) -> list[CoefficientFit]:
-        """Fit the coefficients at several surface positions [m], without derivatives by the position."""
+        """Fit the coefficients at several surface positions [m], without derivatives."""
         table = self._find_table(delay, planes)
         if table is not None and pseudo is None:
             fits = self.others.fit_surfaces(delay, planes, table.rows(delay, planes))

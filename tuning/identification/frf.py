@@ -36,10 +36,9 @@ class Spectrum:
     response: np.ndarray  # complex frequency response, smoothed if the command is not periodic
     coherence: np.ndarray  # 0..1, share of the output's power that the command causes
     noise_std: float  # m, standard deviation of the noise of a single position reading
-    # odd distortion: ratio of the rms output at odd lines without excitation to the rms output at excited
-    # lines
+    # odd distortion: ratio of the rms output at odd lines without excitation to that at excited lines
     odd: float | None
-    # even distortion: the same ratio for even lines without excitation
+    # even distortion: ratio of the rms output at even lines without excitation to that at excited lines
     even: float | None
     excess: tuple[float, float]  # ratio of output to noise power at odd and at even lines without excitation
     periods: int  # number of averaged periods; 0 for a non-periodic command

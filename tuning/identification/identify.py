@@ -56,8 +56,7 @@ def identify(
         campaign: Runs and their timing.
         prior: Mechanism with the values that the logs do not determine, or None.
         options: Options of the identification, or None for the defaults.
-        say: Function that receives a progress message at the start of each stage and after each chunk of
-            bootstrap fits.
+        say: Function that receives a progress message at each stage and after each chunk of bootstrap fits.
 
     Returns:
         Estimates, posterior draws, checks and the mechanism. If a required value is unknown, there is no

@@ -35,7 +35,7 @@ MIN_CONTACTS_FOR_CROSS_VALIDATION = 4  # minimum number of contacts for cross-va
 # Maximum deficit of an acceptable law in log likelihood, in standard errors of the deficit.
 MAX_LIKELIHOOD_DEFICIT_ERRORS = 2.0
 ONSET_DAMPING_EXCLUSION_ERRORS = 4.0  # minimum deficit that excludes onset damping, in standard errors
-ONSET_MARGIN = 1e-3  # s; the evaluation omits rows that are closer to an onset or a release
+ONSET_MARGIN = 1e-3  # s; the evaluation omits rows within this time of an onset or a release
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,7 @@ def choose_contact_law(
 ) -> list[EvaluatedLaw]:
     """Fit and evaluate all contact laws or the named laws; return them with the chosen law first.
 
-    The segments of a long press run are similar. Shape parameters (such as exponents) are therefore fitted to
-    a few segments only.
+    The segments of a long press run are similar. Shape parameters are therefore fitted to a few of them.
     """
     evaluated = []
     lanes = select_representative_lanes(ContactProblem(motion, readings, kelvin_voigt(), plane))

@@ -46,8 +46,7 @@ def check_against_mechanism(
     Args:
         campaign: The logs.
         mechanism: Mechanism that the logs are compared with.
-        limit: Largest allowed effect of all defects on the restitution e, and on the error e - e* (e*: ideal
-            contact).
+        limit: Largest allowed effect of all defects on the restitution e, and on e - e* (e*: ideal contact).
         fitted: Motion simulator that was fitted to the free runs without a specified order, or None. Only
             such a fit reveals a wrong command hold or latency for which the mechanism's delay compensates.
 

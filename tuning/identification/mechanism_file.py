@@ -18,8 +18,7 @@ def make_uncertainty_tables(
 ) -> dict[str, Any]:
     """Return the tables `[uncertainty]` and `[correlation]` of a mechanism file from posterior draws.
 
-    All entries of a list parameter have the same standard deviation and one common row in the correlation
-    matrix.
+    All entries of a list parameter have one standard deviation and one common row in the correlation matrix.
 
     Args:
         keys: Dotted keys of the parameters; the key of a list entry ends in its index.

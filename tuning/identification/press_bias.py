@@ -19,8 +19,8 @@ from tuning.identification.records import LoggedRun
 TYPICAL_FORCE_DELAY = 0.005  # s, assumed delay of the force sensor; accurate enough to detect a release
 SHALLOW_ROW_SHARE = 0.01  # share of the rows, those with the smallest depth, that may be out of contact
 MIN_MEAN_ROWS = 20  # minimum number of rows for a mean
-# Minimum mean excess of these rows' force above the line through deeper readings that shows a release, as a
-# share of the range of the force.
+# Minimum excess of the force at small depths above the line through deeper readings that shows a release, as
+# a share of the range of the force.
 RELEASE_FORCE_SHARE = 0.2
 MIN_BIAS_STD_RATIO = 0.1  # minimum standard deviation of the bias between runs, as a share of the noise
 
@@ -68,7 +68,7 @@ def find_surface_of_press(
 
 
 def _has_release(runs: Sequence[LoggedRun], motion: MotionResponse) -> bool:
-    """Return whether a press run leaves the contact, so that its smallest forces exceed the linear trend."""
+    """Return whether a press run leaves the contact; the force then exceeds the line at small depths."""
     position, _ = motion.at(TYPICAL_FORCE_DELAY)
     x, f = [], []
     for lane, run in enumerate(runs):

@@ -57,10 +57,7 @@ class LoggedRun:
 
 @dataclass(frozen=True)
 class CampaignTiming:
-    """Timing of the logged commands and readings.
-
-    It is specified by the user, not estimated.
-    """
+    """Timing of the logged commands and readings, which the user specifies."""
 
     control_period: float  # s
     command_hold: CommandHold  # drives' input between two ticks: held or interpolated

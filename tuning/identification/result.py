@@ -69,8 +69,7 @@ class Identification:
             separates the parameters.
         lines: Results of the checks.
         mechanism: Content of a mechanism file, or None if a value is missing or invalid.
-        limit: Largest allowed sum of the defects' effects on the restitution e, and on its error e - e* (e*:
-            ideal contact).
+        limit: Largest allowed sum of the defects' effects on the restitution e, and on its error e - e*.
         notes: Further remarks.
         missing: Parameters that neither the logs nor the prior determine, each with advice.
         motion: Fit of the motion simulator, or None.
@@ -111,10 +110,7 @@ class Identification:
 
     @property
     def is_compared(self) -> bool:
-        """Return whether any check compares the logs with the model.
-
-        The check of the uncertainty does not.
-        """
+        """Return whether any check compares the logs with the model; that of the uncertainty does not."""
         return any(line.name != UNCERTAINTY_CHECK for line in self.lines)
 
     @property

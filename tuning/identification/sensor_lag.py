@@ -103,8 +103,7 @@ def _average_over_lag(
 ) -> SensorLag | None:
     """Average over the models with and without a lag; return None if the readings exclude a lag.
 
-    The prior of the time constant is uniform up to `MAX_TIME_CONSTANT`. The delays in the result include the
-    time constant.
+    The prior of the time constant is uniform up to `MAX_TIME_CONSTANT`. The resulting delays include it.
     """
     heights = (
         np.array([posterior.best[2].misfit, *(at(value)[1][2] for value in TRIAL_TIME_CONSTANTS)]) / -2.0
@@ -155,8 +154,7 @@ def compute_posterior_at_lag(
     Args:
         problem: Contact problem with the lag.
         best: Best fit with this lag.
-        like: Posterior of a similar problem; the standard deviation of its delay determines the width of the
-            grid.
+        like: Posterior of a similar problem; the scatter of its delay determines the width of the grid.
         seed: Seed of the random numbers.
         count: Number of delays in the grid.
     """

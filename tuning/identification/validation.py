@@ -29,7 +29,7 @@ MAX_DELAY_SHARE = 0.93  # maximum force delay that passes the check, as a share 
 MIN_CONTACTS_FOR_DEAD_ZONE = 5  # minimum number of contacts for the check of small readings
 MAX_NONZERO_SHARE = 0.8  # maximum share of nonzero readings with a dead zone
 CUTTING_DEAD_ZONE_P_VALUE = 0.01  # maximum p-value that shows a dead zone which is not subtracted
-# minimum size of the smallest reading with such a dead zone, in standard deviations of the noise
+# minimum size of the smallest reading with a dead zone that is not subtracted, in standard deviations
 MIN_SMALL_READING_SIGMAS = 3.0
 MISFIT_SMOOTHING_LINES = 5  # number of adjacent frequency lines whose misfit is averaged
 
@@ -222,8 +222,7 @@ def flag_certain_rows(contact: ContactFit) -> np.ndarray:
     """Return flags of the rows that are certainly in or out of contact, shape (rows, lanes).
 
     A row is certain if it is in contact for all posterior draws of delay and surface position, or for none.
-    Residuals in other rows do not show an error of the law, because the force of a damped contact jumps at
-    the onset.
+    Residuals in other rows do not show an error of the law, because the force jumps at the onset.
     """
     count = len(contact.problem.names)
     flags = [
@@ -275,8 +274,7 @@ def _check_cutting_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list
         return []
     least, std = min(smallest), contact.readings.std
     quantum = np.diff(np.unique(contact.readings.force)).min(initial=np.inf)
-    # In a smooth release, the last reading is assumed to be uniformly distributed between 0 and the last
-    # step.
+    # In a smooth release, the last reading is assumed to be uniform between 0 and the last step.
     probability = np.prod(np.maximum(1.0 - least / (np.array(steps) + 2.0 * std + 1e-300), 0.0))
     if least <= max(MIN_SMALL_READING_SIGMAS * std, 2.5 * quantum) or probability > CUTTING_DEAD_ZONE_P_VALUE:
         return []

@@ -79,8 +79,7 @@ class ExcitationDesign:
         keys: Keys of the identified parameters.
         values: Values of the parameters in the mechanism, in SI units.
         std: Predicted standard deviation of each parameter.
-        slopes: Derivatives of the restitution error e - e* with respect to the parameters; one row per
-            contact and phase, one column per key.
+        slopes: Derivatives of e - e* with respect to the parameters; one row per contact and phase.
         covariance: Predicted covariance of the parameters.
         flat: Error e - e* for equal powers at all lines, divided by the error for this design.
     """
@@ -114,7 +113,7 @@ def design_excitation(
     Args:
         mechanism: Mechanism with the approximate parameters.
         stroke: Largest excursion of the multisine in either direction [m].
-        slopes_by: Function that returns the derivatives of e - e* with respect to the given keys, shape
+        slopes_by: Function from keys to the derivatives of e - e* with respect to these parameters, shape
             (contacts, keys); for example, a call of `differentiate_error`.
         seed: Seed of the random phases.
 

@@ -58,7 +58,7 @@ def _reduce_peak(amplitude, lines, rows, limited, angle) -> np.ndarray:
     )
 
     def mean(angle, doublings):
-        """Return the logarithm of the norm of order 2**`doublings`, and its gradient in the phases."""
+        """Return the logarithm of the norm of order 2**`doublings`, and its gradient."""
         power, total, slope = 2**doublings, 0.0, np.zeros(len(lines))
         for (response, limit), signal in zip(
             limited, make_limited_signals(amplitude, lines, rows, angle, limited), strict=True

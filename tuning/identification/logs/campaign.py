@@ -118,8 +118,7 @@ class _RunsOfFile:
         self.label, self.notes = to_one_line(str(path)) or "''", list[str]()
         self.kind: RunKind = entry.kind
         self._path, self._timing, self._mass = path, timing, mass
-        # Number of contacts so far; last tick of a contact that a gap interrupts; force without contact
-        # before it.
+        # Number of contacts so far; last tick and force at rest of a contact that a gap interrupts.
         self._contact_count, self._open_contact = 0, None
         self._integrator = "semi_implicit_euler" if prior is None else prior.rig.integrator
         # If there are more contacts than list entries, the other contacts use the last entry.

@@ -22,7 +22,7 @@ from tuning.identification.logs.scales import (
 
 MIN_LOG_ROWS = 200  # minimum number of rows in a log
 MIN_FAR_SIDE_CONTACT_GAP = 0.01  # s, minimum time between two contacts at the second surface of a clearance
-MIN_FAR_SIDE_IMPULSE_SHARE = 0.3  # minimum impulse of such a contact as a share of the change of momentum
+MIN_FAR_SIDE_IMPULSE_SHARE = 0.3  # minimum ratio of impulse to change of momentum at the second surface
 MIN_CLIPPED_READINGS = 10  # minimum number of successive readings at the maximum that shows clipping
 MAX_ABSOLUTE_VALUE = 1e30  # largest valid number; time stamps in nanoseconds are about 1e18
 MAX_STROKE = 1.0  # m, largest plausible range of positions
@@ -94,8 +94,8 @@ def check_force(
 ) -> list[str]:
     """Check the sign and unit of the measured force in a segment; return notes.
 
-    In contacts, the force must explain the change of the numerical model's speed. In a press run, it must
-    increase with the position.
+    In contacts, the force must explain the model's change of speed. In a press run, it must increase with the
+    position.
 
     Args:
         label: Name of the log in messages.

@@ -1,14 +1,12 @@
 """Assignment of log rows to control periods (ticks) from time stamps with jitter.
 
-The samples are assumed to be taken exactly at the ticks, whereas the time stamps scatter. A time stamp t is
-modelled as
+Samples are assumed to be taken exactly at the ticks, but the time stamps scatter. A stamp t is modelled as
 
     t = t_0 + phase(t) + n T + error,
 
 with the unknown tick n and the specified control period T. The phase [s] is a slow change of the offset,
 which occurs if the clock of the stamps is faster or slower than the control loop. It is estimated for chunks
-of successive rows, from the angle of the mean of e^(2 pi i t / T). The tick n is (t - t_0 - phase) / T,
-rounded.
+of rows, from the angle of the mean of e^(2 pi i t / T). The tick n is (t - t_0 - phase) / T, rounded.
 """
 
 from __future__ import annotations
@@ -70,8 +68,7 @@ def remove_stamp_jitter(stamps: np.ndarray, period: float, label: str, column: s
     """Return the sampling times [s] of rows: their time stamps without jitter.
 
     The rows are assumed to have a constant rate, which is estimated from the stamps. If the stamps scatter
-    too much for an estimate, `period` [s] is assumed. If the rate is not constant, the stamps are returned
-    unchanged.
+    too much, `period` [s] is assumed. If the rate is not constant, the stamps are not changed.
     """
     _compute_row_distances(stamps, period, label, column)
     first, measured = float(stamps[0]), estimate_row_period(stamps)

@@ -48,8 +48,7 @@ def check_command(
         period: Control period [s].
         mass: Equivalent mass of the numerical model [kg].
         row: Row convention of the mapping.
-        integrator: Integrator of the numerical model; it is used if the logged velocity does not determine
-            one.
+        integrator: Integrator of the numerical model, for logs whose velocity does not determine it.
 
     Returns:
         True if the force command can be used, and a note or None.

@@ -79,8 +79,7 @@ def detect_integrator(x: np.ndarray, v: np.ndarray | None, period: float) -> str
     step = np.diff(x)
     by = {"semi_implicit_euler": v[1:], "explicit_euler": v[:-1], "zoh": (v[1:] + v[:-1]) / 2}
     errors = {name: np.abs(step - period * velocity) for name, velocity in by.items()}
-    # Omit rows without force, in which all integrators agree, and velocity jumps that a reset of the rig
-    # causes.
+    # Omit rows without force (all integrators agree) and velocity jumps that a reset of the rig causes.
     pulled = np.abs(np.diff(v))
     usable = np.isfinite(step) & (pulled > 0)
     usable &= pulled <= 10 * np.nanmedian(pulled[usable]) if np.any(usable) else False
@@ -92,8 +91,7 @@ def detect_integrator(x: np.ndarray, v: np.ndarray | None, period: float) -> str
 def _detect_integrator_over_span(x: np.ndarray, v: np.ndarray, period: float) -> str | None:
     """Detect the integrator from the motion in `INTEGRATOR_SPAN_ROWS` rows, despite rounding or jitter.
 
-    The integrators multiply the period by different velocities: at its start, at its end, or the mean of
-    both.
+    The integrators use different velocities of a period: at its start, at its end, or the mean of both.
     """
     finite = np.isfinite(v)
     summed = np.cumsum(np.where(finite, v, 0.0))

@@ -20,7 +20,7 @@ from tuning.identification.logs import clock
 MASTER_CHANNEL = "position_desired"  # channel whose times define the rows
 MAX_READING_PERIOD = 1.5  # control periods, maximum time between readings; a slower channel is rejected
 MIN_GAP_RATIO = 1.5  # minimum ratio of the time between two readings to its median if a reading was lost
-SIMULTANEITY_TOLERANCE = 0.02  # control periods, maximum distance of readings that count as simultaneous
+SIMULTANEITY_TOLERANCE = 0.02  # periods, maximum distance of a reading from a row that counts as simultaneous
 HELD_CHANNELS = "contact_index", "mode"  # channels whose values are valid until the next reading
 NEAREST_READING_CHANNEL = "force_measured"  # channel with jumps, which is not interpolated
 FORCE_LATE_CHANNEL = "force_late"  # s, time from a row to the force reading that is used for it
@@ -28,10 +28,7 @@ EQUAL_RATE_TOLERANCE = 0.01  # maximum relative difference of two rates that cou
 
 
 def has_same_stamps(first: np.ndarray | None, other: np.ndarray | None) -> bool:
-    """Return whether two channels have the same time stamps.
-
-    None stands for a channel without stamps.
-    """
+    """Return whether two channels have the same time stamps; None stands for no time stamps."""
     if first is None or other is None:
         return first is other
     return first is other or np.array_equal(first, other)

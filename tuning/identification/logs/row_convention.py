@@ -29,8 +29,7 @@ MIN_COEFFICIENT_SHARE = 0.3  # minimum size of a significant coefficient as a sh
 # Maximum size of the coefficient before the first significant one, as a share of the largest coefficient. If
 # it is larger, a slow filter hides the latest reading.
 MAX_PRECEDING_SHARE = 0.12
-# Maximum correlation of successive second differences of readings that noise dominates; it is -2/3 for white
-# noise.
+# Maximum correlation of successive second differences of readings that noise dominates (white noise: -2/3).
 MAX_NEIGHBOUR_CORRELATION = -0.4
 MIN_REGRESSION_ROWS = 100  # minimum number of rows for a regression
 OUTLIER_RATIO = 8.0  # maximum ratio of a residual to the median residual; other rows are excluded

@@ -18,7 +18,7 @@ SPEED_SPAN_TICKS = 10  # number of ticks between the two positions that give a s
 # 1.45.
 IMPULSE_RATIO_RANGE = 0.5, 2.0
 UNIT_FACTOR_TOLERANCE = 0.25  # relative tolerance of a unit's factor, because compensators change the impulse
-# The same if readings are clipped, or if the numerical model may not be a free body.
+# Allowed impulse ratio if readings are clipped, or if the numerical model may not be a free body.
 WIDE_IMPULSE_RATIO_RANGE = 0.2, 5.0
 TOLERANCE_SIGMAS = 5.0  # this number of standard errors is added to a tolerance
 VELOCITY_TOLERANCE = 0.02  # maximum relative deviation of the velocity from the differences of positions
@@ -63,7 +63,7 @@ _LENGTH_FACTORS = {
 
 
 def ask_for_unit(factors: tuple[float, ...], tolerance: float, momentum: bool = True) -> str:
-    """Return a question that names confusions of units, which explain the wrong size of a force.
+    """Return a question that names confusions of units that may explain a wrong magnitude of the force.
 
     Args:
         factors: Estimates of the ratio of the force to its expected value; the best estimate comes first.
@@ -78,12 +78,12 @@ def ask_for_unit(factors: tuple[float, ...], tolerance: float, momentum: bool = 
 
 
 def ask_for_length_unit(factor: float, tolerance: float) -> str:
-    """Return a question that names confusions of length units, which explain a wrong factor."""
+    """Return a question that names confusions of length units that may explain a factor of lengths."""
     return _ask_for_units(list(_LENGTH_FACTORS.items()), (factor,), tolerance)
 
 
 def _ask_for_units(units: list[tuple[float, str]], factors: tuple[float, ...], tolerance: float) -> str:
-    """Return a question that names the confusions of units with the closest factors, or ""."""
+    """Return a question that names the confusions of units with the closest factors, or an empty text."""
     texts: list[str] = []
     for factor in factors:
         distances = sorted(
@@ -137,8 +137,7 @@ def check_impulse(
     low, high = low - TOLERANCE_SIGMAS * error, high + TOLERANCE_SIGMAS * error
     if low <= ratio <= high:
         return
-    # A damping compensator and a dead zone change the impulse, but hardly the slope of force against
-    # position.
+    # Damping compensation and a dead zone change the impulse, but hardly the slope of the force.
     slope = _estimate_force_ratio(force, x, contacts, period, mass) or ratio
     if kind == "contact" and low <= slope <= high:
         return
@@ -226,12 +225,11 @@ def check_velocity(label: str, segment: LogSegment, period: float) -> str | None
     """Check that the desired velocity is the derivative of the desired position.
 
     Returns:
-        A note if the velocity must be ignored, because it is not proportional to the derivative of the
-        position; otherwise None.
+        A note if the velocity must be ignored because it is no multiple of the derivative; otherwise None.
 
     Raises:
-        InputError: If the velocity is proportional to the derivative of the position, but with a factor other
-            than 1.
+        InputError: If the velocity is a multiple of the derivative of the position, with a factor other than
+            1.
     """
     x, v = segment.channels["position_desired"], segment.channels["velocity_desired"]
     if x is None or v is None or len(x) <= 2 * SPEED_SPAN_TICKS:

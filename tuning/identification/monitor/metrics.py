@@ -118,9 +118,8 @@ def compute_weights(
 def _compute_restitution_weights(run: LoggedRun, used: np.ndarray, mass: float, period: float) -> np.ndarray:
     """Return the weights of the force readings in the metric "restitution"; NaN if there is no rebound.
 
-    According to the balance of momentum and energy, an additional force r changes the restitution by -(sum of
-    r v T) / (M v_0 |v_1|), with the speed v, the period T, the mass M, and the speeds v_0 before and v_1
-    after the contact.
+    By the balance of momentum and energy, an additional force r changes the restitution by -(sum of r v T) /
+    (M v_0 |v_1|), with the speed v (v_0 before, v_1 after the contact), period T and mass M.
     """
     x = run.position_desired
     speed = np.gradient(x, period) if run.velocity_desired is None else run.velocity_desired

@@ -45,8 +45,7 @@ class ContactDeviation:
         value: Metrics relative to the mechanism file; NaN if the log does not determine a metric.
         predicted_std: Predicted standard deviation of each metric.
         z: Normalised deviation: (value - predicted value) / `predicted_std`.
-        state: "good" without a change; "watch" after a change that the file's uncertainty explains; "bad"
-            after a larger change.
+        state: "good"; "watch" after a change that the file's uncertainty explains; "bad" after a larger one.
     """
 
     source: str
@@ -167,7 +166,7 @@ def _predict_with_sensitivities(
     timing: CampaignTiming,
     numbers: Sequence[UncertainParameter],
 ) -> tuple[PredictedReadings, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return the predicted readings, and their changes if a parameter increases by its standard deviation."""
+    """Return the predicted readings, and their changes due to an increase of each parameter by its std."""
     slack = max(number.std for number in numbers if number.path in SENSOR_DELAY_KEYS)
     motion, differences = simulate_motion(mechanism, runs, timing, slack), []
     expected = predict_readings(mechanism, runs, motion)
@@ -184,10 +183,7 @@ def _predict_with_sensitivities(
 
 
 class _MonitorState:
-    """State of the monitor after the contacts so far.
-
-    After an alarm, the prediction is not updated.
-    """
+    """State of the monitor after the contacts so far; after an alarm, the prediction is not updated."""
 
     def __init__(self, prediction: MetricFilter):
         self.prediction = prediction
