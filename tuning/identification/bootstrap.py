@@ -3,8 +3,7 @@
 The likelihood of a single fit accounts only for the noise of the readings. If the contacts differ by more
 than this noise, the intervals of such a fit are too narrow. The scatter of the bootstrap fits includes all
 differences between contacts. Contacts are drawn separately for each entry of the mechanism's contact lists.
-The fits are independent of each other, so that the workers of a cluster can compute them. Finished chunks of
-fits are saved as checkpoints.
+The fits are independent, so that the workers of a cluster can compute them. Finished chunks are checkpointed.
 """
 
 from __future__ import annotations
@@ -49,8 +48,7 @@ def bootstrap(
         say: Function that receives a progress message after every chunk except the last one.
 
     Returns:
-        The fit, with wider draws if the bootstrap requires it; its field `resampled` summarises the bootstrap
-        in words.
+        The fit, with wider draws if necessary; its field `resampled` describes the bootstrap in words.
     """
     posterior, readings = fit.posterior, fit.readings
     lanes = readings.force.shape[1]

@@ -1,11 +1,10 @@
 """Drift between a separate force clock and the drives' clock, estimated from contacts at different times.
 
-A constant offset between the two clocks cannot be distinguished from a delay of the force sensor. A drift can
-be distinguished from it, because a drift changes the time from the motion to the force from contact to
-contact. After some hours, the clocks differ by more than `MAX_FORCE_DELAY`, the longest delay in the search
-range of a fit. The drift is therefore estimated in two steps. The first step uses the time from the deepest
-point of each contact to the mean time of its force. The second step uses the residuals of a contact law that
-is fitted to all contacts.
+A constant offset between the two clocks looks like a delay of the force sensor. A drift is different: it
+changes the time from the motion to the force from contact to contact. After some hours, the clocks differ by
+more than `MAX_FORCE_DELAY`, the longest delay in the search range of a fit. The drift is therefore estimated
+in two steps. The first step uses the time from the deepest point of each contact to the mean time of its
+force. The second step uses the residuals of a contact law that is fitted to all contacts.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ class ClockDrift:
 
     rate: float  # s/s, time that the force clock gains per second
     std: float  # s/s, standard error of the rate
-    delays: np.ndarray  # s, (runs,), force delay of each run due to the drift, up to a constant
+    delays: np.ndarray  # s, (runs,), force delay of each run due to the drift, plus an unknown constant
 
 
 def reject_separate_clocks(timing: CampaignTiming) -> None:

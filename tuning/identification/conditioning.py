@@ -24,7 +24,7 @@ from tuning.identification import mechanism_models
 
 DrawsByKey = dict[str, np.ndarray]
 
-CONTRADICTION_SIGMAS = 4.0  # maximum distance of a fixed value from the logs without a note, in std
+CONTRADICTION_SIGMAS = 4.0  # maximum distance of a fixed value from the estimate without a note, in std
 FORCE_DELAY_KEY, SIMULATOR_PREFIX = "rig.force_sensor.delay", "rig.simulator."
 
 

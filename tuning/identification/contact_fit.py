@@ -398,7 +398,7 @@ def estimate_contact_frequency(contact: ContactFit, mass: float) -> float:
 
 
 def compute_force_lag(contact: ContactFit, model: MotionModel, frequency: float) -> float:
-    """Return the phase delay from the command to the force reading at a frequency [Hz], in s."""
+    """Return the phase delay [s] from the command to the force reading at a frequency [Hz]."""
     angle = float(np.angle(model.response(np.array([2j * np.pi * frequency]))[0]))
     return contact.posterior.best[0] - angle / (2.0 * np.pi * frequency)
 

@@ -37,7 +37,7 @@ from tuning.identification.sensor_filter import (
 
 MAX_FORCE_DELAY = 0.02  # s, longest force delay in the search range of a fit
 COARSE_DELAY_STEP = 0.0005  # s, step between the delays of a first search
-MAX_NEWTON_STEPS = 6  # largest number of Newton steps in the search of a surface position
+MAX_NEWTON_STEPS = 6  # maximum number of Newton steps in the search for a surface position
 MIN_LIKELIHOOD_GAIN = 2.0  # a Newton step that increases the log likelihood by less is the last one
 STEP = 1e-7  # m, step of finite differences with respect to the surface position
 FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants after which a filter's response is below rounding errors
@@ -53,7 +53,7 @@ class _NearbyRows(NamedTuple):
 
 
 class _Onsets(NamedTuple):
-    """Onsets of contact between two rows, with the weights of the force in the next lagged reading."""
+    """Onsets of contact between two rows, and the weights of the force in the next, lagged reading."""
 
     plane: np.ndarray  # (onsets,), index of the surface position
     row: np.ndarray  # (onsets,), index into `_NearbyRows.rows` of the row after the onset
@@ -272,7 +272,7 @@ class ContactProblem:
         return lagged
 
     def inside(self, delay: float, planes: np.ndarray) -> np.ndarray:
-        """Return the design matrix, shape (planes, coefficients, used rows), if all rows are in contact."""
+        """Return the design matrix (planes, coefficients, used rows) of lanes that are always in contact."""
         tables, shape = [], self.readings.force.shape
         rows = np.arange(self.readings.force.size).reshape(shape).T.ravel()
         for position, rate in self.motion_at(delay):

@@ -22,9 +22,9 @@ from tuning.identification.contact_regression import CoefficientFit
 from tuning.identification.normal_draws import factorise_covariance
 
 FINE_DELAY_STEP = 2e-5  # s, step between the delays of the second grid
-SMOOTHING_DELAYS = 7  # number of delays of the second grid over which the surface position is averaged
+SMOOTHING_DELAYS = 7  # number of adjacent delays of the second grid whose surface positions are averaged
 FINAL_GRID_DROP = 30.0  # twice the maximum drop of the log posterior from its peak in the final grid
-# The same for the second grid. It is larger, because the log posterior of the coarse grid is less accurate.
+# Twice the maximum drop in the second grid; larger, because the coarse grid's log posterior is inaccurate.
 COARSE_GRID_DROP = 400.0
 SECOND_GRID_SURFACES = 15  # number of surface positions at each delay of the second grid
 MAX_CELL_EDGES = 1000  # maximum number of cell edges; a surface that is hardly determined would need more
@@ -32,7 +32,7 @@ COARSE_STD_FACTOR = 2.0  # the coarse grid's standard deviation of the surface i
 FINAL_GRID_DELAYS, FINAL_GRID_SURFACES = 61, 13  # numbers of delays and surface positions of the final grid
 DELAY_SEARCH_HALF_WIDTH = 0.003  # s, half width of the search around an approximate delay
 SURFACE_HALF_WIDTH_SIGMAS = 3.2  # half width of the grid at a delay, in standard deviations of the surface
-POSTERIOR_DRAWS = 4000  # number of draws
+POSTERIOR_DRAWS = 4000  # number of posterior draws
 
 
 @dataclass(frozen=True)
@@ -160,8 +160,7 @@ def _fit_grid(
     """Fit the coefficients on a grid of delays and of the plausible surface positions at each delay.
 
     The force of damped contact jumps at the onset. The likelihood is therefore smooth in the surface position
-    only between two positions at which another row comes into contact. These positions are the edges of the
-    grid cells.
+    only between two positions at which another row comes into contact: the edges of the grid cells.
 
     Args:
         problem: Readings, motion and contact law.
@@ -189,8 +188,7 @@ def _fit_grid(
 def divide_into_cells(low: float, high: float, at: np.ndarray, number: int) -> np.ndarray:
     """Divide the interval from `low` to `high` into `number` cells with edges at the positions `at`.
 
-    If there are too few positions, the widest cells are halved. If there are too many, small cells are
-    merged.
+    If there are too few positions, wide cells are halved. If there are too many, small cells are merged.
     """
     if len(at) > MAX_CELL_EDGES:
         at = at[np.linspace(0, len(at) - 1, MAX_CELL_EDGES).astype(int)]

@@ -94,7 +94,7 @@ class SummarisedProblem(ContactProblem):
         self.planes = SURFACE_NODES
 
     def changed(self, law: Law, time_constant: float) -> ContactProblem:
-        """Return the same problem with another contact law and another time constant of the sensor [s]."""
+        """Return the same problem with this contact law and this time constant of the sensor [s]."""
         delay = self.delay + self.time_constant - time_constant
         return SummarisedProblem(super().changed(law, time_constant), self.deep, delay)
 

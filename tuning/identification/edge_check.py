@@ -2,9 +2,9 @@
 
 These readings distinguish damping from force delay. An unmodelled sensor filter, an unmodelled dead zone or a
 resampled force changes the readings for some milliseconds after a jump of the force. In one contact, the
-noise hides this change. The mean residual of all contacts reveals it. The mean is computed for rows at the
-same distance from the edge, with the approach speeds as weights. If it is n standard deviations from 0, the
-estimates are assumed to be wrong by n standard deviations, too.
+noise hides this change. The mean residual of all contacts, in rows at the same distance from the edge and
+weighted with the approach speeds, reveals it. If the mean is n standard deviations from 0, the estimates are
+assumed to be wrong by n standard deviations, too.
 """
 
 from __future__ import annotations

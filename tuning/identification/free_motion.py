@@ -31,7 +31,7 @@ MAX_REDUCED_CHI_SQUARE = 1.3  # maximum chi-squared per degree of freedom withou
 MODEL_ERROR_P_VALUE = 1e-6
 MODEL_ERROR_BANDS = 10  # number of frequency bands; the model error is constant in each band
 MAX_MODEL_ERROR = 10.0  # upper bound of the relative model error
-MODEL_ERROR_ITERATIONS = 3  # alternating estimates of the parameters and of the model error
+MODEL_ERROR_ITERATIONS = 3  # number of alternating estimates of the parameters and of the model error
 
 
 @dataclass(frozen=True)

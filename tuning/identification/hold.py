@@ -1,9 +1,9 @@
 """Frequency response of the command hold, which converts sampled commands to a continuous drive input.
 
 A command is one number per tick. The drives either hold it (`zoh`) or interpolate linearly between two
-commands (`linear`). The spectrum of the sampled command repeats at every multiple of the tick rate. The hold
-attenuates these spectral images. The spectrum of the sampled readings is the sum of all images, each
-multiplied by the response of the rig at the frequency of the image:
+commands (`linear`). The spectrum X_d of the sampled command repeats at every multiple of the tick rate 1 / T.
+The hold (response h) attenuates these spectral images. The spectrum Y of the sampled readings is the sum of
+all images, each multiplied by the response H of the rig at the frequency of the image:
 
     Y(f) = X_d(f) sum_m H(2 pi j f_m) h(f_m),    f_m = f + m / T,
 

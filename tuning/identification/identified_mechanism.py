@@ -95,7 +95,7 @@ def make_mechanism(
 
 
 def compute_bound_excess(key: str, draws: np.ndarray) -> float:
-    """Return the value in the file minus the mean of the draws, if the mean is below the bound 0."""
+    """Return minus the mean of the draws if it is below the lower bound 0 of the parameter; otherwise 0."""
     bounded = key.endswith(".delay") or key.startswith("contact.damping")
     return max(-float(draws.mean()), 0.0) if bounded else 0.0
 

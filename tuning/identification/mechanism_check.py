@@ -41,12 +41,12 @@ def check_against_mechanism(
 ) -> Identification:
     """Check whether a mechanism agrees with the logs of a rig, without estimating any parameter.
 
-    The noise of the force sensor is taken from runs at rest or in free motion, or else from the mechanism.
+    The force noise comes from runs at rest or in free motion or, without such runs, from the mechanism.
 
     Args:
         campaign: The logs.
         mechanism: Mechanism that the logs are compared with.
-        limit: Largest allowed effect of all defects on the restitution e, and on e - e* (e*: ideal contact).
+        limit: Largest allowed effect of all defects on the restitution e, and on its error e - e*.
         fitted: Motion simulator that was fitted to the free runs without a specified order, or None. Only
             such a fit reveals a wrong command hold or latency for which the mechanism's delay compensates.
 
@@ -139,7 +139,7 @@ def check_file_uncertainty(effect: UncertaintyEffect, pressed: bool) -> list[val
 def _make_contact_fit(
     runs: Sequence[LoggedRun], model: MotionModel, campaign: Campaign, mechanism: Mechanism
 ) -> ContactFit:
-    """Return the mechanism's contact model as a `ContactFit`, so that the same checks apply to it."""
+    """Return the mechanism's contact model as a `ContactFit`, which the checks require."""
     rig, contact, period = mechanism.rig, mechanism.contact, campaign.timing.control_period
     law = mechanism_models.make_regression_law(contact)
     delay = rig.force_sensor.delay - rig.position_sensor.delay
@@ -183,9 +183,9 @@ def _make_contact_fit(
 
 
 def _estimate_force_noise(runs: Sequence[LoggedRun]) -> NoiseEstimate | None:
-    """Return the force sensor's noise from the first long enough run at rest or, without one, in free motion.
+    """Return the force sensor's noise from the first long run at rest or, without one, in free motion.
 
-    Returns None if no run is long enough.
+    Returns None if no run has 200 readings.
     """
     for kind in ("rest", "free"):
         for run in runs:

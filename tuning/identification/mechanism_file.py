@@ -58,7 +58,7 @@ def make_uncertainty_tables(
 
 
 def _strip_index(key: str) -> str:
-    """Return the key without the index of a list's entry."""
+    """Return the key of a list entry without its index."""
     parts = key.split(".")
     while parts[-1].isdigit():
         parts.pop()

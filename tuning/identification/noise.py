@@ -1,10 +1,10 @@
 """Noise statistics of a sensor at rest: mean, standard deviation, quantum, dead zone and autocorrelation.
 
-A reading that is rounded to a quantum determines only an interval that contains the signal. The estimates of
-mean and standard deviation therefore maximise the likelihood of the number of readings at each multiple of
-the quantum. They remain correct even if the noise is smaller than the quantum. Coloured noise is modelled as
-an autoregression (Yule-Walker equations, order by the Bayesian information criterion); the inverse of the
-model whitens the residuals.
+A reading that is rounded to a quantum determines only an interval of the signal. The estimates of mean and
+standard deviation therefore maximise the likelihood of the number of readings at each multiple of the
+quantum. They are correct even if the noise is smaller than the quantum. Coloured noise is modelled as an
+autoregression (Yule-Walker equations, order by the Bayesian information criterion); the inverse of the model
+whitens the residuals.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _has_excess_zeros(readings: np.ndarray, quantum: float) -> bool:
     if np.mean(zero) > MIN_ZERO_SHARE and (quantum == 0.0 or np.ptp(readings) < 1.5 * quantum):
         return True
     size = float(np.sqrt(np.mean(readings[~zero] ** 2))) if not zero.all() else 0.0
-    # Rounding changes at most a share 0.4 quantum / std of normal readings to 0.
+    # Rounding changes at most a share of 0.4 quantum / std of the readings to 0.
     return size > 0.0 and float(np.mean(zero)) > MIN_EXCESS_ZERO_SHARE + quantum / size
 
 

@@ -1,8 +1,7 @@
 """Sequence of the rows near contact of all lanes (runs), so that a single call filters all lanes.
 
-For each lane, the sequence contains the rows from the first to the last contact, and the following rows, in
-which the response of the filters decays. The filtered values of a lane therefore do not depend on other
-lanes.
+For each lane, the sequence contains the rows from the first to the last contact, and further rows in which
+the filters decay. The filtered values of a lane therefore do not depend on other lanes.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ def find_bias_prior(
 def find_surface_of_press(
     position: np.ndarray, force: np.ndarray, counts: np.ndarray, bias: tuple[float, float]
 ) -> float | None:
-    """Return the surface position [m], at which a line through the forces of a press run reaches the bias.
+    """Return the position [m] at which a line through the forces of a press run reaches the bias.
 
     Returns None if the force does not increase with the position.
     """
@@ -68,7 +68,7 @@ def find_surface_of_press(
 
 
 def _has_release(runs: Sequence[LoggedRun], motion: MotionResponse) -> bool:
-    """Return whether a press run leaves the contact; the force then exceeds the line at small depths."""
+    """Return whether a press run leaves the contact: whether its force at small depths exceeds the trend."""
     position, _ = motion.at(TYPICAL_FORCE_DELAY)
     x, f = [], []
     for lane, run in enumerate(runs):

@@ -162,7 +162,7 @@ class MotionModel:
 
 @dataclass(frozen=True)
 class SpectrumFit:
-    """Model fitted to measured spectra, with the covariance of its parameters and the residuals."""
+    """Model fitted to measured spectra, with the residuals and the covariance of its parameters."""
 
     model: MotionModel
     covariance: np.ndarray  # covariance of the parameters, from the curvature of the likelihood

@@ -6,7 +6,7 @@ change dF of the contact force changes the restitution by
 
     d e* = -(integral of dF v dt) / (M v_0^2 e*).
 
-An additional delay tau of the force adds the energy tau times the integral of F^2 / M, so that
+An additional delay tau of the force adds the energy tau (integral of F^2 dt) / M, so that
 
     e = e* + J tau,    J = (integral of F^2 dt) / (M^2 v_0^2 e*).
 
@@ -168,14 +168,14 @@ def _replace_simulator_value(mechanism: Mechanism, name: str, value: float) -> M
 
 
 def _compute_motion_lag(mechanism: Mechanism, frequency: float) -> float:
-    """Return the phase delay from the command to the position reading at a frequency [Hz], in s."""
+    """Return the phase delay [s] from the command to the position reading at a frequency [Hz]."""
     model = mechanism_models.make_motion_model(mechanism)
     angle = float(np.angle(model.response(np.array([2j * np.pi * frequency]))[0]))
     return -angle / (2.0 * np.pi * frequency)
 
 
 def _compute_total_force_delay(mechanism: Mechanism, frequency: float) -> float:
-    """Return the total delay from the command to the force reading at a frequency [Hz], in s."""
+    """Return the total delay [s] from the command to the force reading at a frequency [Hz]."""
     sensor = mechanism.rig.force_sensor
     total = _compute_motion_lag(mechanism, frequency) + sensor.delay + sensor.time_constant
     return max(total - mechanism.rig.position_sensor.delay, 0.0)

@@ -32,7 +32,7 @@ FADE_TIME = 1.0  # s, duration of the fade-in and of the fade-out
 APPROACH_TIME = 2.0  # s, duration of the approach to the preload of a press run, and of the retraction
 START_CLEARANCE = 0.001  # m, distance to the surface at the start of a press run
 MIN_TOP_FREQUENCY = 45.0  # Hz, minimum of the highest frequency line, which is usually 3 times the bandwidth
-FLAT_POWER_SHARE = 0.2  # share of the power that is distributed evenly over the frequency lines
+FLAT_POWER_SHARE = 0.2  # share of the power that is distributed evenly among the frequency lines
 ASSUMED_CREST_FACTOR = 1.6  # assumed crest factor for the comparison of powers with limits
 PRELOAD_SHARE = 0.45  # mean force of a press run as a share of the largest allowed force
 SWING_SHARE = 0.4  # amplitude of the force about its mean, as a share of the largest allowed force
@@ -268,19 +268,19 @@ class _MultisinePlan:
         self.free, self.press = (
             self._compute_run_lines(mechanism, index, response, std, response_limits, periods)
             for index, response, std, response_limits, periods in (
-                (0, motion, stds[0], self._limits(rig, stroke), MULTISINE_PERIODS - 1),
+                (0, motion, stds[0], self._list_limits(rig, stroke), MULTISINE_PERIODS - 1),
                 (
                     1,
                     force,
                     stds[1],
-                    [*self._limits(rig, stroke), (force, SWING_SHARE * greatest)],
+                    [*self._list_limits(rig, stroke), (force, SWING_SHARE * greatest)],
                     MULTISINE_PERIODS,
                 ),
             )
         )
         self.limits = (
-            self._limits(rig, stroke),
-            [*self._limits(rig, stroke), (force, SWING_SHARE * greatest)],
+            self._list_limits(rig, stroke),
+            [*self._list_limits(rig, stroke), (force, SWING_SHARE * greatest)],
         )
 
     def _list_parameters(self, mechanism: Mechanism) -> dict[str, float]:
@@ -325,7 +325,7 @@ class _MultisinePlan:
         )
         return powers.RunLines(fisher, use)
 
-    def _limits(self, rig, stroke: float) -> list[tuple[np.ndarray, float]]:
+    def _list_limits(self, rig, stroke: float) -> list[tuple[np.ndarray, float]]:
         """Return, for each limited signal, its frequency response to the command and its limit."""
         limits = [(np.ones_like(self.s), stroke)]
         for power, limit in ((1, rig.simulator.velocity_limit), (2, rig.simulator.acceleration_limit)):
@@ -383,7 +383,7 @@ def _differentiate_force(mechanism: Mechanism, depth: float) -> tuple[float, flo
 def _find_preload(mechanism: Mechanism) -> tuple[float, float]:
     """Return the depth at the preload [m] and the largest allowed force [N] of a press run.
 
-    The force must not exceed the range of the sensor, or the peak force of a contact at the approach speed.
+    The force must exceed neither the sensor's range nor the peak force of a contact at the approach speed.
     """
     energy = 0.5 * mechanism.bodies.mass * mechanism.approach.velocity**2
 

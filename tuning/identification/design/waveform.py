@@ -57,7 +57,7 @@ def _reduce_peak(amplitude, lines, rows, limited, angle) -> np.ndarray:
         np.abs(signal).max() for signal in make_limited_signals(amplitude, lines, rows, angle, limited)
     )
 
-    def mean(angle, doublings):
+    def compute_log_norm(angle, doublings):
         """Return the logarithm of the norm of order 2**`doublings`, and its gradient."""
         power, total, slope = 2**doublings, 0.0, np.zeros(len(lines))
         for (response, limit), signal in zip(
@@ -75,8 +75,9 @@ def _reduce_peak(amplitude, lines, rows, limited, angle) -> np.ndarray:
         return np.log(total) / power, slope / total
 
     for doublings in NORM_POWER_LOG2:
+        options = {"maxiter": MAX_SOLVER_ITERATIONS}
         result: Any = optimize.minimize(
-            mean, angle, (doublings,), method="L-BFGS-B", jac=True, options={"maxiter": MAX_SOLVER_ITERATIONS}
+            compute_log_norm, angle, (doublings,), method="L-BFGS-B", jac=True, options=options
         )
         angle = result.x
     return angle

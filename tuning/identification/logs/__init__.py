@@ -1,1 +1,1 @@
-"""Reading of a rig's log files: checks and conversion to the grid of ticks, without jax."""
+"""Reading of a rig's log files: checks, and conversion to one row per tick (without jax)."""

@@ -37,7 +37,7 @@ from tuning.identification.records import Campaign, CampaignTiming, LoggedRun, R
 
 KINDS_SPLIT_AT_CONTACTS = ("tap", "contact")
 MIN_SEGMENT_ROWS = 50  # minimum number of rows in a segment between gaps
-MIN_VELOCITY_JUMP = 0.5  # minimum velocity jump between simulated runs, over the 95 % quantile of the speed
+MIN_VELOCITY_JUMP = 0.5  # minimum velocity jump between simulated runs as a share of the 95 % speed quantile
 
 
 def read_campaign(
@@ -248,7 +248,7 @@ class _RunsOfFile:
         contact: tuple[int, int] | None,
         number: int | None,
     ) -> LoggedRun:
-        """Convert a part of a segment to a run; `number` is the contact index if no channel has it."""
+        """Convert part of a segment to a run; `number` is the contact index if the log contains none."""
         channels = {
             name: None if values is None else values[part] for name, values in segment.channels.items()
         }

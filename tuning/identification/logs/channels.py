@@ -96,7 +96,7 @@ def _read_channel_stamps(
 
 
 def _check_stamps_in_groups(log: OpenLog, mapping: LogMapping, wanted: Mapping[str, str]) -> None:
-    """Raise `InputError` if the mapping ignores different time stamps of a group of columns.
+    """Raise `InputError` if a group of columns has other time stamps than the mapping uses.
 
     In HDF5, MAT and TDMS files, the column names contain the group names.
     """

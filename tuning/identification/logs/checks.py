@@ -94,8 +94,8 @@ def check_force(
 ) -> list[str]:
     """Check the sign and unit of the measured force in a segment; return notes.
 
-    In contacts, the force must explain the model's change of speed. In a press run, it must increase with the
-    position.
+    The force must explain the model's change of speed in contacts, and increase with the position in press
+    runs.
 
     Args:
         label: Name of the log in messages.

@@ -24,7 +24,7 @@ MIN_ROW_DISTANCE = 1e-6  # periods, minimum valid time between rows
 MAX_LOG_PERIODS = 1e12  # periods, maximum length of a log; the ticks of a longer log would lose digits
 MAX_RATE_ROWS = 20_000  # maximum number of rows for an estimate of the row rate; more are not needed
 MAX_RATE_ERROR = 0.1  # maximum relative difference between row rate and control rate
-# Largest relative difference between mean row rate and control rate; otherwise the phase changes too much per
+# Maximum relative difference between mean row rate and control rate; above it, the phase changes too much per
 # chunk.
 MAX_MEAN_RATE_ERROR = 1.5e-3
 # periods, maximum scatter of the time between rows for an estimate of the row rate

@@ -44,7 +44,7 @@ def detect_contacts(
 
 
 def estimate_resting_force(force: np.ndarray) -> float:
-    """Return the force reading without contact [N], the median of the first rows."""
+    """Return the force reading without contact [N]: the median of the first rows."""
     return float(np.nanmedian(_select_first_readings(force)))
 
 

@@ -59,7 +59,7 @@ class ModeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """Column that states the kind of experiment in each row."""
 
     column: ColumnName  # name of the column
-    values: dict[str, RunKind] = field(default_factory=dict)  # kind for each entry that is not a kind itself
+    values: dict[str, RunKind] = field(default_factory=dict)  # kind of each entry that does not name a kind
 
 
 class ChannelTable(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -152,9 +152,8 @@ def _guess_kind(path: Path, log: OpenLog, columns: Mapping[str, str]) -> str:
 def _sample_rows(log: OpenLog, names: Sequence[str]) -> ColumnsByName:
     """Read the given columns and return the first rows, without rows in which a value is missing."""
     read = log.read(names)
-    rows = min(
-        MAX_SAMPLED_ROWS, *(len(values) for values in read.values())
-    )  # columns of other clocks may be longer
+    # Columns with other time stamps may have other lengths.
+    rows = min(MAX_SAMPLED_ROWS, *(len(values) for values in read.values()))
     read = {name: values[:rows] for name, values in read.items()}
     valid = [
         np.abs(values) <= checks.MAX_ABSOLUTE_VALUE for values in read.values() if values.dtype != object

@@ -52,7 +52,7 @@ _THIRD_PARTY_FORMATS = {
 
 
 class OpenLog(NamedTuple):
-    """Log file that was opened: its column names, and functions that read columns and their time stamps."""
+    """Opened log file: its column names, and functions that read columns and their time stamps."""
 
     label: str  # name of the log in messages
     names: list[str]
@@ -158,7 +158,7 @@ def _open_text_log(path: Path, label: str, text: TextFormat) -> OpenLog:
         raw = file.readline(MAX_LINE_BYTES)
         second = file.readline(MAX_LINE_BYTES)
     if not raw.strip():
-        raise InputError(f"{label}: found no line of column names, expected it below {text.skip_rows} lines")
+        raise InputError(f"{label}: found no line of column names, expected it in line {text.skip_rows + 1}")
     line, following = (
         _decode_line(raw_line, text.skip_rows == 0).strip("\r\n") for raw_line in (raw, second)
     )

@@ -2,10 +2,10 @@
 
 In some log formats, each channel or group of channels has its own time stamps. Such a channel may begin
 later, have a higher rate, or lose other rows than the desired position. All channels are resampled to the
-times of the desired position. A reading at exactly such a time is used unchanged; otherwise, readings are
-interpolated linearly. Forces are an exception, because interpolation would smooth the jump of the force at
-the onset of contact. If they are logged at the rate of the desired position, the nearest reading is used, and
-its time offset is returned. Rows in which any channel has no reading are removed.
+times of the desired position. Readings are interpolated linearly. Forces at the rate of the desired position
+are an exception, because interpolation would smooth the jump of the force at the onset of contact: the
+nearest reading is used, and its time offset is returned. Rows in which any channel has no reading are
+removed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tuning.identification.logs import clock
 MASTER_CHANNEL = "position_desired"  # channel whose times define the rows
 MAX_READING_PERIOD = 1.5  # control periods, maximum time between readings; a slower channel is rejected
 MIN_GAP_RATIO = 1.5  # minimum ratio of the time between two readings to its median if a reading was lost
-SIMULTANEITY_TOLERANCE = 0.02  # periods, maximum distance of a reading from a row that counts as simultaneous
+SIMULTANEITY_TOLERANCE = 0.02  # periods, maximum time between a row and a reading that count as simultaneous
 HELD_CHANNELS = "contact_index", "mode"  # channels whose values are valid until the next reading
 NEAREST_READING_CHANNEL = "force_measured"  # channel with jumps, which is not interpolated
 FORCE_LATE_CHANNEL = "force_late"  # s, time from a row to the force reading that is used for it

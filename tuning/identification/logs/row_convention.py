@@ -7,8 +7,7 @@ The force command depends on the force reading, including its noise, and moves t
 The right-hand side depends on the noise of the reading F(n), but not on that of later readings. If a row
 contains the next tick's command, the commands seem to depend on the noise of the following row. If a row
 contains the next tick's readings, the response seems to be one row late. A regression finds the latest
-reading on which the second differences of the commands depend. All signals are differenced twice before, so
-that mainly noise remains.
+reading on which the commands depend. Before, all signals are differenced twice, so that mainly noise remains.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ EXPLICIT_INTEGRATOR = "explicit_euler"  # integrator that responds to a reading 
 def check_row_convention(
     runs: Sequence[LoggedRun], timing: CampaignTiming, integrator: str | None = None
 ) -> None:
-    """Check the row convention `timing.row` with the sensor noise that the commands contain.
+    """Check the row convention `timing.row` by means of the sensor noise in the commands.
 
     A command depends on the force reading `timing.computing_delay` ticks earlier (0: same tick). With the
     explicit Euler integrator, the reading is one tick older.

@@ -26,7 +26,7 @@ MAX_RELATIVE_RESIDUAL = 0.3  # maximum relative residual of a fit that is evalua
 POSITION_GAIN_RANGE = 0.5, 2.0  # allowed ratio of measured to desired position in slow motion
 MAX_EVALUATED_ROWS, MAX_GAIN_ROWS = 50_000, 10_000  # maximum numbers of evaluated rows; more are not needed
 MAX_EVALUATED_CONTACTS = 500  # maximum number of evaluated contacts; more are not needed
-MAX_SLOW_MOTION_LAG = 100  # rows, longest delay between command and motion in the search
+MAX_SLOW_MOTION_LAG = 100  # rows, longest delay of a slow motion in the search
 ROWS_BESIDE_CONTACT = 60  # number of rows before and after a contact that determine the force without contact
 
 # Factors by which a wrong unit multiplies the force.
@@ -78,7 +78,7 @@ def ask_for_unit(factors: tuple[float, ...], tolerance: float, momentum: bool = 
 
 
 def ask_for_length_unit(factor: float, tolerance: float) -> str:
-    """Return a question that names confusions of length units that may explain a factor of lengths."""
+    """Return a question that names confusions of length units that may explain wrong lengths."""
     return _ask_for_units(list(_LENGTH_FACTORS.items()), (factor,), tolerance)
 
 
@@ -180,7 +180,7 @@ def estimate_force_beside_contacts(force: np.ndarray, contacts: list[tuple[int, 
 
 
 def _estimate_impulse_error(force: np.ndarray, period: float, contacts: list[tuple[int, int]]) -> float:
-    """Return the standard deviation [N s] of the total impulse of all contacts that the noise causes."""
+    """Return the standard deviation [N s] of the total impulse of all contacts, due to the noise."""
     steps = np.abs(np.diff(force[:MAX_EVALUATED_ROWS]))
     std = 1.4826 * float(np.nanmedian(steps)) / np.sqrt(2.0)
     rows = sum(end - begin + 2 * SPEED_SPAN_TICKS for begin, end in contacts)
@@ -225,11 +225,10 @@ def check_velocity(label: str, segment: LogSegment, period: float) -> str | None
     """Check that the desired velocity is the derivative of the desired position.
 
     Returns:
-        A note if the velocity must be ignored because it is no multiple of the derivative; otherwise None.
+        A note if the velocity must be ignored, because it is not proportional to the derivative; or None.
 
     Raises:
-        InputError: If the velocity is a multiple of the derivative of the position, with a factor other than
-            1.
+        InputError: If the velocity is proportional to the derivative, with a factor other than 1.
     """
     x, v = segment.channels["position_desired"], segment.channels["velocity_desired"]
     if x is None or v is None or len(x) <= 2 * SPEED_SPAN_TICKS:

@@ -22,7 +22,7 @@ ColumnsByName = dict[str, np.ndarray]
 
 
 class LogReader(NamedTuple):
-    """Log that was opened: its column names, and functions that read columns and their time stamps."""
+    """Opened log: its column names, and functions that read columns and their time stamps."""
 
     names: list[str]  # names of the columns
     read: Callable[[Sequence[str]], ColumnsByName]

@@ -46,7 +46,7 @@ class MetricWeights:
     rest: np.ndarray  # bool, (rows,), rows out of contact
 
     def shift(self, force: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return the change of each metric that changes of the force [N] and position [m] readings cause."""
+        """Return how much each metric changes if the force [N] and position [m] readings change."""
         result = np.zeros(len(METRIC_NAMES))
         result[FORCE_METRICS] = self.force @ force
         result[LAG_INDEX] = self.position @ position
