@@ -44,9 +44,9 @@ def check_contact_edges(
     power, count = float(np.sum(means**2)), len(means)
     times = float(np.sqrt(max(power - count, 0.0)) / special.ndtri(0.5 + 0.5 * EFFECT_PROBABILITY))
     is_present = bool(stats.chi2.sf(power, count) < DEFECT_P_VALUE)
-    finding = f"the mean residual of all touches has {power / count:.3g} times the noise's power there"
+    finding = f"the mean residual of all contacts has {power / count:.3g} times the noise's power there"
     if is_present:
-        finding += ", as with another filter or dead zone than the model's, or with a resampled force"
+        finding += ", as if the filter or dead zone differed from the model's or the force were resampled"
     return [
         CheckResult(
             "edges of contact", finding, is_present, times * effect.restitution, on_error=times * effect.error

@@ -46,8 +46,8 @@ def collect_notes(
         notes.append(f"{gains}; the logs do not show its offset, so {FORCE_DELAY_KEY} is as specified")
     if contact is not None and not contact.problem.damping_indices:
         notes.append(
-            f"law {contact.law.name}: without damping, as specified; a damping b with a force delay longer "
-            "by b over the stiffness may explain the logs as well"
+            f"law {contact.law.name}: without damping, as specified; with a damping b, a force delay that is "
+            "longer by b / stiffness may explain the logs equally well"
         )
     if contact is not None and contact.resampled:
         notes.append(contact.resampled)
@@ -59,9 +59,9 @@ def collect_notes(
         notes.append(f"the logs contain only entries {', '.join(map(str, entries))} of the contact lists")
     if contact is not None and contact.dead_zone and contact.problem.plane is not None:
         spread = 1e3 * contacts.UNKNOWN_SURFACE_STD
-        assumed = f"to be at 0 +- {spread:g} mm; --fix rig.contact_plane=VALUE specifies it"
+        assumed = f"assumed at 0 +- {spread:g} mm; --fix rig.contact_plane=VALUE specifies it"
         taken = "as specified" if contact.has_specified_surface else assumed
-        notes.append(f"the force has a dead zone: the contact plane was taken {taken}")
+        notes.append(f"the force has a dead zone: the contact plane is {taken}")
     return notes
 
 

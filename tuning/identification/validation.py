@@ -240,7 +240,7 @@ def check_stiffness_sign(contact: ContactFit) -> CheckResult:
     ]
     return CheckResult(
         "sign of the force",
-        f"least stiffness {min(values):.4g}: negative if the specified sign of the force is wrong",
+        f"smallest stiffness {min(values):.4g}: negative if the specified sign of the force is wrong",
         min(values) <= 0.0,
         1.0,
     )
@@ -251,7 +251,7 @@ def _check_delay_in_search_range(contact: ContactFit) -> list[CheckResult]:
     delay = contact.posterior.mean[0]
     if delay < MAX_DELAY_SHARE * MAX_FORCE_DELAY:
         return []
-    finding = f"{1e3 * delay:.4g} ms, the longest in the search"
+    finding = f"{1e3 * delay:.4g} ms: at the upper end of the search range"
     return [CheckResult("force delay", finding, True, 1.0)]
 
 

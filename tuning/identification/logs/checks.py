@@ -135,7 +135,7 @@ def check_force(
     notes = _note_slow_readings(label, readings)
     if clipped:
         notes.append(
-            f"{label}: force_measured: {np.count_nonzero(top)} rows have the largest reading, as if clipped"
+            f"{label}: force_measured: {np.count_nonzero(top)} rows contain the largest reading, as if clipped"
         )
     return notes
 
@@ -174,7 +174,7 @@ def _note_slow_readings(label: str, force: np.ndarray) -> list[str]:
     rows = find_change_interval(force)
     if rows == 1:
         return []
-    return [f"{label}: force_measured: a new reading only every {rows} rows: other rows do not fit a law"]
+    return [f"{label}: force_measured: a new reading only every {rows} rows: no law explains the others"]
 
 
 def find_change_interval(values: np.ndarray) -> int:
@@ -260,7 +260,7 @@ def _note_held_readings(label: str, x: np.ndarray, measured: np.ndarray) -> list
         return []
     rows_held = 1 / (1 - share) if share < 1 else np.inf
     message = f"repeated in {100 * share:.0f} % of rows, as if each reading was held for {rows_held:.2g} rows"
-    return [f"{label}: position_measured: {message}: this adds half of this time to the delay"]
+    return [f"{label}: position_measured: {message}, which adds half of this time to the delay"]
 
 
 def _get_channel(segment: LogSegment, name: str) -> np.ndarray:
