@@ -135,7 +135,7 @@ def check_force(
     notes = _note_slow_readings(label, readings)
     if clipped:
         notes.append(
-            f"{label}: force_measured: {np.count_nonzero(top)} rows contain the largest reading, as if clipped"
+            f"{label}: force_measured: {np.count_nonzero(top)} rows have the largest reading, as if clipped"
         )
     return notes
 
