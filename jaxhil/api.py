@@ -33,14 +33,14 @@ def simulate(
     *,
     seed: int = 0,
 ) -> Any:
-    """Simulate the contacts of a nominal mechanism on the rig once, with a compensator.
+    """Simulate the nominal contacts of a mechanism on the rig once, with a compensator.
 
     Args:
         mechanism: Result of `jaxhil.load`, name of a built-in mechanism, or path of a mechanism file.
         compensator: Name of a compensator; with six axes "none", "phase_lead" or "phase_lead_per_axis".
             With a gain file, "none" stands for the compensator of the file.
-        gains: None for the literature's gains, a dict of gains by name (missing gains keep the literature's
-            values), the name of one of the compensator's settings, or the path of a gain file.
+        gains: None for the gains that the literature recommends, a dict of gains by name (for missing gains,
+            the literature's values), the name of a setting of the compensator, or the path of a gain file.
         seed: Seed of the sensors' noise.
 
     Returns:

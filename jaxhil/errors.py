@@ -1,7 +1,7 @@
 """Error class for invalid input, and functions that format values for its one-line messages.
 
-Invalid input (a file, a key, an option) raises an `InputError`. Its message is one printable line with the
-file and key, or the option, the value found, and the expected values.
+Invalid input (a file, a key, an option) raises an `InputError`. Its message is one printable line that
+names the file and the key (or the option), the found value, and the expected values.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def format_value(value: object, limit: int = 60) -> str:
         # The text of a table is long, and `repr` fails on deeply nested tables.
         return "a table"
     if isinstance(value, str):
-        # A long text is shortened before the escaping too, which saves time.
+        # Shortening a long text before escaping it saves time.
         value = value[: limit + 1]
     try:
         return to_one_line(repr(value), limit)

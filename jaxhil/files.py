@@ -1,8 +1,8 @@
 """Atomic writes, checksummed files, and protection of files that this program did not write.
 
-The program writes regular files only. It neither follows, opens nor replaces a link, a pipe or a device that
-has the name of a file. A checksummed file begins with the SHA-256 of its content, as a line of hexadecimal
-digits. The checksum is verified before the content is used.
+The program writes regular files only. If a link, a pipe or a device has the name of an output file, the
+program does not follow, open or replace it. A checksummed file begins with a line that has the SHA-256 of the
+content in hexadecimal digits. The content is used only if it has this checksum.
 """
 
 import ctypes
@@ -26,7 +26,7 @@ CHECKSUM_LENGTH = 65  # number of bytes before the content of a checksummed file
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
 _OPEN_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-_PROCESS_TOKEN = secrets.token_hex(4)  # the system reuses process numbers, so that they are not unique
+_PROCESS_TOKEN = secrets.token_hex(4)  # distinguishes processes with equal numbers, which the system reuses
 _TEMPORARY_NAME_PATTERN = re.compile(rf"\.jaxhil-(\d+)-([0-9a-f]{{8}})-\d+{re.escape(TEMPORARY_SUFFIX)}")
 _name_counter = count()
 
@@ -65,7 +65,7 @@ def write_csv(path: object, columns: Mapping[str, Sequence[float]]) -> None:
 
 
 def write_atomically(path: Path, content: bytes | bytearray | memoryview, lasting: bool = True) -> None:
-    """Write a file atomically. A `lasting` file is on disk, safe from a power cut, when the function returns.
+    """Write a file atomically; if it is `lasting`, return only when the file is safe from a power cut.
 
     Raise OSError if the file cannot be written, or if `path` exists and is not a regular file.
     """
@@ -235,7 +235,7 @@ def temporary_name() -> str:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush the entries of a folder to disk, so that they survive a power cut. Raise OSError on failure."""
+    """Flush a folder's list of files to disk, so that it survives a power cut. Raise OSError on failure."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -244,7 +244,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def _is_process_running(process: int, token: str) -> bool:
-    """Return whether the process with a number and token from a temporary name still runs."""
+    """Return whether the process named in a temporary file name (number and random token) still runs."""
     if process == os.getpid():
         return token == _PROCESS_TOKEN
     try:

@@ -183,7 +183,7 @@ def change(document, path, value):
         ("mechanism.bodies.equivalent_mass", -1.0, "mechanism: bodies.equivalent_mass: found -1.0"),
         ("mechanism.contact.law", "magnetic", "mechanism: contact.law: found 'magnetic'"),
         ("mechanism_sha256", "abc", "mechanism_sha256: found 'abc', expected 64 hexadecimal digits"),
-        ("envelope", None, "envelope: found nothing, expected this key is required"),
+        ("envelope", None, "envelope: found nothing, expected an object of {low, high, unit} objects"),
         ("envelope.delay", [0.0, 1.0], "envelope: found a table, expected an object of {low, high, unit}"),
         ("figures", 3, "figures: found 3, expected an object"),
         ("seed", True, "seed: found true, expected an integer >= 0"),

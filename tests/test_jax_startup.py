@@ -103,7 +103,7 @@ def test_fork_of_process_with_running_jax_is_refused(monkeypatch):
     jax_startup.check_not_forked()
     jax_startup.check_not_forked()
     monkeypatch.setattr(os, "getpid", lambda: -1)
-    with pytest.raises(InputError, match="forked after jax had started, expected one begun by spawn"):
+    with pytest.raises(InputError, match="a process forked after the start of JAX, expected a spawned one"):
         jax_startup.check_not_forked()
 
 

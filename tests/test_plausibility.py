@@ -235,7 +235,8 @@ def refusal(mechanism, **options):
 
 def test_mechanism_whose_run_needs_too_many_ticks_is_refused():
     message = (
-        "found 1e-09 s, expected at most 1e+07 ticks a contact and 1e+09 a run: contact 1 takes about 0.195 s"
+        "found 1e-09 s, expected at most 1e+07 ticks per contact and 1e+09 per run: "
+        "contact 1 takes about 0.195 s"
     )
     assert f"rig.control_period: {message}, 1.9e+08 ticks" in refusal(rig(rig__control_period=1e-9))
     check_run(rig(rig__control_period=2e-8))
@@ -252,7 +253,7 @@ def test_mechanism_with_endless_approach_is_refused():
     gap = {"contact.clearance": 40.0, "approach.contacts": 2}
     check_run(rig(gap))
     message = refusal(rig(gap, contact__clearance=100.0))
-    assert "contact.clearance: found 100 m, expected at most 1e+07 ticks a contact" in message
+    assert "contact.clearance: found 100 m, expected at most 1e+07 ticks per contact" in message
     assert "contact 2 takes about 2e+04 s, 2e+07 ticks" in message
     assert "contact.clearance: found 1e+30 m" in refusal(rig(gap, contact__clearance=1e30))
     # There is no flight after the last contact.
@@ -319,9 +320,9 @@ def test_velocity_limit_check_applies_to_uncertain_values():
 def test_every_public_function_refuses_mechanism_with_endless_run():
     endless = rig(rig__control_period=1e-9)
     for function in (jaxhil.simulate, tuning.tune, tuning.compare):
-        with pytest.raises(jaxhil.InputError, match="at most 1e\\+07 ticks a contact"):
+        with pytest.raises(jaxhil.InputError, match="at most 1e\\+07 ticks per contact"):
             function(endless)
-    with pytest.raises(jaxhil.InputError, match="at most 1e\\+07 ticks a contact"):
+    with pytest.raises(jaxhil.InputError, match="at most 1e\\+07 ticks per contact"):
         jaxhil.jacobian(endless, by="approach.velocity")
 
 

@@ -113,11 +113,11 @@ def test_unusable_compensator_or_contact_law_is_not_registered(registered):
         (ScaledLead, "found the class ScaledLead, expected an instance of"),
         (3, "found 3, expected an instance of"),
         (Unnamed(), "Unnamed.name: found"),
-        (Taken(), "register phase_lead: name: found the name of another law"),
+        (Taken(), "register phase_lead: name: found the name of a registered law"),
         (Boundless(), "gains.toy_lead: found 0, 1, inf, expected lower <= nominal <= upper"),
         (Broken(), "gains.toy_lead.lower: found AttributeError"),
         (Unitless(), "gains.toy_lead.unit: found ''"),
-        (Holding(), "expected only numbers, texts and tuples, no arrays"),
+        (Holding(), "expected only numbers, texts and tuples (no arrays)"),
         (OfItsOwnKey(), "keys: found toy_depth, expected keys of mechanism files: tension, exponent, "),
     ):
         assert message in refusal(jaxhil.register, law)
@@ -128,7 +128,7 @@ def test_unusable_compensator_or_contact_law_is_not_registered(registered):
     assert "expected a class" in refusal(
         jaxhil.register, ScaledLead(), runtime=ScaledLeadOnTheRig({"toy_lead": 0}, 1, 1)
     )
-    assert "runtime: found object without step" in refusal(jaxhil.register, ScaledLead(), runtime=object)
+    assert "runtime: found object without method step" in refusal(jaxhil.register, ScaledLead(), runtime=object)
     jaxhil.register(ScaledLead(), runtime=ScaledLeadOnTheRig)
     jaxhil.register(ScaledLead())
 

@@ -1,7 +1,7 @@
 """Disk cache of compiled programs, so that later processes need not trace and lower them again.
 
-Tracing and lowering take longer than running a short batch. For each compiled program, a file contains the
-data that JAX needs to load this program. The file's name is the hash of everything that determines the
+Tracing and lowering can take longer than the simulation itself. For each compiled program, a file contains
+the data that JAX needs to load this program. The file's name is the hash of everything that determines the
 program: sources, versions of dependencies, static arguments, array shapes, settings of JAX, compiler flags
 and options, and processor.
 
@@ -9,10 +9,11 @@ The machine code is not in this file but in the compile cache (`jaxhil.simulatio
 contains only the key of the machine code. JAX could also serialise the machine code, but machine code that
 JAX has loaded from a file cannot be serialised again.
 
-Anyone who can write to the folder of a cache can run code in the processes that read it: checksums protect
-against damage, not against malicious files.
+Anyone who can write to the cache folder can run code in the processes that read the cache. The checksums
+protect against damaged files, not against malicious files.
 
-This module uses private functions of JAX. If one of them is missing, or on graphics cards, nothing is cached.
+This module uses private functions of JAX. If one of them is missing, nothing is cached. Programs for graphics
+cards are never cached.
 """
 
 import dataclasses
@@ -41,7 +42,7 @@ from jaxhil.simulation.jax_environment import (
 from jaxhil.simulation.source_fingerprint import OWN_PACKAGES, dependency_versions, sources_sha256
 
 PROGRAM_SUFFIX = ".compiled"  # suffix of the names of the cached files
-# Name under which JAX records how long it takes to read a program.
+# Name of the JAX event that records the time for reading a program.
 READ_TIME_EVENT = "/jax/compilation_cache/cache_retrieval_time_sec"
 MACHINE_CODE_TAG = "exec"  # tag with which JAX marks machine code in its pickles
 # Custom calls that a cached program may contain: LAPACK, which is initialised before the program is used, and
@@ -101,7 +102,7 @@ def _find_program(function, static, arguments, options):
         placed = [(leaf.shape, str(leaf.dtype), str(getattr(leaf, "sharding", None))) for leaf in leaves]
         name = function.__module__, function.__qualname__
         identity = (*name, static, structure, placed, sorted(options.items()))
-        # A law may be in the static argument or in the tree structure of the array arguments.
+        # The static argument and the tree structure of the array arguments may contain user-registered laws.
         is_uncacheable = has_user_objects((static, jax.tree.unflatten(structure, [None] * len(leaves))))
         program = load_or_compile(identity, jitted, leaves, None if is_uncacheable else folder)
         _programs[key] = program
@@ -116,7 +117,7 @@ def load_or_compile(
 ) -> Callable[..., Any]:
     """Load a compiled program from the cache folder, or compile and store the program.
 
-    Without a folder, or on a graphics card, the returned program is jitted but not yet compiled.
+    Without a folder, or on a graphics card, return the jitted program, which JAX compiles at its first call.
 
     Args:
         identity: Object whose `repr` describes completely how the program is built.
@@ -129,7 +130,7 @@ def load_or_compile(
     try:
         path = Path(folder) / f"{_hash_program(identity)}{PROGRAM_SUFFIX}"
     except Exception:
-        # This version of JAX does not provide everything that determines the program.
+        # This version of JAX does not provide all data for the hash, so that nothing can be cached.
         return build()
     program = _read_program(path)
     if program is None:
@@ -146,7 +147,7 @@ def find_calls(text: str) -> set[str]:
 
 
 def has_user_objects(value: Any) -> bool:
-    """Return whether a value contains objects that their `repr` may not describe completely.
+    """Return whether a value contains objects whose `repr` may be an incomplete description.
 
     These are arrays, functions, and objects whose class is defined outside this project.
     """
@@ -193,7 +194,7 @@ def _read_program(path: Path) -> Any:
         jax.monitoring.record_event_duration_secs(READ_TIME_EVENT, time.monotonic() - start)
         return program
     except Exception:
-        # Another version of JAX wrote the file, or the machine code was deleted from the compile cache.
+        # A different version of JAX wrote the file, or the compile cache no longer has the machine code.
         return None
 
 
@@ -251,7 +252,7 @@ def _deserialise_program(content):
     file = io.BytesIO(content)
     calls_lapack, indices = pickle.load(file)
     if calls_lapack:
-        # JAX initialises LAPACK when it lowers a call of LAPACK; a loaded program was not lowered here.
+        # JAX initialises LAPACK when it lowers a LAPACK call. This process may not have lowered any.
         linalg.initialize_lapack()
     devices = {device.id: device for device in jax.devices()}
     client, used_devices = jax.devices()[0].client, [devices[index] for index in indices]

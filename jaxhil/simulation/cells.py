@@ -24,10 +24,10 @@ from jaxhil.simulation.motion_simulator import SimulatorState, generator_rows, m
 
 # rad per control period; for faster poles of the motion simulator, the matrix exponential loses accuracy.
 MAX_POLE = 64.0
-# Degree of the power series for each greatest cell length, which is the length times the fastest pole [rad].
-# The truncation error is below 1e-13.
+# Degree of the power series for each maximum of cell length times fastest pole [rad]. The truncation error is
+# below 1e-13.
 SERIES_DEGREES = {0.0: 1, 0.12: 8, 1.0: 16}
-CELL_LENGTH_TOLERANCE = 1e-3  # [1]; relative amount by which a cell may exceed its greatest length
+CELL_LENGTH_TOLERANCE = 1e-3  # [1]; relative amount by which a cell may exceed its maximum length
 LAG_WINDOW = 40.0  # time constants; older forces change a reading by exp(-40), which is below rounding
 MIN_LAG = 1e-12  # control periods; a force sensor with a shorter lag counts as a sensor without lag
 
@@ -35,7 +35,7 @@ MIN_LAG = 1e-12  # control periods; a force sensor with a shorter lag counts as 
 class CellCounts(NamedTuple):
     """Number of cells in each of the two parts of a sampling interval, and degree of their power series."""
 
-    plain: int  # number of cells before the window of a lagging force sensor
+    plain: int  # number of cells before the window of a force sensor with lag
     window: int  # number of cells in this window; 0 for a sensor without lag
     degree: int  # degree of the power series of the motion in a cell
 
@@ -56,7 +56,7 @@ class Cells(NamedTuple):
 
     begin: Float[Array, "cells *batch"]  # start of a cell in the sampling interval [periods]
     length: Float[Array, "cells *batch"]  # length of a cell [periods]
-    rest: Float[Array, "cells *batch"]  # time from a cell's end to the end of its part [periods]
+    remaining: Float[Array, "cells *batch"]  # time from a cell's end to the end of its part [periods]
     # Matrix from (state, command at the interval's start, command at its end) to the state at a cell's start.
     states: Float[Array, "order cells columns *batch"]
     # Matrix from (state, command, increase of the command in a period) at a cell's start to the coefficients
@@ -86,7 +86,7 @@ def count_cells(fastest: float, lags: Any) -> CellCounts:
     plain, window = _power_of_two(fastest), 0
     if np.any(lags > 0):
         shortest = float(np.min(lags))
-        # The window covers the whole part if the lag is long.
+        # If the lag is long, the window covers the whole part.
         if shortest * LAG_WINDOW >= 1:
             plain, window = 0, max(plain, _power_of_two(1 / shortest))
         else:
@@ -128,7 +128,7 @@ def fastest_pole(denominator: Any) -> np.ndarray:
         half, constant = lower[0] / 2, lower[1]
         real = np.abs(half) + np.sqrt(np.maximum(half**2 - constant, 0))
         return np.where(half**2 < constant, np.sqrt(np.abs(constant)), real)
-    # In units of the poles' geometric mean, all coefficients have similar magnitudes.
+    # Division by the poles' geometric mean gives all coefficients similar magnitudes.
     unit = np.abs(lower[-1]) ** (1 / order)
     scaled = lower / unit ** np.arange(1, order + 1)[:, None]
     companion = np.zeros((scaled.shape[1], order, order))
@@ -206,7 +206,7 @@ def bound_time_constant(time_constant: Array, control_period: Array) -> Array:
 class _CellEdges(NamedTuple):
     """Positions of the cells in one part of a sampling interval."""
 
-    # time from each edge between two cells, first and last edge included, to the end of the part [periods]
+    # time from each edge of a cell to the end of the part [periods], in the order of time
     before: Float[Array, "edges *batch"]
     length: Float[Array, "cells *batch"]  # length of each cell [periods]
 
@@ -223,9 +223,10 @@ def _divide_part(counts, whole, lag):
 
 
 def _series(generator, output, degree):
-    """Return y^(j)/j! as rows that multiply w, (degree + 1, columns, *batch).
+    """Return rows that give the power series of y = output w, where w' = generator w.
 
-    Here y = output w, w' = generator w, and w = (state, command, increase of the command in a period).
+    Here w = (state, command, increase of the command in a period). Row j, multiplied by w, gives y^(j)/j!.
+    The result has the shape (degree + 1, columns, *batch).
     """
     order, columns = generator.shape[:2]
     zero = jnp.zeros_like(output[0])

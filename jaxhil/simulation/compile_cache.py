@@ -1,10 +1,10 @@
 """Compile cache: machine code of compiled programs in checksummed files, read and written for JAX.
 
-JAX has its own cache of machine code. If zstandard is installed, this cache does not verify the content of
+JAX has its own cache of machine code. If zstandard is installed, JAX's cache does not verify the content of
 its files, so that a flipped bit is executed as machine code. JAX also never replaces a damaged file, and
 warns about the damage at every use. This module therefore replaces JAX's cache in the folders of this
-project. JAX has no public interface for this. If the private interface is missing, nothing is cached, which
-costs only time.
+project. It uses a private interface of JAX, because JAX has no public one. If that interface is missing,
+nothing is cached, which costs only time.
 """
 
 import os
@@ -55,7 +55,7 @@ def use_checksummed_cache(folder: str | os.PathLike[str]) -> bool:
                 _this_thread.key = key
 
     def get_file_cache(path: str):
-        """Return the checksummed cache for a folder of this project, else JAX's own cache."""
+        """Return the checksummed cache if the folder belongs to this project, else JAX's own cache."""
         return (ChecksummedCache(path), path) if path in _folders else original(path)
 
     if not _folders:
@@ -65,6 +65,6 @@ def use_checksummed_cache(folder: str | os.PathLike[str]) -> bool:
 
 
 def compile_with_key(lowered: Any) -> tuple[Any, str | None]:
-    """Compile a lowered program; return it with its key in the compile cache, or None if not cached."""
+    """Return a lowered program in compiled form, and its cache key; the key is None if nothing was cached."""
     _this_thread.key = None
     return lowered.compile(), _this_thread.key

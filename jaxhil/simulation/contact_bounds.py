@@ -13,9 +13,9 @@ contact's duration. Section 2 of notebooks/guide/model.md gives the reasons for 
 import math
 from typing import Any
 
-MAX_PEAK_FORCE_RATIO = 2.0  # [1]; multiple of the ideal contact's peak force
-MIN_DURATION_RATIO, MAX_DURATION_RATIO = 0.5, 2.0  # [1]; multiples of the ideal contact's duration
-# Control periods. Durations are whole numbers of periods: either end of a contact adds an error of 1.
+MAX_PEAK_FORCE_RATIO = 2.0  # [1]; maximum peak force, divided by the ideal contact's peak force
+MIN_DURATION_RATIO, MAX_DURATION_RATIO = 0.5, 2.0  # [1]; limits of the duration, divided by the ideal one
+# Control periods; maximum rounding error of a measured duration: one period at each end of the contact.
 DURATION_ROUNDING = 2
 CONTACT_BOUNDS = {
     "peak_force_ratio": MAX_PEAK_FORCE_RATIO,

@@ -21,7 +21,7 @@ from jaxhil.contact.laws import ContactLaw, ContactParameters, compute_two_sided
 from jaxhil.simulation.cells import IntervalInputs
 from jaxhil.simulation.sensors import apply_lag, lag_decay
 
-NEWTON_STEPS = 3  # number of steps of Newton's method, which starts at the root of the chord
+NEWTON_STEPS = 3  # number of Newton steps from the root of the secant
 PARABOLAS_PER_SECTION = 2  # number of parabolas that approximate the force in a section, for the sensor's lag
 # Nodes and weights of three-point quadrature on (0, 1).
 GAUSS_LEGENDRE = ((0.5 - 0.15**0.5, 5 / 18), (0.5, 4 / 9), (0.5 + 0.15**0.5, 5 / 18))
@@ -127,9 +127,9 @@ class Surfaces(NamedTuple):
 
 
 class ContactSample(NamedTuple):
-    """Real contact at one instant, at the nearer of the surfaces."""
+    """Real contact at one instant, at the nearer surface."""
 
-    distance: Float[Array, "*batch"]  # penetration of the nearer surface [m]; negative without contact
+    distance: Float[Array, "*batch"]  # penetration into the nearer surface [m]; negative without contact
     force: Float[Array, "*batch"]  # contact force [N]
     edge: Float[Array, "*batch"]  # limit of the force as the penetration goes to 0 [N]
     side: Float[Array, "*batch"]  # side of the nearer surface, 1 or -1
@@ -138,13 +138,13 @@ class ContactSample(NamedTuple):
         """Return the position of the mechanism [m]; `clearance` is the distance between two surfaces [m]."""
         if clearance is None:
             return self.distance
-        # The sample before a run (`no_contact`) may lie beyond the middle between the surfaces.
+        # The distance of the sample before a run (`no_contact`) is arbitrary: limit it to half the clearance.
         distance = jnp.maximum(self.distance, -clearance / 2)
         return jnp.where(self.side > 0, distance, -clearance - distance)
 
 
 def no_contact(like: Array) -> ContactSample:
-    """Return a contact sample without contact, in the batch shape of `like`."""
+    """Return the sample of a mechanism without contact, with the batch shape of `like`."""
     zeros = jnp.zeros_like(like)
     return ContactSample(zeros - 1, zeros, zeros, zeros + 1)
 
@@ -193,7 +193,8 @@ def largest_force(
 ) -> Float[Array, "*batch"]:
     """Return the largest |force| [N] within a sampling interval.
 
-    Candidates are both ends, and the vertex of the parabola through the forces at the ends and in the middle.
+    It is the largest value at both ends and at the vertex of a parabola through the forces at the ends and in
+    the middle.
     """
 
     def magnitude(motion, s):
@@ -278,18 +279,18 @@ def _force_along(surfaces, start, end, duration, s):
 
 
 class _SectionContact(NamedTuple):
-    """Begin and end of the contact in a section of motion."""
+    """Beginning and end of the contact in a section of motion."""
 
     touches: Array  # whether there is contact in the section
     side: Array  # side of the surface, 1 or -1
     begin: Array  # fraction of the section at which the contact begins
     end: Array  # fraction of the section at which the contact ends
-    # whether the contact begins, and whether it ends, within the section at zero penetration
+    # for the beginning and the end: whether it is within the section, at zero penetration
     at_surface: tuple[Array, Array]
 
 
 def _find_section_contact(surfaces, start, end, duration):
-    """Find begin and end of the contact in a section of motion.
+    """Find the beginning and the end of the contact in a section of motion.
 
     The contact lasts while both the penetration and the contact law's function `hold` are positive. `hold`
     becomes negative if the force vanishes while there is still a penetration.

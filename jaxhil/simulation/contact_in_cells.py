@@ -1,10 +1,10 @@
 """Real contact in one sampling interval, from the exact motion: sensor lag, work, peak force, duration.
 
 Each cell (`jaxhil.simulation.cells`) is divided into pieces of monotone motion, at the instants at which the
-motion reverses. A piece is divided into spans: at the surface, where the slope of the contact law changes,
-and where the force vanishes. In each span the force is a smooth function, which Gauss-Legendre quadrature
-integrates. All cells are computed in parallel. Only the state of a contact law with memory is passed from
-cell to cell.
+motion reverses. Each piece is divided into spans at the surface, at the points at which the slope of the
+contact law changes, and at the points at which the force vanishes. In each span the force is a smooth
+function, which Gauss-Legendre quadrature integrates. All cells are computed in parallel. Only the state of a
+contact law with memory is passed from cell to cell.
 """
 
 import functools
@@ -37,16 +37,16 @@ class QuadratureRule(NamedTuple):
     weights: np.ndarray  # weights of the function values at the nodes
 
     def nodes_and_ends(self, dtype: Any) -> np.ndarray:
-        """Return the nodes, preceded by a point just above 0 and followed by a point just below 1.
+        """Return the nodes, with an additional point just above 0 and one just below 1.
 
-        At the two added points, a force that jumps at the ends of (0, 1) has its limits from inside.
+        At the additional points, a force that jumps at 0 or 1 has its one-sided limits.
         """
         inside = np.finfo(dtype).eps ** 0.5
         return np.concatenate([[inside], self.nodes, [1 - inside]]).astype(dtype)
 
 
 def _build_quadrature(number: int) -> QuadratureRule:
-    """Return a rule of `number` nodes for forces that begin or end as a power of the penetration."""
+    """Return a rule with `number` nodes, for forces that are powers of the penetration near their ends."""
     nodes, weights = np.polynomial.legendre.leggauss(number)
     unit = (nodes + 1) / 2
     # The slope of the substitution p -> 3 p^2 - 2 p^3 is 0 at both ends, so that powers of the penetration
@@ -106,14 +106,14 @@ def contact_in_cells(
 
     # Each branch returns distinct arrays: without optimisation, XLA confuses results that share an array.
     def touches(state):
-        """Return the results of the contact, and the contact law's states at the sample and at the end."""
+        """Return contact results and law states (at sample and end) if a lane may be in contact."""
         pieces = split_at_reversals(build_cell_motion(series, cells.length))
         states, at_sample, at_end = _compute_law_states(touch, state, pieces, period)
         parts = [_compute_side_contact(touch, states, pieces, side, period, rates) for side in _sides(touch)]
         return _sum_surfaces(parts), jax.tree.map(lambda *leaves: jnp.stack(leaves), at_sample, at_end)
 
     def free(state):
-        """Return the results, all 0, and the contact law's states for an interval without contact."""
+        """Return results of 0 and the initial law states if no lane is in contact."""
         fresh = touch.law.init(jnp.zeros_like(lagged))
         numbers = jnp.zeros((_RESULT_COUNT, *lagged.shape), lagged.dtype)
         return numbers, jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), fresh)
@@ -148,7 +148,7 @@ def compute_jump_work(
 class _SurfaceContribution(NamedTuple):
     """Results of the contact at one surface in a sampling interval."""
 
-    # addition to the output of the force sensor's lag at the sampling instant and at the interval's end [N]
+    # contribution to the lag's output at the sampling instant and at the interval's end [N]
     readings: tuple[Array, Array]
     work: tuple[Array, Array]  # work done on the mechanism and work returned by it [J]
     peak: Array  # largest |force| [N]
@@ -156,7 +156,7 @@ class _SurfaceContribution(NamedTuple):
 
 
 def _sum_surfaces(parts: list[_SurfaceContribution]) -> Array:
-    """Combine the results of all surfaces in one array, (results, *batch), with the peak force last."""
+    """Return an array (results, *batch): sums for all surfaces, and the largest peak force last."""
     sums = [jnp.stack([*part.readings, *part.work, *part.contact_time]) for part in parts]
     peak = functools.reduce(jnp.maximum, [part.peak for part in parts])
     return jnp.concatenate([functools.reduce(jnp.add, sums), peak[None]])
@@ -196,8 +196,8 @@ class _SensorRates(NamedTuple):
 
     # durations of the parts before and after the sampling instant [time constants of the lag]
     part_durations: tuple[Array, Array]
-    rate: Array  # control period over the lag's time constant [1]
-    rest: Array  # time from a cell's end to the end of its part [periods]
+    rate: Array  # control period, divided by the lag's time constant [1]
+    remaining: Array  # time from a cell's end to the end of its part [periods]
 
 
 def _sensor_rates(cells, period, time_constant) -> _SensorRates | None:
@@ -206,9 +206,9 @@ def _sensor_rates(cells, period, time_constant) -> _SensorRates | None:
         return None
     rate = period / bound_time_constant(time_constant, period)
     half = cells.length.shape[0] // 2
-    first = cells.rest[0] + cells.length[0]
-    second = cells.rest[half] + cells.length[half]
-    return _SensorRates((first * rate, second * rate), rate, cells.rest)
+    first = cells.remaining[0] + cells.length[0]
+    second = cells.remaining[half] + cells.length[half]
+    return _SensorRates((first * rate, second * rate), rate, cells.remaining)
 
 
 def _decay_reading(lagged, rates, readings):
@@ -295,7 +295,7 @@ def _lag_contributions(rates, path, impulses, arguments):
     if rates is None:
         zeros = jnp.zeros(path.length.shape[1:], path.length.dtype)
         return zeros, zeros
-    age = rates.rest + (1 - arguments) * path.length
+    age = rates.remaining + (1 - arguments) * path.length
     remaining = jnp.sum(impulses * jnp.exp(-age * rates.rate) * rates.rate, axis=(0, 1, 2))
     return _sum_by_part(remaining)
 
@@ -307,7 +307,10 @@ def _sum_by_part(values):
 
 
 def _find_largest_force(force, arguments, begin, width, magnitudes):
-    """Return the largest |force| [N] in a span, at a node or at the vertex of a parabola near this node."""
+    """Return the largest |force| [N] in a span, from the values at the nodes (`magnitudes`).
+
+    It may lie between nodes: a parabola through the largest value and its two neighbours is included.
+    """
     middle = jnp.clip(jnp.argmax(magnitudes, axis=0), 1, len(arguments) - 2)[None]
 
     def at(offset):

@@ -153,14 +153,14 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
     fields = {"Date": None} if target.suffix.lower() == ".svg" else fields
     fields = {"Software": None} if target.suffix.lower() == ".png" else fields
     with rc_context({"svg.hashsalt": "jaxhil"}), warnings.catch_warnings():
-        # Characters of the title that the font does not have are drawn as boxes; this needs no warning.
+        # Matplotlib warns about characters that the font lacks, and draws boxes; suppress the warning.
         warnings.filterwarnings("ignore", r"Glyph \d+", UserWarning)
         figure.savefig(content, dpi=120, metadata=fields, format=target.suffix[1:].lower())
     write_atomically(target, content.getvalue())
 
 
 def _panel_title(motion: RunMotion) -> str:
-    """Return the title of a contact's panel: name, approach speed, and curves with another approach speed."""
+    """Return the title of a contact's panel: name, approach speed, and the speeds of curves that differ."""
     speed = motion.curves["in space"].velocity
     text = f"{motion.name}, entered at {1e3 * speed:.3g} mm/s"
     for name, curve in motion.curves.items():

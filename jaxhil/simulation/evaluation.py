@@ -24,10 +24,10 @@ from jaxhil.simulation import cached_programs
 from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS, TICK_OPTIONS
 from jaxhil.simulation.outcome import Outcome
 
-TILE_SIZE = 64  # lanes per tile; more lanes do not fit into the first-level cache of a core
-MIN_TILE_SIZE = 16  # lanes per tile of a small batch
+TILE_SIZE = 64  # maximum number of lanes per tile: more do not fit into a core's first-level cache
+MIN_TILE_SIZE = 16  # minimum number of lanes per tile, for small batches
 DEVICE_AXIS = PartitionSpec("device")  # distributes arrays along their leading axis, one entry per device
-# Tiles per delay from which lanes are sorted by delay. With fewer tiles, durations in a tile differ too much.
+# Minimum number of tiles per delay: if there are fewer, lanes are sorted by expected duration only.
 MIN_TILES_PER_DELAY = 8
 
 
@@ -46,12 +46,13 @@ class RigModel(abc.ABC):
     The methods of a model accept only scenarios and loops that the same model has built. A model has no
     state; all instances of a class are equal.
 
-    A run is one contact on a rig with one axis, and one episode on a rig with six axes.
+    A run is one contact on a rig with one axis. On a rig with six axes it is one episode: a contact with all
+    its touches.
     """
 
     axes: ClassVar[int]  # number of axes, 1 or 6
     run_name: ClassVar[str]  # name of a run in messages: "contact" or "episode"
-    # names of the errors of a run; an outcome contains all runs' first errors, then all runs' second errors
+    # names of a run's error metrics; an outcome contains the first metric of all runs, then the second
     errors: ClassVar[tuple[str, ...]]
     verdict_error: ClassVar[str]  # name of the error that tuning minimises and to which limits apply
     compiler_options: ClassVar[Mapping[str, int | str]] = ROLLOUT_OPTIONS  # compiler options for batches
@@ -77,7 +78,7 @@ class RigModel(abc.ABC):
 
     @abc.abstractmethod
     def runs(self, mechanism: Any) -> int:
-        """Return the number of contacts or episodes in a scenario of this mechanism."""
+        """Return the number of runs (contacts, or six-axis episodes) in a scenario of this mechanism."""
 
     @abc.abstractmethod
     def run(self, loop: Any, gains: Gains, scenario: Any) -> Outcome:
@@ -85,7 +86,7 @@ class RigModel(abc.ABC):
 
     @abc.abstractmethod
     def at_rest(self, scenarios: Any, idle: np.ndarray) -> Any:
-        """Return a copy of the scenarios in which the `idle` lanes, which only fill a tile, have no runs."""
+        """Return a copy of the scenarios without runs in the `idle` lanes, which only fill a tile."""
 
     @abc.abstractmethod
     def expected_duration(self, scenarios: Any) -> np.ndarray:
@@ -104,7 +105,7 @@ class RigModel(abc.ABC):
 
     @abc.abstractmethod
     def with_compensator(self, loop: Any, compensator: str) -> Any:
-        """Return a copy of the loop with another compensator."""
+        """Return a copy of the loop with the given compensator."""
 
     @abc.abstractmethod
     def compensator_name(self, loop: Any) -> str:
@@ -131,7 +132,7 @@ class RigModel(abc.ABC):
         return jnp.ones_like(rig.control_period)
 
     def by_error(self, outcome: Outcome) -> dict[str, Outcome]:
-        """Split an outcome into one outcome per error, by the name of the error."""
+        """Split an outcome into one outcome for each error metric, by name."""
         runs = len(outcome.error) // len(self.errors)
         return {
             name: jax.tree.map(lambda leaf, first=first: leaf[first : first + runs], outcome)
@@ -174,7 +175,7 @@ class RigModel(abc.ABC):
         assignment = self._assign_tiles(scenarios, at_least)
         positions = np.empty_like(assignment.lane, shape=count_lanes(scenarios))
         positions[assignment.lane[~assignment.idle]] = np.flatnonzero(~assignment.idle)
-        # All leaves are placed explicitly: JAX would compile another program for arrays placed otherwise.
+        # Place every leaf explicitly: for any other placement, JAX would compile the program again.
         arranged = self._arrange_scenarios(assignment, scenarios)
         return Batch(_place_leaves(arranged, DEVICE_AXIS), assignment, positions)
 
@@ -197,8 +198,9 @@ class RigModel(abc.ABC):
     ) -> tuple[dict[str, Any], dict[str, Any], Any]:
         """Arrange scenarios and gains in tiles; return the arguments of `run_tiles`.
 
-        These are the gains common to all lanes, the gains with one value per lane, and the scenarios. Arrays
-        with one value per lane have the shape (devices, tiles, ..., lanes of a tile), padded with idle lanes.
+        The arguments are the gains common to all lanes, the gains with one value per lane, and the scenarios.
+        Arrays with one value per lane are padded with idle lanes and have the shape
+        (devices, tiles, ..., lanes of a tile).
         """
         assignment = self._assign_tiles(scenarios, at_least)
         return *_arrange_gains(assignment, scenarios, gains), self._arrange_scenarios(assignment, scenarios)
@@ -216,8 +218,8 @@ class RigModel(abc.ABC):
         tile = TILE_SIZE
         while tile > MIN_TILE_SIZE and tile * devices >= 2 * capacity:
             tile //= 2
-        # Few different numbers of tiles mean few compiled programs: powers of two up to 16 tiles per device,
-        # then multiples of 16.
+        # Round the number of tiles per device up to a power of two or, above 16, to a multiple of 16: each
+        # number needs its own compiled program.
         tiles = -(-capacity // (tile * devices))
         tiles = 1 << (tiles - 1).bit_length() if tiles <= 16 else -(-tiles // 16) * 16
         lanes = tiles * tile * devices
@@ -231,7 +233,7 @@ class RigModel(abc.ABC):
         )
 
     def _sort_lanes(self, scenarios: Any) -> np.ndarray:
-        """Sort lane indices by delay, if there are enough lanes per delay, and by expected duration."""
+        """Sort lane indices by expected duration and, if there are enough lanes per delay, first by delay."""
         duration, delays = self.expected_duration(scenarios), self.whole_delays(scenarios)
         if MIN_TILES_PER_DELAY * TILE_SIZE * len(np.unique(delays)) > len(delays):
             delays = np.zeros_like(delays)

@@ -15,12 +15,11 @@ from jaxhil.simulation.loop_state import LoopState
 from jaxhil.simulation.motion_simulator import apply_row, steady_state
 from jaxhil.simulation.watch import Watch
 
-APPROACH_TIME = 0.02  # s; duration of the free approach before a contact, without its phase
-# [1]; deviation from the steady state, as a fraction of the distance flown in a control period. Below this
-# fraction the motion simulator counts as settled.
+APPROACH_TIME = 0.02  # s; duration of the approach before a contact, to which a part of a period is added
+# [1]; maximum deviation of a settled motion simulator from its steady state, divided by the distance that it
+# moves in a control period.
 SETTLING_TOLERANCE = 1e-6
-# [1]; change of the speed in a control period, as a fraction of the speed. Below this fraction the numerical
-# model counts as free.
+# [1]; maximum change of a freely flying model's speed in a control period, divided by the speed.
 FREE_FLIGHT_TOLERANCE = 1e-12
 
 
@@ -36,9 +35,10 @@ def begin_approach(
 ) -> tuple[LoopState, Int[Array, "*batch"]]:
     """Return the state at the start of a run, and the number of skipped control periods.
 
-    The approach starts at the position x_d = min(surface, 0) - v (0.02 s + phi T), where phi is the phase and
-    T the control period. With `skip_flight`, and if nothing can happen before the contact, the simulation
-    starts only two control periods before the hardware touches the surface.
+    The numerical model starts at x_d = min(p, 0) - v (0.02 s + phi T). Here p is the position of the
+    hardware's surface, v the approach speed, T the control period, and phi the phase: a fraction of T. With
+    `skip_flight`, a flight in which nothing can happen is skipped. Only its last two control periods before
+    the hardware touches the surface are simulated.
     """
     nearer = jnp.minimum(rig.scenario.contact_plane, 0)
     position = nearer - velocity * (APPROACH_TIME + phase * rig.constants.control_period)
@@ -57,10 +57,10 @@ def begin_approach(
 def advance_to_surface(
     loop: Loop, rig: RigConstants, gains: Gains, state: LoopState, watch: Watch, command: Array, tick: Array
 ) -> tuple[LoopState, Bool[Array, "*batch"]]:
-    """Return the state shortly before the opposite surface is reached, and whether each lane may use it.
+    """Return the state shortly before the next touch of a surface, and whether each lane may skip to it.
 
-    The state lies a whole number of control periods ahead. A lane may use the state if the lane flies freely:
-    its motion simulator has settled, and no force acts. `command` is |F_c| [N].
+    The state is a whole number of control periods later. A lane may skip to it if the lane flies freely: its
+    motion simulator has settled, and no force acts. `command` is |F_c| [N].
     """
     scenario, period = rig.scenario, rig.constants.control_period
     velocity, position = state.velocity, state.position
@@ -76,7 +76,7 @@ def advance_to_surface(
         # Time is in control periods, so that all components of the state have similar magnitudes.
         scale = jnp.abs(rig.propagation.steady_command[0] * stride)
         follows = follows & (jnp.abs(component - steady) <= SETTLING_TOLERANCE * scale)
-    # Flight is not uniform while a force command, for example due to noise, accelerates the model.
+    # A force command, for example due to noise, accelerates the model: the flight is not uniform.
     push = command * period / scenario.equivalent_mass
     still = push <= FREE_FLIGHT_TOLERANCE * jnp.abs(velocity)
     return arrived, follows & still & (periods >= 1)

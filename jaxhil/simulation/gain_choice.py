@@ -1,4 +1,4 @@
-"""Choice of a compensator's gains: rule of the literature, named setting, dict, or gain file."""
+"""Choice of a compensator's gains: literature values, named setting, dict, or gain file."""
 
 import math
 import os
@@ -21,14 +21,14 @@ def choose_gains(mechanism: AnyMechanism, compensator: object, gains: object) ->
     Args:
         mechanism: Mechanism that the compensator will control.
         compensator: Name of the compensator. With a gain file, "none" selects the compensator of the file.
-        gains: One of the following. None: all gains by the rule of the literature. Text that names a setting
-            of the compensator: the gains of this setting. Dict: values of some gains; the others are by the
-            rule of the literature. Path, or text with a separator or a suffix or the name of an existing
-            file: the gains of this gain file.
+        gains: One of the following. None: all gains have the values that the literature recommends. Name of
+            a setting of the compensator: the gains of this setting. Dict: values of some gains; the others
+            have the values of the literature. Path of a gain file: the gains of this file. A text is a path
+            if it has a separator or a suffix, or if it names an existing file.
 
     Raises:
         InputError: The compensator, the setting or a gain is unknown; a value is out of its bounds; or the
-            gain file is invalid, or is for another compensator, control period or number of axes.
+            gain file is invalid, or is for a different compensator, control period or number of axes.
     """
     law = find_compensator(compensator, "", axes_of(mechanism))
     if gains is None:
@@ -53,9 +53,7 @@ def check_fit(mechanism: AnyMechanism, loaded: LoadedGains, label: str) -> None:
     """
     period, tuned = mechanism.rig.control_period, loaded.mechanism.rig.control_period
     if period != tuned:
-        raise InputError(
-            f"{label}: control_period: found {tuned:g} s, expected {period:g} s of the mechanism"
-        )
+        raise InputError(f"{label}: control_period: found {tuned:g} s, expected the mechanism's {period:g} s")
     for gain in find_compensator(loaded.compensator, label, axes_of(mechanism)).gains:
         value = loaded.gains[gain.name]
         lower, upper, margin = resolve_gain_bounds(gain, mechanism)
@@ -79,7 +77,7 @@ def _is_path(text: str) -> bool:
 def _complete_gains(
     mechanism: AnyMechanism, law: Compensator | SixAxisCompensator, choice: Mapping[Any, Any]
 ) -> dict[str, float]:
-    """Return the gains of a dict, completed with those from the literature."""
+    """Return the gains of a dict; missing gains have the values of the literature."""
     gains = literature_gains(mechanism, law.name)
     specifications = {gain.name: gain for gain in law.gains}
     for name, value in choice.items():
@@ -114,11 +112,11 @@ def _read_gains(
     label = to_one_line(os.fsdecode(path)) or "''"
     loaded = load_gain_file(os.fsdecode(path), any_axes=True)
     if isinstance(loaded.mechanism, Mechanism) != isinstance(mechanism, Mechanism):
-        found, allowed = f"gains of {_describe_axes(loaded.mechanism)}", f"of {_describe_axes(mechanism)}"
+        found, allowed = (f"gains for {_describe_axes(item)}" for item in (loaded.mechanism, mechanism))
         raise InputError(f"{label}: axes: found {found}, expected {allowed}")
     if law.name not in ("none", loaded.compensator):
         found = f"compensator: found {law.name}, expected {loaded.compensator}"
-        raise InputError(f"{found}, which {label} is for")
+        raise InputError(f"{found}, because {label} contains gains for it")
     check_fit(mechanism, loaded, label)
     return loaded.compensator, loaded.gains
 

@@ -23,7 +23,7 @@ from jaxhil.rig.gain_file import check_gain_document, read_gain_document
 from jaxhil.rig.registry import COMPENSATORS as RUNTIME_COMPENSATORS
 from jaxhil.rig.registry import GainSpecification
 
-# [1]; relative tolerance, because bounds may be rounded differently on another machine
+# [1]; relative tolerance of bounds, which other machines may round differently
 BOUND_TOLERANCE = 1e-9
 
 
@@ -72,7 +72,7 @@ def check_document(
         raise InputError(str(error)) from None
     for key, (fits, allowed) in _REQUIRED_KEYS.items():
         if key not in document:
-            raise _make_error(source, key, "nothing", "this key is required")
+            raise _make_error(source, key, "nothing", allowed)
         if not fits(document[key]):
             raise _make_error(source, key, format_value(document[key]), allowed)
     read = any_from_plain_data if axes == 6 else from_plain_data
@@ -113,7 +113,7 @@ def resolve_gain_bounds(gain: Gain, mechanism: Any) -> tuple[float, float, float
 
 
 def _gains_without_runtime(axes: int) -> dict[str, dict[str, GainSpecification]]:
-    """Return the gain specifications of all compensators with no class for the rig, by compensator."""
+    """Return the gain specifications of the compensators that run in the simulation only, by name."""
     return {
         name: {gain.name: GainSpecification(gain.unit) for gain in law.gains}
         for name, law in (SIX_AXIS_COMPENSATORS if axes == 6 else COMPENSATORS).items()
@@ -164,8 +164,8 @@ def _is_table_of_texts(value: object) -> bool:
     return isinstance(value, Mapping) and all(isinstance(text, str) for text in value.values())
 
 
-# Keys of a gain file that the rig's controller does not check, each with a check of its value and a text that
-# describes valid values.
+# Keys of a gain file that only this module checks: function that returns whether a value is valid, and
+# description of valid values.
 _REQUIRED_KEYS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "mechanism_sha256": (
         lambda value: isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value) is not None,

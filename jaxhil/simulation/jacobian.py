@@ -34,11 +34,11 @@ from jaxhil.simulation.run import ContactResult, check_seed
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 GAIN_PREFIX = "gains."
-# These results have no derivative: durations are whole numbers of ticks, and the status is a text.
+# Results without a derivative: durations are whole numbers of ticks, and the status is a text.
 NOT_DIFFERENTIABLE = ("duration", "duration_ratio", "status")
 DIFFERENTIABLE_RESULTS = tuple(name for name in ContactResult._fields if name not in NOT_DIFFERENTIABLE)
 _QUANTUM_KEYS = ("rig.force_sensor.quantum", "rig.position_sensor.quantum")
-# With the value 0, the effect is absent from the simulated rig, and only a one-sided derivative exists.
+# Keys whose value must not be 0: at 0 the rig does not have the effect, and the derivative is one-sided.
 _KEYS_WITH_CORNER_AT_0 = ("rig.force_sensor.time_constant", "rig.force_sensor.dead_zone")
 # Added to the values of the keys when the loop is built, so that the loop contains effects whose value is 0.
 _KEY_INCREMENT = 1e-9
@@ -66,8 +66,8 @@ def jacobian(
     The derivative for a contact includes the effect of `by` on all earlier contacts. A contact that did not
     end normally has the derivative NaN.
 
-    The program is differentiated exactly, but one effect is missing: a damped contact begins with a jump of
-    the force, and the tick at which the sensor reads this jump counts as constant.
+    The derivative is exact, with one exception: a damped contact begins with a jump of the force, and the
+    tick at which the sensor reads this jump is assumed to be constant.
 
     Args:
         mechanism: Mechanism, name of a built-in mechanism, or path of a mechanism file.
@@ -80,12 +80,12 @@ def jacobian(
         seed: Seed of the sensors' noise.
 
     Returns:
-        Array of shape (contacts,) for each entry of `by`, in the unit of `of` divided by the unit of `by`.
+        Dict: for each entry of `by`, an array (contacts,), in the unit of `of` divided by the entry's unit.
 
     Raises:
         InputError: `of` or an entry of `by` is unknown; a parameter is not a finite real number; or the run
             is not differentiable, because a sensor quantises its readings, or because the parameter is a
-            dead zone or a sensor time constant of 0.
+            dead zone or a time constant of a sensor and its value is 0.
 
     Example:
         >>> import jaxhil
@@ -133,7 +133,7 @@ def _check_no_quantum(mechanism: Mechanism) -> None:
 
 
 def _parse_variable(mechanism: Mechanism, law: Compensator, path: object) -> _Variable:
-    """Return the variable that `path`, an entry of `by`, names; raise `InputError` if it is unusable."""
+    """Return the variable with the given `path`; raise `InputError` if there is no derivative for it."""
     if isinstance(path, str) and path.startswith(GAIN_PREFIX):
         gain, names = path.removeprefix(GAIN_PREFIX), [gain.name for gain in law.gains]
         if gain not in names:
@@ -153,15 +153,15 @@ def _parse_variable(mechanism: Mechanism, law: Compensator, path: object) -> _Va
     if key not in numeric_keys() or key in _QUANTUM_KEYS:
         names = [k for k in numeric_keys() if not k.startswith("uncertainty") and k not in _QUANTUM_KEYS]
         allowed = f"the path of a real number{suggest_names(key, [*names])}"
-        raise _make_error(path, "no parameter with a derivative", allowed)
+        raise _make_error(path, "a path without a derivative", allowed)
     value = value_at(mechanism, key)
     if value is None or value == [] or (isinstance(value, float) and not np.isfinite(value)):
-        raise _make_error(path, f"{format_value(value)} as its value", "a key with a finite value")
+        raise _make_error(path, format_value(value), "a key with a finite value")
     if key in _KEYS_WITH_CORNER_AT_0 and value == 0.0:
-        raise _make_error(path, "0 as its value", "a number > 0: the derivative at 0 is one-sided")
+        raise _make_error(path, "0", "a value > 0: the derivative at 0 is one-sided")
     shape = np.shape(value)
     if len(entry) > len(shape) or any(index >= size for index, size in zip(entry, shape, strict=False)):
-        raise _make_error(path, f"a value of shape {shape}", "indices within this shape")
+        raise _make_error(path, f"indices outside the shape {shape} of the value", "indices within it")
     return _Variable(None, key, entry)
 
 
@@ -183,7 +183,7 @@ def _build_complete_loop(
 def _build_draws(mechanism: Mechanism, variables: list[_Variable], increments: Any) -> dict[str, Any]:
     """Return values of the parameters in one lane per variable, by dotted path.
 
-    In its own lane, a variable has its nominal value plus its entry of `increments`, (variables,).
+    In lane i, variable i is its nominal value plus `increments[i]`; all other values are nominal.
     """
     # If all variables are gains, this entry alone determines the number of lanes.
     draws: dict[str, Any] = {"approach.phase": np.full(len(variables), mechanism.approach.phase)}
@@ -200,10 +200,9 @@ def _build_draws(mechanism: Mechanism, variables: list[_Variable], increments: A
 def _perturb_scenarios(
     mechanism: Mechanism, variables: list[_Variable], gains: dict[str, float], seed: int
 ) -> tuple[Gains, Gains, Scenario, Scenario]:
-    """Return gains and scenarios with one lane per variable, and their derivatives.
+    """Return gains, their derivatives, scenarios, and their derivatives, with one lane per variable.
 
-    The order is gains, derivatives of the gains, scenarios, derivatives of the scenarios. Each lane has the
-    derivatives with respect to its own variable.
+    The derivatives in lane i are those with respect to variable i.
     """
     lanes = len(variables)
     values = {name: jnp.full(lanes, value) for name, value in gains.items()}

@@ -20,7 +20,7 @@ from jaxhil.simulation import jax_startup
 from jaxhil.simulation.compile_cache import use_checksummed_cache
 
 CACHE_VARIABLE = "JAXHIL_CACHE"  # environment variable with the folder of compiled programs
-# Least severity of XLA's messages on standard error. XLA reports slow compilation as an error, which would
+# Minimum severity of XLA's messages on standard error. XLA reports slow compilation as an error, which would
 # confuse users; real errors are also raised as exceptions.
 LOG_LEVEL_VARIABLE, FATAL_LOG_LEVEL = "TF_CPP_MIN_LOG_LEVEL", "3"
 DEVICE_COUNT_FLAG = "--xla_force_host_platform_device_count"
@@ -38,10 +38,10 @@ CACHE_SETTINGS = {
 # Compiler options of programs that run ticks: use the processor's widest vectors, and copy the state less
 # often between ticks.
 TICK_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_copy_insertion_use_region_analysis": True}
-# Compiler options of batches without derivatives: `TICK_OPTIONS`, and each array is computed by its own loop.
-# Batches become twice as fast, but a Jacobian would take three times as long.
+# Compiler options of batches without derivatives: `TICK_OPTIONS`, and a separate loop for each array. They
+# double the speed of such a batch. A Jacobian would take three times as long, and is compiled without them.
 ROLLOUT_OPTIONS = {**TICK_OPTIONS, "xla_disable_hlo_passes": "cpu_multi_output_fusion"}
-# Compiler options for six axes, with hundreds of arrays: the older of XLA's two loop emitters is 10 % faster.
+# Compiler options for six axes: with hundreds of arrays, loops of XLA's older code generator are 10 % faster.
 SIX_AXIS_OPTIONS = {**ROLLOUT_OPTIONS, "xla_cpu_use_fusion_emitters": False}
 # The same with derivatives, where it also compiles in three quarters of the time.
 SIX_AXIS_DERIVATIVE_OPTIONS = {**TICK_OPTIONS, "xla_cpu_use_fusion_emitters": False}
@@ -51,7 +51,7 @@ SINGLE_RUN_OPTIONS = {
     "xla_llvm_disable_expensive_passes": True,
     "xla_cpu_use_fusion_emitters": False,
 }
-# An option of LLVM to unroll loops completely or not at all, and the versions of jaxlib tested with it. An
+# Option of LLVM to unroll loops completely or not at all, and versions of jaxlib for which it was tested: an
 # option that LLVM does not know would end the process.
 FULL_UNROLL_OPTION, TESTED_JAXLIB_VERSIONS = "-unroll-allow-partial=false", ("0.10.",)
 # Settings that switch off JAX's debugging modes, even if the user's environment variables switch them on.
@@ -98,7 +98,7 @@ def prepare_jax() -> None:
 def jax_context() -> Iterator[None]:
     """Use float64 and the folder of compiled programs within this context and thread.
 
-    Start JAX if it does not run yet (`start_jax`). Restore the caller's settings at the end of the context.
+    Start JAX unless it runs already (`start_jax`). Restore the caller's settings at the end of the context.
     """
     start_jax()
     thresholds = gc.get_threshold()
@@ -220,7 +220,7 @@ def active_xla_flags() -> str:
 def rounding_flags(flags: str) -> str:
     """Return, sorted, the XLA flags that may change the last bits of a result.
 
-    These are all flags except the flag for the number of devices, if this number is at least 2.
+    The flag for the number of devices is included only if the number is 1. All other flags are included.
     """
     alone = f"{DEVICE_COUNT_FLAG}=1"
     return " ".join(sorted(flag for flag in flags.split() if DEVICE_COUNT_FLAG not in flag or flag == alone))
@@ -236,11 +236,11 @@ def build_xla_flags(user_flags: str) -> str:
         user_flags = jax_startup.read_xla_flags(user_flags)
     ours = {
         DEVICE_COUNT_FLAG: max(MIN_DEVICES, count_usable_cores()),
-        # This level takes a third of the compile time, and the programs are not slower.
+        # This level reduces the compile time to a third, and the programs are not slower.
         "--xla_backend_optimization_level": 1,
         # With these options, the loop over ticks becomes one function that computes several arrays at a time,
-        # instead of about 60 function calls per tick. The time of a tick and the compile time are halved; a
-        # gradient takes a third of the time.
+        # instead of about 60 function calls per tick. This halves run time and compile time, and divides the
+        # time of a gradient by three.
         "--xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=1000000000,"
         "xla_cpu_use_multi_output_fusion",
     }
@@ -290,10 +290,10 @@ def count_usable_cores() -> int:
 
 @contextmanager
 def use_half_the_cores(half: int) -> Iterator[None]:
-    """Restrict this thread to one half of the usable cores, 0 or 1, within this context.
+    """Restrict this thread to one half of the usable cores within this context; `half` (0 or 1) selects it.
 
-    Use it for work in a thread beside a program that runs on all devices. The operating system usually leaves
-    a thread on its core, so that such work always delays the same device, and the other devices wait. If
+    It is meant for a thread that works while a program runs on all devices. The operating system usually
+    leaves a thread on its core. The thread then always delays the same device, and the other devices wait. If
     successive tasks alternate between both halves of the cores, the delay is shared by all devices.
     """
     usable = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
@@ -313,7 +313,7 @@ def _restrict_to_cores(cores: Collection[int]) -> None:
 
 
 def cache_folder() -> Path | None:
-    """Return the folder $JAXHIL_CACHE or ~/.cache/jaxhil, created if missing; None if not writable."""
+    """Return the folder $JAXHIL_CACHE (default ~/.cache/jaxhil), created if missing; None if not writable."""
     try:
         folder = Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "jaxhil")
         folder.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ from jaxhil.files import open_input
 MAX_REASON_LENGTH = 300  # characters; longer texts of XLA and JAX are shortened in our messages
 
 _FLAG_TEST_CODE = "import jax; jax.jit(lambda: 0)()"
-# Message that XLA writes before it ends the process.
+# Format of the message that XLA writes before it ends the process.
 _LOG_LINE = re.compile(r"[EF]\d{4} .*?\] (.*)|(xla: .*)")
 # Ids of processes that have started JAX: this process, and the process from which this process was forked.
 _processes: set[int] = set()
@@ -83,8 +83,8 @@ def convert_jax_error(error: Exception) -> InputError:
 
 
 def check_not_forked() -> None:
-    """Raise `InputError` if this process was forked from a process that runs JAX; it would hang."""
+    """Raise `InputError` if this process was forked from one that runs JAX, because JAX would hang here."""
     _processes.add(os.getpid())
     if len(_processes) > 1:
-        allowed = 'one begun by spawn: multiprocessing.get_context("spawn")'
-        raise InputError(f"process: found one forked after jax had started, expected {allowed}")
+        allowed = 'a spawned one: use multiprocessing.get_context("spawn")'
+        raise InputError(f"process: found a process forked after the start of JAX, expected {allowed}")

@@ -67,8 +67,8 @@ class Loop(eqx.Module):
         """Return whether the approach to a contact is uniform motion without any event, and can be skipped.
 
         This requires that readings have no noise, bias or quantisation, that the motion simulator has no
-        limits, and that the compensator does nothing before the contact. There must be no probe either,
-        because its time starts at x_d = 0.
+        limits, and that the compensator does nothing before the contact. It also requires that the scenarios
+        have no `Probe`, whose time starts at x_d = 0.
         """
         uneven = self.reads_always or self.has_position_noise or self.has_sample_effects or self.has_limits
         waits = vars(type(self.compensator)).get("waits_for_contact", False)
@@ -76,7 +76,7 @@ class Loop(eqx.Module):
 
     @property
     def first_tick(self) -> int:
-        """Return the number of the first tick, so large that indices into delay lines are not negative."""
+        """Return the number of the first tick: large enough that no index into a delay line is negative."""
         return max(self.ring, self.controller_ring)
 
     @property
@@ -98,15 +98,14 @@ class Loop(eqx.Module):
 class Delays(NamedTuple):
     """Delays of a loop, in sampling intervals.
 
-    With one surface, the contact law is evaluated as soon as the motion is known. This is earlier than the
-    motion itself by the transport delay. With two surfaces, the parameters of the contact law may change
-    before the motion takes place. The contact law is then evaluated when the motion takes place, and the
-    delay of the force reading counts from this evaluation.
+    With one surface, the contact law is evaluated as soon as the motion is computed: one transport delay
+    before the motion takes place. With two surfaces, the parameters of the contact law may change in this
+    time. The law is then evaluated when the motion takes place, and the force's delay counts from there.
     """
 
     force: SplitDelay  # delay of the force reading
     position: SplitDelay  # delay of the position reading
-    real: Int[Array, "*batch"]  # age of the newest computed force that acts before the current tick
+    real: Int[Array, "*batch"]  # age of the last computed force that acts before the current tick
     contact: Int[Array, "*batch"]  # delay of the contact law's evaluation
 
 

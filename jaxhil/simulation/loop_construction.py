@@ -14,14 +14,14 @@ from jaxhil.simulation.cells import MAX_POLE, NO_CELLS, CellCounts, count_cells,
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.scenario import Scenario
 
-MIN_RING_LENGTH = 16  # samples; least length of a delay line
-# Fastest pole of the motion simulator and contact frequency [rad per control period] up to which the contact
-# is computed without cells. Up to these rates, the peak force is accurate to 2e-3.
+MIN_RING_LENGTH = 16  # samples; minimum length of a delay line
+# Maximum pole of the motion simulator and maximum contact frequency [rad per control period] for computing a
+# contact without cells. Up to these rates, the peak force is accurate to 2e-3.
 MAX_SAMPLED_RATES = (1.0, 0.1)
-# The same rates for force sensors with a lag and for contact laws with memory: up to these rates, the
+# The same limits for a force sensor with a lag or a contact law with memory: up to these rates, the
 # restitution is accurate to 1e-5.
 MAX_SAMPLED_RATES_WITH_MEMORY = (0.15, 0.05)
-# [1]; factor for the rate b/M of a damper, which is then compared with contact frequencies. The factor
+# [1]; factor by which the rate b/M of a damper is multiplied for the comparison with contact frequencies. It
 # exceeds 1 because a damper's force jumps at the onset of contact.
 DAMPER_WEIGHT = 2.0
 
@@ -105,7 +105,7 @@ def _choose_cell_counts(mechanism: Mechanism, scenarios: Scenario, exact: bool) 
 
 
 def _max_contact_frequency(mechanism: Mechanism, scenarios: Scenario) -> float:
-    """Return the largest contact frequency [rad/s] of all scenarios, for the first approach velocity.
+    """Return the largest contact frequency [rad/s] of all scenarios, at the velocity of the first approach.
 
     The contact frequency is the larger of sqrt(k/M) and 2 b/M. Here M is the equivalent mass, k is the slope
     of the force against the penetration at the greatest penetration, and b is the slope of the force against

@@ -34,7 +34,7 @@ class Rings(NamedTuple):
     plant_signals: PlantSignals  # real forces, without the effects of the sensors
     # output of the force sensor's lag at the sampling instants [N]; None for a sensor without lag
     reading: Float[Array, "samples *batch"] | None
-    # position of the mechanism when the position sensor samples it [m]; None if unused
+    # position of the mechanism at the position sensor's sampling instant [m]; None if unused
     position: Float[Array, "samples *batch"] | None
     # sampling intervals in which the contact is not yet computed; None with one surface
     interval: SamplingInterval | None

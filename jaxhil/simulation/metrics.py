@@ -46,7 +46,7 @@ class Metrics(NamedTuple):
     square of the difference over the duration of the ideal contact.
     """
 
-    restitution: Float[Array, "slots *batch"]  # rebound speed over approach speed [1]
+    restitution: Float[Array, "slots *batch"]  # rebound speed divided by approach speed [1]
     approach_velocity: Float[Array, "slots *batch"]  # speed of the numerical model before the contact [m/s]
     peak_force: Float[Array, "slots *batch"]  # largest real contact force [N]
     peak_command: Float[Array, "slots *batch"]  # largest |F_c| [N]
@@ -88,7 +88,7 @@ def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
 
 
 def determine_status(scenario: Scenario, watch: Watch, age: Array) -> Array:
-    """Return the status of the current contact; `OK` also while the contact continues.
+    """Return the status of the current contact, which is `OK` while the contact continues.
 
     `age` is the number of ticks since the run began.
     """

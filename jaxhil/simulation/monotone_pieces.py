@@ -38,7 +38,10 @@ def build_cell_motion(series: Array, length: Array) -> CellMotion:
 
 
 def split_at_reversals(path: CellMotion) -> MonotonePieces:
-    """Divide the cells where the motion reverses: at most twice in a cell, at most once in a short cell."""
+    """Divide the cells at the instants at which the motion reverses.
+
+    The motion is assumed to reverse at most twice in a cell, and at most once in a short cell.
+    """
     low, high = jnp.zeros_like(path.length), jnp.ones_like(path.length)
     if len(path.position) == 2:
         return split_at(path, jnp.stack([low, high]))

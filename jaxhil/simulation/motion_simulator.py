@@ -1,4 +1,4 @@
-"""Exact discretisation of the motion simulator x_a = G(s) e^{-s tau_p} x_d.
+"""Exact discretisation of the motion simulator: position x_a = G(s) e^{-s tau_p} x_d for the command x_d.
 
 The order of a linear system and a transport delay can be exchanged. Here G receives the undelayed position
 command. The position x_a at time t is the response of G at the time t - tau_p. A sensor with delay tau_f
@@ -46,7 +46,7 @@ class Propagation(NamedTuple):
     transition: Float[Array, "order columns *batch"]  # rows that give the state one period later
     position: Float[Array, "columns *batch"]  # row that gives the position when the force is sampled [m]
     velocity: Float[Array, "columns *batch"]  # row that gives the velocity when the force is sampled [m/s]
-    # row that gives the position when the position sensor samples it [m]; None if unused
+    # row that gives the position at the position sensor's sampling instant [m]; None if unused
     measured_position: Float[Array, "columns *batch"] | None
     # rows that give position and velocity at the interval's start (right limit); None unless requested
     start: tuple[Array, Array] | None
@@ -106,7 +106,7 @@ def discretise(
     fractions = jnp.stack(instants)
     # The axes are row, column, instant in the interval, batch.
     rows = matrix_exponential(generator[:, :, None] * fractions[None, None], fractions)
-    # Convert rows that multiply (z, u(0), u(1) - u(0)) into rows that multiply (z, u(0), u(1)).
+    # Convert rows for (z, u(0), u(1) - u(0)) to rows for (z, u(0), u(1)).
     rows = rows.at[:, order].add(-rows[:, order + 1])
     state = rows[:order]
 
@@ -170,7 +170,7 @@ def matrix_exponential(
         return units[order] + units[order + 1] * ramp[None]
 
     def product(left, right, ramp):
-        """Return the first rows of left @ right for matrices of this form; `ramp` is the r of `right`."""
+        """Return left @ right without its last row, where `ramp` is the element r of `right`."""
         total = _matrix_product(left[:, :order], right)
         driven = left[:, order, None] * ramp_row(ramp)[None]
         return total + driven + left[:, order + 1, None] * units[None, order + 1]
@@ -206,7 +206,7 @@ def apply_row(row: Array, state: SimulatorState, start: Array, end: Array) -> Ar
 def read_measured_position(
     plant: Propagation, state: SimulatorState, start: Array, end: Array
 ) -> Array | None:
-    """Return the position [m] when the position sensor samples it; None if unused."""
+    """Return the position at the position sensor's sampling instant [m]; None without this output row."""
     return None if plant.measured_position is None else apply_row(plant.measured_position, state, start, end)
 
 
@@ -215,7 +215,7 @@ def rate_row(
     denominator: Float[Array, "order_plus_1 *batch"],
     control_period: Float[Array, "*batch"],
 ) -> Float[Array, "columns *batch"]:
-    """Return the row that computes the time derivative [1/s] of the quantity that `row` computes.
+    """Return the row whose product is the time derivative [1/s] of the product of `row`.
 
     The derivation uses d/ds E(s) = E(s) G, where G is the generator in `discretise`.
     """

@@ -21,7 +21,7 @@ from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 @dataclasses.dataclass(frozen=True)
 class OneAxis(RigModel):
-    """Rig with one axis: a run is one contact, and its error is the restitution error e - e*."""
+    """Rig with one axis: a run is one contact, and its error is the restitution error."""
 
     axes: ClassVar[int] = 1
     run_name: ClassVar[str] = "contact"
@@ -47,12 +47,12 @@ class OneAxis(RigModel):
         return compare_with_ideal(loop, scenario, rollout(loop, gains, scenario))
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
-        """Return the scenarios with no contacts in the `idle` lanes, which only fill a tile."""
+        """Return the scenarios without contacts in the `idle` lanes, which only fill a tile."""
         contacts: Any = np.where(idle, 0, scenarios.contacts).astype(np.int32)
         return scenarios._replace(contacts=contacts)
 
     def expected_duration(self, scenarios: Scenario) -> np.ndarray:
-        """Return the sum of sqrt(M/k) [s] over a scenario's contacts, used only for sorting lanes."""
+        """Return the sum of sqrt(mass/stiffness) [s] of a scenario's contacts, for sorting lanes only."""
         stiffness = np.asarray(scenarios.contact.stiffness)
         while stiffness.ndim > 2:
             stiffness = stiffness[:, 0]
@@ -82,7 +82,7 @@ class OneAxis(RigModel):
         return scenarios._replace(force_sensor=force, position_sensor=position)
 
     def with_compensator(self, loop: Loop, compensator: str) -> Loop:
-        """Return a copy of the loop with another compensator."""
+        """Return a copy of the loop with the given compensator."""
         return dataclasses.replace(loop, compensator=COMPENSATORS[compensator])
 
     def compensator_name(self, loop: Loop) -> str:
@@ -109,11 +109,10 @@ evaluate = ONE_AXIS.evaluate
 
 
 def _separate_loops(rig: RigConstants) -> RigConstants:
-    """Return the same constants, in a form that makes XLA compile the loop of the runs as its own function.
+    """Return equal constants that make XLA compile the loop over the contacts as a separate function.
 
-    XLA compiles nested loops as one function, up to the outermost loop that contains no sort. The time that
-    LLVM needs for a function grows with the square of its length. This function sorts two numbers, so that
-    loops around the runs are compiled separately.
+    XLA compiles nested loops as one function, up to the outermost loop without a sort. LLVM's time for a
+    function grows with the square of its length. This function sorts two numbers to keep functions short.
     """
     contacts = rig.scenario.contacts
     bound = jnp.max(contacts)

@@ -84,7 +84,7 @@ def compare_with_ideal(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outc
 
 
 def parameters_by_slot(contact: ContactParameters) -> ContactParameters:
-    """Reorder the parameters' axes to (segments, contacts, *batch), so that contacts belong to the batch."""
+    """Reorder the parameters' axes to (segments, contacts, *batch): contacts become a batch axis."""
     nested = contact.stiffness.ndim > contact.damping.ndim
     return contact._replace(
         stiffness=jnp.moveaxis(contact.stiffness, 0, 1) if nested else contact.stiffness,

@@ -23,15 +23,15 @@ from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.simulation.outcome import parameters_by_slot
 from jaxhil.simulation.scenario import MAX_CONTACT_DURATION, MotionSimulatorBatch, Scenario, build_scenarios
 
-MAX_CONTACT_TICKS = 1e7  # greatest number of ticks of a contact, including its approach
-MAX_RUN_TICKS = 1e9  # greatest number of ticks of a run; ticks are counted in 32 bits
+MAX_CONTACT_TICKS = 1e7  # maximum number of ticks of a contact, including its approach
+MAX_RUN_TICKS = 1e9  # maximum number of ticks of a run; ticks are counted in 32 bits
 
 PLAUSIBLE_FREQUENCIES = 0.05, 50.0  # Hz; lowest and highest plausible contact frequency
 MAX_FREQUENCY_RATIO = 0.1  # [1]; highest plausible contact frequency as a fraction of the control rate
 MAX_PLAUSIBLE_VELOCITY = 1.0  # m/s; highest plausible approach velocity
-MAX_LISTED_FREQUENCIES = 4  # if there are more contact frequencies, a summary contains only their range
+MAX_LISTED_FREQUENCIES = 4  # a summary lists at most this number of contact frequencies, or only their range
 
-_TAIL_PROBABILITY = 1e-9  # [1]; probability of the values that are ignored at either end of a distribution
+_TAIL_PROBABILITY = 1e-9  # [1]; probability of the values that are ignored at each end of a distribution
 # Prefixes of the keys that determine the number of ticks, the speed of the drives, and the motion simulator's
 # poles.
 _TICK_KEYS = ("bodies.", "approach.velocity", "contact.", "rig.contact_plane", "rig.control_period")
@@ -163,7 +163,7 @@ def check_poles(name: str, denominator: Any, control_period: Any) -> None:
             monic = coefficients / coefficients[0] * period ** np.arange(len(coefficients))
         fastest = np.max(np.abs(np.roots(monic)), initial=0.0) if np.all(np.isfinite(monic)) else math.inf
         if fastest > MAX_POLE:
-            allowed = f"at most {MAX_POLE:g} / control_period; a faster one is ideal"
+            allowed = f"at most {MAX_POLE:g} / control_period; for a faster simulator use model = 'ideal'"
             pole = f"a pole of {fastest / period:.3g} rad/s at a control period of {period:g} s"
             raise InputError(f"{name}: rig.simulator: found {pole}, expected {allowed}")
 
@@ -178,7 +178,7 @@ def compute_bandwidth(simulator: MotionSimulatorBatch) -> float:
     if order == 0:
         return math.inf
     with np.errstate(all="ignore"):
-        # In units of the poles' geometric mean, all coefficients have similar magnitudes.
+        # Division by the poles' geometric mean gives all coefficients similar magnitudes.
         unit = abs(denominator[-1] / denominator[0]) ** (1 / order)
         powers = unit ** np.arange(order, -1, -1.0) / denominator[-1]
         twice, once = 2 * _squared(numerator * powers[1:]), _squared(denominator * powers)
@@ -194,7 +194,7 @@ def _check_ticks(name: str, mechanism: Mechanism, scenarios: Scenario) -> None:
     """Raise `InputError` if a contact exceeds `MAX_CONTACT_TICKS` or a run exceeds `MAX_RUN_TICKS`."""
     contacts = mechanism.approach.contacts
     allowed = min(MAX_CONTACT_TICKS, MAX_RUN_TICKS / contacts)
-    # This upper bound on the duration is usually small enough; then the contacts need not be computed.
+    # If this upper bound on the duration is within the limit, the contacts need not be computed.
     longest = APPROACH_TIME + scenarios.control_period + 2 * MAX_CONTACT_DURATION + _longest_wait(scenarios)
     if np.all(longest <= allowed * scenarios.control_period):
         return
@@ -211,8 +211,8 @@ def _check_ticks(name: str, mechanism: Mechanism, scenarios: Scenario) -> None:
         found = f"contact.clearance: found {scenarios.clearance[lane]:g} m"
     seconds = (approach_time + contact_time)[slot, lane]
     raise InputError(
-        f"{name}: {found}, expected at most {MAX_CONTACT_TICKS:.0e} ticks a contact "
-        f"and {MAX_RUN_TICKS:.0e} a run: "
+        f"{name}: {found}, expected at most {MAX_CONTACT_TICKS:.0e} ticks per contact "
+        f"and {MAX_RUN_TICKS:.0e} per run: "
         f"contact {slot + 1} takes about {seconds:.3g} s, {ticks[slot, lane]:.2g} ticks"
     )
 
@@ -284,7 +284,7 @@ def _estimate_durations(scenarios: Scenario, reference: IdealContact) -> tuple[n
 def _longest_wait(scenarios: Scenario) -> np.ndarray:
     """Return the longest time [s] that the simulation waits for a contact to begin.
 
-    With one surface, this is the time in addition to `MAX_CONTACT_DURATION`.
+    With one surface, `MAX_CONTACT_DURATION` is not included.
     """
     with np.errstate(all="ignore"):
         crossing_time = 10 * scenarios.clearance / scenarios.velocity
@@ -293,9 +293,9 @@ def _longest_wait(scenarios: Scenario) -> np.ndarray:
 
 
 def _extreme_draws(mechanism: Mechanism, prefixes: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Return draws at the corners of the uncertain range: all combinations of extreme values.
+    """Return draws with all combinations of extreme values, for parameters whose path begins with a prefix.
 
-    Parameters whose path begins with none of the prefixes have the median of their distribution.
+    All other parameters have the median of their distribution.
     """
     columns = count_dimensions(mechanism)
     paths = [path for path in columns if path.startswith(prefixes)]
@@ -344,13 +344,12 @@ def _find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) -
 
 
 def _format_frequency(contact: ContactSummary) -> str:
-    """Return the first part of a warning about a contact frequency: key and found value."""
     frequency = f"a contact frequency of {contact.frequency:.3g} Hz (contact {contact.number})"
     return f"contact.stiffness: found {frequency}"
 
 
 def _check_delays(mechanism: Mechanism, shortest: ContactSummary) -> list[str]:
-    """Return a list with at most one warning, that a delay exceeds the duration of the shortest contact."""
+    """Return one warning if a delay exceeds the duration of the shortest contact, else an empty list."""
     rig = mechanism.rig
     force = rig.force_sensor.delay + rig.force_sensor.time_constant
     allowed = f"less than contact {shortest.number} lasts, {shortest.duration:.3g} s"
@@ -366,7 +365,7 @@ def _check_delays(mechanism: Mechanism, shortest: ContactSummary) -> list[str]:
 
 
 def _format_ratio(value: float, whole: float) -> str:
-    """Return value / whole as text, as "1/n" if less than 0.1."""
+    """Return value / whole as text; a ratio below 0.1 has the form "1/n"."""
     ratio = value / whole
     return f"1/{1 / ratio:.0f}" if 0 < ratio < 0.1 else f"{ratio:.2g}"
 

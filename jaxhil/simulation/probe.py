@@ -1,6 +1,6 @@
-"""Probe: an extra push on the hardware, and a reference trajectory, which test a compensator.
+"""Probe for tests of a compensator: an additional push on the hardware, and a reference trajectory.
 
-A push that no model contains shows whether a compensator is transparent, that is, whether events on the
+No model contains the push. It shows whether a compensator is transparent, that is, whether events on the
 hardware reach the numerical model. The reference trajectory is the motion in the ideal contact; the numerical
 model should follow it.
 
@@ -23,7 +23,7 @@ class Push(NamedTuple):
     hardware's first touch, and s = t - centre + width/2.
     """
 
-    size: Float[Array, "*batch"]  # largest force, positive against the penetration [N]
+    size: Float[Array, "*batch"]  # largest force [N]; a positive force acts against the penetration
     centre: Float[Array, "*batch"]  # time of the largest force since the hardware's first touch [s]
     width: Float[Array, "*batch"]  # duration [s]
 
@@ -87,7 +87,7 @@ class Deviation(NamedTuple):
 
 
 def initial_first_contact(like: Float[Array, "*batch"]) -> FirstContact:
-    """Return the record before the hardware's first touch, in the batch shape of `like`."""
+    """Return the record of a hardware that has not touched yet, with the batch shape of `like`."""
     zeros = jnp.zeros_like(like)
     return FirstContact(jnp.zeros(like.shape, bool), zeros, zeros + 1)
 
@@ -97,7 +97,7 @@ def update_first_contact(
 ) -> FirstContact:
     """Return the record of the first touch, updated with a sample of the hardware's motion.
 
-    The time of the touch is extrapolated from the sample by uniform motion.
+    The time of the touch is extrapolated from the sample, assuming uniform motion.
 
     Args:
         first_contact: Record up to the previous sample.
@@ -116,7 +116,7 @@ def update_first_contact(
 
 
 def initial_deviation(like: Float[Array, "*batch"]) -> Deviation:
-    """Return the deviation before the numerical model's first touch, in the batch shape of `like`."""
+    """Return the deviation before the numerical model's first touch: 0, with the batch shape of `like`."""
     zeros = jnp.zeros_like(like)
     return Deviation(jnp.zeros(like.shape, bool), zeros, zeros, zeros)
 
@@ -131,17 +131,17 @@ def update_deviation(
     period: Array,
     lasts: Array,
 ) -> Deviation:
-    """Return the deviation, updated with the numerical model's motion at the current tick.
+    """Return the sums of `deviation`, with the numerical model's deviation at the current tick added.
 
     Args:
         deviation: Deviation up to the previous tick.
-        reference: Penetration of the reference trajectory at evenly spaced times [m].
+        reference: Penetration of the reference trajectory [m], at evenly spaced times.
         span: Duration of the reference trajectory [s].
         depth: Penetration of the numerical model [m].
         rate: Penetration rate of the numerical model [m/s].
         now: Time since the start of the run [control periods].
         period: Control period [s].
-        lasts: Whether the contact has not yet ended; after its end nothing is added.
+        lasts: Whether the contact continues; otherwise nothing is added.
     """
     first = ~deviation.entered & (depth > 0)
     entered = deviation.entered | first
@@ -171,7 +171,7 @@ def root_mean_square(deviation: Deviation) -> Float[Array, "*batch"]:
 
 
 def _periods_since_touch(depth, rate, period):
-    """Return the time since uniform motion reached the surface, 0 to 1 [control periods]."""
+    """Return the time since the touch [control periods], 0 to 1, assuming uniform motion."""
     stride = rate * period
     inward = stride > 0
     return jnp.where(inward, jnp.clip(depth / jnp.where(inward, stride, 1), 0, 1), 0)

@@ -1,4 +1,4 @@
-"""Probe within a tick: push on the hardware, and deviation of the numerical model from the ideal contact."""
+"""Effects of the probe at a tick: push on the hardware, and deviation of the model from the ideal contact."""
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -30,7 +30,7 @@ def apply_probe(
         state: State of the loop.
         over: Whether the contact ended before this tick.
         signals: Inputs of the compensator at this tick.
-        sample: Motion of the hardware when the force is sampled.
+        sample: Motion of the hardware at the instant at which the force is sampled.
         contact: Real contact in the sampling interval.
         watch: Record of the current contact.
     """

@@ -35,10 +35,10 @@ def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None
             (see `jaxhil.rig.registry.Compensator`). It is needed to export a controller.
 
     Raises:
-        InputError: `law` is not an instance of `Compensator` or `ContactLaw`; its name belongs to another law
-            or is not a word of letters, digits and underscores; it contains arrays; a gain has no unit, or
-            its nominal value for the default mechanism is out of its bounds; or `runtime` lacks a method or
-            has other gains.
+        InputError: `law` is not an instance of `Compensator` or `ContactLaw`; its name belongs to a
+            different law or is not a word of letters, digits and underscores; it contains arrays; a gain
+            has no unit, or its nominal value for the default mechanism is out of its bounds; or `runtime`
+            lacks a method or has different gains.
 
     Example:
         >>> import jaxhil
@@ -73,7 +73,7 @@ def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None
 
 
 def _check_name(law: Compensator | ContactLaw, table: dict[str, Any]) -> None:
-    """Raise `InputError` if the name of a law is invalid or belongs to another law in `table`."""
+    """Raise `InputError` if the name of a law is invalid or belongs to a different law in `table`."""
     name = getattr(law, "name", None)
     if not isinstance(name, str) or not _NAME_PATTERN.fullmatch(name):
         where = f"register: {type(law).__name__}.name"
@@ -82,18 +82,18 @@ def _check_name(law: Compensator | ContactLaw, table: dict[str, Any]) -> None:
     if name in table:
         home, other_home = ((type(x).__module__, type(x).__qualname__) for x in (law, table[name]))
         if home != other_home or home[0].startswith("jaxhil."):
-            raise _make_error(law, "name", "the name of another law", f"none of {', '.join(table)}")
+            raise _make_error(law, "name", "the name of a registered law", f"none of {', '.join(table)}")
 
 
 def _check_static(law: Compensator | ContactLaw) -> None:
-    """Raise `InputError` if a law cannot be a static argument: not hashable, or not equal to itself."""
+    """Raise `InputError` if a law cannot be a static argument: not hashable, or unequal to itself."""
     try:
         hash(law)
         is_equal = bool(law == law)
     except Exception:
         is_equal = False
     if not is_equal:
-        allowed = "only numbers, texts and tuples, no arrays"
+        allowed = "only numbers, texts and tuples (no arrays)"
         raise _make_error(law, "fields", "a value that is not hashable", allowed)
 
 
@@ -113,7 +113,7 @@ def _check_gains(law: Compensator) -> None:
                 law,
                 "gains",
                 format_value(gain.name),
-                "a word of letters, digits and underscores that no other gain has",
+                "a unique word of letters, digits and underscores",
             )
         if not isinstance(gain.unit, str) or not gain.unit:
             raise _make_error(
@@ -139,7 +139,7 @@ def _check_bounds(law: Compensator, gain: Gain, mechanism: Mechanism) -> None:
 
 
 def _check_runtime(law: Compensator, runtime: object) -> None:
-    """Raise `InputError` if a class for the rig lacks a method or has other gains than the compensator."""
+    """Raise `InputError` if a class for the rig lacks a method or has gains unlike the compensator's."""
     if not inspect.isclass(runtime):
         raise _make_error(
             law, "runtime", format_value(runtime), "a class like jaxhil.rig.registry.Compensator"
@@ -147,7 +147,7 @@ def _check_runtime(law: Compensator, runtime: object) -> None:
     missing = [name for name in _RUNTIME_METHODS if not callable(getattr(runtime, name, None))]
     if missing:
         raise _make_error(
-            law, "runtime", f"{runtime.__name__} without {missing[0]}", "a class with this method"
+            law, "runtime", f"{runtime.__name__} without method {missing[0]}", "a class with it"
         )
     gains = getattr(runtime, "gains", None)
     units = (

@@ -3,7 +3,7 @@
 The simulation runs segments of a few ticks. Between two segments, the metrics of finished contacts are
 stored, the next contacts begin, and free flight without events is skipped. The simulation ends when the
 slowest scenario has ended; there is no fixed horizon. Results are differentiable in forward mode with respect
-to every array.
+to every input array.
 """
 
 import jax
@@ -52,9 +52,9 @@ def run_until_done(loop: Loop, gains: Gains, rig: RigConstants) -> RunState:
         run, _ = run_segment(loop, rig, gains, run, record=False)
         if loop.is_two_sided:
             return begin_next_contacts(loop, rig, gains, run)
-        # Contacts of a tile end at about the same time. Most segments therefore end no contact and need not
-        # call `begin_next_contacts`. The delay lines do not change in this call. They stay outside the branch
-        # and are therefore not copied.
+        # All contacts end at about the same time: in most segments no contact ends, and the call of
+        # `begin_next_contacts` is skipped. This call does not change the delay lines. They stay outside the
+        # branch and are therefore not copied.
         rings = run.state.sensed.rings
         run_without_rings = run._replace(
             state=run.state._replace(sensed=run.state.sensed._replace(rings=None))
@@ -280,7 +280,7 @@ def _restart(loop, gains, state, entered, begins, fresh):
 
 
 def _select_slot(rig, index):
-    """Return the index of a contact, limited to the last entry of arrays with one entry per contact."""
+    """Return the contact's index, at most the last index of arrays with one entry per contact."""
     return jnp.minimum(index, rig.scenario.phase.shape[0] - 1)
 
 

@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array
 
 MAX_BISECTIONS = 60  # number of bisections after which any bracket is shorter than the rounding error
-# Amount by which a Newton step may leave the bracket, for arguments of order 1 [1].
+# Maximum amount by which a Newton step may leave the bracket, for arguments of order 1 [1].
 ARGUMENT_TOLERANCE = 1e-9
 
 RootFunction = Callable[[Any, Array], Array]  # maps (data, argument) to the function value
@@ -46,7 +46,7 @@ def _find_root(function: RootFunction, data: Any, low: Array, high: Array) -> tu
     fixed, low, high = lax.stop_gradient((data, low, high))
     at_low, at_high = function(fixed, jnp.stack([low, high]))
     change = at_high - at_low
-    # Newton's method converges quadratically: after so short a step, the next step is below rounding.
+    # Newton's method converges quadratically: after a step as short as this, the next is below rounding.
     short = jnp.finfo(at_low.dtype).eps ** 0.6
 
     def value_and_slope(s):

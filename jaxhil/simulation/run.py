@@ -43,7 +43,7 @@ class ContactResult(NamedTuple):
     Attributes:
         restitution: Restitution e [1]: rebound speed divided by approach speed of the numerical model.
         reference_restitution: Restitution e* of the ideal contact [1].
-        error: Restitution error e - e* [1], positive if the contact diverges.
+        error: Restitution error e - e* [1], positive if the rebound is too fast.
         peak_force: Largest real contact force [N].
         reference_peak_force: Peak force of the ideal contact [N].
         peak_force_ratio: Peak force divided by the ideal contact's peak force [1].

@@ -74,7 +74,7 @@ class Scenario(NamedTuple):
     time_limit: Float[Array, "*batch"]  # limit on the duration of a contact [s]
     key: UInt32[Array, "2 *batch"]  # key of the sensors' noise: seed and index of the scenario
     probe: Probe | None = None  # push and reference trajectory for each contact; None without a probe
-    # metrics of the ideal contacts computed beforehand, NaN where not; None if none is computed beforehand
+    # metrics of ideal contacts computed in advance; NaN for the other contacts; None if there are none
     reference: IdealContact | None = None
 
 

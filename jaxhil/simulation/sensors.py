@@ -61,17 +61,17 @@ def apply_lag(
     forces: list[Array],
     time_constant: Array,
 ) -> Float[Array, "*batch"]:
-    """Return the output y [N] of a first-order lag T_s y' = F - y after a period with one contact.
+    """Return the output y [N] of a first-order lag T_s y' = F - y after an interval with one contact.
 
-    During contact, the force F is interpolated by parabolas through three consecutive values each. The result
-    is exact for this interpolation.
+    During contact, the force F is interpolated by parabolas, each through three of the given values. The
+    result is exact for the interpolated force.
 
     Args:
-        reading: Output of the lag at the start [N].
+        reading: Output of the lag at the interval's start [N].
         idle: Time before the contact, with F = 0 [s].
         touching: Duration of the contact [s].
         free: Time after the contact, with F = 0 [s].
-        forces: Odd number of forces at evenly spaced times, from the begin to the end of the contact [N].
+        forces: Odd number of forces at evenly spaced times, from the beginning to the end of the contact [N].
         time_constant: Time constant T_s [s].
     """
     arc = touching / (len(forces) // 2)

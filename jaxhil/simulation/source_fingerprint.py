@@ -1,4 +1,4 @@
-"""Fingerprint of source code and dependency versions, on which results depend in addition to the input."""
+"""Fingerprint of source code and versions of dependencies: results depend on them and on the input."""
 
 import hashlib
 import inspect
@@ -19,8 +19,8 @@ def sources_sha256(*laws: object) -> str:
     The files are read only once per process.
 
     Args:
-        *laws: Compensators and contact laws. The hash includes those that are user-registered: their fields,
-            and the source of their module, or of their class, if available.
+        *laws: Compensators and contact laws. The hash includes the fields and, if available, the source of
+            user-registered laws.
     """
     digest = _hash_folders(
         tuple(Path(str(sys.modules[name].__file__)).parent for name in OWN_PACKAGES if name in sys.modules)
@@ -45,7 +45,7 @@ def dependency_versions(packages: tuple[str, ...] = ("jaxhil", *DEPENDENCIES)) -
 
 
 def _read_class_source(kind: type) -> str:
-    """Return the source of a class's module or, if unavailable, of the class; else an empty text."""
+    """Return the source of a class's module, else of the class, else (if unavailable) an empty text."""
     for source in (sys.modules.get(kind.__module__), kind):
         with suppress(OSError, TypeError):
             return inspect.getsource(source)  # pyright: ignore[reportArgumentType]

@@ -5,7 +5,7 @@
     integrate        integrate M x_d'' = -F_c over one control period
     actuate          apply limits, latency, hold and motion simulator to the position command
     compute_contact  compute the real contact in the sampling interval
-    record_contact   record begin, end, restitution, peaks and work of the current contact
+    record_contact   record beginning, end, restitution, peaks and work of the current contact
 
 `RunState` contains what changes from tick to tick. `Tick` is the record of one tick.
 """
@@ -90,7 +90,7 @@ class ActuationResult(NamedTuple):
 
     plant: PlantState  # state of drives and motion simulator at the end of the control period
     controller: Any  # state of the compensator
-    # position of the mechanism when the position sensor samples it [m]; None if unused
+    # position of the mechanism at the position sensor's sampling instant [m]; None if unused
     position: Float[Array, "*batch"] | None
     interval: SamplingInterval  # sampling interval in which the contact is computed at this tick
     # delay line of intervals in which the contact is not yet computed; None with one surface
@@ -312,7 +312,10 @@ def _delayed_sample(ring, now, age, intervals):
 
 
 def _delayed_position(rig, state, now, age):
-    """Return the delayed position [m], in uniform motion before the start of the run; NaN if unused."""
+    """Return the delayed position [m]; NaN if unused.
+
+    Before the start of the run, the motion is assumed to be uniform.
+    """
     ring, intervals = state.sensed.rings.position, rig.delays.position.intervals
     if ring is None:
         return jnp.full_like(state.position, jnp.nan)
@@ -348,9 +351,9 @@ def _interval_motion(rows, state, start, end, plane):
 
 
 def _current_interval(rig, pending, now, age):
-    """Return the interval that takes place now, from the delay line of motions.
+    """Return the motion in the current sampling interval, from the delay line of motions.
 
-    Before the start of the run, the mechanism is at rest at the surface without a force.
+    Before the start of the run, all entries are 0: the mechanism is at rest at the surface, without a force.
     """
     intervals = rig.delays.contact
     return jax.tree.map(lambda ring: look_back(ring, now, intervals, age >= intervals), pending)

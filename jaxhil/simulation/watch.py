@@ -1,4 +1,4 @@
-"""Record of the current contact, updated at every tick: begin, end, speeds, forces and work.
+"""Record of the current contact, updated at every tick: beginning, end, speeds, forces and work.
 
 The record follows from the real contact (`PlantSignals`) and from the force command. Section 2 of
 notebooks/guide/model.md defines when a contact begins and when it ends.
@@ -17,12 +17,12 @@ from jaxhil.simulation.probe import Deviation, initial_deviation
 from jaxhil.simulation.scenario import Scenario
 
 MAX_DECAY_WAIT = 0.1  # s; longest wait for the force command to decay, because a noisy command never decays
-COMMAND_DECAY_RATIO = 1e-6  # [1]; fraction of its peak below which the force command has decayed
-DIVERGENCE_SPEED_RATIO = 1e3  # [1]; multiple of the first approach speed above which the run has diverged
+COMMAND_DECAY_RATIO = 1e-6  # [1]; a force command below this fraction of its peak has decayed
+DIVERGENCE_SPEED_RATIO = 1e3  # [1]; a run above this multiple of the first approach speed has diverged
 
 
 class CommandVariation(NamedTuple):
-    """Variation of the force command F_c since the begin of the current contact, starting from F_c = 0."""
+    """Variation of the force command F_c in the current contact so far, starting from F_c = 0."""
 
     last: Float[Array, "*batch"]  # last value [N]
     highest: Float[Array, "*batch"]  # highest value so far [N]
@@ -42,7 +42,7 @@ class Watch(NamedTuple):
     recent_forces: tuple[Array, Array]  # real force at the last two ticks [N]
     in_contact: Float[Array, "*batch"]  # duration of the real force so far [control periods]
     measured: Bool[Array, "*batch"]  # whether the force sensor has read a force
-    # number of ticks since the last real force, or since the begin of a contact without a real force yet
+    # number of ticks since the last real force, or since the beginning of a contact without a real force yet
     force_free_ticks: Float[Array, "*batch"]
     work: tuple[Array, ...]  # work done on the mechanism and work returned by it [J]; empty unless recorded
     command_variation: CommandVariation | None  # variation of F_c; None unless recorded
@@ -58,7 +58,7 @@ class Watch(NamedTuple):
 class ContactEndConditions(NamedTuple):
     """Conditions for the end of a contact."""
 
-    force_free_ticks: Float[Array, "*batch"]  # least number of ticks without a real force
+    force_free_ticks: Float[Array, "*batch"]  # minimum number of ticks without a real force
     # number of ticks without a real force after which the contact ends even if F_c has not decayed
     max_force_free_ticks: Float[Array, "*batch"]
     divergence_speed: Float[Array, "*batch"]  # speed above which the run has diverged [m/s]

@@ -21,18 +21,18 @@ from jaxhil.sixdof.watch import quiet_time
 
 
 class EpisodeInSpace(NamedTuple):
-    """Metrics of the first episode of the ideal contact; NaN for a metric that is not defined.
+    """Metrics of the first episode (contact with all its touches) of the ideal contact; NaN if undefined.
 
     Attributes:
         reference_restitution: Restitution e* [1]; NaN unless there is a single touch.
         effective_mass: Effective mass m_n at the first touch [kg].
         approach_velocity: Approach velocity along the normal of the first touch [m/s].
-        point: Point of the first touch, in T axes [m].
+        point: Point of the first touch, in target frame T [m].
         normal: Normal of the target's surface at this point, outward.
         reference_peak_force: Peak force [N].
-        reference_peak_moment: Peak moment about T's origin [N m].
+        reference_peak_moment: Peak moment about the origin of target frame T [N m].
         reference_duration: Time during which shapes touch [s].
-        reference_touches: Number of touches, summed over the candidates.
+        reference_touches: Number of touches of all pairs of shapes.
     """
 
     reference_restitution: float
@@ -61,7 +61,7 @@ class SpaceRun(NamedTuple):
 
 
 def simulate_in_space(mechanism: SixAxisMechanism) -> SpaceRun:
-    """Simulate the ideal contact of a six-axis mechanism over the whole duration of its nominal run.
+    """Simulate the ideal contact of a six-axis mechanism for the whole duration of its nominal run.
 
     Raise `InputError` if the start is invalid, or if a contact is too stiff to be integrated.
     """

@@ -10,7 +10,7 @@ from jaxhil.sixdof.relative import Pair, Pose, States, Twist
 from jaxhil.sixdof.rotations import Quaternion, compose, identity, reverse, rotate, rotate_back
 from jaxhil.sixdof.vectors import Vector, cross
 
-SEARCH_HEIGHT = 10.0  # m; height above the target at which the search for the first touch begins
+SEARCH_HEIGHT = 10.0  # m; z coordinate in target frame T at which the search for the first touch begins
 SEARCH_STEPS = 400  # number of search steps for the first touch
 NEWTON_STEPS = 3  # number of Newton steps after the search; enough for rounding accuracy
 FLIGHT_STEPS = 8  # number of integration steps of the free flight before the first touch
@@ -22,10 +22,11 @@ def touching_height(
     offset_y: Float[Array, "*batch"],
     attitude: Quaternion,
 ) -> Float[Array, "*batch"]:
-    """Return the height z [m] of the frame C at the first touch, if the chaser moves down along z of T.
+    """Return the z coordinate [m] of chaser frame C at the first touch, in target frame T.
 
-    The result is NaN if the chaser passes without a touch. Each search step is as long as the gap between
-    the shapes, so that no step can pass a surface. Newton's method then refines the height to rounding.
+    The chaser moves along -z of T. If it passes without a touch, the result is NaN. Each search step is as
+    long as the gap between the shapes, so that no step can pass a surface. Newton's method then refines the
+    result to rounding.
     """
 
     def depth(height: Array) -> Array:
@@ -44,7 +45,7 @@ def touching_height(
 
 
 def begin(bodies: Pair, pose: Pose, twist: Twist, before: Float[Array, "*batch"]) -> States:
-    """Return the states a time `before` [s] earlier than a relative pose and twist, in free flight.
+    """Return the states from which a free flight of `before` [s] leads to this relative pose and twist.
 
     The target is at rest with its centre of mass at the world's origin. Its body axes equal the world axes.
     """

@@ -1,4 +1,4 @@
-"""Axes of the motion simulator, each with its own transfer function and delay.
+"""Axes of the motion simulator, each with a transfer function and a delay of its own.
 
 An axis is a coordinate of the pose, a coordinate of one of two robots, or a leg of a hexapod. Arrays have the
 shape (axes, *batch). Each axis follows its command like the single axis of
@@ -59,7 +59,7 @@ class Hardware(NamedTuple):
 
     commands: tuple[Array, ...]  # commands c(n), c(n-1), ... to the drives, (axes, *batch) each
     state: tuple[Array, ...]  # states of the axes' transfer functions
-    ring: Float[Array, "rows *batch"]  # ring buffer of the samples, (intervals x quantities x axes, *batch)
+    ring: Float[Array, "rows *batch"]  # delay line of the samples, (intervals x quantities x axes, *batch)
 
 
 def build_axes(
@@ -68,13 +68,13 @@ def build_axes(
     position_delay: Float[Array, "*batch"],
     control_period: Float[Array, "*batch"],
     hold: str,
-    weighed: bool = False,
+    has_tool: bool = False,
     measured: bool = False,
 ) -> Axes:
     """Discretise the axes of a motion simulator without limits, for sensors with the given delays [s].
 
-    `weighed` adds the accelerations, from which the inertia force of a tool follows. `measured` adds the
-    positions at the position sensor's sampling instant.
+    `has_tool` adds the accelerations, which cause the inertia force of a tool. `measured` adds the positions
+    at the position sensor's sampling instant.
     """
     period = jnp.broadcast_to(control_period[None], simulator.delay.shape)
     force, position = (
@@ -82,7 +82,7 @@ def build_axes(
     )
     instant = position.fraction if measured else None
     exact = discretise(simulator.numerator, simulator.denominator, period, force.fraction, instant, hold)
-    acceleration = rate_row(exact.velocity, simulator.denominator, period) if weighed else None
+    acceleration = rate_row(exact.velocity, simulator.denominator, period) if has_tool else None
     return Axes(exact, acceleration, force, position)
 
 
@@ -163,7 +163,7 @@ def actuate(
 
 
 def _samples(axes: Axes, position: Any, rate: Any, acceleration: Any, measured: Any) -> Samples:
-    """Return samples without the quantities that the loop does not need."""
+    """Return the arguments as `Samples`, with None for quantities that the loop does not need."""
     return Samples(
         Motion(position, rate, acceleration if axes.acceleration is not None else None),
         measured if axes.propagation.measured_position is not None else None,

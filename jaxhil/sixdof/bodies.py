@@ -1,4 +1,4 @@
-"""Free rigid body without gravity, and the integration of its motion over one control period.
+"""Free rigid body without gravity, and the integration of its motion for one control period.
 
 The state contains the spin angular momentum in world axes instead of the angular velocity, because the
 angular momentum is constant without a torque.
@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from jaxhil.sixdof.rotations import Quaternion, compose, exponential, normalise, rotate, rotate_back
 from jaxhil.sixdof.vectors import Matrix, Vector, cross, dot, inverse
 
-# Fraction of a period's velocity change that already acts on the position in this period [1]. The integrator
-# adds a delay of 1 - fraction control periods.
+# Fraction of a period's velocity change that acts on the position in the same period [1]. The integrator adds
+# a delay of (1 - fraction) control periods.
 SHARES = {"semi_implicit_euler": 1.0, "zoh": 0.5, "explicit_euler": 0.0}
 
 
@@ -82,17 +82,17 @@ def angular_momentum(body: Body, state: State) -> Vector:
 def kick_drift(
     body: Body, state: State, load: Load, period: Float[Array, "..."], share: Float[Array, "..."] | float
 ) -> State:
-    """Integrate the motion of a body over a control `period` [s] under a constant load.
+    """Integrate the motion of a body for a control `period` [s] under a constant load.
 
-    `share` selects the integrator (see `SHARES`). In one dimension the result equals that of the integrators
-    in `jaxhil.simulation.integrators`. The rotation is integrated by an explicit Lie midpoint step of second
+    `share` selects the integrator (see `SHARES`). In one dimension the results equal those of
+    `jaxhil.simulation.integrators`. The rotation is integrated by an explicit Lie midpoint step of second
     order (Krysl and Endres, Int. J. Numer. Methods Eng. 62, 2005).
     """
     kick, twist = (period / body.mass) * load.force, period * load.torque
     spin = state.spin + share * twist
 
     def turned(attitude: Quaternion, duration) -> Quaternion:
-        """Rotate the initial attitude for `duration` [s]; `attitude` determines the angular velocity."""
+        """Rotate the initial attitude for `duration` [s], at the angular velocity for `attitude`."""
         angular = body.inverse_inertia @ rotate_back(attitude, spin)
         return compose(state.attitude, exponential(duration * angular))
 

@@ -27,7 +27,7 @@ from jaxhil.sixdof.stewart import Stewart
 from jaxhil.sixdof.values import Values
 from jaxhil.sixdof.vectors import Vector, vector
 
-APPROACH_DURATION = 0.02  # s; duration of the free flight before the first touch, without the phase
+APPROACH_DURATION = 0.02  # s; duration of the flight before the first touch, without the phase
 DEFAULT_DURATION = 10.0  # s; duration of a run if [start] does not specify a duration
 
 
@@ -41,7 +41,7 @@ def build_scenarios(
         draws: Drawn values by dotted path, (scenarios,), or (scenarios, *entries) for lists. All other values
             are nominal. None builds the nominal scenario alone.
         seed: Seed of the sensors' noise.
-        first: Index of the first scenario. The noise of a scenario depends on `seed` and its index alone.
+        first: Index of the first scenario. The noise of a scenario depends only on seed and index.
     """
     numbers = Values(mechanism, dict(draws or {}))
     bodies = Pair(*(_body(numbers, name) for name in ("target", "chaser")))
@@ -74,7 +74,7 @@ def build_scenarios(
 
 
 def loop_of(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -> Loop:
-    """Return the structure of the loop that runs a mechanism's scenarios with a compensator."""
+    """Return the loop that runs a mechanism's scenarios with a compensator."""
     rig, sensor = mechanism.rig, scenario.sensor
     return build_loop(
         scenario,
@@ -122,14 +122,14 @@ def _specified(numbers: Values, bodies: Pair) -> States:
 
 
 def _before_touch(numbers: Values, bodies: Pair, groups: tuple[ContactGroup, ...], before: Any) -> States:
-    """Return the states a time `before` [s] earlier than the first touch that [approach] specifies."""
+    """Return the states `before` [s] in advance of the first touch that the table [approach] specifies."""
     keys = ("offset", "attitude", "velocity", "angular_velocity")
     return _lowered(bodies, groups, *(numbers(f"approach.{key}") for key in keys), before)
 
 
 @jax.jit
 def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, before) -> States:
-    """Return the states a time `before` [s] earlier than a first touch with this offset and velocity."""
+    """Return the states `before` [s] in advance of a first touch with this offset and velocity."""
     rotation = exponential(vector(attitude))
     height = touching_height(groups, offset[0], offset[1], rotation)
     pose = Pose(Vector(offset[0], offset[1], height), rotation)

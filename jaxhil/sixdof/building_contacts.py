@@ -1,7 +1,8 @@
 """Construction of contact groups and latches from a six-axis mechanism file.
 
-Each copy of a pattern is a contact candidate. Candidates whose shapes and laws are of the same kinds form a
-group, also if they come from different tables of the file.
+A candidate is a pair of shapes that may touch. A table of the file with a pattern (copies of a shape around
+the z axis) gives one candidate for each copy. Candidates with the same kinds of shapes and laws form a group,
+even if they come from different tables.
 """
 
 from typing import Any, NamedTuple
@@ -27,7 +28,7 @@ from jaxhil.sixdof.vectors import Vector
 class Candidate(NamedTuple):
     """Pair of shapes that may touch, with its contact law and friction law; arrays (lanes,)."""
 
-    name: str  # name of the file's table, with the index of the copy if the table has a pattern
+    name: str  # name of the file's table; for a pattern of several copies, with the copy's index
     pair: Candidates
     law: ContactLaw
     parameters: ContactParameters
@@ -35,7 +36,7 @@ class Candidate(NamedTuple):
 
 
 def candidates(mechanism: SixAxisMechanism, numbers: Values) -> list[list[Candidate]]:
-    """Return all contact candidates of a mechanism, grouped by the kinds of their shapes and laws."""
+    """Return a mechanism's contact candidates (pairs of shapes), grouped by kinds of shapes and laws."""
     groups: dict[Any, list[Candidate]] = {}
     for name, contact in mechanism.contact.items():
         count = contact.pattern.count if contact.pattern else 1
@@ -47,7 +48,7 @@ def candidates(mechanism: SixAxisMechanism, numbers: Values) -> list[list[Candid
 
 
 def candidate_names(mechanism: SixAxisMechanism) -> tuple[str, ...]:
-    """Return the names of all contact candidates, in the order of the groups of `build_groups`."""
+    """Return the names of all contact candidates, in the order in which `build_groups` returns them."""
     groups = candidates(mechanism, Values(mechanism, {}))
     return tuple(candidate.name for group in groups for candidate in group)
 
@@ -76,7 +77,7 @@ def build_latches(mechanism: SixAxisMechanism, numbers: Values) -> tuple[Latch, 
 
 
 def _latch(latch: six_axes.Latch, numbers: Values, path: str) -> Latch:
-    """Build the latches of one table, one latch for each copy of the table's pattern."""
+    """Build the latches of one table: one for each copy of the table's pattern (points around the z axis)."""
     count = latch.pattern.count if latch.pattern else 1
 
     def repeated(value: Any) -> Any:
@@ -105,7 +106,7 @@ def _latch(latch: six_axes.Latch, numbers: Values, path: str) -> Latch:
 
 
 def _candidate(contact: six_axes.Contact, numbers: Values, name: str, copy: int, count: int) -> Candidate:
-    """Build the candidate for copy number `copy` of the `count` copies of a [contact] table."""
+    """Build the candidate for the copy with index `copy`, of `count` copies, of a [contact] table."""
     path = f"contact.{name}"
     turn = numbers(f"{path}.pattern.phase", 0.0) + 2 * np.pi * copy / count
     turns = {"chaser": turn, "target": turn + numbers(f"{path}.target_pattern.phase", 0.0)}

@@ -16,13 +16,13 @@ from jaxhil.sixdof.rotations import rotate, rotate_back
 from jaxhil.sixdof.shapes import Capsule, Shape
 from jaxhil.sixdof.vectors import Vector, cross, direction, dot, norm
 
-# Regularisation for parallel segments, whose nearest points are not unique, relative to the squared length of
-# a segment [1]. It selects points near the middles of both segments.
+# Regularisation, divided by the squared length of a segment [1]. For parallel segments, whose nearest points
+# are not unique, it selects points near the middles of both segments.
 PARALLEL_WEIGHT = 1e-9
 
 
 class Touch(NamedTuple):
-    """Geometry of contact candidates at a pose, in T axes."""
+    """Geometry of contact candidates (pairs of shapes that may touch) at a pose, in target frame T."""
 
     depth: Float[Array, "candidates *batch"]  # penetration d [m]; minus the distance if the shapes are apart
     normal: Vector  # normal n of the target's surface, outward
@@ -35,7 +35,7 @@ class Candidates(eqx.Module):
 
     @abc.abstractmethod
     def touch(self, pose: Pose) -> Touch:
-        """Return penetration, normal and point at a pose, whose arrays have a leading axis of length 1."""
+        """Return penetration, normal and point at a pose; its arrays have a leading axis of length 1."""
 
     @property
     @abc.abstractmethod
@@ -46,9 +46,9 @@ class Candidates(eqx.Module):
 class ChaserSpheres(Candidates):
     """Pairs of a sphere of the chaser and a shape of the target; a sphere of radius 0 is a point."""
 
-    centre: Vector  # centre of the sphere, in C axes [m]
+    centre: Vector  # centre of the sphere, in chaser frame C [m]
     radius: Float[Array, "candidates *batch"]  # radius of the sphere [m]
-    shape: Shape  # shape of the target, in T axes
+    shape: Shape  # shape of the target, in target frame T
 
     @property
     def size(self):
@@ -63,9 +63,9 @@ class ChaserSpheres(Candidates):
 class TargetSpheres(Candidates):
     """Pairs of a sphere of the target and a shape of the chaser; a sphere of radius 0 is a point."""
 
-    centre: Vector  # centre of the sphere, in T axes [m]
+    centre: Vector  # centre of the sphere, in target frame T [m]
     radius: Float[Array, "candidates *batch"]  # radius of the sphere [m]
-    shape: Shape  # shape of the chaser, in C axes
+    shape: Shape  # shape of the chaser, in chaser frame C
 
     @property
     def size(self):
@@ -81,8 +81,8 @@ class TargetSpheres(Candidates):
 class Capsules(Candidates):
     """Pairs of a capsule of the chaser and a capsule of the target."""
 
-    chaser: Capsule  # in C axes
-    target: Capsule  # in T axes
+    chaser: Capsule  # in chaser frame C
+    target: Capsule  # in target frame T
 
     @property
     def size(self):
@@ -111,8 +111,8 @@ def motion_at(touch: Touch, pose: Pose, twist: Twist) -> tuple[Float[Array, "can
 def _nearest(first: Capsule, second: Capsule) -> tuple[Array, Array]:
     """Return the nearest points of two capsules' segments, as fractions of the segments' lengths.
 
-    If the nearest points are not unique, the result is near the middles. Both fractions are first solved for
-    together, with a slight regularisation. Then each point is projected on the other segment.
+    If the nearest points are not unique, the result is near the middles of the segments. A linear equation
+    with a slight regularisation gives both fractions. Then each point is projected on the other segment.
     """
     u, v, apart = first.end - first.start, second.end - second.start, first.start - second.start
     uu, vv, uv = dot(u, u) * (1 + PARALLEL_WEIGHT), dot(v, v) * (1 + PARALLEL_WEIGHT), dot(u, v)

@@ -14,19 +14,19 @@ from jaxhil.sixdof.relative import Pair, States, effective_mass, relative
 from jaxhil.sixdof.space import Space
 from jaxhil.sixdof.vectors import Vector
 
-TOUCH_STEPS = 4  # steps of Newton's method for the time of the first touch
+TOUCH_STEPS = 4  # number of Newton steps for the time of the first touch
 
 
 class Meeting(NamedTuple):
     """Bodies and contact geometry at the first touch of an episode."""
 
     states: States  # states of the bodies
-    point: Vector  # point of the touch, in T axes [m]
-    normal: Vector  # normal of the target's surface, in T axes
+    point: Vector  # point of the touch, in target frame T [m]
+    normal: Vector  # normal of the target's surface, in target frame T
 
 
 def meet(space: Space, before: States, depths: tuple[Float[Array, "candidates *batch"], ...]) -> Meeting:
-    """Find the first touch by Newton's method, on the free flight that leads to it.
+    """Compute the first touch by Newton's method for the time of the free flight that leads to it.
 
     Args:
         space: Constants of the ideal contact.
@@ -46,7 +46,7 @@ def meet(space: Space, before: States, depths: tuple[Float[Array, "candidates *b
         rates = [motion_at(touch, pose, twist)[0] for touch in touches]
         return _deepest(list(zip(touches, rates, strict=True)), depths)
 
-    # A Python loop would be unrolled, and the compiler would fuse and repeat its computations.
+    # The compiler would unroll a Python loop, fuse its computations and repeat them.
     def newton(_, carry: tuple[Array, States, Meeting]) -> tuple[Array, States, Meeting]:
         time, states, _ = carry
         touch, rate = touch_of(states)
@@ -76,7 +76,7 @@ def glide(bodies: Pair, states: States, time: Float[Array, "*batch"]) -> States:
 
 
 def _deepest(candidates: list[tuple[Touch, Array]], depths: tuple[Array, ...]) -> tuple[Touch, Array]:
-    """Return geometry and penetration rate of the candidate with the largest penetration in `depths` [m]."""
+    """Return geometry and penetration rate of the candidate that has the largest of the `depths` [m]."""
     best: tuple[tuple[Touch, Array], Array] | None = None
     for candidate, depth in zip(candidates, depths, strict=True):
         index = jnp.argmax(depth, axis=0)[None]

@@ -40,7 +40,7 @@ class Memory(NamedTuple):
 
 
 class Forces(NamedTuple):
-    """Contact forces on the chaser, for each candidate, in T axes."""
+    """Contact forces on the chaser, for each candidate (pair of shapes), in target frame T."""
 
     touch: Touch  # penetration, normal and point
     normal: Float[Array, "candidates *batch"]  # normal force F [N]
@@ -51,7 +51,7 @@ class Forces(NamedTuple):
 def contact_forces(
     group: ContactGroup, memory: Memory, pose: Pose, twist: Twist, duration: Float[Array, "*batch"]
 ) -> tuple[Forces, Memory]:
-    """Compute the forces of a group's candidates at a pose and twist, and the laws' next states.
+    """Compute a group's contact forces at a pose and twist, and the next states of its laws.
 
     `duration` is the time since the last evaluation of the laws [s].
     """
@@ -68,7 +68,7 @@ def contact_forces(
 
 
 def total_wrench(forces: Forces) -> Wrench:
-    """Sum the forces of all candidates to a wrench on the chaser, with the moment about T's origin."""
+    """Sum all candidates' forces to a wrench on the chaser about the origin of target frame T."""
     force = forces.normal * forces.touch.normal + forces.tangential
     moment = cross(forces.touch.point, force)
     return Wrench(*(jax.tree.map(lambda part: part.sum(axis=0), part) for part in (force, moment)))
@@ -97,7 +97,7 @@ def contact_wrench(
 
 
 def deepest(groups: tuple[ContactGroup, ...], pose: Pose) -> Float[Array, "*batch"]:
-    """Return the largest penetration [m] of all candidates at a pose; minus infinity without candidates."""
+    """Return the largest penetration [m] at a pose; minus infinity if no shapes may touch."""
     lifted = jax.tree.map(lambda leaf: leaf[None], pose)
     depth = jnp.full_like(pose.position.x, -jnp.inf)
     for group in groups:

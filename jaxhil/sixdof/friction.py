@@ -61,9 +61,9 @@ class Regularised(Friction):
 class Bristle(Friction):
     """Bristle friction f_t = -(k_t z + b_t t), limited to mu F, for a slip t (Dahl's model).
 
-    The deflection z of the bristle follows z' = t - |t| z k_t/(mu F). The law is a spring at rest, and
-    Coulomb friction in steady slip. Each evaluation integrates z by one implicit step and projects z on the
-    tangent plane. Without contact z is 0.
+    The deflection z of the bristle follows z' = t - |t| z k_t/(mu F). The law is a spring for small
+    displacements, and Coulomb friction in steady slip. Each evaluation integrates z by one implicit step and
+    projects z on the tangent plane. Without contact z is 0.
     """
 
     coefficient: Float[Array, "candidates *batch"]  # friction coefficient mu [1]

@@ -17,7 +17,7 @@ from jaxhil.sixdof.vectors import vector
 
 
 class Moving(NamedTuple):
-    """Motion of the hardware's frame C relative to T."""
+    """Motion of the hardware: pose, twist and acceleration of chaser frame C relative to target frame T."""
 
     pose: Pose
     twist: Twist
@@ -44,7 +44,7 @@ class Kinematics(eqx.Module):
     def coordinates(self, motion: Motion, near: Float[Array, "6 *batch"]) -> Motion:
         """Convert the motion of the axes to the motion of the coordinates.
 
-        `near` are coordinates near the result, where an iteration can start.
+        `near` contains coordinates near the result, from which an iteration can start.
         """
 
 

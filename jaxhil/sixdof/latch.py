@@ -1,7 +1,7 @@
 """Latches, each of which catches a point of the chaser that is deep, aligned and slow enough.
 
-A latch that has caught holds the point by a six-axis spring and damper, about the pose at which the point was
-caught, so that the spring force begins at 0. A latch belongs to the hardware and does not release in a run.
+A latch holds the caught point by a six-axis spring and damper. The spring is relaxed at the pose at which the
+point was caught, so that its force begins at 0. A latch belongs to the hardware and never releases in a run.
 """
 
 from typing import NamedTuple
@@ -26,13 +26,13 @@ from jaxhil.sixdof.vectors import Vector, cross, vector
 class Latch(NamedTuple):
     """Parameters of the latches of one table."""
 
-    point: Vector  # point of the chaser that the latch catches, in C axes [m]
+    point: Vector  # point of the chaser that the latch catches, in chaser frame C [m]
     depth: Float[Array, "latches *batch"]  # minimum depth of the point below T's plane z = 0 [m]
-    angle: Float[Array, "latches *batch"]  # maximum angle between C and T [rad]
+    angle: Float[Array, "latches *batch"]  # maximum angle between frames of chaser and target [rad]
     speed: Float[Array, "latches *batch"]  # maximum speed at which the point recedes [m/s]; may be infinite
-    # stiffness matrix in T axes: from displacement and rotation to force and moment about the point
+    # stiffness matrix in target frame T: from displacement and rotation to force and moment about the point
     stiffness: Float[Array, "6 6 latches *batch"]  # [N/m, N, N m]
-    # damping matrix in T axes: from velocity and angular velocity to force and moment about the point
+    # damping matrix in target frame T: from velocity and angular velocity to force and moment about the point
     damping: Float[Array, "6 6 latches *batch"]  # [N s/m, N s, N m s]
     from_start: Bool[Array, "latches *batch"]  # whether the latch holds the chaser at the start of the run
 
@@ -41,8 +41,8 @@ class Held(NamedTuple):
     """State of the latches: whether they have caught, and the pose at which they caught."""
 
     caught: Bool[Array, "latches *batch"]
-    point: Vector  # position of the caught point when the latch caught, in T axes [m]
-    attitude: Quaternion  # rotation from C axes to T axes when the latch caught
+    point: Vector  # position of the caught point when the latch caught, in target frame T [m]
+    attitude: Quaternion  # rotation from chaser frame C to target frame T when the latch caught
 
 
 def init_latch(latch: Latch, pose: Pose) -> Held:
@@ -53,7 +53,10 @@ def init_latch(latch: Latch, pose: Pose) -> Held:
 
 
 def latch_wrench(latch: Latch, memory: Held, pose: Pose, twist: Twist) -> tuple[Wrench, Held]:
-    """Return the latches' wrench [N, N m] on the chaser, about T's origin, and the latches' next state."""
+    """Return the wrench of all latches on the chaser [N, N m], and the next state of the latches.
+
+    The wrench is about the origin of target frame T.
+    """
     point = latch_points(latch, pose)
     (position, attitude), (linear, angular) = jax.tree.map(lambda part: part[None], (pose, twist))
     velocity = linear + cross(angular, point - position)
@@ -78,7 +81,7 @@ def latch_wrench(latch: Latch, memory: Held, pose: Pose, twist: Twist) -> tuple[
 
 
 def latch_points(latch: Latch, pose: Pose) -> Vector:
-    """Return the positions of the latches' points at a pose, in T axes [m]."""
+    """Return the positions of the latches' points at a pose, in target frame T [m]."""
     position, attitude = jax.tree.map(lambda part: part[None], (pose.position, pose.attitude))
     return position + rotate(attitude, latch.point)
 

@@ -4,7 +4,8 @@ A tick has four steps. The sensors read the delayed wrench of the real contact a
 The compensator computes the wrench command. The numerical model integrates the motion of both bodies under
 this wrench. The motion simulator receives the relative pose of the bodies as its command.
 
-The contact wrench is computed at the hardware's pose, in T axes about T's origin, and acts at the model's T.
+The contact wrench is computed at the hardware's pose, in target frame T and about the origin of T. It acts on
+the numerical model at the origin of the model's frame T.
 """
 
 from typing import Any, NamedTuple
@@ -54,8 +55,8 @@ from jaxhil.sixdof.sensor import (
 from jaxhil.sixdof.vectors import assembled, vector
 
 SIDES = ("fixed", "moving")  # sides of the rig on which the force sensor may be
-# Number of ticks that are simulated before a run if the axis positions are not linear in the coordinates, so
-# that the hardware has settled.
+# Number of ticks before a run in which the hardware settles, if axis positions are not linear in the
+# coordinates.
 SETTLING_TICKS = 256
 
 
@@ -88,7 +89,7 @@ class Rig(NamedTuple):
     bodies: Pair  # bodies of the numerical model
     axes: Axes  # axes of the motion simulator, with the sensors' delays
     kinematics: Kinematics
-    groups: tuple[ContactGroup, ...]  # candidates of the real contact
+    groups: tuple[ContactGroup, ...]  # groups of shape pairs that may touch
     latches: tuple[Latch, ...]
     sensor: Sensor
     period: Float[Array, "*batch"]  # control period T [s]
@@ -110,8 +111,8 @@ class RunState(NamedTuple):
     """State of a batch of runs between two ticks."""
 
     states: States  # states of the numerical model's bodies
-    near: Float[Array, "6 *batch"]  # coordinates of C relative to T in the numerical model
-    twist: Float[Array, "6 *batch"]  # twist of C relative to T in the numerical model
+    near: Float[Array, "6 *batch"]  # coordinates of the numerical model's pose
+    twist: Float[Array, "6 *batch"]  # twist of the numerical model
     hardware: Hardware
     memories: tuple[Memory, ...]  # states of the contact and friction laws
     held: tuple[Held, ...]  # states of the latches
@@ -126,13 +127,13 @@ class Tick(NamedTuple):
     pose: Pose  # pose of the hardware at the force sensor's sampling instant
     twist: Twist  # twist of the hardware at this instant
     contact: Wrench  # wrench of the real contact at this instant, including the latches
-    forces: tuple[Forces, ...]  # forces of each group of candidates at this instant
+    forces: tuple[Forces, ...]  # contact forces of each group of shape pairs at this instant
     held: tuple[Held, ...]  # states of the latches
     command: Wrench  # wrench command, which acts on the numerical model
 
 
 def build_loop(scenario: Scenario, **static: Any) -> Loop:
-    """Build the loop for a batch of scenarios; `static` contains the fields that the scenarios leave open."""
+    """Build the loop for a batch of scenarios; `static` contains fields that do not follow from scenarios."""
     sensor, period = scenario.sensor, np.asarray(scenario.control_period)
     errors = sensor.errors
     slowest = np.maximum(sensor.delay, sensor.position_delay)[None] + np.asarray(scenario.simulator.delay)
@@ -157,18 +158,18 @@ def build_loop(scenario: Scenario, **static: Any) -> Loop:
 def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
     """Discretise the axes and prepare the compensator; each gain is a scalar or has the batch shape."""
     sensor, period, law = scenario.sensor, scenario.control_period, SIX_AXIS_COMPENSATORS[loop.compensator]
-    weighed = loop.side == "moving"
+    has_tool = loop.side == "moving"
     axes = build_axes(
         scenario.simulator,
         sensor.delay,
         sensor.position_delay,
         period,
         loop.hold,
-        weighed,
-        weighed or law.reads_pose,
+        has_tool,
+        has_tool or law.reads_pose,
     )
     full = {name: jnp.zeros_like(period) + value for name, value in gains.items()}
-    constants = controller_constants(scenario, weighed)
+    constants = controller_constants(scenario, has_tool)
     return Rig(
         bodies=scenario.bodies,
         axes=axes,
@@ -268,19 +269,19 @@ def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
 
 
 def model_motion(bodies: Pair, states: States) -> tuple[Array, Array, Array]:
-    """Return coordinates, coordinate rates and twist of C relative to T, (6, *batch) each.
+    """Return coordinates, their rates and the twist of the numerical model, (6, *batch) each.
 
-    `states` are those of the numerical model's bodies.
+    They describe chaser frame C relative to target frame T; `states` are those of the model's bodies.
     """
     pose, twist = relative(bodies, states)
     at, rates = coordinates(pose, twist)
     return assembled(at), assembled(rates), assembled(twist)
 
 
-def controller_constants(scenario: Scenario, weighed: bool) -> SixAxisConstants:
+def controller_constants(scenario: Scenario, has_tool: bool) -> SixAxisConstants:
     """Return the constants of the rig that the compensator knows.
 
-    `weighed` states whether the force sensor carries a tool.
+    `has_tool` states whether the force sensor carries a tool, whose inertia it also reads.
     """
     bodies, period = scenario.bodies, scenario.control_period
     zero = jnp.zeros_like(period)
@@ -290,7 +291,7 @@ def controller_constants(scenario: Scenario, weighed: bool) -> SixAxisConstants:
     unit = jnp.broadcast_to(jnp.eye(6, dtype=period.dtype).reshape(6, 6, *[1] * period.ndim), mass.shape)
     inverse = solve(mass, unit)
     correction = unit
-    if weighed:
+    if has_tool:
         correction = solve(unit - product(tool_mass(scenario.sensor.assumed_tool), inverse), unit)
     return SixAxisConstants(period, mass, inverse, correction)
 

@@ -1,4 +1,4 @@
-"""Metrics of episodes: comparison of the rig's contact with the ideal contact from the same initial states.
+"""Metrics of episodes (contacts with all their touches): comparison with ideal contacts from the same states.
 
 The comparison takes place at the end of the rig's episode, when the bodies are free in both contacts. Twists
 V are compared in the norm sqrt(V^T M V) of the relative mass matrix M, which relates metres and radians.
@@ -24,8 +24,8 @@ from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.space import Space, fly, scale, start_flight
 from jaxhil.sixdof.vectors import components, cross, dot
 
-# Lower limit of the energy of the first touch by which errors are divided, relative to the energy of the
-# approach [1]: a first touch that only grazes the surface must not enlarge all errors.
+# Minimum energy by which errors are divided, relative to the energy of the approach [1]. Without it, a first
+# touch that only grazes the surface would enlarge all errors.
 LEAST_SHARE = 0.05
 
 
@@ -45,18 +45,18 @@ class Metrics(NamedTuple):
     reference_restitution: Float[Array, "..."]  # restitution of the ideal contact; only for one touch [1]
     effective_mass: Float[Array, "..."]  # effective mass m_n at the first touch [kg]
     approach_velocity: Float[Array, "..."]  # approach velocity v_n along the normal of the first touch [m/s]
-    point: Float[Array, "..."]  # point of the first touch, in T axes, (3, episodes, *batch) [m]
+    point: Float[Array, "..."]  # point of the first touch, in target frame T, (3, episodes, *batch) [m]
     normal: Float[Array, "..."]  # normal of the target's surface at this point, (3, episodes, *batch)
     energy_change: Float[Array, "..."]  # change dE of the bodies' kinetic energy [J]
     reference_energy_change: Float[Array, "..."]  # change of the kinetic energy in the ideal contact [J]
     peak_force: Float[Array, "..."]  # peak force of the real contact [N]
     reference_peak_force: Float[Array, "..."]  # peak force of the ideal contact [N]
-    peak_moment: Float[Array, "..."]  # peak moment of the real contact, about T's origin [N m]
-    reference_peak_moment: Float[Array, "..."]  # peak moment of the ideal contact, about T's origin [N m]
+    peak_moment: Float[Array, "..."]  # largest moment about T's origin in the real contact [N m]
+    reference_peak_moment: Float[Array, "..."]  # largest moment about T's origin, ideal contact [N m]
     duration: Float[Array, "..."]  # time during which the hardware touches [s]
     # time during which the ideal contact touches; NaN if it was too stiff to be integrated [s]
     reference_duration: Float[Array, "..."]
-    touches: Int[Array, "..."]  # number of touches of the hardware, summed over the candidates
+    touches: Int[Array, "..."]  # number of touches of the hardware, all pairs of shapes
     reference_touches: Int[Array, "..."]  # number of touches of the ideal contact
     penetration: Float[Array, "..."]  # largest penetration of the hardware, divided by the shapes' size [1]
     captured: Bool[Array, "..."]  # whether a latch of the hardware holds at the end
@@ -65,9 +65,9 @@ class Metrics(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """Twist, energy and mass matrix of the two bodies at an instant."""
+    """Twist, kinetic energy and mass matrix of the two bodies at one instant."""
 
-    twist: Twist  # twist of C relative to T
+    twist: Twist  # twist of chaser frame C relative to target frame T
     energy: Float[Array, "..."]  # kinetic energy of both bodies [J]
     mass: Float[Array, "..."]  # relative mass matrix, (6, 6, episodes, *batch)
 
@@ -98,7 +98,7 @@ def reference_final(scenario: Scenario, time: Float[Array, "*batch"]) -> States:
 
 
 def judge(bodies: Pair, episodes: Episode) -> Metrics:
-    """Compute the metrics of episodes (episodes, *batch); the bodies have the shape (*batch)."""
+    """Return the metrics of all episodes, (episodes, *batch); each run has its own `bodies`, (*batch)."""
     bodies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, episodes.status.shape), bodies)
     past, meeting = episodes.past, episodes.meeting
     expected_states = states_at(bodies, past, episodes.lasted)
@@ -150,9 +150,9 @@ def _closing(pose: Pose, meeting: Meeting, twist: Twist) -> Array:
 
 
 def _moments(bodies: Pair, states: list[States]) -> list[Moment]:
-    """Return twist, energy and mass matrix for each of the states."""
+    """Return the twist, energy and mass matrix that belong to each of the states."""
 
-    # A Python loop would be unrolled, and the compiler would fuse and repeat its computations.
+    # The compiler would unroll a Python loop, fuse its computations and repeat them.
     def moment(_, states: States) -> tuple[None, Moment]:
         _, twist = relative(bodies, states)
         energies = [kinetic_energy(*item) for item in zip(bodies, states, strict=True)]
@@ -165,7 +165,7 @@ def _moments(bodies: Pair, states: list[States]) -> list[Moment]:
 def _twist_parts(matrix: Array, after: Twist, expected: Twist, before: Twist) -> tuple[Array, ...]:
     """Return the twist error in the norm of M, and its normal, lateral and rotational parts [1].
 
-    All are divided by the norm of the expected change of the twist.
+    All are divided by the norm of the twist's change in the ideal contact.
     """
     error, impulse = (_stacked(a) - _stacked(b) for a, b in ((after, expected), (expected, before)))
     size = safe_sqrt(_square(matrix, impulse))

@@ -26,21 +26,21 @@ from jaxhil.sixdof.stewart import Stewart, condition
 from jaxhil.sixdof.vectors import dot
 
 MAX_TICKS = 1e7  # maximum number of ticks of a run
-MAX_ATTITUDE = 1.0  # rad; maximum angle between C and T at the start
+MAX_ATTITUDE = 1.0  # rad; maximum angle between the frames of chaser and target at the start
 MAX_CONDITION_NUMBER = 100.0  # maximum condition number of a hexapod's Jacobian, with lengths in m
-# Number of control periods between two checks of a run; shapes must not pass through each other in this time.
+# Number of control periods between checks of a run. In this time, shapes must not pass through each other.
 CHECK_PERIODS = STRETCH
 
 
 class StartValues(NamedTuple):
-    """Values at the start of a run that the checks need."""
+    """Values at the start of a run from which `check_scenario` decides whether the run is possible."""
 
-    coordinates: Float[Array, "6 *batch"]  # coordinates of C relative to T
+    coordinates: Float[Array, "6 *batch"]  # coordinates of chaser frame C relative to target frame T
     depth: Float[Array, "*batch"]  # largest penetration [m]
-    # for each group: relative speed of the shapes [m/s], and penetration at which they pass through [m]
+    # per group: speed of the shapes [m/s], and penetration at which one has passed through the other [m]
     passing: tuple[tuple[Float[Array, "candidates *batch"], Float[Array, "candidates *batch"]], ...]
     caught: tuple[Bool[Array, "latches *batch"], ...]  # whether latches catch at the start
-    # lengths of a hexapod's legs [m], and condition number of their Jacobian: at the start, and with C at T
+    # lengths of a hexapod's legs [m], and condition number of their Jacobian, at the start and when docked
     legs: tuple[Float[Array, "6 *batch"], ...]
     conditions: tuple[Float[Array, "*batch"], ...]
 
@@ -67,14 +67,14 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
         )
     angle = float(np.linalg.norm(at[3:]))
     if angle > MAX_ATTITUDE:
-        allowed = f"at most {MAX_ATTITUDE:g} rad between C and T, including interface_rotation"
+        allowed = f"at most {MAX_ATTITUDE:g} rad between the interface frames (see interface_rotation)"
         key = "start.chaser.attitude" if mechanism.start else "approach.angular_velocity"
         found = f"{key}: found a rotation by {angle:.3g} rad at the start"
         raise InputError(f"{mechanism.name}: {found}, expected {allowed}")
     depth = float(start.depth[0])
     if depth > 0:
         key = "start.chaser.position" if mechanism.start else "approach.angular_velocity"
-        change = "move the chaser along z of T" if mechanism.start else "reduce angular or sideways velocity"
+        change = "move the chaser along z" if mechanism.start else "reduce angular or sideways velocity"
         found = f"{key}: found a contact at the start, {depth:.3g} m deep"
         raise InputError(f"{mechanism.name}: {found}, expected a start without contact: {change}")
     _check_speed(mechanism, start, float(scenario.control_period[0]))
@@ -100,9 +100,9 @@ def _check_speed(mechanism: SixAxisMechanism, start: StartValues, period: float)
 
 
 def _check_legs(mechanism: SixAxisMechanism, start: StartValues) -> None:
-    """Raise `InputError` if a hexapod cannot reach the start or the docked pose, or is nearly singular there.
+    """Raise `InputError` if a hexapod cannot reach a required pose, or is nearly singular there.
 
-    In the docked pose, C equals T.
+    The required poses are the start and the docked pose, in which chaser frame C equals target frame T.
     """
     stroke = mechanism.rig.simulator.stroke
     poses = zip(("the start", "the docked pose"), start.legs, start.conditions, strict=False)
@@ -120,12 +120,11 @@ def _check_legs(mechanism: SixAxisMechanism, start: StartValues) -> None:
 
 @cache
 def _compiled() -> Callable[[Scenario], StartValues]:
-    """Return the compiled version of `_start_values`."""
     return jax.jit(_start_values, compiler_options=supported_options(SINGLE_RUN_OPTIONS))
 
 
 def _start_values(scenario: Scenario) -> StartValues:
-    """Compute the values at the start of the runs that the checks need."""
+    """Compute the `StartValues` of the scenarios."""
     pose, twist = relative(scenario.bodies, scenario.start)
     at, *_ = model_motion(scenario.bodies, scenario.start)
     caught = tuple(

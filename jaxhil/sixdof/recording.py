@@ -21,14 +21,14 @@ from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.space import Space, follow
 from jaxhil.sixdof.vectors import Vector
 
-# Minimum number of ticks of a compiled program. The numbers are powers of two, so that runs share programs.
+# Minimum number of ticks of a compiled program. Numbers are powers of two, so that runs can share programs.
 MIN_TICKS = 256
 
 
 class Recorded(NamedTuple):
     """Signals of the rig and of the ideal contact at all ticks of a run, in SI units.
 
-    Coordinates are (p, theta), twists (v, w), and wrenches (force, moment about T's origin), all in T axes.
+    Coordinates (p, theta), twists (v, w) and wrenches (force, moment about the origin) are in target frame T.
     Signals of the hardware are those at the force sensor's sampling instant. The motion of a body consists of
     position, attitude (w, x, y, z), velocity and angular velocity, in the axes of the file's table [start].
 
@@ -45,11 +45,12 @@ class Recorded(NamedTuple):
         wrench_in_space: Wrench of the ideal contact, (ticks, 6).
         target: Motion of the numerical model's target, (ticks, 13).
         chaser: Motion of the numerical model's chaser, (ticks, 13).
-        names: Names of the contact candidates.
+        names: Names of the contact candidates (pairs of shapes that may touch).
         force: Normal force of each candidate [N], (ticks, candidates).
         depth: Penetration of each candidate [m], negative if the shapes are apart, (ticks, candidates).
-        point: Point where each candidate's force acts, in T axes [m], (ticks, candidates, 3).
-        push: Force of each candidate on the chaser, with friction, in T axes [N], (ticks, candidates, 3).
+        point: Point where each candidate's force acts, in target frame T [m], (ticks, candidates, 3).
+        push: Force of each candidate on the chaser, with friction, in target frame T [N],
+            (ticks, candidates, 3).
         groups: Groups of contact candidates.
     """
 
@@ -107,7 +108,7 @@ def record(
 def record_scenario(
     mechanism: SixAxisMechanism, loop: Loop, gains: dict[str, Any], scenario: Scenario
 ) -> Recorded:
-    """Simulate the whole run of one scenario (a batch with one lane) of a mechanism; record all ticks."""
+    """Simulate the whole run of a mechanism's scenario (a batch with one lane), and record all ticks."""
     (duration,) = np.asarray(_duration()(loop, gains, scenario))
     return _recorded(mechanism, loop, gains, scenario, float(duration))
 

@@ -1,6 +1,6 @@
 """Ideal contact as the reference of a run on the rig.
 
-The ideal contact is integrated once, over the whole duration of the run. An episode of the rig ends when both
+The ideal contact is integrated once, for the whole duration of the run. An episode of the rig ends when both
 the rig and the ideal contact are free. Therefore this module records the gaps between touches of the ideal
 contact (periods in which nothing touches), with the motion of the bodies at the start of each gap.
 """
@@ -30,24 +30,24 @@ from jaxhil.sixdof.vectors import norm
 FIRST = 1e-4  # s; length of the first integration step
 LONGEST = 2.0  # control periods; maximum length of an integration step near a touch
 GAPS = 4  # maximum number of recorded gaps between touches
-# Minimum change of the twist by a contact after which an episode may end, relative to the twist before [1].
+# Minimum change of the twist after which an episode may end, divided by the twist before the contact [1].
 LEAST_CHANGE = 0.05
 
 
 class Past(NamedTuple):
-    """States and metrics of the ideal contact from its start up to a time."""
+    """Past of the ideal contact: its metrics up to a time, and the states at this time."""
 
     time: Float[Array, "*batch"]  # time since the start [s]
     states: States  # states of the bodies at this time
-    touches: Int[Array, "*batch"]  # number of touches, summed over the candidates
+    touches: Int[Array, "*batch"]  # number of touches of all pairs of shapes
     touched: Float[Array, "*batch"]  # time during which shapes touched [s]
     peak_force: Float[Array, "*batch"]  # peak force [N]
-    peak_moment: Float[Array, "*batch"]  # peak moment about T's origin [N m]
+    peak_moment: Float[Array, "*batch"]  # peak moment about the origin of target frame T [N m]
     captured: Bool[Array, "*batch"]  # whether a latch holds
 
 
 class Gaps(NamedTuple):
-    """Gaps of the ideal contact: periods without a touch, after a noticeable change of the twist.
+    """Gaps of the ideal contact: periods without a touch that follow a noticeable change of the twist.
 
     Arrays are (GAPS, *batch). If there are more gaps, the latest gap overwrites the last entry. An unused
     entry begins at infinity.
@@ -58,7 +58,7 @@ class Gaps(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """Ideal contact over the whole duration of a run: first touch, gaps, and final values."""
+    """Ideal contact for the whole duration of a run: first touch, gaps, and values at the end."""
 
     meeting: Meeting  # first touch
     gaps: Gaps
@@ -71,21 +71,21 @@ class Passage(NamedTuple):
 
     flight: Flight  # motion of the bodies, with the state of the integrator
     touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each group's candidates touch
-    touches: Int[Array, "*batch"]  # number of touches, summed over the candidates
+    touches: Int[Array, "*batch"]  # number of touches of all pairs of shapes
     touched: Float[Array, "*batch"]  # time during which shapes touched [s]
     before: States  # states at the start of the step in which the first touch begins
     depths: tuple[Float[Array, "candidates *batch"], ...]  # penetrations at the end of this step [m]
     force: Peak  # peak force [N]
-    moment: Peak  # peak moment about T's origin [N m]
+    moment: Peak  # peak moment about the origin of target frame T [N m]
     gaps: Gaps
     slot: Int[Array, "*batch"]  # index of the current or next gap
     active: Bool[Array, "*batch"]  # whether the integration of each lane continues
 
 
 class Approach(NamedTuple):
-    """Relative motion at the start of the ideal contact, and the minimum duration of a recorded gap."""
+    """Constants of the integration: motion at the start of the ideal contact, and minimum recorded gap."""
 
-    twist: Twist  # twist of C relative to T
+    twist: Twist  # twist of chaser frame C relative to target frame T
     mass: Float[Array, "6 6 *batch"]  # relative mass matrix
     speed: Float[Array, "*batch"]  # speed that scales the integration error, see `space.scale` [m/s]
     quiet: Float[Array, "*batch"]  # minimum duration of a recorded gap [s]
@@ -108,7 +108,7 @@ def follow_contact(space: Space, states: States, quiet: Array, until: Array, per
     def body(passage: Passage) -> Passage:
         left = until - passage.flight.time
         after, step = advance_flight(space, passage.flight, left, longest, approach.speed)
-        # A rejected step changes only the length of the next one.
+        # A rejected step changes nothing but the length of the next step.
         going = select_lanes(step.accepted, _updated(passage, approach, after, step.now), passage)
         going = going._replace(flight=after)
         done = (until - after.time <= 1e-13 * until) | ~jnp.isfinite(after.time)
@@ -126,9 +126,9 @@ def is_quiet(reference: Reference, time: Array, quiet: Array) -> Bool[Array, "*b
 
 
 def past_at(reference: Reference, time: Array, common: Bool[Array, "*batch"]) -> Past:
-    """Return the ideal contact up to the start of the gap that contains a `time` [s].
+    """Return the past of the ideal contact at the start of the gap in which a `time` [s] lies.
 
-    In lanes where `common` is false, return the ideal contact up to the end of the run.
+    A gap is a period without a touch. In lanes in which `common` is false, return the past at the run's end.
     """
     past = reference.last
     for slot in range(GAPS):

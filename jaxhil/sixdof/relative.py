@@ -1,7 +1,7 @@
 """Relative pose and twist of chaser and target, wrenches, and the relative mass matrix.
 
 The interface frames are T on the target and C on the chaser. The z axis of T is the docking axis and points
-from the target to the chaser. Relative quantities are in T axes (notebooks/guide/six_axes.md, section 1).
+from the target to the chaser. Relative quantities are in frame T (notebooks/guide/six_axes.md, section 1).
 """
 
 from typing import NamedTuple
@@ -38,29 +38,29 @@ class Frame(NamedTuple):
 class Pose(NamedTuple):
     """Pose of the chaser's frame C relative to the target's frame T."""
 
-    position: Vector  # position p of C's origin, in T axes [m]
-    attitude: Quaternion  # rotation from C axes to T axes
+    position: Vector  # position p of the origin of chaser frame C, in target frame T [m]
+    attitude: Quaternion  # rotation from chaser frame C to target frame T
 
 
 class Twist(NamedTuple):
     """Velocity of the chaser's frame C relative to the target's frame T, observed from T."""
 
-    linear: Vector  # velocity v of C's origin, in T axes [m/s]
-    angular: Vector  # angular velocity w, in T axes [rad/s]
+    linear: Vector  # velocity v of the origin of chaser frame C, in target frame T [m/s]
+    angular: Vector  # angular velocity w, in target frame T [rad/s]
 
 
 class Coordinates(NamedTuple):
     """Six coordinates of a pose, or the rates of these coordinates."""
 
     position: Vector  # position p [m], or its rate [m/s]
-    rotation: Vector  # rotation vector theta of C relative to T [rad], or its rate [rad/s]
+    rotation: Vector  # rotation vector theta of the chaser [rad], or its rate [rad/s]
 
 
 class Wrench(NamedTuple):
-    """Force and moment of the target on the chaser, in T axes."""
+    """Force and moment of the target on the chaser, in target frame T."""
 
     force: Vector  # force f [N]
-    moment: Vector  # moment m about T's origin, if not stated otherwise [N m]
+    moment: Vector  # moment m about the origin of target frame T, if not stated otherwise [N m]
 
 
 class Pair(NamedTuple):
@@ -92,7 +92,7 @@ def interface_frame(body: Body, state: State) -> Frame:
 
 
 def relative_motion(target: Frame, chaser: Frame) -> tuple[Pose, Twist]:
-    """Return pose and twist of frame C (`chaser`) relative to frame T (`target`)."""
+    """Return pose and twist of chaser frame C (`chaser`) relative to target frame T (`target`)."""
     apart = chaser.position - target.position
     velocity = chaser.velocity - target.velocity - cross(target.angular_velocity, apart)
     pose = Pose(rotate_back(target.attitude, apart), compose(reverse(target.attitude), chaser.attitude))
@@ -125,7 +125,7 @@ def motion_of(at: Coordinates, rates: Coordinates) -> tuple[Pose, Twist]:
 
 
 def wrench_at_chaser(wrench: Wrench, pose: Pose) -> Wrench:
-    """Move the moment of a wrench from T's origin to C's origin.
+    """Convert a wrench about the origin of target frame T to a wrench about the origin of chaser frame C.
 
     The product of the result with the relative twist is the power of the wrench.
     """
@@ -133,12 +133,12 @@ def wrench_at_chaser(wrench: Wrench, pose: Pose) -> Wrench:
 
 
 def power(wrench_at_chaser: Wrench, twist: Twist) -> Float[Array, "..."]:
-    """Return the power [W] that a wrench about C's origin transfers to the relative motion."""
+    """Return the power [W] of a wrench about the origin of chaser frame C on the relative motion."""
     return dot(wrench_at_chaser.force, twist.linear) + dot(wrench_at_chaser.moment, twist.angular)
 
 
 def loads(wrench: Wrench, target: Frame, states: States) -> tuple[Load, Load]:
-    """Return the loads on target and chaser that a wrench exerts: equal and opposite, at T's origin."""
+    """Return the loads on target and chaser: equal and opposite, with the wrench at the origin of frame T."""
     force, moment = (rotate(target.attitude, part) for part in wrench)
 
     def about(state: State) -> Vector:
@@ -150,10 +150,10 @@ def loads(wrench: Wrench, target: Frame, states: States) -> tuple[Load, Load]:
 def advance(
     bodies: Pair, states: States, wrench: Wrench, period: Float[Array, "..."], share: Array | float
 ) -> States:
-    """Integrate the motion of both bodies over a control `period` [s] under a constant wrench.
+    """Integrate the motion of both bodies for a control `period` [s] under a constant wrench.
 
     `share` selects the integrator (see `bodies.SHARES`). Linear momentum is conserved exactly. Angular
-    momentum changes by (1 - share) T^2 (v_chaser - v_target) x f per period.
+    momentum changes by (1 - share) period^2 (v_chaser - v_target) x f in a period, where f is the force.
     """
     target, chaser = loads(wrench, interface_frame(bodies.target, states.target), states)
     return States(
@@ -163,7 +163,7 @@ def advance(
 
 
 def acceleration(bodies: Pair, states: States, wrench_at_chaser: Wrench) -> Twist:
-    """Return the relative acceleration M^-1 W_C of bodies at rest under a wrench W_C about C's origin.
+    """Return the relative acceleration M^-1 W_C of bodies at rest; W_C is the wrench about frame C's origin.
 
     M is the relative mass matrix. M^-1 is the sum of the contributions of the two bodies.
     """
@@ -182,7 +182,8 @@ def acceleration(bodies: Pair, states: States, wrench_at_chaser: Wrench) -> Twis
 def mass_matrix(bodies: Pair, states: States) -> Float[Array, "6 6 *batch"]:
     """Return the relative mass matrix M [kg, kg m, kg m^2].
 
-    M relates the relative twist V and the wrench W_C about C's origin: M V' = W_C for bodies at rest.
+    M relates the relative twist V to the wrench W_C about the origin of chaser frame C: M V' = W_C for bodies
+    at rest.
     """
     like = states.target.position.x
     unit = jnp.eye(6, dtype=like.dtype).reshape(6, 6, *[1] * like.ndim)
@@ -198,7 +199,7 @@ def effective_mass(bodies: Pair, states: States, point: Vector, normal: Vector) 
     """Return the effective mass m_n [kg] of the two bodies in a frictionless contact.
 
     1/m_n is the sum of 1/m_i + a_i . J_i^-1 a_i over the bodies, where a_i = (point - r_i) x normal. The
-    contact's `point` [m] and unit `normal` are in T axes.
+    contact's `point` [m] and unit `normal` are in target frame T.
     """
     target = interface_frame(bodies.target, states.target)
     total = jnp.zeros_like(normal.x)
@@ -210,6 +211,6 @@ def effective_mass(bodies: Pair, states: States, point: Vector, normal: Vector) 
 
 
 def _turning(body: Body, state: State, target: Frame, torque: Vector) -> Vector:
-    """Return the angular acceleration J^-1 torque of a body; both vectors are in T axes."""
+    """Return the angular acceleration J^-1 torque of a body; both vectors are in target frame T."""
     in_body = rotate_back(state.attitude, rotate(target.attitude, torque))
     return rotate_back(target.attitude, rotate(state.attitude, body.inverse_inertia @ in_body))

@@ -1,4 +1,4 @@
-"""Rollout of a batch of six-axis runs on the rig, until all evaluated episodes are over.
+"""Rollout: simulation of a batch of six-axis runs on the rig, until all evaluated episodes have ended.
 
 An episode is a contact with all its touches (`jaxhil.sixdof.watch`). Before each episode, the ideal contact
 from the same states is integrated. The ticks run in segments of `STRETCH` ticks. After each segment, the
@@ -39,7 +39,7 @@ STATUS_NAMES = ("miss", "rebounded", "captured", "jammed", "timeout", "diverged"
 
 
 class Episode(NamedTuple):
-    """Results of episodes on the rig, with their ideal contacts, (episodes, *batch)."""
+    """Results of episodes on the rig and their ideal contacts; arrays of shape (episodes, *batch)."""
 
     start: States  # states of the numerical model at the start of the episode
     end: States  # states of the numerical model at the end of the episode
@@ -47,10 +47,10 @@ class Episode(NamedTuple):
     meeting: Meeting  # first touch of the ideal contact from the same start
     # ideal contact up to the gap in which the episode ends; without a common gap, up to the end of the run
     past: Past
-    touches: Int[Array, "episodes *batch"]  # number of touches of the hardware, summed over the candidates
+    touches: Int[Array, "episodes *batch"]  # number of touches of the hardware, all pairs of shapes
     duration: Float[Array, "episodes *batch"]  # time during which the hardware touches [s]
     peak_force: Float[Array, "episodes *batch"]  # peak force of the real contact [N]
-    peak_moment: Float[Array, "episodes *batch"]  # peak moment of the real contact, about T's origin [N m]
+    peak_moment: Float[Array, "episodes *batch"]  # largest moment about T's origin in the real contact [N m]
     penetration: Float[Array, "episodes *batch"]  # largest penetration, divided by the shapes' size [1]
     status: Int[Array, "episodes *batch"]  # index of `STATUS_NAMES`
 

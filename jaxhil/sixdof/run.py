@@ -36,30 +36,30 @@ MAX_PENETRATION_RATIO = 0.5  # penetration divided by the shapes' size, above wh
 class Episode(NamedTuple):
     """Results of one episode (a contact with all its touches); NaN for a result that is not defined.
 
-    The ideal contact is the contact without a rig from the same initial states.
+    The ideal contact is the contact of two free bodies, without a rig, from the same initial states.
 
     Attributes:
         energy_error: Change of kinetic energy minus that of the ideal contact, divided by the energy of the
             approach [1].
         twist_error: Norm of the difference between the twist and the ideal contact's twist, divided by the
             norm of the ideal contact's change of twist [1].
-        normal_part: Part of the twist error along the ideal contact's impulse [1].
+        normal_part: Component of the twist error in the direction of the ideal contact's impulse [1].
         lateral_part: Translational part of the remaining twist error [1].
         rotational_part: Rotational part of the remaining twist error [1].
         restitution: Restitution e [1]; NaN unless there is a single touch.
         reference_restitution: Restitution e* of the ideal contact [1]; NaN unless there is a single touch.
         effective_mass: Effective mass m_n at the first touch [kg].
         approach_velocity: Approach velocity along the normal of the first touch [m/s].
-        point: Point of the first touch, in T axes [m].
+        point: Point of the first touch, in target frame T [m].
         normal: Normal of the target's surface at this point, outward.
         peak_force: Peak force of the real contact [N].
         reference_peak_force: Peak force of the ideal contact [N].
-        peak_moment: Peak moment of the real contact, about T's origin [N m].
-        reference_peak_moment: Peak moment of the ideal contact, about T's origin [N m].
+        peak_moment: Peak moment of the real contact, about the origin of target frame T [N m].
+        reference_peak_moment: Peak moment of the ideal contact, about the same origin [N m].
         duration: Time during which the hardware touches [s].
         reference_duration: Time during which the ideal contact touches [s].
-        touches: Number of touches of the hardware, summed over the candidates.
-        reference_touches: Number of touches of the ideal contact, summed over the candidates.
+        touches: Number of touches of the hardware, for all pairs of shapes.
+        reference_touches: Number of touches of the ideal contact, for all pairs of shapes.
         penetration: Largest penetration of the hardware, divided by the size of the shapes [1].
         status: How the episode ended, one of `rollout.STATUS_NAMES`.
     """
@@ -92,9 +92,8 @@ class Final(NamedTuple):
 
     Attributes:
         time: Time since the start of the run [s].
-        pose: Position and rotation vector of the chaser's frame C relative to the target's frame T, in T axes
-            [m, rad].
-        twist: Velocity and angular velocity of C relative to T, in T axes [m/s, rad/s].
+        pose: Position and rotation vector of chaser frame C relative to target frame T, in T [m, rad].
+        twist: Velocity and angular velocity of C relative to T, in T [m/s, rad/s].
         v1: Velocity of the target's centre of mass, in world axes [m/s].
         w1: Angular velocity of the target, in body axes [rad/s].
         v2: Velocity of the chaser's centre of mass, in world axes [m/s].
@@ -238,7 +237,7 @@ def _stiffest(mechanism: SixAxisMechanism) -> str:
     if slips:
         name = min(slips, key=slips.__getitem__)
         found = f"contact.{name}.friction.slip: found {frictions[name].slip:g} m/s"
-        allowed = "a larger one, or friction = { law = 'bristle', ... }"
+        allowed = "a larger slip, or friction = { law = 'bristle', ... }"
     else:
         name = next(iter(mechanism.contact))
         found, allowed = f"contact.{name}: found forces", "a softer contact"
@@ -265,7 +264,6 @@ def _final(time: float, motion: Any) -> Final:
 
 @cache
 def _compiled() -> Callable[..., Any]:
-    """Return the compiled version of `_run`."""
     return jax.jit(_run, static_argnums=0, compiler_options=supported_options(SINGLE_RUN_OPTIONS))
 
 
@@ -283,7 +281,7 @@ def _ideal_motion(scenario: Scenario, time: Any) -> tuple[Any, ...]:
 
 
 def _tangential_mass(scenario: Scenario, metrics: Metrics) -> Any:
-    """Return the effective mass [kg] along the surface at the first touch.
+    """Return the effective mass [kg] at the first touch for motion along the surface.
 
     The result is the smaller of the masses in two perpendicular directions.
     """

@@ -1,8 +1,8 @@
 """Six-axis force sensor of the rig, and the controller's reconstruction of the contact wrench.
 
-A sensor on the fixed side, under the target's mechanism, reads the reaction; the constant weight on it is
-tared. A sensor on the moving side is between the robot's flange and the chaser's mechanism, which is called
-the tool. The sensor also reads the tool's weight and inertia, which change with the pose. Delay and lag of
+A sensor on the fixed side, under the target's mechanism, reads the reaction force; the constant weight on it
+is tared. A sensor on the moving side is between the robot's flange and the chaser's mechanism (the tool). It
+also reads the tool's weight and inertia, which change with the pose. Delay and lag of
 the sensor are part of `jaxhil.sixdof.loop`.
 """
 
@@ -22,8 +22,8 @@ class Tool(NamedTuple):
     """Mass properties of the mechanism that a sensor on the moving side carries."""
 
     mass: Float[Array, "..."]  # mass m_t [kg]
-    centre: Vector  # vector c from C's origin to the centre of mass, in C axes [m]
-    inertia: Matrix  # inertia J_t about the centre of mass, in C axes [kg m^2]
+    centre: Vector  # vector c from the origin of chaser frame C to the centre of mass, in C [m]
+    inertia: Matrix  # inertia J_t about the centre of mass, in chaser frame C [kg m^2]
 
 
 class SampleErrors(NamedTuple):
@@ -45,21 +45,21 @@ class Sensor(NamedTuple):
     errors: SampleErrors
     noise_std: Float[Array, "6 *batch"]  # standard deviation of the white noise [N, N m]
     mounting: Pose | None  # pose of a sensor on the fixed side relative to T; None if the sensor is at T
-    tool: Tool  # tool of a sensor on the moving side
-    gravity: Vector  # gravity in T axes [m/s^2]
+    tool: Tool  # tool that a sensor on the moving side carries
+    gravity: Vector  # gravity in target frame T [m/s^2]
     assumed_tool: Tool  # tool that the controller assumes
-    assumed_gravity: Vector  # gravity that the controller assumes, in T axes [m/s^2]
+    assumed_gravity: Vector  # gravity that the controller assumes, in target frame T [m/s^2]
     assumed_bias: Float[Array, "6 *batch"]  # bias that the controller assumes [N, N m]
     position_delay: Float[Array, "*batch"]  # delay of the pose sensor [s]
-    position_noise_std: Float[Array, "6 *batch"]  # standard deviation of the coordinates' noise [m, rad]
-    position_quantum: Float[Array, "6 *batch"]  # resolution of the coordinates [m, rad]
+    position_noise_std: Float[Array, "6 *batch"]  # standard deviation of the pose's noise [m, rad]
+    position_quantum: Float[Array, "6 *batch"]  # resolution of the pose's coordinates [m, rad]
 
 
 def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity: Vector) -> Wrench:
-    """Return the wrench of the tool's weight and inertia [N, N m], about C's origin, in T axes.
+    """Return the wrench of the tool's weight and inertia about the origin of chaser frame C [N, N m].
 
-    T is at rest on the ground. `acceleration` contains the acceleration of C's origin and the angular
-    acceleration of the tool.
+    The wrench is in target frame T, which is at rest. `acceleration` contains the acceleration of C's origin
+    and the tool's angular acceleration.
     """
     centre = rotate(pose.attitude, tool.centre)
     angular, alpha = twist.angular, acceleration.angular
@@ -70,13 +70,13 @@ def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity
 
 
 def weight(tool: Tool, attitude: Quaternion, gravity: Vector) -> Wrench:
-    """Return the wrench of the tool's weight [N, N m], about C's origin, in T axes."""
+    """Return the wrench of the tool's weight about the origin of chaser frame C, in target frame T."""
     force = tool.mass * gravity
     return Wrench(force, cross(rotate(attitude, tool.centre), force))
 
 
 def tool_mass(tool: Tool) -> Float[Array, "6 6 *batch"]:
-    """Return the tool's mass matrix about C's origin [kg, kg m, kg m^2], if C and T have equal axes."""
+    """Return the tool's mass matrix about the origin of chaser frame C, in C [kg, kg m, kg m^2]."""
     mass, centre = tool.mass, components(tool.centre)
     unit = jnp.eye(3, dtype=mass.dtype).reshape(3, 3, *[1] * mass.ndim)
     zero = jnp.zeros_like(mass)
@@ -90,7 +90,7 @@ def tool_mass(tool: Tool) -> Float[Array, "6 6 *batch"]:
 
 
 def read_moving(wrench: Wrench, load: Wrench, pose: Pose) -> Wrench:
-    """Return the reading of a sensor on the moving side, about C's origin, in C axes.
+    """Return the reading of a sensor on the moving side, in chaser frame C and about its origin.
 
     The reading is the sum of the contact's `wrench` and the tool's `load`.
     """
@@ -136,7 +136,7 @@ def sample(
 
     With `has_effects`, apply quantum, dead zone and range too.
     """
-    # Each component is a separate array, because the compiler would compute slices of a stack repeatedly.
+    # Each component is a separate array: from a stack, the compiler would compute the components repeatedly.
     components, structure = jax.tree.flatten(reading)
 
     def channel(row: int) -> Array:

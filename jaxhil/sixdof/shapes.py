@@ -15,7 +15,7 @@ from jaxhil.lanes import safe_sqrt
 from jaxhil.sixdof.rotations import Quaternion, rotate, rotate_back
 from jaxhil.sixdof.vectors import Vector, direction, dot, norm
 
-NEAR_AXIS = 1e-12  # m; nearer to the axis, the radial direction decreases smoothly to 0
+NEAR_AXIS = 1e-12  # m; distance from the axis below which the radial direction decreases smoothly to 0
 
 
 class Surface(NamedTuple):
@@ -75,7 +75,7 @@ class Cavity(Shape):
 
 
 class Drogue(Shape):
-    """Cone about the z axis that opens along +z and is touched from inside; a tangent sphere is the bottom.
+    """Cone that opens along +z, is touched from inside, and has a sphere tangent to the cone as its bottom.
 
     A sphere that touches the drogue must be smaller than the bottom sphere: a larger sphere could touch the
     wall while its centre is on the axis, where the wall's normal is not defined.
@@ -99,7 +99,7 @@ class Drogue(Shape):
 
 
 class Shell(Drogue):
-    """Drogue with a mouth: a thin shell, which is touched from both sides.
+    """Drogue of finite length: a thin shell, which is touched from both sides and ends at a mouth.
 
     A sphere that touches the shell must have a radius greater than 0.
     """
@@ -113,7 +113,7 @@ class Shell(Drogue):
         height = self.bottom + (self.mouth_radius * cosine - self.bottom_radius) / sine
         edge = Rim(self.mouth_radius, height, jnp.zeros_like(height)).surface(point)
         radius, _ = _radial(point)
-        # If the nearest point of an endless wall lies beyond the mouth, the edge is the nearest part.
+        # If the nearest point of a wall without end lies beyond the mouth, the edge is the nearest part.
         on_wall = radius * sine + (point.z - self.bottom) * cosine > 0
         beyond = on_wall & (radius + signed * cosine > self.mouth_radius)
         distance = jnp.where(beyond, edge.distance, side * signed)
@@ -212,6 +212,6 @@ def _either(condition: Array, a: Vector, b: Vector) -> Vector:
 
 
 def _radial(point: Vector) -> tuple[Array, Vector]:
-    """Return the distance from the z axis [m], and the radial direction (smooth, and 0 on the axis)."""
+    """Return the distance from the z axis [m], and the radial direction, which is 0 on the axis."""
     radius = jnp.sqrt(point.x**2 + point.y**2 + NEAR_AXIS**2)
     return radius, Vector(point.x / radius, point.y / radius, jnp.zeros_like(radius))

@@ -1,7 +1,7 @@
-"""Rig model for six axes, which `tune`, `sweep` and similar commands use.
+"""Rig model for six axes, for `tune`, `sweep` and similar commands.
 
-Each episode has two errors: energy error and twist error. The arrays of an outcome contain all episodes
-twice: first with the energy errors, then with the twist errors.
+Each episode (a contact with all its touches) has two errors: energy error and twist error. The arrays of an
+outcome contain all episodes twice: first with the energy errors, then with the twist errors.
 """
 
 import dataclasses
@@ -100,7 +100,7 @@ class SixAxes(RigModel):
         return scenarios._replace(duration=duration)
 
     def expected_duration(self, scenarios: Scenario) -> np.ndarray:
-        """Return zeros, because the duration of a run is not known beforehand."""
+        """Return zeros, because the duration of a run is not known in advance."""
         return np.zeros(np.shape(scenarios.duration))
 
     def whole_delays(self, scenarios: Scenario) -> np.ndarray:
@@ -114,7 +114,7 @@ class SixAxes(RigModel):
         return scenarios._replace(sensor=sensor._replace(**quiet))
 
     def with_compensator(self, loop: Loop, compensator: str) -> Loop:
-        """Return the loop with another compensator."""
+        """Return the loop with the given compensator."""
         return dataclasses.replace(loop, compensator=compensator)
 
     def compensator_name(self, loop: Loop) -> str:
@@ -131,10 +131,10 @@ def _compute_ideal_contacts(_: SixAxes, scenarios: Any) -> tuple[Array, ...]:
 
 
 def outcome_of(episodes: Metrics, scenario: Scenario) -> Outcome:
-    """Convert the metrics of episodes to an outcome, whose arrays contain the episodes twice.
+    """Convert the metrics of episodes to an outcome, whose arrays contain every episode twice.
 
-    The first half of the errors are energy errors, the second half twist errors. The peak command is the
-    peak force of the real contact, and the chatter is 0.
+    The first half has the energy errors, the second half the twist errors. Peak command and chatter are not
+    computed with six axes: they are the peak force of the real contact, and 0.
     """
     # A draw that misses the target has no contact to evaluate.
     begins = jnp.isfinite(scenario.start.chaser.position.z)

@@ -1,6 +1,6 @@
 """Integration of the ideal contact: continuous motion of the two bodies, without a rig or delays.
 
-The integrator is the Dormand-Prince pair of order 5(4) with error control and separate steps for each lane. A
+The integrator is the Dormand-Prince pair of order 5(4) with error control; every lane has its own steps. A
 step in which a touch begins or ends is repeated with a shorter length, down to 1 us, so that derivatives with
 respect to the time of this event are accurate too. All stages of a step use the state that the contact and
 friction laws have at the start of the step. For laws with memory, the method is therefore of first order,
@@ -36,9 +36,9 @@ TOLERANCE = 1e-10  # maximum error of a step, divided by the relative speed (fun
 MIN_STEP = 1e-9  # s; steps up to this length are accepted with any error, so that the integration proceeds
 EVENT_ACCURACY = 1e-6  # s; accuracy of the time at which a touch begins or ends, or a latch catches
 MAX_STEP_WITH_MEMORY = 1e-4  # s; maximum length of a step for laws with memory
-MAX_STEPS = 200_000  # number of steps after which the integration stops if the mean step is short
+MAX_STEPS = 200_000  # maximum number of steps if the mean step is short
 MIN_STEP_RATIO, MAX_STEP_RATIO = 0.1, 4.0  # limits of the ratio of two successive step lengths
-NEAREST_POINT_MARGIN = 1.0  # m; margin for the motion of the nearest points along two shapes
+NEAREST_POINT_MARGIN = 1.0  # m; distance by which the nearest points may move along two shapes
 MIN_SPEED = 1e-30  # m/s; avoids a division by zero
 
 
@@ -63,7 +63,7 @@ class Instant(NamedTuple):
     states: States  # states of the bodies
     pose: Pose
     twist: Twist
-    wrench: Wrench  # wrench on the chaser, about T's origin
+    wrench: Wrench  # wrench on the chaser, about the origin of target frame T
     forces: tuple[Forces, ...]  # forces of each group of candidates
 
 
@@ -156,7 +156,7 @@ def advance_flight(
     safe = jnp.where(jnp.isfinite(error), jnp.maximum(error, 1e-12), 1e12)
     change = jnp.clip(0.9 * safe**-0.2, MIN_STEP_RATIO, jnp.where(accepted, MAX_STEP_RATIO, 0.9))
     proposed = length * change
-    # If `left` or `longest` limited an accepted step, the next step may have the length planned before.
+    # If `left` or `longest` limited an accepted step, the next step may have the length before the limit.
     cut = accepted & (length < flight.length)
     proposed = jnp.where(cut, jnp.maximum(flight.length, proposed), proposed)
     ahead = lax.stop_gradient(jnp.where(is_too_long, length / 4, proposed))
@@ -234,10 +234,10 @@ def fly(space: Space, flight: Flight, until: Array, longest: Array, speed: Array
     def body(flight):
         left = until - flight.time
         moved, _ = advance_flight(space, flight, left, longest, speed)
-        return select_lanes(left > _nothing(until), moved, flight)
+        return select_lanes(left > _end_tolerance(until), moved, flight)
 
     def ahead(flight):
-        return jnp.any(until - flight.time > _nothing(until))
+        return jnp.any(until - flight.time > _end_tolerance(until))
 
     return lax.while_loop(ahead, body, flight)
 
@@ -245,8 +245,8 @@ def fly(space: Space, flight: Flight, until: Array, longest: Array, speed: Array
 def scale(space: Space, states: States) -> Float[Array, "*batch"]:
     """Return the relative speed [m/s] by which integration errors are divided.
 
-    The speed is the sum of two speeds: the relative speed of the centres of mass, and the speed that the
-    relative rotation gives a point at a distance of 1 m. It does not depend on the interface frames.
+    It is the relative speed of the centres of mass, plus the speed that the relative rotation gives a point
+    at a distance of 1 m. It does not depend on the interface frames.
     """
     target, chaser = (
         rotate(state.attitude, angular_velocity(body, state))
@@ -256,7 +256,7 @@ def scale(space: Space, states: States) -> Float[Array, "*batch"]:
     return lax.stop_gradient(norm(apart) + norm(chaser - target) + 1e-9)
 
 
-def _nothing(until: Array) -> Array:
+def _end_tolerance(until: Array) -> Array:
     """Return the remaining time [s] below which an integration up to `until` [s] has ended."""
     return 1e-14 + 1e-13 * until
 
@@ -264,7 +264,8 @@ def _nothing(until: Array) -> Array:
 def _time_apart(space: Space, now: Instant) -> Float[Array, "*batch"]:
     """Return a step length [s] in which no shapes can touch and no latch can catch.
 
-    It is half the minimum time until then. The conditions of a latch on angle and speed are not considered.
+    It is half of the shortest time until one of these events is possible. A latch is assumed to catch at any
+    angle and speed.
     """
     linear, angular = norm(now.twist.linear), norm(now.twist.angular)
     time = jnp.full_like(linear, jnp.inf)
@@ -286,9 +287,9 @@ def _remembers(space: Space) -> bool:
 
 
 def _size(space: Space, error: States, speed: Array) -> Array:
-    """Return the size of a step's error relative to `speed` [1].
+    """Return the error of a step, divided by the relative speed [1].
 
-    Errors of velocities are divided by `speed`, errors of positions by the distance `speed` times 0.1 s.
+    Velocity errors are divided by `speed`, position errors by the distance that `speed` covers in 0.1 s.
     """
     largest = jnp.zeros_like(speed)
     for body, state in zip(space.bodies, error, strict=True):

@@ -19,11 +19,11 @@ NEWTON_STEPS = 3  # number of Newton steps, enough to reduce an error of 1e-3 to
 
 
 class Stewart(Kinematics):
-    """Kinematics of a hexapod whose platform carries C and whose base carries T."""
+    """Kinematics of a hexapod: its platform carries chaser frame C, and its base carries target frame T."""
 
-    base: Vector  # joints on the base, from the base's origin, components (6, *batch), in T axes [m]
-    platform: Vector  # joints on the platform, from its origin, components (6, *batch), in C axes [m]
-    height: Vector  # vector from the base's origin to the platform's origin in the docked pose (C at T) [m]
+    base: Vector  # joints on the base, from its origin, in target frame T, (6, *batch) [m]
+    platform: Vector  # joints on the platform, from its origin, in chaser frame C, (6, *batch) [m]
+    height: Vector  # vector from the base's origin to the platform's origin in the docked pose [m]
     stroke: Float[Array, "2 *batch"] | None = None  # minimum and maximum leg length [m]; None without limits
 
     @property
@@ -80,7 +80,7 @@ def condition(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "*
 def _legs(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> tuple[Vector, Vector, Vector]:
     """Return the legs as vectors, the joints on the platform, and the rotation vector theta [rad].
 
-    Legs and joints have components (6, *batch), in T axes [m]. Joints are relative to the platform's origin.
+    Legs and joints are in target frame T [m], (6, *batch). Joints are relative to the platform's origin.
     """
     position, theta = (vector(part[:, None]) for part in (at[:3], at[3:]))
     height = jax.tree.map(lambda part: part[None], hexapod.height)

@@ -44,7 +44,7 @@ class Values:
         return path in self._draws
 
     def is_zero(self, path: str) -> bool:
-        """Return whether the value is not drawn, and 0 in the file."""
+        """Return whether the value is 0 in all scenarios: 0 in the file, and not drawn."""
         return not self.is_drawn(path) and not np.any(np.asarray(value_at(self._mechanism, path), float))
 
     def constant(self, value: float) -> Any:
@@ -52,7 +52,7 @@ class Values:
         return np.full(self.number, value)
 
     def inertia(self, path: str, default: Any = None) -> Any:
-        """Return an inertia, given by three moments or three rows, as matrices (3, 3, lanes)."""
+        """Return an inertia as matrices (3, 3, lanes), from three moments (the diagonal) or three rows."""
         value = self(path, default)
         return value if value.ndim == 3 else np.eye(3)[:, :, None] * value[None]
 

@@ -1,7 +1,7 @@
 """Vectors and matrices in three dimensions, with a separate array for each component.
 
-Each component has the batch shape. An array axis for the components would have to be split and joined at
-every tick.
+Each component has the batch shape. A single array with an axis for the components would have to be split and
+joined at every tick.
 """
 
 from typing import Any
@@ -22,7 +22,7 @@ class Vector(eqx.Module):
     y: Float[Array, "..."]
     z: Float[Array, "..."]
 
-    # With this, NumPy numbers call `__rmul__` of this class for `number * vector`.
+    # For `number * vector`, this makes NumPy numbers call `__rmul__` of this class.
     __array_ufunc__ = None
 
     def __add__(self, other: "Vector") -> "Vector":
@@ -100,7 +100,7 @@ def direction(a: Vector) -> Vector:
 
 @jax.jit
 def inverse(a: Matrix) -> Matrix:
-    """Return the inverse of a regular matrix, computed from the cofactors."""
+    """Return the inverse of an invertible matrix, computed from the cofactors."""
     columns = cross(a.y, a.z), cross(a.z, a.x), cross(a.x, a.y)
     factor = 1 / dot(a.x, columns[0])
     i, j, k = (factor * column for column in columns)

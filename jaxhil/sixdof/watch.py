@@ -1,4 +1,4 @@
-"""Record of the current episode of a six-axis rig, tick by tick, and the condition for the episode's end.
+"""Record of the current episode (a contact with all its touches) of a six-axis rig, and its end condition.
 
 An episode ends at the first tick at which three conditions hold: the hardware and the ideal contact have both
 paused (no touch for `quiet_time`), the numerical model is free, and the wrench command has decayed. The wait
@@ -21,7 +21,7 @@ from jaxhil.sixdof.relative import States, relative
 from jaxhil.sixdof.sensor import Sensor
 from jaxhil.sixdof.vectors import dot, norm
 
-MIN_PAUSE = 0.06  # s; minimum pause, without a touch of rig and ideal contact, after which an episode may end
+MIN_PAUSE = 0.06  # s; minimum time without any touch, after which an episode may end
 
 
 class Beginning(NamedTuple):
@@ -38,12 +38,12 @@ class Watch(NamedTuple):
 
     begun: Bool[Array, "*batch"]  # whether the hardware has touched or a latch has caught
     touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each group's candidates touch
-    touches: Int[Array, "*batch"]  # number of touches, summed over the candidates
+    touches: Int[Array, "*batch"]  # number of touches of all pairs of shapes
     touched: Int[Array, "*batch"]  # number of ticks with a touch
     quiet: Int[Array, "*batch"]  # number of ticks since the last touch
     caught: Bool[Array, "*batch"]  # whether a latch holds
     force: Peak  # peak force of the real contact [N]
-    moment: Peak  # peak moment of the real contact, about T's origin [N m]
+    moment: Peak  # peak moment of the real contact, about the origin of target frame T [N m]
     highest: tuple[Array, Array]  # largest force [N] and largest moment [N m] of the wrench command
     faded: Int[Array, "*batch"]  # number of ticks since the wrench command decayed
     over: Bool[Array, "*batch"]  # whether the episode is over
@@ -97,7 +97,7 @@ def watch_tick(
     def are_free() -> Array:
         return deepest(rig.groups, relative(rig.bodies, after)[0]) < 0
 
-    # Computing the model's penetrations only when needed saves time, because few ticks need them.
+    # Few ticks need the model's penetrations: computing them only there saves time.
     ends = pauses & lax.cond(jnp.any(pauses), are_free, lambda: jnp.ones_like(pauses))
     return watch._replace(
         over=watch.over | ends,
@@ -139,7 +139,7 @@ def mass_share(rig: Rig) -> Array:
 
 
 def _updated(rig: Rig, watch: Watch, seen: Tick) -> Watch:
-    """Update the record's touches, peaks and decay with a tick."""
+    """Update the touches, peaks and decay of the record with those of a tick."""
     touching = tuple(forces.touch.depth > 0 for forces in seen.forces)
     caught = watch.caught
     for latch in seen.held:
