@@ -128,7 +128,7 @@ def test_unusable_compensator_or_contact_law_is_not_registered(registered):
     assert "expected a class" in refusal(
         jaxhil.register, ScaledLead(), runtime=ScaledLeadOnTheRig({"toy_lead": 0}, 1, 1)
     )
-    assert "runtime: found object without method step" in refusal(jaxhil.register, ScaledLead(), runtime=object)
+    assert "found object without method step" in refusal(jaxhil.register, ScaledLead(), runtime=object)
     jaxhil.register(ScaledLead(), runtime=ScaledLeadOnTheRig)
     jaxhil.register(ScaledLead())
 

@@ -14,7 +14,7 @@ import math
 from typing import Any
 
 MAX_PEAK_FORCE_RATIO = 2.0  # [1]; maximum peak force, divided by the ideal contact's peak force
-MIN_DURATION_RATIO, MAX_DURATION_RATIO = 0.5, 2.0  # [1]; limits of the duration, divided by the ideal one
+MIN_DURATION_RATIO, MAX_DURATION_RATIO = 0.5, 2.0  # [1]; limits of duration divided by ideal duration
 # Control periods; maximum rounding error of a measured duration: one period at each end of the contact.
 DURATION_ROUNDING = 2
 CONTACT_BOUNDS = {

@@ -85,13 +85,13 @@ class Surfaces(NamedTuple):
         )
 
     def advance(self, start: MotionSample, end: MotionSample, duration: Array, s: Any = 1) -> "Surfaces":
-        """Return a copy with the contact law's state after part of a smooth section of motion.
+        """Return a copy with the contact law's state at the fraction `s` of a smooth section of motion.
 
         Args:
             start: Motion at the section's start, where the contact law has the state of `self`.
             end: Motion at the section's end.
             duration: Duration of the section [s].
-            s: Fraction of the section, from 0 to 1, after which the state is returned.
+            s: Fraction of the section, from 0 to 1.
         """
         if not self.law.remembers:
             return self

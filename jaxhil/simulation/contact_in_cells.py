@@ -46,7 +46,7 @@ class QuadratureRule(NamedTuple):
 
 
 def _build_quadrature(number: int) -> QuadratureRule:
-    """Return a rule with `number` nodes, for forces that are powers of the penetration near their ends."""
+    """Return a rule with `number` nodes; near its ends, the force may be any power of the penetration."""
     nodes, weights = np.polynomial.legendre.leggauss(number)
     unit = (nodes + 1) / 2
     # The slope of the substitution p -> 3 p^2 - 2 p^3 is 0 at both ends, so that powers of the penetration
@@ -301,7 +301,7 @@ def _lag_contributions(rates, path, impulses, arguments):
 
 
 def _sum_by_part(values):
-    """Return the sums over the cells before and over the cells after the sampling instant."""
+    """Return the sum for the cells before, and the sum for the cells after, the sampling instant."""
     half = len(values) // 2
     return jnp.sum(values[:half], axis=0), jnp.sum(values[half:], axis=0)
 

@@ -45,7 +45,7 @@ CURVE_LABELS = {
     "tuned": "tuned",
     "rig": "on the rig",
 }
-MAX_PANELS = 4  # greatest number of contacts in one plot, side by side
+MAX_PANELS = 4  # maximum number of contacts in one plot, side by side
 
 
 @matplotlib.style.context("default")

@@ -86,7 +86,7 @@ class RigModel(abc.ABC):
 
     @abc.abstractmethod
     def at_rest(self, scenarios: Any, idle: np.ndarray) -> Any:
-        """Return a copy of the scenarios without runs in the `idle` lanes, which only fill a tile."""
+        """Return a copy of the scenarios in which `idle` lanes (which only fill a tile) have no runs."""
 
     @abc.abstractmethod
     def expected_duration(self, scenarios: Any) -> np.ndarray:

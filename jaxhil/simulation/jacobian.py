@@ -40,7 +40,7 @@ DIFFERENTIABLE_RESULTS = tuple(name for name in ContactResult._fields if name no
 _QUANTUM_KEYS = ("rig.force_sensor.quantum", "rig.position_sensor.quantum")
 # Keys whose value must not be 0: at 0 the rig does not have the effect, and the derivative is one-sided.
 _KEYS_WITH_CORNER_AT_0 = ("rig.force_sensor.time_constant", "rig.force_sensor.dead_zone")
-# Added to the values of the keys when the loop is built, so that the loop contains effects whose value is 0.
+# Increment of the keys' values for the construction of the loop, which then contains effects of the value 0.
 _KEY_INCREMENT = 1e-9
 
 
@@ -84,8 +84,8 @@ def jacobian(
 
     Raises:
         InputError: `of` or an entry of `by` is unknown; a parameter is not a finite real number; or the run
-            is not differentiable, because a sensor quantises its readings, or because the parameter is a
-            dead zone or a time constant of a sensor and its value is 0.
+            is not differentiable, because a sensor quantises its readings, or because the parameter is 0
+            and is the dead zone or a time constant of a sensor.
 
     Example:
         >>> import jaxhil

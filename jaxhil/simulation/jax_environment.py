@@ -292,7 +292,7 @@ def count_usable_cores() -> int:
 def use_half_the_cores(half: int) -> Iterator[None]:
     """Restrict this thread to one half of the usable cores within this context; `half` (0 or 1) selects it.
 
-    It is meant for a thread that works while a program runs on all devices. The operating system usually
+    This is for a thread that works while a program runs on all devices. The operating system usually
     leaves a thread on its core. The thread then always delays the same device, and the other devices wait. If
     successive tasks alternate between both halves of the cores, the delay is shared by all devices.
     """

@@ -107,9 +107,9 @@ def _choose_cell_counts(mechanism: Mechanism, scenarios: Scenario, exact: bool) 
 def _max_contact_frequency(mechanism: Mechanism, scenarios: Scenario) -> float:
     """Return the largest contact frequency [rad/s] of all scenarios, at the velocity of the first approach.
 
-    The contact frequency is the larger of sqrt(k/M) and 2 b/M. Here M is the equivalent mass, k is the slope
-    of the force against the penetration at the greatest penetration, and b is the slope of the force against
-    the penetration rate at the onset of contact.
+    The contact frequency is the larger of sqrt(k/M) and 2 b/M. Here M is the equivalent mass, k is the
+    derivative of the force with respect to the penetration at the maximum penetration, and b is the
+    derivative with respect to the penetration rate at the onset of contact.
     """
     # Scenarios may be JAX arrays. Only NumPy broadcasts arrays with a slot axis against arrays without one.
     law, contact = find_contact_law(mechanism.contact.law), jax.tree.map(np.asarray, scenarios.contact)

@@ -43,7 +43,7 @@ class Metrics(NamedTuple):
 
     `trajectory_error` compares the penetration of the numerical model with the penetration of the ideal
     contact. The time of each penetration counts from its own onset of contact. The error is the root mean
-    square of the difference over the duration of the ideal contact.
+    square of the difference during the ideal contact.
     """
 
     restitution: Float[Array, "slots *batch"]  # rebound speed divided by approach speed [1]

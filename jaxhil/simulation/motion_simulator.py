@@ -44,8 +44,8 @@ class Propagation(NamedTuple):
     """
 
     transition: Float[Array, "order columns *batch"]  # rows that give the state one period later
-    position: Float[Array, "columns *batch"]  # row that gives the position when the force is sampled [m]
-    velocity: Float[Array, "columns *batch"]  # row that gives the velocity when the force is sampled [m/s]
+    position: Float[Array, "columns *batch"]  # row that gives the position at the force sample [m]
+    velocity: Float[Array, "columns *batch"]  # row that gives the velocity at the force sample [m/s]
     # row that gives the position at the position sensor's sampling instant [m]; None if unused
     measured_position: Float[Array, "columns *batch"] | None
     # rows that give position and velocity at the interval's start (right limit); None unless requested
@@ -155,8 +155,8 @@ def matrix_exponential(
     """Return the matrix exponential of [[A, B, 0], [0, 0, r], [0, 0, 0]], without its last row (0, 0, 1).
 
     The exponential is computed by scaling, Taylor series and squaring, and is accurate to rounding for norms
-    up to 64. The matrix axes come first: every matrix product then takes a few vector operations over the
-    batch. A library call for every lane would take longer than the simulation of a contact.
+    up to 64. The matrix axes come first: every matrix product then takes a few vector operations for the
+    whole batch. A library call for every lane would take longer than the simulation of a contact.
 
     Args:
         upper: First rows (A, B, 0) of the matrix.
@@ -170,7 +170,7 @@ def matrix_exponential(
         return units[order] + units[order + 1] * ramp[None]
 
     def product(left, right, ramp):
-        """Return left @ right without its last row, where `ramp` is the element r of `right`."""
+        """Return left @ right without its last row; `ramp` is the element r of the matrix `right`."""
         total = _matrix_product(left[:, :order], right)
         driven = left[:, order, None] * ramp_row(ramp)[None]
         return total + driven + left[:, order + 1, None] * units[None, order + 1]
@@ -206,7 +206,7 @@ def apply_row(row: Array, state: SimulatorState, start: Array, end: Array) -> Ar
 def read_measured_position(
     plant: Propagation, state: SimulatorState, start: Array, end: Array
 ) -> Array | None:
-    """Return the position at the position sensor's sampling instant [m]; None without this output row."""
+    """Return the position that the position sensor samples [m]; None if this sensor is not simulated."""
     return None if plant.measured_position is None else apply_row(plant.measured_position, state, start, end)
 
 
@@ -215,7 +215,7 @@ def rate_row(
     denominator: Float[Array, "order_plus_1 *batch"],
     control_period: Float[Array, "*batch"],
 ) -> Float[Array, "columns *batch"]:
-    """Return the row whose product is the time derivative [1/s] of the product of `row`.
+    """Return the row that gives the time derivative of the quantity that `row` gives [per s].
 
     The derivation uses d/ds E(s) = E(s) G, where G is the generator in `discretise`.
     """

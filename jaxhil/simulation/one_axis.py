@@ -47,7 +47,7 @@ class OneAxis(RigModel):
         return compare_with_ideal(loop, scenario, rollout(loop, gains, scenario))
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
-        """Return the scenarios without contacts in the `idle` lanes, which only fill a tile."""
+        """Return a copy of the scenarios in which `idle` lanes (which only fill a tile) have no contacts."""
         contacts: Any = np.where(idle, 0, scenarios.contacts).astype(np.int32)
         return scenarios._replace(contacts=contacts)
 

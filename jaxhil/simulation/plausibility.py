@@ -218,7 +218,7 @@ def _check_ticks(name: str, mechanism: Mechanism, scenarios: Scenario) -> None:
 
 
 def _squared(polynomial: np.ndarray) -> np.ndarray:
-    """Return the coefficients of |p(jw)|^2 as a polynomial in w^2, descending powers, from those of p."""
+    """Return the coefficients of |p(jw)|^2 as a polynomial in w^2; all powers are descending."""
     degrees = np.arange(len(polynomial) - 1, -1, -1)
     product = np.convolve(polynomial, polynomial * (-1.0) ** degrees)[::2]
     return product * (-1.0) ** degrees
@@ -331,9 +331,9 @@ def _find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) -
             f"approach.velocity: found {velocity}, expected at most {MAX_PLAUSIBLE_VELOCITY:g} m/s"
         )
     if strongest.peak_force > rig.force_sensor.range:
-        peak = f"the {strongest.peak_force:.3g} N of the ideal contact {strongest.number}"
+        peak = f"{strongest.peak_force:.3g} N, the peak force of ideal contact {strongest.number}"
         warnings.append(
-            f"rig.force_sensor.range: found {rig.force_sensor.range:.4g} N, expected beyond {peak}"
+            f"rig.force_sensor.range: found {rig.force_sensor.range:.4g} N, expected more than {peak}"
         )
     if not find_contact_law(contact.law).damped and any(contact.damping):
         largest = max(contact.damping)
@@ -352,7 +352,7 @@ def _check_delays(mechanism: Mechanism, shortest: ContactSummary) -> list[str]:
     """Return one warning if a delay exceeds the duration of the shortest contact, else an empty list."""
     rig = mechanism.rig
     force = rig.force_sensor.delay + rig.force_sensor.time_constant
-    allowed = f"less than contact {shortest.number} lasts, {shortest.duration:.3g} s"
+    allowed = f"less than {shortest.duration:.3g} s, the duration of contact {shortest.number}"
     for key, sensor_delay, suffix in (
         ("simulator", 0.0, ""),
         ("force_sensor", force, " with its lag and the motion simulator's delay"),

@@ -87,7 +87,7 @@ class Deviation(NamedTuple):
 
 
 def initial_first_contact(like: Float[Array, "*batch"]) -> FirstContact:
-    """Return the record of a hardware that has not touched yet, with the batch shape of `like`."""
+    """Return the record of hardware that has not touched yet, with the batch shape of `like`."""
     zeros = jnp.zeros_like(like)
     return FirstContact(jnp.zeros(like.shape, bool), zeros, zeros + 1)
 

@@ -280,7 +280,7 @@ def _restart(loop, gains, state, entered, begins, fresh):
 
 
 def _select_slot(rig, index):
-    """Return the contact's index, at most the last index of arrays with one entry per contact."""
+    """Clip the index of a contact to the valid range of arrays with one entry per contact."""
     return jnp.minimum(index, rig.scenario.phase.shape[0] - 1)
 
 

@@ -203,7 +203,7 @@ class Run:
         """Plot force and position against time for each contact, together with the ideal contact.
 
         The suffix of the file, .png, .pdf or .svg, selects the format. Parent folders are created. Raise
-        `InputError` if the file has another suffix or cannot be written.
+        `InputError` if the file has a different suffix or cannot be written.
         """
         target = to_path(path)
         if target.suffix.lower() not in PLOT_SUFFIXES:
@@ -270,16 +270,17 @@ def _bound_reasons(contacts: Sequence[ContactResult], mechanism: Mechanism) -> I
         force, ideal_force = contact.peak_force, contact.reference_peak_force
         if is_peak_force_excessive(force, ideal_force):
             yield (
-                f"contact {number}: real peak force {force:.4g} N, {contact.peak_force_ratio:.3g} times "
-                f"the ideal contact's {ideal_force:.4g} N, expected at most {MAX_PEAK_FORCE_RATIO:g} times"
+                f"contact {number}: real peak force {force:.4g} N, expected at most "
+                f"{MAX_PEAK_FORCE_RATIO * ideal_force:.4g} N, {MAX_PEAK_FORCE_RATIO:g} times "
+                "the ideal contact's"
             )
         duration, ideal_duration = contact.duration, contact.reference_duration
         if is_duration_out_of_bounds(duration, ideal_duration, mechanism.rig.control_period):
             yield (
-                f"contact {number}: real contact of {1e3 * duration:.4g} ms, {contact.duration_ratio:.3g} "
-                f"times the ideal contact's {1e3 * ideal_duration:.4g} ms, expected "
-                f"{MIN_DURATION_RATIO:g} to "
-                f"{MAX_DURATION_RATIO:g} times"
+                f"contact {number}: real contact of {1e3 * duration:.4g} ms, expected "
+                f"{1e3 * MIN_DURATION_RATIO * ideal_duration:.4g} to "
+                f"{1e3 * MAX_DURATION_RATIO * ideal_duration:.4g} ms, "
+                f"{MIN_DURATION_RATIO:g} to {MAX_DURATION_RATIO:g} times the ideal contact's"
             )
 
 

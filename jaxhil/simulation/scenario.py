@@ -1,8 +1,8 @@
 """Scenarios: the numbers of nominal or drawn mechanisms, as a batch of arrays.
 
 Every number of a mechanism file is an array here, including the control period and the delays. Scenarios of
-another mechanism or draw can therefore reuse a compiled program if the arrays have equal shapes. Results can
-be differentiated with respect to every number.
+a different mechanism or draw can therefore reuse a compiled program if the arrays have equal shapes. Results
+can be differentiated with respect to every number.
 
 The batch is the last axis. Axes for contacts, segments of a contact law and polynomial coefficients come
 before it.

@@ -34,7 +34,7 @@ class Watch(NamedTuple):
     """Record of the current contact, from the end of the previous contact to the current tick."""
 
     elapsed: Float[Array, "*batch"]  # number of ticks since the contact began; 0 before
-    over: Bool[Array, "*batch"]  # whether the contact has ended or the run has diverged
+    over: Bool[Array, "*batch"]  # whether the contact has ended normally or by divergence
     approach: Float[Array, "*batch"]  # speed of the numerical model before the contact [m/s]
     rebound: Float[Array, "*batch"]  # speed of the numerical model at the current tick [m/s]
     peak_force: Float[Array, "*batch"]  # largest real force so far [N]
@@ -201,8 +201,8 @@ def _nearer_side(rules, position):
 def _has_ended(rules, signals, side, force_free_ticks, magnitude, peak_command):
     """Return whether the contact ends at this tick.
 
-    The contact ends if the numerical model moves away from the surface, no real force has acted for long
-    enough, and the force command has decayed. The threshold of the decay does not depend on the sensor noise.
+    The contact ends if the numerical model moves away from the surface, the last real force was long enough
+    ago, and the force command has decayed. The threshold of the decay does not depend on the sensor noise.
     If it did, a noisy command that is small by chance could end the contact before its whole impulse has
     acted.
     """

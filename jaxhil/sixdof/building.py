@@ -122,14 +122,14 @@ def _specified(numbers: Values, bodies: Pair) -> States:
 
 
 def _before_touch(numbers: Values, bodies: Pair, groups: tuple[ContactGroup, ...], before: Any) -> States:
-    """Return the states `before` [s] in advance of the first touch that the table [approach] specifies."""
+    """Return the states at `before` seconds before the first touch that the table [approach] specifies."""
     keys = ("offset", "attitude", "velocity", "angular_velocity")
     return _lowered(bodies, groups, *(numbers(f"approach.{key}") for key in keys), before)
 
 
 @jax.jit
 def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, before) -> States:
-    """Return the states `before` [s] in advance of a first touch with this offset and velocity."""
+    """Return the states at `before` seconds before a first touch with this offset and velocity."""
     rotation = exponential(vector(attitude))
     height = touching_height(groups, offset[0], offset[1], rotation)
     pose = Pose(Vector(offset[0], offset[1], height), rotation)

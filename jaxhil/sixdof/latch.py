@@ -41,12 +41,12 @@ class Held(NamedTuple):
     """State of the latches: whether they have caught, and the pose at which they caught."""
 
     caught: Bool[Array, "latches *batch"]
-    point: Vector  # position of the caught point when the latch caught, in target frame T [m]
-    attitude: Quaternion  # rotation from chaser frame C to target frame T when the latch caught
+    point: Vector  # position at which the point was caught, in target frame T [m]
+    attitude: Quaternion  # rotation from chaser frame C to target frame T at the catch
 
 
 def init_latch(latch: Latch, pose: Pose) -> Held:
-    """Return the latches' state at the start of a run, when the chaser has the given pose."""
+    """Return the latches' state at the start of a run, at which the chaser has the given pose."""
     zero = jnp.zeros_like(latch.depth)
     attitude: Quaternion = jax.tree.map(lambda part: part[None] + zero, pose.attitude)
     return Held(latch.from_start, latch_points(latch, pose), attitude)

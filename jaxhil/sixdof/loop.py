@@ -55,8 +55,7 @@ from jaxhil.sixdof.sensor import (
 from jaxhil.sixdof.vectors import assembled, vector
 
 SIDES = ("fixed", "moving")  # sides of the rig on which the force sensor may be
-# Number of ticks before a run in which the hardware settles, if axis positions are not linear in the
-# coordinates.
+# Number of ticks for settling before a run, if axis positions are not linear functions of the coordinates.
 SETTLING_TICKS = 256
 
 
@@ -186,7 +185,7 @@ def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
 
 
 def begin(loop: Loop, rig: Rig, states: States) -> RunState:
-    """Return the state of the loop before tick 0, when the bodies have the given states.
+    """Return the state of the loop before tick 0, at which the bodies have the given states.
 
     Before tick 0, the pose command moves uniformly with the relative rates of these states.
     """

@@ -15,7 +15,7 @@ class Meaning(NamedTuple):
 
     Attributes:
         effective_mass: Effective mass m_n at the first touch [kg].
-        frequency: Frequency of the ideal contact, 1/(2 duration) [Hz]; NaN if a latch ends it.
+        frequency: Frequency of the ideal contact, 1/(2 duration) [Hz]; NaN if a latch catches.
         peak_force: Peak force of the ideal contact [N].
         restitution: Restitution e* of the ideal contact [1]; NaN unless there is a single touch.
         delay: Delay of the loop [s]: delay and lag of the slowest axis and of the force sensor.

@@ -56,7 +56,7 @@ class Metrics(NamedTuple):
     duration: Float[Array, "..."]  # time during which the hardware touches [s]
     # time during which the ideal contact touches; NaN if it was too stiff to be integrated [s]
     reference_duration: Float[Array, "..."]
-    touches: Int[Array, "..."]  # number of touches of the hardware, all pairs of shapes
+    touches: Int[Array, "..."]  # number of touches of the hardware's shapes
     reference_touches: Int[Array, "..."]  # number of touches of the ideal contact
     penetration: Float[Array, "..."]  # largest penetration of the hardware, divided by the shapes' size [1]
     captured: Bool[Array, "..."]  # whether a latch of the hardware holds at the end

@@ -40,7 +40,7 @@ class StartValues(NamedTuple):
     # per group: speed of the shapes [m/s], and penetration at which one has passed through the other [m]
     passing: tuple[tuple[Float[Array, "candidates *batch"], Float[Array, "candidates *batch"]], ...]
     caught: tuple[Bool[Array, "latches *batch"], ...]  # whether latches catch at the start
-    # lengths of a hexapod's legs [m], and condition number of their Jacobian, at the start and when docked
+    # at the start and in the docked pose: lengths of a hexapod's legs [m], condition number of their Jacobian
     legs: tuple[Float[Array, "6 *batch"], ...]
     conditions: tuple[Float[Array, "*batch"], ...]
 
@@ -55,7 +55,7 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
     where = "start" if mechanism.start is not None else "approach"
     if not ticks <= MAX_TICKS:
         found = f"{where}.duration: found {scenario.duration[0]:g} s, {ticks:.2g} control periods"
-        raise InputError(f"{mechanism.name}: {found}, expected at most {MAX_TICKS:.0e}")
+        raise InputError(f"{mechanism.name}: {found}, expected at most {MAX_TICKS:.0e} periods")
     denominator = np.asarray(scenario.simulator.denominator)[..., 0]
     check_poles(mechanism.name, denominator, np.full(denominator.shape[1], scenario.control_period[0]))
     start: StartValues = jax.tree.map(np.asarray, _compiled()(scenario))

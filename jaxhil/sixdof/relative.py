@@ -133,12 +133,15 @@ def wrench_at_chaser(wrench: Wrench, pose: Pose) -> Wrench:
 
 
 def power(wrench_at_chaser: Wrench, twist: Twist) -> Float[Array, "..."]:
-    """Return the power [W] of a wrench about the origin of chaser frame C on the relative motion."""
+    """Return the power [W] on the relative motion of a wrench about the origin of chaser frame C."""
     return dot(wrench_at_chaser.force, twist.linear) + dot(wrench_at_chaser.moment, twist.angular)
 
 
 def loads(wrench: Wrench, target: Frame, states: States) -> tuple[Load, Load]:
-    """Return the loads on target and chaser: equal and opposite, with the wrench at the origin of frame T."""
+    """Return the loads on target and chaser: the wrench acts on the chaser, its reaction on the target.
+
+    Both act at the origin of target frame T.
+    """
     force, moment = (rotate(target.attitude, part) for part in wrench)
 
     def about(state: State) -> Vector:
@@ -198,7 +201,7 @@ def mass_matrix(bodies: Pair, states: States) -> Float[Array, "6 6 *batch"]:
 def effective_mass(bodies: Pair, states: States, point: Vector, normal: Vector) -> Float[Array, "..."]:
     """Return the effective mass m_n [kg] of the two bodies in a frictionless contact.
 
-    1/m_n is the sum of 1/m_i + a_i . J_i^-1 a_i over the bodies, where a_i = (point - r_i) x normal. The
+    1/m_n is the sum of 1/m_i + a_i . J_i^-1 a_i for both bodies i, where a_i = (point - r_i) x normal. The
     contact's `point` [m] and unit `normal` are in target frame T.
     """
     target = interface_frame(bodies.target, states.target)

@@ -47,7 +47,7 @@ class Episode(NamedTuple):
     meeting: Meeting  # first touch of the ideal contact from the same start
     # ideal contact up to the gap in which the episode ends; without a common gap, up to the end of the run
     past: Past
-    touches: Int[Array, "episodes *batch"]  # number of touches of the hardware, all pairs of shapes
+    touches: Int[Array, "episodes *batch"]  # number of touches of the hardware's shapes
     duration: Float[Array, "episodes *batch"]  # time during which the hardware touches [s]
     peak_force: Float[Array, "episodes *batch"]  # peak force of the real contact [N]
     peak_moment: Float[Array, "episodes *batch"]  # largest moment about T's origin in the real contact [N m]
@@ -128,7 +128,7 @@ def _start(loop: Loop, rig: Rig, states: States, reference: Reference) -> Episod
 
 
 def _tick(loop: Loop, rig: Rig, last: Array, progress: EpisodeProgress) -> EpisodeProgress:
-    """Simulate one tick. In lanes whose run is over, the states of the bodies do not change."""
+    """Simulate one tick. In lanes whose run has ended, the states of the bodies do not change."""
     run, watch = progress.run, progress.watch
     after, seen = tick(loop, rig, run)
     runs = progress.active & (progress.lasted < last) & ~watch.beyond

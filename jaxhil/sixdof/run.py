@@ -39,8 +39,8 @@ class Episode(NamedTuple):
     The ideal contact is the contact of two free bodies, without a rig, from the same initial states.
 
     Attributes:
-        energy_error: Change of kinetic energy minus that of the ideal contact, divided by the energy of the
-            approach [1].
+        energy_error: Change of kinetic energy minus its change in the ideal contact, divided by the energy of
+            the approach [1].
         twist_error: Norm of the difference between the twist and the ideal contact's twist, divided by the
             norm of the ideal contact's change of twist [1].
         normal_part: Component of the twist error in the direction of the ideal contact's impulse [1].

@@ -75,7 +75,7 @@ class Cavity(Shape):
 
 
 class Drogue(Shape):
-    """Cone that opens along +z, is touched from inside, and has a sphere tangent to the cone as its bottom.
+    """Cone that opens along +z and is touched from inside; its bottom is a sphere tangent to the cone.
 
     A sphere that touches the drogue must be smaller than the bottom sphere: a larger sphere could touch the
     wall while its centre is on the axis, where the wall's normal is not defined.

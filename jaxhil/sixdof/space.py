@@ -202,7 +202,7 @@ def follow(
     periods: int,
     longest: Float[Array, "*batch"],
 ) -> tuple[Flight, Instant]:
-    """Integrate the ideal contact over a number of periods, and record the start of each period.
+    """Integrate the ideal contact for a number of periods, and record the start of each period.
 
     Args:
         space: Constants of the ideal contact.

@@ -46,7 +46,7 @@ class Stewart(Kinematics):
 
         lengths, near = lax.stop_gradient((motion.position, near))
         at = lax.fori_loop(0, NEWTON_STEPS - 1, lambda _, at: newton(at, lengths), near)
-        # The derivatives of the last Newton step alone are those of the pose.
+        # Differentiating only the last Newton step gives the exact derivatives of the pose.
         at = newton(at, motion.position)
         slopes = jacobian(self, at)
         rate = solve(slopes, motion.rate[:, None])[:, 0]

@@ -46,7 +46,7 @@ class Watch(NamedTuple):
     moment: Peak  # peak moment of the real contact, about the origin of target frame T [N m]
     highest: tuple[Array, Array]  # largest force [N] and largest moment [N m] of the wrench command
     faded: Int[Array, "*batch"]  # number of ticks since the wrench command decayed
-    over: Bool[Array, "*batch"]  # whether the episode is over
+    over: Bool[Array, "*batch"]  # whether the episode has ended
     end: States  # states of the numerical model at the end of the episode
     end_tick: Int[Array, "*batch"]  # number of ticks from the start of the run to the end of the episode
     penetration: Float[Array, "*batch"]  # largest penetration, divided by the shapes' size [1]
@@ -116,7 +116,7 @@ def quiet_time(sensor: Sensor, period: Array) -> Array:
 
 
 def is_rig_quiet(rig: Rig, watch: Watch) -> Array:
-    """Return whether the hardware has paused and the wrench command has decayed, or the wait is over."""
+    """Return whether the hardware has paused and the wrench command has decayed, or the wait is too long."""
     pause = quiet_ticks(rig)
     max_wait = pause + jnp.ceil(MAX_DECAY_WAIT / rig.period).astype(jnp.int32)
     return ((watch.quiet >= pause) & (watch.faded > 0)) | (watch.quiet >= max_wait)
