@@ -36,7 +36,7 @@ class CellCounts(NamedTuple):
     """Number of cells in each of the two parts of a sampling interval, and degree of their power series."""
 
     plain: int  # number of cells before the window of a force sensor with lag
-    window: int  # number of cells in this window; 0 for a sensor without lag
+    window: int  # number of cells in the sensor's window; 0 for a sensor without lag
     degree: int  # degree of the power series of the motion in a cell
 
     @property

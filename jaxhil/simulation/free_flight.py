@@ -60,7 +60,7 @@ def advance_to_surface(
     """Return the state shortly before the next touch of a surface, and whether each lane may skip to it.
 
     The state is a whole number of control periods later. A lane may skip to it if the lane flies freely: its
-    motion simulator has settled, and no force acts. `command` is |F_c| [N].
+    motion simulator has settled, and no force acts. `command` is the magnitude of the force command [N].
     """
     scenario, period = rig.scenario, rig.constants.control_period
     velocity, position = state.velocity, state.position

@@ -1,4 +1,4 @@
-"""Integrators of rigs: advance the numerical model M x'' = -F_c by one control period.
+"""Integrators of rigs: advance the numerical model (mass times acceleration = -force) by one control period.
 
 Each integrator adds its own delay to the loop: 0 for semi-implicit Euler, T/2 for the exact zero-order hold,
 and T for explicit Euler, where T is the control period (notebooks/guide/model.md, section 6, item 7).

@@ -63,7 +63,7 @@ DEBUGGING_OFF = {
     "jax_no_tracing": False,
     "jax_transfer_guard": "allow",
 }
-_startup_flags: list[str] = []  # XLA_FLAGS with which `start_jax` started JAX; empty if started elsewhere
+_startup_flags: list[str] = []  # XLA_FLAGS with which `start_jax` started JAX; empty if other code started it
 
 
 def prepare_jax() -> None:

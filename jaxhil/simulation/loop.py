@@ -68,7 +68,7 @@ class Loop(eqx.Module):
 
         This requires that readings have no noise, bias or quantisation, that the motion simulator has no
         limits, and that the compensator does nothing before the contact. It also requires that the scenarios
-        have no `Probe`, whose time starts at x_d = 0.
+        have no `Probe`, whose time starts at the numerical model's first touch.
         """
         uneven = self.reads_always or self.has_position_noise or self.has_sample_effects or self.has_limits
         waits = vars(type(self.compensator)).get("waits_for_contact", False)

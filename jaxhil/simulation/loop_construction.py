@@ -111,7 +111,7 @@ def _max_contact_frequency(mechanism: Mechanism, scenarios: Scenario) -> float:
     derivative of the force with respect to the penetration at the maximum penetration, and b is the
     derivative with respect to the penetration rate at the onset of contact.
     """
-    # Scenarios may be JAX arrays. Only NumPy broadcasts arrays with a slot axis against arrays without one.
+    # Convert JAX arrays: only NumPy broadcasts arrays with a contact axis against arrays without one.
     law, contact = find_contact_law(mechanism.contact.law), jax.tree.map(np.asarray, scenarios.contact)
     mass, velocity = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
     if contact.stiffness.ndim > contact.damping.ndim:  # (slots, segments, lanes): the stiffest segment

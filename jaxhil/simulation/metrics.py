@@ -49,15 +49,15 @@ class Metrics(NamedTuple):
     restitution: Float[Array, "slots *batch"]  # rebound speed divided by approach speed [1]
     approach_velocity: Float[Array, "slots *batch"]  # speed of the numerical model before the contact [m/s]
     peak_force: Float[Array, "slots *batch"]  # largest real contact force [N]
-    peak_command: Float[Array, "slots *batch"]  # largest |F_c| [N]
-    excess_variation: Float[Array, "slots *batch"]  # chatter of F_c [N], see above; 0 unless recorded
-    # largest change of the position command by the limits [m], see above
+    peak_command: Float[Array, "slots *batch"]  # largest |force command| [N]
+    excess_variation: Float[Array, "slots *batch"]  # chatter of the force command [N]; 0 unless recorded
+    # largest change of the position command by the motion simulator's limits [m]
     position_shortfall: Float[Array, "slots *batch"]
     duration: Float[Array, "slots *batch"]  # time during which a real force acts [s]
     # work done on the mechanism by the real force [J]; 0 unless recorded
     work_in: Float[Array, "slots *batch"]
     work_out: Float[Array, "slots *batch"]  # work returned by the mechanism [J]; 0 unless recorded
-    # rms difference from the ideal contact [m], see above; 0 without a probe
+    # rms difference of the penetration from the ideal contact's [m]; 0 without a probe
     trajectory_error: Float[Array, "slots *batch"]
     # delay of the force measurement as estimated by the compensator [s]; 0 if it estimates no delay
     force_delay: Float[Array, "slots *batch"]

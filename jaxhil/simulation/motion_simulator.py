@@ -31,8 +31,8 @@ class SplitDelay(NamedTuple):
     """Delay, divided into a number of whole sampling intervals and a fraction of a sampling interval."""
 
     intervals: Int[Array, "*batch"]  # number of intervals to look back from the newest complete interval
-    # Relative time in (0, 1] within that interval. It is 1, not 0, at a tick: readings have the value just
-    # before the tick.
+    # Relative time in (0, 1] within the interval that the look-back gives. At a tick it is 1, not 0: readings
+    # have the value just before the tick.
     fraction: Float[Array, "*batch"]
 
 

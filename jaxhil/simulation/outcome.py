@@ -20,13 +20,13 @@ class Outcome(NamedTuple):
     """
 
     metrics: Metrics  # metrics of the contacts on the rig
-    reference_restitution: Float[Array, "slots *batch"]  # restitution e* of the ideal contact [1]
+    reference_restitution: Float[Array, "slots *batch"]  # restitution of the ideal contact [1]
     reference_peak_force: Float[Array, "slots *batch"]  # peak force of the ideal contact [N]
     # duration of the ideal contact [s]; infinite if the bodies never separate
     reference_duration: Float[Array, "slots *batch"]
-    error: Float[Array, "slots *batch"]  # restitution error e - e* [1]
-    peak_ratio: Float[Array, "slots *batch"]  # largest |F_c| divided by the ideal contact's peak force [1]
-    # excess variation of F_c (see `Metrics`) divided by the ideal contact's peak force [1]
+    error: Float[Array, "slots *batch"]  # restitution minus the ideal contact's restitution [1]
+    peak_ratio: Float[Array, "slots *batch"]  # largest |force command|, divided by the ideal peak force [1]
+    # chatter of the force command (see `Metrics`), divided by the ideal contact's peak force [1]
     chatter: Float[Array, "slots *batch"]
     wanted: Bool[Array, "slots *batch"]  # whether the scenario has this contact
     good: Bool[Array, "slots *batch"]  # whether the contact was reached and ended with the status `OK`
@@ -84,7 +84,7 @@ def compare_with_ideal(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outc
 
 
 def parameters_by_slot(contact: ContactParameters) -> ContactParameters:
-    """Reorder the parameters' axes to (segments, contacts, *batch): contacts become a batch axis."""
+    """Reorder the parameters' axes to (segments, contacts, *batch), so that contacts are a batch axis."""
     nested = contact.stiffness.ndim > contact.damping.ndim
     return contact._replace(
         stiffness=jnp.moveaxis(contact.stiffness, 0, 1) if nested else contact.stiffness,

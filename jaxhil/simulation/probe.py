@@ -81,9 +81,9 @@ class Deviation(NamedTuple):
     """Sum of the squared deviations of the numerical model's penetration from the reference trajectory."""
 
     entered: Bool[Array, "*batch"]  # whether the numerical model has touched the surface
-    time: Float[Array, "*batch"]  # time of this first touch since the start of the run [control periods]
+    time: Float[Array, "*batch"]  # time of the model's first touch since the run's start [control periods]
     squares: Float[Array, "*batch"]  # sum of the squared deviations at all ticks [m^2]
-    count: Float[Array, "*batch"]  # number of ticks in this sum
+    count: Float[Array, "*batch"]  # number of ticks in the sum of squared deviations
 
 
 def initial_first_contact(like: Float[Array, "*batch"]) -> FirstContact:

@@ -65,7 +65,7 @@ def apply_push(
 def update_model_deviation(
     constants: KnownConstants, probe: Probe, over: Array, signals: Signals, watch: Watch
 ) -> Watch:
-    """Add the deviation of x_d from the ideal contact at this tick, unless the contact is `over`."""
+    """Add the numerical model's deviation from the ideal contact, unless the contact is `over`."""
     assert watch.deviation is not None
     depth, rate = signals.position_desired, signals.velocity_desired
     if watch.side is not None:

@@ -18,7 +18,7 @@ def limit_command(
     The velocity limit v_max restricts the step to v_max T. The acceleration limit a_max restricts the change
     of the step to q = a_max T^2.
 
-    The limited command follows the unlimited command without overshoot if the latter moves uniformly. If the
+    The limited command follows a uniformly moving unlimited command without overshoot. If the
     limited command is a distance b behind, the closing step s is the largest step from which m further steps,
     each shorter by q, close the distance: b = (m + 1) s - q m (m + 1)/2.
 

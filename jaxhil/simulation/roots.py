@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-MAX_BISECTIONS = 60  # number of bisections after which any bracket is shorter than the rounding error
+MAX_BISECTIONS = 60  # maximum number of bisections: any bracket is then shorter than the rounding error
 # Maximum amount by which a Newton step may leave the bracket, for arguments of order 1 [1].
 ARGUMENT_TOLERANCE = 1e-9
 

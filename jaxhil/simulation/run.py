@@ -47,7 +47,7 @@ class ContactResult(NamedTuple):
         peak_force: Largest real contact force [N].
         reference_peak_force: Peak force of the ideal contact [N].
         peak_force_ratio: Peak force divided by the ideal contact's peak force [1].
-        peak_command: Largest |F_c| [N], where F_c is the force on the numerical model.
+        peak_command: Largest magnitude of the force command, which acts on the numerical model [N].
         position_shortfall: Largest change of the position command by the motion simulator's limits [m].
         duration: Time during which a real contact force acts [s].
         reference_duration: Duration of the ideal contact [s].

@@ -1,8 +1,8 @@
 """Simulation of one tick of the rig, in six stages (notebooks/guide/model.md, section 1).
 
     sense            read the force sensor and the position sensor
-    compensate       compute the force command F_c from the measured force F, x_d, v_d and x_a
-    integrate        integrate M x_d'' = -F_c for one control period
+    compensate       compute the force command F_c from the readings and the numerical model's motion
+    integrate        integrate the numerical model for one control period, under the force -F_c
     actuate          apply limits, latency, hold and motion simulator to the position command
     compute_contact  compute the real contact in the sampling interval
     record_contact   record beginning, end, restitution, peaks and work of the current contact
@@ -166,7 +166,7 @@ def compensate(
 
 
 def integrate(loop: Loop, rig: RigConstants, state: LoopState, force: Array) -> ModelState:
-    """Stage 3: integrate M x_d'' = -F_c for one control period, where F_c is `force` [N]."""
+    """Stage 3: integrate the numerical model for one control period, under the force -`force` [N]."""
     acceleration = -force * rig.inverse_mass
     step = INTEGRATORS[loop.integrator]
     position, velocity = step(state.position, state.velocity, acceleration, rig.constants.control_period)

@@ -38,28 +38,28 @@ class Watch(NamedTuple):
     approach: Float[Array, "*batch"]  # speed of the numerical model before the contact [m/s]
     rebound: Float[Array, "*batch"]  # speed of the numerical model at the current tick [m/s]
     peak_force: Float[Array, "*batch"]  # largest real force so far [N]
-    peak_command: Float[Array, "*batch"]  # largest |F_c| so far [N]
+    peak_command: Float[Array, "*batch"]  # largest |force command| so far [N]
     recent_forces: tuple[Array, Array]  # real force at the last two ticks [N]
     in_contact: Float[Array, "*batch"]  # duration of the real force so far [control periods]
     measured: Bool[Array, "*batch"]  # whether the force sensor has read a force
     # number of ticks since the last real force, or since the beginning of a contact without a real force yet
     force_free_ticks: Float[Array, "*batch"]
     work: tuple[Array, ...]  # work done on the mechanism and work returned by it [J]; empty unless recorded
-    command_variation: CommandVariation | None  # variation of F_c; None unless recorded
-    # largest change of the position command by the limits so far [m]; None without limits
+    command_variation: CommandVariation | None  # variation of the force command; None unless recorded
+    # largest change of the position command by the motion simulator's limits so far [m]; None without limits
     shortfall: Float[Array, "*batch"] | None
     side: Float[Array, "*batch"] | None  # side of the touched surface, 1 or -1; None with one surface
-    command: Float[Array, "*batch"] | None  # |F_c| at the last tick [N]; None with one surface
-    # |F_c| at the end of the previous contact [N]; None with one surface
+    command: Float[Array, "*batch"] | None  # |force command| at the last tick [N]; None with one surface
+    # |force command| at the end of the previous contact [N]; None with one surface
     remaining_command: Float[Array, "*batch"] | None
-    deviation: Deviation | None  # deviation of x_d from the ideal contact; None without a probe
+    deviation: Deviation | None  # deviation of the model from the ideal contact; None without a probe
 
 
 class ContactEndConditions(NamedTuple):
     """Conditions for the end of a contact."""
 
     force_free_ticks: Float[Array, "*batch"]  # minimum number of ticks without a real force
-    # number of ticks without a real force after which the contact ends even if F_c has not decayed
+    # number of ticks without a real force after which the contact ends even if the command has not decayed
     max_force_free_ticks: Float[Array, "*batch"]
     divergence_speed: Float[Array, "*batch"]  # speed above which the run has diverged [m/s]
     clearance: Float[Array, "*batch"]  # distance between two surfaces [m]; infinite for one surface
@@ -124,7 +124,7 @@ def record_contact(
         signals: Inputs of the compensator.
         plant_signals: Real forces in the last sampling interval.
         command: Force command F_c [N].
-        shortfall: Change of the position command by the limits [m]; None without limits.
+        shortfall: Change of the position command by the motion simulator's limits [m]; None without limits.
     """
     speed, magnitude = jnp.abs(signals.velocity_desired), jnp.abs(command)
     force = jnp.abs(plant_signals.force)
@@ -225,7 +225,7 @@ def _peak_force(loop, watch, plant_signals, force):
 
 
 def _largest_shortfall(watch, shortfall, lasts):
-    """Return the largest change of the position command by the limits so far [m]; None without limits."""
+    """Return the largest shortfall of the position command so far [m]; None without limits."""
     if watch.shortfall is None or shortfall is None:
         return watch.shortfall
     return jnp.where(lasts, jnp.maximum(watch.shortfall, shortfall), watch.shortfall)

@@ -36,7 +36,7 @@ class Candidate(NamedTuple):
 
 
 def candidates(mechanism: SixAxisMechanism, numbers: Values) -> list[list[Candidate]]:
-    """Return a mechanism's contact candidates (pairs of shapes), grouped by kinds of shapes and laws."""
+    """Return the pairs of shapes that may touch (candidates), grouped by the kinds of shapes and laws."""
     groups: dict[Any, list[Candidate]] = {}
     for name, contact in mechanism.contact.items():
         count = contact.pattern.count if contact.pattern else 1
@@ -54,7 +54,7 @@ def candidate_names(mechanism: SixAxisMechanism) -> tuple[str, ...]:
 
 
 def build_groups(mechanism: SixAxisMechanism, numbers: Values) -> tuple[ContactGroup, ...]:
-    """Build the groups of contact candidates, with arrays (..., candidates, lanes)."""
+    """Build the groups of contact candidates (shape pairs), with arrays (..., candidates, lanes)."""
 
     def stacked(*leaves: Any) -> Any:
         # Slopes and depths have a leading axis for their segments, before the axis of the candidates.

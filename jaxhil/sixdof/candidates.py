@@ -31,7 +31,7 @@ class Touch(NamedTuple):
 
 
 class Candidates(eqx.Module):
-    """Interface of all kinds of contact candidates."""
+    """Interface of the kinds of contact candidates (pairs of shapes that may touch)."""
 
     @abc.abstractmethod
     def touch(self, pose: Pose) -> Touch:

@@ -31,7 +31,7 @@ def meet(space: Space, before: States, depths: tuple[Float[Array, "candidates *b
     Args:
         space: Constants of the ideal contact.
         before: States at the start of the integration step in which the first touch begins.
-        depths: Penetration of each candidate at the end of this step [m]; 0 if nothing ever touches.
+        depths: Penetration of each pair of shapes at the end of this step [m]; 0 if nothing ever touches.
     """
     zero = jnp.zeros_like(before.target.position.x)
     if not space.groups:
@@ -40,7 +40,7 @@ def meet(space: Space, before: States, depths: tuple[Float[Array, "candidates *b
         return Meeting(before, nowhere, nowhere)
 
     def touch_of(states: States) -> tuple[Touch, Array]:
-        """Return geometry and penetration rate of the candidate that is deepest at the end of the step."""
+        """Return geometry and penetration rate of the shape pair that is deepest at the end of the step."""
         pose, twist = jax.tree.map(lambda leaf: leaf[None], relative(space.bodies, states))
         touches = [group.candidates.touch(pose) for group in space.groups]
         rates = [motion_at(touch, pose, twist)[0] for touch in touches]
@@ -76,7 +76,7 @@ def glide(bodies: Pair, states: States, time: Float[Array, "*batch"]) -> States:
 
 
 def _deepest(candidates: list[tuple[Touch, Array]], depths: tuple[Array, ...]) -> tuple[Touch, Array]:
-    """Return geometry and penetration rate of the candidate that has the largest of the `depths` [m]."""
+    """Return geometry and penetration rate of the shape pair that has the largest of the `depths` [m]."""
     best: tuple[tuple[Touch, Array], Array] | None = None
     for candidate, depth in zip(candidates, depths, strict=True):
         index = jnp.argmax(depth, axis=0)[None]

@@ -19,7 +19,7 @@ from jaxhil.sixdof.vectors import Vector, cross
 
 
 class ContactGroup(eqx.Module):
-    """Contact candidates with the same kinds of shapes, contact law and friction law."""
+    """Pairs of shapes that may touch (candidates), with equal kinds of shapes and of laws."""
 
     candidates: Candidates  # pairs of shapes
     law: ContactLaw = eqx.field(static=True)  # contact law of the normal force
@@ -81,7 +81,7 @@ def contact_wrench(
     twist: Twist,
     duration: Float[Array, "*batch"],
 ) -> tuple[Wrench, tuple[Forces, ...], tuple[Memory, ...]]:
-    """Compute the wrench [N, N m] of all groups on the chaser, the candidates' forces, and the next states.
+    """Compute the wrench [N, N m] of all groups on the chaser, the contact forces, and the next states.
 
     `duration` is the time since the last evaluation of the contact and friction laws [s].
     """

@@ -41,7 +41,7 @@ class Held(NamedTuple):
     """State of the latches: whether they have caught, and the pose at which they caught."""
 
     caught: Bool[Array, "latches *batch"]
-    point: Vector  # position at which the point was caught, in target frame T [m]
+    point: Vector  # position of the point at the catch, in target frame T [m]
     attitude: Quaternion  # rotation from chaser frame C to target frame T at the catch
 
 

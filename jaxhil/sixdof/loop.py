@@ -124,9 +124,9 @@ class Tick(NamedTuple):
 
     states: States  # states of the numerical model's bodies at the tick
     pose: Pose  # pose of the hardware at the force sensor's sampling instant
-    twist: Twist  # twist of the hardware at this instant
-    contact: Wrench  # wrench of the real contact at this instant, including the latches
-    forces: tuple[Forces, ...]  # contact forces of each group of shape pairs at this instant
+    twist: Twist  # twist of the hardware at the force sensor's sampling instant
+    contact: Wrench  # wrench of contacts and latches at the sampling instant
+    forces: tuple[Forces, ...]  # contact forces of each group at the sampling instant
     held: tuple[Held, ...]  # states of the latches
     command: Wrench  # wrench command, which acts on the numerical model
 

@@ -30,12 +30,12 @@ LEAST_SHARE = 0.05
 
 
 class Metrics(NamedTuple):
-    """Metrics of episodes, (episodes, *batch); NaN for a metric that is not defined.
+    """Metrics of episodes (contacts with all their touches), (episodes, *batch); NaN for undefined metrics.
 
     V is the twist after the contact, V_0 the twist before the contact. A star marks the ideal contact.
     """
 
-    energy_error: Float[Array, "..."]  # (dE - dE*) divided by the energy of the approach [1]
+    energy_error: Float[Array, "..."]  # error of the energy change, divided by the approach's energy [1]
     twist_error: Float[Array, "..."]  # |V - V*| divided by |V* - V_0|, in the norm of M [1]
     normal_part: Float[Array, "..."]  # part of the twist error along the ideal impulse [1]
     lateral_part: Float[Array, "..."]  # translational part of the remaining twist error [1]
@@ -46,8 +46,8 @@ class Metrics(NamedTuple):
     effective_mass: Float[Array, "..."]  # effective mass m_n at the first touch [kg]
     approach_velocity: Float[Array, "..."]  # approach velocity v_n along the normal of the first touch [m/s]
     point: Float[Array, "..."]  # point of the first touch, in target frame T, (3, episodes, *batch) [m]
-    normal: Float[Array, "..."]  # normal of the target's surface at this point, (3, episodes, *batch)
-    energy_change: Float[Array, "..."]  # change dE of the bodies' kinetic energy [J]
+    normal: Float[Array, "..."]  # normal of the target's surface at `point`, (3, episodes, *batch)
+    energy_change: Float[Array, "..."]  # change of the bodies' kinetic energy [J]
     reference_energy_change: Float[Array, "..."]  # change of the kinetic energy in the ideal contact [J]
     peak_force: Float[Array, "..."]  # peak force of the real contact [N]
     reference_peak_force: Float[Array, "..."]  # peak force of the ideal contact [N]

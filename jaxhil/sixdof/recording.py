@@ -181,7 +181,7 @@ _OF_CANDIDATES = {"force": (), "depth": (), "point": (3,), "push": (3,)}
 
 
 def _of_candidates(forces: Forces) -> dict[str, Any]:
-    """Return force, depth, point and push of a group's candidates, (ticks, candidates, ..., lanes)."""
+    """Return force, depth, point and push of a group's shape pairs, (ticks, candidates, ..., lanes)."""
     touch = forces.touch
     push = forces.normal * touch.normal + forces.tangential
     return {

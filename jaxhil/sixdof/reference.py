@@ -38,7 +38,7 @@ class Past(NamedTuple):
     """Past of the ideal contact: its metrics up to a time, and the states at this time."""
 
     time: Float[Array, "*batch"]  # time since the start [s]
-    states: States  # states of the bodies at this time
+    states: States  # states of the bodies at the field `time`
     touches: Int[Array, "*batch"]  # number of touches of all pairs of shapes
     touched: Float[Array, "*batch"]  # time during which shapes touched [s]
     peak_force: Float[Array, "*batch"]  # peak force [N]
@@ -70,11 +70,11 @@ class Passage(NamedTuple):
     """State of the integration of an ideal contact, with the metrics so far."""
 
     flight: Flight  # motion of the bodies, with the state of the integrator
-    touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each group's candidates touch
+    touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each pair of shapes touches, per group
     touches: Int[Array, "*batch"]  # number of touches of all pairs of shapes
     touched: Float[Array, "*batch"]  # time during which shapes touched [s]
     before: States  # states at the start of the step in which the first touch begins
-    depths: tuple[Float[Array, "candidates *batch"], ...]  # penetrations at the end of this step [m]
+    depths: tuple[Float[Array, "candidates *batch"], ...]  # penetrations at the end of the same step [m]
     force: Peak  # peak force [N]
     moment: Peak  # peak moment about the origin of target frame T [N m]
     gaps: Gaps
@@ -235,7 +235,7 @@ def _updated(passage: Passage, approach: Approach, after: Flight, now: Instant) 
 
 
 def _touches(passage: Passage) -> Array:
-    """Return whether any candidate touches or any latch holds."""
+    """Return whether any pair of shapes touches or any latch holds."""
     result = jnp.zeros(passage.touched.shape, bool)
     for flags in (*passage.touching, *(latch.caught for latch in passage.flight.memories.held)):
         result = result | jnp.any(flags, axis=0)

@@ -39,13 +39,13 @@ STATUS_NAMES = ("miss", "rebounded", "captured", "jammed", "timeout", "diverged"
 
 
 class Episode(NamedTuple):
-    """Results of episodes on the rig and their ideal contacts; arrays of shape (episodes, *batch)."""
+    """Results of episodes (contacts with all their touches) and their ideal contacts, (episodes, *batch)."""
 
     start: States  # states of the numerical model at the start of the episode
     end: States  # states of the numerical model at the end of the episode
     lasted: Float[Array, "episodes *batch"]  # time from start to end [s]
     meeting: Meeting  # first touch of the ideal contact from the same start
-    # ideal contact up to the gap in which the episode ends; without a common gap, up to the end of the run
+    # ideal contact up to the gap (period without a touch) in which the episode ends; else up to the run's end
     past: Past
     touches: Int[Array, "episodes *batch"]  # number of touches of the hardware's shapes
     duration: Float[Array, "episodes *batch"]  # time during which the hardware touches [s]

@@ -118,9 +118,9 @@ class SixAxisRun:
         compensator: Name of the compensator.
         gains: Gains of the compensator by name [SI units].
         seed: Seed of the sensors' noise.
-        episodes: Results of every episode.
-        status: Status of the first episode that ended neither "rebounded" nor "captured"; if there is no such
-            episode, status of the last episode.
+        episodes: Results of every episode (a contact with all its touches).
+        status: Status of the first episode that did not end with "rebounded" or "captured"; if there is no
+            such episode, status of the last episode.
         final: Motion of the numerical model at the end of the run.
         meaning: Summary of the mechanism.
     """

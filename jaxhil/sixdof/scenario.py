@@ -1,6 +1,7 @@
 """Scenarios of a six-axis mechanism as arrays that contain every number of a run.
 
-The last axis of all arrays is the batch. Candidates, latches and simulator axes have an axis before it.
+The last axis of all arrays is the batch. The axis before it, if any, has an entry for each pair of shapes,
+each latch or each axis of the motion simulator.
 """
 
 from typing import NamedTuple
@@ -21,7 +22,7 @@ class Scenario(NamedTuple):
 
     bodies: Pair
     start: States  # states of the numerical model at tick 0
-    groups: tuple[ContactGroup, ...]  # groups of contact candidates
+    groups: tuple[ContactGroup, ...]  # groups of shape pairs that may touch
     latches: tuple[Latch, ...]
     simulator: MotionSimulatorBatch  # transfer function of each axis, (..., axes, *batch), without limits
     kinematics: Kinematics  # kinematics of the motion simulator

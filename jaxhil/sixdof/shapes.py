@@ -1,4 +1,4 @@
-"""Shapes of contact candidates, with the signed distance from a point to the surface and the outward normal.
+"""Shapes that may touch, with the signed distance from a point to the surface and the outward normal.
 
 The parameters of a shape are arrays (candidates, *batch), in the axes of the body's interface frame [m].
 Distances are positive outside. The formulas follow Quilez, "3D signed distance functions".

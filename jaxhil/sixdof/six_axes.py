@@ -71,7 +71,7 @@ class SixAxes(RigModel):
         return building.loop_of(mechanism, compensator, scenarios)
 
     def runs(self, mechanism: SixAxisMechanism) -> int:
-        """Return the number of evaluated episodes in a scenario of the mechanism."""
+        """Return the number of evaluated episodes (contacts with all their touches) in a scenario."""
         return mechanism.approach.episodes if mechanism.approach else 1
 
     def with_ideal_contacts(self, batches: Sequence[Scenario]) -> list[Scenario]:

@@ -43,10 +43,10 @@ MIN_SPEED = 1e-30  # m/s; avoids a division by zero
 
 
 class Space(NamedTuple):
-    """Constants of an ideal contact: bodies, contact candidates and latches."""
+    """Constants of an ideal contact: bodies, pairs of shapes that may touch, and latches."""
 
     bodies: Pair
-    groups: tuple[ContactGroup, ...]  # groups of contact candidates
+    groups: tuple[ContactGroup, ...]  # groups of shape pairs that may touch
     latches: tuple[Latch, ...]
 
 
@@ -64,7 +64,7 @@ class Instant(NamedTuple):
     pose: Pose
     twist: Twist
     wrench: Wrench  # wrench on the chaser, about the origin of target frame T
-    forces: tuple[Forces, ...]  # forces of each group of candidates
+    forces: tuple[Forces, ...]  # contact forces of each group of shape pairs
 
 
 class Flight(NamedTuple):
@@ -72,7 +72,7 @@ class Flight(NamedTuple):
 
     time: Float[Array, "*batch"]  # time since the start of the integration [s]
     length: Float[Array, "*batch"]  # length of the next step [s]
-    touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each group's candidates touch
+    touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each pair of shapes touches, per group
     memories: Memories
     states: States  # states of the bodies
     tries: Int[Array, "*batch"]  # number of steps so far, including rejected steps

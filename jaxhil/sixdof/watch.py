@@ -25,7 +25,7 @@ MIN_PAUSE = 0.06  # s; minimum time without any touch, after which an episode ma
 
 
 class Beginning(NamedTuple):
-    """Start of an episode, which is the start of the run or the end of the last episode."""
+    """Start of an episode (a contact with all its touches): start of the run, or end of the last episode."""
 
     states: States  # states of the numerical model at the start
     tick: Int[Array, "*batch"]  # index of the tick at the start
@@ -34,10 +34,10 @@ class Beginning(NamedTuple):
 
 
 class Watch(NamedTuple):
-    """Record of the current episode on the rig."""
+    """Record of the current episode (a contact with all its touches) on the rig."""
 
     begun: Bool[Array, "*batch"]  # whether the hardware has touched or a latch has caught
-    touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each group's candidates touch
+    touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each pair of shapes touches, per group
     touches: Int[Array, "*batch"]  # number of touches of all pairs of shapes
     touched: Int[Array, "*batch"]  # number of ticks with a touch
     quiet: Int[Array, "*batch"]  # number of ticks since the last touch
