@@ -40,11 +40,11 @@ _POLE_KEYS = ("rig.simulator.", "rig.control_period")
 
 
 class ContactSummary(NamedTuple):
-    """Metrics of an ideal contact with the velocity of the first approach.
+    """Metrics of an ideal contact at the velocity of the first approach.
 
     Attributes:
         number: Number of the first scheduled contact with these metrics, from 1.
-        frequency: Contact frequency [Hz]: sqrt(k/M)/(2 pi) for a spring, 1/(2 duration) for other laws.
+        frequency: Contact frequency [Hz]: sqrt(stiffness/mass)/(2 pi) for a spring, else 1/(2 duration).
         duration: Duration [s]; infinite if the bodies do not separate.
         peak_force: Peak force [N].
     """
@@ -284,7 +284,7 @@ def _estimate_durations(scenarios: Scenario, reference: IdealContact) -> tuple[n
 def _longest_wait(scenarios: Scenario) -> np.ndarray:
     """Return the longest time [s] that the simulation waits for a contact to begin.
 
-    With one surface, `MAX_CONTACT_DURATION` is not included.
+    With one surface, this time is in addition to `MAX_CONTACT_DURATION`; with two, it includes this duration.
     """
     with np.errstate(all="ignore"):
         crossing_time = 10 * scenarios.clearance / scenarios.velocity

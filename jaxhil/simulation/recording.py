@@ -38,8 +38,8 @@ class LaneRecord(NamedTuple):
     command: np.ndarray | Array  # force command F_c [N]
     # estimates of stiffness [N/m] and damping [N s/m]; None if the compensator identifies neither
     identified: tuple[np.ndarray | Array, np.ndarray | Array] | None
-    # Whether the loop sets the force command to 0 at the first tick of a run: no force acts before a run, even
-    # if a sensor with noise or bias reads one.
+    # Whether the loop sets the force command to 0 at the first tick of a run: no force acts before a run, but
+    # a sensor with noise or bias reads one.
     zeroed: bool
     # position command at the end of each tick [m]
     sent: np.ndarray | Array | None = None

@@ -87,7 +87,7 @@ def latch_points(latch: Latch, pose: Pose) -> Vector:
 
 
 def _sine(attitude: Quaternion) -> Array:
-    """Return the sine of half a rotation's angle, as a constant for differentiation."""
+    """Return the sine of half the rotation's angle, as a constant: its derivatives are 0."""
     v = attitude.v
     return jax.lax.stop_gradient(jnp.sqrt(v.x**2 + v.y**2 + v.z**2))
 

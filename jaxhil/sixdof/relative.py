@@ -79,7 +79,7 @@ class States(NamedTuple):
 
 @jax.jit
 def interface_frame(body: Body, state: State) -> Frame:
-    """Return the motion of a body's interface frame in the world."""
+    """Return position, attitude and velocities of a body's interface frame, in world axes."""
     angular = rotate(state.attitude, angular_velocity(body, state))
     offset = rotate(state.attitude, body.interface)
     rotation = body.interface_attitude

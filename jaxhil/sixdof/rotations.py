@@ -50,13 +50,13 @@ def reverse(rotation: Quaternion) -> Quaternion:
 
 @jax.jit
 def rotate(rotation: Quaternion, vector: Vector) -> Vector:
-    """Return R vector, where R is the matrix of the rotation."""
+    """Return the product R v, where R is the matrix of the rotation and v the `vector`."""
     along = 2 * cross(rotation.v, vector)
     return vector + rotation.w * along + cross(rotation.v, along)
 
 
 def rotate_back(rotation: Quaternion, vector: Vector) -> Vector:
-    """Return R^T vector, where R is the matrix of the rotation."""
+    """Return the product R^T v, where R is the matrix of the rotation and v the `vector`."""
     return rotate(reverse(rotation), vector)
 
 

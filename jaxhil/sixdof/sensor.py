@@ -44,7 +44,7 @@ class Sensor(NamedTuple):
     time_constant: Float[Array, "*batch"]  # time constant of the lag of all channels [s]; 0 without a lag
     errors: SampleErrors
     noise_std: Float[Array, "6 *batch"]  # standard deviation of the white noise [N, N m]
-    mounting: Pose | None  # pose of a sensor on the fixed side relative to T; None if the sensor is at T
+    mounting: Pose | None  # pose of a sensor on the fixed side in target frame T; None if equal
     tool: Tool  # tool that a sensor on the moving side carries
     gravity: Vector  # gravity in target frame T [m/s^2]
     assumed_tool: Tool  # tool that the controller assumes
@@ -111,7 +111,7 @@ def undo_moving(reading: Wrench, load: Wrench, pose: Pose) -> Wrench:
 def read_fixed(wrench: Wrench, mounting: Pose | None) -> Wrench:
     """Return the reading (the reaction) of a sensor on the fixed side, in the sensor's frame.
 
-    `mounting` is the pose of this frame relative to T; None if the frame equals T.
+    `mounting` is the pose of the sensor's frame relative to target frame T; None if both are equal.
     """
     if mounting is None:
         return Wrench(-wrench.force, -wrench.moment)

@@ -156,7 +156,7 @@ def advance_flight(
     safe = jnp.where(jnp.isfinite(error), jnp.maximum(error, 1e-12), 1e12)
     change = jnp.clip(0.9 * safe**-0.2, MIN_STEP_RATIO, jnp.where(accepted, MAX_STEP_RATIO, 0.9))
     proposed = length * change
-    # If `left` or `longest` limited an accepted step, the next step may have the length before the limit.
+    # If `left` or `longest` shortened an accepted step, the next step may have the original length.
     cut = accepted & (length < flight.length)
     proposed = jnp.where(cut, jnp.maximum(flight.length, proposed), proposed)
     ahead = lax.stop_gradient(jnp.where(is_too_long, length / 4, proposed))
