@@ -241,8 +241,6 @@ class RigModel(abc.ABC):
         return order[np.argsort(delays[order], kind="stable")]
 
     def _arrange_scenarios(self, assignment: "_TileAssignment", scenarios: Any) -> Any:
-        """Arrange scenarios in tiles according to the assignment."""
-
         def fold(leaf):
             if leaf.strides[-1] == 0:
                 value = leaf[..., 0]
@@ -317,7 +315,6 @@ class _TileAssignment(NamedTuple):
 
 
 def _place_leaves(tree: Any, spec: PartitionSpec) -> Any:
-    """Place the leaves of a pytree on the devices."""
     return jax.device_put(tree, NamedSharding(_build_device_mesh(), spec))
 
 

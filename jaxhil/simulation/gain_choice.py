@@ -122,5 +122,4 @@ def _read_gains(
 
 
 def _describe_axes(mechanism: AnyMechanism) -> str:
-    """Return "one axis" or "six axes"."""
     return "one axis" if isinstance(mechanism, Mechanism) else "six axes"

@@ -140,7 +140,6 @@ def _make_error(source: str, key: str, found: str, allowed: str) -> InputError:
 
 
 def _is_date(value: object) -> bool:
-    """Return whether a value is a text in ISO format with date, time and time zone."""
     try:
         return isinstance(value, str) and datetime.fromisoformat(value).tzinfo is not None
     except ValueError:
@@ -155,12 +154,10 @@ def _is_envelope(value: object) -> bool:
 
 
 def _is_object(value: object) -> bool:
-    """Return whether a value is a JSON object."""
     return isinstance(value, Mapping)
 
 
 def _is_table_of_texts(value: object) -> bool:
-    """Return whether a value is a JSON object whose values are texts."""
     return isinstance(value, Mapping) and all(isinstance(text, str) for text in value.values())
 
 

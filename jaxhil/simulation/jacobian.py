@@ -125,7 +125,6 @@ def _check_result(of: object, law: Compensator) -> None:
 
 
 def _check_no_quantum(mechanism: Mechanism) -> None:
-    """Raise `InputError` if a sensor quantises its readings."""
     for path in _QUANTUM_KEYS:
         if value_at(mechanism, path) != 0.0:
             allowed = "0: quantised readings have no derivative"

@@ -271,7 +271,6 @@ def supported_options(options: Mapping[str, int | str]) -> dict[str, int | str]:
 
 @cache
 def _is_supported(name: str, value: int | str) -> bool:
-    """Return whether XLA accepts a compiler option."""
     import jax
 
     try:

@@ -80,6 +80,5 @@ def horner(series: Array, tau: Array) -> Array:
 
 
 def _derivative(series):
-    """Return the coefficients of a power series' derivative."""
     orders = np.arange(1, len(series)).reshape(-1, *[1] * (series.ndim - 1))
     return series[1:] * orders.astype(series.dtype)

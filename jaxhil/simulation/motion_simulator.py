@@ -305,7 +305,6 @@ def _weighted_sum(weights, rows):
 
 
 def _matrix_product(left, right):
-    """Multiply two matrices whose axes come before the batch axes."""
     total = left[:, 0, None] * right[None, 0]
     for k in range(1, left.shape[0]):
         total = total + left[:, k, None] * right[None, k]

@@ -310,7 +310,6 @@ def _extreme_draws(mechanism: Mechanism, prefixes: tuple[str, ...]) -> dict[str,
 
 
 def _find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) -> list[str]:
-    """Return one warning for each implausible number of the mechanism."""
     rig, contact, warnings = mechanism.rig, mechanism.contact, []
     fastest = max(contacts, key=lambda item: item.frequency)
     slowest = min(contacts, key=lambda item: item.frequency)

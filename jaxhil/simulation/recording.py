@@ -110,7 +110,6 @@ def _build_lane_record(ticks: Tick, zeroed: bool) -> LaneRecord:
 
 
 def _start_loop(loop: Loop, gains: Gains, scenario: Scenario) -> tuple[RigConstants, RunState]:
-    """Return constants and initial state of the loop."""
     rig = build_rig_constants(loop, scenario)
     return rig, start_rollout(loop, rig, gains, skip_flight=False)
 

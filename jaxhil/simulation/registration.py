@@ -166,7 +166,6 @@ def _check_runtime(law: Compensator, runtime: object) -> None:
 
 
 def _format_units(gains: dict[str, Any]) -> str:
-    """Return names and units of gains as text, such as "lead [s], weight [1]"."""
     return to_one_line(", ".join(f"{name} [{unit}]" for name, unit in gains.items()), 200) or "no gains"
 
 

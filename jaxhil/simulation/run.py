@@ -257,7 +257,6 @@ def check_seed(seed: Any) -> int:
 
 
 def _error_reasons(contacts: Sequence[ContactResult], limit: float) -> Iterator[str]:
-    """Yield a text about the largest restitution error if it exceeds the limit."""
     worst = max((contact.error for contact in contacts), key=abs)
     if not abs(worst) <= limit:
         kind = "divergence" if worst > 0 else "convergence"

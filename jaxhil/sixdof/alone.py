@@ -111,5 +111,4 @@ def _ideal_metrics(scenario: Scenario) -> Metrics:
 
 @cache
 def _compiled() -> Callable[[Scenario], Metrics]:
-    """Return the compiled version of `_ideal_metrics`."""
     return jax.jit(_ideal_metrics, compiler_options=supported_options(SINGLE_RUN_OPTIONS))

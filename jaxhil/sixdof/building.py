@@ -94,7 +94,6 @@ def loop_of(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -
 
 
 def _body(numbers: Values, name: str) -> Body:
-    """Build the body `name`, "target" or "chaser"."""
     rotation_path = f"{name}.interface_rotation"
     return build_body(
         jnp.asarray(numbers(f"{name}.mass")),
@@ -137,7 +136,6 @@ def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, befor
 
 
 def _kinematics(mechanism: SixAxisMechanism, numbers: Values) -> Kinematics:
-    """Build the kinematics of the motion simulator."""
     path, simulator = "rig.simulator.", mechanism.rig.simulator
     if simulator.space == "task":
         return TaskSpace()

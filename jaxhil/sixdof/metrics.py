@@ -180,7 +180,6 @@ def _twist_parts(matrix: Array, after: Twist, expected: Twist, before: Twist) ->
 
 
 def _stacked(twist: Twist) -> Float[Array, "6 *batch"]:
-    """Stack the components of a twist along a leading axis."""
     return jnp.stack(jax.tree.leaves(twist))
 
 

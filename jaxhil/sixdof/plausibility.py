@@ -124,7 +124,6 @@ def _compiled() -> Callable[[Scenario], StartValues]:
 
 
 def _start_values(scenario: Scenario) -> StartValues:
-    """Compute the `StartValues` of the scenarios."""
     pose, twist = relative(scenario.bodies, scenario.start)
     at, *_ = model_motion(scenario.bodies, scenario.start)
     caught = tuple(

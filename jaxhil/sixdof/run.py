@@ -245,8 +245,6 @@ def _stiffest(mechanism: SixAxisMechanism) -> str:
 
 
 def _episode(metrics: Metrics, slot: int) -> Episode:
-    """Convert the metrics of episode number `slot` to an `Episode`."""
-
     def value(name: str) -> Any:
         entry = np.asarray(getattr(metrics, name))[..., slot, 0]
         if name == "status":
@@ -257,7 +255,6 @@ def _episode(metrics: Metrics, slot: int) -> Episode:
 
 
 def _final(time: float, motion: Any) -> Final:
-    """Convert the arrays that `_motion` returns to a `Final`."""
     pose, twist, *velocities = (tuple(np.asarray(part, float)[:, 0].tolist()) for part in motion)
     return Final(time, pose, twist, *velocities)
 

@@ -301,7 +301,6 @@ def _size(space: Space, error: States, speed: Array) -> Array:
 
 
 def _slope(body: Body, state: State, load: Load) -> State:
-    """Return the time derivative of a body's state under a load."""
     angular = angular_velocity(body, state)
     turning = compose(state.attitude, Quaternion(0 * state.attitude.w, 0.5 * angular))
     return State(state.velocity, (1 / body.mass) * load.force, turning, load.torque)
