@@ -184,7 +184,7 @@ def _build_draws(mechanism: Mechanism, variables: list[_Variable], increments: A
 
     In lane i, variable i is its nominal value plus `increments[i]`; all other values are nominal.
     """
-    # If all variables are gains, this entry alone determines the number of lanes.
+    # If all variables are gains, the phase is the only draw, and determines the number of lanes.
     draws: dict[str, Any] = {"approach.phase": np.full(len(variables), mechanism.approach.phase)}
     for lane, variable in enumerate(variables):
         if variable.gain is None:

@@ -30,7 +30,7 @@ MIN_DEVICES = 2
 # Thresholds of Python's garbage collector. Tracing creates millions of objects, of which few are in reference
 # cycles. With the default thresholds, their collection costs 10 % of the time of a short command.
 GC_THRESHOLDS = 100_000, 50, 50
-# JAX caches only programs that take longer to compile than to read from a file.
+# Settings with which JAX caches only programs that take longer to compile than to read from a file.
 CACHE_SETTINGS = {
     "jax_persistent_cache_min_compile_time_secs": 0.05,
     "jax_persistent_cache_min_entry_size_bytes": 0,
@@ -249,8 +249,8 @@ def build_xla_flags(user_flags: str) -> str:
         del ours["--xla_backend_optimization_level"]
     elif version("jaxlib").startswith(TESTED_JAXLIB_VERSIONS):
         # Each time LLVM unrolls a loop partially, it repeats its analysis of the surrounding loops. For a
-        # compensator with a thousand loops, this is a third of the compile time, and the programs are not
-        # faster.
+        # compensator with a thousand loops, this analysis takes a third of the compile time, and partial
+        # unrolling does not make the program faster.
         ours["--xla_backend_extra_options"] += f",{FULL_UNROLL_OPTION}"
     user_names = {flag.split("=")[0] for flag in user_flags.split()}
     added = [f"{name}={value}" for name, value in ours.items() if name not in user_names]

@@ -370,7 +370,7 @@ def _format_ratio(value: float, whole: float) -> str:
 
 
 def _format_frequencies(frequencies: list[float]) -> str:
-    """Return frequencies as text: a list, or lowest and highest if there are many."""
+    """Return frequencies as text: as a list or, if there are many, as lowest and highest."""
     texts = list(dict.fromkeys(f"{frequency:.3g}" for frequency in frequencies))
     if len(texts) > MAX_LISTED_FREQUENCIES:
         return f"{min(frequencies):.3g} to {max(frequencies):.3g}"

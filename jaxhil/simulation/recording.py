@@ -1,7 +1,7 @@
 """Recording of the compensator's readings and commands at every tick, for each lane of a batch.
 
-Uses of these records: plots and time series of a run, test vectors in a bundle for the rig, and the replay of
-a run by the rig's controller during verification.
+These records are used for plots and time series of a run, for test vectors in a bundle for the rig, and for
+the replay of a run by the rig's controller during verification.
 """
 
 from collections.abc import Mapping

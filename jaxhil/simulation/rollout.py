@@ -176,7 +176,7 @@ def begin_next_contacts(
     index = run.index + over.astype(jnp.int32)
     ends = (status != OK) | (index >= scenario.contacts)
     if loop.has_limits and not loop.is_two_sided:
-        # The next run would begin with a rebound speed that the drives cannot follow.
+        # End a scenario whose drives cannot follow the rebound speed, with which the next run would begin.
         ends = ends | (watch.rebound > scenario.simulator.velocity_limit)
     active = run.active & ~(over & ends)
     blank = fresh_watch(loop, watch.approach)

@@ -42,7 +42,7 @@ class Watch(NamedTuple):
     recent_forces: tuple[Array, Array]  # real force at the last two ticks [N]
     in_contact: Float[Array, "*batch"]  # duration of the real force so far [control periods]
     measured: Bool[Array, "*batch"]  # whether the force sensor has read a force
-    # number of ticks since the last real force, or since the beginning of a contact without a real force yet
+    # number of ticks since the last real force; in a contact without a real force so far, since its beginning
     force_free_ticks: Float[Array, "*batch"]
     work: tuple[Array, ...]  # work done on the mechanism and work returned by it [J]; empty unless recorded
     command_variation: CommandVariation | None  # variation of the force command; None unless recorded
@@ -148,7 +148,7 @@ def record_contact(
         elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
         # A run that has diverged ends at this tick, even if the speed would decrease again.
         over=watch.over | ends | (speed > rules.divergence_speed),
-        # The approach speed is taken at the tick before the contact begins, the rebound speed at its end.
+        # The approach speed is taken at the tick before the contact, the rebound speed at the contact's end.
         approach=jnp.where(begun | watch.over, watch.approach, speed),
         rebound=jnp.where(watch.over, watch.rebound, speed),
         peak_force=jnp.maximum(watch.peak_force, _peak_force(loop, watch, plant_signals, force)),

@@ -24,7 +24,7 @@ from jaxhil.sixdof.vectors import Vector, cross, vector
 
 
 class Latch(NamedTuple):
-    """Parameters of the latches of one table."""
+    """Parameters of all latches of one [latch] table in the mechanism file."""
 
     point: Vector  # point of the chaser that the latch catches, in chaser frame C [m]
     depth: Float[Array, "latches *batch"]  # minimum depth of the point below T's plane z = 0 [m]

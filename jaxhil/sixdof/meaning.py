@@ -72,7 +72,7 @@ def meaning(
         friction = contact.friction
         if friction is None or friction.slip is None or not peak_force > 0:
             continue
-        # A delayed damper on a mass is stable if (damping times delay) / mass is below pi/2.
+        # A delayed damper on a mass is stable if damping times delay, divided by the mass, is below pi/2.
         slip = 2 / math.pi * friction.coefficient * peak_force * delay / tangential_mass
         limit = slip if math.isnan(limit) else max(limit, slip)
         if friction.slip < slip:
