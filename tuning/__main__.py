@@ -90,7 +90,7 @@ def _open_closed_streams() -> None:
 
 
 def _print_error(text: str, code: int) -> int:
-    """Print an error message on standard error, and return `code`; a broken stream is ignored."""
+    """Print an error message on standard error, ignoring a broken stream, and return `code`."""
     try:
         print(f"jaxhil: {text}", file=sys.stderr, flush=True)
     except OSError:

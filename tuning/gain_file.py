@@ -1,8 +1,9 @@
 """Writing of gain files (`schema = "jaxhil/gains/1"`), which later commands and the rig read.
 
-A gain file contains a compensator's gains with units and bounds, the mechanism for which the gains were
-tuned, the ranges of the scenarios, and the metrics of the gains. `build_document` builds the content,
-`write_gain_file` writes the file with a checksum, and `jaxhil.simulation.gain_file.load_gain_file` reads it.
+A gain file contains a compensator's gains with their units and bounds, the mechanism for which they were
+tuned, the ranges of the scenarios on which they were evaluated, and the resulting metrics. `build_document`
+builds the content, `write_gain_file` writes the file with a checksum, and
+`jaxhil.simulation.gain_file.load_gain_file` reads it.
 """
 
 import json
@@ -43,7 +44,7 @@ def build_document(
     seed: int,
     timings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the content of a gain file, with a checksum, as JSON data with null for non-finite numbers.
+    """Return the content of a gain file, including its checksum, as JSON data; null for non-finite numbers.
 
     Units and bounds come from the registry of compensators. A gain that exceeds a bound by a rounding error
     is set to the bound. Raise `InputError` if the compensator is unknown, if the gains are not those of this
@@ -117,12 +118,12 @@ def six_axis_validity_envelope(scenarios: Any, outcome: Any) -> dict[str, dict[s
 
     Args:
         scenarios: batch of six-axis scenarios.
-        outcome: outcome of these scenarios; only contacts that ended count.
+        outcome: outcome of these scenarios; contacts that did not end are ignored.
 
     Returns:
-        A dictionary {"low", "high", "unit"} for each of four quantities: `contact_frequency`, 1/(2 duration)
-        [Hz]; `approach_velocity` at the first touch [m/s]; `force`, the ideal contact's peak force [N];
-        `delay`, the delay of force sensor plus motion simulator [s].
+        A dictionary {"low", "high", "unit"} for each of four quantities: `contact_frequency`, 1/(2 d) with
+        the contact's duration d [Hz]; `approach_velocity` at the first touch [m/s]; `force`, the ideal
+        contact's peak force [N]; `delay`, the delay of force sensor plus motion simulator [s].
     """
     ended = outcome.good
     quantities = {
@@ -161,7 +162,7 @@ def to_json_data(value: Any) -> Any:
 
 
 def _peak_forces(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
-    """Return the peak force [N] of every contact at the approach speed without damping, (slots, lanes)."""
+    """Return the peak force [N] that every contact would have without damping, (contacts, scenarios)."""
     contact = jax.tree.map(np.asarray, scenarios.contact)
     motion = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)
     return find_contact_law(mechanism.contact.law).undamped_peak_force(contact, *motion)

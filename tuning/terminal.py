@@ -26,7 +26,7 @@ MIN_SHARE_FOR_RATE = 0.05  # finished share of the work above which the rate is 
 
 
 def emit(*things: RenderableType, wrap: bool = True) -> None:
-    """Print tables and texts on standard output, wrapping long texts if `wrap`; ignore a closed pipe."""
+    """Print tables and texts on standard output; if `wrap` is true, wrap long texts. Ignore a closed pipe."""
     with _convert_output_errors():
         for thing in things:
             console = _make_console(sys.stdout)
@@ -69,7 +69,7 @@ def note(text: str) -> None:
 def build_table(
     title: str, headings: Sequence[str], rows: Sequence[Sequence[Any]], texts: Sequence[int] = (0,)
 ) -> Table:
-    """Return a table; `texts` are the indices of the columns that contain text instead of numbers."""
+    """Return a table; `texts` holds the indices of the columns that contain text instead of numbers."""
     # The title is on one line even if the table is narrower.
     heading = Text(title, style="bold", no_wrap=True, overflow="ignore")
     result = Table(title=heading, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
@@ -131,7 +131,7 @@ class Progress:
 
     @property
     def rate(self) -> float | None:
-        """Return the units done per second, not counting skipped units; None if no unit is done yet."""
+        """Return the work units done per second, without skipped units; None before the first is done."""
         worked, duration = self._done - self._skipped, time.monotonic() - self._begun
         return worked / duration if worked > 0 and duration > 0 else None
 
@@ -193,7 +193,7 @@ class Progress:
         self._begun_stage = True
 
     def _show(self, due: float) -> None:
-        """Update the bar, or print a line if the last line is at least `due` seconds old."""
+        """Update the bar; if there is none, print a line unless the last line is newer than `due` [s]."""
         if self._bar is not None:
             rate = self._format_rate()
             self._bar.update(self._task, completed=self._done, description=self._text, pace=rate)
@@ -214,7 +214,7 @@ class Progress:
         if (rate := self.rate) is None or self._done < MIN_SHARE_FOR_RATE * self._total:
             return f"{_format_duration(time.monotonic() - self._begun)} so far"
         left = max(self._total - self._done, 0.0) / rate
-        # For a single unit the rate is shown in percent.
+        # If the whole work is a single unit, the rate is the percentage of it that is done per unit of time.
         scale, unit = (100.0, " %") if self._total == 1 else (1.0, f" {self._unit}")
         hourly = 3600 * scale * rate
         divisor, per = next((pair for pair in ((3600, "s"), (60, "min")) if hourly >= pair[0]), (1, "h"))
@@ -275,10 +275,10 @@ def _show_bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[r
 
 
 def _table_width(table: Table, console: Console) -> int:
-    """Return the width for a table, at least the terminal's, such that no number or word is broken.
+    """Return the smallest width of a table, at least the terminal's, that breaks no number and no word.
 
-    If the terminal is too narrow, put each word of a heading on its own line; the terminal then wraps lines
-    that are still too long.
+    If the terminal is too narrow, put each word of a heading on a line of its own. The terminal wraps the
+    lines that are still too long.
     """
 
     def full_width() -> int:

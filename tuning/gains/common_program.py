@@ -1,8 +1,9 @@
 """One compiled program for mechanisms that differ in contact law, number of segments or number of contacts.
 
-In this program these properties are array values of each lane. The program contains every optional part of
-the loop that any of the mechanisms needs; neutral parameters disable the part for the other mechanisms.
-Mechanisms with two contact surfaces share another program, because the second surface slows every lane.
+In this program these properties are arrays with one value per lane (element of the batch). The program
+contains every optional part of the loop that at least one mechanism needs; neutral parameters disable the
+part for the other mechanisms. Mechanisms with two contact surfaces share another program, because the second
+surface slows every lane.
 """
 
 import dataclasses
@@ -40,7 +41,7 @@ _DISTINGUISHING_PROPERTIES = ("integrator", "hold", "latency", "is_two_sided")
 class CommonProgram:
     """Static properties of a compiled program that several mechanisms share."""
 
-    laws: tuple[str, ...]  # names of the contact laws
+    laws: tuple[str, ...]  # names of the contact laws of all mechanisms
     segments: int  # largest number of segments of a contact law
     slots: int  # largest number of contacts in a run
     parts: tuple[str, ...]  # names of the optional parts of the loop that at least one mechanism needs
@@ -50,12 +51,12 @@ class CommonProgram:
     beforehand: bool  # whether ideal contacts without a closed form are integrated before the simulation
 
     def law(self, beforehand: bool | None = None) -> LawMixture:
-        """Return one law that mixes all contact laws; unless `beforehand`, it integrates ideal contacts."""
+        """Return a law that selects a law per lane; unless `beforehand`, it also computes ideal contacts."""
         return LawMixture(self._kinds, self.beforehand if beforehand is None else beforehand)
 
     @property
     def _kinds(self) -> tuple[ContactLaw, ...]:
-        """Return the simulated contact laws, each once even if two law names share it."""
+        """Return the contact laws that the simulation uses, each once even if several names mean it."""
         return tuple(dict.fromkeys(find_contact_law(name).simulated for name in self.laws))
 
     def loop(self, loop: Loop) -> Loop:
@@ -98,7 +99,7 @@ class CommonProgram:
         return batch._replace(contact=contact, phase=by_slot(batch.phase), reference=reference)
 
     def _first(self, law: ContactLaw, batch: Scenario) -> Any:
-        """Compute the ideal first contact of every scenario, and repeat it for every contact of the run."""
+        """Compute the ideal first contact of every scenario, and use it for every contact of the run."""
         contact: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[0], batch.contact)
         reference = jax.device_get(
             _compute_ideal_contact(law, contact, batch.equivalent_mass, batch.velocity)
@@ -118,7 +119,7 @@ def _compute_ideal_contact(
 
 def group_by_common_program(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], CommonProgram]]:
     """Group mechanisms that can share a compiled program; return (indices, program) of each group."""
-    # The scenarios at both ends of every uncertain range need every part of the loop that a draw can need.
+    # These scenarios have the ends of all uncertain ranges, and so need every part that a draw can need.
     batches = [build_scenarios(mechanism, draw_extremes(mechanism)) for mechanism in mechanisms]
     loops = [build_loop(m, "none", batch) for m, batch in zip(mechanisms, batches, strict=True)]
     groups: dict[Any, list[int]] = {}
@@ -136,7 +137,7 @@ def group_by_common_program(mechanisms: Sequence[Mechanism]) -> list[tuple[list[
 
 
 def _needs_simulated_speeds(mechanism: Mechanism) -> bool:
-    """Return whether ideal contacts must be integrated from approach speeds that the simulation computes."""
+    """Return whether ideal contacts are integrated numerically from speeds known only during simulation."""
     return mechanism.approach.contacts > 1 and not find_contact_law(mechanism.contact.law).closed_form
 
 
@@ -156,7 +157,7 @@ def _build_common_program(mechanisms, group, loops, batches) -> CommonProgram:
 
 
 def _join_cell_counts(mechanisms, loops, batches) -> CellCounts:
-    """Return the largest numbers of integration cells of all mechanisms, or `NO_CELLS` if none uses cells."""
+    """Return how many integration cells suffice for all mechanisms; `NO_CELLS` if none uses cells."""
     if not any(loop.has_cells for loop in loops):
         return NO_CELLS
     exact = [build_loop(m, "none", batch, exact=True) for m, batch in zip(mechanisms, batches, strict=True)]

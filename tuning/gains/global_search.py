@@ -14,7 +14,8 @@ from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import search_globally
 
 EVALUATION_FACTOR = 50
-MIN_LANES_PER_CALL = 8192  # lanes; large calls of the compiled program take less time per lane
+# minimum number of lanes in a call of the compiled program; large calls take less time per lane
+MIN_LANES_PER_CALL = 8192
 
 
 class GlobalComparison(NamedTuple):
@@ -23,8 +24,8 @@ class GlobalComparison(NamedTuple):
     tuned: float  # objective of the tuned gains [1]
     best: float  # objective of the best gains of the search [1]
     above: float  # relative excess of the tuned objective, tuned / best - 1 [1]
-    spent: int  # evaluations by tuning; a Jacobian with respect to P gains counts as 1 + P
-    evaluations: int  # evaluations by the global search
+    spent: int  # number of evaluations in tuning; a Jacobian with respect to P gains counts as 1 + P
+    evaluations: int  # number of evaluations in the global search
     gains: dict[str, float]  # best gains of the search
 
 
@@ -35,7 +36,7 @@ def compare_with_global_search(
     settings: TuneSettings,
     factor: int = EVALUATION_FACTOR,
 ) -> GlobalComparison | None:
-    """Compare tuned gains with a search of `factor` times as many evaluations; None if tuning failed."""
+    """Compare tuned gains with a search of `factor` times as many evaluations; None without tuned gains."""
     if found.best is None:
         return None
 

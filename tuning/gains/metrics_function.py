@@ -46,14 +46,14 @@ class ScenarioMetrics(NamedTuple):
 
 
 class MetricsFunction:
-    """User's objective function, which equals no other object, so that it has its own compiled program."""
+    """User's objective function; an instance equals only itself, so that it has its own compiled program."""
 
     def __init__(self, function: Callable[[ScenarioMetrics], Any]):
         self.function = function
         self._vectorised = jax.jit(jax.vmap(self._value))
 
     def check(self, contacts: int, scenarios: int) -> None:
-        """Raise `InputError` if the function does not reduce (contacts, scenarios) metrics to one number."""
+        """Raise `InputError` unless the function returns one number for metrics (contacts, scenarios)."""
         like: Any = jax.ShapeDtypeStruct((contacts, scenarios), jnp.result_type(float))
         count: Any = jax.ShapeDtypeStruct((contacts, scenarios), jnp.int32)
         metrics = ScenarioMetrics(*[like] * 7, status=count)
@@ -77,11 +77,11 @@ class MetricsFunction:
             )
 
     def values(self, metrics: ScenarioMetrics) -> Float[Array, "several"]:
-        """Apply the function to each of several sets of metrics, arrays (several, contacts, scenarios)."""
+        """Compute the function of each of several sets of metrics, arrays (sets, contacts, scenarios)."""
         return jax.vmap(self._value)(metrics)
 
     def numbers(self, metrics: ScenarioMetrics) -> Float[np.ndarray, "several"]:
-        """Return `values` as a NumPy array, with NaN for infinity; raise `InputError` for negative values."""
+        """Return `values` as a NumPy array, NaN for infinity; raise `InputError` if a value is negative."""
         values = np.asarray(self._vectorised(metrics), float)
         if np.any(values < 0):
             raise InputError(

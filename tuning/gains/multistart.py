@@ -2,9 +2,9 @@
 
 A start is a set of gains from which the gradient-based solver descends. The first batch of starts holds the
 literature's gains and the best points of a scan. If the descents do not reach the same minimum, further
-batches start at the best points of other scans, until several descents reach the best value. This repetition
-indicates that few better minima remain. Contacts begin and end at ticks, so that the objective has kinks at
-which a descent may stop; a derivative-free search therefore improves the best point.
+batches start at the best points of other scans, until several descents have reached the best value. It is
+then likely that there is no better minimum. Contacts begin and end at ticks, so that the objective has kinks
+at which a descent may stop; a derivative-free search therefore improves the best point.
 
 Source: multistart until a minimum recurs, Boender and Rinnooy Kan, "Bayesian stopping rules for multistart
 global optimization methods" (1987).
@@ -43,11 +43,12 @@ from tuning.gains.tasks import TuneTask, list_tuned_gains
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import polish
 
-NONSMOOTH_POLISH_FACTOR = 3  # a user's function gets so many times the derivative-free evaluations
+# factor on the number of derivative-free evaluations if there is a user's function
+NONSMOOTH_POLISH_FACTOR = 3
 MAX_START_BATCHES = 4  # largest number of batches of starts
 MIN_AGREEING_STARTS = 3  # starts that must reach the best value; two can reach the same poor minimum
 AGREEMENT_TOLERANCE = 0.005  # largest relative difference between values of the same minimum
-# Tolerance for scenarios with probes, where another draw of the scenarios changes the value by more.
+# The same for scenarios with probes, whose objective varies more between different draws of scenarios.
 PROBED_AGREEMENT_TOLERANCE = 0.02
 # derivative-free search from a stuck start: generations, initial standard deviation in unit coordinates
 RESTART_GENERATIONS, RESTART_STD = 24, 0.2
@@ -62,8 +63,8 @@ class MultistartResult(NamedTuple):
 
     best: StartResult | None  # best start, improved by a derivative-free search; None if all starts failed
     starts: list[StartResult]  # all starts, in the order of their batches
-    # Number of evaluations of the objective. A Jacobian with respect to P gains counts as 1 + P. A point of
-    # a scan counts as the share of the scenarios on which a scan evaluates.
+    # Number of evaluations of the objective. A Jacobian with respect to P gains counts as 1 + P. A point of a
+    # scan, which uses only some of the scenarios, counts as their share.
     evaluations: int
     quiet: Objective | None = None  # objective of the search for quieter gains; None if there was no search
 
@@ -102,10 +103,10 @@ def find_gains(
                 validation, i, search.starts, agreed, settings.seed, objective
             )
             search.evaluations += more
-    # If probed starts agree, another draw of the scenarios changes the value by more than polishing does.
+    # With probes, if the starts agree, a different draw of scenarios changes the value more than polishing.
     polishing = 0 if probed and not unfinished else settings.polish * len(validation.names)
     if objective.function is not None:
-        # A user's function may have many kinks: the maximum of several metrics, for example.
+        # A user's function may have many kinks, for example if it is the maximum of several metrics.
         polishing *= NONSMOOTH_POLISH_FACTOR
     objectives, ends = list_objectives(objective, len(tasks)), [search.starts for search in searches]
     quieter = _search_quieter_gains(validation, settings, first, searches) if quiet else {}
@@ -135,7 +136,8 @@ def _search_quieter_gains(
     """Search for quieter gains, starting from the most accurate gains.
 
     Tasks whose error exceeds the limit are skipped. The number of starts equals that of the first batch, so
-    that the compiled program is reused. Return objective and final starts, by task index.
+    that the compiled program is reused. Return, by task index, the objective and the point that each start
+    reached.
     """
     tasks, objective = validation.tasks, settings.objective
     best = [ranked[0] if (ranked := _rank_starts(search.starts)) else None for search in searches]
@@ -175,7 +177,7 @@ def estimate_search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
 def _solve_batches(
     validation, settings, first, agreed, searches: list[_SearchState], meanwhile: Callable[[], object]
 ) -> list[int]:
-    """Solve batches of starting points; return tasks with fewer than `MIN_AGREEING_STARTS` best results."""
+    """Solve batches of starts; return the tasks in which too few starts agree on the best value."""
     tasks, objective, work = validation.tasks, settings.objective, validation.work
     numbers = [len(gains) for gains in first] if first else [0 for _ in tasks]
     number = _count_batch_starts(settings, first)
@@ -217,7 +219,7 @@ def choose_starts(
     first: Sequence[Sequence[Mapping[str, float]]] | None = None,
     scanned: int = TuneSettings.scanned,
 ) -> list[Float[np.ndarray, "starts gains"]]:
-    """Choose the solver's starting points for every task: the literature's gains, then the best of a scan.
+    """Choose the solver's starts for every task: the literature's gains, then the best points of a scan.
 
     `first` holds, for each task, gains that replace the last points of the scan.
     """
@@ -321,7 +323,7 @@ def _recompute_exact_values(
 def _run_while_compiling(
     validation: Validation, number: int, objective: Objective, work: Callable, more: Callable[[], object]
 ):
-    """Call `work` and `more` while a second thread compiles the solver; return the result of `work`.
+    """Call `work`, then `more`, while a second thread compiles the solver; return the result of `work`.
 
     The second thread runs no program, because concurrent programs on several devices could deadlock.
     """
@@ -344,7 +346,7 @@ def _compile_in_thread(validation: Validation, number: int, objective: Objective
 def _move_start(
     validation: Validation, task: int, start: StartResult, point: np.ndarray, loss: float
 ) -> StartResult:
-    """Return a solver result with the gains and the loss of `point`, where a further search ended."""
+    """Replace gains and loss of a solver result by those of `point`, at which a further search ended."""
     if (point == start.coordinates).all():
         return start
     history = [*start.history, float(loss)]

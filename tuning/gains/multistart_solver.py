@@ -31,12 +31,13 @@ from tuning.optimisation.solution import SOLVER_STATUSES, SolverResult
 from tuning.optimisation.unit_box import GainBounds
 from tuning.transparency.probes import LANES_PER_SCENARIO
 
-MIN_PROBLEMS_PER_CALL, MAX_PROBLEMS_PER_CALL = 4, 32  # problems in one call of the compiled program
-LANES_PER_TILE = 64  # lanes that a device computes together; more lanes exceed the processor's cache
+MIN_PROBLEMS_PER_CALL, MAX_PROBLEMS_PER_CALL = 4, 32  # limits on the number of problems per call
+# lanes that a device computes together (tile); the data of more lanes exceed the processor's cache
+LANES_PER_TILE = 64
 STEPS_BEFORE_SELECTION = 8  # solver steps of the first round
 MAX_CONTINUED_STARTS = 3  # number of starts per task that continue after the first round
 MAX_STEPS_PER_CALL = 32  # largest number of solver steps in one call
-# With probes, a start counts as converged if a round improves the objective by a smaller fraction.
+# With probes, minimum relative improvement of the objective in a round; below it, a start has converged.
 MIN_RELATIVE_IMPROVEMENT = 0.005
 STEP_LIMIT = SOLVER_STATUSES.index("step limit")
 GIVEN_UP = "given up"
@@ -137,7 +138,7 @@ def solve_tasks(
 
 
 def _mark_converged(problems: list[_StartState], before: list[float]) -> None:
-    """Mark problems as converged whose loss `before` the round fell by less than the minimum improvement."""
+    """Mark each problem as converged if the round reduced its loss from `before` by less than the minimum."""
     for problem, loss in zip(problems, before, strict=True):
         if problem.status == STEP_LIMIT and problem.loss > (1 - MIN_RELATIVE_IMPROVEMENT) ** 2 * loss:
             problem.status = SOLVER_STATUSES.index("converged")
@@ -157,7 +158,7 @@ def _stop_poor_starts(problems: list[_StartState]) -> None:
 def compute_inverse_hessian(
     curvature: Float[np.ndarray, "gains gains"], value: float
 ) -> Float[np.ndarray, "gains gains"]:
-    """Return the inverse Hessian of the relative objective in unit coordinates.
+    """Return the inverse Hessian of the objective, relative to its value, in unit coordinates.
 
     `curvature` is J^T J and `value` the objective. The inverse Hessian describes the region in which the
     objective rises little. No eigenvalue exceeds (1/4)^2, a standard deviation of a quarter of the range.
@@ -226,7 +227,8 @@ def _choose_call_size(number: int) -> int:
 def assign_to_devices(size: int) -> np.ndarray:
     """Return which problem each position of a call holds, so that all devices take about equally long.
 
-    Problems are sorted by duration and go to the devices in turn. Each device has adjacent positions.
+    Problems are sorted by duration and distributed to the devices in turn. The positions of a device are
+    adjacent.
     """
     devices = math.gcd(jax.device_count(), size)
     return np.arange(size).reshape(-1, devices).T.ravel()
@@ -258,10 +260,10 @@ def _build_call(tasks, names, bounds, objectives, number):
 
 
 def _sort_by_duration(task: TuneTask) -> Any:
-    """Return the task's scenarios; those with probes run in tiles and are sorted by duration."""
+    """Return the task's scenarios; sort them by duration if they have probes, which are computed in tiles."""
     if not task.probed:
         return task.scenarios
-    # The time limit is proportional to the duration of the contacts.
+    # The time limit increases with the duration of the contacts.
     longest = np.asarray(task.scenarios.time_limit)[::LANES_PER_SCENARIO]
     order = np.argsort(-longest, kind="stable")
     lanes = (LANES_PER_SCENARIO * order[:, None] + np.arange(LANES_PER_SCENARIO)).ravel()

@@ -41,10 +41,10 @@ from tuning.transparency.probes import mask_probes
 
 # error [1] that gives a residual of 1; the solver's initial damping suits residuals of about 1
 RESIDUAL_SCALE = 0.01
-# error e - e* [1] of a contact that does not end or does not occur, the size of a strong divergence
+# error e - e* [1] that is assigned to a contact that does not end or does not occur: a strong divergence
 FAILED_CONTACT_ERROR = 3.0
 PROBED_LANES_PER_TILE = 32  # lanes per tile if the scenarios have transparency probes
-CVAR_TAIL_DIVISOR = 20  # cvar averages the worst 1/20 of the contacts, at least one contact
+CVAR_TAIL_DIVISOR = 20  # cvar is the mean of the worst 1/20 of the contacts, at least of one contact
 NORM_POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # even exponents p of the norm in the residuals
 OBJECTIVE_NAMES = tuple(NORM_POWERS)
 WEIGHT_FIELDS = tuple(
@@ -72,15 +72,15 @@ class Objective:
         N  max(0, A - 1) [1], where A is the amplification of the force sensor's white noise, which depends
            only on the gains (`Compensator.noise_amplification`)
 
-    C and S include the contacts of the probes. At the gains with the least metric, let a penalty X (C, S or
-    N) have the value X and the weight w. Then the minimum of J has a metric of at most
-    sqrt(metric^2 + (w limit X)^2). A weight thus costs the same multiple of the limit on every rig.
+    C and S include the contacts of the probes. Let X be the value of one penalty (C, S or N) at the gains
+    with the least metric, and w its weight. At the minimum of J, the metric is at most sqrt(metric^2 + (w
+    limit X)^2). A weight thus costs the same multiple of the limit on every rig.
 
     With a `tolerance`, max(metric - tolerance, `TOLERATED_ERROR_FACTOR` metric) replaces the metric, so that
     the penalties decide between gains whose error is within the tolerance.
 
     Raises:
-        InputError: the name is unknown, or a weight is negative, not finite, or 0 for divergence.
+        InputError: If the name is unknown, a weight is negative or not finite, or `divergence_weight` is 0.
     """
 
     name: str = "rms"  # name of the metric, one of `OBJECTIVE_NAMES`
@@ -94,7 +94,8 @@ class Objective:
     # probes. divergence_weight has no effect on the function.
     function: MetricsFunction | None = None
     limit: float = 0.01  # limit of the error [1], the unit of the weights of command, noise and chatter
-    tolerance: float | None = None  # metric below which only the penalties count [1]; None: no tolerance
+    # metric [1] below which almost only the penalties count; None: no tolerance
+    tolerance: float | None = None
 
     def __post_init__(self):
         if self.name not in OBJECTIVE_NAMES:
@@ -112,7 +113,7 @@ class Objective:
             )
 
     def unit(self, weight: str) -> float:
-        """Return the error [1] that corresponds to 1 in the field named `weight`."""
+        """Return the error [1] that a value of 1 in the field `weight` stands for."""
         return self.limit if weight in LIMIT_SCALED_WEIGHTS else 1.0
 
     @property
@@ -128,7 +129,7 @@ RMS_OBJECTIVE = Objective()
 
 
 class ObjectiveTerms(NamedTuple):
-    """Static properties of an objective; each combination needs its own compiled program."""
+    """Static properties of an objective; each combination of them needs its own compiled program."""
 
     name: str  # name of the metric
     command: bool  # whether excess peaks of the force command are penalised
@@ -143,7 +144,8 @@ class ObjectiveTerms(NamedTuple):
 class ObjectiveWeights(NamedTuple):
     """Weights of each problem's objective (terms C, N, S and H of `Objective`), arguments of the program."""
 
-    divergence: Float[Array, "*problems"]  # weight of squared positive errors over that of negative ones [1]
+    # weight of squared positive errors, divided by that of negative ones [1]
+    divergence: Float[Array, "*problems"]
     command: Float[Array, "*problems"]  # weight of the excess peak command C [1]
     noise: Float[Array, "*problems"]  # weight of the excess noise amplification N [1]
     chatter: Float[Array, "*problems"]  # weight of the chatter S [1]
@@ -167,9 +169,9 @@ def list_objectives(objective: Objective | Sequence[Objective], number: int) -> 
 def join_terms(objectives: Sequence[Objective], probed: bool = False, contacts: int = 0) -> ObjectiveTerms:
     """Return the terms that at least one of several objectives has, so that all can share a program.
 
-    An objective without one of these terms gives the term a weight of 0. `probed` states whether the
-    scenarios include probes, `contacts` the number of contacts that a user's function gets. Raise ValueError
-    if the objectives differ in metric or function.
+    An objective without one of these terms gives the term a weight of 0. `probed` is whether the scenarios
+    include probes; `contacts` is the number of contacts that a user's function gets. Raise ValueError if the
+    objectives differ in metric or function.
     """
     [(name, function)] = {(objective.name, objective.function) for objective in objectives}
     tolerance = any(objective.tolerance is not None for objective in objectives)
@@ -194,9 +196,9 @@ def compute_residuals(
     """Compute the least-squares residuals of every problem.
 
     Their sum of squares is (J / `RESIDUAL_SCALE`)^2, where J is the objective with the smooth norm as its
-    metric. Each contact of each scenario has one residual for its error, and one for each of probes, command
-    and chatter that the objective has; the noise has one residual. A failed contact has an error, an excess
-    and a chatter of `FAILED_CONTACT_ERROR`.
+    metric. Each contact of each scenario has one residual for its error, and one for each of the other terms
+    of the objective (probes, command, chatter). The noise has a single residual. A failed contact has an
+    error, an excess and a chatter of `FAILED_CONTACT_ERROR`.
 
     `static` holds the rig model, the loop, the names of the tuned gains and the objective's terms. All
     problems are simulated in one batch, whose lanes are their scenarios.
@@ -251,7 +253,7 @@ def weight_residuals(
     errors by a single residual.
     """
 
-    # A problem that only fills a call has no wanted contact; a count of 1 avoids a division by 0.
+    # A problem that only fills a call has no contact; a count of 1 avoids a division by 0.
     def counted(mask):
         return jnp.maximum(jnp.sum(mask, axis=1, dtype=jnp.int32), 1)[:, None]
 
@@ -297,8 +299,8 @@ def compute_contact_terms(
     """Return the restitution error, the excess of the peak command and the chatter of every contact, all [1].
 
     The excess is max(0, peak command / peak force of the ideal contact - 1). All three are
-    `FAILED_CONTACT_ERROR` for failed contacts and 0 for contacts that are not wanted. The results are NumPy
-    arrays if the outcome holds NumPy arrays, otherwise JAX arrays.
+    `FAILED_CONTACT_ERROR` for failed contacts, and 0 for rows that are no contact of the scenario (`wanted`
+    is false). The results are NumPy arrays if the outcome holds NumPy arrays, otherwise JAX arrays.
     """
     xp = jnp if isinstance(outcome.error, jax.Array) else np
     # Without the inner `where`, non-finite numbers of failed contacts would make the derivative NaN.
@@ -396,7 +398,7 @@ def _compute_norm_residuals(
 
 
 def _map_over_tiles(function: Callable[[Any], Outcome], arguments: Any) -> Outcome:
-    """Apply `function` to tiles of `PROBED_LANES_PER_TILE` lanes; a slow lane delays only its own tile."""
+    """Apply `function` to groups (tiles) of lanes, so that a slow lane delays only its own tile."""
     lanes = jax.tree.leaves(arguments)[0].shape[-1]
     size = math.gcd(lanes, PROBED_LANES_PER_TILE)
     chunks = jax.tree.map(

@@ -49,7 +49,8 @@ class ParetoPoint(NamedTuple):
     """Point of a Pareto front: gains and their metrics on fresh scenarios."""
 
     gains: dict[str, float]  # all gains of the compensator
-    weight: float | None  # weight of the second criterion [1] in tuning; None for gains tuned without one
+    # weight of the second criterion in tuning [1]; None for gains that were tuned without it
+    weight: float | None
     # second criterion [1]: the amplification of the force sensor's noise, the 99th percentile of the peak
     # command divided by the ideal contact's peak force, or the rms error of the transparency probes
     cost: float
@@ -58,7 +59,7 @@ class ParetoPoint(NamedTuple):
     nominal: ErrorMetrics  # metrics of the nominal run
     intervals: ErrorIntervals  # 95 % confidence intervals of the metrics on the fresh scenarios
     on_front: bool  # whether no other point dominates this point (`find_dominated`)
-    # transparency, slope and peak with confidence intervals; None for scenarios without probes
+    # transparency, its slope and its peak, with confidence intervals; None for scenarios without probes
     transparency: dict[str, IntervalEstimate] | None = None
 
     @property
@@ -110,7 +111,7 @@ class ParetoFront(NamedTuple):
 
 
 def find_dominated(places: Sequence[tuple[float, float]]) -> list[bool]:
-    """Return for each (error, cost) whether another pair has no larger number and at least one smaller."""
+    """Return for each pair (error, cost) whether another has a smaller number and no larger number."""
     return [
         any(e <= error and a <= noise and (e, a) != (error, noise) for e, a in places)
         for error, noise in places
@@ -182,7 +183,7 @@ def _compute_locally(
 def _compute_on_cluster(
     scheduler: str, groups: list[_FrontGroup], work: SearchProgress, pieces: Checkpoints
 ) -> Iterator[tuple[int, list[ParetoFront]]]:
-    """Compute Pareto fronts on a cluster; yield (index of the group, fronts) when a worker is done."""
+    """Compute Pareto fronts on a cluster; yield (index of the group, fronts) of each finished group."""
     missing = []
     for index, group in enumerate(groups):
         group_fronts = _read_fronts(group, pieces)
@@ -254,8 +255,7 @@ def _evaluate_fronts(
         [*ladder, (None, task.literature), (None, result.gains)]
         for task, result, ladder in zip(validation.tasks, tuned, points, strict=True)
     ]
-    # Each call evaluates one set of gains of every task, like the evaluation after tuning, and so shares its
-    # compiled program.
+    # Each call evaluates one set of gains of every task, and so uses the same compiled program as tuning.
     outcomes = [validation.judge([gains for _, gains in row]) for row in zip(*plans, strict=True)]
     fronts = []
     for index, (plan, pairs) in enumerate(zip(plans, zip(*outcomes, strict=True), strict=True)):

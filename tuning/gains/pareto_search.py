@@ -1,8 +1,8 @@
 """Search for the gains of Pareto fronts (`tuning.gains.pareto`), one set of gains per weight.
 
 The weights of a front are in ascending order and are called a ladder. One compiled program solves all weights
-of all mechanisms on the training scenarios. In the next pass, the gains of each weight are also starts for
-the next smaller and the next larger weight. The search ends when no point improves.
+of all mechanisms on the training scenarios. In each further pass, the gains of each weight are also starts
+for the next smaller and the next larger weight. The search ends when no point improves.
 """
 
 import dataclasses
@@ -22,13 +22,14 @@ from tuning.gains.tasks import TuneTask, list_tuned_gains
 from tuning.gains.tune import TuneResult
 from tuning.gains.validation import Validation
 
-# Smallest and largest positive weight, as the weighted noise of accurate gains divided by their error [1].
+# Smallest and largest weighted second criterion of accurate gains, divided by their error [1].
 # The first ladder extends to a larger weight, since the solver otherwise finds no quiet, inaccurate gains.
 LADDER_ENDS, FIRST_LADDER_ENDS = (0.5, 10.0), (1.0, 100.0)
-MAX_ACCURATE_ERROR_RATIO = 1.05  # gains count as accurate up to this multiple of the least error
-MIN_NOISE_EXCESS = 0.1  # least noise amplification beyond 1 [1] that scales a ladder
+MAX_ACCURATE_ERROR_RATIO = 1.05  # largest error of accurate gains, as a multiple of the least error
+# least noise amplification minus 1 that scales a ladder; a smaller one counts as this value [1]
+MIN_NOISE_EXCESS = 0.1
 MAX_NEIGHBOUR_SEARCHES = 4  # largest number of passes that start from the gains of neighbouring weights
-MIN_IMPROVEMENT = 1e-3  # relative improvement of a point that causes another pass
+MIN_IMPROVEMENT = 1e-3  # minimum relative improvement of a point that leads to a further pass
 
 
 class ParetoCriterion(NamedTuple):
@@ -38,7 +39,8 @@ class ParetoCriterion(NamedTuple):
     weight: str  # name of the field of `Objective` that weights the criterion
     cost: str  # name in JSON files
     words: str  # name in sentences
-    least: float  # least value of the criterion [1] that scales a ladder of weights
+    # least value of the criterion's term [1] that scales a ladder; a smaller one counts as this value
+    least: float
 
 
 NOISE_CRITERION = ParetoCriterion(
@@ -69,9 +71,9 @@ def build_weight_ladder(
 ) -> np.ndarray:
     """Return a ladder (number,) of weights [1]: 0, then logarithmically spaced positive weights.
 
-    `error` is the objective J and `excess` the second criterion's term (for example A - 1) of accurate gains.
-    The smallest and largest positive weights times `excess` are `ends` times `error`. A smaller `excess` than
-    `least` counts as `least`.
+    For accurate gains, `error` is the objective J and `excess` is the term of the second criterion, for
+    example the noise amplification minus 1. The smallest and largest positive weights times `excess` are
+    `ends` times `error`. A smaller `excess` than `least` counts as `least`.
     """
     light, heavy = ends
     weights = np.geomspace(heavy, light, number - 1)[::-1] * error / max(excess, least)
@@ -99,7 +101,7 @@ def solve_weight_ladders(
     settings: TuneSettings,
     axis: ParetoCriterion = NOISE_CRITERION,
 ) -> list[list[tuple[float, dict[str, float]]]]:
-    """Search the best gains for every weight of every task; return (weight, gains) of every point."""
+    """Search for the best gains for every weight of every task; return (weight, gains) of every point."""
     unit = settings.objective.unit(axis.weight)
     weight = unit * getattr(settings.objective, axis.weight)
     pools = [
@@ -108,7 +110,7 @@ def solve_weight_ladders(
     ]
     ladders = []
     for turn in range(1 + MAX_NEIGHBOUR_SEARCHES):
-        # Each pass improves the estimates of the least error and its excess, which determine the ladder.
+        # Each pass improves the least error and the excess at this error, which determine the ladder.
         ends = LADDER_ENDS if turn > 0 else FIRST_LADDER_ENDS
         ladders = [_build_fitting_ladder(pool, number, ends, axis) for pool in pools]
         before = [_pick_candidates(pool, weights) for pool, weights in zip(pools, ladders, strict=True)]
@@ -135,7 +137,7 @@ def solve_weight_ladders(
 
 
 def estimate_ladder_runs(tasks: list[TuneTask], number: int, settings: TuneSettings) -> int:
-    """Return the approximate number of runs of `solve_weight_ladders` if all passes are needed."""
+    """Return about how many simulated runs `solve_weight_ladders` needs if it makes all passes."""
     starts = max(settings.starts, 2) + MAX_NEIGHBOUR_SEARCHES * 2
     return len(tasks) * number * starts * settings.steps * count_step_runs(tasks, list_tuned_gains(tasks))
 
@@ -152,7 +154,7 @@ def _build_fitting_ladder(
 
 
 def replace_weight(objective: Objective, axis: ParetoCriterion, weight: float) -> Objective:
-    """Return a copy of the objective with another weight of the second criterion, given as an error [1]."""
+    """Return the objective with a new weight [1] of the second criterion, not scaled by the limit."""
     return dataclasses.replace(objective, **{axis.weight: float(weight) / objective.unit(axis.weight)})
 
 

@@ -31,11 +31,11 @@ from tuning.optimisation.derivative_free import select_distant_points
 
 MAX_PEAK_RATIO = 1.5  # peak command divided by the ideal contact's peak force [1], above which tune warns
 MAX_NOISE_AMPLIFICATION = 2.0  # amplification of the force sensor's noise [1], above which tune warns
-# On other scenarios, the rms error may be larger by this number / sqrt(number of scenarios) [1]: two standard
-# errors of the rms of numbers with a kurtosis of 10.
+# The rms error on fresh scenarios may be larger by the fraction (this number) / sqrt(number of scenarios):
+# two standard errors of the rms of numbers with a kurtosis of 10.
 GENERALISATION_MARGIN = 3.0
-# Penalty of the most accurate gains, in multiples of the error limit; small, so that the error stays within
-# the tolerance.
+# Penalty of the most accurate gains, in multiples of the error limit. It is small, so that the error stays
+# within the tolerance.
 QUIET_PENALTY_WEIGHT = 0.1
 
 
@@ -47,7 +47,7 @@ class CommandExcess(NamedTuple):
 
 
 def is_quiet_search_needed(task: TuneTask, settings: TuneSettings) -> bool:
-    """Return whether a search for the quietest gains is requested, and the compensator amplifies noise."""
+    """Return whether quiet gains are requested, a sensor has noise, and the gains affect its amplification."""
     return (
         settings.quiet
         and isinstance(task.mechanism, Mechanism)
@@ -57,12 +57,12 @@ def is_quiet_search_needed(task: TuneTask, settings: TuneSettings) -> bool:
 
 
 def compute_training_tolerance(limit: float, scenarios: int) -> float:
-    """Return the rms error [1] on training scenarios up to which fresh scenarios should meet the limit."""
+    """Return the largest rms training error [1] for which fresh scenarios probably meet the error limit."""
     return limit / (1 + GENERALISATION_MARGIN / math.sqrt(scenarios))
 
 
 def build_least_error_objective(objective: Objective) -> Objective:
-    """Return the objective of the search for accurate gains, in a form whose program both searches share."""
+    """Return the objective of accurate gains; its tolerance of 0 lets both searches share a program."""
     return replace(objective, tolerance=0.0)
 
 

@@ -14,7 +14,7 @@ from tuning.optimisation.derivative_free import select_distant_points, select_po
 
 SCAN_SCENARIOS = 32  # number of scenarios on which a scan evaluates its points
 PRESCREEN_SCENARIOS = 8  # number of scenarios that suffice to discard most points
-POINTS_PER_CALL = 16  # points per task that one call evaluates on all `SCAN_SCENARIOS`
+POINTS_PER_CALL = 16  # number of points per task that one call evaluates on `SCAN_SCENARIOS` scenarios
 ROUNDING_TOLERANCE = 1e-9  # relative rounding error of an objective
 
 
@@ -27,7 +27,7 @@ def scan_gain_ranges(
     scanned: int,
     beside: list[np.ndarray] | None = None,
 ) -> list[Float[np.ndarray, "number gains"]]:
-    """Scan the gains of the tasks `which`; return the `number` best points of each task.
+    """Scan the ranges of the gains of the tasks `which`; return the `number` best points of each task.
 
     The points keep a minimum distance from each other and from the points in `beside`.
     """

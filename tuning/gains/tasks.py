@@ -92,10 +92,9 @@ def build_task(
     """Build a tuning task with quasi-random training scenarios, whose contacts have a time limit.
 
     Each scenario has its own realisation of the sensor noise. With noise, the default number of `scenarios`
-    is larger, since gains would fit a few realisations too closely; it includes transparency probes if
-    `probed` is true. `setting` names one of the compensator's fixed sets of gains, which replaces the gains
-    by the literature's rule.
-    Raise ValueError if `probed` is true and a `common` program is given.
+    is larger, because the gains would fit a few realisations too closely. If `probed` is true, the number
+    includes transparency probes. `setting` names one of the compensator's fixed sets of gains, which replaces
+    the gains by the literature's rule. Raise ValueError if `probed` is true and a `common` program is given.
     """
     if probed and common is not None:
         raise ValueError("probed: found True, expected False for mechanisms that share a program")
@@ -133,7 +132,8 @@ def has_sensor_noise(mechanism: AnyMechanism) -> bool:
 def group_by_program(loops: list[Any], scenarios: list[Any]) -> list[list[int]]:
     """Group loops that can share a compiled program; return the indices of each group.
 
-    The loops of a group differ only in the length of their delay lines. Their scenarios have equal shapes.
+    The loops of a group differ only in the length of their delay lines; their arrays of scenarios have equal
+    shapes.
     """
     groups: dict[Any, list[int]] = {}
     for index, (loop, batch) in enumerate(zip(loops, scenarios, strict=True)):
@@ -164,7 +164,7 @@ def list_tuned_gains(tasks: list[TuneTask]) -> tuple[str, ...]:
 
 
 def build_gain_bounds(task: TuneTask, names: tuple[str, ...]) -> GainBounds:
-    """Return the bounds (gains,) of the gains `names`; both are the literature's value for untuned gains."""
+    """Return the bounds (gains,) of the gains `names`; an untuned gain has equal bounds (its literature value)."""
     gains = {gain.name: gain for gain in get_compensator(task.compensator, task.model.axes).gains}
     moved = {gain.name for gain in task.tuned}
 

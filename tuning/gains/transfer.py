@@ -56,7 +56,7 @@ def compute_mechanism_distance(a: Mechanism, b: Mechanism) -> float:
         (pi/2) omega (tau_a - tau_b)        for force delay, motion simulator delay and control period; omega
                                             is the geometric mean of the four contact frequencies
         pi (xi_a - xi_b)                    for the damping ratio
-        1                                   if contact law or number of surfaces differ
+        1                                   if contact law or number of surfaces differs
 
     Each term approximates the effect of its property on ln e: a delay in the loop multiplies the restitution
     e by about exp(pi omega tau / 2), and damping by about exp(-pi xi).
@@ -108,7 +108,7 @@ def find_nearest(mechanism: Mechanism, tuned: Sequence[EarlierGains]) -> Earlier
 def find_nearest_of_each(
     mechanism: AnyMechanism, sources: Sequence[Sequence[EarlierGains]]
 ) -> list[EarlierGains]:
-    """Return the nearest tuned gains of each source; none for six axes, where no distance is defined."""
+    """Return the nearest gains of each list in `sources`; nothing for six axes, which have no distance."""
     if not isinstance(mechanism, Mechanism):
         return []
     return [find_nearest(mechanism, tuned) for tuned in sources]

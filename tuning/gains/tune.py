@@ -82,7 +82,7 @@ class TuneResult:
     first: tuple[EarlierGains, ...] = ()  # earlier gains that replaced the last starts of the first batch
     freedom: dict[str, GainTolerance] = field(default_factory=dict)  # tolerance of each tuned gain
     global_comparison: GlobalComparison | None = None  # None if no global search was requested
-    # transparency, slope and peak; empty if the scenarios have no probes
+    # transparency, its slope and its peak; empty if the scenarios have no probes
     transparency: dict[str, dict[str, IntervalEstimate]] = field(default_factory=dict)
     # metrics of the tuned gains on the fresh scenarios without sensor noise; None if no sensor has noise
     without_noise: ErrorMetrics | None = None
@@ -258,7 +258,7 @@ def _compute_transparency(
 def _compute_tolerances(
     task: TuneTask, names: tuple[str, ...], best: StartResult | None
 ) -> dict[str, GainTolerance]:
-    """Return the tolerance of each tuned gain, from the solver's final J^T J; empty without a result."""
+    """Return the tolerance of each tuned gain, from the solver's final J^T J; empty if the solver failed."""
     moved = [i for i, name in enumerate(names) if name in {gain.name for gain in task.tuned}]
     if best is None or not moved or not np.all(np.isfinite(best.curvature)):
         return {}
@@ -304,7 +304,7 @@ def _compare_real_contacts(outcome: Outcome) -> dict[str, Any]:
 
 
 def compute_metrics_by_error(result: TuneResult) -> dict[str, dict[str, ErrorMetrics]]:
-    """Return the metrics of each error of a six-axis rig, by error and set of gains; empty for one axis."""
+    """Return the metrics by error (energy, twist) and by set of gains for six axes; empty for one axis."""
     model = choose_rig_model(result.mechanism)
     if len(model.errors) == 1:
         return {}
@@ -320,8 +320,8 @@ def remove_compensation(
 ) -> tuple[str, dict[str, float]]:
     """Return a compensator and gains that leave the measured force unchanged.
 
-    They are the same compensator with neutral gains, which needs no other compiled program. A compensator
-    without neutral gains is replaced by the compensator "none".
+    The compensator remains and its gains become neutral, so that no other compiled program is needed. A
+    compensator without neutral gains is replaced by "none".
     """
     specifications = get_compensator(compensator, axes).gains
     if not any(gain.neutral is not None for gain in specifications):

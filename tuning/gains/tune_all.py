@@ -35,7 +35,7 @@ from tuning.gains.validation import draw_fresh_scenarios
 from tuning.statistics.bootstrap import ErrorIntervals
 from tuning.statistics.intervals import IntervalEstimate
 
-MAX_GROUP_SIZE = 16  # mechanisms that are tuned together; an interruption loses at most one group
+MAX_GROUP_SIZE = 16  # largest number of mechanisms in a group; an interruption loses at most one group
 
 
 class _TuneGroup(NamedTuple):
@@ -86,8 +86,8 @@ def tune_all(
     groups but the first, the gains of the most similar mechanism of the first group are a start too. These
     starts never replace the literature's gains.
 
-    `pieces` caches each result under the mechanism's name and group, since the other mechanisms of the group
-    affect the last bits. If `scheduler` is given, the workers of a cluster tune the groups.
+    `pieces` caches each result under the mechanism's name and its group, because the other mechanisms of the
+    group affect the last bits. If `scheduler` is given, the workers of a cluster tune the groups.
     """
     work, first_group = work or SearchProgress(), []
     tasks = _build_tasks(mechanisms, compensator, settings, common)
@@ -131,7 +131,7 @@ def _build_tasks(
 
 
 def _group_tasks(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int]]:
-    """Return the indices of tasks that share a program and, with a user's function, a number of contacts."""
+    """Group the tasks by compiled program and, if there is a user's function, by number of contacts."""
     groups = group_by_program([task.loop for task in tasks], [task.scenarios for task in tasks])
     if settings.objective.function is None:
         return groups
@@ -167,7 +167,7 @@ def _tune_on_cluster(
     work: SearchProgress,
     pieces: Checkpoints,
 ) -> Iterator[tuple[int, list[TuneResult]]]:
-    """Tune groups of mechanisms on a cluster; yield (index of the group, results) when a worker is done."""
+    """Tune groups of mechanisms on a cluster; yield (index of the group, results) of each finished group."""
     missing = []
     for index, group in enumerate(groups):
         runs = estimate_group_runs(group.tasks, settings)
@@ -200,7 +200,7 @@ def tune_and_encode(
     common: CommonProgram | None,
     near: list[list[EarlierGains]],
 ) -> bytes:
-    """Tune a group of mechanisms on a cluster worker; return the encoded fields that are cached."""
+    """Tune a group of mechanisms on a cluster worker; return the results' cached fields, encoded."""
     tasks = _build_tasks(mechanisms, compensator, settings, common)
     return encode_value(
         [_select_cached_fields(result) for result in tune_group(tasks, settings, SearchProgress(), near)]

@@ -1,4 +1,4 @@
-"""Evaluation of gains without derivatives, on fresh scenarios and (during searches) on training scenarios.
+"""Evaluation of gains, without derivatives, on fresh scenarios and (during searches) on training scenarios.
 
 All calls have the same number of lanes, so that they share a compiled program of
 `jaxhil.simulation.evaluation`.
@@ -64,9 +64,9 @@ class Validation:
         `compensator` replaces the tasks' compensator. `noise=False` removes the sensor noise.
 
         Returns:
-            for each task, an outcome of the fresh scenarios followed by the nominal run, and an outcome of
-            the scenarios with their probes, arrays (contacts, scenarios, `LANES_PER_SCENARIO`). The second
-            outcome is None for tasks without probes.
+            Two outcomes for each task. The first contains the fresh scenarios and, as its last element, the
+            nominal run. The second contains each fresh scenario with its probes, as arrays (contacts,
+            scenarios, `LANES_PER_SCENARIO`); it is None for tasks without probes.
         """
         model, loop = self.tasks[0].model, self.loop
         if compensator is not None:
@@ -108,7 +108,8 @@ class Validation:
         losses = np.empty((len(which), points))
         lanes = max(lanes, self.lanes * len(self.tasks))
         at_once = max(1, lanes // number)
-        # All calls have the same number of points per task, so that they share scenarios on the devices.
+        # All calls have the same number of points per task, so that they can use the same scenarios in device
+        # memory.
         tasks_per_call = min(len(which), at_once)
         points_per_call = at_once // tasks_per_call
         calls = [
@@ -172,7 +173,8 @@ class Validation:
         ended = self.tasks[0].model.begin_batch(self.loop, values, batch, read)
         if not noise:
             return lambda: (ended(), np.ones(shape))
-        # The mean over all scenarios, as in `tuning.gains.objective.compute_residuals`.
+        # A point's amplification is the mean of its scenarios', as in
+        # `tuning.gains.objective.compute_residuals`.
         constants = KnownConstants(
             jax.numpy.asarray(scenarios.control_period), jax.numpy.asarray(scenarios.clearance)
         )
@@ -182,7 +184,7 @@ class Validation:
 
     @cached_property
     def _evaluated_batch(self) -> Batch:
-        # A small batch is padded to the lanes of the training scenarios, so that both share a program.
+        # A small batch is padded to the number of training lanes, so that both batches share a program.
         return self.tasks[0].model.place_batch(self.judged, at_least=count_lanes(self.training))
 
     @cached_property
@@ -218,7 +220,7 @@ def _keep_outcome(outcome: Outcome) -> Outcome:
 
 
 def _keep_contact_terms(outcome: Any) -> Any:
-    """Keep the fields of an outcome that `compute_contact_terms` needs; replace all others by None."""
+    """Keep the fields of an outcome that `compute_contact_terms` needs; replace all other fields by None."""
     return outcome._replace(metrics=None, reference_restitution=None, reference_peak_force=None)
 
 
