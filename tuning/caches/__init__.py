@@ -1,1 +1,1 @@
-"""Checkpoints on disk, with which interrupted work can resume, and distribution of work to a cluster."""
+"""Checkpoints on disk, from which interrupted work can resume, and distribution of work to a cluster."""

@@ -1,12 +1,12 @@
-"""Checkpoints of long work, with which an interrupted run can resume.
+"""Checkpoints of long computations, from which an interrupted run can resume.
 
-A checkpoint is a file with a checksum that stores the result of one work unit, next to the results of the
-command. It contains a digest of the inputs and the code that determine the result. A resumed run uses the
-checkpoint if the digest equals that of the result to be computed, because both results would be identical to
-the bit. Otherwise the run computes the result and replaces the checkpoint.
+A checkpoint is a file next to the results of a command. It stores the result of one work unit (part of the
+computation), a digest of the inputs and the code that determine this result, and a checksum. A resumed run
+uses the checkpoint if its own inputs and code have the same digest: it would compute the same result to the
+last bit. Otherwise it computes the result and replaces the checkpoint.
 
-The content is MessagePack, so that reading executes no code, and numbers keep all bits. Checkpoints do not
-depend on the machine that wrote them, so that several machines can share them.
+The format is MessagePack, so that reading a file executes no code and numbers keep all their bits.
+Checkpoints do not depend on the machine that wrote them, so that several machines can share them.
 """
 
 import hashlib
@@ -29,7 +29,7 @@ CHECKPOINT_SUFFIX = ".piece"
 
 
 class Checkpoints:
-    """Checkpoints in a folder, read only if `resume` is true; without a folder, nothing is stored or read."""
+    """Folder of checkpoints, which are read if `resume` is true; without a folder, nothing is stored."""
 
     def __init__(self, folder: Path | None = None, resume: bool = False):
         self._folder, self._resume = folder, resume
@@ -88,7 +88,7 @@ class Checkpoints:
         return StepCheckpoints(steps, inputs)
 
     def remove(self) -> None:
-        """Remove all checkpoints, and their folder if it is then empty; add a write error to `unwritten`."""
+        """Remove all checkpoints, and their folder if it is empty then; add an error to `unwritten`."""
         if self._folder is None or not self._folder.is_dir():
             return
         with self._recording_errors(self._folder):
@@ -104,7 +104,7 @@ class Checkpoints:
 
     @contextmanager
     def _recording_errors(self, path: Path) -> Iterator[None]:
-        """Add a write error to `unwritten` instead of raising it, during a `with` block."""
+        """Context manager: add a write error of the `with` block to `unwritten` instead of raising it."""
         try:
             with report_write_errors(path):
                 yield
@@ -113,9 +113,9 @@ class Checkpoints:
 
 
 class StepCheckpoints:
-    """Checkpoints of the steps of one computation, stored until the whole computation is finished.
+    """Checkpoints of the steps of one computation, which are kept until the whole computation is finished.
 
-    The inputs and the previous steps must determine the result of a step. Steps with the same name are
+    The result of a step must depend only on the inputs and the previous steps. Steps with the same name are
     numbered.
     """
 

@@ -1,7 +1,8 @@
 """Distribution of work units to the workers of a dask.distributed cluster.
 
-If a worker dies, another worker computes the worker's units. If several workers died while they computed the
-same unit, or if there are no workers, this process computes the unit. The workers run `tuning.caches.worker`.
+If a worker dies, its units are computed by another worker. If several workers have died while they computed
+the same unit, or if there is no worker, this process computes the unit. The workers run
+`tuning.caches.worker`.
 """
 
 import asyncio
@@ -19,8 +20,8 @@ from jaxhil.errors import InputError, format_value, to_one_line
 from tuning.caches.worker import ProcessSetting, run_pickled_call
 
 SCHEDULER_TIMEOUT = 10  # s; a scheduler must answer within this time
-IDLE_TIMEOUT = 20.0  # s; if no unit finishes within this time, the workers are counted again
-WORKER_COUNT_INTERVAL = 2.0  # s; shortest time between two counts of the workers
+IDLE_TIMEOUT = 20.0  # s; waiting time for a finished unit, after which the workers are counted again
+WORKER_COUNT_INTERVAL = 2.0  # s; minimum time between two counts of the workers
 UNITS_PER_WORKER = 2  # submitted units per worker, so that a worker need not wait for the next unit
 
 
@@ -54,12 +55,13 @@ def connect_workers(address: str) -> Iterator["ClusterWorkers"]:
             raise InputError(f"--scheduler: {missing}") from None
         stack.enter_context(_suppress_logs())
         try:
-            with ThreadPoolExecutor(1) as thread:  # needed because this thread may already run an event loop
+            # a second thread, because this one may already run an event loop
+            with ThreadPoolExecutor(1) as thread:
                 thread.submit(asyncio.run, _check_answer(address)).result()
             client = stack.enter_context(
                 distributed.Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
             )
-        except (OSError, ValueError, TypeError) as error:  # a TimeoutError is an OSError
+        except (OSError, ValueError, TypeError) as error:  # includes TimeoutError, a subclass of OSError
             reason = to_one_line(str(error), 100)
             raise InputError(
                 f"--scheduler: found {format_value(address)}, expected the address of a scheduler: {reason}"
@@ -91,7 +93,7 @@ async def _check_answer(address: str) -> None:
 
 @contextmanager
 def _suppress_logs() -> Iterator[None]:
-    """Suppress the log messages of dask.distributed during a `with` block; errors are reported separately."""
+    """Context manager: suppress the logs of dask.distributed; its errors are reported separately."""
     loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if "distributed" in name]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -118,9 +120,10 @@ class ClusterWorkers:
     ) -> Generator[tuple[Any, Any], None, None]:
         """Call `function` for every work unit on the workers; yield (name, result) of each finished unit.
 
-        Workers can join later. `function` is defined at the top level of a module. Unless `setting` is None,
-        every worker must have this process setting. `what` is a unique name of the work. Raise `InputError`
-        if the scheduler is lost or a worker has another setting.
+        Workers can join later. `function` must be defined at the top level of a module. `what` is a unique
+        name of this work. Unless `setting` is None, every worker must have the same code, package versions
+        and XLA flags as `setting`. Raise `InputError` if a worker does not, or if the connection to the
+        scheduler is lost.
         """
         with _raise_if_lost(self._address):
             from cloudpickle import dumps  # pyright: ignore[reportMissingImports]
@@ -161,7 +164,7 @@ def _count_workers(client: Any) -> int:
 
 
 def _wait_for_next(ended: "SimpleQueue[Any]") -> Any:
-    """Return the next future that ends, or None if this takes longer than `IDLE_TIMEOUT`."""
+    """Return the next future that finishes, or None if none finishes within `IDLE_TIMEOUT`."""
     try:
         return ended.get(timeout=IDLE_TIMEOUT)
     except Empty:
@@ -185,7 +188,7 @@ def _get_result(future: Any) -> tuple[Any] | None:
 
 @contextmanager
 def _raise_if_lost(address: str) -> Iterator[None]:
-    """Convert the errors of a lost scheduler to an `InputError`, during a `with` block."""
+    """Context manager: convert errors that mean a lost connection to the scheduler to an `InputError`."""
     from distributed import CancelledError  # pyright: ignore[reportMissingImports]
 
     try:

@@ -1,8 +1,8 @@
 """Code that runs on the workers of a dask.distributed cluster.
 
-A worker imports this module with its first work unit. It then sets the flags of JAX like a command, and
-imports JAX afterwards. If other code on the worker imports JAX earlier, dask must preload this module, with
-`PRELOAD_COMMAND`.
+A worker imports this module with its first work unit. It then sets the same flags of JAX as a command does,
+before it imports JAX. If other code on the worker imports JAX earlier, start the worker with
+`PRELOAD_COMMAND`, so that dask loads this module first.
 """
 
 import pickle
@@ -33,15 +33,15 @@ def get_process_setting() -> ProcessSetting:
 
 
 def dask_setup(worker: Any) -> None:
-    """Start JAX with the flags of a command; dask calls this function when it preloads the module."""
+    """Prepare JAX with the flags of a command; dask calls this function when it preloads the module."""
     prepare_jax()
 
 
 def run_pickled_call(content: bytes, asked: ProcessSetting | None) -> Any:
     """Call a pickled function with its pickled arguments; return the result.
 
-    Raise `InputError` if this process does not have the setting `asked`. Exceptions of the function are
-    raised too.
+    Raise `InputError` if code, package versions or XLA flags of this process differ from `asked`. The
+    function's own exceptions are passed on.
     """
     with _run_lock:
         prepare_jax()
@@ -52,7 +52,7 @@ def run_pickled_call(content: bytes, asked: ProcessSetting | None) -> Any:
 
 
 def check_process_setting(asked: ProcessSetting, here: ProcessSetting) -> None:
-    """Raise `InputError` if the setting `here` of a worker differs from the requested setting `asked`."""
+    """Raise `InputError` if a worker's code, package versions or XLA flags, `here`, differ from `asked`."""
     for name in ProcessSetting._fields:
         actual, expected = getattr(here, name), getattr(asked, name)
         if actual == expected or expected is None:
@@ -65,6 +65,6 @@ def check_process_setting(asked: ProcessSetting, here: ProcessSetting) -> None:
 
 
 def build_setting_error(what: str, flags: bool) -> InputError:
-    """Build the error for a worker with a wrong setting; if `flags`, name the command that starts workers."""
+    """Return the error for a worker's wrong setting; if `flags`, name the command that starts workers."""
     advice = f"; start workers by: {PRELOAD_COMMAND}" if flags else ""
     return InputError(f"--scheduler: a worker: {what}: its results would differ{advice}")

@@ -47,7 +47,7 @@ class CommandExcess(NamedTuple):
 
 
 def is_quiet_search_needed(task: TuneTask, settings: TuneSettings) -> bool:
-    """Return whether quiet gains are requested, a sensor has noise, and the gains affect its amplification."""
+    """Return whether quiet gains are requested, a sensor has noise, and the gains change its effect."""
     return (
         settings.quiet
         and isinstance(task.mechanism, Mechanism)

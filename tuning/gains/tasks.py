@@ -164,7 +164,7 @@ def list_tuned_gains(tasks: list[TuneTask]) -> tuple[str, ...]:
 
 
 def build_gain_bounds(task: TuneTask, names: tuple[str, ...]) -> GainBounds:
-    """Return the bounds (gains,) of the gains `names`; an untuned gain has equal bounds (its literature value)."""
+    """Return the bounds (gains,) of the gains `names`; those of an untuned gain are its literature value."""
     gains = {gain.name: gain for gain in get_compensator(task.compensator, task.model.axes).gains}
     moved = {gain.name for gain in task.tuned}
 

@@ -1,8 +1,9 @@
 """Derivative-free optimisation in the unit box: local search by CMA-ES, and global search with restarts.
 
-Unlike gradient methods, these searches are not stopped by kinks and can leave the nearest basin. The loss
-function maps NumPy arrays to NumPy arrays. All calls have the same number of points, so that a compiled
-function is compiled once. A point has unit coordinates: 0 is a gain's lower bound, 1 is the upper bound.
+Unlike gradient methods, these searches do not get stuck at kinks and can leave the nearest basin of
+attraction. The loss function maps NumPy arrays to NumPy arrays. All calls have the same number of points, so
+that a compiled function is compiled once. A point has unit coordinates: 0 is a gain's lower bound, 1 is the
+upper bound.
 """
 
 from collections.abc import Callable
@@ -58,10 +59,10 @@ def polish(
         evaluations: number of evaluations per start, rounded down to complete generations, at least one.
         candidates: number of candidates per generation.
         reach: initial standard deviation in unit coordinates, averaged over the gains.
-        covariance: covariance of the initial distribution, up to a factor; None: isotropic. The search needs
-            fewer generations with the inverse Hessian of least squares, (J^T J / (2 L) + 16)^-1, where J is
-            the Jacobian of the residuals and L the loss. The 16 limits the standard deviation of a gain
-            without effect to a quarter of its range.
+        covariance: covariance of the initial distribution, up to a factor; None for an isotropic one. The
+            search needs fewer generations with the inverse Hessian of least squares, (J^T J / (2 L) + 16)^-1,
+            where J is the Jacobian of the residuals and L the loss. The 16 limits the standard deviation of a
+            gain without effect to a quarter of its range.
         seed: seed of the random numbers.
 
     Returns:
@@ -103,10 +104,10 @@ def search_globally(
 ) -> SearchResult:
     """Find the best point of the whole unit box within `budget` evaluations.
 
-    A scan of a scrambled Sobol sequence uses an eighth of the evaluations. The best points that keep a
-    minimum distance start simultaneous runs of `polish`, in rounds of equal cost. Each round continues from
-    the better half of the minima, with an isotropic distribution and twice as many candidates, which average
-    out the roughness of the loss. The last round refines the best minimum.
+    A scan of a scrambled Sobol sequence uses an eighth of the evaluations. The best points with a minimum
+    distance from each other are the starts of simultaneous runs of `polish`, in rounds of equal cost. Each
+    round continues from the better half of the minima, with an isotropic distribution and twice as many
+    candidates, which average out the roughness of the loss. The last round refines the best minimum.
 
     Source: restarts with a growing population, Auger and Hansen, "A restart CMA evolution strategy with
     increasing population size" (2005); successive halving, Jamieson and Talwalkar (2016).
@@ -186,7 +187,7 @@ class _CmaConstants(NamedTuple):
     rank_one: float  # learning rate of the rank-one update (c_1)
     rank_mu: float  # learning rate of the rank-mu update (c_mu)
     effective: float  # effective number of selected candidates (mu_eff)
-    length: float  # expected length of a path of random steps (E|N(0, I)|)
+    length: float  # expected length of an evolution path of random steps (E|N(0, I)|)
 
 
 def _compute_constants(gains: int, candidates: int) -> _CmaConstants:
@@ -247,7 +248,8 @@ def _evolve(state, points, constants, generation) -> _Generation:
         + constants.rank_mu * np.einsum("c,...ci,...cj->...ij", weights, steps, steps)
     )
     growth = constants.step_rate / constants.damping * (size / constants.length - 1)
-    # If the distribution is wider than the box, reflected candidates are uniform and carry no information.
+    # If the distribution is wider than the box, the reflected candidates are uniformly distributed and carry
+    # no information.
     step = np.clip(state.step * np.exp(np.minimum(growth, 1)), 1e-12, 0.5)
     root, inverse_root = _compute_square_roots(covariance)
     return _Generation(
@@ -288,7 +290,7 @@ def select_distant_points(ranked, fixed_points, number):
 
 
 def select_points_at_distance(ranked, fixed_points, number, distance=None):
-    """Select points like `select_distant_points`, but fewer if not enough points keep the `distance`."""
+    """Select points like `select_distant_points`, but return fewer if too few keep the minimum `distance`."""
     distance = MIN_START_DISTANCE * np.sqrt(ranked.shape[-1]) if distance is None else distance
     chosen = list(np.clip(fixed_points[:number], 0, 1))
     for point in ranked:

@@ -23,8 +23,8 @@ from tuning.optimisation.solution import SolverResult
 from tuning.optimisation.unit_box import GainBounds, to_gains
 
 INITIAL_DAMPING = 0.1  # damping of the first step, relative to the mean diagonal element of J^T J [1]
-MIN_STEP_LENGTH = 1e-6  # a problem has converged if all gains move less than this, in unit coordinates
-# A problem has converged if the relative decrease of the loss in so many steps is below the minimum.
+MIN_STEP_LENGTH = 1e-6  # minimum step, in unit coordinates; a problem whose step is shorter has converged
+# Number of steps and minimum relative decrease of the loss in these steps; below it, a problem has converged.
 PROGRESS_STEPS, MIN_LOSS_DECREASE = 5, 1e-3
 
 
@@ -41,7 +41,7 @@ def solve_least_squares(
     rtol: float = 1e-4,
     atol: float = 1e-6,
 ) -> SolverResult:
-    """Minimise half the sum of squared residuals for many problems, distributed over the devices.
+    """Minimise half the sum of squared residuals of many problems, which are distributed to all devices.
 
     A problem has converged if residuals and coordinates change by less than `rtol` and `atol` permit, if a
     step is shorter than `MIN_STEP_LENGTH`, or if the relative decrease of the loss in `PROGRESS_STEPS` steps
@@ -94,7 +94,7 @@ def solve_least_squares(
 
 
 def _shard_over_devices(one_device: Callable[..., SolverResult], *arguments: Any) -> tuple[Array, ...]:
-    """Split the arguments along their leading axis, and call `one_device` with one part on each device."""
+    """Split the arguments along their leading axis, and call `one_device` on each device with its part."""
     leaves, structure = jax.tree.flatten(arguments)
     devices = math.gcd(jax.device_count(), len(leaves[0]))
     # Tracing is done outside `jax.shard_map`, because the solver's linear algebra cannot be traced inside.
@@ -110,10 +110,11 @@ def _shard_over_devices(one_device: Callable[..., SolverResult], *arguments: Any
 
 
 def _with_jacobian(residuals, free, arguments, tile=None):
-    """Return a function that computes (residuals, loss) of one problem, for a `jax.vmap` over all problems.
+    """Return a function that computes (residuals, loss) of one problem, for `jax.vmap` with all problems.
 
     The function's derivative multiplies by a Jacobian that is computed once, in forward mode, for `tile`
-    problems at a time. `free` and `arguments` are example arguments with a leading axis of problems.
+    problems at a time. `free` and `arguments` are examples of the function's arguments, with a leading axis
+    of problems.
     """
 
     def value_and_jacobian(free, arguments):
@@ -121,12 +122,12 @@ def _with_jacobian(residuals, free, arguments, tile=None):
             directions = jnp.broadcast_to(direction, free.shape)
             return jax.jvp(lambda free: residuals(free, arguments), (free,), (directions,))
 
-        # All problems share one direction, because the residuals of a problem depend only on its own gains.
+        # One tangent serves all problems, because the residuals of a problem depend only on its own gains.
         basis = jnp.eye(free.shape[-1], dtype=free.dtype)
         return jax.vmap(along, out_axes=(None, -1))(basis)
 
     def in_tiles(free, arguments):
-        # A problem delays only its tile, and the data of a tile fit into the processor's cache.
+        # Problems run in groups (tiles): a slow problem delays only its tile, whose data fit into the cache.
         size = math.gcd(len(free), tile or len(free))
         shape = len(free) // size, size
         tiles = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), (free, arguments))
@@ -177,8 +178,8 @@ class _LinearModel(NamedTuple):
 class _BoxedDescent(optx.AbstractDescent):
     """Descent of optimistix whose step d minimises the damped linear model within the unit box.
 
-    For the gains that are not at a bound, d solves (J^T J + D 1) d = -J^T r, with the damping
-    D = `INITIAL_DAMPING` mean(diag(J^T J)) / step_size.
+    For the gains that are not at a bound, d solves (J^T J + D I) d = -J^T r, with the identity I and the
+    damping D = `INITIAL_DAMPING` mean(diag(J^T J)) / step_size.
     """
 
     def init(self, y, f_info_struct):
@@ -194,7 +195,7 @@ class _BoxedDescent(optx.AbstractDescent):
         number, dtype = len(coordinates), coordinates.dtype
         damping = INITIAL_DAMPING * jnp.trace(curvature) / number / step_size.astype(dtype)
         identity = jnp.eye(number, dtype=dtype)
-        # The added small number makes the matrix regular for gains without effect, whose curvature is 0.
+        # The small number makes the matrix regular even if a gain has no effect and its curvature is 0.
         damped = curvature + (damping + jnp.finfo(dtype).tiny ** 0.5) * identity
         room = -coordinates, 1 - coordinates
         free = ~((coordinates <= 0) & (gradient > 0) | (coordinates >= 1) & (gradient < 0))

@@ -26,8 +26,8 @@ def compute_gain_tolerance(jacobian: Float[np.ndarray, "residuals gains"], loss:
 
         L(u + d) = L (1 + rise d^T A d),    A = J^T J / (2 rise L),    rise = `LOSS_RISE`
 
-    so that d^T A d = 1 where L has risen by the fraction `LOSS_RISE`. B = A + 1 replaces A, so that no gain
-    moves by more than its range, and
+    so that d^T A d = 1 where L has risen by the fraction `LOSS_RISE`. A is replaced by B = A + I with the
+    identity I, so that no gain moves by more than its range. Then
 
         alone_p = B_pp^(-1/2),        together_p = ((B^-1)_pp)^(1/2)
 
@@ -38,7 +38,7 @@ def compute_gain_tolerance(jacobian: Float[np.ndarray, "residuals gains"], loss:
     models and optimization", Phys. Rev. E 83, 036701 (2011).
     """
     gains = jacobian.shape[1]
-    # If there are fewer residuals than gains, rows of zeros add the directions without effect on residuals.
+    # If there are fewer residuals than gains, rows of zeros stand for the directions that have no effect.
     padded = np.concatenate([jacobian, np.zeros((max(0, gains - len(jacobian)), gains))])
     _, values, directions = np.linalg.svd(padded, full_matrices=False)
     scale = 2 * LOSS_RISE * max(loss, np.finfo(float).tiny)

@@ -19,7 +19,7 @@ class GainBounds(NamedTuple):
 def to_gains(coordinates: Float[Any, "*points gains"], bounds: GainBounds) -> Float[Any, "*points gains"]:
     """Convert unit coordinates to gains; NumPy arrays give NumPy arrays, JAX arrays give JAX arrays.
 
-    A coordinate outside [0, 1] is clipped, but has the same derivative as if it were not clipped.
+    A coordinate outside [0, 1] is clipped; its derivative is the same as without clipping.
     """
     xp = jnp if isinstance(coordinates, jax.Array) else np
     inside = xp.clip(coordinates, 0, 1)

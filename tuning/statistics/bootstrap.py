@@ -8,7 +8,7 @@ from scipy.stats import bootstrap
 
 BOOTSTRAP_RESAMPLES = 1999  # number of bootstrap resamples
 CONFIDENCE_LEVEL = 0.95
-# Largest number of scenarios with the BCa correction. With more, the correction is negligible and slow.
+# Largest number of scenarios for which the BCa correction is computed; for more, it is negligible and slow.
 MAX_BCA_SCENARIOS = 4096
 
 
@@ -110,7 +110,7 @@ def _resample_percentile(magnitudes, good, share, resamples, generator):
         drawn += scenarios * np.arange(number)[:, None]
         weights = np.bincount(drawn.reshape(-1), minlength=number * scenarios).reshape(number, scenarios)
         above = np.cumsum(weights[:, largest % scenarios], axis=1)
-        # Interpolate linearly as `np.quantile` does, with ranks counted from the largest value.
+        # Interpolate linearly, like `np.quantile`; ranks are counted from the largest value.
         rank = (1 - share) * (weights @ counts - 1)
         near, far = (
             values[np.argmax(above > index[:, None], axis=1)]

@@ -23,10 +23,11 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 CONFIDENCE_LEVEL = 0.95
-BETA_PRIOR = 0.5  # both parameters of the mixing beta distribution (Jeffreys; Krichevsky and Trofimov) [1]
-# With fewer failures (or successes) in all replicates, Student's interval alone is not valid.
+BETA_PRIOR = 0.5  # both parameters of the beta mixture [1], as in Jeffreys' prior
+# Minimum number of failures, and of successes, in all replicates; below it, Student's interval alone is not
+# valid.
 MIN_STUDENT_FAILURES = 100
-_BISECTION_STEPS = 62  # number of bisections; they reduce an interval of the length 1500 to a rounding error
+_BISECTION_STEPS = 62  # number of bisections; they reduce an interval of length 1500 to a rounding error
 
 
 class IntervalEstimate(NamedTuple):
@@ -66,7 +67,7 @@ def binomial_interval(
     failures, number = _check_counts(failures, number, level)
     tail = (1.0 - level) / 2.0
     passes = number - failures
-    # A beta distribution with the parameter 0 does not exist. Then the bound is 0 or 1.
+    # A beta distribution cannot have the parameter 0; in this case the bound is 0 or 1.
     low = np.where(failures > 0, special.betaincinv(np.maximum(failures, 1.0), passes + 1.0, tail), 0.0)
     high = np.where(passes > 0, special.betainccinv(failures + 1.0, np.maximum(passes, 1.0), tail), 1.0)
     return IntervalEstimate(_compute_share(failures, number), low, high)
@@ -140,8 +141,8 @@ def is_narrow_enough(running: SequentialState, width: float) -> bool:
 def estimate_sequence_scenarios(probability: float, width: float, level: float = CONFIDENCE_LEVEL) -> int:
     """Estimate how many scenarios `confidence_sequence` needs until its interval is `width` wide.
 
-    `probability` is the expected probability of failure. The result is from 1 to 2**62; progress bars use it.
-    Raise ValueError unless 0 <= probability <= 1, width > 0 and 0 < level < 1.
+    `probability` is the expected probability of failure. The result, from 1 to 2**62, is for progress
+    displays. Raise ValueError unless 0 <= probability <= 1, width > 0 and 0 < level < 1.
     """
     if not (0 <= probability <= 1 and width > 0):
         raise ValueError(f"probability, width: found {probability}, {width}, expected 0 to 1, and above 0")
@@ -156,7 +157,7 @@ def estimate_sequence_scenarios(probability: float, width: float, level: float =
 def estimate_deciding_scenarios(
     failures: int, number: int, allowed: float, level: float = CONFIDENCE_LEVEL
 ) -> int | None:
-    """Estimate how many scenarios decide whether the probability of failure is at most `allowed`.
+    """Estimate how many scenarios are needed to decide whether the failure probability is at most `allowed`.
 
     With this number, `binomial_interval` lies entirely below or above `allowed`, if the fraction of failures
     remains failures / number (0 without scenarios). Return None if a billion scenarios are not enough. Raise
@@ -184,9 +185,9 @@ def replicate_interval(failures: ArrayLike, number: int, level: float = CONFIDEN
     is therefore valid if the fractions are normally distributed. In three cases the interval is wider:
 
     - *Counts are integers.* The sequence may be so even that every scrambling counts one of the two integers
-      next to n p. Then all R counts may be equal by chance, although n p differs from them by d. This has the
-      probability (1 - d)^R, which is at most (1 - level) / 2 if d >= 1 - ((1 - level) / 2)^(1/R). The half
-      width of the interval is at least this d, divided by n.
+      next to n p. Then all R counts may be equal by chance, although n p differs from them by d. The
+      probability of this event is (1 - d)^R, which is at most (1 - level) / 2 if d >= 1 - ((1 - level) /
+      2)^(1/R). The half width of the interval is at least this d, divided by n.
     - *There are few failures (or successes),* less than `MIN_STUDENT_FAILURES`. The distribution of the
       fractions is then too skewed for Student's interval. The interval also includes the exact binomial
       interval of all points. The binomial interval is conservative if the counts spread less than those of

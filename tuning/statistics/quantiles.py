@@ -26,26 +26,26 @@ BIN_COUNT = len(BIN_EDGES) + 1
 def compute_order_ranks(
     number: int, order: float, level: float = CONFIDENCE_LEVEL, sequential: bool = False
 ) -> tuple[int, int]:
-    """Return the ranks of the two order statistics that enclose a quantile with the confidence `level`.
+    """Return the ranks of two order statistics between which a quantile lies with the confidence `level`.
 
-    Rank 1 is the smallest of the values. The ranks 0 and `number` + 1 mean that there is no bound. The
-    interval includes both order statistics, and is also valid if values are equal (David and Nagaraja 2003,
-    section 7.1).
+    Rank 1 is that of the smallest value. A lower rank of 0 or an upper rank of `number` + 1 means that there
+    is no such bound. The interval includes both order statistics, and is valid even if some values are equal
+    (David and Nagaraja 2003, section 7.1).
 
-    If n = `number` is fixed, low and high - 1 are the quantiles of order (1 -+ level) / 2 of the binomial
-    distribution with n and q = `order`. If `sequential`, they are the smallest and the largest count for
-    which the martingale of `tuning.statistics.intervals.confidence_sequence` at p = q is below 1 / (1 -
-    level). The interval is then valid for every stopping rule (Howard and Ramdas 2022, "Sequential estimation
-    of quantiles").
+    Let n = `number` and q = `order`. If n is fixed in advance, low and high - 1 are the quantiles of order (1
+    - level) / 2 and (1 + level) / 2 of the binomial distribution with n trials of probability q. If
+    `sequential`, they are the smallest and the largest count for which the martingale of
+    `tuning.statistics.intervals.confidence_sequence` at p = q is below 1 / (1 - level). The interval is then
+    valid for every stopping rule (Howard and Ramdas 2022, "Sequential estimation of quantiles").
 
     Args:
         number: number of independent values.
         order: order q of the quantile, between 0 and 1.
         level: confidence level, between 0 and 1.
-        sequential: whether the number depends on the values, by a stopping rule.
+        sequential: whether a stopping rule determines the number from the values.
 
     Returns:
-        Ranks low and high.
+        The lower and the upper rank.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -58,7 +58,7 @@ def compute_order_ranks(
     if number == 0:
         return 0, 1
     if not sequential:
-        # This import takes most of a second, and only this branch needs it.
+        # Only this branch needs the import, which takes most of a second.
         from scipy import stats
 
         tail = (1.0 - level) / 2.0
@@ -85,7 +85,7 @@ def count_in_bins(values: ArrayLike) -> np.ndarray:
     """
     magnitudes = np.abs(np.asarray(values, float)).ravel()
     magnitudes = np.sort(np.where(np.isfinite(magnitudes), magnitudes, np.inf))
-    # There are more values than edges, so that it is faster to search the edges among the values.
+    # There are more values than edges, so that it is faster to search for the edges among the sorted values.
     return np.diff(np.searchsorted(magnitudes, BIN_EDGES), prepend=0, append=len(magnitudes)).astype(np.int64)
 
 
@@ -95,10 +95,10 @@ def binned_quantile(
     """Return a quantile of the magnitudes of values with its interval, from the counts of `count_in_bins`.
 
     The bounds are the order statistics of `compute_order_ranks`, rounded outward to the edges of their bins.
-    This changes them by less than `BIN_RESOLUTION` between the first and the last edge. Without such an order
-    statistic, the bounds are 0 and infinity. The estimate is the geometric mean of the edges of the bin that
-    contains rank ceil(order n); in the first bin it is 0, and in the last bin infinity. The other arguments
-    are those of `compute_order_ranks`. Raise ValueError if an argument is out of its range.
+    This changes them by less than `BIN_RESOLUTION` between the first and the last edge. A bound without an
+    order statistic is 0 or infinity. The estimate is the geometric mean of the edges of the bin that contains
+    rank ceil(order n); in the first bin it is 0, and in the last bin infinity. The other arguments are those
+    of `compute_order_ranks`. Raise ValueError if an argument is out of its range.
     """
     number = int(np.sum(counted))
     below = np.cumsum(counted)
@@ -155,7 +155,7 @@ def replicate_quantile(
 
 def _compute_rank(number: ArrayLike, order: float) -> np.ndarray:
     """Return the rank of the order statistic that estimates the quantile: ceil(order n), from 1 to n."""
-    # Without this factor, a rounding error could increase an exact product to the next rank.
+    # Without this factor, a rounding error could increase an integer product to the next rank.
     rank = np.ceil(order * np.asarray(number) * (1.0 - 1e-14))
     return np.clip(rank, 1, np.maximum(number, 1)).astype(np.int64)
 

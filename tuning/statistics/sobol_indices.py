@@ -48,7 +48,7 @@ def saltelli_design(inputs: int | Sequence[int], number: int, seed: int) -> np.n
 
     Args:
         inputs: number of inputs, or a list with the number of columns of each input.
-        number: number of rows in each set, a power of two from 2.
+        number: number of rows in each set, a power of two, at least 2.
         seed: seed of the scrambling, 0 or more.
 
     Returns:
@@ -57,7 +57,7 @@ def saltelli_design(inputs: int | Sequence[int], number: int, seed: int) -> np.n
     Raises:
         ValueError: If an argument is out of its range.
     """
-    # This import takes most of a second, and only this function needs it.
+    # Only this function needs the import, which takes most of a second.
     from scipy.stats import qmc
 
     columns = _count_columns(inputs)
@@ -95,9 +95,8 @@ def sobol_indices(
     as in `scipy.stats.sobol_indices`. Estimates are not clipped, so that they may be below 0. The bootstrap
     resamples the same rows of A, B and all AB_i (Archer, Saltelli, Sobol 1997), and assumes that the rows are
     independent. The rows of a Sobol sequence are more even, so that the intervals are conservative. An input
-    that changes no result has the total index 0 and an interval of width 0. If the results are rare failures,
-    counted as 0 or 1, this proves little. If all results are equal, the indices are NaN and the intervals 0
-    to 1.
+    that changes no result has the total index 0 and an interval of width 0. This proves little if the results
+    are 0 or 1 (rare failures). If all results are equal, the indices are NaN and the intervals 0 to 1.
 
     Args:
         values: results of the scenarios in the order of `saltelli_design`, (number (inputs + 2),).

@@ -1,10 +1,10 @@
-"""Subset simulation of rare failures, with probabilities down to 1e-6 and confidence intervals.
+"""Subset simulation: probability of rare failures, down to 1e-6, with a confidence interval.
 
-A probability of 1e-6 is the product of six conditional probabilities of 0.1. Each belongs to a level, and the
-levels have increasing thresholds of the performance. The scenarios of a level come from Markov chains. These
-start at the worst scenarios of the previous level and stay above its threshold (Au and Beck 2001, "Estimation
-of small failure probabilities in high dimensions by subset simulation"). In standard-normal space, a chain
-proposes the step from u to
+A probability of 1e-6 is the product of six conditional probabilities of 0.1. Each of them belongs to a level;
+the levels have increasing thresholds of the performance. The scenarios of a level come from Markov chains,
+which start at the worst scenarios of the previous level and stay above its threshold (Au and Beck 2001,
+"Estimation of small failure probabilities in high dimensions by subset simulation"). In standard-normal
+space, a chain proposes the step from u to
 
     v = sqrt(1 - sigma^2) u + sigma z,    z standard normal.
 
@@ -34,7 +34,8 @@ from tuning.statistics.intervals import CONFIDENCE_LEVEL, binomial_interval, log
 
 PerformanceFunction = Callable[[np.ndarray], np.ndarray]
 
-LEVEL_PROBABILITY = 0.1  # conditional probability of each level [1]; 0.1 to 0.3 are about equally efficient
+# conditional probability of each level [1]; values from 0.1 to 0.3 are about equally efficient
+LEVEL_PROBABILITY = 0.1
 CHAIN_LENGTH = round(1.0 / LEVEL_PROBABILITY)  # number of scenarios in each Markov chain, including its start
 TARGET_ACCEPTANCE = 0.44  # acceptance rate to which sigma is adapted (Papaioannou et al. 2015) [1]
 INITIAL_SIGMA, MIN_SIGMA = 0.6, 1e-4  # initial and smallest step size sigma of the Markov chains [1]
@@ -206,7 +207,7 @@ def _choose_level(
     ends = state.open & (threshold >= failing)
     estimates = np.where(ends, state.reached * share, state.estimates)
     return threshold, state._replace(
-        # In a replicate without a failure, `reached` remains as an upper bound of its probability.
+        # For a replicate without a failure, `reached` remains an upper bound of the probability.
         reached=np.where(state.open & (share > 0.0), state.reached * share, state.reached),
         variance=np.where(state.open, state.variance + squared, state.variance),
         open=state.open & ~ends,

@@ -1,8 +1,8 @@
 """Parquet file of one chunk of a sweep: rows with a checksum.
 
 pandas, DuckDB and Arrow can read the file. Its metadata hold the manifest's digest and a SHA-256 checksum of
-the file, computed while zeros replace the checksum's digits. Reading checks the checksum before parsing the
-file, and then checks that the rows' outcomes follow from their errors and statuses.
+the file, computed while zeros replace the checksum's digits. A reader verifies the checksum before it parses
+the file, and then checks that the outcome of each row follows from its errors and statuses.
 """
 
 import hashlib
@@ -31,8 +31,8 @@ def encode_chunk(manifest: Manifest, rows: Mapping[str, np.ndarray]) -> bytearra
     buffer = pa.BufferOutputStream()
     table = to_table(manifest, rows)
     texts = [column.name for column in manifest.columns if column.kind == "text"]
-    # Stronger compression saves only a tenth of the size and takes twice the time. Only the index column
-    # needs statistics, because readers search rows by index.
+    # A stronger compression would save only a tenth of the size and take twice the time. Only the index
+    # column needs statistics, because readers search for rows by index.
     options: dict[str, Any] = {"compression": "lz4", "use_dictionary": texts, "write_statistics": ["index"]}
     with parquet.ParquetWriter(buffer, table.schema, **options) as writer:
         writer.write_table(table)
@@ -45,7 +45,7 @@ def encode_chunk(manifest: Manifest, rows: Mapping[str, np.ndarray]) -> bytearra
 
 
 def decode_chunk(manifest: Manifest, part: int, content: bytes) -> dict[str, np.ndarray] | None:
-    """Decode the rows of chunk number `part`; return None if the file is damaged or of another chunk."""
+    """Decode the rows of chunk number `part`; return None if the file is damaged or from another chunk."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -76,7 +76,8 @@ def _check_rows(manifest: Manifest, part: int, table: Any) -> dict[str, np.ndarr
         return None
     mechanism = load_gains(manifest).mechanism
     if isinstance(mechanism, SixAxisMechanism):
-        # The sensor's range is the smallest of the three force channels, each drawn or nominal.
+        # The sensor's range is that of the smallest force channel; a channel's range is drawn or else
+        # nominal.
         forces = [f"{FORCE_RANGE_KEY}_{axis}" for axis in (1, 2, 3)]
         ranges = zip(forces, mechanism.rig.force_sensor.range[:3], strict=True)
         values = (rows.get(name, nominal) for name, nominal in ranges)
@@ -133,7 +134,7 @@ def to_table(manifest: Manifest, rows: Mapping[str, np.ndarray]) -> Any:
                 pa.DictionaryArray.from_arrays(pa.array(values), list(list_allowed_texts(column.name)))
             )
         else:
-            # Without NaN, Arrow need not copy the values.
+            # If there is no NaN, Arrow need not copy the values.
             gaps = values.dtype.kind == "f" and bool(np.any(np.isnan(values)))
             arrays.append(pa.array(values, field.type, from_pandas=gaps))
     return pa.Table.from_arrays(arrays, schema=target)

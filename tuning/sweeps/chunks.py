@@ -1,7 +1,7 @@
-"""Computation of a sweep's chunks on all cores: draw scenarios, run them, and build the rows of the store.
+"""Computation of a sweep's chunks: the scenarios are drawn, run on all cores, and converted to rows.
 
 All chunks share one compiled program. Its delay lines are long enough for every possible draw, so that the
-row of a scenario does not depend on the chunk, to the bit.
+row of a scenario is the same to the last bit whichever chunk contains it.
 """
 
 from collections.abc import Callable, Generator, Iterable
@@ -41,7 +41,7 @@ class SweepProgram(NamedTuple):
 
 
 class _ScenarioBatch(NamedTuple):
-    """Consecutive scenarios of a sweep, with the values that were drawn for them."""
+    """Consecutive scenarios of a sweep, and the values that were drawn for them."""
 
     first: int  # index of the first scenario
     draws: dict[str, np.ndarray]  # drawn values by key of the mechanism file
@@ -55,10 +55,10 @@ def build_sweep(manifest: Manifest) -> SweepProgram:
 
 
 def build_widest_loop(loaded: LoadedGains, works: bool) -> Any:
-    """Build a loop whose delay lines are long enough for all draws; `works` adds exact mechanical works."""
+    """Build a loop whose delay lines suffice for all draws; if `works`, it computes mechanical work."""
     draws = draw_extremes(loaded.mechanism)
     if CONTROL_PERIOD_KEY in draws:
-        # The longest delay line is needed for the longest delay together with the shortest control period.
+        # The longest delay and the shortest control period together need the longest delay line.
         draws[CONTROL_PERIOD_KEY] = draws[CONTROL_PERIOD_KEY][::-1]
     model = choose_rig_model(loaded.mechanism)
     scenarios = model.scenarios(loaded.mechanism, draws)
@@ -66,7 +66,7 @@ def build_widest_loop(loaded: LoadedGains, works: bool) -> Any:
 
 
 def run_chunk(sweep: SweepProgram, first: int, number: int, precision: str | None = None) -> Rows:
-    """Compute the rows of `number` scenarios from index `first`, at most the size of a chunk.
+    """Compute the rows of `number` scenarios, at most a chunk; `first` is the index of the first scenario.
 
     A run that fails or becomes non-finite yields a row with this status. `precision` replaces the precision
     of the manifest.

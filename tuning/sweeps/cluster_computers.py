@@ -12,7 +12,7 @@ from tuning.sweeps.chunks import Rows, SweepProgram, build_sweep, run_chunk
 from tuning.sweeps.manifest import decode_manifest, encode_manifest, list_process_differences
 from tuning.sweeps.run_sweep import ChunkComputer
 
-BATCHES_PER_STUDY = 64  # number of batches of a study's points; the number of workers does not matter
+BATCHES_PER_STUDY = 64  # number of batches of a study's points, for any number of workers
 
 
 def build_chunk_computer(workers: ClusterWorkers) -> ChunkComputer:
@@ -21,7 +21,7 @@ def build_chunk_computer(workers: ClusterWorkers) -> ChunkComputer:
     def run(sweep: SweepProgram, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
         content = encode_manifest(sweep.manifest)
         units = (WorkUnit(part, (content, part)) for part in parts)
-        # No process setting is passed, because each worker compares its settings with the manifest.
+        # No process setting is requested here, because each worker compares its own with the manifest.
         return workers.run(run_manifest_chunk, units, None, sweep.manifest.sha256[:16])
 
     return run

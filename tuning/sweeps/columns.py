@@ -1,7 +1,8 @@
 """Columns of a sweep's store, with names, units and descriptions.
 
-A metric has one column per contact (`error_1`, `error_2`, ...). A drawn list has one column per entry
-(`contact.stiffness_1`). A metric that a failed or unreached contact does not have is null.
+A metric has one column per contact (`error_1`, `error_2`, ...) or, for six axes, per episode. An episode is a
+contact with all its touches, until the bodies are free again. A drawn key that is a list has one column per
+entry (`contact.stiffness_1`). A metric that a failed or unreached contact does not have is null.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -105,7 +106,7 @@ UNENDED_METRICS = (
 
 
 class ContactColumns(NamedTuple):
-    """Names of the error and status columns of one contact, or of one error of a six-axis episode."""
+    """Names of the error and status columns of a contact or, for six axes, of one error of an episode."""
 
     number: int  # number of the contact or episode, from 1
     error: str  # name of the error's column
@@ -113,7 +114,7 @@ class ContactColumns(NamedTuple):
 
 
 def list_contact_columns(mechanism: AnyMechanism) -> list[ContactColumns]:
-    """Return the column names for each row of an outcome: each contact, or each error of each episode."""
+    """Return the column names for every contact or, for six axes, for every error of every episode."""
     model = choose_rig_model(mechanism)
     return list_error_columns(model.errors, model.runs(mechanism))
 
@@ -297,7 +298,7 @@ def classify_outcomes(
     peak = stacked(f"peak_force_{slot.number}" for slot in made)
     size = np.where(status == OK, np.abs(error), -1)
     worst = np.take_along_axis(error, np.argmax(size, axis=0)[None], axis=0)[0]
-    # An unreached contact has a peak and a shortfall of NaN, so that both comparisons are false.
+    # For an unreached contact, peak and shortfall are NaN, so that both comparisons are false.
     beyond_range = peak > force_range.astype(peak.dtype)
     saturated = np.any(beyond_range, axis=0)
     for name in {f"position_shortfall_{slot.number}" for slot in made} & set(rows):
@@ -308,7 +309,7 @@ def classify_outcomes(
 
 
 def _find_unlike(rows: Mapping[str, np.ndarray], numbers: Iterable[int], period: np.ndarray) -> np.ndarray:
-    """Return whether each row has a contact whose peak force or duration differs too much from the ideal."""
+    """Return for each row whether a contact's force or duration differs too much from the ideal contact's."""
     unlike = np.zeros(len(rows["index"]), bool)
     for number in numbers:
         ideal = [rows.get(f"reference_{name}_{number}") for name in ("peak_force", "duration")]

@@ -68,7 +68,7 @@ class _SobolSequence:
 
 
 def _draw_without_warning(engine, number: int) -> np.ndarray:
-    """Return the next points, and avoid SciPy's warning that their number is not a power of two."""
+    """Return the next points, without SciPy's warning that their number is not a power of two."""
     if number == 0:
         return np.empty((0, engine.d))
     if engine.num_generated:

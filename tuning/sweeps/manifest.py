@@ -81,7 +81,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class ManifestOptions(NamedTuple):
-    """Options with which a sweep is requested; `Manifest` describes the fields."""
+    """Options of a requested sweep; the fields are described in `Manifest`."""
 
     scenarios: int
     seed: int = 0
@@ -94,7 +94,7 @@ class ManifestOptions(NamedTuple):
 
 
 def build_manifest(loaded: LoadedGains, choices: ManifestOptions) -> Manifest:
-    """Build the manifest of a sweep with a loaded gain file; raise `InputError` if an option is invalid."""
+    """Build the manifest of a sweep from a loaded gain file; raise `InputError` if an option is invalid."""
     if choices.sampling == "sobol" and choices.scenarios < SOBOL_REPLICATES:
         allowed = f"{SOBOL_REPLICATES} or more, the replicates of sobol sampling"
         raise InputError(f"--scenarios: found {choices.scenarios}, expected {allowed}")
@@ -163,7 +163,7 @@ def load_gains(manifest: Manifest, source: str = "sweep") -> LoadedGains:
 
 
 def list_input_differences(old: Manifest, new: Manifest) -> list[str]:
-    """Return how the inputs of two manifests differ, each as "key: found OLD, requested NEW"."""
+    """Return differences between the inputs of two manifests, as texts "key: found OLD, requested NEW"."""
     keys = ("gains_sha256", *ManifestOptions._fields, "xla_flags")
     values = ((key, getattr(old, key), getattr(new, key)) for key in keys)
     return [
@@ -174,13 +174,13 @@ def list_input_differences(old: Manifest, new: Manifest) -> list[str]:
 
 
 def list_code_differences(old: Manifest, new: Manifest) -> list[str]:
-    """Return how the code that computes the rows differs, each as "key: found OLD, here NEW"."""
+    """Return the differences in the code that computes the rows, as texts "key: found OLD, here NEW"."""
     changes = _list_version_differences(old, new.sources_sha256, new.versions)
     return changes + ([COLUMN_DIFFERENCE] if old.columns != new.columns else [])
 
 
 def list_process_differences(manifest: Manifest) -> list[str]:
-    """Return how code and settings of this process differ from the manifest, which may change last bits."""
+    """Return how this process differs from the manifest in code and settings, which affect the last bits."""
     flags = rounding_flags(active_xla_flags())
     loaded = load_gains(manifest)
     changes = _list_version_differences(manifest, _compute_sources_digest(loaded), dependency_versions())

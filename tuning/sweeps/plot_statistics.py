@@ -1,8 +1,8 @@
 """Statistics for the plots of a sweep, accumulated chunk by chunk in constant memory.
 
-They are counts of errors in the cells of a grid over two inputs, the first scenarios as points, and the
-number of failures as a function of the number of scenarios. Chunks can have any order and size. The grid does
-not depend on the draws.
+They contain counts of errors in the cells of a grid whose axes are two inputs, the first scenarios as points,
+and the number of failures as a function of the number of scenarios. The chunks can be added in any order and
+have any size. The grid does not depend on the draws.
 """
 
 from collections.abc import Mapping
@@ -119,7 +119,7 @@ def read_regions(store: SweepStore, mechanism: AnyMechanism) -> tuple[PlotPlan |
 
 
 def plan_statistics(manifest: Manifest, mechanism: AnyMechanism, rows: Rows) -> PlotPlan:
-    """Choose two inputs, a grid and scenario counts for the statistics of a sweep.
+    """Choose two inputs, a grid and numbers of scenarios for the statistics of a sweep.
 
     The inputs are contact stiffness and force delay. If one of them is not drawn, the input whose rank
     correlation with |error| is strongest in `rows`, the first chunk, replaces it.
@@ -186,8 +186,8 @@ def add_to_statistics(plan: PlotPlan, regions: PlotStatistics, rows: Rows) -> Pl
 def compute_error_quantile(sizes: np.ndarray, order: float, least: int) -> np.ndarray:
     """Estimate the quantile of order `order` of |error|, with a relative accuracy of 0.5 %.
 
-    The last axis of `sizes` holds the counts per bin. The quantile is at least the lowest edge of the bins,
-    so that its logarithm is finite. It is NaN if the counts sum to less than `least`.
+    The last axis of `sizes` holds the counts per bin. The result is at least the lowest edge of the bins, so
+    that its logarithm is finite. It is NaN if the sum of the counts is below `least`.
     """
     values = np.maximum(binned_estimate(sizes, order), BIN_EDGES[0])
     return np.where(np.sum(sizes, axis=-1) >= least, values, np.nan)
@@ -225,7 +225,7 @@ def _select_first_points(points: PlotPoints) -> PlotPoints:
 def _compute_rank_correlations(
     mechanism: AnyMechanism, path: str, rows: Rows, size: np.ndarray
 ) -> np.ndarray:
-    """Return |rank correlation| (Spearman 1904) of each entry of an input with `size`; NaN if constant."""
+    """Return |rank correlation| (Spearman 1904) of each input entry and `size`; NaN if one is constant."""
     _, low, high = _find_input_range(mechanism, path)
 
     def ranks(values: np.ndarray) -> np.ndarray:
@@ -252,7 +252,7 @@ def _find_input_range(mechanism: AnyMechanism, path: str) -> tuple[np.ndarray, n
 
 
 def _build_contact_input(mechanism: AnyMechanism, path: str) -> PlotInput:
-    """Describe an input with one column per contact; contacts may use different entries of a list."""
+    """Describe an input with one column per contact: the contacts may use different entries of a list."""
     names, (_, low, high) = list_input_columns(mechanism, path), _find_input_range(mechanism, path)
     contacts = range(len(list_contact_columns(mechanism)))
     listed = path == PHASE_KEY or (
@@ -274,7 +274,7 @@ def _build_contact_input(mechanism: AnyMechanism, path: str) -> PlotInput:
 def _build_scenario_input(mechanism: AnyMechanism, path: str, entry: int) -> PlotInput:
     """Describe an input with one column per scenario, which holds entry `entry` of the input.
 
-    If all entries are drawn together, the plot shows their common ratio to the nominal values.
+    If all entries are drawn with a common factor, the plot shows this factor.
     """
     names, (nominal, low, high) = list_input_columns(mechanism, path), _find_input_range(mechanism, path)
     name = INPUT_LABELS.get(path, path)

@@ -1,4 +1,4 @@
-"""Runs of scenarios that a study selects as points in the unit cube of all uncertain numbers.
+"""Runs of the scenarios that a study selects, as points of the unit cube of all uncertain numbers.
 
 The points run in batches with the program of a sweep, in this process or on the workers of a cluster. Each
 finished batch is cached, since its result depends only on the sweep and the points.
@@ -23,19 +23,19 @@ CountCallback = Callable[[int], None]  # called with a number of scenarios
 
 
 class PointBatch(NamedTuple):
-    """Points of the unit cube that run together."""
+    """Points of the unit cube whose scenarios run together."""
 
     name: str  # unique name, from the digest of points and noise
     points: Float[np.ndarray, "number inputs"]  # coordinates from 0 to 1
     noise: Int[np.ndarray, "number"]  # index of the noise realisation of each point
 
 
-# Runs batches and yields their names and rows in any order.
+# Function that runs batches, and yields their names and rows in any order.
 PointComputer = Callable[[SweepProgram, Iterable[PointBatch]], Iterator[tuple[str, Rows]]]
 
 
 def run_batch(sweep: SweepProgram, points: np.ndarray, noise: np.ndarray) -> Rows:
-    """Run the scenarios at the points, at most as many as a chunk; return `POINT_COLUMNS` for each."""
+    """Run one scenario per point, at most a chunk of them; return the columns `POINT_COLUMNS`."""
     manifest = sweep.manifest
     scenarios = sweep.model.scenarios(sweep.mechanism, draw_at_points(sweep.mechanism, points), manifest.seed)
     key = np.stack([scenarios.key[0], noise.astype(np.uint32)])
@@ -51,7 +51,7 @@ def run_locally(sweep: SweepProgram, batches: Iterable[PointBatch]) -> Iterator[
 
 
 class PointRunSettings(NamedTuple):
-    """Settings for running the points of a study: progress, cache and computer."""
+    """Settings for running the points of a study: progress reports, cache, function that runs batches."""
 
     report_computed: CountCallback = lambda _: None  # called with the number of scenarios of each new batch
     report_cached: CountCallback = lambda _: None  # called with the number of scenarios of each cached batch
@@ -66,10 +66,10 @@ LOCAL_RUN = PointRunSettings()
 def run_points(
     sweep: SweepProgram, points: np.ndarray, noise: np.ndarray, running: PointRunSettings = LOCAL_RUN
 ) -> Rows:
-    """Run the scenarios at points (number, inputs) of the unit cube; return `POINT_COLUMNS` for each.
+    """Run one scenario for each point (number, inputs) of the unit cube; return the columns `POINT_COLUMNS`.
 
     `noise` (number,) holds the index of each scenario's noise realisation. The division into batches does not
-    change a bit of the result.
+    affect the result.
     """
     number, label = len(points), sweep.manifest.sha256
     size = min(sweep.manifest.chunk, max(MIN_POINTS_PER_BATCH, -(-number // running.max_batches)))

@@ -1,4 +1,4 @@
-"""Replay of one stored scenario: a recomputed row, identical to the bit, and the motion at every tick."""
+"""Replay of one stored scenario: its row, recomputed to the last bit, and its motion at every tick."""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 

@@ -20,11 +20,11 @@ from tuning.sweeps.columns import SCENARIO_OUTCOMES, list_contact_columns
 from tuning.sweeps.store import SweepStore, read_chunk, remove_chunks, write_chunk
 from tuning.sweeps.tally import Tally, add_to_tally, build_empty_tally
 
-COMPARED_SCENARIOS = 4096  # number of scenarios that a float32 sweep also runs in float64
+COMPARED_SCENARIOS = 4096  # number of scenarios of a float32 sweep that are also run in float64
 
 # Called after each chunk with the chunk's number of rows and the tally of all chunks so far.
 ChunkProgress = Callable[[int, Tally], None]
-# Computes chunks of a sweep, given their numbers; yields each number with the rows, in any order.
+# Function that computes the chunks with given numbers, and yields each number with the rows, in any order.
 ChunkComputer = Callable[[SweepProgram, Iterable[int]], Generator[tuple[int, Rows], None, None]]
 
 
@@ -88,7 +88,7 @@ def compare_precisions(sweep: SweepProgram, number: int = COMPARED_SCENARIOS) ->
 
 
 def count_outcomes(tally: Tally) -> dict[str, int]:
-    """Return the number of scenarios of each outcome that occurred at least once."""
+    """Return the number of scenarios with each outcome, without the outcomes that did not occur."""
     return {name: count for name, count in zip(SCENARIO_OUTCOMES, tally.outcomes, strict=True) if count}
 
 
@@ -99,7 +99,7 @@ def _run_until_narrow(
     computed: ChunkProgress,
     computer: ChunkComputer,
 ) -> Tally:
-    """Run a sweep that ends at the width `until_width`; return the tally of the chunks up to the end."""
+    """Run a sweep until its interval is at most `until_width` wide; return the tally of its chunks."""
     manifest = store.manifest
     tally = build_empty_tally(manifest.replicates, manifest.scenarios, looked_at=True)
     width: Any = manifest.until_width
@@ -128,7 +128,7 @@ def _run_until_narrow(
             for part, rows in parts:
                 write_chunk(store, part, rows)
                 new.add(part)
-                # A cluster can finish a later chunk first; that chunk waits in the store.
+                # A cluster can finish a later chunk first; that chunk stays in the store until it is next.
                 if part == following and (look(rows) or look_at_stored()):
                     break
     remove_chunks(store, following)

@@ -10,7 +10,7 @@
 files are written atomically and have a checksum (`tuning.sweeps.chunk_file`). After an interruption, the same
 code computes the missing chunks; the rows equal those of an uninterrupted sweep.
 
-A folder that holds files other than a store is never changed.
+A folder that holds files other than those of a store is never changed.
 """
 
 import os
@@ -104,7 +104,7 @@ def read_store(folder: Path) -> SweepStore:
 def lock_store(folder: Path) -> Iterator[None]:
     """Lock the store in `folder` against other writing processes, during a `with` block.
 
-    Raise `InputError` if another process holds the lock or the folder holds files other than a store.
+    Raise `InputError` if another process holds the lock, or if the folder holds files other than a store's.
     """
     _is_store(folder)
     with report_write_errors(folder):
@@ -122,7 +122,7 @@ def lock_store(folder: Path) -> Iterator[None]:
 def write_chunk(store: SweepStore, part: int, rows: Mapping[str, np.ndarray]) -> None:
     """Write the file of chunk number `part` atomically; raise `InputError` if writing fails."""
     path = store.chunk_path(part)
-    # Meanwhile the next chunk is prepared on the other half of the cores.
+    # The next chunk is prepared at the same time, on the other half of the cores.
     with use_half_the_cores(1), report_write_errors(path):
         write_atomically(path, encode_chunk(store.manifest, rows))
 

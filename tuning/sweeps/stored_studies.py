@@ -2,10 +2,10 @@
 
     DIR/studies/drivers-1024.json, rare-0.04-10x1000.json, ...
 
-The sweep's manifest and a few arguments determine a study's result to the bit. The file of a study
-(`schema = "jaxhil/study/1"`) holds these arguments, the manifest's digest, the result and a digest of its own
-content. A file that is damaged or from another sweep is ignored, so that the study runs again. JSON cannot
-store infinity and NaN. Each field can have only one of these values, and null represents it.
+The sweep's manifest and a few arguments determine a study's result to the bit. The file of a study (`schema =
+"jaxhil/study/1"`) holds these arguments, the manifest's digest, the result and a digest of its own content. A
+file that is damaged or from another sweep is ignored, so that the study runs again. JSON cannot store
+infinity and NaN. A field can have at most one of these two values, which is stored as null.
 """
 
 import json
@@ -24,7 +24,7 @@ from tuning.sweeps.store import STUDY_FOLDER, SweepStore
 from tuning.sweeps.studies import SUBSET_REPLICATES, SUBSET_SAMPLES, ErrorIndices, InputIndices
 
 STUDY_SCHEMA = "jaxhil/study/1"
-# number that null represents in each record, and in fields that differ from the rest of their record
+# non-finite number that null stands for, by record and, for fields that differ from their record, by field
 NULL_VALUES: dict[Any, float | None] = {
     InputIndices: math.nan,
     ErrorIndices: None,
@@ -115,7 +115,7 @@ def _describe_study(manifest: Manifest, request: StudyRequest) -> dict[str, Any]
 
 
 def _convert_to_plain(value: Any, null: float | None) -> Any:
-    """Convert records to dictionaries, arrays to lists, and the non-finite number `null` to None."""
+    """Convert records to dictionaries, arrays to lists, and the number that null stands for to None."""
     if hasattr(value, "_fields"):
         null = NULL_VALUES[type(value)]
         return {

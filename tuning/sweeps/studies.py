@@ -29,8 +29,8 @@ KEY_SEPARATOR = " + "  # between the keys of correlated numbers, which together 
 CAP_IN_LIMITS = 10.0  # cap on |error| for Sobol indices, in multiples of the error limit
 CAP_WITHOUT_LIMIT = 10.0  # cap on |error| [1] if there is no error limit
 SUBSET_SAMPLES, SUBSET_REPLICATES = 1000, 10  # samples per level and replicate, number of replicates
-# Ratio of the observed spread of replicates to the spread that the formula predicts [1]; a larger ratio means
-# that the replicates found different failure regions.
+# Largest plausible ratio of the replicates' spread to the spread that the formula predicts [1]; a larger
+# ratio means that the replicates found different failure regions.
 MAX_SPREAD_RATIO = 2.0
 
 
@@ -58,18 +58,18 @@ class ErrorIndices(NamedTuple):
 def compute_error_indices(
     sweep: SweepProgram, number: int, running: PointRunSettings = LOCAL_RUN
 ) -> ErrorIndices:
-    """Compute Sobol indices of the worst |error|, from `number` x (inputs + 2) scenarios.
+    """Compute Sobol indices of the worst |error| from `number` * (inputs + 2) scenarios.
 
     `number` is a power of two. Each uncertain key of the mechanism file is one input, with all entries of a
     list. Correlated keys are one input, since the indices assume independent inputs. The phases of all
-    contacts are one input, and so is sensor noise, which has other realisations in matrix B of the design
-    than in matrix A. A run whose |error| exceeds the cap, or that has no error, counts as the cap, so that a
-    few diverging runs do not dominate the variance.
+    contacts are one input. Sensor noise is also one input; its realisations in matrix B of the design differ
+    from those in matrix A. A run whose |error| exceeds the cap, or that has no error, counts as the cap, so
+    that a few diverging runs do not dominate the variance.
     """
     inputs = group_independent_inputs(sweep.mechanism)
     names, entries = list(inputs), [len(columns) for columns in inputs.values()]
     if _has_noise(sweep):
-        # This column only selects between two realisations of the noise.
+        # This column of the design only selects one of two realisations of the noise.
         names, entries = [*names, NOISE_INPUT], [*entries, 1]
     order = np.argsort(np.concatenate(list(inputs.values())))
     points = saltelli_design(entries, number, sweep.manifest.seed)[:, order]
@@ -101,7 +101,7 @@ def group_independent_inputs(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
 def count_most_scenarios(samples: int = SUBSET_SAMPLES, replicates: int = SUBSET_REPLICATES) -> int:
     """Return the largest number of scenarios that `estimate_rare_failure` can run.
 
-    Every level but the first reuses some scenarios of the previous level.
+    Each level except the first reuses some scenarios of the previous level.
     """
     return replicates * (samples + (MAX_LEVELS - 1) * (samples - samples // CHAIN_LENGTH))
 
@@ -117,7 +117,7 @@ def estimate_rare_failure(
 
     A scenario fails if its worst |error| exceeds `limit` [1], or for another reason, which counts as an
     infinite error. Every proposed scenario has a new realisation of sensor noise. The Markov chain accepts or
-    rejects both together, so that its distribution is correct.
+    rejects scenario and realisation together, so that its distribution is correct.
     """
     unlike, run = SCENARIO_OUTCOMES.index(UNLIKE_IDEAL), 0
 
@@ -133,7 +133,7 @@ def estimate_rare_failure(
 
 
 def is_spread_beyond_formula(rare: SubsetSimulation) -> bool:
-    """Return whether the replicates of a subset simulation differ much more than the formula predicts."""
+    """Return whether the replicates of a subset simulation differ more than the formula can explain."""
     return rare.coefficient_of_variation > MAX_SPREAD_RATIO * rare.formula_coefficient_of_variation
 
 

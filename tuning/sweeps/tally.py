@@ -1,7 +1,7 @@
 """Statistics of a running sweep: counts of outcomes, histograms of errors, worst scenarios and intervals.
 
-A tally does not depend on the order of the chunks, unless the sweep can stop early. Its memory does not
-depend on the number of chunks.
+Unless the sweep can stop early, a tally does not depend on the order of the chunks. The memory that it needs
+does not depend on their number.
 
 The replicates of Sobol sampling must have equal numbers of scenarios. If the number of scenarios is not a
 multiple of the number of replicates, the last few scenarios are counted in the outcomes and the worst
@@ -96,10 +96,10 @@ def add_to_tally(tally: Tally, rows: Mapping[str, np.ndarray]) -> Tally:
     index, outcome, failed = rows["index"], rows["outcome"], rows["failed"]
     outcomes = np.bincount(outcome, minlength=len(SCENARIO_OUTCOMES))
     replicates, errors = _add_to_replicates(tally, rows)
-    # Scenarios that are good or beyond the limit are ranked by their error only.
+    # Among good scenarios and those whose error exceeds the limit, only the error determines the rank.
     severity = np.where(outcome <= SCENARIO_OUTCOMES.index(BEYOND_LIMIT), 0, outcome)
     error = np.nan_to_num(np.abs(rows["worst_error"].astype(float)), nan=-1.0, posinf=np.inf)
-    # Only candidates for the worst scenarios are sorted.
+    # Only the scenarios that can be among the worst are sorted.
     size = np.where(severity > 0, np.inf, error)
     few = np.flatnonzero(
         size >= np.partition(size, -MAX_WORST_SCENARIOS)[-MAX_WORST_SCENARIOS]
