@@ -1,4 +1,4 @@
-"""Checks of the arguments of public functions; each check raises an error with a message of one line.
+"""Checks of the arguments of public functions; a failed check raises an error with a message of one line.
 
 The commands use the same checks: an `ArgumentError` contains a second text, which names the command's option
 instead of the function's argument.
@@ -47,7 +47,7 @@ class ArgumentError(InputError):
             name: name of the argument.
             found: unusable value, as text.
             allowed: description of the allowed values.
-            entry: name of the wrong entry, if the argument has several entries.
+            entry: name of the wrong entry if the argument has several entries.
         """
         text = f"{f': {entry}' if entry else ''}: found {found}, expected {allowed}"
         super().__init__(name + text)
@@ -146,7 +146,7 @@ def check_supports_mechanism(
 
 
 def check_one_axis_arguments(mechanism: AnyMechanism, **values: Any) -> None:
-    """Raise `ArgumentError` if the mechanism has six axes and a value is set that only one axis supports.
+    """Raise `ArgumentError` if the mechanism has six axes and an option that needs one axis is set.
 
     The keywords are the names of the arguments.
     """
@@ -181,7 +181,7 @@ def check_setting_name(compensator: str, value: Any) -> None:
 
 
 def as_list(value: Any, kinds: tuple[type, ...]) -> tuple[list[Any], bool]:
-    """Return a value as a list, and whether it was an iterable of several values.
+    """Return a value as a list, and whether it was already an iterable of values.
 
     A value of one of the types `kinds`, a mapping, or a value that is not iterable becomes a list of one
     entry.

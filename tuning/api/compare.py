@@ -1,4 +1,4 @@
-"""Function `tuning.compare`: tunes compensators, and compares them on the same fresh scenarios."""
+"""Function `tuning.compare`, which tunes compensators and compares them on the same fresh scenarios."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -58,10 +58,10 @@ class Board:
 
     Attributes:
         document: all results, as `jaxhil compare --json` prints them under `mechanisms`.
-        figures: metrics by compensator, then by the name of its gains ("literature", "tuned", or that of a
-            setting). The metrics are attributes rms, p99, worst, early, late, slope, peak [1] and more, each
-            an `ComparedMetric`.
-        gains: gains [SI units] by compensator, then by the names of `figures`, then by the gain's name.
+        figures: metrics by compensator, then by set of gains ("literature", "tuned", or the name of a
+            setting). The metrics are the attributes rms, p99, worst, early, late, slope, peak [1] and more;
+            each is a `ComparedMetric`.
+        gains: gains [SI units] by compensator, then by set of gains as in `figures`, then by the gain's name.
         winners: for each metric, the compensator that is better than all others by more than the confidence
             intervals, or None if there is no such compensator.
     """
@@ -122,7 +122,7 @@ def compare(
         compensators: names of built-in or registered compensators; by default all built-in ones. A
             compensator that has settings is evaluated with each setting instead of being tuned.
         progress: report the progress on standard error.
-        **options: OPTIONS
+        **options: see `CompareOptions`.
 
     Returns:
         A `Board` with metrics, gains and winners; for a list of mechanisms, a list of boards.
@@ -156,14 +156,14 @@ def compare_each(
     bar: terminal.Progress,
     checkpoints: "Checkpoints | None" = None,
 ) -> Iterator[Any]:
-    """Yield the metrics, or the failure, of each compensator for each mechanism, as soon as it is known.
+    """Yield the result of each compensator for each mechanism (metrics or failure) as soon as it is known.
 
     Args:
         loaded: mechanisms.
         options: options of the comparison.
         processes: number of processes; 0 for the current process.
         bar: progress display.
-        checkpoints: store of finished work, which is not repeated, and to which new work is added.
+        checkpoints: results of finished work, which is not repeated; new results are added.
 
     Yields:
         Results of `tuning.benchmark.comparison.compare_laws`.

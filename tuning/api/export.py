@@ -1,4 +1,4 @@
-"""Function `tuning.export`: writes gains as a bundle that a rig computer can check and run."""
+"""Function `tuning.export`, which writes gains as a bundle that a rig computer can check and run."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -120,7 +120,7 @@ def export(
         limits: limits of this rig by name [SI units], which replace the computed limits; a value of None
             removes a limit.
         progress: report the progress on standard error.
-        **options: OPTIONS
+        **options: see `ExportOptions`.
 
     Returns:
         The verdict with its reasons, all results, and the sizes of the files.
@@ -170,12 +170,12 @@ def export(
 
 
 def _build_document(loaded, bundle, format_names, rates) -> dict[str, Any]:
-    """Return the JSON document of the export; its path of the bundle is None."""
+    """Return the JSON document of the export, in which the path of the bundle is still missing (None)."""
     from tuning.verification.stops import describe_limit_changes
 
     stops = []
     if bundle.stop is not None:
-        # A nominal run that the limits stop in the simulation would also be stopped on the rig.
+        # If the limits stop the nominal run in the simulation, they also stop it on the rig.
         stops = [f"the nominal run is {bundle.stop.text}; {describe_limit_changes(bundle.passing)}"]
     elif bundle.ended and bundle.ended[0]:
         stops = [f"the nominal run, {bundle.ended[0]}"]
@@ -205,7 +205,8 @@ def _calibrate_limits(
 ):
     """Compute the watchdog's limits, and its rates of false and missed alarms.
 
-    `replaced` contains limits that the user set, and `allowed` the acceptable rates of both kinds of alarms.
+    `replaced` contains the limits that the user set, and `allowed` the acceptable rates of false and of
+    missed alarms.
     """
     from tuning.watchdog.calibration import DEFAULT_DRAWS, calibrate, count_stored_scenarios
     from tuning.watchdog.fault_injection import INJECTED_FAULTS, count_fault_scenarios

@@ -1,4 +1,4 @@
-"""Function `tuning.map`: computes the restitution error over two keys, and margins of the nominal point."""
+"""Function `tuning.map`, which computes the restitution error as a function of two keys, and margins."""
 
 import os
 from collections.abc import Mapping
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 
 SCHEMA = "jaxhil/map/1"
 DOCUMENT_FILE, PLOT = "map.json", "map.png"
-MAX_POINTS = 1000  # points along an axis; the number of runs is the square of this number
+MAX_POINTS = 1000  # largest number of points along an axis; the number of runs is its square
 
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """Result of `map`: restitution and its error at every point of a grid over two keys.
+    """Result of `map`: restitution and restitution error as functions of two keys, at the points of a grid.
 
     Attributes:
         document: all results, as `jaxhil map --json` prints them.
@@ -106,22 +106,22 @@ def map(
     """Compute a stability map: the restitution error as a function of two keys, with closed-form theory.
 
     The gains at every point are those of the nominal mechanism, so that the map shows the effect of changes
-    that the controller does not know. If compensator and contact law are linear, the map also contains the
+    that are unknown to the controller. If compensator and contact law are linear, the map also contains the
     spectral radius of the sampled loop in contact and, at the nominal point, its derivative with respect to
     each gain.
 
     Args:
         mechanism: a `Mechanism`, the name of a built-in mechanism, or the path of a mechanism file.
-        x: key along x, "PATH" or "PATH=LOW:HIGH" in SI units, or "gains.NAME". The default range is that of
-            the file's [uncertainty], or else 0.3 to 3 times the nominal value; for a gain, its bounds. The
-            entries of a list are scaled together, and the values along the axis are those of the first entry;
-            "contact.stiffness[1]" varies a single entry.
+        x: key along x, "PATH" or "PATH=LOW:HIGH" in SI units, or "gains.NAME". The default range is the key's
+            [uncertainty] in the file or, if there is none, 0.3 to 3 times the nominal value; for a gain, it
+            is the gain's bounds. The entries of a list are scaled together, and the values along the axis are
+            those of the first entry; "contact.stiffness[1]" varies a single entry.
         y: key along y, in the format of `x`.
         compensator: name of a compensator.
         gains: gains, in one of the forms that `jaxhil.simulate` accepts.
         folder: folder for map.json and map.png; None writes nothing.
         progress: report the progress on standard error.
-        **options: OPTIONS
+        **options: see `MapOptions`.
 
     Returns:
         The values along both axes, the errors and restitutions, and all further results.
@@ -155,7 +155,7 @@ def _compute(
     target: Path | None,
     progress: bool,
 ) -> StabilityMap:
-    """Compute the map over the keys x and y, and write it into the folder `target` unless it is None."""
+    """Compute the map as a function of the keys x and y; unless `target` is None, write it to this folder."""
     from jaxhil.simulation.gain_choice import choose_gains
     from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
     from tuning.stability_map.grid import compute_map, count_runs
@@ -180,7 +180,7 @@ def _compute(
 def _axes(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, float], x: str, y: str
 ) -> "tuple[MapAxis, MapAxis]":
-    """Build both axes of the map; raise `InputError`, which names the wrong option, if this fails."""
+    """Build both axes of the map; if this fails, raise an `InputError` that names the wrong option."""
     from jaxhil.laws.compensators import COMPENSATORS
     from tuning.stability_map.axes import check_axes, parse_axis
 

@@ -1,4 +1,4 @@
-"""Summary of a mechanism, and a check that its contacts can be simulated in reasonable time."""
+"""Summary of a mechanism, and a check that its contacts can be simulated within a reasonable time."""
 
 from collections.abc import Callable
 

@@ -31,7 +31,8 @@ class AllowedValues:
     least: float = -math.inf  # smallest number, in the unit of the option
     most: float = math.inf  # largest number, in the unit of the option
     names: tuple[str, ...] = ()  # allowed names; empty for a number
-    words: str = ""  # text for error messages; empty for a text made from `least` and `most`
+    # allowed values in words, for error messages; if empty, the text follows from `least` and `most`
+    words: str = ""
 
 
 def number_option(meaning: str):
@@ -165,8 +166,8 @@ def _check_option(name: str, value: Any, kind: Any, allowed: AllowedValues) -> N
 def add_options(options: type) -> Callable[[Function], Function]:
     """Return a decorator that adds the fields of the dataclass `options` to a function's signature.
 
-    The function must accept the fields as `**options`. In its docstring, the line `**options: OPTIONS` is
-    replaced by the help texts of the fields.
+    The function must accept the fields as `**options`. In its docstring, the help texts of the fields replace
+    the line `OPTIONS` or `**options: see ...`.
     """
 
     def decorate(function: Function) -> Function:
@@ -182,7 +183,7 @@ def add_options(options: type) -> Callable[[Function], Function]:
         function.__signature__ = signature.replace(parameters=[*first, *more])  # pyright: ignore
         lines = [_option_help(options, field.name) for field in fields]
         function.__doc__ = re.sub(
-            r" +(\*\*options: )?OPTIONS\n", lambda _: "".join(lines), function.__doc__ or ""
+            r" +(\*\*options: see `\w+`\.|OPTIONS)\n", lambda _: "".join(lines), function.__doc__ or ""
         )
         return function
 

@@ -1,4 +1,4 @@
-"""Function `tuning.report`: builds an HTML page for a review board from the results of the other commands."""
+"""Function `tuning.report`, which builds an HTML page for a review board from results of other commands."""
 
 import os
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ class Report:
     Attributes:
         html: HTML page, encoded as UTF-8.
         verdict: "good", "bad", or "unknown" if the results do not suffice for a verdict.
-        requirements: texts what, required, result, margin and verdict of each requirement.
+        requirements: for each requirement, the texts "what", "required", "result", "margin" and "verdict".
     """
 
     html: bytes
@@ -44,9 +44,9 @@ def report(
     """Build an HTML page of results: verdict, requirements, assumptions, gains, runs, errors and commands.
 
     Args:
-        results: paths of the results of `identify`, `tune`, `sweep`, `compare`, `map` and `export`, at most
-            one result of each command. A path is that of a folder or of the JSON file in the folder; for
-            `monitor`, it is that of a file with the output of `--json`.
+        results: paths of results of `identify`, `monitor`, `tune`, `sweep`, `compare`, `map` and `export`, at
+            most one per command. A path is that of the folder with the result, or of the JSON file in this
+            folder. For `monitor`, it is that of a file with the output of `jaxhil monitor --json`.
         progress: report the progress on standard error.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Function `tuning.sweep`: estimates the probability of failure, and finds the worst scenarios.
+"""Function `tuning.sweep`, which estimates the probability of failure and finds the worst scenarios.
 
 A row contains the inputs and the outcome of one scenario. The rows are written to a store
 (`tuning.sweeps.store`) in a permanent or temporary folder. All other results are in one JSON document, which
@@ -52,7 +52,7 @@ class SweepStudy:
         manifest: all inputs that determine the rows (`tuning.sweeps.manifest.Manifest`).
         folder: folder with the rows; None if the rows are only in memory.
         rows: rows in memory, one per scenario; None if the rows are in a folder.
-        unwritten: errors of files, other than the rows, that could not be written.
+        unwritten: errors for files that could not be written (other than the rows).
     """
 
     document: dict[str, Any]
@@ -105,7 +105,7 @@ class SweepStudy:
 
     @contextmanager
     def store(self) -> Iterator["SweepStore"]:
-        """Provide a store with the rows: the store in the folder, or a temporary store within the context."""
+        """Provide the store with the rows: the one in the folder, or a temporary one for rows in memory."""
         from tuning.sweeps.chunk_file import from_table
         from tuning.sweeps.store import open_store, read_store, write_chunk
 
@@ -135,9 +135,9 @@ def sweep(
 
     Args:
         gains: path of a gain file or of its folder, or a result of `tuning.tune`.
-        folder: folder for the results of the scenarios and for plots; None keeps the results in memory.
+        folder: folder for the scenarios' results and for plots; None keeps the results in memory.
         progress: report the progress on standard error.
-        **options: OPTIONS
+        **options: see `SweepOptions`.
 
     Returns:
         The failure probability with its confidence interval, the verdict, and the results of all scenarios.
@@ -233,8 +233,8 @@ def _add_studies(
 ) -> list[InputError]:
     """Add plots and additional studies to the document; if `keep`, write the document after every step.
 
-    Return the errors of files that could not be written. These errors are not raised, so that the results are
-    not lost if the disk is full.
+    Return the errors for files that could not be written. They are not raised, so that the results are not
+    lost if the disk is full.
     """
     from tuning.plots.sweep import write_plots
     from tuning.sweeps.run_sweep import compare_precisions

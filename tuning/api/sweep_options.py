@@ -22,8 +22,8 @@ from tuning.api.options import (
 )
 from tuning.sweeps import MAX_CHUNK_SIZE, MAX_SCENARIOS, MAX_SEED, PRECISIONS, SAMPLINGS
 
-MAX_SOBOL_SCENARIOS = 2**20  # scenarios for the Sobol indices of each input
-DEFAULT_SOBOL_SCENARIOS = 1024  # scenarios for the Sobol indices of each input, a power of two
+MAX_SOBOL_SCENARIOS = 2**20  # largest number of scenarios for the Sobol indices of each input
+DEFAULT_SOBOL_SCENARIOS = 1024  # number of scenarios for the Sobol indices of each input, a power of two
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +102,7 @@ class SweepOptions:
     scheduler: Scheduler = None
 
     def check(self) -> None:
-        """Raise `InputError` if an option's value, or a combination of options, is not allowed."""
+        """Raise `InputError` if the value of an option or a combination of options is not allowed."""
         check_options(self)
         if self.until_width is not None and self.sampling != "random":
             raise ArgumentError("until_width", f"sampling {self.sampling}", "sampling random")
@@ -128,5 +128,5 @@ class SweepOptions:
 
 
 def _format_value(value: Any) -> str:
-    """Return a number, or any other value of an option, as text for an error message."""
+    """Return an option's value, which may be no number, as text for an error message."""
     return str(value) if arguments.is_number(value) else format_value(value)

@@ -15,7 +15,7 @@ from tuning import terminal
 def compute_sobol_indices(
     options: Any, store, sweep, unwritten: list[InputError], progress: bool, workers: Any = None
 ) -> dict[str, Any]:
-    """Compute or read the Sobol indices of the error, and return their JSON entry.
+    """Return the JSON entry of the error's Sobol indices; compute them unless the store contains them.
 
     If the indices cannot be written to the store, the error is added to `unwritten` instead of raised.
     """
@@ -29,7 +29,7 @@ def compute_sobol_indices(
     if indices is not None:
         _report_stored("drivers", study_path(store, request), progress)
         return indices._asdict()
-    # Sensor noise is a further input, which this estimate for the progress bar ignores.
+    # This estimate, for the progress bar, ignores that sensor noise is a further input.
     total = count_evaluations(len(group_independent_inputs(sweep.mechanism)), number)
     with _study_runner(options, store, total, "scenarios", "drivers", progress, workers) as running:
         indices = compute_error_indices(sweep, number, running)
@@ -42,7 +42,7 @@ def compute_sobol_indices(
 def run_subset_simulation(
     options: Any, store, sweep, unwritten: list[InputError], progress: bool, workers: Any = None
 ) -> dict[str, Any]:
-    """Compute or read the subset simulation of rare failures, and return its JSON entry.
+    """Return the JSON entry of the subset simulation of rare failures; run it unless the store contains it.
 
     If the result cannot be written to the store, the error is added to `unwritten` instead of raised.
     """
@@ -70,7 +70,7 @@ def run_subset_simulation(
 def _study_runner(
     options: Any, store, total: int, unit: str, study: str, progress: bool, workers: Any
 ) -> Iterator[Any]:
-    """Provide the settings for running a study's scenarios: process or cluster, checkpoints, progress."""
+    """Provide the settings for running a study: this process or a cluster, checkpoints, progress report."""
     from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
     from tuning.sweeps.cluster_computers import BATCHES_PER_STUDY, build_point_computer
     from tuning.sweeps.point_batches import PointRunSettings
@@ -86,7 +86,7 @@ def _study_runner(
 
 @contextmanager
 def collect_input_errors(unwritten: list[InputError]) -> Iterator[None]:
-    """Catch an `InputError` within the context, and add it to the list `unwritten`."""
+    """Context manager: catch an `InputError` of the `with` block, and add it to the list `unwritten`."""
     try:
         yield
     except InputError as error:

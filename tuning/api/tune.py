@@ -1,4 +1,4 @@
-"""Function `tuning.tune`: tunes one compensator's gains for one or several mechanisms."""
+"""Function `tuning.tune`, which tunes one compensator's gains for one or several mechanisms."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -27,7 +27,7 @@ def tune(
 ) -> Any:
     """Tune a compensator's gains for a mechanism, and evaluate the tuned gains on fresh scenarios.
 
-    Equal arguments give gains that are equal to the last bit, also with the command `jaxhil tune`.
+    Equal arguments give gains that are equal to the last bit; so does the command `jaxhil tune`.
 
     Args:
         mechanism: result of `jaxhil.load`, or a name or path that `jaxhil.load` accepts; or a list of these,
@@ -35,10 +35,10 @@ def tune(
         compensator: name of a built-in or registered compensator; for six axes, "none", "phase_lead" or
             "phase_lead_per_axis".
         progress: report the progress on standard error.
-        **options: OPTIONS
+        **options: see `TuneOptions`.
 
-    `start` also accepts results of `tune`. `objective` also accepts a function of the metrics of all
-    scenarios that returns a number >= 0, which is minimised.
+    The option `start` also accepts results of `tune`. The option `objective` also accepts a function to
+    minimise, which gets the metrics of all scenarios and returns a number >= 0.
 
     Returns:
         A `TunedGains` with gains, errors and verdict; for a list of mechanisms, a list of `TunedGains`.
@@ -89,7 +89,7 @@ def tune_each(
         loaded: mechanisms.
         options: options of the tuning.
         bar: progress display.
-        checkpoints: store of finished work, which is not repeated, and to which new work is added.
+        checkpoints: results of finished work, which is not repeated; new results are added.
 
     Yields:
         Index into `loaded`, and tuned gains.

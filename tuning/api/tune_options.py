@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tuning.gains.settings import TuneSettings
     from tuning.gains.transfer import EarlierGains
 
-    # The command line accepts only texts; the function also accepts results of `tune`, and functions.
+    # Only texts on the command line; the function `tune` also accepts results of `tune`, and functions.
     Start = Any
     ObjectiveOption = str | Callable[[Any], Any]
 else:
@@ -80,8 +80,8 @@ class TuneOptions:
         OptionalWeight,
         text_option(
             "NUMBER",
-            "Penalty, in multiples of the limit, for each ideal peak force by which the peak command is too "
-            "high; by default 0.3 for impulse_ledger, 0 for others.",
+            "Penalty, in multiples of the limit, for a peak command of twice the ideal peak force; by "
+            "default 0.3 for impulse_ledger, 0 for others.",
         ),
     ] = None
     noise_weight: Annotated[
@@ -104,7 +104,7 @@ class TuneOptions:
         OptionalWeight,
         text_option(
             "NUMBER",
-            "Weight of the errors of the same scenarios with a push on the hardware, and with more damping; "
+            "Weight of the errors in runs of the same scenarios with a push on the hardware or more damping; "
             "by default 1 for impulse_ledger, 0 for others.",
             aliases=("--honesty-weight",),
         ),
@@ -173,7 +173,7 @@ class TuneOptions:
 
     @property
     def wants_quiet(self) -> bool:
-        """Return whether the quietest gains within the limit are wanted.
+        """Return whether the options ask for the quietest gains whose error is within the limit.
 
         This is the case if the limit is positive and finite, and all options of the objective have their
         default values.

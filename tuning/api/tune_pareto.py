@@ -1,4 +1,4 @@
-"""Pareto fronts of `tuning.tune`: gains that trade off the restitution error against another cost."""
+"""Pareto fronts of `tuning.tune`: gains that trade off the restitution error against a second cost."""
 
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
@@ -36,7 +36,7 @@ def check_pareto_options(number: Any, against: Any, compensator: str) -> None:
 
 
 def select_cost_axis(against: str | None, compensator: str) -> "ParetoCriterion | None":
-    """Return the cost to be traded off against the error, or None if the gains do not affect this cost."""
+    """Return the cost that the front trades off against the error; None if the gains do not affect it."""
     from tuning.gains.pareto_search import (
         NOISE_CRITERION,
         PARETO_CRITERIA,
@@ -65,7 +65,7 @@ def compute_fronts(
         number: number of points of a front.
         against: name of the cost; None for the compensator's default.
         bar: progress display.
-        checkpoints: store of finished work, which is not repeated, and to which new work is added.
+        checkpoints: results of finished work, which is not repeated; new results are added.
         scheduler: address of a cluster's scheduler, whose workers compute the fronts; None for this process.
 
     Yields:

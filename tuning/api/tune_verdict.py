@@ -10,7 +10,7 @@ from jaxhil.mechanism.structs import Mechanism
 if TYPE_CHECKING:
     from tuning.gains.tune import ErrorMetrics, TuneResult
 
-# Allowed share of fresh contacts whose real peak force or duration is out of the bounds (`contact_bounds`).
+# Largest allowed share of contacts whose real peak force or duration violates a bound (`contact_bounds`).
 MAX_UNLIKE_SHARE = 0.01
 
 
@@ -58,7 +58,7 @@ def _evaluated_errors(result: "TuneResult") -> list["ErrorMetrics"]:
 def command_warnings(result: "TuneResult", command: CommandMetrics) -> tuple[str, ...]:
     """Return a sentence for each metric of the force command that exceeds its bound.
 
-    The noise amplification counts only if the mechanism has sensor noise.
+    The noise amplification is considered only if the mechanism has sensor noise.
     """
     from tuning.gains.quiet_gains import MAX_NOISE_AMPLIFICATION, MAX_PEAK_RATIO
 
@@ -105,7 +105,7 @@ def describe_verdict(result: "TuneResult", limit: float) -> str:
 
 
 def _describe_real_contacts(metrics: "ErrorMetrics") -> str:
-    """Return a sentence that compares the real contacts' peak force and duration with the ideal contacts'."""
+    """Return a sentence that compares peak force and duration of the real and the ideal contacts."""
     from jaxhil.simulation.contact_bounds import MAX_DURATION_RATIO, MAX_PEAK_FORCE_RATIO, MIN_DURATION_RATIO
 
     shortest, longest = metrics.duration_ratio

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tuning.gains.pareto import ParetoFront, ParetoPoint
     from tuning.gains.tune import ErrorMetrics, TuneResult
 
-# Names of the objective's weights in files, if they differ from the names of the fields.
+# Names in files of those weights of the objective whose fields have a different name.
 NAMES_IN_FILES = {"transparency_weight": "honesty_weight"}
 
 
@@ -167,10 +167,10 @@ class TunedGains:
 
 @dataclass(frozen=True)
 class TradedGains:
-    """Gains of one point of a Pareto front between the restitution error and another cost.
+    """Gains of one point of a Pareto front that trades off the restitution error against a second cost.
 
     Attributes:
-        tuned: gains that were tuned for the least error, without regard to the other cost.
+        tuned: gains that were tuned for the least error, without regard to the second cost.
         front: the whole front (`tuning.gains.pareto.ParetoFront`).
         point: this point of the front (`tuning.gains.pareto.ParetoPoint`).
     """
@@ -193,8 +193,8 @@ class TradedGains:
     def traded(self) -> dict[str, Any]:
         """Return the JSON entry of this point: weight, cost, error [1], and whether it is on the front.
 
-        The weight is that of the cost in the tuning's objective. A point is not on the front if another point
-        has no larger error and cost, and one of them is smaller.
+        The weight is that of the cost in the objective of the tuning. A point is on the front unless another
+        point has a smaller error or cost, and does not have a larger one.
         """
         axis = self.front.axis
         return {

@@ -1,7 +1,7 @@
-"""Function `tuning.verify`: checks that the rig's runtime reproduces the simulated controller.
+"""Function `tuning.verify`, which checks that the rig's controller code reproduces the simulated controller.
 
-The checks of a bundle have three steps: compare all files with a new export, run the bundle's self-test in an
-isolated interpreter, and verify the gain file.
+For a bundle, three checks are made: all files are compared with a new export, the bundle's self-test runs in
+an isolated interpreter, and the gain file is verified.
 """
 
 import os
@@ -66,15 +66,16 @@ class VerifyOptions:
 @arguments.convert_os_errors
 @add_options(VerifyOptions)
 def verify(path: Any, *, progress: bool = False, **options: Any) -> Verification:
-    """Replay recorded signals through the rig's runtime, and compare its commands with the simulated ones.
+    """Check that the rig's controller code (runtime) returns the same force commands as the simulation.
 
-    The self-test of a bundle runs first. Code of a bundle is run only if the bundle equals, byte for byte,
-    what this version exports for the bundle's gains.
+    The runtime gets the sensor signals of simulated runs. The self-test of a bundle runs first. Code of a
+    bundle is run only if the bundle equals, byte for byte, a new export of its gains by this version of
+    jaxhil.
 
     Args:
         path: path of a bundle, of a gain file, or of the folder of a gain file; or a result of `tuning.tune`.
         progress: report the progress on standard error.
-        **options: OPTIONS
+        **options: see `VerifyOptions`.
 
     Returns:
         The verdict with its reasons, and all results.
@@ -125,7 +126,7 @@ def _verify_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: 
 
 
 def _verify_gains(gains: Any, document: dict[str, Any], scenarios: int, seed: int, progress: bool):
-    """Verify a gain file, or gains in memory; return `document` with the JSON entries of the result added."""
+    """Verify a gain file, or gains in memory; return `document` together with the result's JSON entries."""
     with jax_context():
         import msgspec
 

@@ -52,7 +52,7 @@ class Export(ExportOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Verify(VerifyOptions):
-    """Replay recorded signals through the rig's runtime, and compare its commands with the simulated ones.
+    """Check that the rig's controller code (runtime) returns the same force commands as the simulation.
 
     Example: jaxhil verify jaxhil-out/varying/gains.json
 

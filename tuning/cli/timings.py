@@ -1,6 +1,6 @@
-"""Measurement of a command's time by kind of work: imports, tracing, compilation, reading of cached programs.
+"""Measurement of a command's time by kind of work: import, tracing, compilation, reading cached programs.
 
-Overlapping time intervals, for example of a program that is traced within another one, count once.
+Overlapping time intervals count once, for example if a program is traced within another one.
 """
 
 import builtins
@@ -18,14 +18,14 @@ EVENT_KINDS = {
     "/jax/core/compile/backend_compile_duration": "compiling",
     "/jax/compilation_cache/cache_retrieval_time_sec": "reading cached programs",
 }
-# Kinds by priority: time that belongs to several kinds counts only for the first of these kinds.
+# In order of priority: time that belongs to several kinds counts only for the first of them.
 WORK_KINDS = ("importing", "reading cached programs", "compiling", "tracing")
 TimeInterval = tuple[float, float]
 
 
 @contextmanager
 def report_timings(wanted: bool) -> Iterator[None]:
-    """Measure the time spent within the context; if `wanted`, report it by kind of work on standard error."""
+    """Context manager: measure the time of the `with` block; if `wanted`, report it on standard error."""
     if not wanted:
         yield
         return

@@ -1,4 +1,4 @@
-"""Creation of a command's checkpoints (`tuning.caches.checkpoints`), and warnings about unusable ones."""
+"""Creation of a command's checkpoints (`tuning.caches.checkpoints`), and warnings of unusable ones."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
 def open_checkpoints(output: str, resume: bool) -> Checkpoints:
     """Return the checkpoints of a command whose results are written to the folder `output`.
 
-    With `resume`, checkpoints of an earlier run are used.
+    If `resume` is true, checkpoints of an earlier run are used.
     """
     return Checkpoints(Path(output) / CHECKPOINT_FOLDER, resume)
 

@@ -16,9 +16,10 @@ from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.files import open_regular, remove_stale, report_write_errors, resolve_output_path
 from tuning.cli.options import PLOT_SUFFIXES
 
-# Names that Windows reserves for devices, with any suffix; results may be copied to a Windows system.
+# Names that Windows reserves for devices, even with a suffix; results may be copied to a Windows system.
 RESERVED_NAME = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.I)
-MAX_FOLDER_NAME_BYTES = 120  # bytes; file systems allow 255, but some tools allow less
+# bytes; largest length of a folder name: file systems allow 255 bytes, but some tools allow less
+MAX_FOLDER_NAME_BYTES = 120
 MAX_NAMES_IN_MESSAGE = 3  # largest number of mechanism names listed in a message
 
 
@@ -71,11 +72,11 @@ def _is_permitted(character: str) -> bool:
 def check_earlier_results(
     document: Path, mark: str, plots: Sequence[str], mechanisms: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Check that a command would overwrite only results of an earlier run; return the earlier document.
+    """Check that a command overwrites nothing but results of an earlier run; return the earlier document.
 
     Args:
         document: path of the JSON document that the command writes.
-        mark: key by which an earlier document of this command is recognised.
+        mark: key that identifies a document of this command.
         plots: file names of the plots that the command writes to the same folder.
         mechanisms: names of the mechanisms whose earlier results may be overwritten; empty for all.
 

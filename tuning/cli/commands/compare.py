@@ -21,7 +21,7 @@ def run(options: Compare) -> int:
     """Compare the compensators, and write and print the results.
 
     After an interruption, the finished results are written and printed. With `--resume`, finished work is not
-    repeated. Return the exit code: 1 if the evaluation of a compensator failed, 130 after an interruption,
+    repeated. Return the exit code: 130 after an interruption, 1 if the evaluation of a compensator failed,
     else 0.
     """
     options.check()
@@ -82,7 +82,7 @@ def run(options: Compare) -> int:
 
 
 def _load(options: Compare) -> list[LoadedMechanism]:
-    """Load the mechanisms of the files and, with `--suites`, the standard suites."""
+    """Load the mechanisms of the files and, with `--suites`, those of the built-in sets (suites)."""
     files: list[str | None] = [*options.files, *(suite_names() if options.suites else [])]
     loaded = [load(file, options.overrides, options.unset) for file in files or [None]]
     check_distinct_names(loaded)

@@ -1,4 +1,4 @@
-"""Command `jaxhil identify`: estimates a mechanism file from a rig's logs, or checks one against them."""
+"""Command `jaxhil identify`: estimates a mechanism file from a rig's logs, or compares one with the logs."""
 
 import math
 from dataclasses import replace
@@ -29,8 +29,9 @@ PLOTS = ("bode.png", "delay.png", "contacts.png", "residuals.png", "compare.png"
 def run(options: IdentifyOptions) -> int:
     """Identify the mechanism from logs, and write and print the result.
 
-    With `--guess`, `--design` or `--check`, only draft a mapping, design rig commands or check a mechanism.
-    Return the exit code: 1 if the model does not explain the logs, else 0.
+    The options `--guess`, `--design` and `--check` replace the identification: they draft a mapping, design
+    rig commands, or check a mechanism. Return the exit code: 1 if the model does not explain the logs, else
+    0.
     """
     logs = [Path(log) for log in options.logs]
     if options.guess:
@@ -102,7 +103,7 @@ def _check_options(options: IdentifyOptions) -> None:
 def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], folder: Path) -> None:
     """Write the JSON document, then the mechanism file.
 
-    The order matters: by the document, the next run recognises that the mechanism file is an earlier result.
+    The document must be written first: it shows the next run that the mechanism file is an earlier result.
     """
     from tuning.identification.mechanism_file import to_toml
 
@@ -116,7 +117,7 @@ def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], fo
 def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) -> None:
     """Raise `InputError` if the folder contains results of other logs, which would be overwritten.
 
-    This check is needed without a prior, when all mechanisms have the same default name.
+    Without a prior, all mechanisms have the same default name, which therefore does not prevent this.
     """
     sources = earlier.get("sources")
     if not isinstance(sources, dict) or not sources or {*sources.values()} & {*campaign.sources.values()}:
@@ -196,12 +197,11 @@ def read_logs(logs: list[Path], mapping: str | None, prior: Mechanism | None) ->
 
     Args:
         logs: paths of the log files.
-        mapping: path of the TOML file with the meaning of the columns; None if the columns have the default
-            names.
+        mapping: path of the TOML file that states the meaning of the columns; None for the default names.
         prior: mechanism with values that the logs do not contain.
 
     Returns:
-        The runs of all logs, with notes on unusable parts.
+        The runs of all logs, and notes on unusable parts.
 
     Raises:
         InputError: If a log or the mapping cannot be read.
@@ -220,7 +220,7 @@ def read_logs(logs: list[Path], mapping: str | None, prior: Mechanism | None) ->
 
 
 def _select_stage(campaign: Campaign, stage: str | None) -> Campaign:
-    """Return the campaign with only the runs of the kind `stage` and the runs at rest."""
+    """Return a campaign that contains only the runs of the kind `stage` and the runs at rest."""
     if stage is None:
         return campaign
     runs = tuple(run for run in campaign.runs if run.kind in (stage, "rest"))
@@ -324,7 +324,7 @@ def _estimate_entry(estimate, prior: Mechanism | None) -> dict[str, Any]:
 
 
 def _prior_value(prior: Mechanism | None, key: str) -> float | None:
-    """Return the prior's value of a key, or None if there is none; the last entry of a list repeats."""
+    """Return the prior's value of a key, or None; a list is continued by copies of its last entry."""
     if prior is None:
         return None
     path, _, index = key.rpartition(".")
@@ -357,7 +357,7 @@ def _print(document: dict[str, Any], folder: Path | None) -> None:
 
 
 def _check_table(document: dict[str, Any], title: str) -> Any:
-    """Return the table of the model's checks, with the effect of each finding on e and e - e*."""
+    """Return the table of the checks of the model; each row shows the effect of a finding on e and e - e*."""
     rows = []
     for check in document["checks"]:
         finding = ", ".join(filter(None, (check["finding"], check["where"])))

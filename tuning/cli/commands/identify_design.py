@@ -28,9 +28,9 @@ COMPENSATOR = "response_error"
 
 
 def run(options: IdentifyOptions) -> int:
-    """Write the rig commands of a free run and a press run, and the predicted uncertainty.
+    """Write the commands for a run without contact and a run that presses the mechanism against the surface.
 
-    Return exit code 0.
+    Also write the predicted uncertainty of the estimates. Return exit code 0.
     """
     mechanisms = [*options.logs, *([options.prior] if options.prior is not None else [])]
     if len(mechanisms) != 1:

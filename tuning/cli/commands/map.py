@@ -1,4 +1,4 @@
-"""Command `jaxhil map`: computes the restitution error over two keys of a mechanism."""
+"""Command `jaxhil map`: computes the restitution error as a function of two keys of a mechanism."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
@@ -39,7 +39,7 @@ def run(options: Map) -> int:
 
 
 def _describe_map(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences on the nominal point and its margins, and on the reason if theory does not apply."""
+    """Yield sentences on the nominal point and its margins and, if theory does not apply, on the reason."""
     nominal, limit = document["nominal"], document["limit"]
     error = nominal["error"]
     if error is None:
@@ -88,7 +88,7 @@ def _describe_bounds(document: Mapping[str, Any]) -> str:
 
 
 def _describe_margins(document: Mapping[str, Any], margins: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a text for each key of the map: the range of values around the nominal one within the limit."""
+    """Yield a text for each key: the range around the nominal value with an error within the limit."""
     for axis in "xy":
         margin, values = margins[axis], document[axis]["values"]
         ends = [

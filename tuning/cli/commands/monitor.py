@@ -1,4 +1,4 @@
-"""Command `jaxhil monitor`: compares each later contact with the identified mechanism."""
+"""Command `jaxhil monitor`: compares contacts in newer logs with the identified mechanism."""
 
 from pathlib import Path
 from typing import Any

@@ -14,14 +14,15 @@ from tuning.cli.options_rig import RigOptions
 
 MAX_EMPTY_LOOP_DURATION = 30.0  # s; longest duration of the empty loop, which only exchanges packets
 EMPTY_LOOP_SHARE = 0.2  # duration of the empty loop, divided by the run's duration
-MAX_TICKS = 2_000_000  # largest number of ticks of a run
+MAX_TICKS = 2_000_000  # largest number of ticks in a run
 MAX_TABLE_ROWS = 12  # largest number of contacts in the printed table
 
 
 def run(options: RigOptions) -> int:
     """Run an empty loop, which only exchanges packets, then the controller, and print the result.
 
-    Return exit code 0 if the verdict is good, else 1. Raise KeyboardInterrupt after an interruption.
+    Return exit code 0 if the verdict is good, else 1. If the user interrupts the run, raise KeyboardInterrupt
+    after printing.
     """
     arguments.check_limit(options.limit)
     arguments.check_integers(0, seed=options.seed)
@@ -64,7 +65,7 @@ def run(options: RigOptions) -> int:
             priority=options.realtime,
         )
         session = run_session(setup, scratch, terminal.note, _LoopProgress(period).tell)
-    # The next function imports jax, which must not disturb the real-time loop.
+    # The next function imports jax, which would disturb the real-time loop if it was still running.
     references = ideal_restitutions(mechanism, session.contacts)
     result = evaluate_session(setup, session, references, options.limit, document["compensator"])
     if options.plot is not None:
@@ -103,7 +104,7 @@ def write_controller_files(compensator: str, scratch: Path) -> Path:
 
 
 def load_checked_gains(gains: Path) -> tuple[dict[str, Any], Any]:
-    """Return the document and the mechanism of a gain file, after the checks that the rig's runtime makes.
+    """Make the checks of the rig's runtime on a gain file; return the file's document and mechanism.
 
     Raise `InputError` if a check fails.
     """

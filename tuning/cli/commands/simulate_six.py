@@ -112,7 +112,7 @@ def _worst_twist_error(result: "SixAxisRun") -> float:
 
 
 def _is_unlike_ideal(result: "SixAxisRun") -> list[bool]:
-    """Return for each episode whether its peak force or duration differs too much from the ideal contact."""
+    """Return for each episode whether its force or duration differs too much from the ideal contact's."""
     from jaxhil.simulation.contact_bounds import is_contact_out_of_bounds
 
     period = result.mechanism.rig.control_period

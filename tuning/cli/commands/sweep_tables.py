@@ -144,7 +144,7 @@ def _subset_simulation_table(rare: dict[str, Any]):
 
 
 def _describe_interval_width(document: dict[str, Any]) -> list[str]:
-    """Return a list with a sentence on the interval's width, or an empty list without `--until-width`."""
+    """Return a list with a sentence on the interval's width; without `--until-width`, the list is empty."""
     width = document["until_width"]
     if width is None:
         return []

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 PLOTS = ("errors.png", "contact.png", "loss.png", "pareto.png")
 OVERVIEW_FILE = "overview.png"
-MAX_PLOTTED_MECHANISMS = 4  # up to this number, each mechanism has its own plots; more share an overview plot
+# largest number of mechanisms with plots of their own; more share an overview plot
+MAX_PLOTTED_MECHANISMS = 4
 
 
 def run(options: Tune) -> int:
@@ -46,7 +47,7 @@ def run(options: Tune) -> int:
     loaded, problems = _load(options)
     entries, interrupted = [], False
     if loaded:
-        # The folder is checked before the tuning, whose results would be lost if it could not be written.
+        # The folder is checked before tuning, because the results would be lost if it were not writable.
         _check_output(Path(options.output), [entry.mechanism for entry in loaded])
         loaded = _check_mechanisms(options, loaded, problems)
     if loaded:
@@ -73,7 +74,7 @@ def run(options: Tune) -> int:
         return 130
     if problems:
         if entries:
-            # The problems are printed again, because the first notes are far above.
+            # The problems are printed again, because their first output is far above.
             terminal.note(f"jaxhil: {len(problems)} {'problem' if len(problems) == 1 else 'problems'}:")
             for problem in problems:
                 terminal.note(f"jaxhil: {problem}")
@@ -82,7 +83,7 @@ def run(options: Tune) -> int:
 
 
 def _check_output(output: Path, mechanisms: list[AnyMechanism]) -> None:
-    """Raise `InputError` if files would be overwritten that are not results for these mechanisms.
+    """Raise `InputError` if a file that is not a result for these mechanisms would be overwritten.
 
     Print a warning if the earlier results are for a different mechanism with the same name.
     """
@@ -323,7 +324,7 @@ def _prepare_drawing(mechanism, compensator: str) -> None:
 
 
 def is_better(metrics, other) -> bool:
-    """Return whether `metrics` have fewer failed contacts than `other` or, if equally many, a smaller rms."""
+    """Return whether `metrics` has fewer failed contacts than `other` or, if equally many, a smaller rms."""
     return metrics.failed < other.failed or (metrics.failed == other.failed and metrics.rms < other.rms)
 
 
@@ -352,7 +353,7 @@ def _draw(result, options: Tune, limit: float, folder: Path) -> list[str]:
 
 
 def _verdict(entries, problems, interrupted) -> str:
-    """Return "good" if the gains of every mechanism are good, else "bad"; or why there is no verdict."""
+    """Return "good" if the gains of every mechanism are good, else "bad"; without a verdict, the reason."""
     if interrupted:
         return "interrupted"
     if problems:

@@ -123,7 +123,7 @@ def _remove_stale_points(folder: Path, number: int) -> None:
 
 
 def _is_gain_file(path: Path) -> bool:
-    # The import is local, because it loads jax, which a command with unusable options must not do.
+    # The import is local because it loads jax, which must not happen if options are unusable.
     from jaxhil.simulation.gain_file import load_gain_file
 
     try:
@@ -135,7 +135,7 @@ def _is_gain_file(path: Path) -> bool:
 
 
 def _is_rms_objective(result: Any) -> bool:
-    """Return whether the tuning minimised the plain rms error, without any weights."""
+    """Return whether tuning minimised the rms error alone, without weights or penalties."""
     objective = result.settings.objective
     weights = (
         objective.divergence_weight,
@@ -150,6 +150,6 @@ def _point_cells(result: Any, point: Any) -> list[Any]:
     """Return the table cells of a point of a front: cost, errors, and number of failed contacts."""
     metrics = point.figures
     errors = [metrics.rms] if _is_rms_objective(result) else [point.error, metrics.rms]
-    # A cost below 0.1 is an error; larger costs are amplification factors or peak ratios.
+    # A cost below 0.1 is an error and needs more digits than an amplification or a peak ratio.
     cost = f"x {point.cost:.3f}" if point.cost >= 0.1 else f"{point.cost:.4g}"
     return [cost, *errors, metrics.p99, metrics.max, metrics.failed]

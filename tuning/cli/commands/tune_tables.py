@@ -107,7 +107,7 @@ def _cells(figures: Any) -> tuple[Any, ...]:
 
 
 def _gain_tables(options: Tune, result: Any) -> list[Any]:
-    """Return a list with the table of gains; an empty one if the compensator has no gains."""
+    """Return a list with the table of gains; the list is empty if the compensator has no gains."""
     from jaxhil.laws.compensators import axes_of, get_compensator
 
     mechanism = result.mechanism
@@ -131,7 +131,7 @@ def _gain_tables(options: Tune, result: Any) -> list[Any]:
 def _describe_aim(limit: float, result: Any) -> list[str]:
     """Return a list with a sentence on the aim of the tuning, least noise or least error.
 
-    The list is empty if the options fixed the aim.
+    The list is empty if the user's options determine the aim.
     """
     if not result.settings.quiet or result.without_noise is None or not result.starts:
         return []

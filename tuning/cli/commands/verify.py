@@ -1,4 +1,4 @@
-"""Command `jaxhil verify`: checks that the rig's runtime reproduces the simulated controller."""
+"""Command `jaxhil verify`: checks that the rig's controller code reproduces the simulated controller."""
 
 from typing import Any
 
@@ -10,8 +10,8 @@ from tuning.cli.options_rig import Verify
 def run(options: Verify) -> int:
     """Verify a bundle or a gain file, and print the result.
 
-    Return exit code 0 if the runtime's commands agree with the simulated ones, and 1 if they differ or a file
-    is corrupt. Raise `InputError` for an unreadable file.
+    Return exit code 0 if the force commands agree with the simulated ones, and 1 if they differ or a file is
+    corrupt. Raise `InputError` for an unreadable file.
     """
     result = verify(
         options.path, key=options.key, scenarios=options.scenarios, seed=options.seed, progress=True
