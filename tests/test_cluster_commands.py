@@ -69,8 +69,8 @@ def test_sweep_resumes_after_interrupt_and_lost_scheduler(tmp_path):
         cluster.kill(cluster.processes[0])
         code, out, messages = result_of(process)
         assert code == 2 and out == "" and len(messages) == 1
-        assert messages[0].startswith(f"jaxhil: --scheduler: {cluster.address}: lost, ")
-        assert messages[0].endswith("; finished results are cached, continue with --resume")
+        assert messages[0].startswith(f"jaxhil: --scheduler: {cluster.address}: connection lost, ")
+        assert messages[0].endswith("; finished results are cached; continue with --resume")
     (tmp_path / "later").mkdir()
     with started(tmp_path / "later") as cluster:
         cluster.worker()
@@ -93,7 +93,7 @@ def test_bootstrap_resumes_after_lost_scheduler(jaxhil, tmp_path):
         cluster.kill(cluster.processes[0])
         code, out, messages = result_of(process)
     assert code == 2 and out == "" and len(messages) == 1
-    assert messages[0].startswith(f"jaxhil: --scheduler: {cluster.address}: lost, ")
+    assert messages[0].startswith(f"jaxhil: --scheduler: {cluster.address}: connection lost, ")
     number_finished = len([*tmp_path.glob("there/.pieces/*.piece")])
     assert 2 <= number_finished < 8 and not (tmp_path / "there" / "mechanism.toml").exists()
     process = start(*asked, "-o", "there", "--resume", folder=tmp_path)

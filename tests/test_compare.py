@@ -139,7 +139,7 @@ def literature(law):
     [
         (["--compensators", "magic"], "--compensators: found 'magic', expected none, dead_zone_observer"),
         (["no-such-file"], "no-such-file"),
-        (["varying", "varying"], "name: found varying, expected another name than in varying"),
+        (["varying", "varying"], "name: found varying, expected a name that differs from that of varying"),
         (["--judged", "1"], "--judged: found 1, expected an integer >= 2"),
         (["--scenarios", "0"], "--scenarios: found 0, expected an integer >= 1"),
         (["--limit", "nan"], "--limit: found nan, expected a number >= 0"),

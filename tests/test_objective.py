@@ -381,10 +381,10 @@ def test_objective_without_any_error_has_a_finite_derivative(name):
     "values, message",
     [
         ({"name": "mean"}, "objective: found 'mean', expected rms, cvar, worst"),
-        ({"divergence_weight": 0.0}, "objective: divergence_weight: found 0.0, expected finite numbers > 0"),
-        ({"noise_weight": -1.0}, "objective: noise_weight: found -1.0, expected finite numbers >= 0"),
-        ({"chatter_weight": -0.1}, "objective: chatter_weight: found -0.1, expected finite numbers >= 0"),
-        ({"command_weight": np.inf}, "objective: command_weight: found inf, expected finite numbers >= 0"),
+        ({"divergence_weight": 0.0}, "objective: divergence_weight: found 0.0, expected a finite number > 0"),
+        ({"noise_weight": -1.0}, "objective: noise_weight: found -1.0, expected a finite number >= 0"),
+        ({"chatter_weight": -0.1}, "objective: chatter_weight: found -0.1, expected a finite number >= 0"),
+        ({"command_weight": np.inf}, "objective: command_weight: found inf, expected a finite number >= 0"),
     ],
 )
 def test_unknown_objective_is_refused(values, message):

@@ -53,7 +53,7 @@ def test_sweep_without_scheduler_fails_in_one_line_and_writes_no_files(tmp_path)
 
 @pytest.mark.parametrize(
     ("says", "reason"),
-    ((b"", "nothing that answers within"), (b"HTTP/1.1 400 Bad", "another program answers")),
+    ((b"", "nothing answers within"), (b"HTTP/1.1 400 Bad", "another program answers")),
 )
 def test_sweep_with_unresponsive_scheduler_fails_in_one_line(monkeypatch, says, reason):
     pytest.importorskip("distributed")
@@ -86,7 +86,7 @@ def test_cluster_worker_with_other_xla_flags_reports_correct_start_command(monke
     with monkeypatch.context() as patched:
         patched.setattr("tuning.sweeps.manifest.active_xla_flags", lambda: "--others")
         asked = encode_manifest(manifest(case()))
-    with pytest.raises(InputError, match=r"start workers by: dask worker ADDRESS --preload"):
+    with pytest.raises(InputError, match=r"start workers with: dask worker ADDRESS --preload"):
         run_manifest_chunk(asked, 0)
 
 

@@ -50,7 +50,7 @@ def test_sweep_manifest_contains_interval_width_only_if_specified():
     wide = manifest(until_width=0.1)
     assert decode_manifest(encode_manifest(wide), "f") == wide and wide.until_width == 0.1
     assert list_input_differences(GOOD, wide) == ["until_width: found nothing, requested 0.1"]
-    with pytest.raises(InputError, match="until_width: found with sobol, expected with random"):
+    with pytest.raises(InputError, match="until_width: found sampling sobol, expected random"):
         manifest(until_width=0.1, sampling="sobol", scenarios=96, chunk=32)
 
 

@@ -199,7 +199,7 @@ def check_distinct_names(loaded: Sequence[LoadedMechanism]) -> None:
         name = entry.mechanism.name
         if name in labels:
             raise InputError(
-                f"{entry.label}: name: found {name}, expected another name than in {labels[name]}"
+                f"{entry.label}: name: found {name}, expected a name that differs from that of {labels[name]}"
             )
         labels[name] = entry.label
 

@@ -91,7 +91,7 @@ def describe_verdict(result: "TuneResult", limit: float) -> str:
     if failed:
         from jaxhil.simulation.scenario import MAX_CONTACT_DURATION
 
-        ended = f"did not end well, at the latest after {MAX_CONTACT_DURATION:g} s,"
+        ended = f"did not end well within {MAX_CONTACT_DURATION:g} s"
         return f"Bad: {failed} contacts {ended} with the tuned gains{where}; {command_text}."
     error = f"the tuned rms error {tuned.rms:.2g}{interval}"
     if noise_free is not None:
@@ -112,6 +112,6 @@ def _describe_real_contacts(metrics: "ErrorMetrics") -> str:
     return (
         f"Real contacts, 98 in 100: peak force up to {metrics.peak_force_ratio:.3g} times, duration "
         f"{shortest:.3g} to {longest:.3g} times the ideal contact's; {100 * metrics.unlike:.2g} % of all are "
-        f"beyond {MAX_PEAK_FORCE_RATIO:g} times or {MIN_DURATION_RATIO:g} to {MAX_DURATION_RATIO:g} "
-        f"times, limit {100 * MAX_UNLIKE_SHARE:g} %."
+        f"outside the bounds (force at most {MAX_PEAK_FORCE_RATIO:g} times, duration "
+        f"{MIN_DURATION_RATIO:g} to {MAX_DURATION_RATIO:g} times), limit {100 * MAX_UNLIKE_SHARE:g} %."
     )

@@ -85,7 +85,7 @@ async def _check_answer(address: str) -> None:
     except TypeError:
         return  # The client's configuration may contain the missing encryption settings.
     except TimeoutError:
-        raise TimeoutError(f"nothing that answers within {SCHEDULER_TIMEOUT} s") from None
+        raise TimeoutError(f"nothing answers within {SCHEDULER_TIMEOUT} s") from None
     except (MemoryError, struct.error):  # the answer does not have the format of a scheduler's greeting
         raise OSError("another program answers") from None
     await greeted.close()
@@ -195,5 +195,7 @@ def _raise_if_lost(address: str) -> Iterator[None]:
         yield
     except (CancelledError, OSError) as error:
         reason = to_one_line(str(getattr(error, "reason", None) or error) or type(error).__name__, 100)
-        advice = "finished results are cached, continue with --resume"
-        raise InputError(f"--scheduler: {to_one_line(address)}: lost, {reason}; {advice}") from None
+        advice = "finished results are cached; continue with --resume"
+        raise InputError(
+            f"--scheduler: {to_one_line(address)}: connection lost, {reason}; {advice}"
+        ) from None

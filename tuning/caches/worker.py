@@ -59,12 +59,13 @@ def check_process_setting(asked: ProcessSetting, here: ProcessSetting) -> None:
             continue
         if name == "sources_sha256":
             raise build_setting_error(
-                f"{name}: found {actual[:12]}, expected {expected[:12]} (another version of jaxhil)", False
+                f"{name}: found {actual[:12]}, expected {expected[:12]} (a different version of jaxhil)",
+                False,
             )
         raise build_setting_error(f"{name}: found {actual}, expected {expected}", name == "xla_flags")
 
 
 def build_setting_error(what: str, flags: bool) -> InputError:
     """Return the error for a worker's wrong setting; if `flags`, name the command that starts workers."""
-    advice = f"; start workers by: {PRELOAD_COMMAND}" if flags else ""
+    advice = f"; start workers with: {PRELOAD_COMMAND}" if flags else ""
     return InputError(f"--scheduler: a worker: {what}: its results would differ{advice}")

@@ -105,11 +105,11 @@ class Objective:
         for name in WEIGHT_FIELDS:
             weight, may_be_0 = getattr(self, name), name != "divergence_weight"
             if not (0 < weight < math.inf or (may_be_0 and weight == 0)):
-                allowed = f"expected finite numbers {'>=' if may_be_0 else '>'} 0"
+                allowed = f"expected a finite number {'>=' if may_be_0 else '>'} 0"
                 raise InputError(f"objective: {name}: found {format_value(weight)}, {allowed}")
         if not 0 < self.limit < math.inf:
             raise InputError(
-                f"objective: limit: found {format_value(self.limit)}, expected finite numbers > 0"
+                f"objective: limit: found {format_value(self.limit)}, expected a finite number > 0"
             )
 
     def unit(self, weight: str) -> float:

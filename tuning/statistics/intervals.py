@@ -145,7 +145,9 @@ def estimate_sequence_scenarios(probability: float, width: float, level: float =
     displays. Raise ValueError unless 0 <= probability <= 1, width > 0 and 0 < level < 1.
     """
     if not (0 <= probability <= 1 and width > 0):
-        raise ValueError(f"probability, width: found {probability}, {width}, expected 0 to 1, and above 0")
+        raise ValueError(
+            f"probability, width: found {probability}, {width}, expected probability 0 to 1, width > 0"
+        )
     numbers = np.unique(np.round(2.0 ** np.arange(0, 62.01, 0.05)))
     failures = np.round(probability * numbers)
     is_narrow = confidence_sequence(failures, numbers, level).width <= width

@@ -33,11 +33,11 @@ GOOD, BEYOND_LIMIT, UNLIKE_IDEAL, SATURATED = (
     "saturated",
 )
 UNLIKE_IDEAL_MEANING = (
-    f"a real peak force beyond {MAX_PEAK_FORCE_RATIO:g} times, or a duration beyond "
+    f"a real peak force above {MAX_PEAK_FORCE_RATIO:g} times, or a duration outside "
     f"{MIN_DURATION_RATIO:g} to {MAX_DURATION_RATIO:g} times "
     "that of the ideal contact"
 )
-SATURATED_MEANING = "a force beyond the sensor's range, or a limit of the motion simulator that bound"
+SATURATED_MEANING = "a force beyond the sensor's range, or an active limit of the motion simulator"
 CONTACT_STATUSES = tuple(CONTACT_STATUS_NAMES.values())
 # In ascending order of severity; every status of a failed run is also an outcome.
 SCENARIO_OUTCOMES = (
@@ -69,17 +69,19 @@ class ContactMetric(NamedTuple):
 
 
 CONTACT_METRICS = (
-    ContactMetric("restitution", "1", "rebound speed over approach speed"),
-    ContactMetric("reference_restitution", "1", "that of the same contact in space"),
-    ContactMetric("error", "1", "restitution less the reference's"),
+    ContactMetric("restitution", "1", "rebound speed divided by approach speed"),
+    ContactMetric("reference_restitution", "1", "restitution of the ideal contact"),
+    ContactMetric("error", "1", "restitution minus that of the ideal contact"),
     ContactMetric("peak_force", "N", "largest real contact force"),
-    ContactMetric("reference_peak_force", "N", "that of the ideal contact"),
+    ContactMetric("reference_peak_force", "N", "largest force of the ideal contact"),
     ContactMetric("peak_command", "N", "largest force on the numerical model"),
-    ContactMetric("peak_ratio", "1", "peak command over the reference's peak force"),
-    ContactMetric("position_shortfall", "m", "most that the motion simulator's limits took off its command"),
-    ContactMetric("duration", "s", "time in touch"),
-    ContactMetric("reference_duration", "s", "that of the ideal contact; infinite if it never ends"),
-    ContactMetric("approach_velocity", "m/s", "speed at which the contact was entered"),
+    ContactMetric("peak_ratio", "1", "peak command divided by the ideal contact's peak force"),
+    ContactMetric(
+        "position_shortfall", "m", "largest part of a command that the motion simulator's limits cut off"
+    ),
+    ContactMetric("duration", "s", "duration of the contact"),
+    ContactMetric("reference_duration", "s", "duration of the ideal contact; infinite if it never ends"),
+    ContactMetric("approach_velocity", "m/s", "speed at the onset of the contact"),
     ContactMetric("energy_in", "J", "kinetic energy of the numerical model before the contact"),
     ContactMetric("energy_out", "J", "kinetic energy of the numerical model after the contact"),
 )
@@ -87,12 +89,12 @@ CONTACT_METRICS = (
 EPISODE_METRICS = ("restitution", "reference_restitution", "peak_force", "reference_peak_force", "peak_ratio")
 EPISODE_METRICS = (*EPISODE_METRICS, "duration", "reference_duration", "approach_velocity")
 SIX_AXIS_ERRORS = {
-    "energy_error": "kinetic energy gained beyond that in space, over that of the approach",
-    "twist_error": "deviation of the twist from that in space, over the change there",
+    "energy_error": "gain of kinetic energy minus the ideal contact's, divided by the energy of approach",
+    "twist_error": "deviation of the twist from the ideal contact's, divided by the ideal change of the twist",
 }
 WORK_METRICS = (
     ContactMetric("work_in", "J", "work done on the mechanism by the real contact force"),
-    ContactMetric("work_out", "J", "work returned by the mechanism"),
+    ContactMetric("work_out", "J", "work that the mechanism returns"),
 )
 # Metrics that are also stored for a contact that did not end; they cover the time until the run ended.
 UNENDED_METRICS = (
@@ -139,7 +141,7 @@ def list_sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
     """Return all columns of a sweep of `mechanism`, in the order in which they are stored."""
     columns = [Column("index", "integer", "", "number of the scenario")]
     columns += [
-        Column(name, "input", find_key_unit(mechanism, path), f"{path}, drawn")
+        Column(name, "input", find_key_unit(mechanism, path), f"drawn value of {path}")
         for path in count_dimensions(mechanism)
         for name in list_input_columns(mechanism, path)
     ]
@@ -150,7 +152,7 @@ def list_sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
             Column(f"{metric.name}_{number}", "number", metric.unit, f"{run} {number}: {metric.meaning}")
             for metric in _list_stored_metrics(mechanism, works)
         ]
-        columns.append(Column(f"status_{number}", "text", "", f"{run} {number}: how it ended"))
+        columns.append(Column(f"status_{number}", "text", "", f"{run} {number}: status at its end"))
     return [
         *columns,
         Column("worst_error", "number", "1", f"the {error} of largest magnitude of all {run}s that ended"),
@@ -158,10 +160,10 @@ def list_sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
             "outcome",
             "text",
             "",
-            f"good, or why the scenario counts as failed; {UNLIKE_IDEAL}: {UNLIKE_IDEAL_MEANING}; "
+            f"good, or the reason why the scenario failed; {UNLIKE_IDEAL}: {UNLIKE_IDEAL_MEANING}; "
             f"{SATURATED}: {SATURATED_MEANING}",
         ),
-        Column("failed", "flag", "", "whether the scenario counts as failed"),
+        Column("failed", "flag", "", "whether the scenario failed"),
     ]
 
 

@@ -228,10 +228,11 @@ def _convert_document(document: Mapping[str, Any], source: str) -> Manifest:
     if computed != manifest.sha256:
         raise InputError(f"{source}: sha256: found {manifest.sha256[:12]}..., expected {computed[:12]}...")
     if manifest.until_width is not None and manifest.sampling != "random":
-        raise InputError(f"{source}: until_width: found with {manifest.sampling}, expected with random")
+        raise InputError(f"{source}: until_width: found sampling {manifest.sampling}, expected random")
     for key, inner in (("gains_sha256", "sha256"), ("mechanism_sha256", "mechanism_sha256")):
         if manifest.gain_file.get(inner) != getattr(manifest, key):
-            raise InputError(f"{source}: {key}: found another digest than in gain_file, expected the same")
+            allowed = f"{_shorten(manifest.gain_file.get(inner))}, as in gain_file"
+            raise InputError(f"{source}: {key}: found {_shorten(getattr(manifest, key))}, expected {allowed}")
     return manifest
 
 

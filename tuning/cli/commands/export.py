@@ -89,8 +89,8 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
     if document["verdict"] != "bad":
         good = document["verdict"] == "good"
         lines.append(
-            f"{'Good' if good else 'Not known to be good'}: {document['ticks']} ticks of {document['runs']} "
-            "runs recorded; the controller's forces are those simulated, "
-            f"{'wrong alarms as rare as' if good else 'wrong alarms perhaps not as rare as'} allowed."
+            f"{'Good' if good else 'Not known to be good'}: in {document['ticks']} ticks of "
+            f"{document['runs']} runs, the controller's forces equal the simulated ones; wrong alarms "
+            f"{'are as rare as required' if good else 'may be too frequent'}."
         )
     terminal.emit(*tables, *lines)

@@ -92,12 +92,12 @@ def _check_options(options: IdentifyOptions) -> None:
     if not 0.0 <= options.hold_out < 1.0:
         raise InputError(f"--hold-out: found {options.hold_out}, expected a share >= 0 and < 1")
     if options.bayes and options.prior is None:
-        raise InputError("--bayes: found no prior, expected --prior with a normal entry in [uncertainty]")
+        raise InputError(
+            "--bayes: found no prior, expected --prior with a normal distribution in [uncertainty]"
+        )
     for name in ("scheduler", "resume"):
         if getattr(options, name) and not options.bootstrap:
-            raise InputError(
-                f"--{name}: found no --bootstrap, expected --bootstrap, for whose fits --{name} is meant"
-            )
+            raise InputError(f"--{name}: found no --bootstrap, expected --bootstrap, whose fits it concerns")
 
 
 def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], folder: Path) -> None:

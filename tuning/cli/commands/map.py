@@ -71,8 +71,8 @@ def _describe_map(document: Mapping[str, Any]) -> Iterator[str]:
         factor = "" if half is None else f", by the factor {half:.4f} over half an oscillation"
         yield f"A contact that lasts {rate_text}{factor} (spectral radius {radius:.6f} a control period)."
         if growth["by_gain"]:
-            slopes = ", ".join(f"{slope:+.3g} by {name}" for name, slope in growth["by_gain"].items())
-            yield f"Derivative of the spectral radius, in SI units: {slopes}."
+            slopes = ", ".join(f"{name} {slope:+.3g}" for name, slope in growth["by_gain"].items())
+            yield f"Derivative of the spectral radius with respect to gains, in SI units: {slopes}."
         if (margins := nominal["margins"]["spectral_radius"]) is not None:
             yield from (
                 f"{text}, with a spectral radius of at most 1."

@@ -47,8 +47,8 @@ def run(options: RigOptions) -> int:
     except OSError as error:
         reason = to_one_line(error.strerror or str(error), 100)
         raise InputError(
-            f"--realtime: found no permission for real-time priority ({reason}), expected permission: run "
-            "without --realtime"
+            f"--realtime: found no permission for real-time priority ({reason}), expected this permission: "
+            "grant it, or run without --realtime"
         ) from None
 
     with tempfile.TemporaryDirectory(prefix="jaxhil-rig-") as temporary:
@@ -213,20 +213,23 @@ def _session_remarks(document: dict[str, Any], loops: dict[str, Any]) -> list[st
     if document["largest_error"] is not None:
         lines.append(f"Largest error of {document['judged']} contacts: {document['largest_error']:+.5f}.")
     lines += [
-        f"{loop['replayed']} ticks of the controller took more than their share of CPU time, and at most "
-        f"{1e6 * loop['replayed_most']:.0f} µs when the same packets were gone through again."
+        f"{loop['replayed']} ticks of the controller exceeded their CPU time; when the same packets were "
+        f"processed again, a tick took at most {1e6 * loop['replayed_most']:.0f} µs."
         for loop in loops.values()
         if loop["replayed"]
     ]
     if document["stalled"]:
         lines.append(
-            f"{document['stalled']} contacts are not judged: the machine left the controller without time "
+            f"{document['stalled']} contacts are not evaluated: the computer did not run the controller "
             "for more than three periods."
         )
     if document["resets"]:
-        lines.append(f"{len(document['resets'])} times the controller tripped over that, and was reset.")
+        lines.append(
+            f"The controller tripped {len(document['resets'])} times because of this, and was reset."
+        )
     lines += [
-        f"The machine held up the rig of the {name}: its clock stood still for {loop['stood_still']:.3g} s."
+        f"The computer stopped the simulated rig ({name}): its clock stood still for "
+        f"{loop['stood_still']:.3g} s."
         for name, loop in loops.items()
         if loop["stood_still"] > 0
     ]

@@ -99,10 +99,12 @@ def _run_ideal_contact(options: SimulateOptions, mechanism: SixAxisMechanism) ->
             episode.reference_touches,
             result.status,
         ]
-        table = terminal.build_table(f"{mechanism.name}, in space", [*headings, "status"], [row], texts=(7,))
+        table = terminal.build_table(
+            f"{mechanism.name}, ideal contact", [*headings, "status"], [row], texts=(7,)
+        )
         speed, turning = ([f"{part:.4g}" for part in result.final.twist[at : at + 3]] for at in (0, 3))
         after = f"After {result.final.time:.4g} s: velocity ({', '.join(speed)}) m/s, "
-        terminal.emit(table, after + f"angular velocity ({', '.join(turning)}) rad/s of C against T.")
+        terminal.emit(table, after + f"angular velocity ({', '.join(turning)}) rad/s of C relative to T.")
     return 0 if episode.reference_touches else 1
 
 
@@ -202,8 +204,8 @@ def _describe_twist_error(number: int, episode: "Episode") -> str:
     parts += f", rotational {episode.rotational_part:.3f}"
     space = f"{episode.reference_peak_force:.4g} N, {episode.reference_peak_moment:.3g} N m"
     space += f", {1e3 * episode.reference_duration:.4g} ms"
-    touches = f"touches: {episode.touches}, in space {episode.reference_touches}"
-    return f"Episode {number}: twist error {parts}; in space {space}; {touches}."
+    touches = f"touches: {episode.touches}, ideal contact {episode.reference_touches}"
+    return f"Episode {number}: twist error {parts}; ideal contact {space}; {touches}."
 
 
 def _verdict(limit: float, result: "SixAxisRun", good: bool) -> str:
@@ -211,7 +213,7 @@ def _verdict(limit: float, result: "SixAxisRun", good: bool) -> str:
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_SHORT_TEXT, CONTACT_BOUNDS_TEXT
 
     if result.status == "miss":
-        return "Bad: nothing touched."
+        return "Bad: the bodies did not touch."
     if result.status not in GOOD_STATUSES:
         return f"Bad: the run ended with status '{result.status}'."
     if good:
@@ -223,6 +225,6 @@ def _verdict(limit: float, result: "SixAxisRun", good: bool) -> str:
             episode.peak_force / episode.reference_peak_force,
             episode.duration / episode.reference_duration,
         )
-        reason = f"real peak force {force:.3g} times, time in touch {time:.3g} times the ideal contact's"
+        reason = f"real peak force {force:.3g} times, contact time {time:.3g} times the ideal contact's"
         return f"Bad: episode {number + 1}: {reason}, expected {CONTACT_BOUNDS_SHORT_TEXT}."
     return f"Bad: the largest twist error is {_worst_twist_error(result):.4f}, limit {limit:g}."

@@ -51,7 +51,7 @@ def _summary_lines(document: dict[str, Any]) -> list[str]:
     from tuning.sweeps.columns import UNLIKE_IDEAL, UNLIKE_IDEAL_MEANING
 
     probability, number, limit = (document[key] for key in ("failure_probability", "scenarios", "limit"))
-    within = "nothing" if limit is None else f"{limit:g}"
+    within = "infinite" if limit is None else f"{limit:g}"
     lines = [
         f"Failure probability {probability['value']:.4g}, 95 % interval {probability['low']:.3g} to "
         f"{probability['high']:.3g} ({probability['method']}); {document['failed']} of {number} failed, "
@@ -73,14 +73,14 @@ def _summary_lines(document: dict[str, Any]) -> list[str]:
     if document.get("rare", {}).get("spread_beyond_formula"):
         lines.append(
             "The replicates of the subset simulation differ far more than its formula explains: some have "
-            "missed failures, and the interval may too."
+            "missed failures, and the interval may be wrong."
         )
     if (compared := document.get("float32")) is not None:
         lines.append(
-            f"float32 beside float64 on {compared['scenarios']} scenarios: errors differ by at most "
-            f"{terminal.format_number(compared['largest_difference'], 2)}, {compared['changed_outcomes']} "
-            "outcomes "
-            f"changed, {compared['failed_float32']} and {compared['failed_float64']} failed."
+            f"float32 compared with float64 on {compared['scenarios']} scenarios: errors differ by at most "
+            f"{terminal.format_number(compared['largest_difference'], 2)}; {compared['changed_outcomes']} "
+            f"outcomes differ; {compared['failed_float32']} (float32) and {compared['failed_float64']} "
+            "(float64) scenarios failed."
         )
     if document["scenarios_per_second"]:
         lines.append(f"{document['scenarios_per_second']:.0f} scenarios per second.")

@@ -117,9 +117,9 @@ def _load(options: Tune) -> tuple[list[LoadedAnyMechanism], list[str]]:
             folder = make_folder_name(entry.mechanism.name)
             if (first_label := folders.get(folder.casefold())) is not None:
                 raise InputError(
-                    f"{entry.label}: name: found {format_value(entry.mechanism.name)}, whose results would "
-                    f"be in the folder {to_one_line(folder)}, expected a name with another folder than that "
-                    f"of {first_label} (capitals do not count)"
+                    f"{entry.label}: name: found {format_value(entry.mechanism.name)}, whose folder "
+                    f"{to_one_line(folder)} is also that of {first_label}, expected a name with a different "
+                    "folder, even without distinction of upper and lower case"
                 )
             folders[folder.casefold()] = entry.label
             loaded.append(entry)

@@ -53,7 +53,9 @@ def print_result(options: Tune, result: Any, entry: dict[str, Any]) -> None:
     closing += [f"wrote {path}" for path in (entry["gain_file"], *entry["plots"])]
     if not entry["sensor_noise"]:
         noise = "'{force=0.5,torque=0.05}'" if "energy_error" in entry else "2.67"
-        closing.append(f"No sensor noise in the mechanism; with it: --set rig.force_sensor.noise_std={noise}")
+        closing.append(
+            f"The mechanism has no sensor noise; to add noise: --set rig.force_sensor.noise_std={noise}"
+        )
     closing.append("took: " + ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items()))
     terminal.emit(
         *tables, *_describe_confidence(result), *closing, describe_verdict(result, entry["limit"]), ""
@@ -148,21 +150,21 @@ def _describe_confidence(result: Any) -> list[str]:
     lines = []
     if result.freedom:
         lines.append(
-            "Free: the share of its range by which a gain may move, alone or with the others moved along, "
-            "before the loss rises by 1 %."
+            "Free: the change of a gain, as a share of its range, that raises the loss by 1 %: alone, or "
+            "together with the other gains readjusted."
         )
     errors = sorted(start.rms for start in result.starts if math.isfinite(start.rms))
     if result.settings.probed and len(errors) > 1:
         above = 100 * (errors[-1] / errors[0] - 1)
         lines.append(
-            f"Starts: {len(errors)} of {len(result.starts)} ended, the worst {above:.1f} % above the best."
+            f"Starts: {len(errors)} of {len(result.starts)} ended; the worst is {above:.1f} % above the best."
         )
     if result.global_comparison:
         search = result.global_comparison
         lines.append(
-            f"Best of {search.evaluations} evaluations anywhere: {search.best:.4g}; tuned, with "
-            f"{search.spent}: {search.tuned:.4g}, "
-            f"{100 * abs(search.above):.1f} % {'above' if search.above > 0 else 'below'} it."
+            f"Global search with {search.evaluations} evaluations: {search.best:.4g}. Tuning with "
+            f"{search.spent} evaluations: {search.tuned:.4g}, "
+            f"{100 * abs(search.above):.1f} % {'higher' if search.above > 0 else 'lower'}."
         )
     return lines
 

@@ -38,7 +38,7 @@ def _print(document: dict[str, Any]) -> None:
     if "replay" in document:
         tables += [
             terminal.build_table(
-                f"{document['mechanism']}, {document['compensator']}: recorded runs through the runtime",
+                f"{document['mechanism']}, {document['compensator']}: runs replayed by the runtime",
                 ["run", "ticks", "compared", "near a threshold", "command range [N]", "largest difference"],
                 [
                     (
