@@ -142,7 +142,7 @@ class TuneOptions:
         check_options(self)
         arguments.check_supports_mechanism(self.compensator, None)
         if callable(self.objective) and self.pareto:
-            raise ArgumentError("objective", "a function, with pareto", "one of rms, cvar, worst")
+            raise ArgumentError("objective", "a function together with pareto", "rms, cvar or worst")
         tune_pareto.check_pareto_options(self.pareto, self.pareto_against, self.compensator)
 
     def check_mechanism(self, mechanism: AnyMechanism) -> None:

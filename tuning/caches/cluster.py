@@ -39,7 +39,7 @@ def run_on_workers(
     setting: ProcessSetting | None,
     what: str,
 ) -> Generator[tuple[Any, Any], None, None]:
-    """Connect to the scheduler at `address`, and yield from `ClusterWorkers.run`."""
+    """Connect to the scheduler at `address`, and yield the results of `ClusterWorkers.run`."""
     with connect_workers(address) as workers:
         yield from workers.run(function, pieces, setting, what)
 

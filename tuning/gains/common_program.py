@@ -45,7 +45,7 @@ class CommonProgram:
     segments: int  # largest number of segments of a contact law
     slots: int  # largest number of contacts in a run
     parts: tuple[str, ...]  # names of the optional parts of the loop that at least one mechanism needs
-    discontinuity_order: int  # order of the lowest derivative that is discontinuous at a tick
+    discontinuity_order: int  # order of the lowest derivative of the motion that is discontinuous at a tick
     ring: int  # length of the delay lines [samples]
     cells: CellCounts  # numbers of integration cells in a control period
     beforehand: bool  # whether ideal contacts without a closed form are integrated before the simulation

@@ -85,7 +85,8 @@ class MetricsFunction:
         values = np.asarray(self._vectorised(metrics), float)
         if np.any(values < 0):
             raise InputError(
-                f"objective: found {float(np.nanmin(values)):.6g}, expected {FUNCTION_REQUIREMENT}"
+                f"objective: found a function that returns {float(np.nanmin(values)):.6g}, expected "
+                f"{FUNCTION_REQUIREMENT}"
             )
         return np.where(np.isfinite(values), values, np.nan)
 

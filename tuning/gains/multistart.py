@@ -275,7 +275,8 @@ def _check_function(validation: Validation, objective: Objective) -> None:
     for value in validation.losses(objective, list(tasks), np.stack(literature))[:, 0]:
         if not np.isfinite(value):
             raise InputError(
-                f"objective: found {value:g} for the literature's gains, expected {FUNCTION_REQUIREMENT}"
+                f"objective: found a function that returns {value:g} for the literature's gains, expected "
+                f"{FUNCTION_REQUIREMENT}"
             )
 
 
@@ -287,7 +288,7 @@ def _restart_stuck_starts(
     seed: int,
     objective: Objectives,
 ) -> tuple[list[StartResult], int]:
-    """Continue from every solver result above the best value by a derivative-free search.
+    """Improve every solver result that is worse than the best one by a derivative-free search.
 
     The solver can get stuck at the kink of the objective where the compensator's correction reaches its
     limit. Return all results, and the number of evaluations of the search.

@@ -161,7 +161,8 @@ def compute_inverse_hessian(
     """Return the inverse Hessian of the objective, relative to its value, in unit coordinates.
 
     `curvature` is J^T J and `value` the objective. The inverse Hessian describes the region in which the
-    objective rises little. No eigenvalue exceeds (1/4)^2, a standard deviation of a quarter of the range.
+    objective rises little. No eigenvalue exceeds (1/4)^2, so that the standard deviation of a gain is at most
+    a quarter of its range.
     """
     # If a derivative has overflowed, the curvature is unknown and replaced by 0.
     curvature = np.where(np.all(np.isfinite(curvature)), curvature, 0.0)

@@ -1,4 +1,4 @@
-"""Amplification of the force sensor's noise by a compensator, from its gains alone."""
+"""Amplification of the force sensor's noise by a compensator, computed from the gains only."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +10,7 @@ from jaxhil.laws.simulation_base import Compensator, KnownConstants
 
 
 def has_noise_trade_off(compensator: str) -> bool:
-    """Return whether the gains of a compensator change its amplification of sensor noise."""
+    """Return whether a compensator's amplification of sensor noise depends on its gains."""
     law = COMPENSATORS.get(compensator)
     return law is not None and type(law).noise_amplification is not Compensator.noise_amplification
 

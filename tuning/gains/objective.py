@@ -12,9 +12,9 @@ multiples of the limit, that counts as much as a penalty of 1. `evaluate_objecti
 objective.
 
 Levenberg-Marquardt needs a smooth sum of squares. The residuals of `compute_residuals` therefore replace the
-metric by the norm
+metric by a norm of the errors E of all n contacts,
 
-    (sum of |E|^p / m)^(1/p)    rms: p = 2, m contacts;  cvar: p = 6, m the worst 5 %;  worst: p = 8, m = 1
+    (sum of |E|^p / m)^(1/p)    rms: p = 2, m = n;  cvar: p = 6, m = 0.05 n;  worst: p = 8, m = 1
 
 The norm equals the rms and is an upper bound of `cvar` and `worst`, since a mean of magnitudes is at most the
 p-th root of the mean of their p-th powers. A solver that linearises the exact `cvar` would ignore contacts
@@ -72,9 +72,9 @@ class Objective:
         N  max(0, A - 1) [1], where A is the amplification of the force sensor's white noise, which depends
            only on the gains (`Compensator.noise_amplification`)
 
-    C and S include the contacts of the probes. Let X be the value of one penalty (C, S or N) at the gains
-    with the least metric, and w its weight. At the minimum of J, the metric is at most sqrt(metric^2 + (w
-    limit X)^2). A weight thus costs the same multiple of the limit on every rig.
+    C and S include the contacts of the probes. Let m be the least metric of all gains, X the value of one
+    penalty (C, S or N) at these gains, and w its weight. At the minimum of J, the metric is at most sqrt(m^2
+    + (w limit X)^2). A weight thus costs the same multiple of the limit on every rig.
 
     With a `tolerance`, max(metric - tolerance, `TOLERATED_ERROR_FACTOR` metric) replaces the metric, so that
     the penalties decide between gains whose error is within the tolerance.

@@ -1,7 +1,7 @@
 """Pareto fronts of restitution error against a second criterion.
 
 The second criterion is noise amplification, the peak of the force command or transparency. Each point of a
-front is a set of gains, tuned with another weight of the second criterion in the objective
+front is a set of gains, tuned with a different weight of the second criterion in the objective
 (`Objective.noise_weight`, `command_weight` or `transparency_weight`). For example, a larger noise weight
 gives a quieter, less accurate force command.
 """

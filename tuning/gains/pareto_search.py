@@ -154,7 +154,7 @@ def _build_fitting_ladder(
 
 
 def replace_weight(objective: Objective, axis: ParetoCriterion, weight: float) -> Objective:
-    """Return the objective with a new weight [1] of the second criterion, not scaled by the limit."""
+    """Return a copy of the objective in which the second criterion has a weight of the error `weight` [1]."""
     return dataclasses.replace(objective, **{axis.weight: float(weight) / objective.unit(axis.weight)})
 
 

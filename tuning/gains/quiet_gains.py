@@ -47,7 +47,7 @@ class CommandExcess(NamedTuple):
 
 
 def is_quiet_search_needed(task: TuneTask, settings: TuneSettings) -> bool:
-    """Return whether quiet gains are requested, a sensor has noise, and the gains change its effect."""
+    """Return whether quiet gains are requested, a sensor has noise, and gains affect its amplification."""
     return (
         settings.quiet
         and isinstance(task.mechanism, Mechanism)
@@ -67,7 +67,7 @@ def build_least_error_objective(objective: Objective) -> Objective:
 
 
 def build_quiet_objective(objective: Objective, scenarios: int, accurate: CommandExcess) -> Objective:
-    """Return the objective of the search for quiet gains, scaled by the excess of the most accurate gains."""
+    """Return the objective of quiet gains, whose penalties are scaled by those of the most accurate gains."""
     return replace(
         objective,
         tolerance=compute_training_tolerance(objective.limit, scenarios),

@@ -9,8 +9,8 @@ from typing import Any
 
 from tuning.caches.checkpoints import NO_CHECKPOINTS, StepCheckpoints
 
-# Arguments: description of the current stage, completed share of all work (0 to 1), and share of all work
-# that was read from the cache (0 to 1).
+# The callback's arguments are the description of the current stage, the completed share of all work, and the
+# share of all work that was read from the cache (0 to 1).
 SearchProgressCallback = Callable[[str, float, float], None]
 
 

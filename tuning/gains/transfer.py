@@ -1,4 +1,4 @@
-"""Transfer of tuned gains to a similar mechanism, as a start of its tuning.
+"""Transfer of tuned gains to a similar mechanism, whose tuning then starts from them.
 
 `compute_mechanism_distance` measures how much two mechanisms differ, `find_nearest` selects the most similar
 tuned mechanism, and `transfer_gains` converts gains from one mechanism to another.
@@ -68,8 +68,8 @@ def compute_traits(mechanism: Mechanism) -> MechanismTraits:
     """Compute the nominal properties by which a mechanism is compared with others.
 
     The contact frequencies of a nonlinear law are those of the linear contact with the same peak force
-    (`validity_envelope`). The damping ratio is b/(2 sqrt(k M)), or for the law of Hunt and Crossley chi v/pi,
-    which follows from e = 1 - chi v.
+    (`validity_envelope`). The damping ratio is b/(2 sqrt(k M)). For the law of Hunt and Crossley, it is chi
+    v/pi with the law's damping parameter chi, since e = 1 - chi v.
     """
     nominal = build_scenarios(mechanism)
     frequency = validity_envelope(mechanism, nominal)["contact_frequency"]

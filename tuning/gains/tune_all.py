@@ -46,7 +46,7 @@ class _TuneGroup(NamedTuple):
 
 
 class _CachedResult(NamedTuple):
-    """Fields of a `TuneResult` that are cached, with outcomes as arrays; the inputs determine the others."""
+    """Cached fields of a `TuneResult`, with outcomes as arrays; the other fields follow from the inputs."""
 
     gains: dict[str, float]
     figures: dict[str, ErrorMetrics]
@@ -79,7 +79,7 @@ def tune_all(
     pieces: Checkpoints = NO_CHECKPOINTS,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, TuneResult]]:
-    """Tune the gains of `compensator` for many mechanisms; yield (index, result) when a mechanism is done.
+    """Tune the gains of `compensator` for many mechanisms; yield (index, result) of each finished mechanism.
 
     Mechanisms that share a program are tuned together; a `common` program lets different kinds of mechanisms
     share one. The tuned gains of the most similar mechanism in `tuned` are a start of each mechanism. In all

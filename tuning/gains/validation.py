@@ -227,7 +227,7 @@ def _keep_contact_terms(outcome: Any) -> Any:
 def _place_training_scenarios(
     model: RigModel, training: Any, which: tuple[int, ...], points: int, number: int, lanes: int
 ) -> tuple[Any, Batch]:
-    """Repeat the first training scenarios of each task for each point; return them on host and devices."""
+    """Repeat the first training scenarios of each task for each point; return copies for host and devices."""
 
     def side_by_side(leaf):
         picked = np.moveaxis(leaf[np.repeat(which, points)][..., :number], 0, -2)
@@ -273,7 +273,7 @@ def count_evaluated_runs(scenarios: int, probed: bool) -> int:
 
 
 def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
-    """Split an outcome into that of the fresh scenarios and that of the nominal run, its last lane."""
+    """Split an outcome into the outcomes of the fresh scenarios and of the nominal run (the last lane)."""
     fresh, nominal = (
         jax.tree.map(lambda leaf, part=part: leaf[..., part], outcome)
         for part in (slice(-1), slice(-1, None))
@@ -290,7 +290,7 @@ def draw_fresh_scenarios(task: TuneTask, number: int, seed: int) -> Any:
 def _draw_evaluation_lanes(
     task: TuneTask, number: int, seed: int
 ) -> tuple[Any, ProbedScenarios | None, Any, Any]:
-    """Return a task's fresh scenarios, those with probes or None, all scenarios to evaluate, and the loop."""
+    """Return a task's fresh scenarios, with probes (else None), with all lanes to evaluate, and the loop."""
     drawn = draw(task.mechanism, number, seed)
     fresh, probed = task.model.scenarios(task.mechanism, drawn, seed), None
     if task.probed and isinstance(task.mechanism, Mechanism):

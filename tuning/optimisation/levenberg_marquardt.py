@@ -228,8 +228,8 @@ class _BoxedLevenbergMarquardt(optx.AbstractGaussNewton):
     def __init__(self, rtol: float, atol: float):
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = _BoxedDescent()
-        # The trust region grows if the decrease is 0.75 of the predicted one; the default condition is never
-        # met.
+        # The trust region grows if the decrease is at least 0.75 of the predicted one; the default condition
+        # is never met.
         self.search = optx.ClassicalTrustRegion(0.75, 1e-3, 3.0, 0.25)
         self.verbose = lambda **_: None
 

@@ -1,6 +1,7 @@
 """Monte Carlo sweeps: many random scenarios, computed in chunks, and stored so that a sweep can resume.
 
-This module defines the allowed values of options without importing JAX, because options configure JAX.
+This module defines the allowed values of options. It does not import JAX, because some options configure JAX
+before it is imported.
 """
 
 SAMPLINGS = ("random", "sobol")

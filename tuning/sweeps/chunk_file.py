@@ -146,7 +146,7 @@ def from_table(manifest: Manifest, table: Any) -> dict[str, np.ndarray]:
     for column in manifest.columns:
         array = table.column(column.name).combine_chunks()
         if column.kind == "text":
-            # Arrow may return the dictionary's texts in another order.
+            # Arrow may return the dictionary's texts in a different order.
             indices = {text: index for index, text in enumerate(list_allowed_texts(column.name))}
             translated = np.array([indices[text.as_py()] for text in array.dictionary], np.int8)
             rows[column.name] = translated[array.indices.to_numpy(zero_copy_only=False)]

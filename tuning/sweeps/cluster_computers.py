@@ -16,7 +16,7 @@ BATCHES_PER_STUDY = 64  # number of batches of a study's points, for any number 
 
 
 def build_chunk_computer(workers: ClusterWorkers) -> ChunkComputer:
-    """Return a function that computes chunks of a sweep on these workers."""
+    """Return a function that computes chunks of a sweep on `workers`."""
 
     def run(sweep: SweepProgram, parts: Iterable[int]) -> Generator[tuple[int, Rows], None, None]:
         content = encode_manifest(sweep.manifest)
@@ -28,7 +28,7 @@ def build_chunk_computer(workers: ClusterWorkers) -> ChunkComputer:
 
 
 def build_point_computer(workers: ClusterWorkers) -> point_batches.PointComputer:
-    """Return a function that computes batches of scenarios at given points on these workers."""
+    """Return a function that computes batches of scenarios at given points on `workers`."""
 
     def run(
         sweep: SweepProgram, batches: Iterable[point_batches.PointBatch]

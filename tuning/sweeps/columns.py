@@ -90,7 +90,7 @@ EPISODE_METRICS = ("restitution", "reference_restitution", "peak_force", "refere
 EPISODE_METRICS = (*EPISODE_METRICS, "duration", "reference_duration", "approach_velocity")
 SIX_AXIS_ERRORS = {
     "energy_error": "gain of kinetic energy minus the ideal contact's, divided by the energy of approach",
-    "twist_error": "deviation of the twist from the ideal contact's, divided by the ideal change of the twist",
+    "twist_error": "deviation of the twist from the ideal contact's, divided by the ideal change of twist",
 }
 WORK_METRICS = (
     ContactMetric("work_in", "J", "work done on the mechanism by the real contact force"),

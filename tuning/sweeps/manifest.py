@@ -96,7 +96,7 @@ class ManifestOptions(NamedTuple):
 def build_manifest(loaded: LoadedGains, choices: ManifestOptions) -> Manifest:
     """Build the manifest of a sweep from a loaded gain file; raise `InputError` if an option is invalid."""
     if choices.sampling == "sobol" and choices.scenarios < SOBOL_REPLICATES:
-        allowed = f"{SOBOL_REPLICATES} or more, the replicates of sobol sampling"
+        allowed = f"{SOBOL_REPLICATES} or more: one for each replicate of sobol sampling"
         raise InputError(f"--scenarios: found {choices.scenarios}, expected {allowed}")
     document = {
         "schema": MANIFEST_SCHEMA,
@@ -124,7 +124,7 @@ def encode_manifest(manifest: Manifest) -> bytes:
 
 
 def decode_manifest(content: bytes, source: str) -> Manifest:
-    """Parse the content of a manifest file; raise `InputError`, with the name `source`, if it is invalid."""
+    """Parse the content of the manifest file `source`; raise `InputError` if it is invalid."""
     try:
         document = json.loads(content.decode("utf-8"), parse_constant=_reject_constant)
     except (ValueError, RecursionError) as error:

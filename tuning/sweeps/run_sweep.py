@@ -31,8 +31,8 @@ ChunkComputer = Callable[[SweepProgram, Iterable[int]], Generator[tuple[int, Row
 class PrecisionComparison(NamedTuple):
     """Comparison of float32 with float64 results on the first scenarios of a sweep.
 
-    Differences are magnitudes, over all contacts that ended in both precisions; None if there is no such
-    contact.
+    The differences are magnitudes, from all contacts that ended in both precisions; they are None if there is
+    no such contact.
     """
 
     scenarios: int  # number of compared scenarios

@@ -45,7 +45,7 @@ from tuning.sweeps.manifest import (
 )
 
 CHUNK_FOLDER = "parts"
-PLOTS = ("errors.png", "failures.png", "convergence.png")  # plots made from the rows
+PLOTS = ("errors.png", "failures.png", "convergence.png")  # plots of the rows
 STUDY_FOLDER = "studies"
 VERDICT_FILE = "verdict.json"
 LOCK_FILE = ".lock"
@@ -69,8 +69,8 @@ def open_store(folder: Path, manifest: Manifest, resume: bool) -> SweepStore:
     Remove temporary files of an interrupted run.
 
     Raises:
-        InputError: the folder holds a store but `resume` is false, the store comes from other inputs or other
-            code, the folder holds other files, or the folder cannot be written.
+        InputError: If the folder holds a store but `resume` is false, if the store comes from other inputs or
+            other code, if the folder holds other files, or if the folder cannot be written.
     """
     where = to_one_line(str(folder))
     exists = _is_store(folder)
@@ -102,7 +102,7 @@ def read_store(folder: Path) -> SweepStore:
 
 @contextmanager
 def lock_store(folder: Path) -> Iterator[None]:
-    """Lock the store in `folder` against other writing processes, during a `with` block.
+    """Context manager: lock the store in `folder`, so that no other process writes to it.
 
     Raise `InputError` if another process holds the lock, or if the folder holds files other than a store's.
     """

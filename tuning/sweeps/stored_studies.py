@@ -2,10 +2,10 @@
 
     DIR/studies/drivers-1024.json, rare-0.04-10x1000.json, ...
 
-The sweep's manifest and a few arguments determine a study's result to the bit. The file of a study (`schema =
-"jaxhil/study/1"`) holds these arguments, the manifest's digest, the result and a digest of its own content. A
-file that is damaged or from another sweep is ignored, so that the study runs again. JSON cannot store
-infinity and NaN. A field can have at most one of these two values, which is stored as null.
+The sweep's manifest and a few arguments determine a study's result to the last bit. The file of a study
+(`schema = "jaxhil/study/1"`) holds these arguments, the manifest's digest, the result and a digest of its own
+content. A file that is damaged or from another sweep is ignored, so that the study runs again. JSON cannot
+store infinity and NaN. A field can have at most one of these two values, which is stored as null.
 """
 
 import json

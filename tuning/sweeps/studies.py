@@ -60,8 +60,8 @@ def compute_error_indices(
 ) -> ErrorIndices:
     """Compute Sobol indices of the worst |error| from `number` * (inputs + 2) scenarios.
 
-    `number` is a power of two. Each uncertain key of the mechanism file is one input, with all entries of a
-    list. Correlated keys are one input, since the indices assume independent inputs. The phases of all
+    `number` is a power of two. Each uncertain key of the mechanism file, even a list, is one input.
+    Correlated keys are one input together, because the indices assume independent inputs. The phases of all
     contacts are one input. Sensor noise is also one input; its realisations in matrix B of the design differ
     from those in matrix A. A run whose |error| exceeds the cap, or that has no error, counts as the cap, so
     that a few diverging runs do not dominate the variance.

@@ -67,7 +67,7 @@ class ProbabilityEstimate(NamedTuple):
 
 
 class QuantileEstimate(NamedTuple):
-    """Quantile of |error| over the scenarios, with a 95 % interval."""
+    """Quantile of the |error| of all scenarios, with a 95 % interval."""
 
     order: float  # share of the scenarios that do not exceed the quantile [1]
     value: float  # estimate [1]

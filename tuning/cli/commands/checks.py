@@ -103,7 +103,7 @@ def check_earlier_results(
         others = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
         raise InputError(
             f"{where}: found results of mechanism {format_value(lost[0])}{others}, expected results of "
-            f"{allowed} or none: choose another folder by --output, or rename the mechanism"
+            f"{allowed} or none: choose another folder with --output, or rename the mechanism"
         )
     return earlier
 
