@@ -103,7 +103,7 @@ def map(
     progress: bool = False,
     **options: Any,
 ) -> StabilityMap:
-    """Compute a stability map: the restitution error as a function of two keys, with closed-form theory.
+    """Compute a stability map: the restitution error as a function of two keys, and closed-form predictions.
 
     The gains at every point are those of the nominal mechanism, so that the map shows the effect of changes
     that are unknown to the controller. If compensator and contact law are linear, the map also contains the

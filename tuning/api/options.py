@@ -1,4 +1,4 @@
-"""Options that commands and public functions share: type, allowed values, default and help.
+"""Options that commands and public functions share: their types, allowed values, defaults and help texts.
 
 Each command has a frozen dataclass that defines its options. tyro turns the fields into options of the
 command line, the decorator `add_options` turns them into keyword arguments of the Python function, and

@@ -24,7 +24,7 @@ AXIS_METAVAR = "PATH[=LOW:HIGH]"
 
 @dataclass(frozen=True, kw_only=True)
 class Map(MapOptions):
-    """Compute a stability map: the restitution error as a function of two keys, with closed-form theory.
+    """Compute a stability map: the restitution error as a function of two keys, and closed-form predictions.
 
     Example: jaxhil map rig-300kg --x contact.stiffness=5e4:5e5 --y rig.force_sensor.delay
 

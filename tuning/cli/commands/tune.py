@@ -353,7 +353,7 @@ def _draw(result, options: Tune, limit: float, folder: Path) -> list[str]:
 
 
 def _verdict(entries, problems, interrupted) -> str:
-    """Return "good" if the gains of every mechanism are good, else "bad"; without a verdict, the reason."""
+    """Return "good" if the gains of every mechanism are good, else "bad", or why there is no verdict."""
     if interrupted:
         return "interrupted"
     if problems:
