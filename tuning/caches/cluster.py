@@ -37,11 +37,11 @@ def run_on_workers(
     function: Callable[..., Any],
     pieces: Iterable[WorkUnit],
     setting: ProcessSetting | None,
-    what: str,
+    label: str,
 ) -> Generator[tuple[Any, Any], None, None]:
     """Connect to the scheduler at `address`, and yield the results of `ClusterWorkers.run`."""
     with connect_workers(address) as workers:
-        yield from workers.run(function, pieces, setting, what)
+        yield from workers.run(function, pieces, setting, label)
 
 
 @contextmanager
@@ -116,11 +116,11 @@ class ClusterWorkers:
         function: Callable[..., Any],
         pieces: Iterable[WorkUnit],
         setting: ProcessSetting | None,
-        what: str,
+        label: str,
     ) -> Generator[tuple[Any, Any], None, None]:
         """Call `function` for every work unit on the workers; yield (name, result) of each finished unit.
 
-        Workers can join later. `function` must be defined at the top level of a module. `what` is a unique
+        Workers can join later. `function` must be defined at the top level of a module. `label` is a unique
         name of this work. Unless `setting` is None, every worker must have the same code, package versions
         and XLA flags as `setting`. Raise `InputError` if a worker does not, or if the connection to the
         scheduler is lost.
@@ -136,7 +136,7 @@ class ClusterWorkers:
                     # The worker unpickles the content after setting the flags of JAX, because unpickling can
                     # import JAX.
                     content = dumps((function, unit.arguments))
-                    key = f"jaxhil-{what}-{unit.name}"
+                    key = f"jaxhil-{label}-{unit.name}"
                     future = client.submit(run_pickled_call, content, setting, key=key, pure=False)
                     running[future] = unit
                     future.add_done_callback(ended.put)

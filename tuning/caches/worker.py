@@ -65,7 +65,7 @@ def check_process_setting(asked: ProcessSetting, here: ProcessSetting) -> None:
         raise build_setting_error(f"{name}: found {actual}, expected {expected}", name == "xla_flags")
 
 
-def build_setting_error(what: str, flags: bool) -> InputError:
+def build_setting_error(difference: str, flags: bool) -> InputError:
     """Return the error for a worker's wrong setting; if `flags`, name the command that starts workers."""
     advice = f"; start workers with: {PRELOAD_COMMAND}" if flags else ""
-    return InputError(f"--scheduler: a worker: {what}: its results would differ{advice}")
+    return InputError(f"--scheduler: a worker: {difference}: its results would differ{advice}")

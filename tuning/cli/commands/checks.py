@@ -117,7 +117,7 @@ def mechanism_names(document: Mapping[str, Any]) -> set[str]:
 
 
 def _read_document(document: Path) -> dict[str, Any]:
-    """Return the JSON object in a file, or an empty dictionary if the file has none or is unreadable."""
+    """Return the JSON object in a file; an empty dictionary if the file contains none or cannot be read."""
     try:
         with open_regular(document) as opened:
             content = json.loads(opened.read())

@@ -62,7 +62,7 @@ def load_six_axis_mechanism(options: SimulateOptions) -> SixAxisMechanism | None
 
 
 def _check_uses_file(options: SimulateOptions | Map) -> bool:
-    """Check the compensator's name; return True if the mechanism is FILE's, False if the gain file's."""
+    """Check the compensator's name; return True if FILE names the mechanism, False if the gain file does."""
     if options.compensator is not None:
         arguments.check_compensators([options.compensator])
     return options.gains is None or options.file is not None

@@ -35,7 +35,7 @@ def run(options: Export) -> int:
 
 
 def _parse_limits(settings: tuple[str, ...]) -> dict[str, float | None]:
-    """Parse texts LIMIT=VALUE to limits by name, None for no limit; raise `InputError` for wrong texts."""
+    """Return limits by name (None: no limit) from texts LIMIT=VALUE; raise `InputError` for wrong texts."""
     replaced: dict[str, float | None] = {}
     for words in settings:
         name, _, text = words.partition("=")

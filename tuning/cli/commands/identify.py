@@ -117,7 +117,7 @@ def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], fo
 def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) -> None:
     """Raise `InputError` if the folder contains results of other logs, which would be overwritten.
 
-    Without a prior, all mechanisms have the same default name, which therefore does not prevent this.
+    Without a prior, all mechanisms have the same default name, so that a comparison of names is not enough.
     """
     sources = earlier.get("sources")
     if not isinstance(sources, dict) or not sources or {*sources.values()} & {*campaign.sources.values()}:
@@ -357,7 +357,7 @@ def _print(document: dict[str, Any], folder: Path | None) -> None:
 
 
 def _check_table(document: dict[str, Any], title: str) -> Any:
-    """Return the table of the checks of the model; each row shows the effect of a finding on e and e - e*."""
+    """Return the table of the model's checks; a row shows what was found and its effect on e and e - e*."""
     rows = []
     for check in document["checks"]:
         finding = ", ".join(filter(None, (check["finding"], check["where"])))
