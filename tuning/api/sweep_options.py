@@ -128,5 +128,5 @@ class SweepOptions:
 
 
 def _format_value(value: Any) -> str:
-    """Return an option's value, which may be no number, as text for an error message."""
+    """Return an option's value, which may not be a number, as text for an error message."""
     return str(value) if arguments.is_number(value) else format_value(value)

@@ -48,7 +48,7 @@ NONSMOOTH_POLISH_FACTOR = 3
 MAX_START_BATCHES = 4  # largest number of batches of starts
 MIN_AGREEING_STARTS = 3  # starts that must reach the best value; two can reach the same poor minimum
 AGREEMENT_TOLERANCE = 0.005  # largest relative difference between values of the same minimum
-# The same for scenarios with probes, whose objective varies more between different draws of scenarios.
+# The same with probes, for which the objective varies more between different draws of the scenarios.
 PROBED_AGREEMENT_TOLERANCE = 0.02
 # derivative-free search from a stuck start: generations, initial standard deviation in unit coordinates
 RESTART_GENERATIONS, RESTART_STD = 24, 0.2
@@ -103,7 +103,8 @@ def find_gains(
                 validation, i, search.starts, agreed, settings.seed, objective
             )
             search.evaluations += more
-    # With probes, if the starts agree, a different draw of scenarios changes the value more than polishing.
+    # With probes, if the starts agree, polishing changes the value less than a different draw of scenarios
+    # would.
     polishing = 0 if probed and not unfinished else settings.polish * len(validation.names)
     if objective.function is not None:
         # A user's function may have many kinks, for example if it is the maximum of several metrics.

@@ -253,7 +253,7 @@ def weight_residuals(
     errors by a single residual.
     """
 
-    # A problem that only fills a call has no contact; a count of 1 avoids a division by 0.
+    # A copy of a problem that only fills a call has no contact; a count of 1 avoids a division by 0.
     def counted(mask):
         return jnp.maximum(jnp.sum(mask, axis=1, dtype=jnp.int32), 1)[:, None]
 

@@ -48,7 +48,7 @@ class TuneTask:
     literature: dict[str, float]
     scenarios: Any  # training scenarios
     loop: Any  # static properties of the simulated loop
-    common: CommonProgram | None = None  # program shared with mechanisms of another kind, or None
+    common: CommonProgram | None = None  # program shared with mechanisms of a different kind, or None
     probed: bool = False  # whether each scenario includes transparency probes
 
     @property
@@ -218,7 +218,8 @@ def _compute_time_limit(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*
     velocity = jnp.broadcast_to(scenarios.velocity, shape)
     reference = law.reference(parameters_by_slot(scenarios.contact), mass, velocity)
     longest = TIME_LIMIT_FACTOR * jnp.max(reference.duration, axis=0) + TIME_LIMIT_OFFSET
-    # A noisy command does not decay, so that a contact ends later, after the longest wait for its decay.
+    # With noise, the command does not decay, so that a contact ends only after the longest wait for its
+    # decay.
     sensor = scenarios.force_sensor
     longest = longest + jnp.where((sensor.noise_std != 0) | (sensor.bias != 0), MAX_DECAY_WAIT, 0.0)
     return jnp.minimum(longest, scenarios.time_limit)

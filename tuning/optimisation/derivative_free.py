@@ -214,7 +214,7 @@ def _make_first_generation(start, reach, covariance) -> _Generation:
     gains = start.shape[-1]
     shape = np.broadcast_to(np.eye(gains), (*start.shape[:-1], gains, gains))
     if covariance is not None:
-        # The mean variance is scaled to 1, so that the spread is `reach` on average over the gains.
+        # The mean variance of all gains is scaled to 1, so that `reach` is their root mean square spread.
         average = np.trace(covariance, axis1=-2, axis2=-1) / gains
         shape = np.broadcast_to(covariance / average[..., None, None], shape.shape)
     root, inverse_root = _compute_square_roots(shape)

@@ -19,7 +19,7 @@ from tuning.sweeps.columns import build_rows
 MIN_POINTS_PER_BATCH = 256  # smallest number of points per batch if there are several batches
 POINT_COLUMNS = ("outcome", "worst_error")
 
-CountCallback = Callable[[int], None]  # called with a number of scenarios
+CountCallback = Callable[[int], None]  # callback that gets a number of scenarios
 
 
 class PointBatch(NamedTuple):

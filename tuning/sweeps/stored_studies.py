@@ -24,7 +24,7 @@ from tuning.sweeps.store import STUDY_FOLDER, SweepStore
 from tuning.sweeps.studies import SUBSET_REPLICATES, SUBSET_SAMPLES, ErrorIndices, InputIndices
 
 STUDY_SCHEMA = "jaxhil/study/1"
-# non-finite number that null stands for, by record and, for fields that differ from their record, by field
+# non-finite number that null stands for: by record, or by field if a field differs from its record
 NULL_VALUES: dict[Any, float | None] = {
     InputIndices: math.nan,
     ErrorIndices: None,
