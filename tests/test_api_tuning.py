@@ -132,7 +132,7 @@ def test_user_objective_receives_contacts_and_scenarios():
     ("objective", "words"),
     [
         (lambda metrics: metrics.error, "shape"),
-        (lambda metrics: -2.0 + 0 * jnp.max(metrics.error), "found -2,"),
+        (lambda metrics: -2.0 + 0 * jnp.max(metrics.error), "returns -2,"),
         (lambda metrics: jnp.nan * jnp.max(metrics.error), "nan"),
         (lambda metrics: jnp.max(metrics.speed), "AttributeError"),
         (lambda metrics: None, "NoneType"),

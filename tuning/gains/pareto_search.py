@@ -85,8 +85,8 @@ class _LadderCandidate(NamedTuple):
 
     gains: dict[str, float]
     error: float  # objective J without the second criterion's term [1]
-    # term of the second criterion for a weight of 1 [1]: max(0, A - 1), or the rms of the excess peak
-    # commands or of the probes' errors
+    # term of the second criterion for a weight of 1 [1]: the noise amplification minus 1 (at least 0), the
+    # rms of the excess peak commands, or the rms of the probes' errors
     excess: float
 
     def value(self, weight: float) -> float:
