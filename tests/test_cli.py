@@ -112,7 +112,7 @@ def test_tune_command_reports_tables_or_json(jaxhil, table, tmp_path):
     tuned, code, out, err = table
     assert code == 1 and out.startswith("rig-300kg: equivalent mass 300 kg; contact at 3 Hz, ")
     words = ("before", "literature", "tuned", "rms", "99th", "chatter", "lead_filter", "step limit")
-    for word in (*words, "exceeds 0.01", "No sensor noise"):
+    for word in (*words, "exceeds 0.01", "no sensor noise"):
         assert word in out
     assert "evaluating on 16 fresh scenarios" in err
     arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
