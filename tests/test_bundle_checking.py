@@ -302,7 +302,7 @@ def test_write_bundle_keeps_file_added_during_replacement(files, folder, monkeyp
         exchange_names(new, target)
 
     monkeypatch.setattr("tuning.bundle.bundle.exchange_names", late)
-    with pytest.raises(InputError, match=r"thesis\.txt: is no file of this bundle"):
+    with pytest.raises(InputError, match=r"thesis\.txt: is not a file of this bundle"):
         write_bundle(folder, {"manifest.json": b"another"})
     assert (folder / "thesis.txt").read_text() == "years of work"
     assert (folder / "manifest.json").read_bytes() == files["manifest.json"]

@@ -225,7 +225,7 @@ def test_export_leaves_third_party_folder_unchanged(jaxhil, gains, tmp_path):
     refused(jaxhil("export", gains, "-o", folder), "mine", "'thesis.txt' and no bundle")
     refused(jaxhil("export", gains, "-o", folder / "thesis.txt"), "thesis.txt", "found a file")
     placed(folder)
-    refused(jaxhil("export", gains, "-o", folder), "thesis.txt: is no file of this bundle")
+    refused(jaxhil("export", gains, "-o", folder), "thesis.txt: is not a file of this bundle")
     (folder / "thesis.txt").unlink()
     check_bundle_folder(folder)
     for name in ("manifest.json", "README.md"):

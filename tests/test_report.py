@@ -116,7 +116,7 @@ def test_report_verdict_follows_from_all_requirements(put):
         (write_identification() | {"effect": 0.0}, "the file was changed"),
         (write_identification(estimates=[{"key": 1}]), "Expected `str`, got `int` - at `$.estimates[0].key`"),
         (write_identification(schema="other/1"), "found the schema 'other/1'"),
-        (signed(write_map() | {"error": [[0.0]]}), "a table whose shape differs from its axes"),
+        (signed(write_map() | {"error": [[0.0]]}), "a table that does not match its axes"),
         ({"some": "thing"}, "no schema of jaxhil"),
         ([1, 2], "found no JSON object"),
         ('{"schema": NaN}', "found no JSON"),

@@ -258,7 +258,7 @@ def test_self_test_names_surplus_and_missing_files(files, folder):
     os.unlink(folder / "summary.html")
     good, out = run_selftest(folder)
     assert not good and out.count("FAIL  ") == 2
-    assert "FAIL  other/: is no file of this bundle" in out
+    assert "FAIL  other/: is not a file of this bundle" in out
     assert "note  __pycache__/: contains compiled code, which is not checked" in out
     assert "FAIL  summary.html: cannot be read: No such file or directory" in out
 

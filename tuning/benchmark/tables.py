@@ -31,14 +31,15 @@ WINNER_MARK = "*"  # marks the metric of a compensator that is significantly bet
 def find_winners(results: Sequence[LawMetrics], which: str = TUNED_GAINS) -> dict[str, str | None]:
     """Return for each metric the compensator that is significantly the best on one mechanism, or None.
 
-    Each compensator is compared with the gains `which` or, without them, with the gains of the literature.
+    The metrics of a compensator are those with the gains `which` or, if it lacks these gains, with the gains
+    of the literature.
     """
     by_law = {result.law: choose_best_metrics(result, which) for result in results}
     return {name: find_winner(name, {law: m[name] for law, m in by_law.items()}) for name in METRIC_HEADINGS}
 
 
 def choose_best_metrics(result: LawMetrics, which: str = TUNED_GAINS) -> dict[str, IntervalEstimate]:
-    """Return the metrics for the gains `which` or, without them, for the gains of the literature."""
+    """Return the metrics with the gains `which` or, if there are none, with the literature's gains."""
     return result.figures.get(which) or result.figures[LITERATURE_GAINS]
 
 

@@ -37,10 +37,10 @@ class Bundle(NamedTuple):
     files: dict[str, bytes]  # content of every file, by its path in the bundle
     ticks: int  # number of ticks in the test vectors
     runs: int  # number of runs in the test vectors
-    # for each recorded run, why the comparison with the simulation ended before the run; None if it did not
+    # for each recorded run, the reason if its comparison with the simulation ended early, else None
     ended: list[str | None]
     reasons: list[str]  # descriptions of the differences between runtime and simulation
-    stop: ControllerStop | None  # tick at which a limit stops the nominal run; None if no limit does
+    stop: ControllerStop | None  # first stop of the nominal run by a limit; None if no limit stops it
     passing: dict[str, float] | None  # changed limits that do not stop the nominal run; None if not needed
 
 
@@ -225,7 +225,7 @@ def _list_bundle_files(folder: Path) -> list[str]:
             # Delete Python's cache only if it contains nothing but compiled files.
             if not (entry.is_file(follow_symlinks=False) and entry.name.endswith(".pyc")):
                 raise InputError(
-                    f"{where}: {name}{to_one_line(entry.name, 80)}: is no file of this bundle; {expected}"
+                    f"{where}: {name}{to_one_line(entry.name, 80)}: is not a file of this bundle; {expected}"
                 )
             files.append(name + entry.name)
     folders = {f"{name[:index]}/" for name in files for index, sign in enumerate(name) if sign == "/"}

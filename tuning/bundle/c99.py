@@ -256,7 +256,7 @@ def _generate_code(law: str, class_: type[Compensator]) -> tuple[str, str]:
 
 
 def _sign_condition(lowest: float) -> str:
-    """Return the C condition on the sign of a value that follows from its lower bound; empty if none."""
+    """Return the C condition that a value's lower bound imposes on its sign; empty if there is none."""
     return "> 0" if lowest > 0.0 else ">= 0" if lowest >= 0.0 else ""
 
 

@@ -30,8 +30,8 @@ MAX_FILES, MAX_BUNDLE_BYTES, MAX_TEXT_BYTES = (
     1 << 23,
 )  # of a bundle, and bytes of a text file in it
 SCHEMA = "jaxhil/bundle/1"
-# Largest difference between runtime and simulation, divided by the range of a run's commands [1]. The
-# simulation rounds in another order.
+# Largest difference between runtime and simulation, divided by the range of a run's commands [1]. They
+# compute in a different order, so that they differ by rounding errors.
 MAX_SIMULATION_ERROR = 1e-11
 MAX_REPORTED_DIFFERENCES = 8  # largest number of reported differences in one file
 C_SOURCES = ("c99/test_vectors.c", "c99/jaxhil_controller.c")
@@ -109,7 +109,7 @@ def find_differences(folder):
                 problems += [(name, text) for text in find_value_differences(content, values)]
     for name in find_unlisted_paths(folder, files):
         compiled = "contains compiled code, which is not checked: delete this folder before use"
-        problems.append((name, compiled if name.endswith(PYTHON_CACHE) else "is no file of this bundle"))
+        problems.append((name, compiled if name.endswith(PYTHON_CACHE) else "is not a file of this bundle"))
     return found, problems
 
 
@@ -300,8 +300,8 @@ def read_vectors(text):
 def replay_vectors(rows, gains, runtime):
     """Replay all rows of vectors.csv through the runtime's controller with the gain file `gains`.
 
-    Return a dictionary by run of lists of (line number, force command, simulated force command), and
-    descriptions of the differences from the recorded commands.
+    Return for each run the list of (line number, force command, simulated force command), as a dictionary,
+    and descriptions of the differences from the recorded commands.
     """
     controller, runs, different = None, {}, []
     for number, row in rows:
@@ -411,7 +411,7 @@ def escape_unprintable(text):
 
 
 def check_this_file():
-    """Check the SHA-256 of this file again, because a damaged check above could have passed it."""
+    """Check the SHA-256 of this file again, because a damaged check above could have accepted it."""
     here = os.path.dirname(os.path.abspath(__file__))
     try:
         manifest = json.loads(read_plain_file(here, "manifest.json", MAX_TEXT_BYTES))

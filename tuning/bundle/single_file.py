@@ -1,8 +1,8 @@
 """Generation of `jaxhil_runtime.py`: the rig's controller and one compensator in a single source file.
 
-The file contains the modules of the names in `jaxhil.rig.__all__`, the module of the compensator, and all
-modules of `jaxhil` that these import. Imports of other packages come first. Each module follows the modules
-that it imports, with comments but without its imports. Two modules must not define the same name.
+The file contains the modules that define the names in `jaxhil.rig.__all__`, the module of the compensator,
+and all modules of `jaxhil` that they import. Imports of other packages are at the top. Each module comes
+after the modules that it imports, without its import statements. Two modules must not define the same name.
 """
 
 import ast
@@ -158,7 +158,7 @@ def _sort_by_imports(names: Iterable[str], generated: dict[str, ModuleSource]) -
 
 
 def _check_unique(sources: Iterable[ModuleSource]) -> None:
-    """Raise ValueError if two modules define the same name, or import different objects under it."""
+    """Raise ValueError if two modules define the same name, or import different objects under one name."""
     owners: dict[str, str] = {}
     for source in sources:
         bound = {name: source.name for statement in source.tree.body for name in _bound_names(statement)}

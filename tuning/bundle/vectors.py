@@ -1,9 +1,9 @@
-"""Test vectors: inputs and commands of the runtime in each tick, which every controller must reproduce.
+"""Test vectors: inputs and commands of the runtime in each tick, to test other builds of the controller.
 
 `record_vectors` simulates the nominal run and random draws, and replays them through the runtime. The vectors
-contain the commands of both. `make_damaged_rows` adds damaged segments of the nominal run. The damage
-includes readings and model states that are infinite, NaN, huge or stuck, and clocks that jump or run
-backwards. The numerical model moves under the runtime's force command.
+contain the commands of both. `make_damaged_rows` adds segments of the nominal run with corrupted inputs:
+readings and model states that are infinite, NaN, huge or stuck, and clocks that jump or run backwards. The
+numerical model moves under the runtime's force command.
 """
 
 import csv
@@ -82,10 +82,10 @@ class RecordedVectors(NamedTuple):
 
     rows: list[VectorRow]  # rows of all runs
     mass: float  # equivalent mass in the nominal run [kg]
-    # for each recorded run, why the comparison with the simulation ended before the run; None if it did not
+    # for each recorded run, the reason if its comparison with the simulation ended early, else None
     ended: list[str | None]
     reasons: list[str]  # descriptions of the differences between runtime and simulation
-    stop: ControllerStop | None  # tick at which a limit stops the nominal run; None if no limit does
+    stop: ControllerStop | None  # first stop of the nominal run by a limit; None if no limit stops it
     passing: dict[str, float] | None  # changed limits that do not stop the nominal run; None if not needed
 
 
@@ -119,7 +119,7 @@ def record_vectors(
 def make_damaged_rows(
     nominal: Sequence[VectorRow], integrator: str, mass: float, gain_file: GainFile, seed: int
 ) -> list[VectorRow]:
-    """Return the rows of damaged runs: random segments of the nominal run with random damage of the inputs.
+    """Return the rows of random segments of the nominal run with randomly corrupted inputs.
 
     `mass` is the equivalent mass of the numerical model [kg], `integrator` its integration rule.
     """
@@ -177,7 +177,7 @@ def _lane_inputs(run: int, lane: LaneRecord, period: float) -> Iterator[Controll
 def _damage_inputs(
     source: random.Random, run: int, segment: Sequence[VectorRow], period: float
 ) -> Iterator[ControllerInputs]:
-    """Yield the controller's inputs in each tick of a segment, with random damage."""
+    """Yield the controller's inputs in each tick of a segment, randomly corrupted."""
     timed = source.random() < 0.8
     time, stuck = source.uniform(0.0, 1e3), {}
     for tick, row in enumerate(segment):
@@ -245,8 +245,8 @@ def _run_controller(
         faults = controller.faults
         rows.append(VectorRow(*reading[:7], *motion, force, command, faults, reading.force_simulated))
         identified.append(controller.identified)
-        # The fault LAW_IN_DOUBT changes no command. A trip between two contacts is not in the faults of a
-        # tick, but in the cause.
+        # The fault LAW_IN_DOUBT changes no command. The cause also contains a trip between two contacts,
+        # which the faults of a tick do not.
         acting.append(faults & ~LAW_IN_DOUBT | controller.cause)
     return rows, identified, acting
 

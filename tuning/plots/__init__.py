@@ -1,1 +1,1 @@
-"""Plots of results; the plot of a run, the colours and the layout are in `jaxhil.simulation.contact_plot`."""
+"""Plots of results; the plot of a one-axis run and the layout are in `jaxhil.simulation.contact_plot`."""

@@ -25,7 +25,7 @@ COLUMN_TITLES = ("in space", "on the rig")
 
 @matplotlib.style.context("default")
 def animate(recorded: Recorded, title: str, path: str | Path) -> None:
-    """Write an animation of target and chaser near the contact, in two views: ideal contact and rig.
+    """Write an animation of target and chaser near the contact, for the ideal contact and for the rig.
 
     Raise OSError if the file cannot be written.
     """
@@ -59,10 +59,10 @@ def _select_writer(target: Path) -> AbstractMovieWriter:
 def _draw_scene(
     figure: Figure, recorded: Recorded
 ) -> list[tuple[LineCollection, list[Polyline], np.ndarray, Any]]:
-    """Draw the target in four axes: two views, each of the ideal contact and of the contact on the rig.
+    """Draw the target in four subplots: two views of the ideal contact, and two of the contact on the rig.
 
-    Return for each axes what is needed to draw a frame: the lines of the chaser, its outline in C axes, its
-    pose at each tick, and the view.
+    Return for each subplot the data to draw the chaser in one frame of the animation: its lines, its outline
+    in frame C (the chaser's docking interface), its pose at each tick, and the view.
     """
     target, chaser = outlines(recorded.groups)
     middle, half = _shown_region(recorded)
@@ -81,7 +81,7 @@ def _draw_scene(
 
 
 def _shown_region(recorded: Recorded) -> tuple[np.ndarray, float]:
-    """Return middle (3,) and half width [m] of the region shown: all contact points, and a margin."""
+    """Return centre (3,) and half width [m] of the shown region: all contact points, and a margin."""
     touching = recorded.depth > 0
     points = recorded.point[touching] if np.any(touching) else recorded.actual[:1, :3]
     ticks = find_shown_ticks(recorded)
@@ -91,7 +91,7 @@ def _shown_region(recorded: Recorded) -> tuple[np.ndarray, float]:
 
 
 def _format_axes(axes: Axes, middle: np.ndarray, half: float, view: tuple[int, int]) -> None:
-    """Set limits, labels and grid of the axes for a view of the region with `middle` and half width [m]."""
+    """Set limits, labels and grid of a subplot that shows the region with this centre and half width [m]."""
     across, up = (1e3 * (centre + half * np.array([-1, 1])) for centre in middle)
     axes.set(xlim=tuple(across), ylim=tuple(up), aspect="equal")
     axes.set(xlabel=f"{AXIS_NAMES[view[0]]} of T [mm]", ylabel=f"{AXIS_NAMES[view[1]]} of T [mm]")

@@ -1,4 +1,4 @@
-"""Plot for the summary page of a bundle: restitution errors, and ranges of the scenarios of the tuning."""
+"""Plot for the summary page of a bundle: restitution errors, and ranges of the tuning scenarios."""
 
 import io
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ ENVELOPE_QUANTITIES = {
 
 @matplotlib.style.context("default")
 def summary_png(document: Mapping[str, Any]) -> bytes:
-    """Draw the restitution errors before and after tuning, and the ranges of the tuning, as a PNG file.
+    """Return a PNG plot: restitution errors before and after tuning, and ranges of the tuning scenarios.
 
     `document` is the content of a gain file.
     """
@@ -46,7 +46,7 @@ def summary_png(document: Mapping[str, Any]) -> bytes:
 
 
 def _draw_errors(axes: Axes, document: Mapping[str, Any]) -> None:
-    """Draw bars of the errors of the nominal run and of fresh scenarios, one bar for each set of gains."""
+    """Draw bars of each set of gains' errors, in the nominal run and in scenarios not used for tuning."""
     groups = _error_groups(document["figures"])
     series = [name for name in COLOURS if any(name in values for _, values in groups)]
     width = 0.8 / max(1, len(series))
@@ -77,7 +77,7 @@ def _draw_errors(axes: Axes, document: Mapping[str, Any]) -> None:
 
 
 def _error_groups(metrics: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:
-    """Return groups of bars: the label of each group, and the error [1] by name of the gains."""
+    """Return for each group of bars its label, and the error [1] of each set of gains."""
     groups = []
     for kind, key, label in (
         ("nominal", "rms", "nominal run,\nrms"),

@@ -79,7 +79,7 @@ def plot_errors(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]
 
 @matplotlib.style.context("default")
 def plot_transparency(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]]) -> Figure:
-    """Plot transparency, slope and peak command of each compensator with its best gains.
+    """Plot transparency, slope of e against e*, and peak command of each compensator with its best gains.
 
     Each mechanism in `names` is a point; `results` are the metrics of all compensators by mechanism.
     """
@@ -116,7 +116,7 @@ def plot_transparency(names: Sequence[str], results: Mapping[str, Sequence[LawMe
 
 
 def _list_gain_names(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]]) -> list[str]:
-    """Return the names of all evaluated sets of gains, in the order literature, settings, tuned."""
+    """Return the names of all evaluated sets of gains: "literature", then named settings, then "tuned"."""
     keys = {key: None for name in names for result in results[name] for key in result.figures}
     rank = {LITERATURE_GAINS: 0, TUNED_GAINS: 2}
     return sorted(keys, key=lambda key: rank.get(key, 1))

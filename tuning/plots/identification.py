@@ -28,9 +28,9 @@ from tuning.plots.parts import INTERVAL_SIGMAS, legend_above
 DOT_STYLE: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 2.5, "markeredgewidth": 0}
 PLOTTED_CONTACTS = 3  # number of contacts that are plotted over time
 RUN_COLOURS = (BLUE, ORANGE, GREEN)
-# Rows of the log: ranges of the lags at which the residuals' correlations are plotted.
+# Limits of the lags at which the correlations of the residuals are plotted [rows of the log].
 MAX_AUTOCORRELATION_LAG, MIN_CROSS_CORRELATION_LAG, MAX_CROSS_CORRELATION_LAG = 25, -20, 100
-# Standard deviations: if an estimate is closer to 0, its relative deviation from the prior has no meaning.
+# Smallest distance from 0 [standard deviations] at which an estimate's relative deviations are plotted.
 MIN_ESTIMATE_SIGMAS = 3.0
 
 
@@ -53,7 +53,7 @@ def draw_identification(result: Identification, entries: Sequence[Mapping[str, A
 
 @matplotlib.style.context("default")
 def plot_bode(motion: FreeMotion) -> Figure:
-    """Plot the motion simulator's measured and modelled frequency response, noise, distortion, coherence."""
+    """Plot noise, distortion, coherence, and measured and modelled frequency response of the simulator."""
     lines, fit = motion.lines, motion.fit
     order = np.argsort(lines.frequency)
     frequency = lines.frequency[order]
@@ -137,7 +137,7 @@ def plot_force_delay(contact: ContactFit, prior: float | None) -> Figure:
 
 @matplotlib.style.context("default")
 def plot_contacts(contact: ContactFit) -> Figure:
-    """Plot the measured and the modelled force over time and over penetration, for up to three contacts."""
+    """Plot the measured and the modelled force of up to three contacts against time and penetration."""
     readings, problem = contact.readings, contact.problem
     depth, predicted = _compute_depth_and_force(contact)
     inside = readings.counts & (depth > 0.0)
@@ -169,7 +169,7 @@ def plot_contacts(contact: ContactFit) -> Figure:
 
 @matplotlib.style.context("default")
 def plot_residuals(contact: ContactFit) -> Figure:
-    """Plot the whitened residuals of the force over time and penetration, and their correlations."""
+    """Plot the whitened force residuals against time and penetration, and their correlations."""
     readings, problem = contact.readings, contact.problem
     depth, predicted = _compute_depth_and_force(contact)
     residuals = problem.whiten(readings.force - predicted) / readings.std
@@ -292,7 +292,7 @@ def _select_plotted_contacts(contact: ContactFit, inside: np.ndarray) -> list[in
 
 
 def _plot_correlation(axes: Axes, x: np.ndarray, y: np.ndarray, lags: range, label: str) -> None:
-    """Plot the correlation of `x` with the later `y` over the lag [rows], and white noise's 95 % band."""
+    """Plot the correlation of `x` with the later `y` against the lag [rows], and white noise's 95 % band."""
     values, chance = [], []
     for lag in lags:
         early, late = slice(max(0, -lag), len(x) - max(0, lag)), slice(max(0, lag), len(x) - max(0, -lag))

@@ -18,7 +18,7 @@ from tuning.plots.parts import INTERVAL_SIGMAS
 def monitor_plot(
     mechanism: str, contacts: Sequence[int], metrics: Mapping[str, np.ndarray], since: float | None
 ) -> Figure:
-    """Plot each metric over the number of the contact, with its predicted 95 % range, in a separate panel.
+    """Plot each metric against the number of the contact, with its predicted 95 % range, in a separate panel.
 
     Args:
         mechanism: name or path of the mechanism file, for the title.

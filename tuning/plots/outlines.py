@@ -20,9 +20,10 @@ POINT_MARK_SIZE = 0.02  # half size of the cross that marks a point, divided by 
 
 
 def outlines(groups: Sequence[ContactGroup]) -> tuple[list[Polyline], list[Polyline]]:
-    """Return the outlines of target (in T axes) and chaser (in C axes) as lines, each (points, 3) [m].
+    """Return the outlines of target and chaser as lines, each (points, 3) [m].
 
-    The shapes are those of the first batch element. Lines that several shapes share are contained once.
+    The points are in frame T (docking interface of the target) and C (of the chaser). The shapes are those of
+    the first batch element. A line that several shapes share occurs once.
     """
     pairs = [pair for group in groups for pair in _shape_pairs(group.candidates)]
     corners = np.concatenate([np.zeros((0, 3)), *(_corners(shape) for pair in pairs for shape in pair)])

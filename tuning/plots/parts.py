@@ -24,7 +24,7 @@ LINK_PATTERN = re.compile(r'<a xlink:href="#scenario-(\d+)"[^>]*>')
 
 
 def draw_limit(line: Callable[..., Any], limit: float | None, width: float = 1.2, **style: Any) -> None:
-    """Draw a line at the limit, unless it is None, 0 or infinite, which a logarithmic axis cannot show.
+    """Draw a line at the limit; draw none if the limit is None, 0 or infinite (for logarithmic axes).
 
     `line` is `Axes.axvline` or `Axes.axhline`.
     """
@@ -67,7 +67,7 @@ def set_plain_ticks(axis: Axis, low: float, high: float) -> None:
 
 @matplotlib.style.context("default")
 def as_svg(figure: Figure, points: Mapping[int, str] | None = None) -> str:
-    """Return a figure as an SVG element; links to scenarios get the texts in `points`, by scenario index."""
+    """Return a figure as an SVG element; `points` are the texts of its links, by index of the scenario."""
     content = io.StringIO()
     FigureCanvasSVG(figure)
     # With a fixed salt, the names of the elements depend only on the content of the figure.

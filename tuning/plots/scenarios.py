@@ -1,4 +1,4 @@
-"""Plots of a sweep's scenarios: failures and worst errors over the inputs, and the run of one scenario."""
+"""Plots of a sweep's scenarios: failures and worst errors against the inputs, and the run of one scenario."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -39,7 +39,7 @@ def scenario_plot(sweep: SweepProgram, index: int, title: str) -> Figure:
 
 @matplotlib.style.context("default")
 def plot_failure_region(plan: PlotPlan, regions: PlotStatistics, manifest: Manifest, name: str) -> Figure:
-    """Plot the scenarios of a sweep as points: failures over two inputs, and worst error over each input."""
+    """Plot scenarios as points: failures in the plane of two inputs, and worst error against each input."""
     number = len(plan.per_scenario)
     points, limit = regions.points, manifest.limit or None
     size = (13, 4.9) if number == 2 else (7, 5.3)
@@ -78,7 +78,7 @@ def plot_failure_region(plan: PlotPlan, regions: PlotStatistics, manifest: Manif
 def linked_scenarios(
     name: str, inputs: Sequence[Any], points: PlotPoints, limit: float | None, linked: Sequence[int]
 ) -> Figure:
-    """Plot the worst error of scenarios over each input, with links to the plots of some scenarios.
+    """Plot the worst error of scenarios against each input, with links to the plots of some scenarios.
 
     Args:
         name: name of the mechanism, for the title.
@@ -135,7 +135,7 @@ def _draw_points(
 
 
 def _label_with_count(label: str, points: PlotPoints, regions: PlotStatistics) -> str:
-    """Return a legend label with the number of its points and, if not all are drawn, the total number."""
+    """Return a legend label with the number of drawn points and, if some are not drawn, the total number."""
     shown, total = int(np.sum(points.failed)), regions.failed
     unended = int(np.sum(points.failed & ~np.isfinite(points.size)))
     if label in (FAILED, UNENDED) and unended:

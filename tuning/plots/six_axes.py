@@ -23,11 +23,11 @@ from tuning.plots.outlines import Polyline, outlines, rotation_matrix
 
 AXIS_NAMES = ("x", "y", "z")
 AXIS_COLOURS = (BLUE, VERMILION, GREEN)
-# Colours of the contact candidates; further candidates repeat the colours with dashed lines.
+# Colours of the pairs of shapes that may touch; further pairs repeat the colours with dashed lines.
 CANDIDATE_COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY_BLUE, "0.35")
 TIME_MARGIN = 0.05  # s; time shown before the first and after the last contact
 MIN_VIEW_RATIO = 0.3  # smallest ratio of a view's height to its width, so that force arrows have space
-MAX_LEGEND_ENTRIES = 12  # largest number of candidates in a legend
+MAX_LEGEND_ENTRIES = 12  # largest number of pairs of shapes in a legend
 VIEWS = ((0, 2), (1, 2))  # indices of the horizontal and the vertical axis of each view
 
 
@@ -59,7 +59,7 @@ def six_axes_plot(recorded: Recorded, title: str) -> Figure:
     for axes in (left, right):
         axes.set(xlabel=f"time {since} [ms]")
     target, chaser = outlines(recorded.groups)
-    for column, (name, tick) in enumerate(_moments_shown(recorded) if recorded.names else ()):
+    for column, (name, tick) in enumerate(_find_shown_instants(recorded) if recorded.names else ()):
         after = 1e3 * (recorded.time[tick] - recorded.time[origin])
         for view, (across, up) in enumerate(VIEWS):
             axes = figure.add_subplot(rows[2, 2 * column + view])
@@ -74,8 +74,8 @@ def six_axes_plot(recorded: Recorded, title: str) -> Figure:
 def find_time_origin(recorded: Recorded) -> tuple[int, str]:
     """Return the tick at which the plots' time is 0, and a text that describes this tick.
 
-    The tick is that of the first touch in the ideal contact, or else on the rig, or else the start of the
-    run.
+    This is the tick of the first touch in the ideal contact. If there is none, it is the first touch on the
+    rig, or without any contact the start of the run.
     """
     in_space = np.flatnonzero(np.any(recorded.wrench_in_space != 0, axis=1))
     if len(in_space):
@@ -84,7 +84,7 @@ def find_time_origin(recorded: Recorded) -> tuple[int, str]:
     return (int(on_the_rig[0]), "since first touch") if len(on_the_rig) else (0, "since the start")
 
 
-def _moments_shown(recorded: Recorded) -> tuple[tuple[str, int], ...]:
+def _find_shown_instants(recorded: Recorded) -> tuple[tuple[str, int], ...]:
     """Return description and tick of the two instants for which the mechanism is drawn."""
     touching = np.flatnonzero(np.any(recorded.depth > 0, axis=1))
     if not len(touching):
@@ -93,7 +93,7 @@ def _moments_shown(recorded: Recorded) -> tuple[tuple[str, int], ...]:
 
 
 def find_shown_ticks(recorded: Recorded) -> slice:
-    """Return the ticks to be shown: from the first to the last contact, on the rig or ideal, with a margin.
+    """Return the ticks to be shown: from the first to the last (ideal or real) contact, with a margin.
 
     Without contact, return all ticks.
     """
@@ -114,7 +114,7 @@ def draw_view(
     across: int,
     up: int,
 ) -> None:
-    """Draw target, chaser and contact forces at a tick, projected onto the axes `across` and `up` [mm].
+    """Draw target, chaser and contact forces at a tick, projected onto the plane of axes `across` and `up`.
 
     `target` and `chaser` are outlines, as returned by `outlines`.
     """
@@ -152,7 +152,7 @@ def quaternion_of(theta: np.ndarray) -> Any:
 
 
 def _plot_forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
-    """Plot the normal force of each candidate that touches, and the total force of the ideal contact."""
+    """Plot the normal force between each pair of shapes that touches, and the ideal contact's total force."""
     total = np.linalg.norm(recorded.wrench_in_space[shown, :3], axis=1)
     axes.plot(time, total, color="0.7", linewidth=3, label="total force in space")
     for index, candidate in enumerate(np.flatnonzero(np.any(recorded.force > 0, axis=0))):
@@ -167,7 +167,7 @@ def _plot_forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray)
 
 
 def _plot_moments(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
-    """Plot the moments about T of the real contact, of the command, and of the ideal contact."""
+    """Plot the moments about the origin of the target's frame T: real contact, command, and ideal contact."""
     for axis, colour in enumerate(AXIS_COLOURS):
         axes.plot(time, recorded.wrench_in_space[shown, 3 + axis], color="0.7", linewidth=3)
         axes.plot(time, recorded.command[shown, 3 + axis], color=colour, label=AXIS_NAMES[axis])

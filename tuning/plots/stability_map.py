@@ -29,7 +29,7 @@ PALE_ORANGE = "#F7CF85"  # orange, light enough for black lines to be visible
 def map_plot(stability_map: MapResults, title: str, limit: float) -> Figure:
     """Plot a stability map: signed error in colours, contours of error and theory, nominal point.
 
-    The margins of the nominal point are those for the error `limit` [1].
+    The margins of the nominal point are the ranges in which the error is at most `limit` [1].
     """
     figure = create_figure((8.6, 7.0), title)
     figure.subplots_adjust(left=0.09, right=0.88)
@@ -160,7 +160,7 @@ def _draw_nominal(axes: Axes, stability_map: MapResults) -> list[Any]:
 
 
 def _contour_levels(error: np.ndarray, limit: float, most: int = MAX_CONTOURS) -> list[float]:
-    """Return the levels of the contours of both signs: the limit, and 1 and 3 in each larger decade.
+    """Return the contour levels of both signs: the limit, and all larger powers of 10 and their triples.
 
     Only levels within the range of `error` are returned, at most `most` of each sign.
     """

@@ -1,4 +1,4 @@
-"""Plots of a sweep: restitution error over the inputs, failure region, convergence of the probability.
+"""Plots of a sweep: restitution error against the inputs, failure region, convergence of the probability.
 
 The plots are computed from the stored rows, and are written to the folder of the store.
 """
@@ -41,7 +41,7 @@ from tuning.sweeps.plot_statistics import (
 )
 from tuning.sweeps.store import PLOTS, SweepStore
 
-MIN_CONTACTS_PER_CELL = 20  # number of contacts in a cell below which its 95th percentile is not shown
+MIN_CONTACTS_PER_CELL = 20  # smallest number of contacts in a cell whose 95th percentile is shown
 # Terms of one-axis plots, with the terms that replace them in six-axis plots.
 SIX_AXIS_TERMS = {
     "|e - e*|": "|error|",
@@ -49,7 +49,7 @@ SIX_AXIS_TERMS = {
     "a contact": "an episode",
     "contacts": "errors",
 }
-# Order, label, colour and line style of each quantile that is plotted over the first input.
+# Order, label, colour and line style of each quantile that is plotted against the first input.
 PROFILE_QUANTILES = (
     (0.5, "half of the contacts", SKY_BLUE, "-"),
     (0.95, "95 %", BLUE, "-"),
@@ -105,7 +105,7 @@ def write_plots(store: SweepStore, acceptable: float | None = None) -> list[str]
 
 @matplotlib.style.context("default")
 def plot_error_map(plan: PlotPlan, regions: PlotStatistics, manifest: Manifest, name: str) -> Figure:
-    """Plot quantiles of |e - e*| over the plan's first input and, as a map, over both inputs of the plan."""
+    """Plot quantiles of |e - e*| against the plan's first input, and a map of one quantile for two inputs."""
     figure = create_figure(
         (8.6, 7.4), f"{name}: restitution error of {regions.scenarios} scenarios", below=0.85
     )
@@ -131,7 +131,7 @@ def plot_error_map(plan: PlotPlan, regions: PlotStatistics, manifest: Manifest, 
 def plot_convergence(
     plan: PlotPlan, regions: PlotStatistics, manifest: Manifest, name: str, acceptable: float | None = None
 ) -> Figure:
-    """Plot the estimated failure probability and its 95 % interval over the number of scenarios.
+    """Plot the estimated failure probability and its 95 % interval against the number of scenarios.
 
     Scenarios are added in the order of their index. `acceptable` is a failure probability [1], drawn as a
     line.
@@ -185,7 +185,7 @@ def plot_convergence(
 def _draw_profile(
     axes: Axes, quantity: PlotInput, cells: int, sizes: np.ndarray, limit: float | None
 ) -> None:
-    """Draw the quantiles `PROFILE_QUANTILES` of |e - e*| over one input."""
+    """Draw the quantiles `PROFILE_QUANTILES` of |e - e*| against one input."""
     counts = sizes.reshape(cells, -1, sizes.shape[-1]).sum(axis=1)
     edges = quantity.edges(cells)
     middles = np.sqrt(edges[1:] * edges[:-1]) if quantity.logarithmic else (edges[1:] + edges[:-1]) / 2
@@ -267,9 +267,9 @@ def _set_bar_ticks(axis: Axis, low: float, high: float) -> None:
 
 
 def _set_probability_limits(axes: Axes, looks, share, low, high, acceptable: float | None) -> None:
-    """Set the limits of the probability axis so that the estimates after 1 % of the scenarios fit.
+    """Set the probability axis so that it shows the estimates from at least 1 % of the scenarios.
 
-    Earlier estimates have wide intervals, which would dominate the axis.
+    Estimates from fewer scenarios have wide intervals, which would dominate the axis.
     """
     late = looks >= looks[-1] / 100
     ends = [*low[late], *high[late], *share[late], acceptable or 0.0]

@@ -1,4 +1,4 @@
-"""Plots of tuning results: errors before and after tuning, objective over solver steps, Pareto fronts."""
+"""Plots of tuning results: errors before and after tuning, objective in each solver step, Pareto fronts."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -29,7 +29,7 @@ from tuning.plots.parts import MARKERS, draw_limit, legend_above
 
 @matplotlib.style.context("default")
 def errors_plot(result: TuneResult, limit: float) -> Figure:
-    """Plot the restitution errors before and after tuning: their distribution, and over contact frequency."""
+    """Plot the distribution of restitution errors before and after tuning, and errors against frequency."""
     figure = create_figure(
         (11, 4.6), f"{result.mechanism.name}: restitution error on fresh scenarios", above=0.75
     )
@@ -78,7 +78,7 @@ def six_axis_errors_plot(result: TuneResult, limit: float) -> Figure:
 
 
 def _draw_shares(axes: Axes, outcomes: Mapping[str, Any], limit: float) -> None:
-    """Plot the share of contacts whose error exceeds a value over this value, for each set of gains."""
+    """Plot, against the error, the fraction of contacts with a larger error, for each set of gains."""
     shown_errors: list[float] = [limit] if 0 < limit < np.inf else []
     for name, outcome in outcomes.items():
         errors = np.sort(np.abs(outcome.error[outcome.good]))[::-1]
@@ -98,7 +98,7 @@ def _draw_shares(axes: Axes, outcomes: Mapping[str, Any], limit: float) -> None:
 
 @matplotlib.style.context("default")
 def loss_plot(result: TuneResult) -> Figure:
-    """Plot the objective over the solver's steps, one curve for each start."""
+    """Plot the objective against the solver's steps, one curve for each starting point."""
     figure = create_figure((7, 4.6), f"{result.mechanism.name}: tuning from {len(result.starts)} starts")
     axes = figure.subplots()
     finite = [start for start in result.starts if np.all(np.isfinite(start.history))]
@@ -197,7 +197,7 @@ def front_plot(front: ParetoFront, result: TuneResult, limit: float) -> Figure:
 
 
 def _set_log_scale(axes: Axes, name: str, values: Sequence[float]) -> None:
-    """Make axis "x" or "y" logarithmic, with plain tick labels, if its values span a factor above 3."""
+    """If the values of axis "x" or "y" span a factor above 3, make it logarithmic with plain tick labels."""
     low, high = min(values), max(values)
     if not 0 < 3 * low < high:
         return

@@ -1,4 +1,4 @@
-"""Structs for the JSON documents of commands, with the fields that a report shows.
+"""Structs for the JSON documents that commands write, with the fields that a report shows.
 
 A file that lacks a field, or whose field has another type, cannot be converted to these structs.
 """
@@ -16,7 +16,7 @@ class ProbabilityEntry(Struct):
 
 
 class QuantileEntry(Struct):
-    """Quantile, over the scenarios of a sweep, of the worst |e - e*| of a scenario."""
+    """Quantile of the scenarios' worst |e - e*| in a sweep."""
 
     order: float  # order of the quantile, 0 to 1
     value: float | None = None  # quantile [1]; None if it is infinite
@@ -105,7 +105,7 @@ class EstimateEntry(Struct):
 
 
 class CheckEntry(Struct):
-    """Result of the search for one effect that an identified model may not explain."""
+    """Result of a check of the logs for one effect that the identified model does not contain."""
 
     name: str
     finding: str
@@ -132,7 +132,7 @@ class IdentificationDocument(Struct):
 
 
 class MonitoredMetric(Struct):
-    """Metric of a monitored contact, which is 0 on average if the mechanism file is correct.
+    """Metric of a monitored contact; the mean of the metric is 0 if the mechanism file is correct.
 
     A field is None if the log does not contain enough data for the metric.
     """
@@ -208,7 +208,7 @@ class AxisOfMap(Struct):
 
 
 class Theory(Struct):
-    """Values of the closed forms at every point of a stability map, as rows along y.
+    """Values of the closed-form solutions on the grid of a stability map, one row for each value of y.
 
     A field is None if its closed form does not apply.
     """
@@ -239,14 +239,14 @@ class GrowthOfMap(Struct):
 
 
 class MarginOfMap(Struct):
-    """Range of one key around its nominal value within which a condition holds."""
+    """Range of one key, around its nominal value, in which a condition holds."""
 
     low: float | None = None  # lower end; None if the condition holds down to the end of the map
     high: float | None = None  # upper end; None if the condition holds up to the end of the map
 
 
 class MarginsOfMap(Struct):
-    """Margins of the nominal point for three conditions, each by axis, "x" and "y".
+    """Margins of the nominal point for three conditions, each with one range for axis "x" and "y".
 
     A field is None if the nominal point itself violates the condition.
     """

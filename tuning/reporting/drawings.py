@@ -102,7 +102,7 @@ def draw_estimates(document: IdentificationDocument) -> SvgPlot:
 
 
 def monitor_drawing(document: MonitoringDocument) -> SvgPlot:
-    """Draw the metrics of monitored contacts over the number of the contact, from the JSON document."""
+    """Draw the metrics of monitored contacts against the number of the contact, from the JSON document."""
     numbers = [contact.contact for contact in document.contacts]
     metrics = {name: _columns(document, name) for name, *_ in METRICS}
     figure = monitor_plot(document.mechanism, numbers, metrics, document.since)
@@ -111,7 +111,7 @@ def monitor_drawing(document: MonitoringDocument) -> SvgPlot:
 
 
 def _columns(document: MonitoringDocument, name: str) -> np.ndarray:
-    """Return value, predicted standard deviation, and z of a metric, (3, contacts); NaN for None."""
+    """Return value, predicted standard deviation and normalised deviation z of a metric, (3, contacts)."""
     rows = []
     for contact in document.contacts:
         metric = contact.figures.get(name)

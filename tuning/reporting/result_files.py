@@ -93,7 +93,7 @@ def read_results(paths: list[Path]) -> Results:
 
 
 def _add_result(results: Results, source: Path) -> None:
-    """Read and check the result at a path, and store it in `results`; raise `InputError` if it is wrong."""
+    """Read and check the result at a path, and store it in `results`; raise `InputError` if it is invalid."""
     where, path = to_one_line(str(source)), _document_path(source)
     document = _read_json(path, where)
     schema = document.get("schema")
@@ -174,7 +174,7 @@ def _read_json(path: Path, where: str) -> dict[str, Any]:
 
 
 def _refuse_constant(name: str) -> None:
-    """Raise ValueError; called for NaN and infinity in a file, which standard JSON does not allow."""
+    """Raise ValueError for NaN or infinity in a file, because standard JSON does not allow them."""
     raise ValueError(name)
 
 
@@ -204,7 +204,7 @@ def _check_sweep(store: SweepStore, verdict: dict[str, Any], where: str) -> None
     """Raise `InputError` if a verdict belongs to another sweep, or names a scenario that does not exist."""
     if verdict["sweep_sha256"] != store.manifest.sha256:
         raise InputError(
-            f"{where}: {VERDICT_FILE}: found the verdict of another sweep, expected that of this sweep"
+            f"{where}: {VERDICT_FILE}: found the verdict of another sweep, expected the verdict of this sweep"
         )
     for scenario in verdict["worst"]:
         if not 0 <= scenario["index"] < store.manifest.scenarios:
@@ -228,7 +228,7 @@ def _check_map(document: MapDocument, where: str) -> None:
         rising = all(a < b for axis in (x, y) for a, b in pairwise(axis))
         if min(len(x), len(y)) < 2 or not rising or [len(row) for row in table] != [len(x)] * len(y):
             raise InputError(
-                f"{where}: found a table whose shape differs from its axes, expected {ALLOWED_RESULTS}"
+                f"{where}: found a table that does not match its axes, expected {ALLOWED_RESULTS}"
             )
 
 
@@ -269,7 +269,7 @@ def _check_consistency(results: Results) -> None:
         for key in ("compensator", "gains", "mechanism"):
             if getattr(gains, key) != getattr(subject, key):
                 raise InputError(
-                    f"{name}: {key}: found another value than in the other results, expected the same"
+                    f"{name}: {key}: found a value that differs from the other results, expected the same"
                 )
     comparison, mechanism = results.comparison, subject.mechanism.name
     if comparison is not None and mechanism not in (entry.mechanism for entry in comparison.mechanisms):

@@ -187,7 +187,7 @@ def reproduction_section(results: Results) -> Section:
 
 
 def _repeat_commands(results: Results) -> Iterator[str]:
-    """Yield, as typed in a shell, the commands that compute the results again."""
+    """Yield the shell commands that compute the results again."""
     paths = {source.command: str(source.path) for source in results.sources}
     subject, sweep = results.subject, results.sweep
     gains = paths.get("tune", paths.get("export", "GAINS"))

@@ -41,7 +41,7 @@ class Section:
     texts: Sequence[str] = ()  # paragraphs
     tables: Sequence[ReportTable] = ()
     drawings: Sequence[SvgPlot] = ()
-    traces: Sequence[ScenarioPlot] = ()  # runs of scenarios, of which one is shown at a time
+    traces: Sequence[ScenarioPlot] = ()  # runs of scenarios; the page shows one at a time
     lines: Sequence[str] = field(default=())  # commands as typed in a shell
 
 
@@ -258,7 +258,7 @@ def _as_verdict(verdict: str) -> str:
 
 
 def _error_rows(metrics: Any, key: str) -> Iterator[tuple[str, ...]]:
-    """Yield a table row of errors on fresh scenarios for each set of gains: before, literature, tuned.
+    """Yield for each set of gains a table row with its errors in scenarios that were not used for tuning.
 
     `metrics` is the entry "figures" of a gain file, and `key` the kind of error in it.
     """
@@ -280,7 +280,7 @@ def _error_rows(metrics: Any, key: str) -> Iterator[tuple[str, ...]]:
 
 
 def _identified_origins(results: Results) -> dict[str, str]:
-    """Return a text by key: the source of each value that the identification estimated or the user fixed."""
+    """Return, for each key that was estimated or fixed by the user, a text with the source of its value."""
     document = results.identification
     if document is None or not is_identified(results):
         return {}

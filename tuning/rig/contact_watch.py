@@ -1,4 +1,4 @@
-"""Detection of the onset and end of contacts, and computation of their restitution, in plain floats.
+"""Detection of the onset and end of contacts, and computation of their restitution, in plain Python.
 
 The rules are those of `notebooks/guide/model.md`, section 2. `jaxhil.simulation.metrics` applies the same
 rules to batches, but is too slow for a real-time loop.
@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 from jaxhil.mechanism.structs import Mechanism
 
-FADED_COMMAND_RATIO = 1e-6  # force command divided by its peak [1]; below this, the command has decayed
+FADED_COMMAND_RATIO = 1e-6  # force command, divided by its peak, below which it has decayed [1]
 MAX_FADING_TIME = 0.1  # longest wait for the force command to decay [s]
 MAX_CONTACT_DURATION = 10.0  # longest contact [s]; a longer one ends with the status "timeout"
-DIVERGENCE_SPEED_RATIO = 1e3  # speed divided by approach speed [1]; above this, the status is "diverged"
+DIVERGENCE_SPEED_RATIO = 1e3  # largest speed / approach speed [1]; above it, the status is "diverged"
 
 
 class RigContact(NamedTuple):
@@ -50,7 +50,7 @@ class ContactWatch:
         self.begin(0)
 
     def begin(self, number: int) -> None:
-        """Begin a new run; `number` is the index of its first contact in the mechanism's lists."""
+        """Begin a new run; `number` is the index of its first contact in the mechanism's stiffness list."""
         self._number, self._tick = number, 0
         self._ticks_without_force, self._remaining_command = 1_000_000, 0.0
         self._approach = self._rebound = 0.0

@@ -32,18 +32,19 @@ class DiscreteSimulator(NamedTuple):
 
     transition: tuple[ResponseRow, ...]  # state one period later
     start: MotionRows  # motion at the interval's start, as the limit from inside the interval
-    sample: MotionRows  # motion at the time at which the force sensor samples
+    sample: MotionRows  # motion at the sampling time of the force sensor
     end: MotionRows  # motion at the interval's end, as the limit from inside the interval
-    measured: ResponseRow  # position at the time at which the position sensor samples
+    measured: ResponseRow  # position at the sampling time of the position sensor
     # In uniform motion, the state is steady_command * command + steady_step * command increment per period.
     steady_command: ResponseRow  # [1/m]
     steady_step: ResponseRow  # [1/m]
 
 
 def split_delay(delay: float, period: float) -> tuple[int, float]:
-    """Return where a sample with a `delay` [s] lies: how many whole intervals earlier, and at which fraction.
+    """Return the time of a sample that is `delay` [s] old, as a number of whole intervals and a fraction.
 
-    The fraction is in (0, 1] and measured from the start of that sampling interval.
+    The sample lies this number of sampling intervals before the current one, at the fraction in (0, 1] after
+    the start of its interval.
     """
     periods = delay / period
     whole = math.floor(periods + DELAY_ROUNDING_TOLERANCE)
@@ -114,7 +115,7 @@ def discretise_simulator(
 
 
 def transfer_function(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
-    """Return numerator and denominator of G(s) in descending powers of s; both are 1 if it is ideal."""
+    """Return numerator and denominator of G(s) in descending powers of s; 1 and 1 for an ideal simulator."""
     if simulator.model == "ideal":
         return np.ones(1), np.ones(1)
     if simulator.model == "transfer_function":

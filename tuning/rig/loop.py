@@ -1,8 +1,8 @@
 """Real-time loop of the rig's process, with absolute deadlines and one packet per control period.
 
 At the start of each period, the rig sends a packet with the sensor readings to the controller's process. The
-answer is in time if it arrives within the fraction `ANSWER_SHARE` of the period. The rig needs the rest of
-the period. A tick without an answer in time is a missed tick: the rig continues with the newest command
+answer is in time if it arrives within the fraction `ANSWER_SHARE` of the period; the rig needs the remaining
+time. A tick without an answer in time is a missed tick: the rig continues with the newest command
 (`RigTask.advance`), and accepts the late answer when it arrives. If the rig itself is late, it executes all
 due ticks at once and counts them as missed. If it is late by more than `MAX_CATCH_UP_PERIODS` periods, it
 shifts its clock by this delay instead.
@@ -25,7 +25,7 @@ from tuning.rig.udp_protocol import (
     encode_reading,
 )
 
-ANSWER_SHARE = 0.8  # longest time until an answer [periods]; the rig needs the rest of the period
+ANSWER_SHARE = 0.8  # longest time until an answer [periods]; the rig needs the remaining time
 MAX_CATCH_UP_PERIODS = 10  # largest delay of the rig [periods] after which it still executes the due ticks
 BUSY_WAIT_TIME = 100_000  # time before a tick [ns] in which the loop polls the clock; a sleep may be too long
 START_DELAY = 50_000_000  # time from the start of the loop to the first tick [ns]
@@ -33,7 +33,7 @@ TIME_AFTER_TRIP = 1.0  # time for which the rig continues after the controller h
 
 
 class RealTimeTask(Protocol):
-    """Protocol of the work that `run_loop` does in each tick, such as `tuning.rig.rig_task.RigTask`."""
+    """Interface of the task that `run_loop` executes in each tick, such as `tuning.rig.rig_task.RigTask`."""
 
     @property
     def tripped(self) -> str: ...

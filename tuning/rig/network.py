@@ -64,7 +64,7 @@ class Network:
         self._socket.close()
 
     def send(self, number: int, packet: bytes) -> None:
-        """Send packet `number`, unless injection loses or delays it; `wait` sends a delayed packet."""
+        """Send packet `number`; injection may lose the packet, or delay it until `wait` sends it."""
         delay = self._draw_delay(number)
         if delay is None:
             return
@@ -83,7 +83,7 @@ class Network:
             pass
 
     def ask(self, packet: bytes, wait: float) -> bytes | None:
-        """Send a packet without injected faults; return the answer, or None after `wait` [s] without one."""
+        """Send a packet without injected faults; return the answer, or None after `wait` [s]."""
         self.send_without_faults(packet)
         if not select.select([self._socket], [], [], wait)[0]:
             return None

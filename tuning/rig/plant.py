@@ -1,4 +1,4 @@
-"""Simulated hardware of a rig in plain floats: motion simulator, contact and sensors.
+"""Simulated hardware of a rig in plain Python: motion simulator, contact and sensors.
 
     plant = RigHardware(mechanism, seed=0)
     plant.begin(position, velocity, command, number)  # begin a run in uniform motion towards contact `number`
@@ -143,7 +143,7 @@ class RigHardware:
             self._law, self._number = _contact_law_of(self._contact, number), number
 
     def _contact_force(self, interval: SamplingInterval | None) -> float:
-        """Compute the contact during one sampling interval; return the sensor's force after its lag [N]."""
+        """Compute the contact in one sampling interval; return the output of the force sensor's lag [N]."""
         if interval is None:
             return 0.0
         sample, start, end = interval
@@ -204,7 +204,7 @@ class RigHardware:
 
 
 def _contact_law_of(contact: Contact, number: int) -> FloatLaw:
-    """Return the law of contact `number`; the last entries of the stiffness and damping lists repeat."""
+    """Return the law of contact `number`; contacts beyond the end of a list use its last entry."""
     stiffness = contact.stiffness[min(number, len(contact.stiffness) - 1)]
     damping = contact.damping[min(number, len(contact.damping) - 1)]
     return find_contact_law(contact.law).in_floats(contact, stiffness, damping)

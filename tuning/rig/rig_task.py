@@ -26,7 +26,7 @@ from tuning.rig.udp_protocol import (
 
 MAX_EXTRAPOLATED_PERIODS = 10  # number of periods after which a command is held instead of extrapolated
 MAX_COMMAND_AGE = 3  # [periods]; if a command is older, its effects are not the controller's fault
-# Reasons of a trip that an old command can cause.
+# Reasons for a trip that an old command can cause.
 TRIPS_BY_OLD_COMMANDS = ("tripped: restitution", "tripped: missed_tick")
 PAUSE_TICKS = 5  # number of ticks between two runs
 STALLED = "stalled"  # status of a contact in which the computer delayed the commands too long
@@ -54,10 +54,11 @@ class RigTask:
         seed: seed of the sensor noise and of the phases.
         stroke: lowest and highest position of the drives [m].
         resets: whether to reset a controller that trips because of old commands. This applies if a command
-            was older than `MAX_COMMAND_AGE` periods and the reason is one of `TRIPS_BY_OLD_COMMANDS`.
+            was older than `MAX_COMMAND_AGE` periods and `TRIPS_BY_OLD_COMMANDS` contains the reason for the
+            trip.
 
     Attributes:
-        tripped: reason of the controller's trip; empty if it has not tripped.
+        tripped: reason for the controller's trip; empty if it has not tripped.
     """
 
     def __init__(
@@ -79,7 +80,7 @@ class RigTask:
         self._newest: AnswerPacket | None = None
         self._force = 0.0
         self.tripped, self._first, self._oldest = "", 0, 0
-        self._resets, self._forgiven_trips, self._requests_reset = resets, [], False
+        self._resets, self._reset_trips, self._requests_reset = resets, [], False
         self._next_run(0)
 
     @property
@@ -88,9 +89,9 @@ class RigTask:
         return tuple(self._contacts)
 
     @property
-    def forgiven(self) -> tuple[str, ...]:
-        """Return the reasons of the trips that old commands caused; the controller was reset after each."""
-        return tuple(self._forgiven_trips)
+    def reset_trips(self) -> tuple[str, ...]:
+        """Return the reasons for all trips that were caused by old commands and followed by a reset."""
+        return tuple(self._reset_trips)
 
     @property
     def commanded(self) -> CommandRange:
@@ -165,14 +166,14 @@ class RigTask:
                 self._contacts.append(aborted_contact)
 
     def _largest_command_age(self) -> int:
-        """Return the largest command age [periods] in the current contact, or the last one between runs."""
+        """Return the largest command age [periods] in the current (between runs: in the last) contact."""
         if self._tick < 0 and self._contacts:
             return self._contacts[-1].oldest_command
         return self._oldest
 
     def _reset(self) -> None:
         """Abort this run, prepare the next one, and request a reset of the controller."""
-        self._forgiven_trips.append(self.tripped)
+        self._reset_trips.append(self.tripped)
         self.tripped = ""
         number = self._number
         if self._tick >= 0:

@@ -14,7 +14,7 @@ from jaxhil.contact.float_law import FloatLaw
 FORCE_PARABOLAS = 2  # number of parabolas that interpolate the force in one segment
 MAX_ROOT_STEPS = 50  # largest number of iterations of the root finder
 ROOT_TOLERANCE = 1e-13  # largest error of a root [fraction of the segment]
-# Duration of a parabola [time constants]; below this, cancellation makes the closed form inaccurate.
+# Shortest duration of a parabola [time constants] at which the closed form is accurate (cancellation).
 MIN_CLOSED_FORM_DURATION = 1e-2
 
 
@@ -145,7 +145,7 @@ def _reached_surface(start: float, end: float, clearance: float) -> tuple[float,
 
 
 def _turning_point(path: "_CubicPath", depth: Callable[[float], float], side: float) -> tuple[float, float]:
-    """Return the fraction s at which the motion reverses inside the surface, and the penetration [m] there.
+    """Return the fraction s at which the motion reverses in contact, and the penetration [m] there.
 
     If the motion does not reverse, use the end of the segment, s = 1.
     """
@@ -177,7 +177,7 @@ class _CubicPath:
 
 
 def _positive_interval(function: Callable[[float], float]) -> tuple[float, float]:
-    """Return the interval of s in [0, 1] where `function` is positive; it changes its sign at most once."""
+    """Return the interval in [0, 1] where `function` is positive; the function has at most one root."""
     at_0, at_1 = function(0.0), function(1.0)
     if at_0 <= 0.0 and at_1 <= 0.0:
         return 1.0, 0.0

@@ -105,9 +105,9 @@ class SessionReport(NamedTuple):
     run: LoopReport | None  # loop with the simulated rig; None if the session ended before it
     contacts: tuple[RigContact, ...]  # contacts that have ended
     commanded: CommandRange | None  # extreme values of the commands
-    tripped: str  # reason of the controller's trip; empty if it has not tripped
+    tripped: str  # reason for the controller's trip; empty if it has not tripped
     interrupted: bool  # whether the user interrupted the session
-    # reasons of the trips that late commands caused, and after which the controller was reset
+    # reasons for all trips that were caused by old commands and followed by a reset
     resets: tuple[str, ...] = ()
 
 
@@ -156,7 +156,9 @@ def run_session(
     except KeyboardInterrupt:
         interrupted = True
     task.finish()
-    return SessionReport(empty, run, task.contacts, task.commanded, task.tripped, interrupted, task.forgiven)
+    return SessionReport(
+        empty, run, task.contacts, task.commanded, task.tripped, interrupted, task.reset_trips
+    )
 
 
 def _run_controller_loop(
@@ -320,8 +322,9 @@ def find_miss_causes(
 ) -> np.ndarray:
     """Return the cause of each missed tick.
 
-    Injection is the cause in three cases: it lost the packet or the answer; without the injected delay, the
-    answer would have been in time; or a delayed packet was never answered, because a newer one overtook it.
+    Injection is the cause in three cases: injection lost the packet or its answer; the answer would have been
+    in time without the injected delay; or a delayed packet was not answered, because a newer packet overtook
+    it.
 
     Args:
         in_time: whether the answer was in time, (ticks,).
@@ -329,7 +332,7 @@ def find_miss_causes(
         round_trip: time from the packet to the answer [s], 0 without an answer, (ticks,).
         injected_delay: injected delay of the packet and its answer [s], (ticks,).
         lost: whether injection lost the packet or its answer, (ticks,).
-        allowance: longest time until an answer that is in time [s].
+        allowance: longest round-trip time of an answer that is in time [s].
 
     Returns:
         `NOT_MISSED`, `CAUSE_CONTROLLER`, `CAUSE_INJECTION` or `CAUSE_MACHINE` for each tick, (ticks,).

@@ -80,7 +80,7 @@ class AnswerPacket(NamedTuple):
     velocity: float  # velocity of the numerical model at this tick [m/s]
     force_command: float  # force command F_c, which acts on the numerical model [N]
     faults: int  # bits of the controller's faults at this tick
-    trip_reason: str  # reason of the controller's trip; empty if it has not tripped
+    trip_reason: str  # reason for the controller's trip; empty if it has not tripped
 
 
 def encode_reading(reading: ReadingPacket, session: int) -> bytes:
@@ -108,7 +108,7 @@ def decode_reading(packet: bytes | bytearray, session: int | None) -> ReadingPac
 
 
 def encode_answer(answer: AnswerPacket, session: int) -> bytes:
-    """Encode an answer as a packet of the session; the reason of a trip is cut to 96 ASCII characters."""
+    """Encode an answer as a packet of the given session; only 96 characters of the trip reason are sent."""
     trip_reason = answer.trip_reason.encode("ascii", "replace")
     return ANSWER_FORMAT.pack(ANSWER_MARK, VERSION, answer.flags, session, *answer[1:-1], trip_reason)
 
@@ -128,7 +128,7 @@ def decode_answer(packet: bytes, session: int | None) -> AnswerPacket:
         raise PacketError("answer packet of another session")
     text = trip_reason.rstrip(b"\0")
     if not all(32 <= byte < 127 for byte in text):
-        raise PacketError("the reason of the trip has characters that are not printable")
+        raise PacketError("the reason for the trip has characters that are not printable")
     return AnswerPacket._make((flags, *fields, text.decode("ascii")))
 
 
@@ -210,8 +210,8 @@ class NumericalModel:
     each control period.
 
     Attributes:
-        start: default position [m] and velocity v [m/s] at the start of a run. The position is
-            min(contact plane, 0) - v (0.02 s + phase T), where T is the control period.
+        start: default position [m] and velocity v [m/s] at the start of a run. The motion reaches a surface
+            after 0.02 s + `approach.phase` T at the earliest (T: control period).
         position: relative position of the bodies [m].
         velocity: relative velocity [m/s].
         acceleration: relative acceleration in the last period [m/s^2].
@@ -354,7 +354,7 @@ class ControllerTask:
         return self._reply(reading, 0, rate, position, velocity, self._force, faults)
 
     def _interpolate(self, missed: int, reading: ReadingPacket) -> int:
-        """Execute the missing ticks with interpolated readings; return the controller's faults in them."""
+        """Execute the ticks of missing packets with interpolated readings; return all their faults."""
         self.interpolated += missed
         faults = 0
         last = self._last

@@ -1,1 +1,1 @@
-"""Stability maps: restitution error over two keys, theory, spectral radii, margins of the nominal point."""
+"""Stability maps: restitution error on a grid of two keys, theory, spectral radii, nominal margins."""

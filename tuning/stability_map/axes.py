@@ -21,9 +21,9 @@ from jaxhil.simulation.plausibility import check_run
 from tuning.sweeps.columns import find_key_unit
 
 GAIN_PREFIX = "gains."
-DEFAULT_RANGE_FACTORS = 0.3, 3.0  # ends of an axis without uncertainty, divided by the nominal value
+DEFAULT_RANGE_FACTORS = 0.3, 3.0  # axis' ends for a key without uncertainty, divided by its nominal value
 NORMAL_RANGE_PROBABILITIES = 0.001, 0.999  # quantiles of a normal distribution that are the axis' ends
-MIN_LOGARITHMIC_RATIO = 5.0  # ratio of the axis' ends above which the scale is logarithmic
+MIN_LOGARITHMIC_RATIO = 5.0  # smallest ratio of the axis' ends for a logarithmic scale
 AXIS_FORMAT = "PATH or PATH=LOW:HIGH, such as contact.stiffness=5e4:5e5"
 
 
@@ -34,7 +34,7 @@ class MapAxis(NamedTuple):
     path: str  # path of the key without indices; "" for a gain
     entry: tuple[int, ...]  # indices of one entry of a list; () if the whole value varies
     unit: str  # SI unit of the values
-    nominal: float  # nominal value; for a list, that of the first entry
+    nominal: float  # nominal value, for a list of its first entry
     low: float  # lower end of the range
     high: float  # upper end of the range
 
@@ -91,7 +91,7 @@ def mechanism_draws(
 def check_axes(mechanism: Mechanism, axes: Sequence[MapAxis]) -> None:
     """Raise `InputError` if both axes have the same key, or if a corner of the map cannot be simulated."""
     if axes[0].key == axes[1].key:
-        raise InputError(f"y: found {axes[1].key}, expected another key than for x")
+        raise InputError(f"y: found {axes[1].key}, expected a key that differs from the key of x")
     raw = to_plain_data(mechanism)
     for name in ("uncertainty", "correlation"):
         raw.pop(name, None)
@@ -106,7 +106,7 @@ def check_axes(mechanism: Mechanism, axes: Sequence[MapAxis]) -> None:
 def _gain_axis(
     name: str, key: str, mechanism: Mechanism, law: Compensator, gains: Mapping[str, float]
 ) -> MapAxis:
-    """Return the axis of a gain, whose default range are the gain's bounds; raise `InputError` if unknown."""
+    """Return the axis of a gain, by default between its bounds; raise `InputError` for an unknown gain."""
     gain_by_name = {gain.name: gain for gain in law.gains}
     gain = gain_by_name.get(key.removeprefix(GAIN_PREFIX))
     if gain is None:
@@ -120,7 +120,7 @@ def _gain_axis(
 def _key_axis(
     name: str, key: str, mechanism: Mechanism, law: Compensator, gains: Mapping[str, float]
 ) -> MapAxis:
-    """Return the axis of a key of the mechanism file with its default range; raise `InputError` if wrong."""
+    """Return the axis of a key with its default range; raise `InputError` if the key cannot be an axis."""
     try:
         parts = parse_key(key)
     except KeyProblem:
@@ -135,7 +135,7 @@ def _key_axis(
     value = value_at(mechanism, path)
     shape = np.shape(value)
     if len(entry) > len(shape) or any(index >= size for index, size in zip(entry, shape, strict=False)):
-        raise InputError(f"{name} {key}: found a value of the shape {shape}, expected indices within it")
+        raise InputError(f"{name} {key}: found the shape {shape}, expected indices within this shape")
     if value is None or value == []:
         raise InputError(f"{name} {key}: found no value in {mechanism.name}, expected a key that has a value")
     nominal = float(np.asarray(value, float)[entry].flat[0])
@@ -148,8 +148,9 @@ def _default_range(
 ) -> tuple[float, float]:
     """Return the default range of a key.
 
-    The range is that of the key's uncertainty, or else `DEFAULT_RANGE_FACTORS` times the nominal value,
-    within the allowed values. If the nominal value is 0 or infinite, both ends equal the nominal value.
+    This is the range of the key's uncertainty. Without uncertainty it is `DEFAULT_RANGE_FACTORS` times the
+    nominal value, clipped to the allowed values. If the nominal value is 0 or infinite, both ends equal the
+    nominal value.
     """
     uncertain = mechanism.uncertainty.get(path)
     if uncertain is not None:

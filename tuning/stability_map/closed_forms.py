@@ -1,7 +1,7 @@
 """Closed forms for an uncompensated contact with a pure delay (notebooks/guide/model.md, section 6).
 
 Items 1 and 2 of this section hold for linear contact without damping, and item 5 for Kelvin-Voigt contact.
-All items hold in the limit of a small control period, whose only effect is a mean delay (item 7).
+All items assume a small control period, whose only effect is a mean delay (item 7).
 """
 
 import math
@@ -15,7 +15,7 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.scenario import Scenario
 
 SERIES_TERMS = 40  # terms of the series; the first omitted term, 4.5^81/81!, is far below the rounding error
-MAX_DELAY_PHASE = 1.0  # omega tau [rad]; up to this value, the first zero of the series is before 4.5/omega
+MAX_DELAY_PHASE = 1.0  # largest omega tau [rad]; the first zero of the series is then before 4.5/omega
 TABLE_SIZE = 2049  # entries of the table of the series; linear interpolation has errors below 1e-6
 INTEGRATOR_DELAYS = {"semi_implicit_euler": 0.0, "zoh": 0.5, "explicit_euler": 1.0}  # delay [control periods]
 
@@ -25,7 +25,7 @@ class ClosedForms(NamedTuple):
 
     series: np.ndarray | None  # restitution e from the series, item 1 [1]
     characteristic_root: np.ndarray | None  # restitution e from the dominant root, item 2 [1]
-    # delay divided by the critical delay, above which the oscillation in contact grows, item 5 [1]
+    # delay divided by the critical delay; above 1, the oscillation in contact grows, item 5 [1]
     delay_over_critical: np.ndarray | None
     reason: str | None  # reason if no closed form applies
 
@@ -46,10 +46,10 @@ def compute_closed_forms(mechanism: Mechanism, compensator: str, scenarios: Scen
 
 
 def mean_delay(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
-    """Return the total mean delay [s] from motion to force with an ideal motion simulator, (lanes,).
+    """Return the total mean delay [s] from motion to force of an uncompensated loop, (lanes,).
 
-    The total is the sum of the delays of motion simulator and force sensor, and of the delays by integrator,
-    command latency and hold, which are proportional to the control period (item 7).
+    The total is the sum of the transport delays of motion simulator and force sensor, and of the delays
+    caused by integrator, command latency and hold, which are proportional to the control period.
     """
     rig = mechanism.rig
     periods = INTEGRATOR_DELAYS[rig.integrator] + rig.command_latency - 0.5 * (rig.command_hold == "zoh")
@@ -61,8 +61,8 @@ def restitution_by_series(phase: np.ndarray) -> np.ndarray:
     """Return the restitution for x'' = -omega^2 x(t - tau), where `phase` is omega tau [rad], from a series.
 
     With time in units of 1/omega, the motion is S(t) = sum_n (-1)^n (t - n tau)^(2n+1)/(2n+1)!. The delayed
-    force acts until the time tau after the first zero t_s of S, so that the restitution is |S'(t_s + tau)|
-    (item 1). The result is NaN unless 0 <= phase <= 1.
+    force acts until the time tau after the first zero t_s of S, so that the restitution is |S'(t_s + tau)|.
+    The result is NaN unless 0 <= phase <= 1.
     """
     table = np.linspace(0.0, MAX_DELAY_PHASE, TABLE_SIZE)
     low, high = np.full_like(table, 2.0), np.full_like(table, 4.5)
@@ -78,9 +78,8 @@ def restitution_by_series(phase: np.ndarray) -> np.ndarray:
 def restitution_by_root(phase: np.ndarray) -> np.ndarray:
     """Return the restitution for x'' = -omega^2 x(t - tau), where `phase` is omega tau [rad], from a root.
 
-    The dominant root s = (2/tau) W_0(j omega tau/2) of s^2 = -omega^2 e^(-s tau) gives the restitution
-    exp(pi Re s/|Im s|) (item 2). W_0 is the principal branch of the Lambert function. The result is NaN for a
-    negative phase.
+    The dominant root s = (2/tau) W_0(j omega tau/2) of s^2 = -omega^2 e^(-s tau) gives the restitution exp(pi
+    Re s/|Im s|). W_0 is the principal branch of the Lambert function. The result is NaN for a negative phase.
     """
     phase = np.asarray(phase, float)
     root = lambertw(0.5j * np.where(phase > 0, phase, 1.0))
@@ -90,9 +89,9 @@ def restitution_by_root(phase: np.ndarray) -> np.ndarray:
 
 
 def critical_delay(mass: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return the critical delay tau_c [s] of M x'' + b x'(t - tau) + k x(t - tau) = 0 (item 5).
+    """Return the critical delay [s]: for a longer delay tau, the oscillation in contact grows.
 
-    For a delay tau > tau_c, the oscillation grows.
+    The equation of motion is M x'' + b x'(t - tau) + k x(t - tau) = 0.
     """
     square = (damping**2 + np.sqrt(damping**4 + 4 * mass**2 * stiffness**2)) / (2 * mass**2)
     frequency = np.sqrt(square)

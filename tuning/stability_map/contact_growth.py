@@ -6,8 +6,9 @@ sensor's lag, the delayed readings, and the compensator's filters. The motion be
 and the matrix of the map is the derivative of one control period with respect to the state.
 
 The spectral radius is the largest magnitude of the eigenvalues of this matrix. If it exceeds 1, the
-oscillation grows. For the eigenvalue z with this magnitude, the growth rate is ln|z|/T per second. Over half
-an oscillation, the duration of a free contact, the amplitude grows by the factor exp(pi ln|z|/|arg z|).
+oscillation grows. For the eigenvalue z with this magnitude, the growth rate is ln|z|/T per second, where T is
+the control period. In half an oscillation, the duration of a contact that ends, the amplitude grows by the
+factor exp(pi ln|z|/|arg z|).
 
 This module does not use the loop of `jaxhil.simulation`; tests compare both.
 """
@@ -37,7 +38,7 @@ MIN_LAG = 1e-3  # control periods; replaces a lag of 0 in a batch in which other
 # Squarings and terms of the matrix exponential; its errors are below 1e-12 for norms up to 1000.
 EXPONENTIAL_SQUARINGS, EXPONENTIAL_TERMS = 12, 12
 LINEARISATION_DEPTH = 1e-3  # m; penetration at which the loop is linearised
-MAX_CHUNK_ENTRIES = 4_000_000  # matrix entries that are computed together, to limit the memory
+MAX_CHUNK_ENTRIES = 4_000_000  # largest number of matrix entries that are computed together
 
 
 class ProgramParameters(NamedTuple):
@@ -71,7 +72,7 @@ class Growth(NamedTuple):
     per_second: float  # growth rate ln(spectral radius)/T [1/s]
     per_half_oscillation: float | None  # factor of the amplitude per half oscillation [1]; None without one
     frequency: float  # frequency of the oscillation [Hz]
-    by_gain: dict[str, float]  # derivative of the spectral radius by each gain [1/unit of the gain]
+    by_gain: dict[str, float]  # derivative of the radius with respect to each gain [1/unit of the gain]
 
 
 def explain_nonlinearity(mechanism: Mechanism, compensator: str) -> str | None:
@@ -88,7 +89,8 @@ def spectral_radii(
 ) -> np.ndarray:
     """Return the spectral radius of the loop in contact for each scenario of a batch, (lanes,).
 
-    The radius of a scenario is the largest of its contacts. `gains` are scalars or have one value per lane.
+    The value of a scenario is the largest spectral radius of its contacts. `gains` are scalars or have one
+    value per lane.
     """
     number = len(np.asarray(scenarios.velocity))
     shape, lane_gains = _program_parameters(mechanism, compensator, scenarios), _per_lane(gains, number)
@@ -117,7 +119,7 @@ def eigenvalue_cost(mechanism: Mechanism, compensator: str, scenarios: Scenario)
 def compute_growth(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, float], scenarios: Scenario
 ) -> Growth:
-    """Return the growth for the first scenario, in the contact with the largest spectral radius."""
+    """Return the growth in that contact of the first scenario that has the largest spectral radius."""
     shape, values = (
         _program_parameters(mechanism, compensator, scenarios),
         {k: jnp.asarray(v) for k, v in gains.items()},
@@ -260,11 +262,11 @@ def _advance_period(
 
 
 def _plant_transition(shape: ProgramParameters, lane: LoopParameters) -> tuple[jax.Array, jax.Array]:
-    """Return the transition of motion simulator and sensor lag over a control period, and the reading's row.
+    """Return the transition matrix of simulator and sensor lag for a period, and the row of the reading.
 
-    The transition is a matrix. Matrix and row multiply the vector (state, command at the start of the period,
-    command at the end). The matrix gives the state at the end, and the row gives the new force reading. Both
-    follow from the exponential of the system augmented by its input and the slope of the input (Van Loan
+    Matrix and row multiply the vector (state, command at the start of the period, command at the end). The
+    product with the matrix is the state at the end, and the product with the row is the new force reading.
+    Both follow from the exponential of the system augmented by its input and the slope of the input (Van Loan
     1978). Time is in control periods, and the command is linear within a period.
     """
     order, period = lane.numerator.shape[0], lane.period

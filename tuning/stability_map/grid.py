@@ -31,14 +31,14 @@ from tuning.stability_map.contact_growth import (
     spectral_radii,
 )
 
-LINE_POINTS = 201  # points of each line through the nominal point
+LINE_POINTS = 201  # number of points of each line through the nominal point
 MAX_TILE_RUNS = 2048  # largest number of runs computed at a time
-MAX_EIGENVALUE_COST = 5e7  # cost of all eigenvalues; beyond it, the spectral radius has a coarser grid
+MAX_EIGENVALUE_COST = 5e7  # largest cost of all eigenvalues; at a higher cost, the grid becomes coarser
 MIN_COARSE_POINTS = 15  # smallest number of points along an axis of the coarser grid
 
 
 class NominalMargin(NamedTuple):
-    """Range of one key around its nominal value within which a limit is not exceeded."""
+    """Range of one key, around its nominal value, in which a limit is not exceeded."""
 
     low: float | None  # lower end [unit of the key]; None if the limit is not exceeded down to the map's end
     high: float | None  # upper end [unit of the key]; None if the limit is not exceeded up to the map's end
@@ -56,11 +56,11 @@ class NominalPoint(NamedTuple):
     """Results at the nominal point of a stability map, which the mechanism file describes."""
 
     restitution: float | None  # e of the contact with the largest error [1]
-    error: float | None  # e - e* of that contact [1]; None if a contact did not end
+    error: float | None  # largest error e - e* [1]; None if a contact did not end
     # largest ratio of a real contact's peak force to the ideal one's [1]; None if a contact did not end
     peak_force_ratio: float | None
-    duration_ratio: float | None  # ratio of durations farthest from 1 [1]; None if a contact did not end
-    growth: Growth | None  # growth of a lasting contact; None if the loop in contact is not linear
+    duration_ratio: float | None  # duration ratio that is farthest from 1 [1]; None if a contact did not end
+    growth: Growth | None  # growth of the oscillation in contact; None if the loop is not linear
     # ranges of x and y with an error within the limit; None if the nominal error exceeds the limit
     error_margins: tuple[NominalMargin, NominalMargin] | None
     # ranges of x and y with peak force and duration within their bounds; None if the nominal ones are not
@@ -76,7 +76,7 @@ class MapResults(NamedTuple):
     x: np.ndarray  # values along x, (columns,), in the unit of its key
     y: np.ndarray  # values along y, (rows,), in the unit of its key
     restitution: np.ndarray  # e of the contact with the largest error, (rows, columns) [1]
-    error: np.ndarray  # e - e* of that contact, (rows, columns) [1]; NaN if a contact did not end
+    error: np.ndarray  # largest error e - e*, (rows, columns) [1]; NaN if a contact did not end
     peak_force_ratio: np.ndarray  # as in `NominalPoint` (rows, columns) [1]; NaN if a contact did not end
     duration_ratio: np.ndarray  # as in `NominalPoint` (rows, columns) [1]; NaN if a contact did not end
     closed: ClosedForms  # closed forms, each (rows, columns)
@@ -97,20 +97,20 @@ def compute_map(
     scheduler: str | None = None,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> MapResults:
-    """Compute a stability map.
+    """Compute a stability map: restitution errors and theory on a grid of two keys, and nominal margins.
 
     Args:
         mechanism: nominal mechanism.
         compensator: name of the compensator.
-        gains: gains at every point [SI units].
+        gains: gains at the nominal point, and at all points unless an axis is a gain [SI units].
         axes: axes x and y.
         points: number of values along each axis.
-        limit: error [1] for the margins of the nominal point.
+        limit: limit of the error [1], which defines the margins of the nominal point.
         seed: seed of the sensor noise.
         tell: called with the current activity, and the number of finished runs out of `count_runs(points)`.
         scheduler: address of a cluster's scheduler, whose workers simulate the contacts; None for this
             process.
-        checkpoints: store of finished tiles of runs, which are not repeated.
+        checkpoints: store of the results of finished runs, which are not repeated.
 
     Returns:
         The results at all points and at the nominal point.
@@ -209,7 +209,7 @@ def count_runs(points: int) -> int:
 
 
 def run_tile(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int) -> np.ndarray:
-    """Simulate a tile of scenarios, and return the results of `_worst_contact`, (5, lanes)."""
+    """Simulate a tile (scenarios that are computed together); return `_worst_contact`, (5, lanes)."""
     return np.stack(_worst_contact(evaluate(loop, gains, scenarios, at_least=at_least)))
 
 
@@ -222,9 +222,10 @@ def _run_tiles(
     scheduler: str | None,
     checkpoints: Checkpoints,
 ) -> np.ndarray:
-    """Simulate all runs tile by tile, and return the results of `_worst_contact`, (5, lanes).
+    """Simulate all runs in tiles, and return the results of `_worst_contact`, (5, lanes).
 
-    Each tile contains both long and short runs, so that all tiles take a similar time.
+    A tile consists of runs that are computed together. Each tile contains both long and short runs, so that
+    all tiles take a similar time.
     """
     loop = build_loop(mechanism, compensator, scenarios)
     order = np.argsort(ONE_AXIS.expected_duration(scenarios))
@@ -307,8 +308,8 @@ def _worst_contact(outcome: Outcome) -> tuple[np.ndarray, ...]:
     """Return five arrays (lanes,) with the worst values among the contacts of each lane.
 
     The values are e and e - e* of the contact with the largest |e - e*|, the largest peak force ratio, the
-    duration ratio farthest from 1, and 1 if a real contact is out of the bounds of the ideal contact, else 0.
-    All values are NaN if a contact did not end.
+    duration ratio farthest from 1, and 1 if the peak force or duration of a real contact is out of bounds,
+    else 0. All values are NaN if a contact did not end.
     """
     used = outcome.wanted & outcome.good
     ended = ~np.any(outcome.wanted & ~outcome.good, axis=0)

@@ -1,9 +1,9 @@
 """Damping perturbations: scenarios of the same mechanism with additional damping.
 
-The slope of e over e* measures how a compensator responds to damping for which it was not tuned. An elastic
-mechanism alone cannot show this, because its e* is always 1. The additional damping of scenario i dissipates
-as much energy as an oscillator with the damping ratio zeta_i, which has e* = exp(-pi zeta_i). The values
-zeta_i are spread evenly from 0 to `MAX_DAMPING_RATIO`. `ContactLaw.perturb_damping` converts them to
+The slope of e against e* measures how a compensator responds to damping for which it was not tuned. An
+elastic mechanism alone cannot show this, because its e* is always 1. The additional damping of scenario i
+dissipates as much energy as an oscillator with the damping ratio zeta_i, which has e* = exp(-pi zeta_i). The
+values zeta_i are spread evenly from 0 to `MAX_DAMPING_RATIO`. `ContactLaw.perturb_damping` converts them to
 parameters of the contact law.
 """
 
@@ -22,7 +22,7 @@ MAX_DAMPING_RATIO = 0.15  # largest additional damping ratio [1]; an elastic mec
 def perturb_damping(
     mechanism: Mechanism, draws: Mapping[str, np.ndarray]
 ) -> tuple[Mechanism, dict[str, np.ndarray]]:
-    """Add damping to a mechanism, with another damping ratio for each draw.
+    """Add damping to a mechanism, with a different damping ratio for each draw.
 
     Return the mechanism, whose contact law has damping, and the draws with the additional damping. Raise
     `InputError` if the contact law does not define how to add damping.

@@ -3,13 +3,13 @@
     rms, p99, worst      rms, 99th percentile and maximum of the restitution error |e - e*| of all contacts
     failures             fraction of scenarios with a contact that does not end, has an error above the limit,
                          or violates the bounds on real peak force and duration
-    early, late          transparency to a push at 25 % and at 75 % of the contact; the best value is 1
-    slope                slope of e over e* in scenarios with damping perturbations; the best value is 1
-    peak                 99th percentile of (peak of the force command) / (peak force of the ideal contact)
-    peak_force_ratio     99th percentile of (real peak force) / (peak force of the ideal contact)
-    duration_ratio       99th percentile of (duration of the contact) / (duration of the ideal contact)
-    trajectory           rms of (difference between x_d and the ideal contact) / (depth of the ideal contact)
-    noise                amplification of white force noise, computed from the gains, without an interval
+    early, late          transparency to a push at 25 % and at 75 % of the contact; the best value is 1 slope
+    slope of e against e* in scenarios with damping perturbations; best value 1 peak                 99th
+    percentile of (peak of the force command) / (peak force of the ideal contact) peak_force_ratio     99th
+    percentile of (real peak force) / (peak force of the ideal contact) duration_ratio       99th percentile
+    of (duration of the contact) / (duration of the ideal contact) trajectory           rms of (difference
+    between x_d and the ideal contact) / (depth of the ideal contact) noise                amplification of
+    white force noise, computed from the gains, without an interval
 
 Most intervals are bootstrap intervals. They resample whole scenarios, because the contacts of a scenario are
 not independent. The interval of `failures` is a Clopper-Pearson interval.
@@ -51,7 +51,7 @@ def compute_metrics(
     limit: float,
     seed: int,
 ) -> dict[str, IntervalEstimate]:
-    """Compute all metrics of a compensator, by name (see the module's list).
+    """Compute all metrics of a compensator, by name (listed in the module's docstring).
 
     Args:
         outcomes: outcomes of the scenarios, with and without perturbations.
@@ -117,10 +117,10 @@ def compute_transparency_metrics(
 def fit_transmission(
     change: Float[np.ndarray, "*resamples contacts"], true: Float[np.ndarray, "*resamples contacts"]
 ) -> Float[np.ndarray, "*resamples"]:
-    """Return the slope of a least-squares line through 0, fitted to `change` over `true`.
+    """Return the slope of a least-squares line through the origin, of `change` against `true`.
 
-    `change` is the change of e on the rig caused by a push, `true` that of the ideal contact. NaN are
-    ignored.
+    A push causes the change `change` of e on the rig, and the change `true` of e* in the ideal contact. NaN
+    are ignored.
     """
     return np.nansum(change * true, axis=-1) / np.nansum(true**2, axis=-1)
 
@@ -129,7 +129,7 @@ def fit_slope(
     restitution: Float[np.ndarray, "*resamples contacts"],
     reference: Float[np.ndarray, "*resamples contacts"],
 ) -> Float[np.ndarray, "*resamples"]:
-    """Return the slope of a least-squares line with an intercept, fitted to e over e*; NaN are ignored."""
+    """Return the slope of a least-squares line with intercept, of e against e*; NaN are ignored."""
     centred = reference - np.nanmean(reference, axis=-1, keepdims=True)
     return np.nansum(centred * restitution, axis=-1) / np.nansum(centred**2, axis=-1)
 

@@ -55,7 +55,7 @@ def compute_ideal_contacts(
 ) -> IdealContacts:
     """Compute the first `contacts` ideal contacts of every scenario, with and without pushes.
 
-    `velocity` contains the approach speeds [m/s]. Slots beyond the last computed contact repeat it.
+    `velocity` contains the approach speeds [m/s]. Later slots repeat the last computed contact.
     """
     slots, number = velocity.shape
     contact = jax.tree.map(lambda leaf: np.asarray(leaf)[:contacts], scenarios.contact)

@@ -79,9 +79,9 @@ def run_closed_loop(
 class ExternalController(Compensator):
     """Placeholder in the simulated loop for a controller that runs outside JAX.
 
-    Before a run's first tick, the simulated compensator `law` commands the history. From then on,
-    `SentCommand` contains the position commands of the external controller. The state of the compensator does
-    not change.
+    Before a run's first tick, the simulated compensator `law` computes the position commands. From then on,
+    `SentCommand` contains the commands of the external controller. The state of the compensator does not
+    change.
     """
 
     law: Compensator
@@ -96,7 +96,7 @@ class ExternalController(Compensator):
         return self.law.restart(gains, state, begins, fresh)
 
     def step(self, prepared, state, signals, tick):
-        raise NotImplementedError("the controller runs outside the loop")
+        raise NotImplementedError("the external controller computes the force command")
 
     def position_command(self, gains, state, position, velocity, acceleration):
         if isinstance(state, SentCommand):

@@ -63,7 +63,7 @@ class ContactComparison(msgspec.Struct, frozen=True):
     """Comparison of one nominal contact with the runtime and with the JAX controller in the loop."""
 
     restitution: float | None  # restitution with the runtime [1]; None if the contact does not end
-    simulated_restitution: float | None  # restitution with the JAX controller [1]; None likewise
+    simulated_restitution: float | None  # JAX controller's restitution [1]; None if the contact does not end
     status: str  # status of the contact with the runtime, as in `jaxhil.simulation.metrics`
     simulated_status: str  # status of the contact with the JAX controller
     peak_force_ratio: float | None = None  # peak force with the runtime / peak force of the ideal contact [1]
@@ -104,7 +104,7 @@ def verify(
         RuntimeError: If JAX does not compute in float64.
     """
     if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError("jax_enable_x64: found False, expected True: verification compares to 1e-11")
+        raise RuntimeError("jax_enable_x64: found False, expected True (float32 is too inaccurate)")
     gain_file = check_gain_document(loaded.document)
     progress(f"recording {scenarios} runs")
     batch = nominal_and_draws(loaded.mechanism, scenarios, seed)
@@ -219,7 +219,7 @@ def compute_position_difference(positions: np.ndarray, lane: LaneRecord) -> floa
 
 
 def compute_command_range(commands: np.ndarray) -> float:
-    """Return the range [N] of the commands and 0; commands that are not finite are ignored."""
+    """Return the width [N] of the range that contains 0 and all finite commands."""
     finite = commands[np.isfinite(commands)]
     return float(np.max(finite, initial=0.0) - np.min(finite, initial=0.0))
 
@@ -241,10 +241,10 @@ def find_divergence_tick(
     expected: Sequence[np.ndarray | jax.Array] | None,
     near: np.ndarray,
 ) -> int | None:
-    """Return the first tick in which runtime and simulation decide differently at a threshold.
+    """Return the first tick in which runtime and simulation decide differently at a threshold, or None.
 
-    The result is None if no tick near a threshold has a difference of commands or estimates, or if an earlier
-    tick already has one.
+    This is the first tick near a threshold with a difference of commands or estimates. The result is None if
+    there is no such tick, or if a tick before it has such a difference.
 
     Args:
         error: relative difference of the force commands, (ticks,).
@@ -268,8 +268,8 @@ def find_threshold_ticks(signals: Signals, gain_file: GainFile) -> np.ndarray:
 
     Compensators that identify the contact have two thresholds. The first is each surface, for the
     delay-aligned position; near means within `THRESHOLD_TOLERANCE` times the largest measured position. The
-    second is the contact threshold, for |F| in contact; near means within `THRESHOLD_TOLERANCE` times the
-    larger of both.
+    second is the contact threshold, for the magnitude of the force in contact; near means within
+    `THRESHOLD_TOLERANCE` times the larger of force and threshold.
     """
     gains, clearance = gain_file.gains, gain_file.clearance
     near = np.zeros(len(signals.age), bool)
@@ -288,7 +288,7 @@ def find_threshold_ticks(signals: Signals, gain_file: GainFile) -> np.ndarray:
 def _align_position(signals: Signals, delay: float, period: float) -> np.ndarray:
     """Delay the measured position [m] by `delay` [s].
 
-    Between ticks, the position is interpolated linearly. Before a run, the motion is uniform.
+    Between ticks, the position is interpolated linearly. Before a run, the motion is assumed to be uniform.
     """
     measured, velocity, age = signals.position_measured, signals.velocity_desired, signals.age
     tick = np.arange(len(measured))

@@ -17,8 +17,8 @@ from tuning.watchdog.expectation import ContactFeatures, ExpectationFit, expecte
 from tuning.watchdog.recording import RecordedRuns
 from tuning.watchdog.signal_extremes import SignalExtremes, find_signal_extremes
 
-# Errors divided by the limit: a run with errors up to the first value is good for the alarm rates; a run with
-# an error above the second value must be stopped.
+# Largest error of a run that counts as good, and largest error of a run that need not be stopped, both
+# divided by the limit.
 GOOD_ERROR_FACTOR, BAD_ERROR_FACTOR = 0.5, 1.0
 MIN_DETECTED_SHARE = 0.95  # fraction of contacts that must raise an alarm for an error to be detectable [1]
 MIN_DETECTED_CONTACTS = 20  # smallest number of contacts for an estimate of this fraction
@@ -52,12 +52,12 @@ def evaluate_runs(chunk: RecordedRuns, rules: AuditRules, free_distance: float) 
 
 
 def find_good_runs(runs: EvaluatedRuns, limit: float) -> Bool[np.ndarray, "lanes"]:
-    """Return whether all contacts of a run have ended with errors within `limit`, for each run."""
+    """Return for each run whether all its contacts have ended with errors within `limit`."""
     return np.all((runs.status == OK) & (np.abs(runs.error) <= limit), axis=0)
 
 
 def find_reached_contacts(runs: EvaluatedRuns, limit: float) -> Bool[np.ndarray, "slots lanes"]:
-    """Return which contacts the rig would reach: those with no bad contact before them in their run."""
+    """Return for each contact whether it occurs on the rig, where a run ends after its first bad contact."""
     bad = (runs.status != OK) | ~(np.abs(runs.error) <= limit)
     first = find_first_true(bad)
     return (np.arange(len(bad))[:, None] <= first) & runs.audited.begun
@@ -80,9 +80,9 @@ def compute_alarm_rates(
 ) -> dict[str, Any]:
     """Compute the rates of false and missed alarms, with exact 95 % intervals, as JSON data.
 
-    A good run has no error above half the limit. It is a false alarm if the watchdog or another guard stops
-    it. A bad run has a contact that does not end or has an error beyond the limit. It is a missed alarm if
-    the watchdog has not tripped by the end of this contact. The intervals are exact for independent
+    A good run has no error above half the limit; its stop by the watchdog or another guard is a false alarm.
+    A bad run has a contact that does not end or has an error beyond the limit. If the watchdog has not
+    tripped by the end of this contact, the alarm is missed. The intervals are exact for independent
     scenarios, and conservative for points of a Sobol sequence. The result also contains the smallest
     detectable error (`find_detectable_error`).
 
@@ -120,7 +120,7 @@ def compute_alarm_rates(
 def find_alarms(
     runs: EvaluatedRuns, expectation: ExpectationFit, limits: Mapping[str, float | None], mass: float
 ) -> Bool[np.ndarray, "slots lanes"]:
-    """Return whether the watchdog raises an alarm, for each contact."""
+    """Return for each contact whether the watchdog raises an alarm."""
     audited = runs.audited
     expected = expected_restitution(expectation, extract_features(audited), mass)
     margin, balance, longest = (
@@ -137,7 +137,7 @@ def find_alarms(
 
 
 def find_guard_trips(extent: SignalExtremes, limits: Mapping[str, float | None]) -> Bool[np.ndarray, "lanes"]:
-    """Return whether a guard other than the watchdog would act on a reading or a command, for each run."""
+    """Return for each run whether a guard, apart from the watchdog, would act on a reading or a command."""
 
     def limit(name: str, unlimited: float = np.inf) -> float:
         value = limits[name]

@@ -82,7 +82,7 @@ class _AuditState:
     def audit(self, where: Bool[np.ndarray, "lanes"], velocity: np.ndarray, extra: np.ndarray) -> None:
         """Audit the contacts that end in the lanes `where`.
 
-        `velocity` [m/s] is that of the rebound, `extra` [J] the work of the last force command.
+        `velocity` [m/s] is the rebound velocity, `extra` [J] the work of the last force command.
         """
         lanes = np.nonzero(where & (self.count < self.slots))[0]
         mass = self.rules.mass
@@ -187,7 +187,7 @@ class _LaneDelayLine:
         self._past: list[np.ndarray] = []
 
     def step(self, position: np.ndarray, velocity: np.ndarray, begins: np.ndarray) -> np.ndarray:
-        """Return the delayed position [m]; before the tick in which a run `begins`, the motion is uniform."""
+        """Return the delayed position [m]; the motion before a run `begins` is assumed to be uniform."""
         if not self._past:
             self._past = [np.zeros_like(position)] * (self._whole + 1)
         if np.any(begins):

@@ -38,15 +38,15 @@ from tuning.watchdog.signal_extremes import SignalExtremes
 from tuning.watchdog.verdict import DEFAULT_ALLOWED_RATES, AllowedAlarmRates, add_verdict
 
 LIMIT_MARGIN = 1.5  # limit divided by the extreme signal of good runs [1]
-FITTED_RUNS = 2048  # number of runs that determine the limits, but 1/16 to 1/4 of all runs
+FITTED_RUNS = 2048  # number of runs that determine the limits, clipped to 1/16 to 1/4 of all runs
 MIN_FORCE_LIMIT_SHARE = 0.02  # smallest limit of a force, divided by the largest force reading [1]
-DEFAULT_DRAWS = 2048  # number of draws without a sweep; enough for the rate of false alarms if 1/3 are good
+DEFAULT_DRAWS = 2048  # number of draws without a sweep; enough for the false-alarm rate if 1/3 are good runs
 DEFAULT_ERROR_LIMIT = 0.01  # limit of the restitution error without a sweep [1]
-MAX_BAD_TICKS_IN_A_ROW = 3  # largest number of successive ticks with a bad reading, a miss or a limited rate
+MAX_BAD_TICKS_IN_A_ROW = 3  # largest number of successive bad readings, missed ticks or limited rates
 TARE_DURATION = 0.1  # duration of the tare [s]
 FREE_APPROACH_TIME = 0.005  # time before a contact in which the mechanism is not in free flight [s]
 MIN_BALANCE_LIMIT = 1e-6  # smallest limit of the relative energy balance [1]; far above rounding errors
-SUFFICIENT_FIT_ERROR = 0.01  # rms error of a sufficient fit of the restitution, divided by the limit [1]
+SUFFICIENT_FIT_ERROR = 0.01  # largest rms error of a sufficient fit of the restitution / limit [1]
 
 
 class Calibration(NamedTuple):
@@ -71,7 +71,8 @@ def calibrate(
 
     Args:
         loaded: gain file.
-        store: sweep with this gain file, whose scenarios are simulated again. None: draw new scenarios.
+        store: sweep whose scenarios are simulated again; it must have used this gain file. None: draw new
+            scenarios.
         scenarios: number of scenarios. Default: all scenarios of the sweep, or 2048 draws.
         limit: limit of the restitution error [1]. Default: the limit of the sweep, or 0.01.
         lanes: number of scenarios that are simulated together.
@@ -85,7 +86,7 @@ def calibrate(
         The limits, and the alarm rates with a verdict.
 
     Raises:
-        InputError: If the sweep has another gain file or fewer scenarios, or if no run ends.
+        InputError: If the sweep used another gain file or has fewer scenarios, or if no run ends.
     """
     chosen = _choose_scenarios(loaded, store, scenarios)
     limit = _error_limit(limit, store)
@@ -119,7 +120,7 @@ def calibrate(
 def _origin(
     chosen: ScenarioSelection, store: SweepStore | None, used: Bool[np.ndarray, "lanes"], are_good: bool
 ) -> dict[str, Any]:
-    """Return the runs that the limits come from, as plain data."""
+    """Return a description of the runs from which the limits were computed, as plain data."""
     return {
         "scenarios": chosen.number,
         "sampling": chosen.sampling,
@@ -132,7 +133,7 @@ def _origin(
 
 
 def _error_limit(limit: float | None, store: SweepStore | None) -> float:
-    """Return the limit of the restitution error [1]: `limit`, the store's, or `DEFAULT_ERROR_LIMIT`."""
+    """Return `limit` or, if it is None, the sweep's limit (without a sweep, `DEFAULT_ERROR_LIMIT`)."""
     if limit is None and store is not None:
         limit = store.manifest.limit
     limit = DEFAULT_ERROR_LIMIT if limit is None else limit
@@ -185,7 +186,7 @@ def compute_guard_limits(
     rules: AuditRules,
     free_distance: float,
 ) -> dict[str, float | None]:
-    """Return the limits of readings and commands: extreme signals of the runs `used`, times a margin."""
+    """Return limits of readings and commands: extreme values of the signals in the runs `used`, widened."""
     extent = SignalExtremes(*(leaf[used] for leaf in runs.extent))
     rig, period = loaded.mechanism.rig, rules.period
     most = {name: float(np.max(getattr(extent, name))) for name in SignalExtremes._fields}
@@ -287,9 +288,9 @@ def _has_status(loaded: LoadedGains) -> bool:
 def _choose_scenarios(
     loaded: LoadedGains, store: SweepStore | None, scenarios: int | None
 ) -> ScenarioSelection:
-    """Return the scenarios to simulate.
+    """Return the scenarios to simulate: those of the sweep or, without a sweep, random draws.
 
-    Raise `InputError` if the sweep has another gain file, or if the number of scenarios is out of range.
+    Raise `InputError` if the sweep used another gain file, or if the number of scenarios is out of range.
     """
     if scenarios is not None and scenarios < 2:
         raise InputError(f"--scenarios: found {scenarios}, expected 2 or more")

@@ -1,10 +1,11 @@
 """Fit of the watchdog's expected restitution to recorded contacts.
 
 The expected restitution is a polynomial in p = sqrt(k_0/k) - 1, w = v/v_0 - 1 and z = b/(2 sqrt(k M)). Here v
-is the approach speed, M the equivalent mass, and k and b are the stiffness and damping that the watchdog
-estimates (`jaxhil.rig.watchdog`). An unknown delay delta of the force changes the estimate of k only by the
-factor cos(omega delta), but the estimate of b by -k delta, which the rig cannot distinguish from damping. The
-polynomial therefore contains b only if this reduces the error for contacts that were not part of the fit.
+is the approach speed, M the equivalent mass, k and b are the stiffness and damping that the watchdog
+estimates (`jaxhil.rig.watchdog`), and k_0 and v_0 are reference values. An unknown delay delta of the force
+changes the estimate of k only by the factor cos(omega delta), but the estimate of b by -k delta, which the
+rig cannot distinguish from damping. The polynomial therefore contains b only if this reduces the error for
+contacts that were not part of the fit.
 """
 
 from collections.abc import Sequence
@@ -16,13 +17,13 @@ from jaxtyping import Bool, Float
 POLYNOMIAL_TERMS = ("1", "p", "pp", "ppp", "w", "ww", "pw", "z", "zz", "pz", "wz")
 # Sets of terms, simplest first. `fit_expectation` selects the first sufficient set.
 TERM_SETS = (("1",), ("1", "p", "pp", "ppp"), POLYNOMIAL_TERMS[:7], POLYNOMIAL_TERMS)
-MAX_RESIDUAL_RATIO = 1.25  # rms residual of a sufficient set, divided by that of the best set [1]
+MAX_RESIDUAL_RATIO = 1.25  # largest rms residual of a sufficient set / smallest rms residual [1]
 RANGE_EXTENSION = 0.1  # extension of a fitted range on each side, divided by its width [1]
 SINGULAR_VALUE_CUTOFF = 1e-9  # singular values below this, relative to the largest, count as 0 [1]
 
 
 class ExpectationFit(NamedTuple):
-    """Fitted polynomial of the expected restitution in p, w and z (see the module's text)."""
+    """Fitted polynomial of the expected restitution in p, w and z (see the module's docstring)."""
 
     coefficients: dict[str, float]  # coefficient of each of `POLYNOMIAL_TERMS` [1]
     stiffness: float  # reference stiffness k_0 [N/m]
@@ -71,11 +72,11 @@ def fit_expectation(
 ) -> ExpectationFit:
     """Fit the expected restitution to the ideal restitution e* of contacts, by least squares.
 
-    Every set of `TERM_SETS` is first fitted to half of the runs. The simplest set is selected whose rms
-    residual in the other half is at most `sufficient`, or at most `MAX_RESIDUAL_RATIO` times that of the best
-    set. The selected set is fitted to all runs. A simple set is preferred, because a term that hardly
-    improves the fit may be wrong on a rig that differs from the sweep. If no contact has a stiffness, the
-    expectation is the mean of e*.
+    Every set of polynomial terms in `TERM_SETS` is first fitted to half of the runs. A set is sufficient if
+    its rms residual in the other half is at most `sufficient`, or at most `MAX_RESIDUAL_RATIO` times the
+    smallest rms residual of all sets. The simplest sufficient set is fitted to all runs, because a term that
+    hardly improves the fit may be wrong on a rig that differs from the sweep. If no contact has an observable
+    stiffness, the expectation is the mean of e*.
 
     Args:
         features: stiffness, damping and approach speed of the contacts.

@@ -39,18 +39,18 @@ MAX_FAULT_ERROR = 1.25  # largest restitution error of a used scenario, divided 
 MIN_BAD_SHARE = 0.5  # smallest fraction of used scenarios for a fault that counts for the verdict [1]
 FIRST_SCENARIO_INDEX = 2**31  # index of the first scenario; sweeps and calibration use lower indices
 MIN_FAULT_SCENARIOS, MAX_FAULT_SCENARIOS = 64, 4096  # bounds on the number of scenarios for a fault
-# Largest size of a fault, in multiples of the uncompensated delay whose restitution error equals the limit.
+# Largest multiple: size of a delay fault, divided by the delay that alone causes the limit of the error.
 MAX_FAULT_MULTIPLE = 32.0
-# Sizes that are tried in this order, before bisection.
+# Multiples that are tried in this order, before bisection.
 FAULT_MULTIPLES = tuple(MAX_FAULT_MULTIPLE / 2.0**step for step in range(6, -1, -1))
-BISECTION_STEPS = 4  # number of bisections between two successive sizes of `FAULT_MULTIPLES`
+BISECTION_STEPS = 4  # number of bisections between two successive entries of `FAULT_MULTIPLES`
 MAX_DELAY_SHARE = 0.5  # longest injected delay, divided by the duration of the ideal contact [1]
 
 FaultSizes = Float[np.ndarray, "lanes"]
 
 
 class InjectedFault(NamedTuple):
-    """Fault that is injected into the simulation, and that the controller does not know."""
+    """Fault that is injected into the simulation and is unknown to the controller."""
 
     name: str  # name of the fault in files
     meaning: str  # description of the fault for messages
@@ -69,8 +69,8 @@ class _FaultCase(NamedTuple):
 
     fault: InjectedFault
     scenarios: Scenario  # scenarios without the fault
-    unit: float  # size of a fault with the multiple 1 [the fault's unit]
-    most: float  # largest size [the fault's unit]
+    unit: float  # size of the fault at the multiple 1 of `FAULT_MULTIPLES` [`fault.unit`]
+    most: float  # largest size [`fault.unit`]
 
 
 def compute_fault_rates(
@@ -155,7 +155,7 @@ def _find_neutral_gains(loaded: LoadedGains) -> dict[str, float]:
 
 
 def _compute_ideal_duration(loaded: LoadedGains) -> float:
-    """Return the duration [s] of the first nominal ideal contact, or half a period if it does not end."""
+    """Return the duration [s] of the first nominal ideal contact; half an oscillation if it does not end."""
     first = summarise_mechanism(loaded.mechanism).contacts[0]
     return first.duration if math.isfinite(first.duration) else 0.5 / first.frequency
 

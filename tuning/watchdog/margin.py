@@ -23,7 +23,7 @@ from tuning.watchdog.alarms import (
 )
 from tuning.watchdog.expectation import ExpectationFit, expected_restitution
 
-UNSEEN_RUN_FACTOR = 1.25  # bound for other runs, divided by the largest value in the used runs [1]
+UNSEEN_RUN_FACTOR = 1.25  # bound for all other runs / largest value in the used runs [1]
 # Smallest margin, and margin for an accurate expectation, divided by the limit [1].
 MIN_MARGIN_SHARE, USUAL_MARGIN_SHARE = 0.25, 0.75
 
@@ -46,11 +46,10 @@ def choose_restitution_margin(
 ) -> RestitutionMargin:
     """Choose the restitution margin.
 
-    The margin is `USUAL_MARGIN_SHARE` times the limit. It is smaller if the error of the expectation exceeds
-    the rest of the limit, because an error e - e* beyond the limit is detected only if the expectation's
-    error is below limit - margin. It is larger if it would otherwise stop more than the fraction
-    `false_alarms` of good runs. Then every second run is used in addition to the `fitted` runs, because a
-    small fraction needs many runs.
+    The margin is `USUAL_MARGIN_SHARE` times the limit. It is smaller if the sum of margin and error of the
+    expectation would exceed the limit, because an error e - e* beyond the limit might then be missed. It is
+    larger if it would otherwise stop more than the fraction `false_alarms` of good runs. Then every second
+    run is used in addition to the `fitted` runs, because the estimate of a small fraction needs many runs.
 
     Args:
         runs: recorded runs.

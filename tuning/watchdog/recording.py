@@ -73,7 +73,7 @@ def record_selection(
 ) -> Generator[RecordedRuns, None, None]:
     """Simulate and record the chosen scenarios; yield chunks of `lanes` scenarios."""
     loop = build_widest_loop(loaded, works=False)
-    # Record further scenarios in a short last chunk, so that it can use the same compiled program.
+    # Fill a short last chunk with further scenarios, so that all chunks use the same compiled program.
     lanes = min(lanes, chosen.number)
     for first in range(0, chosen.number, lanes):
         _, scenarios = draw_scenarios(loaded.mechanism, chosen.sampling, chosen.seed, first, lanes)

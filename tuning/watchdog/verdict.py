@@ -15,8 +15,8 @@ from tuning.statistics.intervals import binomial_interval, estimate_deciding_sce
 class AllowedAlarmRates(NamedTuple):
     """Largest acceptable rates of false and missed alarms."""
 
-    false_alarms: float = 0.01  # fraction of good runs that are stopped [1]
-    missed_alarms: float = 0.02  # fraction of bad runs that are not stopped [1]
+    false_alarms: float = 0.01  # largest fraction of good runs that are stopped [1]
+    missed_alarms: float = 0.02  # largest fraction of bad runs that are not stopped [1]
 
 
 DEFAULT_ALLOWED_RATES = AllowedAlarmRates()
