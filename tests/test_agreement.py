@@ -281,7 +281,7 @@ def test_runtime_and_jax_commands_agree_on_recorded_ticks(mechanism_name):
         assert count.magnified <= (name in LONG_LAWS)
 
 
-def test_runtime_and_jax_commands_agree_in_long_held_contact():
+def test_runtime_and_jax_commands_agree_in_a_long_contact():
     """Penetrate, hold for 1e4 ticks, and leave: no state may grow without bound."""
     forgetting = np.array([0.8, 0.9, 0.98])
     gains = {

@@ -62,7 +62,7 @@ def test_unknown_alarm_verdict_states_number_of_scenarios_needed(missed, words):
 
 @pytest.mark.parametrize("allowed", [0.001, 0.02, 0.3])
 @pytest.mark.parametrize(("failures", "number"), [(0, 0), (0, 30), (1, 200), (3, 60), (40, 100)])
-def test_deciding_scenarios_is_smallest_number_that_decides_alarm_verdict(failures, number, allowed):
+def test_stated_number_of_scenarios_is_smallest_that_decides_alarm_verdict(failures, number, allowed):
     number_found = estimate_deciding_scenarios(failures, number, allowed)
     share = failures / max(number, 1)
     assert number_found is not None
@@ -75,7 +75,7 @@ def test_deciding_scenarios_is_smallest_number_that_decides_alarm_verdict(failur
     assert decided(number_found) and not all(decided(runs) for runs in fewer)
 
 
-def test_detectable_error_is_smallest_error_that_raises_alarm_in_95_percent():
+def test_detectable_error_raises_alarm_in_at_least_95_percent_of_contacts():
     rng = np.random.default_rng(0)
     error = rng.normal(0.0, 0.01, 4000)
     result = find_detectable_error(error, np.abs(error) + rng.normal(0.0, 0.001, 4000) > 0.02)

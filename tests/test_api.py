@@ -69,7 +69,7 @@ def test_controller_import_needs_neither_jax_nor_numpy():
 # Loading.
 
 
-def test_load_overrides_equal_set_options_of_command_line(command):
+def test_overrides_of_load_function_equal_set_options_of_commands(command):
     mechanism = jaxhil.load("varying", {"rig.force_sensor.delay": np.float32(0.0035), **TWO})
     assert mechanism.contact.stiffness == [124355.0, 90000.0] and mechanism.approach.contacts == 2
     assert mechanism.rig.force_sensor.delay == float(np.float32(0.0035))
@@ -134,7 +134,7 @@ def run():
     return jaxhil.simulate(jaxhil.load("varying", TWO), "phase_lead")
 
 
-def test_simulate_function_equals_simulate_command(run, command, tmp_path):
+def test_simulate_function_gives_the_results_of_simulate_command(run, command, tmp_path):
     options = [f"--set={path}={value}" for path, value in TWO.items()]
     document = command("simulate", "--compensator", "phase_lead", "--json", *options).document
     assert [
@@ -147,7 +147,7 @@ def test_simulate_function_equals_simulate_command(run, command, tmp_path):
     assert (tmp_path / "new" / "run.svg").read_bytes() == (tmp_path / "command.svg").read_bytes()
 
 
-def test_run_ticks_are_consistent_with_contacts(run):
+def test_recorded_ticks_of_a_run_agree_with_its_contacts(run):
     period = run.mechanism.rig.control_period
     ticks = len(run.time)
     for name in run.ticks._fields[:-1]:
@@ -169,7 +169,7 @@ def test_run_ticks_are_consistent_with_contacts(run):
         run.status = "good"
 
 
-def test_run_to_csv_writes_ticks_exactly(run, tmp_path):
+def test_csv_file_of_a_run_contains_exact_tick_values(run, tmp_path):
     run.to_csv(tmp_path / "run.csv")
     table = np.genfromtxt(tmp_path / "run.csv", delimiter=",", names=True)
     assert table.dtype.names == run.ticks._fields
@@ -180,7 +180,7 @@ def test_run_to_csv_writes_ticks_exactly(run, tmp_path):
     assert "ends in .png" in refusal(run.plot, tmp_path / "run.gif")
 
 
-def test_run_lists_contact_that_is_not_reached():
+def test_simulated_run_lists_contacts_that_are_not_reached():
     diverging = {**TWO, "rig.force_sensor.delay": 0.9, "contact.stiffness": [1e7]}
     run = jaxhil.simulate(jaxhil.load("varying", diverging), "none")
     first, second = run.contacts
@@ -258,7 +258,7 @@ def as_by_default():
 
 
 @pytest.mark.slow
-def test_simulate_in_float32_process_equals_command(as_by_default, command):
+def test_simulate_function_in_float32_process_gives_the_results_of_command(as_by_default, command):
     *contacts, slope = json.loads(as_by_default)
     document = command("simulate", "varying", "--compensator", "phase_lead", "--json").document
     wanted = [

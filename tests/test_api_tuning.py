@@ -55,14 +55,16 @@ def test_tuning_import_loads_submodules_lazily():
 
 
 @pytest.mark.slow
-def test_tune_function_equals_tune_command(jaxhil, tuned, tmp_path):
+def test_tune_function_gives_the_results_of_tune_command(jaxhil, tuned, tmp_path):
     jaxhil("tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY)
     written = json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())
     assert written["sha256"] == tuned.document["sha256"]
     assert tuned.verdict == "bad" and tuned.figures["tuned"].rms < tuned.figures["before"].rms
 
 
-def test_sweep_without_folder_equals_stored_sweep(tuned, tmp_path, monkeypatch, capsys):
+def test_sweep_function_without_folder_gives_the_results_of_stored_sweep(
+    tuned, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     study = tuning.sweep(tuned, scenarios=40, chunk=32, limit=0.5)
     assert not list(tmp_path.iterdir()) and capsys.readouterr() == ("", "")

@@ -88,7 +88,7 @@ def test_bundle_check_accepts_exported_bundle(files, folder):
 
 
 @pytest.mark.parametrize("name", [*CODE, "c99/jaxhil_controller.c", "README.md", "ros2.yaml", "gains.mat"])
-def test_third_party_bundle_with_valid_checksums_is_not_run(files, folder, tmp_path, name):
+def test_code_of_third_party_bundle_with_valid_checksums_is_not_run(files, folder, tmp_path, name):
     """Add code that would leave a file if executed, and update the manifest."""
     trap = b"\nopen(%r, 'w')\n" % str(tmp_path / "ran").encode()
     signed_files = signed({**files, name: files[name] + trap}, document_of(files))

@@ -262,13 +262,13 @@ def test_c99_impulse_ledger_contacts_equal_python_to_the_bit(batch):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_c99_commands_equal_python_if_compared_values_are_equal(law, batch):
+def test_c99_commands_equal_python_for_values_exactly_at_thresholds(law, batch):
     rng = np.random.default_rng([10, LAWS.index(law)])
     for _ in range(25):
         compare(batch(law), *drawn_exactly(law, 300, rng))
 
 
-def test_c99_random_test_ticks_raise_every_fault(batch):
+def test_random_ticks_of_c99_tests_raise_every_fault(batch):
     made = batch("response_error")
     rng = np.random.default_rng(6)
     seen, audited, identified = 0, set(), set()
@@ -318,7 +318,7 @@ def limit_values(law, name):
 
 @settings(max_examples=150)
 @given(case=cases())
-def test_c99_commands_equal_python_on_hypothesis_ticks(case, batch):
+def test_c99_commands_equal_python_for_ticks_generated_by_hypothesis(case, batch):
     gain_file, rows = case
     compare(batch(gain_file.compensator), gain_file, rows)
 

@@ -46,7 +46,7 @@ def test_c99_compensators_compile_without_warnings(law, controller_object):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_c99_controller_has_no_static_data_and_calls_only_math(law, controller_object):
+def test_c99_controller_has_no_static_data_and_calls_only_math_functions(law, controller_object):
     if shutil.which("nm") is None:
         pytest.skip("no nm on this machine")
     folder = controller_object(law)

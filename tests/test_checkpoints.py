@@ -36,7 +36,7 @@ def test_checkpoint_values_are_read_back_to_the_bit():
 
 
 @pytest.mark.parametrize("thing", [print, object(), np.array([print]), {"a": lambda: 1}])
-def test_checkpoint_of_value_that_is_not_data_raises_type_error(thing):
+def test_checkpoint_of_object_that_is_not_plain_data_raises_type_error(thing):
     with pytest.raises(TypeError):
         encode_value(thing)
 

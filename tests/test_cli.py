@@ -83,7 +83,7 @@ def test_simulate_reports_failed_run(jaxhil):
     assert "timeout" in jaxhil("simulate", "rig-300kg", *weak).out
 
 
-def test_simulate_gives_equal_results_for_name_and_file(jaxhil):
+def test_simulate_gives_equal_results_for_name_and_file_of_mechanism(jaxhil):
     document = jaxhil("simulate", builtin_path("rig-300kg"), "--json").document
     assert document == jaxhil("simulate", "rig-300kg", "--json").document
 
@@ -133,7 +133,7 @@ def test_tune_json_states_sensor_noise(jaxhil, tmp_path):
     assert entry["sensor_noise"] is True
 
 
-def test_tune_continues_after_unusable_files(jaxhil, tmp_path):
+def test_tune_skips_unusable_mechanism_files(jaxhil, tmp_path):
     files = ["nowhere.toml", "rig-300kg", builtin_path("rig-300kg")]
     arguments = ["--compensator", "none", "-o", tmp_path, "--json", "--limit", "inf", *TINY]
     ran = jaxhil("tune", *files, *arguments)

@@ -222,7 +222,7 @@ def test_folder_name_is_a_single_safe_path_component(name):
     assert len(folder.encode()) <= 120 and not folder.startswith(".")
 
 
-def test_result_comparison_ranks_number_of_failures_before_error():
+def test_results_are_ranked_by_number_of_failures_before_error():
     def made(rms, failed):
         return ErrorMetrics(rms, rms, rms, rms, 0.0, 1.0, 0.0, failed)
 

@@ -123,7 +123,7 @@ def test_compare_plots_are_written(tmp_path):
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("errors.png", "honesty.png"))
 
 
-def test_compare_cost_per_tick_is_a_positive_time():
+def test_compare_reports_positive_computing_time_per_tick():
     assert 0 < measure_tick_time("phase_lead", literature("phase_lead"), 1e-3, inf, 0.005) < 1e3
 
 

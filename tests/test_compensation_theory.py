@@ -52,7 +52,7 @@ COMPENSATIONS = [(0, 0, 0), (0, 1, 0), (0.5, 0, 0), (0.5, 1, 0), (1, 1, 0), (1, 
 
 
 @pytest.mark.parametrize("model", ["first_order", "second_order"])
-def test_response_error_net_delay_matches_closed_form(model):
+def test_net_delay_with_response_error_compensator_matches_closed_form(model):
     simulator = {"first_order": {"time_constant": 0.006}, "second_order": SECOND_ORDER}[model]
     parsed = validated(
         mechanism({"stiffness": [STIFFNESS]}, simulator | {"model": model}, 0.006, period=FINE)
@@ -162,18 +162,18 @@ def first_order_leads():
     return result, np.array([decay(root(b, tau)) for b, tau in zip(damping, delay, strict=True)])
 
 
-def test_first_order_lead_growth_matches_characteristic_root():
+def test_growth_with_first_order_lead_matches_characteristic_root():
     result, expected = first_order_leads()
     np.testing.assert_allclose(result, expected, rtol=0, atol=1e-4)
 
 
-def test_first_order_lead_stays_divergent_without_damping():
+def test_contact_with_first_order_lead_diverges_without_damping():
     angle = LEADS[0, :3]
     ratio = first_order_leads()[0][:3] / (pi / 6 * angle**3)
     assert np.all(np.abs(ratio - 1) < 0.01 + 0.7 * angle**2)
 
 
-def test_first_order_lead_stability_changes_at_critical_damping():
+def test_contact_with_first_order_lead_is_stable_above_critical_damping():
     result = first_order_leads()[0][3:].reshape(2, 3)
     assert np.all(np.abs(result[:, 1]) < 1e-4)
     assert np.all(result[:, 0] > 4e-3) and np.all(result[:, 2] < -4e-3)
@@ -247,7 +247,7 @@ def clamped_and_not(name, law, blind, gains, **leaves):
 
 
 @pytest.mark.parametrize("blind", [0, 40])
-def test_clamped_response_error_diverges_as_predicted(blind):
+def test_contact_with_clamped_response_error_diverges_as_predicted(blind):
     gains = fixed_gains(validated(mechanism({}, IDEAL, 0.0, period=FINE)), phase_lead=0.0)
     lag = CLAMP_PHASES / OMEGA
     free, clamped = clamped_and_not("response_error", ResponseError(), blind, gains, simulator__delay=lag)
@@ -258,7 +258,7 @@ def test_clamped_response_error_diverges_as_predicted(blind):
     assert np.all(np.abs(free - 1) < 0.1 * CLAMP_PHASES**2)
 
 
-def test_clamped_phase_lead_diverges_more_than_unclamped_phase_lead():
+def test_contact_diverges_more_with_clamped_than_with_unclamped_phase_lead():
     delay = CLAMP_PHASES / OMEGA
     gains = {"phase_lead": delay, "lead_filter": FINE / 2}
     free, clamped = clamped_and_not("phase_lead", PhaseLead(), 0, gains, force_sensor__delay=delay)

@@ -136,7 +136,7 @@ def test_nominal_gains_lie_within_bounds_of_runtime(name, hostile):
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_jax_and_runtime_agree_on_contacts_and_on_noise(name):
+def test_jax_and_runtime_compensators_agree_for_contacts_and_for_noise(name):
     signals, constants = readings((), GAP)
     rng = np.random.default_rng(1)
     noise = Signals(*(leaf * rng.standard_normal(TICKS) for leaf in signals[:4]), signals.age)
@@ -280,7 +280,7 @@ def test_compensator_noise_amplification_matches_prediction(name):
 
 
 @pytest.mark.parametrize("depth", [1.0, 1e4, 1e9])
-def test_peak_force_of_weak_hardening_equals_linear_contact(depth):
+def test_weakly_hardening_contact_has_peak_force_of_linear_contact(depth):
     """Cancellation must not give a peak force of 0."""
     linear = load("claw-350kg", ["contact.damping=[0.0]"]).mechanism
     hardening = load(

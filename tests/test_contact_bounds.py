@@ -77,7 +77,7 @@ def test_verdict_is_bad_for_correct_restitution_with_wrong_force(slow_simulator)
     assert long.startswith("contact 1: real contact of ") and long.endswith("2 times the ideal contact's")
 
 
-def test_verdict_reasons_name_status_or_error_first(slow_simulator):
+def test_first_reason_of_verdict_is_status_or_error_of_the_contact(slow_simulator):
     plain = jaxhil.simulate("claw-350kg")
     (diverges,) = plain.reasons()
     assert diverges.startswith("the largest error is +") and "divergence" in diverges

@@ -150,7 +150,7 @@ def test_mean_restitution_does_not_depend_on_noise_for_any_mechanism(built_in, n
 
 
 @pytest.mark.parametrize("name", ["phase_lead", "response_error", "smith_predictor"])
-def test_contact_end_is_declared_after_the_whole_impulse(name):
+def test_contact_counts_as_ended_only_after_its_whole_impulse(name):
     """Without noise, the model's velocity no longer changes after the detected end."""
     parsed = heavy_mechanisms()
     gains = nominal_gains(parsed, name)
@@ -218,7 +218,7 @@ def test_exported_watchdog_false_alarms_lie_within_stated_interval(tmp_path):
     assert binomial_interval(alarms, len(runs), 0.99)[0] <= stated["high"], (alarms, stated)
 
 
-def test_tuning_time_limit_includes_wait_for_noisy_contact_end():
+def test_simulated_time_in_tuning_includes_wait_for_noisy_contact_end():
     noisy, free = (
         build_task(heavy_mechanisms(noise_std=std), "phase_lead", 8, 0).scenarios.time_limit
         for std in (1.0, 0.0)

@@ -41,7 +41,7 @@ def second_order(frequency):
     return {"model": "second_order", "natural_frequency": frequency, "damping_ratio": 0.8}
 
 
-def test_lagging_sensor_restitution_converges_to_ideal_simulator():
+def test_restitution_with_sensor_lag_converges_for_increasingly_fast_simulator():
     cases = [fast_mechanism(second_order(frequency)) for frequency in (300.0, 600.0, 1200.0)]
     parsed = [validated(case) for case in cases]
     scenarios = join(build_scenarios(member) for member in parsed)
@@ -57,7 +57,7 @@ def test_lagging_sensor_restitution_converges_to_ideal_simulator():
     )
 
 
-def test_lagging_contact_derivatives_match_finite_differences():
+def test_derivatives_of_contact_with_sensor_lag_match_finite_differences():
     parsed = validated(fast_mechanism(second_order(60.0), law="kelvin_voigt", damping=[300.0]))
     loop = build_loop(parsed, "none", join([build_scenarios(parsed)]), energies=True)
     scenario = jax.tree.map(jax.numpy.asarray, join([build_scenarios(parsed)]))

@@ -64,7 +64,7 @@ def test_correlated_draws_keep_marginals_and_have_stated_correlation(draws):
     assert draws is draw or np.max(beyond) < 1
 
 
-def test_correlated_draws_keep_small_variance_of_a_combination():
+def test_correlated_draws_keep_small_variance_of_a_linear_combination():
     parsed = mechanism(keys=[DELAY, DAMPING], matrix=[[1.0], [0.98, 1.0]])
     values = draw(parsed, 4096, 0)
     stiffness = 120e3

@@ -23,7 +23,7 @@ from jaxhil.files import (
 )
 
 
-def test_write_atomically_replaces_file(tmp_path):
+def test_atomic_write_replaces_the_file(tmp_path):
     path = tmp_path / "file"
     for content in (b"old", bytearray(b"new"), memoryview(b"newer")):
         write_atomically(path, content)
@@ -31,7 +31,7 @@ def test_write_atomically_replaces_file(tmp_path):
 
 
 @pytest.mark.parametrize("has_links", [True, False])
-def test_write_new_never_overwrites_a_file(tmp_path, monkeypatch, has_links):
+def test_writing_a_new_file_never_overwrites_a_file(tmp_path, monkeypatch, has_links):
     def refuse(*_):
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
@@ -45,7 +45,7 @@ def test_write_new_never_overwrites_a_file(tmp_path, monkeypatch, has_links):
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_write_atomically_keeps_old_file_after_failure(tmp_path, monkeypatch, step):
+def test_failed_atomic_write_keeps_the_old_file(tmp_path, monkeypatch, step):
     path = tmp_path / "file"
     write_atomically(path, b"old")
 
@@ -59,7 +59,7 @@ def test_write_atomically_keeps_old_file_after_failure(tmp_path, monkeypatch, st
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_report_write_errors_passes_other_errors_through(tmp_path):
+def test_errors_other_than_write_errors_pass_through_report_write_errors(tmp_path):
     with pytest.raises(InputError, match=r"^something else$"), report_write_errors(tmp_path):
         raise InputError("something else")
 
@@ -92,7 +92,7 @@ def test_file_functions_reject_anything_but_plain_files(tmp_path):
     assert target.read_bytes() == b"years" and sorted(os.listdir(tmp_path)) == before
 
 
-def test_make_folder_rejects_links(tmp_path):
+def test_folder_creation_rejects_links(tmp_path):
     for name in ("new/inner", "new"):
         make_folder(tmp_path / name)
     assert (tmp_path / "new/inner").is_dir()
@@ -115,7 +115,7 @@ def test_output_path_given_as_link_is_written_through_the_link(tmp_path):
         write_atomically(resolve_output_path(tmp_path / "device"), b"picture")
 
 
-def test_read_checksummed_returns_exact_content_or_none(tmp_path):
+def test_checksummed_file_is_read_back_exactly_or_ignored(tmp_path):
     path = tmp_path / "file"
     generator = np.random.default_rng(0)
     assert read_checksummed(path) is None
@@ -135,7 +135,7 @@ def test_read_checksummed_returns_exact_content_or_none(tmp_path):
                 assert read_checksummed(path) is None
 
 
-def test_remove_stale_removes_only_temporary_files_of_killed_processes(tmp_path):
+def test_only_temporary_files_of_killed_processes_are_removed_as_stale(tmp_path):
     killed = """
 import os, signal, sys
 from pathlib import Path

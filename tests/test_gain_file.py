@@ -132,12 +132,12 @@ def test_json_data_has_null_for_non_finite_values():
         ({"phase_leed": 0.0}, "gains: phase_leed: found an extra gain, expected phase_lead, "),
     ],
 )
-def test_build_document_rejects_gains_out_of_bounds(changes, message):
+def test_gain_document_with_gains_out_of_bounds_is_rejected(changes, message):
     with pytest.raises(InputError, match=message):
         make(**changes)
 
 
-def test_build_document_rejects_missing_gain_and_unknown_compensator():
+def test_gain_document_with_missing_gain_or_unknown_compensator_is_rejected():
     mechanism, sha256, _ = load("varying")
     with pytest.raises(
         InputError, match="gains: lead_filter: found nothing, expected phase_lead, lead_filter"
@@ -147,7 +147,7 @@ def test_build_document_rejects_missing_gain_and_unknown_compensator():
         build_document("pid", {}, mechanism, sha256, {}, {}, 0, {})
 
 
-def test_build_document_clips_gain_beyond_bound_by_rounding():
+def test_gain_beyond_its_bound_by_rounding_is_clipped_in_gain_document():
     assert make(forgetting=1.0 + 2e-16 * 5)["gains"]["forgetting"]["value"] == 1.0
 
 

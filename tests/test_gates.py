@@ -66,7 +66,7 @@ def crossing(enters, leaves):
 
 
 @SIDES
-def test_contact_gate_sums_to_contact_time_and_lags_one_period(gates):
+def test_sum_of_contact_gate_equals_contact_time_and_gate_lags_one_period(gates):
     enters, duration = (leaf.ravel() for leaf in np.meshgrid(PHASES, 7.3 + PHASES))
     leaves = enters + duration
     result = gates(crossing(enters, leaves))

@@ -147,7 +147,7 @@ def disagreements(study):
     }
 
 
-def test_restitution_derivatives_by_gains_and_parameters_are_finite_and_nonzero(study):
+def test_restitution_derivatives_for_gains_and_parameters_are_nonzero(study):
     exact = study[-1]
     assert np.all(np.isfinite(exact))
     # Every parameter, including the threshold, changes the restitution of most scenarios.
@@ -192,7 +192,7 @@ def test_restitution_is_continuous_in_the_identification_delay(sweep):
     np.testing.assert_allclose(steps.sum(), expected.sum(), rtol=1e-4)
 
 
-def test_restitution_derivative_by_identification_delay_matches_difference(sweep):
+def test_restitution_derivative_for_identification_delay_matches_difference(sweep):
     delay, restitution, slope = sweep
     difference = (restitution[2:] - restitution[:-2]) / (delay[2:] - delay[:-2])
     # At a whole number of periods the interpolation between two samples, and with it the curve, has a kink.

@@ -178,7 +178,7 @@ def test_trajectory_of_linear_contact_matches_closed_form():
     "case, tolerance",
     [("kelvin_voigt", 1e-3), pytest.param("piecewise_linear", 1e-3, marks=pytest.mark.slow)],
 )
-def test_integrated_contact_derivatives_match_those_of_closed_forms(case, tolerance):
+def test_integrated_contact_derivatives_match_derivatives_of_closed_forms(case, tolerance):
     name, values = CASES[case]
     law, parameters = CONTACT_LAWS[name], contact(**values)
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))

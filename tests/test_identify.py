@@ -188,7 +188,7 @@ def test_identify_without_prior_reports_missing_runs(speeds, seconds, says):
     assert result["rig.force_sensor.noise_std"].value == pytest.approx(0.5, rel=0.06)
 
 
-def test_identify_uses_prior_for_contact_below_noise():
+def test_identify_uses_prior_if_contact_force_is_below_noise():
     """The noise of 2.67 N exceeds the contact force at 0.3 mm/s."""
     campaign = campaigns.campaign("noisy", 0, speeds=(0.0002, 0.0003), seconds=5.0)
     options = IdentificationOptions(law="linear", fixed={"rig.contact_plane": 0.0}, hold_out=0.0)
@@ -327,7 +327,7 @@ def test_validation_contacts_of_identify_cover_every_speed():
     assert not select_held_out_contacts(runs, 0.0).any() and not select_held_out_contacts(runs[:2], 0.2).any()
 
 
-def test_uncertainty_tables_have_floors_and_positive_definite_correlation():
+def test_uncertainty_tables_have_minimum_std_and_positive_definite_correlation():
     rng = np.random.default_rng(0)
     column = rng.standard_normal(3000)
     draws = np.column_stack([column, column, 1e-9 * rng.standard_normal(3000), rng.standard_normal(3000)])

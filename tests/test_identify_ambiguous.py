@@ -138,7 +138,9 @@ PROPERTY = [
 
 
 @pytest.mark.parametrize(("name", "options", "change"), PROPERTY)
-def test_identify_verdict_equals_check_of_written_file(monkeypatch, tmp_path, name, options, change):
+def test_identify_verdict_equals_verdict_of_check_of_written_file(
+    monkeypatch, tmp_path, name, options, change
+):
     monkeypatch.setattr(campaigns, "KINDS", campaign_kinds.KINDS | ambiguous.KINDS)
     campaign = change(campaigns.campaign(name, 3, speeds=FEW, seconds=10.0))
     result = identify(campaign, options=IdentificationOptions(**options))

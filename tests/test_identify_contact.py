@@ -184,7 +184,7 @@ def test_contact_law_selection_selects_the_true_law(name, law):
         assert candidates[0].law.shape == {"exponent": 1.5}
 
 
-def test_contact_profile_grid_is_divided_at_contact_onsets():
+def test_grid_of_delay_profile_is_divided_where_contact_onsets_cross_ticks():
     at = np.array([0.1, 0.15, 0.7])
     np.testing.assert_allclose(
         contact_profile.divide_into_cells(0.0, 1.0, at, 6), [0.0, 0.1, 0.15, 0.425, 0.7, 0.85, 1.0]

@@ -47,7 +47,7 @@ def problem(law, time_constant=0.0, whitening=(1.0,), threshold=0.0, seconds=12.
     "lag, whitening", [(0.0, (1.0,)), (0.0015, (1.0,)), (0.0, COLOURED), (0.001, COLOURED)]
 )
 @pytest.mark.parametrize("threshold", [0.0, 0.5])
-def test_pseudo_rows_of_long_press_have_the_misfit_of_all_rows(law, lag, whitening, threshold):
+def test_pseudo_rows_of_a_long_press_run_have_the_misfit_of_all_rows(law, lag, whitening, threshold):
     full = problem(law, lag, whitening, threshold)
     few = summarise_deep_lanes(full, (NEAR[0] - lag, 0.0))
     assert few is not full
@@ -70,7 +70,7 @@ def test_pseudo_rows_of_long_press_have_the_misfit_of_all_rows(law, lag, whiteni
 @pytest.mark.parametrize(
     "law, plane", [(kelvin_voigt(), 9e-4), (KINKED.make(8e-4), 0.0)], ids=["shallow", "kinks in the force"]
 )
-def test_long_press_uses_all_rows_if_pseudo_rows_are_inaccurate(law, plane):
+def test_long_press_run_uses_all_rows_if_pseudo_rows_are_inaccurate(law, plane):
     full = problem(law)
     few = summarise_deep_lanes(full, NEAR)
     exact, fit = full.at(0.0037, plane), few.at(0.0037, plane)

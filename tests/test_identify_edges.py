@@ -46,7 +46,7 @@ def test_dead_zone_is_estimated_from_noise_at_rest():
 
 
 @pytest.mark.parametrize("is_cut", [True, False])
-def test_identify_reports_dead_zone_without_subtraction_as_defect(monkeypatch, tmp_path, is_cut):
+def test_identify_reports_dead_zone_that_sensor_does_not_subtract_as_defect(monkeypatch, tmp_path, is_cut):
     campaign = ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0)
     runs = []
     for run in campaign.runs:

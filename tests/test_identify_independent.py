@@ -96,7 +96,7 @@ def test_identify_verdict_is_good_for_campaign_of_independent_simulator(tmp_path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_identify_verdict_is_never_good_for_wrong_file_of_independent_campaign(kind, tmp_path):
+def test_identify_on_independent_simulator_never_calls_inaccurate_file_good(kind, tmp_path):
     outcomes = []
     for seed in range(CAMPAIGNS):
         outcomes.append(judge(kind, seed, tmp_path / str(seed)))

@@ -64,7 +64,7 @@ def close(actual, expected, share=0.06):
     np.testing.assert_allclose((covariance - spread) / np.outer(std, std), 0.0, atol=share)
 
 
-def test_combination_of_logs_and_prior_equals_weighted_least_squares():
+def test_estimate_from_logs_and_prior_equals_weighted_least_squares():
     mechanism, mean, spread = prior()
     result = conditioning.condition_on_prior(logs_say(KEYS), mechanism, 3.0)
     both = np.linalg.inv(np.linalg.inv(COVARIANCE) + np.linalg.inv(spread))
@@ -72,7 +72,7 @@ def test_combination_of_logs_and_prior_equals_weighted_least_squares():
     close(summary(result), (wanted, both))
 
 
-def test_combination_of_logs_and_prior_updates_values_known_only_from_prior():
+def test_estimate_from_logs_updates_correlated_values_known_only_from_prior():
     """Without free motion, the estimated force delay includes the error of the prior's motion simulator."""
     mechanism, mean, spread = prior()
     draws = conditioning.condition_on_prior(logs_say(KEYS[1:]), mechanism, 3.0)
@@ -87,7 +87,7 @@ def test_combination_of_logs_and_prior_updates_values_known_only_from_prior():
     close(summary(draws), (wanted, both))
 
 
-def test_fixed_values_condition_parameter_draws_and_contradictions_are_reported():
+def test_parameter_draws_are_conditioned_on_fixed_values_with_note_if_contradictory():
     result, notes = conditioning.condition_on_fixed(logs_say(KEYS), {"contact.damping.0": 660.0})
     assert KEYS[3] not in result and notes == []
     regression = COVARIANCE[:3, 3] / COVARIANCE[3, 3]

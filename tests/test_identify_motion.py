@@ -157,7 +157,7 @@ def test_spectrum_detects_nonlinearity_at_unexcited_frequencies():
 
 
 @pytest.mark.parametrize("logarithms", [(4.3, -0.2), (4.3, 1.1), (156.8, 153.0)])
-def test_motion_model_limits_poles_above_all_measured_frequencies(logarithms):
+def test_poles_of_motion_model_far_above_measured_frequencies_are_limited(logarithms):
     """A pole of 1e134 rad/s would make the motion overflow."""
     structure = rational.STRUCTURES[2]
     asked = np.array([*logarithms, 0.001])

@@ -8,7 +8,7 @@ from tuning.identification.noise import detect_quantum, estimate_noise, fit_whit
 
 
 @pytest.mark.parametrize("quantum", (0.0, 0.5, 3.0, 8.0))
-def test_noise_and_bias_at_rest_lie_within_stated_errors_for_any_quantum(quantum):
+def test_noise_and_bias_at_rest_lie_within_stated_errors_for_any_resolution(quantum):
     scores = []
     for seed in range(20):
         signal = 1.3 + 2.67 * np.random.default_rng(seed).standard_normal(3000)
@@ -21,7 +21,7 @@ def test_noise_and_bias_at_rest_lie_within_stated_errors_for_any_quantum(quantum
     assert np.all(rms < 1.6) and np.all(rms > 0.5)
 
 
-def test_noise_smaller_than_the_quantum_is_estimated_at_rest():
+def test_noise_smaller_than_sensor_resolution_is_estimated_at_rest():
     """Quantisation alone would increase 0.3 of a quantum to 0.42."""
     readings = 0.5 * np.round((0.21 + 0.15 * np.random.default_rng(0).standard_normal(20_000)) / 0.5)
     result = estimate_noise(readings)
@@ -40,7 +40,7 @@ def test_coloured_noise_at_rest_is_whitened():
     assert fit_whitening_filter(rng.standard_normal(5000)) == (1.0,)
 
 
-def test_quantum_is_detected_with_and_without_dead_zone():
+def test_sensor_resolution_is_detected_with_and_without_dead_zone():
     force = 0.5 * np.round(20.0 * np.random.default_rng(0).standard_normal(4000))
     dead = np.sign(force) * np.maximum(0.0, np.abs(force) - 3.7)
     assert detect_quantum(force) == pytest.approx(0.5) and detect_quantum(dead) == pytest.approx(0.5)

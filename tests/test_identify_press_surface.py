@@ -50,7 +50,7 @@ def fit(run, noise):
     ],
     ids=["multisine", "biased", "ten times the noise", "slow"],
 )
-def test_surface_is_estimated_from_press_run_in_contact_and_bias_at_rest(run, noise, bias):
+def test_surface_is_estimated_from_bias_at_rest_and_press_run_always_in_contact(run, noise, bias):
     result = fit(replace(run, force_measured=run.force_measured + bias), rest(noise, bias)).posterior
     plane, stiffness = (result.names.index(name) for name in ("plane", "stiffness.0"))
     assert abs(result.mean[plane]) < 4.0 * np.std(result.draws[:, plane]) < 1e-4
@@ -58,7 +58,7 @@ def test_surface_is_estimated_from_press_run_in_contact_and_bias_at_rest(run, no
     assert result.mean[stiffness] == pytest.approx(1.2e5, rel=0.01 * noise)
 
 
-def test_press_run_in_contact_is_rejected_without_bias_at_rest():
+def test_press_run_always_in_contact_is_rejected_without_bias_at_rest():
     for run in (multisine(), ramp(2e-4), multisine(noise=10.0)):
         with pytest.raises(
             InputError, match=r"^press.csv: force_measured: found a press run that never leaves"

@@ -164,7 +164,7 @@ def test_confidence_sequence_has_stated_coverage_if_stopped_at_a_width(probabili
     assert (running.number, running.low, running.high) == (number[stop][0], low[stop][0], high[stop][0])
 
 
-def test_sequential_interval_is_intersection_and_restarts_on_contradiction():
+def test_sequential_interval_is_intersection_of_all_looks_unless_it_is_empty():
     failures, number = walks(0.3, repeats=1, looks=50)
     running = SequentialState()
     for added in np.diff(failures[0], prepend=0):

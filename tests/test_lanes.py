@@ -13,7 +13,7 @@ def test_safe_sqrt_and_derivative_are_zero_for_arguments_up_to_zero():
     np.testing.assert_array_equal(jax.vmap(jax.grad(safe_sqrt))(squares), [0.0, 0.0, 0.25])
 
 
-def test_select_lanes_works_for_arrays_of_any_rank():
+def test_lanes_of_arrays_of_any_rank_are_selected():
     new = {"scalar": jnp.array([1.0, 2.0]), "vector": jnp.array([[1.0, 2.0], [3.0, 4.0]])}
     old = jax.tree.map(jnp.zeros_like, new)
     chosen = select_lanes(jnp.array([True, False]), new, old)

@@ -28,7 +28,7 @@ def at(position, theta):
     return Pose(place(position, BATCH), exponential(place(theta, BATCH)))
 
 
-def test_latch_captures_and_holds_bodies_if_deep_enough_and_aligned():
+def test_latch_captures_and_holds_bodies_that_are_deep_enough_and_aligned():
     """The force is zero before and at the capture, then that of a spring."""
     one = latch(False)
     still = Twist(place([0, 0, 0], BATCH), place([0, 0, 0], BATCH))

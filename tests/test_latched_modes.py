@@ -60,7 +60,7 @@ def scenario(delays):
 
 
 @pytest.mark.parametrize("delays", [[DELAY] * 6, UNEQUAL], ids=["equal", "unequal"])
-def test_latched_vibration_modes_grow_under_delay_as_characteristic_roots(delays):
+def test_vibration_modes_of_latched_bodies_grow_as_characteristic_roots(delays):
     """Compare with the fastest growing root of det(s^2 M + K diag(exp(-s tau))) = 0.
 
     For equal delays this is the root of the stiffest mode, by Lambert's function. The integrator adds half a

@@ -20,7 +20,7 @@ FACTORS = [(1, 1, 1, 1), (1e3, 1e3, 1e3, 1), (1e6, -1e3, 1e3, -1e-3), (1, -1e6, 
 
 
 @pytest.mark.parametrize(("names", "factors"), list(zip(NAMES, FACTORS, strict=True)))
-def test_drafted_mapping_file_reads_the_logs_of_the_draft(tmp_path, names, factors):
+def test_logs_are_read_with_the_mapping_file_drafted_from_them(tmp_path, names, factors):
     columns = [LOG[name] * factor for name, factor in zip(("t", "xd", "xm", "F"), factors, strict=True)]
     day = write_csv(tmp_path / "contact_1.csv", dict(zip(names, columns, strict=True)))
     free = sway() | {"F": 0.3 * np.random.default_rng(0).standard_normal(800)}

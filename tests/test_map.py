@@ -54,7 +54,7 @@ def simulated_growth(run, period):
 @pytest.mark.slow
 @pytest.mark.parametrize("changes", RIGS.values(), ids=RIGS)
 @pytest.mark.parametrize("compensator", LINEAR_COMPENSATORS)
-def test_stability_map_growth_rate_equals_that_of_long_simulated_contact(compensator, changes):
+def test_stability_map_growth_rate_equals_growth_in_long_simulated_contact(compensator, changes):
     mechanism = jaxhil.load("varying", SOFT | changes)
     result = compute_growth(
         mechanism, compensator, literature_gains(mechanism, compensator), build_scenarios(mechanism)
@@ -65,7 +65,7 @@ def test_stability_map_growth_rate_equals_that_of_long_simulated_contact(compens
 
 
 @pytest.mark.slow
-def test_stability_map_derivatives_by_gains_match_finite_differences():
+def test_stability_map_derivative_for_each_gain_matches_finite_difference():
     mechanism = jaxhil.load("varying", {"uncertainty": {}})
     gains, scenarios = literature_gains(mechanism, "phase_lead"), build_scenarios(mechanism)
     slopes = compute_growth(mechanism, "phase_lead", gains, scenarios).by_gain

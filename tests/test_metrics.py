@@ -101,7 +101,7 @@ def test_excess_variation_counts_return_of_the_last_command_to_zero():
     assert float(excess(padded, touching)) == pytest.approx(0, abs=1e-11)
 
 
-def test_excess_variation_derivatives_equal_those_of_explicit_sum():
+def test_excess_variation_derivatives_equal_derivatives_of_explicit_sum():
     generator = np.random.default_rng(1)
     touching = (np.arange(400) >= BEFORE) & (np.arange(400) < BEFORE + len(HUMP))
     commands, way = np.zeros((2, 400))

@@ -52,7 +52,7 @@ def alarms(mean, lanes, contacts, rng):
     return first
 
 
-def test_first_monitor_alarm_equals_that_of_control_charts():
+def test_first_monitor_alarm_equals_first_alarm_of_control_charts():
     z = np.random.default_rng(2).standard_normal((40, 3)) + np.array([0.0, 1.5, -4.0])
     for figure in range(3):
         first = next((i for i in range(40) if detect_changes(z[: i + 1])[0][figure] > ALARM_THRESHOLD), 40)

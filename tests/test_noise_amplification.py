@@ -34,7 +34,7 @@ def amplify(compensator, gains, period=1e-3):
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
-def test_noise_amplification_equals_that_of_compensator_filter(compensator):
+def test_noise_amplification_equals_amplification_by_compensator_filter(compensator):
     for gains in GAINS:
         values = dict(zip(NAMES, gains, strict=True))
         ours, slopes = amplify(compensator, values)

@@ -137,7 +137,7 @@ def at_the_same_time(series):
     return np.stack([series[250 * 2**lane, :, lane] for lane in range(3)], axis=-1)
 
 
-def test_free_top_converges_to_jacobis_solution_at_second_order(run):
+def test_torque_free_rotation_converges_to_jacobi_solution_at_second_order(run):
     result = AXES.inv().apply(at_the_same_time(run["angular"][0]).T).T
     (one, two, three), (first, _, third) = MOMENTS, FREE
     second = third * np.sqrt(three * (one - three) / (two * (one - two)))

@@ -124,7 +124,7 @@ def test_tuning_residuals_equal_errors_of_an_evaluation(outcomes, known_residual
 
 
 @pytest.mark.parametrize("name", OBJECTIVE_NAMES)
-def test_residual_sum_of_squares_equals_or_slightly_exceeds_objective(outcomes, name):
+def test_residual_sum_of_squares_is_never_below_but_close_to_objective(outcomes, name):
     objective = of_name(name)
     for gains, outcome in zip(GAINS, outcomes, strict=True):
         terms = compute_contact_terms(outcome)

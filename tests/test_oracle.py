@@ -236,7 +236,7 @@ def test_oracle_applies_sensor_effects_in_documented_order():
     assert expected.max() == 25.0
 
 
-def test_oracle_samples_position_before_step_of_ideal_zero_order_hold():
+def test_oracle_samples_position_before_ideal_simulator_steps_to_held_command():
     case = mechanism(contact={"law": "linear", "stiffness": [1e5]}, command_hold="zoh")
     signals = simulate(case, record=True)[0]["signals"]
     # In [t_{n-1}, t_n) the drives hold x_d(n): the sensor at tick n reads k x_d(n), not k x_d(n + 1).
@@ -244,7 +244,7 @@ def test_oracle_samples_position_before_step_of_ideal_zero_order_hold():
     assert np.allclose(signals["force_measured"], expected, rtol=0.0, atol=1e-12)
 
 
-def test_oracle_readings_and_peak_force_of_ideal_simulator_are_exact():
+def test_oracle_with_ideal_simulator_has_exact_readings_and_peak_force():
     case = mechanism(
         contact={"law": "linear", "stiffness": [1e5]},
         force_delay=0.00237,

@@ -64,7 +64,7 @@ def test_third_party_json_document_is_not_replaced(jaxhil, tmp_path, content):
     assert [(tmp_path / name).read_text() for name in ("compare.json", "gains.json")] == [content] * 2
 
 
-def test_sweep_does_not_use_a_folder_of_the_user(jaxhil, thesis, untouched, tmp_path):
+def test_sweep_refuses_folder_with_third_party_files(jaxhil, thesis, untouched, tmp_path):
     write_gain_file(tmp_path / "gains.json", case())
     for more in ((), ("--resume",)):
         ran = jaxhil("sweep", tmp_path / "gains.json", "--scenarios", "2", "-o", thesis, *more)

@@ -93,7 +93,7 @@ def test_pareto_point_is_dominated_if_another_is_better_and_none_worse():
 
 
 @pytest.mark.parametrize("compensator", ["phase_lead", "response_error"])
-def test_pareto_noise_amplification_equals_that_of_lead_filter(compensator):
+def test_pareto_noise_amplification_equals_amplification_by_lead_filter(compensator):
     mechanism = load("varying", ["rig.control_period=0.002"]).mechanism
     gains = {**literature_gains(mechanism, compensator), "phase_lead": 0.006, "lead_filter": 0.0017}
     impulse = np.zeros(3000)
@@ -116,7 +116,7 @@ def test_only_compensators_that_amplify_noise_have_a_pareto_front():
 
 
 @pytest.mark.slow
-def test_metrics_of_every_pareto_point_equal_those_of_an_evaluation(results, made):
+def test_metrics_of_every_pareto_point_equal_metrics_of_an_evaluation(results, made):
     for mechanism, result, front in zip(MECHANISMS, results, made[0], strict=True):
         seed = SETTINGS.seed + VALIDATION_SEED_OFFSET
         scenarios = build_scenarios(mechanism, draw(mechanism, SETTINGS.validation, seed), seed)

@@ -90,7 +90,7 @@ def test_simulator_follows_the_model_under_position_lead():
     assert apart[0] < 0.01 and apart[1] == pytest.approx(apart[0] / 2, rel=0.1)
 
 
-def test_position_lead_derivatives_by_gains_match_finite_differences():
+def test_position_lead_derivative_for_each_gain_matches_finite_difference():
     law = COMPENSATORS["position_lead"]
     gains = {"position_lead": jnp.asarray(0.02), "acceleration_lead": jnp.asarray(2e-4)}
 

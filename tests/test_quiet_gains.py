@@ -101,7 +101,7 @@ def test_searches_for_quiet_gains_and_accurate_gains_share_one_program(quiet_gai
     assert quiet_gains[1] == 1
 
 
-def test_no_gains_on_a_grid_have_less_noise_within_the_error_tolerance(quiet_gains, validation):
+def test_quiet_gains_have_least_noise_of_all_grid_points_within_tolerance(quiet_gains, validation):
     result = quiet_gains[0][0]
     accurate = most_accurate(result).gains
     side = np.linspace(0, 1, 24)
@@ -222,7 +222,7 @@ def test_tuning_warnings_report_peak_force_and_noise_beyond_bounds():
     assert warned(**loud, silent=None) == ()
 
 
-def test_objective_value_of_quiet_gains_is_small_within_the_tolerance():
+def test_objective_of_errors_within_tolerance_is_small_but_not_zero():
     within = Objective(tolerance=0.01)
     assert evaluate_objective(within, np.array([0.005])) == pytest.approx(1e-4)
 

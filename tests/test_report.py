@@ -229,7 +229,7 @@ def test_report_page_is_accessible(whole, browser):
 
 
 @pytest.mark.slow
-def test_printed_report_cuts_no_picture(whole, browser):
+def test_no_picture_is_cut_off_in_printed_report(whole, browser):
     """No element exceeds a page or is split between pages."""
     browser.open(whole, 1440)
     pages, faults = browser.printed(*A4)

@@ -186,7 +186,7 @@ def test_contacts_end_without_force_even_if_compensator_output_decays_slowly(cal
     assert CONTACT_TOO_LONG in faults(1e-3) and CONTACT_TOO_LONG not in faults(1e-9)
 
 
-def test_rig_specific_limits_are_preserved_and_counted_as_false_alarms():
+def test_runs_stopped_by_rig_specific_limits_count_as_false_alarms():
     small = {"force_limit": 1e-3, "command_lowest": -0.05}
     result = calibrate(ONE_SIDED, scenarios=64, limit=LIMIT, replaced=small)
     assert {name: result.limits[name] for name in small} == small

@@ -224,7 +224,7 @@ def test_documentation_pages_open_offline(site, browser, width):
 
 
 @pytest.mark.slow
-def test_printed_documentation_pages_cut_no_content(site, browser):
+def test_no_content_is_cut_off_in_printed_documentation_pages(site, browser):
     for path in sorted(site.rglob("*.html")):
         browser.open(path, max(WIDTHS))
         pages, faults = browser.printed(*A4)

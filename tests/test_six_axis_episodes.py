@@ -77,7 +77,7 @@ def evaluated():
     return jax.tree.map(np.asarray, jax.jit(evaluate, static_argnums=0)(loop, {}, scenarios))
 
 
-def test_central_six_axis_episode_equals_one_axis_contact(evaluated):
+def test_central_contact_in_six_axis_run_equals_one_axis_contact(evaluated):
     expected = package.simulate("claw-350kg", "none").contacts[0]
     result = evaluated.metrics
 
@@ -98,7 +98,7 @@ def test_central_six_axis_episode_equals_one_axis_contact(evaluated):
     np.testing.assert_allclose(of("normal"), [0, 0, 1], atol=1e-12)
 
 
-def test_oblique_six_axis_episode_has_normal_tangential_and_rotational_errors(evaluated):
+def test_oblique_contact_has_normal_tangential_and_rotational_errors(evaluated):
     result = evaluated.metrics
 
     def of(name):
@@ -111,7 +111,7 @@ def test_oblique_six_axis_episode_has_normal_tangential_and_rotational_errors(ev
     assert 100 < of("effective_mass") < 300
 
 
-def test_six_axis_episode_does_not_depend_on_start_time_of_run(evaluated):
+def test_six_axis_metrics_do_not_depend_on_start_time_of_run(evaluated):
     for name, figure in evaluated.metrics._asdict().items():
         one, other = (figure[..., 0, lane] for lane in (ASIDE, EARLIER))
         # The ideal contact determines begin and end of a touch to 1 us.
@@ -151,7 +151,7 @@ def last_touches(touches):
 
 
 @pytest.mark.parametrize("lane", [CENTRAL, ASIDE, AGAIN])
-def test_six_axis_episode_ends_60_ms_after_last_touch_of_rig_and_ideal_contact(evaluated, ticks, lane):
+def test_six_axis_run_ends_60_ms_after_last_real_and_ideal_contact(evaluated, ticks, lane):
     rig, energy, ideal, expected = (part[:, lane] for part in ticks)
     since = [np.arange(TICKS) - last_touches(touches) for touches in (rig, ideal)]
     over = np.flatnonzero((np.minimum(*since) > QUIET / PERIOD) & np.isfinite(since[0] + since[1]))[0]
@@ -170,7 +170,7 @@ def test_six_axis_episode_ends_60_ms_after_last_touch_of_rig_and_ideal_contact(e
         assert onsets == [1, 2]
 
 
-def test_six_axis_episode_with_sensor_bias_ends_after_longest_wait(evaluated, ticks):
+def test_six_axis_run_with_sensor_bias_ends_after_longest_wait(evaluated, ticks):
     """A biased wrench never decays, so the model also moves before and after contact."""
     rig, energy, *_ = (part[:, BIASED] for part in ticks)
     over = np.flatnonzero(rig)[-1] + round((QUIET + 0.1) / PERIOD) + 2
@@ -178,7 +178,7 @@ def test_six_axis_episode_with_sensor_bias_ends_after_longest_wait(evaluated, ti
     np.testing.assert_allclose(evaluated.metrics.energy_change[0, BIASED], change, rtol=1e-10)
 
 
-def test_six_axis_episode_does_not_end_after_contact_of_little_energy(evaluated):
+def test_six_axis_run_does_not_end_after_contact_of_little_energy(evaluated):
     result = evaluated.metrics
     assert STATUS_NAMES[result.status[0, GRAZING]] == "timeout"
     assert result.touches[0, GRAZING] == result.reference_touches[0, GRAZING] == 1
@@ -196,7 +196,7 @@ def test_six_axis_episode_does_not_end_after_contact_of_little_energy(evaluated)
     np.testing.assert_allclose((change - expected) / first_touch, result.energy_error[0, CENTRAL], rtol=0.1)
 
 
-def test_six_axis_episode_without_contact_has_status_miss(evaluated):
+def test_six_axis_run_without_contact_has_status_miss(evaluated):
     result = evaluated.metrics
     assert STATUS_NAMES[result.status[0, AWAY]] == "miss"
     assert np.isnan(result.energy_error[0, AWAY]) and result.touches[0, AWAY] == 0

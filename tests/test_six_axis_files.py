@@ -45,7 +45,7 @@ def test_six_axis_builtins_are_read_and_state_their_sources(name):
     assert any_from_plain_data(json.loads(text), name) == mechanism
 
 
-def test_six_axis_values_may_be_given_as_one_or_two_numbers():
+def test_one_or_two_numbers_set_the_values_of_all_six_axes():
     simulator = load_any("probe-drogue").mechanism.rig.simulator
     assert simulator.damping_ratio == [0.8] * 6
     assert simulator.natural_frequency == [14.0] * 3 + [11.0] * 3

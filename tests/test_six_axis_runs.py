@@ -22,7 +22,7 @@ APART = {"approach": None, "uncertainty": {}, "start.duration": 0.05}
 APART |= {"start.target": {**STILL, "position": [0, 0, 0]}, "start.chaser": {**STILL, "position": [0, 0, 3]}}
 
 
-def test_six_axis_contact_patterns_are_rotated_copies():
+def test_pattern_of_six_axis_shapes_consists_of_rotated_copies():
     mechanism = load_any("petals", APART).mechanism
     scenario = build_scenarios(mechanism)
     edges, rings = jax.tree.map(np.asarray, scenario.groups)

@@ -130,7 +130,7 @@ def test_contact_that_differs_too_much_from_ideal_contact_counts_as_failure(idea
     np.testing.assert_array_equal(result["reference_duration_1"], ideal[1])
 
 
-def test_contact_unlike_ideal_contact_ranks_between_error_and_saturation():
+def test_outcome_unlike_ideal_contact_ranks_between_error_and_saturation():
     errors, status = [[0.5, 0.5], [0.0, 0.0]], [[OK, OK], [OK, OK]]
     assert outcomes(rows(errors, status, ideal=(1.0, 1.0))) == ["unlike the ideal contact"] * 2
     assert outcomes(rows(errors, status, 10.0, 9.0, ideal=(1.0, 1.0))) == ["saturated"] * 2

@@ -148,7 +148,7 @@ def test_contact_without_end_has_infinite_error_and_later_contacts_are_ignored(l
     np.testing.assert_array_equal(np.isinf(result.points.size), bad)
 
 
-def test_convergence_plot_counts_failures_up_to_each_look(swept):
+def test_convergence_plot_counts_failures_up_to_each_plotted_scenario(swept):
     made, mechanism, rows = swept
     plan = plan_statistics(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])

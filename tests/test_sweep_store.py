@@ -257,7 +257,7 @@ def test_sweep_store_is_resumed_only_by_the_same_source_code(tmp_path):
         open_store(folder, MANIFEST, resume=True)
 
 
-def test_sweep_store_changes_no_file_of_the_user(tmp_path):
+def test_sweep_store_changes_no_third_party_file(tmp_path):
     thesis = tmp_path / "thesis"
     thesis.mkdir()
     for name in (".thesis.docx.tmp", ".thesis.docx.1.tmp", "thesis.docx", ".lock"):

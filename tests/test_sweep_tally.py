@@ -104,7 +104,7 @@ def test_sweep_tally_has_no_interval_for_replicates_of_unequal_size():
     assert estimate_failure_probability(add_to_tally(build_empty_tally(16, 10), fake_rows(10))).high == 1
 
 
-def test_sweep_tally_interval_of_repeated_looks_is_confidence_sequence():
+def test_sweep_tally_interval_for_repeated_looks_is_confidence_sequence():
     rows = fake_rows(1000)
     tally, running = build_empty_tally(1, 10**6, looked_at=True), SequentialState()
     for part in np.split(np.arange(1000), 10):

@@ -73,7 +73,7 @@ class Toy(Compensator):
 }
 # Agreement of JAX and runtime, derivatives, and export with the bundle's self-test, in C too.
 RUN = (
-    "test_compensators.py::test_jax_and_runtime_agree_on_contacts_and_on_noise",
+    "test_compensators.py::test_jax_and_runtime_compensators_agree_for_contacts_and_for_noise",
     "test_compensators.py::test_compensator_gain_derivatives_match_finite_differences",
     "test_export.py::test_export_builds_bundle_for_every_compensator",
 )

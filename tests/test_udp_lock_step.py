@@ -34,7 +34,7 @@ def varying():
 
 
 @pytest.mark.parametrize("name", ["varying", "layered", "rattling"])
-def test_udp_lock_step_contacts_equal_those_of_closed_loop(name):
+def test_udp_lock_step_contacts_equal_contacts_of_closed_loop(name):
     mechanism = load(name).mechanism
     gains = literature_gains(mechanism, "response_error")
     contacts, _ = closed_loop(mechanism, "response_error", gains)

@@ -96,7 +96,7 @@ def test_latency_quantiles_of_no_values_are_nan():
     assert compute_quantiles(np.arange(1001.0)) == (500.0, 999.0, 1000.0)
 
 
-def test_overrunning_ticks_are_repeated_to_identify_the_cause(varying):
+def test_overrunning_ticks_are_replayed_to_find_the_cause(varying):
     mechanism, _ = varying
     record = TickRecord(4)
     for tick, cpu in enumerate((10, 2_000_000_000, 30, 40)):

@@ -275,7 +275,7 @@ def test_unusable_uncertainty_table_is_refused(path, entry, reason):
     assert "uncertainty." in message and reason in message
 
 
-def test_mechanism_rules_are_checked_over_the_whole_uncertain_range():
+def test_mechanism_rules_are_checked_in_the_whole_uncertain_range():
     third = {"model": "third_order", "coefficients": [0.1, 0.1, 0.005]}
     path, wide = "rig.simulator.coefficients", {"distribution": "uniform", "factor": [0.4, 1.5]}
     narrow = wide | {"factor": [0.6, 1.5]}

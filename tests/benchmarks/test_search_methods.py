@@ -45,7 +45,7 @@ def compared() -> dict[str, Results]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_optimisers_are_compared_on_mechanism(name, cases, compared, capsys):
+def test_success_and_cost_of_optimisers_are_compared_on_one_mechanism(name, cases, compared, capsys):
     case = cases[name]
     starts = case.starts(STARTS, SEED)
     case.warm_up()
@@ -83,7 +83,7 @@ def test_tuning_needs_fewer_rollouts_than_other_optimisers(compared, capsys):
     assert seconds <= COST
 
 
-def test_compared_optimisers_minimise_the_loss_of_tuning(cases):
+def test_compared_optimisers_and_tuning_minimise_the_same_loss(cases):
     for case in {(case.loop, case.names): case for case in cases.values()}.values():
         points = case.starts(5, 1)
         together = case.losses(points)

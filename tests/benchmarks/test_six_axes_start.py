@@ -55,7 +55,7 @@ def no_compile_cache():
 
 
 @pytest.mark.usefixtures("no_compile_cache")
-def test_six_axis_program_of_twelve_contact_candidates_compiles_within_time_limit(capsys):
+def test_six_axis_program_of_twelve_shape_pairs_compiles_within_time_limit(capsys):
     """Use candidates of two kinds, first without, then with derivatives by six leads."""
     mechanism = load_any("petals", []).mechanism
     scenario = build_scenarios(mechanism)

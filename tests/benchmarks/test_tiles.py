@@ -20,7 +20,7 @@ OTHERS = [(32, 512), (128, 512), (256, 512), (64, 256)]
 
 
 @pytest.mark.parametrize("compensator", ["none", "response_error"])
-def test_no_other_tile_size_or_vector_width_is_faster(compensator, monkeypatch, capsys):
+def test_default_tile_size_and_vector_width_are_the_fastest(compensator, monkeypatch, capsys):
     loop, gains, scenarios = case(compensator, LANES)
     runs, outcomes = [], []
 
