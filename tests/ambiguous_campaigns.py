@@ -31,7 +31,7 @@ def campaign(monkeypatch, name, seed, **changes):
 
 
 def prior(name):
-    """Return a prior with stiffness, a rough motion simulator and the delay of the position sensor.
+    """Return a prior with stiffness, inaccurate motion simulator and delay of the position sensor.
 
     The force sensor has no damping, delay, lag or dead zone in the prior.
     """
@@ -56,7 +56,7 @@ def truth(name):
 
 
 def numbers(mechanism, position_delay):
-    """Return the rig's parameters that determine e and e*, by key, for a position sensor with this delay [s].
+    """Return, by key, the rig's parameters that determine e and e*, for this position sensor delay [s].
 
     A rig whose motion and force delays are smaller by d, and whose position sensor delay is larger by d,
     gives the same readings.
@@ -73,7 +73,7 @@ def numbers(mechanism, position_delay):
 
 
 def off(name, written, compensator, gains):
-    """Return the errors of e and e - e* of each mechanism relative to the truth, (mechanisms, 2).
+    """Return the errors of e and e - e* of each mechanism, compared with the true rig, (mechanisms, 2).
 
     All mechanisms run with the same gains in the simulation of `jaxhil`; e is the mean over contact phases.
     """

@@ -89,7 +89,7 @@ PAPER = """(wide, high) => {
 
 
 class Opened(NamedTuple):
-    """Errors and requests of a page that was opened."""
+    """Errors and requests of a page after it was opened."""
 
     errors: list[str]  # errors of scripts, and on the console
     elsewhere: list[str]  # requested addresses that are neither files nor data
@@ -103,7 +103,7 @@ class Browser:
         """Start the browser; `folder` holds its temporary files."""
         assert CHROMIUM is not None
         ends = (*os.pipe(), *os.pipe())
-        # Above 4, so that neither is overwritten before use.
+        # Move the pipe ends above descriptor 4, so that neither end is overwritten before use.
         reads, writes = (fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in (ends[0], ends[3]))
         self._out, self._in = os.fdopen(ends[1], "wb"), os.fdopen(ends[2], "rb", 0)
         flags = (*FLAGS, f"--user-data-dir={folder}")

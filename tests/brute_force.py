@@ -1,7 +1,7 @@
 """Integration of the whole hybrid loop by SciPy's `solve_ivp`: slow, and independent of the oracle.
 
 Method of steps: the simulator's differential equation is restarted at every break of its delayed command and
-at every event of the contact. The sensor's lag is integrated over the resulting force.
+at every event of the contact. The sensor's lag is then integrated numerically for the resulting force.
 """
 
 from math import exp, pi

@@ -218,7 +218,7 @@ def drawn_gains(law: str, rng: np.random.Generator, hostile: bool, period: float
 def drawn_limits(law: str, rng: np.random.Generator, hostile: bool, period: float) -> Mapping[str, float]:
     """Draw limits that are sometimes reached, some of them missing; if `hostile`, of any size."""
     limits = {}
-    only_audited = rng.random() < 0.4  # so that contacts end
+    only_audited = rng.random() < 0.4  # without guard limits, which would stop contacts
     for name, specification in LIMITS.items():
         if (only_audited and name not in AUDIT) or (rng.random() < 0.3 and name != "equivalent_mass"):
             continue
@@ -256,7 +256,7 @@ def contact_rows(
 
 
 def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -> np.ndarray:
-    """Draw ticks of a `contact`, or of `random` or `hostile` values, with some resets and next contacts."""
+    """Draw ticks of the given kind ("contact", "random" or "hostile"), with some resets and next contacts."""
     phase, rate, amplitude = rng.uniform(0, 2 * np.pi), rng.uniform(10, 60), 10 ** rng.uniform(-5, -3)
     rows = contact_rows(count, rng, period, phase, rate, amplitude)
     time = rows[:, 5].copy()
@@ -290,7 +290,7 @@ def drawn_exactly(law: str, count: int, rng: np.random.Generator) -> tuple[GainF
     period = 2.0**-10
     per_period = {"N/s": 1 / period, "m": period, "m/s^2": 1 / period, "s": period}
     limits = {}
-    only_expected = rng.random() < 0.5  # so that contacts have the expected restitution
+    only_expected = rng.random() < 0.5  # without limits that would stop contacts
     for name, specification in LIMITS.items():
         guards = name not in AUDIT or name in ("energy_balance", "restitution_margin", "longest_contact")
         if (only_expected and guards) or (rng.random() < 0.4 and name != "equivalent_mass"):

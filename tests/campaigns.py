@@ -2,7 +2,8 @@
 
 All contacts are simulated together, one lane each. The motion simulator's output is exact at any time (matrix
 exponentials of the oracle's state space). The contact force is the oracle's law at the sampling time of the
-sensor; a sensor lag is integrated by quadrature. `test_campaigns.py` compares lanes with `oracle.simulate`.
+sensor; the sensor lag is computed by numerical integration. `test_campaigns.py` compares lanes with
+`oracle.simulate`.
 """
 
 from __future__ import annotations
@@ -203,7 +204,7 @@ def touches(kind, speeds, indices, phases, rng, seconds=0.42, lead=0.05, damping
 
 
 def sense(force, sensor):
-    """Apply bias, quantisation, dead zone and range, in this order; noise is already in `force`."""
+    """Apply bias, quantisation, dead zone and range, in this order; `force` already contains noise."""
     force = _rounded(force + sensor.get("bias", 0.0), sensor.get("quantum", 0.0))
     force = np.sign(force) * np.maximum(0.0, np.abs(force) - sensor.get("dead_zone", 0.0))
     limit = sensor.get("range", np.inf)
@@ -332,7 +333,7 @@ def _run(kind, what, command, measured, force):
 
 
 def _lose(kind, run, rng):
-    """Remove single rows and a block of rows; contacts keep their restored command, as in log readers."""
+    """Remove single rows and a block of rows; the commands of contacts are restored, as by the log reader."""
     rows = len(run.tick)
     valid = rng.uniform(size=rows) >= kind.lost
     valid[:3] = True

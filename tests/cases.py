@@ -1,7 +1,7 @@
 """Registry of mechanisms and gains that cover every branch of the simulation loop, and functions to run them.
 
-Cases whose compiled loop has the same form share one program, as lanes of one batch (`batches`). So each case
-also tests that unused optional parts of the loop have no effect, and that lanes are independent.
+Cases whose compiled loop has the same form share one program, as lanes of one batch (`batches`). Therefore
+each case also tests that unused optional parts of the loop have no effect, and that lanes are independent.
 `oracle_contacts` runs the same case in the independent oracle with the Python compensator of the rig.
 """
 
@@ -154,7 +154,7 @@ LEAD_ALONE = {"response_error": 0.0, "response_error_damping": 0.0}
 LAGGED = {"force_sensor": {"time_constant": 0.0023}}
 
 CASES: dict[str, Case] = {
-    # Kelvin-Voigt and linear contact behind a second-order simulator, uncompensated.
+    # Kelvin-Voigt and linear contact with a second-order simulator, uncompensated.
     "linear": Case(mechanism({"law": "linear", "damping": [900.0]})),
     "delays of whole periods": Case(
         mechanism({"damping": [300.0]}, {**SECOND_ORDER, "delay": 2 * PERIOD}, 3 * PERIOD)

@@ -54,7 +54,7 @@ class Cluster:
 
 
 def killed_meanwhile(monkeypatch, holder, cluster, worker, name="on_workers"):
-    """Kill `worker` as soon as the first work unit that the wrapped function sends to workers is finished."""
+    """Run the wrapped function, and kill `worker` as soon as the workers have finished one work unit."""
     handed = getattr(holder, name)
 
     def killing(*asked):

@@ -37,8 +37,8 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Shapes are checked in modules that compute with arrays, but every day only in their own tests: tracing with
-# checks takes a quarter longer.
+# Shapes are checked in modules that compute with arrays. The daily run checks them only in the modules' own
+# tests, because tracing with checks takes a quarter longer.
 PACKAGES = ("compensators", "contact", "simulation", "sixdof")
 # These functions check the caller's arguments themselves.
 FRONT_DOOR = ("gain_choice", "gain_file", "jacobian", "registration", "run")
@@ -66,7 +66,7 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(items):
-    """Order the tests: longest modules first, so that workers end together; then similar modules."""
+    """Sort the tests: longest modules first, so that all workers end together; then similar modules."""
     items.sort(
         key=lambda item: (item.path.stem not in LONG, item.get_closest_marker("users_options") is None)
     )
@@ -134,7 +134,7 @@ class Ran(NamedTuple):
 @pytest.fixture
 def jaxhil(capsys):
     """Return a function that runs `jaxhil ARGUMENTS` in this process."""
-    # After the import hook.
+    # This import must follow the installation of the import hook for shape checks.
     from tuning.__main__ import main
 
     def call(*arguments):

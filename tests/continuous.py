@@ -1,4 +1,4 @@
-"""Limit T -> 0 by independent methods: closed forms, and ordinary and delay differential equations in SciPy.
+"""Limit of a small control period, by closed forms and by ordinary and delay differential equations in SciPy.
 
 Positions, delays and time are in SI units; `law(d, d')` is the contact force [N] at penetration d > 0 [m].
 """

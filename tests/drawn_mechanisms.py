@@ -1,8 +1,8 @@
 """Random mechanisms over the whole allowed range, and their results in the oracle.
 
-The properties that determine a compiled program depend on the index of the form: contact law, motion
-simulator, hold, latency, integrator, speed of the poles and of the sensor's lag. Mechanisms of one form are
-lanes of one batch.
+A form, given by its index, has the properties that determine a compiled program: contact law, motion
+simulator, hold, latency, integrator, and ranges of the poles and of the sensor's lag. Mechanisms of one form
+are lanes of one batch.
 """
 
 import math

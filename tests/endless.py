@@ -29,7 +29,7 @@ CHUNK = 256  # ticks
 def persistent(
     parsed: Mechanism, compensator: str, seconds: float, gains: Mapping[str, Any], **leaves: Any
 ) -> Tick:
-    """Return the record of an endless contact; `leaves` as for `spread`."""
+    """Return the record of an endless contact; `leaves` are scenario values, as in `lanes.spread`."""
     lanes = next(iter(leaves.values())).shape[-1]
     scenario = spread(parsed, lanes, clearance=np.zeros(lanes), **leaves)
     loop = build_loop(parsed, compensator, scenario)

@@ -74,9 +74,9 @@ class FaultRun(NamedTuple):
     """Ticks and their expected faults, (ticks,).
 
     `tripped` marks ticks on which the controller must be tripped. `catching_up` marks ticks after a reset on
-    which the command returns within the velocity limit and may flag this. `entered` marks ticks of a contact
-    with a reset during or shortly before the contact, and the ticks after it: a compensator with a status may
-    report that it does not know this contact.
+    which the velocity limit may act, while the command returns. `entered` marks ticks of a contact with a
+    reset during or shortly before the contact, and the ticks after it: a compensator with a status may report
+    that it does not know this contact.
     """
 
     rows: np.ndarray
@@ -189,7 +189,7 @@ def _early(run: FaultRun, begin: int, rng: np.random.Generator) -> None:
 
 
 def _rate(run: FaultRun, begin: int, rng: np.random.Generator) -> int:
-    """Inject ticks at a slightly wrong rate; no single tick is early or late."""
+    """Inject ticks with a slightly wrong rate; no single tick is early or late."""
     wrong = _pick(rng, (-0.24, -0.21, -0.16, 0.16, 0.21, 0.24))
     end = begin + UNTIL_RESET
     run.rows[begin:end, TIME] += PERIOD * wrong * np.arange(1, UNTIL_RESET + 1)

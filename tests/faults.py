@@ -58,7 +58,7 @@ class Runner:
         )
 
     def run(self, *arguments: Any, folders: tuple[Path, ...] = (), at: int = -1, kill: bool = False) -> Ran:
-        """Run `jaxhil ARGUMENTS`; system call number `at` on the folders fails, or is the last one."""
+        """Run `jaxhil ARGUMENTS`; system call number `at` on the folders fails, or kills the process."""
         assert self._process.stdin and self._process.stdout
         job = {
             "arguments": [str(argument) for argument in arguments],
@@ -82,7 +82,7 @@ def without_times(value: Any) -> Any:
     """Return a document without timings and dates."""
     if isinstance(value, dict):
         times = {"timings", "created", "scenarios_per_second"}
-        # A verdict's digest depends on its times, too.
+        # The digest of a verdict also depends on the times in it.
         times |= {"sha256"} if "sweep_sha256" in value else set()
         return {key: without_times(one) for key, one in value.items() if key not in times}
     return [without_times(one) for one in value] if isinstance(value, list) else value

@@ -1,10 +1,10 @@
-"""New scenarios run through the C controller with every guard active and its limits as exported.
+"""New scenarios replayed through the C controller, with all guards and the exported limits.
 
 Scenarios of a seed that calibration does not use are recorded and passed to the compiled controller tick by
 tick with its clock. A run is bad if the restitution error of a contact exceeds the limit, or if a contact
 does not end. A bad run is missed unless the controller trips before the tick on which the next contact begins
-(for the last contact: before the next run is announced). A run is good if no error exceeds half the limit. A
-good run is a false alarm if any fault is raised, except a compensator's status of doubt.
+(for the last contact: before the next run is announced). A run is good if no error exceeds half the limit.
+Any fault in a good run is a false alarm, except `law_in_doubt`, which reports the compensator's status.
 """
 
 from collections import Counter

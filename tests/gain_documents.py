@@ -57,7 +57,7 @@ GAINS: dict[str, dict[str, dict[str, Any]]] = {
     "phase_lead": _LEAD,
     "impulse_ledger": {
         **_entries("impulse_ledger"),
-        # Between ticks, where the derivative exists.
+        # The delay is not a whole number of ticks, where no derivative exists.
         "identification_delay": {"value": 0.0083, "unit": "s", "lower": 0.0, "upper": 0.05},
         "velocity_gain": {"value": 10.0, "unit": "1/s", "lower": 1.0, "upper": 1e3},
         "correction_limit": {"value": 0.9, "unit": "1", "lower": 0.01, "upper": 20.0},

@@ -90,7 +90,7 @@ def text_of(document: dict[str, Any], rng: random.Random) -> str:
 
 
 def wild(rng: random.Random, usual: float, lowest: float, highest: float) -> float:
-    """Draw a number of any size, near the usual value, or near the ends of the admitted range."""
+    """Draw a number: of any size, near the usual value, or near an end of the admitted range."""
     kind = rng.randrange(5)
     if kind == 0:
         return rng.choice(EXTREMES)

@@ -33,7 +33,7 @@ class Kind:
     sweep: bool = False  # the free motion is a swept sine in place of a multisine
     colour: float = 0.0  # N, standard deviation of low-frequency noise of the force
     walk: float = 0.0  # N/sqrt(s), random walk of the force bias
-    lost: float = 0.0  # share of rows lost; time stamps jitter, too
+    lost: float = 0.0  # share of lost rows; if positive, the time stamps also jitter
     force_clock: bool = False  # the force has its own time stamps and begins later
     # linear interpolation of force readings to these time stamps before logging
     resampled: bool = False
@@ -159,7 +159,7 @@ def free_motion(rng, kind, period):
 
 
 def multisine(rng, time, highest):
-    """Return a multisine of 5 s period, flat in position to 3 Hz and falling as 1/f above."""
+    """Return a multisine of 5 s period; its amplitude is constant up to 3 Hz and falls as 1/f above."""
     frequencies = np.arange(0.2, highest, 0.2)
     size = 1 / np.maximum(frequencies / 3.0, 1.0)
     phases = rng.uniform(0, 2 * np.pi, len(frequencies))

@@ -13,7 +13,7 @@ from scipy.signal import cont2discrete, lfilter
 
 POINTS = 40  # fine points per control period
 LOGGER = 15  # fine points by which a force logger with its own clock samples before the tick
-WARM_UP = 0.6  # s of uniform motion before the first tick; the slowest drive settles to 1e-9 in it
+WARM_UP = 0.6  # s of uniform motion before the first tick, in which the slowest drive settles to 1e-9
 LONGEST = 1.5  # s; longer contacts count as never ending
 
 
@@ -208,8 +208,8 @@ def touch(rig, start, speed, controller, ticks, disturb=lambda tick, force, posi
 def restitution(rig, speed, law):
     """Return the restitution of the rig's first contact under a compensator's `step`, without noise.
 
-    As stated in the guide, the contact ends after no real force for longer than the sensor's memory, and a
-    command below 1e-6 of its peak or a further 0.1 s.
+    As stated in the guide, the contact ends when no real force has acted for longer than the sensor's memory,
+    and the command has fallen below 1e-6 of its peak (at most 0.1 s later).
     """
     start = min(rig.plane, 0.0) - speed * (0.02 + rig.period / 3)
 

@@ -34,8 +34,8 @@ class Outcome:
     message: str
     check: str  # verdict of `--check`; empty where no file was written
     restitution: float  # e of the true rig; all e and e - e* are for the file's gains
-    error: float  # e of the file less e of the true rig
-    difference: float  # e - e* of the file less that of the true rig
+    error: float  # e of the file minus e of the true rig
+    difference: float  # e - e* of the file minus e - e* of the true rig
     named: bool  # the message names the defect or, for a clean kind, a check
     trouble: str  # an internal error
     seconds: float  # duration of identify
@@ -76,7 +76,7 @@ def errors_of(file, campaign):
     return e, contact.restitution - e, contact.error - (e - ideal)
 
 
-def judge(kind, seed, folder):
+def evaluate_identification(kind, seed, folder):
     """Write a campaign, identify it and return the outcome."""
     campaign = write_campaign(kind, seed, folder)
     begin, result = time.perf_counter(), folder / "identified"
@@ -95,7 +95,7 @@ def judge(kind, seed, folder):
             if c["there"] and max(c["effect"] or 0, c["effect_on_error"] or 0) > LIMIT / 2
         ]
         text = " ".join([message, *(f"{c['name']} {c['finding']}" for c in large), *document["notes"]])
-        if verdict == "good":  # this check takes longer than the rest
+        if verdict == "good":  # this check takes longer than all others
             e, error, difference = errors_of(result / "mechanism.toml", campaign)
         arguments = [
             "identify",
@@ -143,7 +143,7 @@ def main(folder, first, count, *kinds):
         for kind in outcomes:
             place = Path(folder) / f"{kind}_{seed}"
             shutil.rmtree(place, ignore_errors=True)
-            outcome = judge(kind, seed, place)
+            outcome = evaluate_identification(kind, seed, place)
             outcomes[kind].append(outcome)
             with (Path(folder) / "outcomes.jsonl").open("a") as lines:
                 lines.write(json.dumps(asdict(outcome)) + "\n")

@@ -19,7 +19,7 @@ LONGEST = 2000
 
 
 class Ran(NamedTuple):
-    """Record of a contact by tick: rows of `c99_cases.ROW`, faults, and compensator status."""
+    """Record of a contact, tick by tick: rows of `c99_cases.ROW`, faults, and compensator status."""
 
     rows: np.ndarray
     faults: np.ndarray

@@ -1,4 +1,4 @@
-"""Recorded runs replayed through the rig's controller, to obtain the tick and cause of a trip."""
+"""Replay of recorded runs through the rig's controller, to obtain the tick and cause of a trip."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple

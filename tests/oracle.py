@@ -50,14 +50,13 @@ def simulate(
     - begin_tick), begin_tick, end_tick, peak_command [N], excess_variation [N] of the command,
     position_shortfall [m] (largest reduction of the position command by the velocity limit), status ('over'
     or 'timeout'); `record=True` adds per-tick `signals` of the whole run, among them the force just before
-    the tick (`force`).
-    The compensator has `reset()` and `step(force, x_d, v_d, x_measured)`; an optional `position_command(x, v,
-    a)` modifies the position command, and an optional `next_contact()` replaces `reset()` between contacts.
-    `force_noise` [N] and `position_noise` [m] are sequences indexed by tick (a list of sequences: one per
-    run). With `first_force_zero`, tick 0 commands F_c = 0 for any reading.
-    With `index_waits_for_exit` and a clearance, the next stiffness applies only after x_a has left the
-    surface: damped contact separates at F = 0 inside the surface, where a stiffer next contact would push
-    again and count as a contact.
+    the tick (`force`). The compensator has `reset()` and `step(force, x_d, v_d, x_measured)`; an optional
+    `position_command(x, v, a)` modifies the position command, and an optional `next_contact()` replaces
+    `reset()` between contacts. `force_noise` [N] and `position_noise` [m] are sequences indexed by tick (a
+    list of sequences: one per run). With `first_force_zero`, tick 0 commands F_c = 0 for any reading. With
+    `index_waits_for_exit` and a clearance, the next stiffness applies only after x_a has left the surface. A
+    damped contact separates at F = 0 while x_a is still beyond the surface, where a stiffer contact law would
+    push again and count as another contact.
     """
     compensator = NoCompensator() if compensator is None else compensator
     approach = mechanism["approach"]

@@ -173,15 +173,15 @@ def on_the_rig(case, ticks):
         force, moment = wrench(case, x[:3], rotation, rate[:3], w)
         if case["tool"] is not None:
             measured, *_ = seen(tick * period, case["position_delay"])
-            force, moment = weighed(case, x, rotation, w, rate, bend, force, moment, measured)
+            force, moment = sensor_reading(case, x, rotation, w, rate, bend, force, moment, measured)
         bodies = moved(case, bodies, force, moment)
         for axis, value in zip(axes, command(case, bodies)[0], strict=True):
             axis.send(value)
     return bodies
 
 
-def weighed(case, x, rotation, w, rate, bend, force, moment, measured):
-    """Return the compensated wrench of a sensor behind a tool for a contact wrench."""
+def sensor_reading(case, x, rotation, w, rate, bend, force, moment, measured):
+    """Return the reading of a sensor that carries the tool, after tool compensation."""
     mass, centre, inertia = case["tool"]
     step = 1e-6
     ahead, behind = (

@@ -224,7 +224,7 @@ def random_readings(name: str, lanes: int, ticks: int, seed: int) -> Readings:
 
 
 LONG_LAWS = ("impulse_ledger",)
-# Random readings make its covariance ill-conditioned, so that more lanes amplify rounding.
+# Random readings make the ledger's covariance ill-conditioned, so that more lanes amplify rounding.
 MAGNIFIED = {"impulse_ledger": 0.1}  # allowed share of lanes; 0.02 for other compensators
 
 

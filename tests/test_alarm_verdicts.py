@@ -9,7 +9,7 @@ from tuning.watchdog.verdict import DEFAULT_ALLOWED_RATES, AllowedAlarmRates, ad
 
 
 def rates(false, missed, held_out=1000):
-    """Return alarm rates for these counts (alarms, runs) of false and of missed alarms."""
+    """Return alarm rates for these numbers (alarms, runs) of false and of missed alarms."""
     result = {"held_out_runs": held_out}
     for kind, (alarms, runs) in (("false_alarms", false), ("missed_alarms", missed)):
         _, low, high = binomial_interval(alarms, runs)

@@ -1,4 +1,4 @@
-"""Public interface of `tuning`: its functions give the results of the commands, errors are one line."""
+"""Public interface of `tuning`: results equal those of the commands, and error messages have one line."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Replay of recorded vectors by the C program of a bundle, which must detect a single wrong bit."""
+"""Replay of recorded test vectors by a bundle's C test program, which must detect a single wrong bit."""
 
 import math
 import subprocess

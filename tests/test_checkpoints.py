@@ -1,4 +1,4 @@
-"""Checkpoints: values are read back to the bit, and never for other inputs, other code, or damaged files."""
+"""Checkpoints: exact values after reading, and no value for other inputs, other code or damaged files."""
 
 import math
 import struct

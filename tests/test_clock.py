@@ -73,7 +73,7 @@ def test_clock_check_trips_on_non_finite_time(time):
 
 @pytest.mark.parametrize("rate", [0.98, 0.984, 1.016, 1.02, 1.1])
 def test_clock_check_trips_on_rate_error_above_1_5_percent(rate):
-    """The drift after n ticks is r (1 - 0.99^n)/0.01 periods, which exceeds 1.5 if r > 0.015."""
+    """A rate error r causes a drift of r (1 - 0.99^n)/0.01 periods after n ticks; the limit is 1.5."""
     wrong = abs(rate - 1.0)
     ticks = math.ceil(math.log(1.0 - 0.015 / wrong) / math.log(0.99))
     result = faults(periods(*[rate] * 300))

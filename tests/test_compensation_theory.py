@@ -98,7 +98,7 @@ def test_net_delay_with_response_error_compensator_matches_closed_form(model):
     assert np.ptp(expected) > 0.007
 
 
-# Items 5 and 6, for an endless contact.
+# Cases for items 5 and 6 of model.md, section 6, with an endless contact.
 
 DAMPING = 2 * 0.05 * MASS * OMEGA
 MARGIN = np.array([0.8, 0.95, 1.0, 1.05, 1.2])
@@ -199,7 +199,7 @@ def test_identification_with_misaligned_force_is_biased_as_predicted():
     np.testing.assert_allclose(result[-1] / damping, biased / damping, rtol=0, atol=2e-3)
 
 
-# Item 8: effect of clamping F_c at zero.
+# Cases for item 8 of model.md, section 6: effect of clamping F_c at zero.
 
 
 class Clamped(Compensator):

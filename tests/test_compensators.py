@@ -281,7 +281,7 @@ def test_compensator_noise_amplification_matches_prediction(name):
 
 @pytest.mark.parametrize("depth", [1.0, 1e4, 1e9])
 def test_weakly_hardening_contact_has_peak_force_of_linear_contact(depth):
-    """Cancellation must not give a peak force of 0."""
+    """Numerical cancellation must not give a peak force of 0."""
     linear = load("claw-350kg", ["contact.damping=[0.0]"]).mechanism
     hardening = load(
         "claw-350kg", ['contact.law="hardening"', "contact.damping=[0.0]", f"contact.reference_depth={depth}"]

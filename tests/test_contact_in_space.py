@@ -1,6 +1,6 @@
 """Six-axis contact: closed forms of impacts, and independence of the choice of axes.
 
-Each friction law is one program with two candidates per lane; the lanes are the cases.
+Each friction law is one program with two pairs of shapes per lane; the lanes are the cases.
 """
 
 import jax
@@ -98,7 +98,7 @@ def collect(key, index=None):
 
 
 def both_candidates(key):
-    """Return a value of both candidates, (components, candidates, lanes)."""
+    """Return a value of both shape pairs, (components, candidates, lanes)."""
     return vector(jnp.asarray(np.moveaxis(collect(key), 0, 1)))
 
 
@@ -245,7 +245,7 @@ def test_six_axis_ball_slides_or_rolls_as_in_closed_form(run, request):
     np.testing.assert_allclose(sliding[0], 0.5 - 0.2 * 2 * 0.1, rtol=1e-4)
     # The penetration, at most v_n sqrt(m/k), shortens the lever: 10/49 v_t times its share of the radius.
     shorter = 10 / 49 * 0.3 * 1e-3 / 0.1
-    # Its spin about y is that of rolling; remaining slip contributes 2/7 of itself.
+    # The ball spins about y as in rolling; a remaining slip changes the speed by 2/7 of the slip.
     slip = rolling[0] - 0.1 * seen["rolling"]["angular"][-1, 1]
     assert 0.5 * shorter < 5 / 7 * 0.3 + 2 / 7 * slip - rolling[0] < shorter
     if not bristle:

@@ -22,7 +22,7 @@ def led():
 
 
 def test_force_sensor_dead_zone_shifts_the_apparent_surface(led):
-    """The surface moves by dz/k: the hardware is pressed by dz more and rebounds at the same speed."""
+    """A dead zone of dz newtons shifts the surface by dz/k; the rebound speed is the same."""
     assert led["restitution"][1] == pytest.approx(led["restitution"][0], abs=1e-4)
     assert led["peak_force"][1] - led["peak_force"][0] == pytest.approx(DEAD_ZONE, rel=1e-3)
 

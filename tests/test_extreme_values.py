@@ -1,4 +1,4 @@
-"""Extreme values of every numeric key: simulated or rejected in one line, without traceback or hang."""
+"""Extreme values of every numeric key: simulated, or rejected with a one-line message, without hanging."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""Faults injected tick by tick: exactly these are raised; outputs stay finite and limited."""
+"""Faults injected tick by tick: the controller raises exactly these; outputs stay finite and limited."""
 
 from collections.abc import Iterable
 

@@ -93,7 +93,7 @@ def test_regularised_friction_dissipates_expected_power():
 
 
 def test_bristle_friction_never_generates_energy():
-    """-f_t.t less the rate of k_t z^2/2 over a step is never negative, however large the deflection."""
+    """The dissipated power -f_t.t - d(k_t z^2/2)/dt is never negative, for any deflection z."""
     touching, before = random_contacts(3000, 2)
     force, (after,) = BRISTLE.step(touching, (before,))
     work = np.asarray(-PERIOD * dot(force, touching.slip))

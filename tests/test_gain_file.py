@@ -1,4 +1,4 @@
-"""Gain files: atomic writes, equal values after reading, one-line errors, and the force envelope."""
+"""Gain files: atomic writes, exact values after reading, one-line errors, and the force envelope."""
 
 import copy
 import itertools

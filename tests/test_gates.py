@@ -1,4 +1,4 @@
-"""Contact gates of JAX and of the runtime: a triangle of two periods over the time beyond a threshold."""
+"""Contact gates of JAX and runtime: time beyond a threshold, weighted with a triangle of two periods."""
 
 from itertools import pairwise
 
@@ -38,7 +38,7 @@ def _shares(positions, clearance):
 @jax.jit
 @jax.grad
 def slope(positions, clearance):
-    """Return the derivative of the last gate by every reading (ticks,)."""
+    """Return the derivative of the last gate with respect to every reading, (ticks,)."""
     shares = _shares(positions, clearance)
     return gate(shares[1], shares[0])
 

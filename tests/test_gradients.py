@@ -1,10 +1,10 @@
 """Forward-mode derivatives of the restitution compared with central differences, scenario by scenario.
 
 For 200 random scenarios of the built-in `varying` mechanism with random gains, the first contact's
-restitution is differentiated by every gain of response_error, both delays, stiffness and damping. The loop is
-piecewise smooth: if a discrete event moves to another tick within the step of the difference, derivative and
-difference may disagree, and the event is reported. The restitution is also a smooth function of the
-identification delay, because the compensator's gates are differentiable.
+restitution is differentiated with respect to every gain of response_error, both delays, stiffness and
+damping. The loop is piecewise smooth: if a discrete event moves to another tick within the step of the
+difference, derivative and difference may disagree, and the event is reported. The restitution is also a
+smooth function of the identification delay, because the compensator's gates are differentiable.
 """
 
 import functools

@@ -254,7 +254,8 @@ def test_delay_caused_by_integrator_matches_closed_form(integrator, latency, per
 def test_noise_of_early_stiffness_estimate_matches_closed_form():
     """Least squares of F on x with an intercept: sigma_k = sigma_F sqrt(12 T) / (v t^1.5).
 
-    On increments, only the noise of the first and last force counts: sqrt(t / 6 T) times that.
+    A fit to increments of F uses only the noise of the first and last force, so that sigma_k is sqrt(t/(6 T))
+    times as large.
     """
     lanes, samples, deviation, period = 1500, 40, 0.01, 1e-3
     # The contact is so soft that x = v t during the fit.

@@ -117,7 +117,7 @@ def numbers(words):
 
 
 def grown(root):
-    """Return e for a root of the characteristic equation."""
+    """Return the restitution that corresponds to a root of the characteristic equation."""
     return math.exp(math.pi * root.real / abs(root.imag))
 
 

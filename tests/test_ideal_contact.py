@@ -28,7 +28,7 @@ def compiled(law):
 
 
 def evaluate(law, *parameters):
-    """Convert lists and floats to arrays; compile once per law and shape."""
+    """Compute the ideal contact from lists or floats; compile once per law and shape."""
     arrays = [jnp.asarray(p) if np.asarray(p).dtype == bool else jnp.asarray(p, float) for p in parameters]
     return jax.device_get(compiled(law)(*arrays))
 

@@ -157,7 +157,7 @@ def test_identify_widens_dead_zone_interval_by_surface_uncertainty(law):
 
 
 def test_identified_dead_zone_decreases_if_assumed_surface_is_further_away():
-    """The readings determine only stiffness times surface position plus dead zone."""
+    """The readings determine only the sum of dead zone and stiffness times surface position."""
     campaign = campaigns.campaign("dead_zone", 0, speeds=FEW)
     posterior = identify(campaign, options=IdentificationOptions(law="kelvin_voigt")).contact.posterior
     surface, bias = (posterior.draws[:, posterior.names.index(name)] for name in ("plane", "bias"))
@@ -264,7 +264,7 @@ def test_identify_copies_previous_list_entry_for_grazing_contact():
 
 
 def test_identify_keeps_position_delay_if_force_delay_may_be_zero(monkeypatch):
-    """Both sensors lag alike, so the force delay is 0; its estimate is negative within its spread."""
+    """Both sensors have the same lag, so the force delay is 0; its estimate is slightly negative."""
     rig = campaign_kinds.rig(force_sensor__delay=0.003, position_sensor__delay=0.003)
     monkeypatch.setitem(campaigns.KINDS, "same", campaign_kinds.Kind(rig, campaign_kinds.voigt()))
     campaign = campaigns.campaign("same", 2, speeds=FEW, seconds=30.0)

@@ -181,7 +181,7 @@ def test_identify_delay_and_lag_errors_reach_cramer_rao_bound():
 
 
 def test_identify_separates_force_delay_from_damping_with_press_run():
-    """The Cramer-Rao bound is 0.05 ms with a press of 30 s at 0.05 mm, and 0.2 ms from contacts alone."""
+    """The Cramer-Rao bound is 0.05 ms with a press run of 30 s at 0.05 mm, and 0.2 ms from contacts alone."""
     off = []
     for seed in range(5):
         result = identify(

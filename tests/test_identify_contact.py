@@ -129,7 +129,7 @@ def test_contact_fit_of_press_run_in_chunks_is_exact():
 
 
 def test_contact_fit_skips_rows_after_gap_until_transient_has_decayed():
-    """Lose 30 rows at the turning point; the missing commands affect the later motion."""
+    """Remove 30 rows at the turning point; the missing commands affect the later motion."""
     kind = campaigns.KINDS["clean"]
     silent = {"force_sensor": {**kind.rig["force_sensor"], "noise_std": 0.0}}
     runs = campaigns._touch_runs(

@@ -1,4 +1,4 @@
-"""Long press runs in fits: pseudo-rows with the misfit of all rows, and independent noise filters."""
+"""Fits of long press runs: pseudo-rows, which replace many rows, and independent noise filters."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -31,7 +31,7 @@ COLOURED = (1.0, -0.6, 0.1)
 
 
 def problem(law, time_constant=0.0, whitening=(1.0,), threshold=0.0, seconds=12.0):
-    """Return contacts and a long press of the same rig."""
+    """Return contacts and a long press run of the same rig."""
     kind, rng = campaigns.KINDS["clean"], np.random.default_rng(1)
     press = campaigns._press_run(kind, rng, seconds=seconds, depth=0.0008)
     runs = [*split_long_run(press, 0.001), *campaigns._touch_runs(kind, rng, (0.003, 0.006, 0.012))]
@@ -63,7 +63,7 @@ def test_pseudo_rows_of_a_long_press_run_have_the_misfit_of_all_rows(law, lag, w
         assert abs(fit.slope - exact.slope) < 0.02 * np.sqrt(exact.curvature) * np.sqrt(exact.misfit)
         (across,) = few.fit_surfaces(delay - lag, np.array([plane]))
         assert across.misfit == pytest.approx(fit.misfit, rel=1e-9)
-    # Pseudo-rows are used: only contacts and the ends of the press are computed row by row.
+    # Pseudo-rows are used: only contacts and both ends of the press run are computed row by row.
     assert len(few.tables) > 0 and len(few.others.used_rows) < 0.6 * len(full.used_rows)
 
 

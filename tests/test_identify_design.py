@@ -19,7 +19,7 @@ from tuning.identification.identify import MIN_REST_ROWS
 from tuning.identification.noise import estimate_noise
 from tuning.identification.records import CampaignTiming
 
-# Derivatives of e - e* by the parameters of "clean", as the slow test computes them.
+# Derivatives of e - e* with respect to the parameters of "clean", as the slow test computes them.
 SLOPES = np.array([[0.0076, -0.089, -3.9, 30.4, -2.8e-7, -5.7e-5]])
 
 
@@ -81,7 +81,7 @@ def test_excitation_design_reaches_but_does_not_exceed_limits(planned):
     assert np.abs(free).max() > 0.0017 or np.abs(acceleration).max() > 0.85 * 18.0
     # No signal has a low crest factor in position, velocity and acceleration together.
     assert max(planned.free.crest, planned.press.crest) < 2.1
-    # The press never leaves the mechanism, and its force stays within that of an approach.
+    # The press run never leaves the contact, and its force stays below the force of an approach.
     force = campaign_rigs.commanded("clean", "press", press, 0, noise=False).force_measured
     greatest = 0.006 * np.sqrt(1.2e5 * 350.0)
     pressed = slice(3000, 3000 + 12 * 5000)

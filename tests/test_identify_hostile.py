@@ -38,7 +38,7 @@ def identified(jaxhil, folder, files, mapping=MAPPING, *options):
 
 
 def changed(day, column, change, kinds=KINDS, reveals=False):
-    """Return all files with one column changed; omit columns that reveal the change, unless `reveals`."""
+    """Return all files with one column changed; columns that reveal the change remain only with `reveals`."""
     files = {}
     for name, table in day.items():
         remaining = {key: values for key, values in table.items() if reveals or key not in TOLD}
@@ -190,7 +190,7 @@ def test_identify_command_is_accurate_despite_gaps_and_noise(jaxhil, day, tmp_pa
 
 
 def test_identified_file_with_good_verdict_predicts_the_rig(jaxhil, day, tmp_path):
-    """Interpolating commands over 4 rows removes fast content, so another model may fit the same contacts."""
+    """Interpolation between every fourth row is a low-pass, so a wrong model may fit the contacts."""
     ran = identified(jaxhil, tmp_path, changed(day, COMMAND, joined(4)))
     noise_free = {"force_sensor__noise_std": 0.0, "position_sensor__noise_std": 0.0}
     truth = package.simulate(campaign_rigs.mechanism("clean", **noise_free), "response_error")

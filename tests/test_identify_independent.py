@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from independent_logs import KINDS, mechanism_file, write_campaign
 from independent_rig import Rig, drive, ideal_restitution, restitution, touch
-from independent_study import LIMIT, errors_of, judge, summary
+from independent_study import LIMIT, errors_of, evaluate_identification, summary
 
 CAMPAIGNS = 100  # number of campaigns of each kind in the study
 WRONG = 0.01  # share of campaigns that may get a good verdict for a wrong file
@@ -90,7 +90,7 @@ def test_independent_study_errors_are_zero_only_for_true_mechanism_file(tmp_path
 
 
 def test_identify_verdict_is_good_for_campaign_of_independent_simulator(tmp_path):
-    outcome = judge("plain", 1, tmp_path)
+    outcome = evaluate_identification("plain", 1, tmp_path)
     assert (outcome.verdict, outcome.check, outcome.wrong, outcome.trouble) == ("good", "good", False, "")
 
 
@@ -99,7 +99,7 @@ def test_identify_verdict_is_good_for_campaign_of_independent_simulator(tmp_path
 def test_identify_on_independent_simulator_never_calls_inaccurate_file_good(kind, tmp_path):
     outcomes = []
     for seed in range(CAMPAIGNS):
-        outcomes.append(judge(kind, seed, tmp_path / str(seed)))
+        outcomes.append(evaluate_identification(kind, seed, tmp_path / str(seed)))
         shutil.rmtree(tmp_path / str(seed))
     print(summary(kind, outcomes))
     assert not [outcome for outcome in outcomes if outcome.trouble]

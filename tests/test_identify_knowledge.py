@@ -1,4 +1,4 @@
-"""Fixed values and prior in addition to logs, compared with weighted least squares."""
+"""Estimates from logs, prior and fixed values, compared with weighted least squares."""
 
 from dataclasses import replace
 
@@ -87,7 +87,7 @@ def test_estimate_from_logs_updates_correlated_values_known_only_from_prior():
     close(summary(draws), (wanted, both))
 
 
-def test_parameter_draws_are_conditioned_on_fixed_values_with_note_if_contradictory():
+def test_parameter_draws_respect_fixed_values_and_note_contradictions():
     result, notes = conditioning.condition_on_fixed(logs_say(KEYS), {"contact.damping.0": 660.0})
     assert KEYS[3] not in result and notes == []
     regression = COVARIANCE[:3, 3] / COVARIANCE[3, 3]

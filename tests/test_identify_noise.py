@@ -1,4 +1,4 @@
-"""Sensors at rest: noise, bias and quantum with standard errors, coloured noise, dead zone."""
+"""Sensors at rest: noise, bias and resolution with standard errors, coloured noise, dead zone."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_noise_and_bias_at_rest_lie_within_stated_errors_for_any_resolution(quan
 
 
 def test_noise_smaller_than_sensor_resolution_is_estimated_at_rest():
-    """Quantisation alone would increase 0.3 of a quantum to 0.42."""
+    """Without a correction, a standard deviation of 0.3 quantisation steps would be estimated as 0.42."""
     readings = 0.5 * np.round((0.21 + 0.15 * np.random.default_rng(0).standard_normal(20_000)) / 0.5)
     result = estimate_noise(readings)
     assert result.std == pytest.approx(0.15, rel=0.03) and result.mean == pytest.approx(0.21, abs=0.01)

@@ -1,4 +1,4 @@
-"""Surface position from a press run in permanent contact: estimated with the bias at rest, or rejected."""
+"""Surface position from a press run always in contact: estimated with the bias at rest, rejected without."""
 
 from dataclasses import replace
 

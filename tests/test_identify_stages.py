@@ -1,6 +1,6 @@
 """Staged fit compared with a joint fit of all runs.
 
-The force delay is profiled in both fits, so the other parameters have a Cramer-Rao bound at each delay.
+Both fits profile the likelihood of the force delay, so the Cramer-Rao bounds of the others depend on it.
 `pytest -m "slow or not slow" -s tests/test_identify_stages.py` prints the bounds.
 """
 

@@ -20,7 +20,7 @@ from tuning.identification.identify import IdentificationOptions, identify
 
 pytestmark = [pytest.mark.slow, pytest.mark.users_options]
 PHASES = 511
-LEAST_DEVIATION = 1.02e-4  # s, standard deviation of the force delay on the lagging rig, without a press
+LEAST_DEVIATION = 1.02e-4  # s, standard deviation of the force delay on the lagging rig without press run
 
 
 def error(mechanism, compensator, gains):
@@ -92,7 +92,12 @@ def with_noise(name):
 
 GOOD, TRIED = 40, 80
 LIMIT = 0.01  # error limit for tuning on the file
-HARDLY_TOLD = ("plain", "no delay", "undamped", "lost rows")  # kinds for which some files get a good verdict
+AMBIGUOUS_KINDS = (
+    "plain",
+    "no delay",
+    "undamped",
+    "lost rows",
+)  # kinds for which some files get a good verdict
 
 
 def test_gains_tuned_on_files_with_good_verdict_have_little_additional_error(monkeypatch):
@@ -104,7 +109,7 @@ def test_gains_tuned_on_files_with_good_verdict_have_little_additional_error(mon
     """
     best, losses = {}, []
     for number in range(TRIED):
-        name = HARDLY_TOLD[number % len(HARDLY_TOLD)]
+        name = AMBIGUOUS_KINDS[number % len(AMBIGUOUS_KINDS)]
         campaign = ambiguous.campaign(monkeypatch, name, 90_000 + number)
         result = identify(campaign, ambiguous.prior(name), IdentificationOptions(seed=number))
         if not result.good:

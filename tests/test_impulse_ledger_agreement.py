@@ -1,4 +1,4 @@
-"""Agreement of the impulse ledger in JAX and in the runtime for simulated contacts of standard suites.
+"""Agreement of the impulse ledger in JAX and in the runtime, in contacts of built-in mechanisms.
 
 `pytest -m slow -s tests/test_impulse_ledger_agreement.py` compares a million ticks. `test_agreement.py`
 compares random and hostile readings.

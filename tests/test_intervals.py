@@ -103,14 +103,14 @@ def test_confidence_sequence_is_correct_at_extreme_counts():
 
 
 def walks(probability, repeats=1000, looks=150, step=25):
-    """Return the failures at every look of many sweeps, (repeats, looks), and the scenarios so far."""
+    """Return failures and scenarios so far, at each interim look of many sweeps, (repeats, looks)."""
     rng = np.random.default_rng(1)
     failures = np.cumsum(rng.binomial(step, probability, (repeats, looks)), axis=1)
     return failures, np.broadcast_to(step * np.arange(1, looks + 1), failures.shape)
 
 
 def of_each(interval, failures, number):
-    """Return the interval of every look, computed once for equal counts."""
+    """Return the interval at every interim look; equal counts are computed only once."""
     pairs, which = np.unique(np.stack([failures.ravel(), number.ravel()]), axis=1, return_inverse=True)
     return IntervalEstimate(*(part[which].reshape(failures.shape) for part in interval(*pairs)))
 
@@ -121,7 +121,7 @@ def ever_outside(interval, probability):
 
 @pytest.mark.parametrize("probability", PROBABILITIES)
 def test_confidence_sequence_has_stated_coverage_for_any_stopping_rule(probability, capsys):
-    """Stopping at the worst of 150 looks keeps the coverage, unlike exact intervals."""
+    """The coverage holds even for a stop at the worst of 150 looks, unlike that of exact intervals."""
     failures, number = walks(probability)
     missed = np.mean(ever_outside(of_each(confidence_sequence, failures, number), probability))
     peeked = np.mean(ever_outside(of_each(binomial_interval, failures, number), probability))

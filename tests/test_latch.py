@@ -1,4 +1,4 @@
-"""Latches: condition of capture, and the spring that connects the captured bodies."""
+"""Latches: condition for capture, and spring that connects the captured bodies."""
 
 import jax
 import jax.numpy as jnp

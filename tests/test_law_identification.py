@@ -1,4 +1,4 @@
-"""Errors of contacts with status identified, and of contacts with other status, under the impulse ledger.
+"""Errors under the impulse ledger, of contacts with the status "identified" and with other statuses.
 
 `pytest -m slow -s tests/test_law_identification.py` prints how often identified contacts exceed the limit.
 """
@@ -85,7 +85,7 @@ WRONG = {
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", WRONG)
 def test_contacts_with_status_identified_rarely_exceed_error_limit(wrong):
-    """Few errors exceed 1.5 % with any modelling error; without, 98 % of contacts are identified."""
+    """Few errors exceed 1.5 % with modelling errors; without them, 98 % of contacts have this status."""
     (changes, known), contacts = WRONG[wrong], 100
     mechanism_known = load("suite-noisy", list(known)).mechanism
     odd = identified = 0
@@ -117,7 +117,7 @@ def restitution(mechanism: Mechanism) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("lag", [0.0, 1e-3, 3e-3])
 def test_contact_with_status_identified_is_accurate_for_damper_with_unmodelled_lag(lag):
-    """The lag offsets the loss of the damper, so that the readings suggest no damper."""
+    """The lag hides the energy loss of the damper, so that the readings suggest no damper."""
     contacts, mechanism_known = 60, load("suite-damped").mechanism
     errors, statuses = np.empty(contacts), []
     changes = (f"rig.force_sensor.time_constant={lag}",) if lag else ()

@@ -113,5 +113,5 @@ def test_least_squares_gradient_equals_gradient_of_residuals(number):
     np.testing.assert_allclose(value, np.sin(free) * factors)
     np.testing.assert_allclose(loss, np.sum(np.asarray(value) ** 2, axis=1) / 2)
     np.testing.assert_allclose(slope, np.cos(free) * factors * tangent[None])
-    # The function of one problem alone is the same.
+    # The function gives the same value for a single problem.
     np.testing.assert_allclose(function(free[0], factors[0])[0], np.asarray(value)[0])

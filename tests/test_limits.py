@@ -1,4 +1,4 @@
-"""Velocity and acceleration limits of the command: respected, without overshoot, no effect if not reached."""
+"""Velocity and acceleration limits of the command: no violation, no overshoot, no effect if not reached."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ def follow(targets, velocity_limit, acceleration_limit):
 
 
 def limited(targets, velocity_limit=np.inf, acceleration_limit=np.inf):
-    """Return `follow` with the initial position in front."""
+    """Return the result of `follow`, preceded by the initial position."""
     limits = np.array([velocity_limit, acceleration_limit], np.asarray(targets).dtype)
     return np.concatenate([targets[:1], np.asarray(follow(jnp.asarray(targets), *limits))])
 
@@ -95,7 +95,7 @@ def test_limited_command_reaches_displaced_target_in_fewest_periods(count, spare
 def test_limited_command_stops_in_the_minimum_time(limit):
     """A displacement x takes at least 2 sqrt(x/a).
 
-    Reaching 0.99 x takes a tenth of sqrt(2 x/a) less; times are whole periods.
+    The time until 0.99 x is shorter by sqrt(2 x/a)/10; times are whole periods.
     """
     distance = 1e-4
     commands = limited(np.r_[0.0, 0.0, np.full(600, distance)], acceleration_limit=limit)

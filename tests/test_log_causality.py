@@ -1,4 +1,4 @@
-"""Tick of the readings in a log row, estimated from noise; logs of an independent simulator."""
+"""Tick of the readings in a log row, estimated from sensor noise in logs of an independent simulator."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ SPEEDS = (0.003, 0.006, 0.012) * 2
 
 
 def logged(run, ahead):
-    """Return the run in rows whose readings are from `ahead` ticks later."""
+    """Return the run with rows whose readings were measured `ahead` ticks later."""
     end = len(run.tick) - 1
     command = slice(1, None) if ahead > 0 else slice(0, end)
     reading = slice(1, None) if ahead < 0 else slice(0, end)
@@ -68,7 +68,7 @@ def test_tick_of_log_readings_is_estimated_if_rig_moves_before_and_after_contact
 
 
 def test_force_command_of_explicit_integrator_acts_one_tick_later():
-    """The position uses the velocity before the force, as if the controller needed a tick."""
+    """The position is integrated with the old velocity, as if the controller needed a further tick."""
     runs, timing = runs_of("noisy", -1)
     speeds = [np.diff(run.position_desired, append=np.nan) / 1e-3 for run in runs]
     moved = [replace(run, velocity_desired=v) for run, v in zip(runs, speeds, strict=True)]

@@ -1,4 +1,4 @@
-"""Drafted mapping files: each reads the logs of its draft, for any column names."""
+"""Drafted mapping files: logs with any column names are read with the mapping drafted from them."""
 
 import numpy as np
 import pytest

@@ -49,7 +49,7 @@ def batch(name, compensator):
 
 
 def jacobian(name, compensator):
-    """Return the external calls of the derivatives of tuning errors by all gains."""
+    """Return the external calls in the derivatives of tuning errors with respect to all gains."""
     model, loop, gains, scenarios = case(name, compensator)
 
     def errors(values, scenarios):

@@ -132,7 +132,7 @@ def test_stability_map_of_uncompensated_contact_agrees_with_theory(ideal):
 
 
 def spectral_radius_of(e, restitution):
-    """Return the spectral radius that corresponds to the restitution over half an oscillation."""
+    """Return the spectral radius for which half an oscillation has this restitution."""
     stiffness, delay = np.meshgrid(e.x, e.y)
     frequency = np.sqrt(stiffness / 350.0)
     roots = np.vectorize(solved_root)(frequency * delay)

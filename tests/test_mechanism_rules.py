@@ -1,4 +1,4 @@
-"""Rules that involve several mechanism keys: laws, models, start of a run, transfer functions."""
+"""Rules for combinations of mechanism keys: contact laws, models, start of a run, transfer functions."""
 
 import math
 

@@ -93,7 +93,7 @@ def test_excess_variation_ignores_commands_after_the_contact():
 
 
 def test_excess_variation_counts_return_of_the_last_command_to_zero():
-    """Half of the undershoot remains at the end of the wait."""
+    """Half of the undershoot remains when the wait for the decay of the command ends."""
     commands = np.concatenate([HUMP, np.full(120, -10.0)])
     touching = np.zeros(400, bool)
     touching[BEFORE : BEFORE + len(HUMP)] = True

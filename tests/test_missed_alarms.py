@@ -1,4 +1,4 @@
-"""Missed alarms, counted on runs with an injected fault that makes the error just too large."""
+"""Missed alarms in runs with an injected fault that causes an error slightly above the limit."""
 
 import math
 

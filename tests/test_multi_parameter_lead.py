@@ -53,7 +53,7 @@ def test_pole_placement_refuses_nonpositive_and_nonfinite_arguments(bad):
 
 
 def place_poles(phases):
-    """Return gains for every desired restitution and omega tau, one lane each, and omega tau."""
+    """Return gains and omega tau, with one lane for each combination of desired restitution and omega tau."""
     phase, desired = grid(phases, DESIRED)
     gain, rate = np.transpose(
         [pole_placement(OMEGA, p / OMEGA, e) for p, e in zip(phase, desired, strict=True)]

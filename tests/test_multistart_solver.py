@@ -1,4 +1,4 @@
-"""Many problems in one program: same optima as separately, weak starts dropped, failures isolated."""
+"""Many problems in one program: same optima as in separate programs, even if one problem fails."""
 
 import numpy as np
 import pytest

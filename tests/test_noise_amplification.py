@@ -28,7 +28,7 @@ def _amplified(compensator, gains, period):
 
 
 def amplify(compensator, gains, period=1e-3):
-    """Return the noise amplification and its derivative by every gain."""
+    """Return the noise amplification and its derivative with respect to every gain."""
     gains = {name: np.asarray(value, float) for name, value in gains.items()}
     return _amplified(compensator, gains, np.asarray(period))
 
@@ -96,7 +96,7 @@ def test_noise_amplification_matches_simulated_loop_in_steady_contact():
 def test_identification_increases_noise_amplification_early_in_contact():
     """The increase depends on the initial covariance and ends after a tenth of the contact.
 
-    A force above the contact threshold is hardly ever noise.
+    The contact threshold is so high that noise alone hardly ever exceeds it.
     """
 
     def noise(**values):

@@ -72,8 +72,8 @@ def bodies():
     )
 
 
-FREE = np.array([0.4, 0.0, 0.25])  # of the target about its principal axes [rad/s]
-SPUN = np.array([0.2, -0.1, 0.35])  # of the chaser about its own
+FREE = np.array([0.4, 0.0, 0.25])  # angular velocity of the target about its principal axes [rad/s]
+SPUN = np.array([0.2, -0.1, 0.35])  # angular velocity of the chaser about its principal axes [rad/s]
 
 
 def start(pair):
@@ -147,7 +147,7 @@ def test_torque_free_rotation_converges_to_jacobi_solution_at_second_order(run):
     errors = np.linalg.norm(result - np.array([[first * dn], [-second * sn], [third * cn]]), axis=0)
     np.testing.assert_allclose(errors[:-1] / errors[1:], 4, rtol=0.02)
     assert errors[-1] < 1e-6
-    # It is passed on unchanged, to the bit.
+    # Every step leaves the angular momentum unchanged, to the bit.
     np.testing.assert_array_equal(run["spin"][:, :, TOPS], run["spin"][:1, :, TOPS] + np.zeros((STEPS, 1, 1)))
     energy = run["energy"][:, 2]
     assert np.max(np.abs(energy / energy[0] - 1)) < 1e-6

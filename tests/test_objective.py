@@ -65,7 +65,7 @@ def batch():
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def with_jacobian(static, gains, problems):
-    """Return residuals (problems, residuals) and derivatives by all gains (gain's problem, gain, ...)."""
+    """Return residuals (problems, residuals) and derivatives for all gains (gain's problem, gain, ...)."""
 
     def along(direction):
         return jax.jvp(lambda gains: compute_residuals(static, gains, problems), (gains,), (direction,))
@@ -152,14 +152,18 @@ def test_objective_terms_with_weight_zero_are_ignored():
     errors, excesses, swings, noise = [0.1, -0.2], [0.3, 0.4], [0.5, 0.6], 3.0
     terms = *map(padded, (errors, excesses, swings)), np.arange(SLOTS) < 2, np.asarray(noise)
     none = *[padded([])] * 3, np.asarray(0.0)
-    whole, _ = weigh(ObjectiveTerms("rms", True, True, True), stacked([Objective()]), terms, none)
-    plain, _ = weigh(ObjectiveTerms("rms", False, False, False), stacked([Objective()]), terms, none)
+    whole, _ = compute_residuals_of(
+        ObjectiveTerms("rms", True, True, True), stacked([Objective()]), terms, none
+    )
+    plain, _ = compute_residuals_of(
+        ObjectiveTerms("rms", False, False, False), stacked([Objective()]), terms, none
+    )
     assert len(whole) == 3 * len(plain) + 1 and not whole[len(plain) :].any()
     np.testing.assert_array_equal(whole[: len(plain)], plain)
 
 
 def test_objective_weights_are_scaled_by_the_error_limit():
-    """A weight w of a metric X costs an error of at most sqrt(J_0^2 - X_0^2) = w limit X_0."""
+    """A weight w of a metric X increases the error to at most sqrt(J_0^2 - X_0^2) = w limit X_0."""
     errors, excesses, swings = np.array([0.01, -0.02]), np.array([0.3, 0.5]), np.array([0.7, 0.1])
     for limit in (0.003, 0.01, 0.2):
         for name, value in (("command", excesses), ("chatter", swings), ("noise", np.array([2.5]))):
@@ -238,7 +242,7 @@ def test_objective_derivatives_match_central_differences(batch, known_residuals)
 
 
 def test_sensor_noise_in_objective_is_the_same_for_all_gains(known_residuals):
-    """Every call uses the same noise, so that residuals are differentiable by gains."""
+    """Every call uses the same noise, so that the residuals are differentiable functions of the gains."""
     noisy = build_batch(["rig.force_sensor.noise_std=2.667", "rig.position_sensor.noise_std=1e-6"])
     value, jacobian = run(noisy)
     assert np.all(np.max(np.abs(value - known_residuals[0]), axis=1) > 0.3)
@@ -271,7 +275,7 @@ def test_failed_contacts_increase_objective_with_zero_derivative(batch, known_re
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
-def weigh(static, weights, terms, tangents):
+def compute_residuals_of(static, weights, terms, tangents):
     """Return residuals and derivative of one problem from its errors, excesses, variation and noise."""
     *contacts, wanted, noise = terms
 
@@ -292,7 +296,7 @@ def single_residuals(objective, errors, excesses=(), noise=1.0, chatter=(), tang
     terms = padded(errors), padded(excesses), padded(chatter), wanted, np.asarray(noise)
     tangents = *map(padded, tangents[:-1]), np.asarray(tangents[-1])
     static = join_terms([objective])
-    return tuple(map(np.asarray, weigh(static, stacked([objective]), terms, tangents)))
+    return tuple(map(np.asarray, compute_residuals_of(static, stacked([objective]), terms, tangents)))
 
 
 def sum_of_squares(*arguments):

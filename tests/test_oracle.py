@@ -291,7 +291,7 @@ def test_oracle_uses_successive_stiffnesses_at_alternating_surfaces():
             force_delay=0.001,
             approach={"velocity": result["approach_velocity"]},
         )
-        # The contact phase is another, which changes the restitution slightly.
+        # The contact phase differs, which changes the restitution slightly.
         assert result["restitution"] == pytest.approx(simulate(alone)[0]["restitution"], abs=4e-3)
     speeds = [r["restitution"] * r["approach_velocity"] for r in results]
     assert [r["approach_velocity"] for r in results[1:]] == pytest.approx(speeds[:-1], rel=1e-12)

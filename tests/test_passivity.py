@@ -93,7 +93,7 @@ def test_passivity_energy_is_reset_at_next_contact_but_not_at_other_surface():
 
 @pytest.mark.parametrize("damping", [0.0, 300.0])
 def test_passivity_controller_limits_restitution_of_delayed_contact(damping):
-    """Observing the energy only at ticks leaves an excess of (T F_c)^2/(2 M) per tick."""
+    """The observer sees the energy only at ticks, which leaves an excess of (T F_c)^2/(2 M) per tick."""
     parsed = validated(mechanism({"damping": [damping]}, IDEAL))
     delay = np.array([0.001, 0.004, 0.01, 0.02])
     scenario = spread(parsed, len(delay), force_sensor__delay=delay)

@@ -1,4 +1,4 @@
-"""Rig plant in plain Python floats, compared with the oracle, the JAX simulation and closed forms."""
+"""Rig plant in plain Python, compared with the oracle, the JAX simulation and closed forms."""
 
 import math
 import time
@@ -42,7 +42,7 @@ def test_rig_plant_agrees_with_oracle_in_every_contact(name):
     result, shortfalls = closed_loop(mechanism, case.compensator, gains)
     expected = oracle_contacts(name)
     assert len(result) == len(expected) == mechanism.approach.contacts
-    # It uses a cubic for the motion near the deepest point.
+    # The oracle uses a cubic for the motion near the deepest point.
     case_lags = mechanism.rig.force_sensor.time_constant > 0
     accuracy = LAGGED if case_lags or "elastoplastic" in name else 1e-11
     for number, (mine, other) in enumerate(zip(result, expected, strict=True)):

@@ -247,7 +247,7 @@ def test_command_before_the_first_reading_is_never_in_contact(model, expected):
 
 @pytest.mark.parametrize("law", LAWS)
 def test_run_with_delayed_drives_starts_without_a_jump(law):
-    """The first command is that of the compensator, without a fault, within `start_distance`."""
+    """Within `start_distance`, the first command is the compensator's command, without a fault."""
     start = {"desired": -4e-4, "velocity": 5e-3, "measured": -5e-4, "x": -3.95e-4, "v": 5e-3}
     gain_file = plain(law, start_distance=5e-4)
     result = in_both(gain_file, rows_of(start))[0]

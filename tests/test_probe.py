@@ -49,7 +49,7 @@ def recorded(parsed, scenarios):
 
 
 def with_push(scenarios, size=0.0, share=0.25, depth=None, span=0.1):
-    """Return scenarios with a push of the given force [N] at this share of 0.16 s."""
+    """Return scenarios with a push of the given force [N] at the fraction `share` of 0.16 s."""
     shape = scenarios.phase.shape
     full = np.full(shape, 1.0)
     push = Push(size * full, share * 0.16 * full, 0.02 * full)

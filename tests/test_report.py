@@ -145,7 +145,7 @@ def test_report_command_refuses_invalid_arguments(jaxhil, put, tmp_path):
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """Results of a complete workflow with a third-party name: tuned, swept, compared, mapped, exported."""
+    """Write the results of all commands for a mechanism whose name contains special characters."""
     folder = tmp_path_factory.mktemp("results")
     mechanism = jaxhil.load("varying", {"name": HOSTILE, "rig.force_sensor.noise_std": 0.5})
     tuned = tuning.tune(mechanism, "phase_lead", scenarios=16, starts=1)

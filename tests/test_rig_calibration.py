@@ -133,7 +133,7 @@ def test_calibration_audit_restitution_equals_simulated_restitution():
 
 
 def test_audit_of_impulse_ledger_begins_when_the_compensator_acts():
-    """The surface is 1 mm nearer than specified, so that neither position passes the specified surface."""
+    """The real surface is 1 mm nearer than specified, so that no position reaches the specified surface."""
     nearer = gains(uncertainty={}, compensator="impulse_ledger", contact_plane=-1e-3)
     assert build_audit_rules(nearer)[0].has_status and not build_audit_rules(ONE_SIDED)[0].has_status
     (chunk,) = record_selection(nearer, ScenarioSelection("random", 1, 8))

@@ -1,6 +1,6 @@
 """Six-axis loop of the rig: comparison with one axis, momentum, and a rotated and boosted world.
 
-One program, whose lanes are the cases. All lanes have the rig of claw-350kg, but two have other delays.
+The cases are the lanes of one program. All lanes have the rig of claw-350kg, two of them with other delays.
 """
 
 from functools import partial

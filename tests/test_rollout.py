@@ -42,7 +42,7 @@ from jaxhil.simulation.sensors import draw_noise
 ACCURACY = {
     name: 1e-7 for name, case in CASES.items() if "time_constant" in case.mechanism["rig"]["force_sensor"]
 }
-# It uses a cubic for the motion near the deepest point.
+# The oracle uses a cubic for the motion near the deepest point.
 ACCURACY |= {name: 1e-7 for name in CASES if "elastoplastic" in name}
 # Corners of layers, and the sampling interval in which a contact ends, are not split.
 WORK_ACCURACY = {

@@ -1,4 +1,4 @@
-"""Bounds in the code accept gains from tuning, the literature and settings for any realistic rig."""
+"""Bounds in the code: they admit gains from tuning, literature and settings for any realistic rig."""
 
 import math
 

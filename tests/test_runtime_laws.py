@@ -16,7 +16,7 @@ from jaxhil.rig.filters import DelayLine, LeadFilter, VelocityFilter
 
 
 def by_matrices(document: dict[str, Any], ticks: list[Reading]) -> tuple[np.ndarray, np.ndarray]:
-    """Return F_c and theta per tick of the response-error law, computed with whole signals and matrices.
+    """Return force command and estimates of the response-error law per tick, from whole signals and matrices.
 
     Lead and velocity are state-space models discretised by the bilinear transform. The delay interpolates the
     whole record, and the time in contact within a period is a length on the polygon. The identification is
@@ -75,7 +75,7 @@ def covariance_of(identification) -> tuple[float, float, float]:
 
 
 def bounded(covariance: np.ndarray, most: tuple[float, float]) -> np.ndarray:
-    """Return the covariance with d_1 = P_11 - P_12^2/P_22 and d_2 = P_22 at most their initial values."""
+    """Return the covariance P with P_11 - P_12^2/P_22 and P_22 limited to their initial values."""
     factor = np.array([[1.0, covariance[0, 1] / covariance[1, 1]], [0.0, 1.0]])
     d_1 = covariance[0, 0] - factor[0, 1] * covariance[0, 1]
     return factor @ np.diag([min(d_1, most[0]), min(covariance[1, 1], most[1])]) @ factor.T
@@ -91,7 +91,7 @@ def measure(signal: np.ndarray, start: float, low: float, high: float) -> np.nda
 
 
 def triangle(share: np.ndarray) -> np.ndarray:
-    """Return, for each period, the share of a two-period triangle over the time beyond a threshold."""
+    """Return for each period the time beyond a threshold, weighted with a triangle of two periods."""
     before = np.concatenate([[0.0], share[:-1]])
     return (share**2 + before**2) / 2 + share * before * (2 - share - before)
 
@@ -243,7 +243,7 @@ def test_runtime_identification_equals_weighted_recursive_least_squares(seed, fo
 
 
 def test_runtime_identification_covariance_stays_bounded():
-    """Hold the contact still, so that damping is unobservable, and at zero depth, so that stiffness is."""
+    """Hold the contact still (damping is unobservable), and at zero depth (stiffness is unobservable)."""
     for deflection, rate in ((2e-4, 0.0), (0.0, 1e-3), (0.0, 0.0)):
         identification = ContactIdentification(1e5, 100.0, 1e12, 1e6, 0.8)
         for _ in range(100_000):

@@ -1,4 +1,4 @@
-"""Watchdog of the runtime: audits of contacts before the next begins, causes, and energies."""
+"""Watchdog of the runtime: audit of each contact before the next one, causes of trips, and energies."""
 
 import itertools
 import math

@@ -177,7 +177,7 @@ def test_self_test_names_recorded_and_computed_command_if_different(files, folde
 
 
 def test_self_test_replays_vectors_even_if_all_checksums_match(files, folder):
-    """A wrong port of the controller may have a matching manifest."""
+    """A controller that was translated wrongly may have a manifest with correct checksums."""
     document = json.loads(files["gains.json"])
     runtime = files["jaxhil_runtime.py"]
     for old, new in [(b"2.0 * lag - period", b"2.0 * lag + period"), (b"held = 0", b"held = 1")]:

@@ -9,7 +9,7 @@ STIFF_ENOUGH = 0.05  # the box constraint changes the region by the square of th
 
 
 def quadratic():
-    """Return J of a stiff and a weak combination of three gains; the third gain has no effect."""
+    """Return a Jacobian J for three gains with a stiff and a weak direction; the third gain has no effect."""
     return np.array([[300.0, 300.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 

@@ -1,4 +1,4 @@
-"""Position shortfall of the motion simulator due to its limits: exactly 0, or as in the oracle."""
+"""Position shortfall caused by limits of the motion simulator: 0 without limits, else as in the oracle."""
 
 import dataclasses
 import functools

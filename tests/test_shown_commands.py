@@ -45,7 +45,7 @@ def shown(page):
 
 @pytest.mark.slow
 def test_commands_in_guide_print_the_output_shown(tmp_path):
-    """Words and lines must agree; differing numbers, which depend on a solver, are printed."""
+    """Words and lines must agree; numbers may differ because of a solver, and are then printed."""
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": path, "COLUMNS": "110"}
     names = {"jaxhil": [sys.executable, "-m", "tuning"], "python": [sys.executable]}

@@ -109,7 +109,7 @@ def as_numbers(document: dict) -> GainFile:
 
 
 def longest_line(gain_file: GainFile) -> float:
-    """Return the longest delay in periods; 0 if a period is invalid."""
+    """Return the longest delay in control periods; 0 if the control period is invalid."""
     numbers = {**gain_file.limits, **gain_file.gains}
     period = gain_file.control_period
     delays = c99_cases.delays(gain_file.compensator) if period > 0.0 else ()

@@ -16,7 +16,7 @@ LANES = 6
 
 
 def compare(form: Form, seed: int, lanes: int, longest: int) -> list[tuple[dict[str, Any], dict[str, float]]]:
-    """Compare metrics of mechanisms whose contact ends and whose oracle result is well-conditioned."""
+    """Compare metrics; omit mechanisms whose contact does not end or whose oracle is ill-conditioned."""
     rng = np.random.default_rng(seed)
     drawn = [form.draw(rng, longest) for _ in range(lanes)]
     mechanisms = [validated(one) for one in drawn]

@@ -64,7 +64,7 @@ def poses(monkeypatch):
 
 
 def test_six_axis_compensator_reads_pose_delayed_by_sensor(poses):
-    """With equal sensor delays, the pose is that at the sampling time of the force."""
+    """With equal sensor delays, the pose is measured at the sampling time of the force."""
     measured, hardware = poses({"rig.position_sensor.delay": 0.0037, "rig.force_sensor.delay": 0.0037})
     np.testing.assert_allclose(measured, hardware, atol=1e-12)
     later, _ = poses({"rig.position_sensor.delay": 0.0})

@@ -1,4 +1,4 @@
-"""Derivatives of six-axis energy and twist errors by parameters of rig and contact.
+"""Derivatives of six-axis energy and twist errors with respect to parameters of rig and contact.
 
 Half of the lanes are a probe in a drogue, half a ring of three points on a plane, in one program. The first
 lane of each is aligned with the axis, without rotation and slip.
@@ -34,7 +34,7 @@ AWAY = 10.0  # m, distance of candidates that are unused in a lane
 
 
 def contact(scales):
-    """Return the candidates with scaled stiffness, dissipation and friction."""
+    """Return the pairs of shapes with scaled stiffness, dissipation and friction."""
     stiffness, dissipation, friction = scales
     is_ring = np.arange(LANES) >= DRAWS
 

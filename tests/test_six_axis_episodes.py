@@ -1,8 +1,8 @@
-"""Six-axis contact episodes: comparison with one axis and with closed forms.
+"""Six-axis contact episodes (all contacts of a run): comparison with one axis and with closed forms.
 
-One program, whose lanes are the cases: central contact of claw-350kg, oblique contact far off the centre
-line, the same in a run that begins earlier, and with a biased sensor, a miss, a contact whose rotation makes
-another point touch, and a contact that hardly changes a fast motion along the surface.
+The cases are the lanes of one program: central contact of claw-350kg; oblique contact far off the centre
+line; the same in a run that begins earlier; the same with a biased sensor; a miss; a contact whose rotation
+makes a second point touch; and a contact that hardly changes a fast motion along the surface.
 """
 
 from functools import partial

@@ -27,7 +27,7 @@ BARS = {
 
 
 def evaluated(mechanism, compensator, *changes, lanes=LANES, scenario=None):
-    """Return the metrics of the first episode for each change of the literature's gains."""
+    """Return the metrics of all contacts of a run, for each change of the literature's gains."""
     with jax_context():
         scenarios = build_scenarios(mechanism, draw(mechanism, lanes, 1), seed=1)
         if scenario is not None:
@@ -49,7 +49,7 @@ def rms(values):
 
 
 def check_good(metrics):
-    """Check that every lane has a status of success."""
+    """Check that the status of every lane is a success."""
     assert {STATUS_NAMES[status] for status in metrics["status"]} <= {"rebounded", "captured"}
 
 

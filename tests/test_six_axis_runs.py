@@ -82,7 +82,7 @@ def test_six_axis_latches_and_robots_are_built_as_specified():
 
 
 def central_contact(name):
-    """Return one contact of a one-axis mechanism as two bodies with central impact."""
+    """Return a six-axis mechanism with the central impact of a one-axis mechanism's contact."""
     one = load_any(name, {"approach.contacts": 1}).mechanism
     raw = to_plain_data(one)
     body = {"mass": 2 * one.bodies.mass, "inertia": [3.0, 4.0, 5.0]}

@@ -72,7 +72,7 @@ def test_repeated_subset_simulation_intervals_contain_the_probability(name, prob
 
 
 def test_subset_simulation_coefficient_of_variation_matches_repeats():
-    """The spread over replicates is right; the published formula underestimates."""
+    """The estimate from the spread of the replicates is right; the published formula is too small."""
     results = repeated("plane of 5", 1e-4, 40)
     seen = np.std([result.estimates for result in results]) / 1e-4
     of_replicates = np.sqrt(np.mean([result.coefficient_of_variation**2 for result in results]) * 10)

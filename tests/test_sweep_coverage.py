@@ -1,4 +1,4 @@
-"""Coverage of intervals of complete sweeps: scenarios are drawn, simulated and counted as by the command.
+"""Coverage of intervals of complete sweeps, which draw, simulate and count scenarios like the command.
 
 The true probability has a closed form: a linear contact of speed v, stiffness k and equivalent mass m has a
 peak force of at most v sqrt(k m), so that a force sensor of range R saturates if v > R / sqrt(k m). For v
@@ -26,7 +26,7 @@ from tuning.sweeps.tally import (
 
 pytestmark = pytest.mark.slow
 
-BAR = 0.935  # probability of repeated sweeps, for stated 95 %
+BAR = 0.935  # smallest coverage in repeated sweeps, for intervals of stated 95 %
 SWEEPS, NUMBER = 1000, 256
 LOOK = 32  # scenarios
 LOW, HIGH = 0.002, 0.006  # m/s

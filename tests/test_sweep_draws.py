@@ -1,4 +1,4 @@
-"""Scenario i depends only on the seed and on i."""
+"""Draws of a sweep: scenario i depends only on the seed and on i."""
 
 import jax
 import numpy as np

@@ -1,4 +1,4 @@
-"""Contact shapes and candidates: signed distances, normals, depth rates, and nearest points of segments."""
+"""Contact shapes: signed distances, normals, penetration rates, and nearest points of segments."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Transparency in tuning: probed copies of every scenario, their ideal restitution and their weights."""
+"""Transparency in tuning: copies of scenarios with a push or additional damping, their e* and weights."""
 
 import dataclasses
 

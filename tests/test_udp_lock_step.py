@@ -52,7 +52,7 @@ def test_udp_lock_step_contacts_equal_contacts_of_closed_loop(name):
 
 
 class Unreliable:
-    """Network that loses packets with a probability, or delays packets by up to the given number of ticks."""
+    """Network that loses packets with a given probability, and delays the others by up to some ticks."""
 
     def __init__(self, drops, ticks, seed):
         self.random, self.drops, self.ticks = Random(seed), drops, ticks

@@ -106,7 +106,7 @@ def test_overrunning_ticks_are_replayed_to_find_the_cause(varying):
     record.add(15, 1, 3_000_000_000)
     assert record.count == record.packet_count == 4  # rows that do not fit are dropped
     again = replay_slow_ticks(lambda: prepared(mechanism), record, 1e9)
-    # The second spent by the computer is not needed again.
+    # In the replay, this tick no longer needs a second of CPU time.
     assert list(again) == [11] and 0 < again[11] < 1e9
     assert replay_slow_ticks(lambda: pytest.fail("nothing to go through"), record, 1e10) == {}
 

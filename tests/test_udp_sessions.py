@@ -1,4 +1,4 @@
-"""Sessions of the controller process: their rig, packets of other senders, and the end."""
+"""Sessions of the controller process: their rig, packets of other senders, and their end."""
 
 import json
 import socket

@@ -1,4 +1,4 @@
-"""Verification of the runtime against the simulation: agreeing controllers pass, differences are reported."""
+"""Verification that runtime and simulation agree: agreement passes, differences are reported."""
 
 import jax
 import msgspec

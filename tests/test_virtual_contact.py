@@ -45,8 +45,8 @@ def test_nominal_virtual_damping_is_stability_limit_for_total_delay():
 def test_simulated_virtual_contact_is_marginal_at_the_stability_limit():
     """The growth per half-cycle, pi Re s/Im s, is 0 at the limit.
 
-    Semi-implicit Euler delays the velocity by half a period; errors of first order in T are extrapolated to
-    0.
+    Semi-implicit Euler delays the velocity by half a period; this first-order error is removed by
+    extrapolation to T = 0.
     """
     delay = np.repeat([0.1, 0.2, 0.4], 3) / OMEGA
     share, added = np.tile([0.9, 1.0, 1.1], 3), np.tile([0.0, 0.0, 0.2 * STIFFNESS], 3)

@@ -1,6 +1,6 @@
 """Watchdog of the C controller on new scenarios: no missed bad runs and no false stops.
 
-Limits are calibrated on some draws, and evaluated on draws of another seed (`fresh_runs.py`).
+Limits are calibrated on draws of one seed, and evaluated on draws of a different seed (`fresh_runs.py`).
 """
 
 from typing import Any

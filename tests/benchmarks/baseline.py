@@ -1,6 +1,7 @@
 """Hand-written C++ baseline (baseline.cpp), compiled on demand and called through ctypes.
 
-The supported options are listed in baseline.cpp. All computations use doubles, for any dtype of the input.
+The supported options are listed in baseline.cpp. All computations are in double precision, even if the input
+is in single precision.
 """
 
 import ctypes
@@ -75,7 +76,7 @@ class Baseline(NamedTuple):
         ticks: int,
         threads: int = 2,
     ) -> dict[str, Any]:
-        """Simulate `ticks` ticks of every lane's first contact and of the flight after this contact.
+        """Simulate `ticks` ticks of every lane: its first contact and the flight after this contact.
 
         Returns the arrays of `run`; only slot 0 is used.
         """

@@ -1,4 +1,4 @@
-"""Other identification methods for the motion simulator, run in an environment of their own.
+"""Other identification methods for the motion simulator, run in a separate Python environment.
 
 `python identify_others.py DATA.npz` prints a line of JSON. DATA has command and reading [m], period [s], the
 averaged response (frequency [Hz], complex), and frequencies `at` [Hz]. Each method returns its response at
@@ -16,7 +16,7 @@ import warnings
 import numpy as np
 
 DELAYS = range(2, 7)
-BLOCKS, THINNED = 10, 10  # rows of the Hankel matrices of N4SID; rows from one sample to the next
+BLOCKS, THINNED = 10, 10  # rows of the Hankel matrices of N4SID; only every `THINNED`-th row is used
 ROWS = {"OE": 2_000, "ARX": 20_000}  # rows that each method processes within a minute
 
 
@@ -38,9 +38,9 @@ def parametric(data, method):
 
 
 def subspace(data):
-    """Fit a N4SID model with the delay among its states.
+    """Fit an N4SID model whose states include the delay.
 
-    Only every tenth row is used: at 1 kHz the states are almost equal.
+    Only every tenth row is used, because successive states at 1 kHz are almost equal.
     """
     import pandas
     from nfoursid.nfoursid import NFourSID

@@ -91,7 +91,7 @@ class Case:
 
 
 def build_cases(mechanisms: Sequence[Mechanism]) -> list[Case]:
-    """Return the tuning problems of the mechanisms; similar mechanisms share their programs."""
+    """Return the tuning problems of the mechanisms; similar mechanisms share a compiled program."""
     tasks = [build_task(mechanism, COMPENSATOR, SCENARIOS, SEED) for mechanism in mechanisms]
     cases: dict[int, Case] = {}
     for group in group_by_program([task.loop for task in tasks], [task.scenarios for task in tasks]):
@@ -143,7 +143,7 @@ def _build_constants(loop: Loop, scenarios: Scenario) -> RigConstants:
 
 
 def _dealt(scenarios: Scenario) -> Scenario:
-    """Sort the scenarios so that every device gets as many long scenarios as the others."""
+    """Sort the scenarios so that all devices get the same number of long scenarios."""
     order = np.argsort(ONE_AXIS.expected_duration(scenarios), kind="stable")
     order = np.concatenate([order[device :: _devices()] for device in range(_devices())])
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., order], scenarios)

@@ -17,19 +17,19 @@ from scipy import optimize
 Losses = Callable[[Float[np.ndarray, "points gains"]], Float[np.ndarray, "points"]]
 Method = Callable[[Losses, Float[np.ndarray, "gains"], int], None]
 
-PARTICLES, ITERATIONS = 15, 13  # as published for real-time hybrid simulation
+PARTICLES, ITERATIONS = 15, 13  # values published for real-time hybrid simulation
 INERTIA, PULL = 0.729844, 1.496180  # constriction: Clerc and Kennedy (2002)
 SPREAD = 0.3  # first standard deviation of CMA-ES relative to the box
 EDGE = 0.25  # edge of the first simplex of Nelder-Mead; SciPy's default is 0 for a gain of 0
 POPULATION = 2  # per gain; with SciPy's default of 15 only a few generations fit into the time limit
-NEVER = 1 << 40  # evaluations
+NEVER = 1 << 40  # evaluation limit that is never reached
 
 
 class Trace(NamedTuple):
-    """Number of rollouts, seconds and best loss after each call of the loss.
+    """Number of rollouts, seconds and best loss after each call of the loss function.
 
-    A rollout is one point simulated on all scenarios; residuals with their Jacobian over P gains count as 1 +
-    P rollouts.
+    A rollout is the simulation of one point in all scenarios; residuals with their Jacobian with respect to P
+    gains count as 1 + P rollouts.
     """
 
     rollouts: Float[np.ndarray, "calls"]
@@ -143,7 +143,7 @@ def nelder_mead(losses: Losses, start: Float[np.ndarray, "gains"], seed: int) ->
 
 
 def differential_evolution(losses: Losses, start: Float[np.ndarray, "gains"], seed: int) -> None:
-    """SciPy's differential evolution, one generation per call; the first population has the start."""
+    """SciPy's differential evolution, one generation per call; the first population contains the start."""
     generator = np.random.default_rng(seed)
     while True:
         optimize.differential_evolution(

@@ -1,4 +1,4 @@
-"""Optimiser of jaxhil in the comparison; to be adapted if tuning changes its search.
+"""Optimiser of jaxhil in the comparison; it must be adapted if the search of tuning changes.
 
 `ours` takes all starting points at once, as tuning does, and returns a trace for each; `warm_up` compiles the
 programs.
@@ -29,17 +29,17 @@ from tuning.optimisation.solution import SolverResult
 
 SCANNED, DESCENTS, GO_ON = 64, 6, 3  # per batch: points scanned, descents started, descents continued
 STEPS = 25  # steps of Levenberg-Marquardt
-POLISH = 320  # evaluations
+POLISH = 320  # evaluations of the polishing search
 LONGEST = 32  # largest number of steps of the compiled program
 
 
 def ours(case: Case, starts: Float[np.ndarray, "starts gains"], warming: bool = False) -> list[Trace]:
     """Run the search of tuning separately from every starting point in the unit box.
 
-    The search scans points, descends by Levenberg-Marquardt in two rounds, repeats if the descents disagree,
-    and ends with a derivative-free polishing search. A trace has an entry for every step of the descents and
-    for the stages before and after. Its seconds are those of the batch divided by the number of starting
-    points; the steps of a round, which is one program, count as equally long.
+    The search scans points, runs Levenberg-Marquardt in two rounds, repeats this if the results disagree, and
+    ends with a derivative-free polishing search. A trace has an entry for every Levenberg-Marquardt step and
+    for the stages before and after. The time of the batch is divided equally among the starting points, and
+    the time of a round equally among its steps.
     """
     number, gains = starts.shape
     stages = _Stages(number, time.perf_counter())

@@ -1,8 +1,7 @@
 """Success rate and cost of several optimisers, computed from their traces.
 
-A start succeeds if it comes within `CLOSE` of the best loss that any method reaches from any start of the
-mechanism. If a share p of the starts succeeds at a median cost c, a user who restarts until success expects
-to pay c/p.
+A start succeeds if its relative distance from the best loss of all methods and starts is at most `CLOSE`. If
+a share p of the starts succeeds at a median cost c, the expected cost of restarts until success is c/p.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +33,7 @@ class Success(NamedTuple):
 Results = Mapping[str, Success]
 
 
-def judge(traces: Mapping[str, Sequence[Trace]]) -> tuple[float, dict[str, Success]]:
+def rate_methods(traces: Mapping[str, Sequence[Trace]]) -> tuple[float, dict[str, Success]]:
     """Return the best loss of all methods, and the success of every method on one mechanism."""
     best = min(float(np.min(trace.loss)) for several in traces.values() for trace in several)
     return best, {name: _success(several, best) for name, several in traces.items()}
@@ -56,7 +55,7 @@ def ratios(ours: Success, others: Sequence[Success]) -> tuple[float, float]:
 
 
 def table(results: Results) -> str:
-    """Return a table with one line per method; losses are stated as excess over the best loss."""
+    """Return a table with one line per method; losses are stated relative to the best loss."""
     lines = [
         f"{'':24}{'starts that':>12}  {'to be expected':>19}  {'loss above best':>17}"
         f"  {'spent on a start':>19}",

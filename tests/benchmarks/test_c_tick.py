@@ -20,8 +20,8 @@ pytestmark = [
     pytest.mark.benchmark,
     pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine"),
 ]
-BAR = 100.0  # ns
-BARS = {"impulse_ledger": 5000.0}  # updates 18 parameters and their covariance
+BAR = 100.0  # ns, largest time per tick
+BARS = {"impulse_ledger": 5000.0}  # ns; this compensator updates 18 parameters and their covariance
 ROWS = 200_000
 REPEATS = 40
 # Contacts of 0.2 s and up to 84 N, 0.3 s apart: every compensator's force decays in between, so that the

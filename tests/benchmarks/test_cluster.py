@@ -68,7 +68,7 @@ def test_cluster_sweep_is_at_least_half_as_fast_as_local_sweep(workers, tmp_path
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="times of other processes are Linux's")
 def test_scheduler_is_not_the_bottleneck_of_a_thousand_workers(tmp_path, capsys):
-    """Measure the CPU time of scheduler and command per empty task."""
+    """Measure the CPU time that scheduler and command use for one empty task."""
     distributed = pytest.importorskip("distributed")
     with started(tmp_path) as cluster:
         command = [sys.executable, str(STUBS), cluster.address, str(THOUSAND)]

@@ -17,10 +17,10 @@ from jaxhil.rig.limits import LIMITS
 
 pytestmark = pytest.mark.benchmark
 TICKS = 200_000
-BAR = 10.0  # us
+BAR = 10.0  # us, largest time per tick
 # The impulse ledger updates 17 parameters and their covariance on every tick in contact.
 BARS = {"impulse_ledger": 250.0}
-TAILS = {"impulse_ledger": 500.0}  # limit for 99.9 % of the ticks in contact
+TAILS = {"impulse_ledger": 500.0}  # us, limit for 99.9 % of the ticks in contact
 
 
 @pytest.mark.parametrize("guarded", [False, True], ids=["bare", "guarded"])

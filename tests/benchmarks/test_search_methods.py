@@ -1,9 +1,9 @@
-"""Our tuning beside what users would pick, on the same loss with the same time for each start.
+"""Tuning compared with other optimisers, on the same loss with the same time for each start.
 
-Every method tunes the same mechanisms of the family from the same starts; what counts is how often a start
-ends within 1 % of the best that any of them finds, and after how many rollouts and how long. Compilation is
-outside of all times. Run with `pytest -m benchmark -s tests/benchmarks/test_search_methods.py`, for a few
-mechanisms with `-k "03 or 48 or fewer"`.
+Every method tunes the same mechanisms of the family from the same starts. A start succeeds if it ends within
+1 % of the best loss of all methods. The success rates, rollouts and times until success are compared. The
+times exclude compilation. Run with `pytest -m benchmark -s tests/benchmarks/test_search_methods.py`, for a
+few mechanisms with `-k "03 or 48 or fewer"`.
 """
 
 import os
@@ -16,7 +16,7 @@ from lanes import QUICK
 from search_case import CAPACITY, Case, build_cases, several
 from search_methods import OTHERS, Recorder, TimeIsUp, Trace, record
 from search_ours import ours, warm_up
-from search_table import Results, judge, medians, ratios, table
+from search_table import Results, medians, rate_methods, ratios, table
 
 from tuning.gains.objective import RESIDUAL_SCALE, RMS_OBJECTIVE, compute_residuals, join_terms
 
@@ -56,7 +56,7 @@ def test_success_and_cost_of_optimisers_are_compared_on_one_mechanism(name, case
         # Run the optimisers alternately, so that other load on the machine affects all of them.
         for method, function in OTHERS.items():
             traces[method].append(record(function, case.losses, start, seed, seconds))
-    best, compared[name] = judge(traces)
+    best, compared[name] = rate_methods(traces)
     with capsys.disabled():
         print(
             f"\n\n{name}: {len(case.names)} gains, {STARTS} starts, {seconds:.2f} s for each;"
@@ -132,7 +132,7 @@ def test_expected_cost_is_median_cost_divided_by_success_rate():
         calls = np.arange(1, 1 + len(losses))
         return Trace(10.0 * calls, 0.5 * calls, np.array(losses))
 
-    best, success = judge(
+    best, success = rate_methods(
         {
             "ours": [trace(5, 2.01, 2), trace(2.02, 2.02, 2.02), trace(9, 9, 9), trace(3, 2.03, 2.021)],
             "theirs": [trace(3, 3)],

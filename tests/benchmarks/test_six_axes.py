@@ -1,8 +1,9 @@
 """Speed of the six-axis simulation on one core, compared with C++ and MuJoCo.
 
-The best of several repetitions counts. The C++ code (six_axes.cpp) has the same physics, to rounding. MuJoCo
-simulates the same two bodies without the rig, by Euler's method, with friction between a sphere and a wall.
-Its time per step is the average of steps with and without contact, weighted by the time in contact.
+The best of several repetitions counts. The C++ code (six_axes.cpp) gives the same results, except for
+rounding. MuJoCo simulates the same two bodies without the rig, by Euler's method, with friction between a
+sphere and a wall. Its time per step is the average of steps with and without contact, weighted by the time in
+contact.
 """
 
 import ctypes
@@ -27,7 +28,7 @@ from jaxhil.sixdof.shapes import Drogue
 pytestmark = pytest.mark.benchmark
 TILES, REPEATS = 8, 25
 LANES = TILES * TILE_SIZE  # lanes of a tile run in parallel, tiles one after the other
-TICKS = 384  # all contact episodes have ended by then
+TICKS = 384  # all contacts have ended by then
 CPP, MUJOCO = 0.3, 30.0  # required speed relative to C++ and to MuJoCo
 FLAGS = ("-O3", "-march=native", "-std=c++17", "-fno-math-errno", "-Wno-psabi", "-shared", "-fPIC")
 NUMBERS = (

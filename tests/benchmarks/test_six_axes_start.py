@@ -1,4 +1,4 @@
-"""CPU time until the first six-axis result: the first `jaxhil simulate`, and programs of many candidates.
+"""CPU time until the first six-axis result: the first `jaxhil simulate`, and programs of many shape pairs.
 
 Run with `pytest -m benchmark -s tests/benchmarks/test_six_axes_start.py`.
 """
@@ -56,7 +56,7 @@ def no_compile_cache():
 
 @pytest.mark.usefixtures("no_compile_cache")
 def test_six_axis_program_of_twelve_shape_pairs_compiles_within_time_limit(capsys):
-    """Use candidates of two kinds, first without, then with derivatives by six leads."""
+    """Compile pairs of two kinds, first without, then with derivatives with respect to six leads."""
     mechanism = load_any("petals", []).mechanism
     scenario = build_scenarios(mechanism)
     assert sum(group.parameters.damping.shape[0] for group in scenario.groups) == 12

@@ -81,7 +81,7 @@ def no_compile_cache():
 
 @pytest.mark.parametrize("compensator", [name for name, law in COMPENSATORS.items() if law.gains])
 def test_rollouts_with_derivatives_compile_within_time_limit(compensator, no_compile_cache, capsys):
-    """Compile the restitutions of a tile and their derivatives by all gains, as the solver does."""
+    """Compile the restitutions of a tile and their derivatives for all gains, as the solver does."""
     loop, gains, scenarios = case(compensator, LANES_PER_TILE)
     rig = jax.jit(build_rig_constants, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
 

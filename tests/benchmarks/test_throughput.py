@@ -37,7 +37,7 @@ INTEL = "GenuineIntel" in INFORMATION
 # Required speed relative to the C++ loop at its best width, at 16 lanes per block, and for a fixed horizon.
 LANE_STEPS = {"none": 0.33, "response_error": 0.4} if INTEL else {"none": 0.5, "response_error": 0.5}
 LANE_STEPS_16 = {"none": 0.33, "response_error": 0.43} if INTEL else {"none": 0.65, "response_error": 0.65}
-JACOBIAN = 0.85  # largest time relative to that without compiler options
+JACOBIAN = 0.85  # largest time, divided by the time without compiler options
 SCENARIOS = {"none": 0.4, "response_error": 0.45} if INTEL else {"none": 1.0, "response_error": 0.95}
 
 
@@ -133,7 +133,7 @@ def test_rollout_speed_is_compared_with_cpp_baseline(compensator, names, capsys)
 
 
 def jacobian(lanes, options):
-    """Measure the Jacobian of the restitutions by all gains of response_error for this number of lanes."""
+    """Time the Jacobian of `lanes` restitutions with respect to all gains of response_error."""
     loop, gains, scenarios = case("response_error", lanes)
     rig = jax.jit(build_rig_constants, static_argnums=0)(loop, jax.tree.map(jnp.asarray, scenarios))
 
