@@ -110,7 +110,7 @@ class CheckEntry(Struct):
     name: str
     finding: str
     there: bool  # whether the effect was detected
-    effect: float | None = None  # change of e by the effect [1]
+    effect: float | None = None  # change of e caused by the effect [1]
     where: str = ""  # log and time of the effect
     counts: bool = True  # whether the effect counts in the verdict
 
@@ -120,7 +120,7 @@ class IdentificationDocument(Struct):
 
     estimates: list[EstimateEntry]
     checks: list[CheckEntry]
-    effect: float | None  # possible change of e by unexplained effects and uncertainty [1]
+    effect: float | None  # possible change of e caused by unexplained effects and uncertainty [1]
     limit: float | None  # smallest effect for which the verdict is bad [1]
     verdict: str
     reason: str
@@ -231,11 +231,11 @@ class RadiusOfMap(Struct):
 class GrowthOfMap(Struct):
     """Growth of the oscillation in a contact that does not end, at the nominal point of a stability map."""
 
-    spectral_radius: float  # factor per control period [1]
+    spectral_radius: float  # growth factor of the amplitude per control period [1]
     per_second: float  # growth rate [1/s]
     frequency: float  # frequency of the oscillation [Hz]
     by_gain: dict[str, float]  # derivative of the spectral radius with respect to each gain
-    per_half_oscillation: float | None = None  # factor per half oscillation [1]
+    per_half_oscillation: float | None = None  # growth factor per half oscillation [1]
 
 
 class MarginOfMap(Struct):

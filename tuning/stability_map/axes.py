@@ -34,7 +34,7 @@ class MapAxis(NamedTuple):
     path: str  # path of the key without indices; "" for a gain
     entry: tuple[int, ...]  # indices of one entry of a list; () if the whole value varies
     unit: str  # SI unit of the values
-    nominal: float  # nominal value, for a list of its first entry
+    nominal: float  # nominal value (of the first entry, if the value is a list)
     low: float  # lower end of the range
     high: float  # upper end of the range
 

@@ -68,9 +68,11 @@ class LoopParameters(NamedTuple):
 class Growth(NamedTuple):
     """Growth of the oscillation in a contact that does not end."""
 
-    spectral_radius: float  # factor of the amplitude per control period [1]
+    spectral_radius: float  # growth factor of the amplitude per control period [1]
     per_second: float  # growth rate ln(spectral radius)/T [1/s]
-    per_half_oscillation: float | None  # factor of the amplitude per half oscillation [1]; None without one
+    per_half_oscillation: (
+        float | None
+    )  # growth factor of the amplitude per half oscillation [1]; None if none
     frequency: float  # frequency of the oscillation [Hz]
     by_gain: dict[str, float]  # derivative of the radius with respect to each gain [1/unit of the gain]
 

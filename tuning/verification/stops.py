@@ -45,8 +45,10 @@ class ControllerStop(msgspec.Struct, frozen=True, kw_only=True):
 
     fault: str  # name of the fault, as in `jaxhil.rig.faults`
     by: str  # part of the controller that raises the fault: "watchdog" or "guard"
-    tripped: bool  # whether the controller trips; otherwise it replaces a reading or limits a command
-    contact: int  # number of the contact, from 1; between contacts, number of the audited or the next contact
+    tripped: bool  # True if the controller trips; False if it only replaces a reading or limits a command
+    contact: (
+        int  # number, from 1, of the audited contact if the audit acts, else of the current or next contact
+    )
     tick: int  # tick of the run, from 0
     time: float  # time since the start of the run [s]
     found: float | None  # value that is compared with the limit [`unit`]; None if there is no such number

@@ -299,7 +299,9 @@ def _choose_scenarios(
     manifest = store.manifest
     if manifest.gains_sha256 != loaded.document["sha256"]:
         found, allowed = manifest.gains_sha256[:12], loaded.document["sha256"][:12]
-        raise InputError(f"{store.folder}: gains_sha256: found {found}..., expected {allowed}...")
+        raise InputError(
+            f"{store.folder}: gains_sha256: found {found}..., expected {allowed}... of this gain file"
+        )
     stored = count_stored_scenarios(store)
     if scenarios is not None and scenarios > stored:
         raise InputError(f"--scenarios: found {scenarios}, expected at most {stored} (those of the sweep)")

@@ -39,7 +39,7 @@ MAX_FAULT_ERROR = 1.25  # largest restitution error of a used scenario, divided 
 MIN_BAD_SHARE = 0.5  # smallest fraction of used scenarios for a fault that counts for the verdict [1]
 FIRST_SCENARIO_INDEX = 2**31  # index of the first scenario; sweeps and calibration use lower indices
 MIN_FAULT_SCENARIOS, MAX_FAULT_SCENARIOS = 64, 4096  # bounds on the number of scenarios for a fault
-# Largest multiple: size of a delay fault, divided by the delay that alone causes the limit of the error.
+# Largest size of a delay fault, divided by the delay that causes an error equal to the limit.
 MAX_FAULT_MULTIPLE = 32.0
 # Multiples that are tried in this order, before bisection.
 FAULT_MULTIPLES = tuple(MAX_FAULT_MULTIPLE / 2.0**step for step in range(6, -1, -1))
