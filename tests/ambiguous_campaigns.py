@@ -72,7 +72,7 @@ def numbers(mechanism, position_delay):
     return values
 
 
-def restitution_errors(name, written, compensator, gains):
+def deviations(name, written, compensator, gains):
     """Return the errors of e and e - e* of each mechanism, compared with the true rig, (mechanisms, 2).
 
     All mechanisms run with the same gains in the simulation of `jaxhil`; e is the mean over contact phases.

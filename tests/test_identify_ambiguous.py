@@ -212,10 +212,7 @@ def test_identified_files_with_good_verdict_are_accurate(monkeypatch, name):
         estimate = delay_and_lag(result)
         inside.append([*covered, estimate.low <= age + share <= estimate.high])
     gains = choose_gains(ambiguous.truth(name), "response_error", None)[1]
-    off, good = (
-        np.abs(ambiguous.restitution_errors(name, mechanisms, "response_error", gains)),
-        np.array(good),
-    )
+    off, good = np.abs(ambiguous.deviations(name, mechanisms, "response_error", gains)), np.array(good)
     wrong = np.mean(np.any(off[good] >= 0.01, axis=1)) if good.any() else 0.0
     shares = np.mean(inside, axis=0)
     print(f"{name}: {good.mean():.2f} good, {wrong:.3f} of them wrong; rms off e, e - e*", end=" ")

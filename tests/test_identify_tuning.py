@@ -92,12 +92,7 @@ def with_noise(name):
 
 GOOD, TRIED = 40, 80
 LIMIT = 0.01  # error limit for tuning on the file
-AMBIGUOUS_KINDS = (
-    "plain",
-    "no delay",
-    "undamped",
-    "lost rows",
-)  # kinds for which some files get a good verdict
+GOOD_KINDS = ("plain", "no delay", "undamped", "lost rows")  # kinds for which some files get a good verdict
 
 
 def test_gains_tuned_on_files_with_good_verdict_have_little_additional_error(monkeypatch):
@@ -109,7 +104,7 @@ def test_gains_tuned_on_files_with_good_verdict_have_little_additional_error(mon
     """
     best, losses = {}, []
     for number in range(TRIED):
-        name = AMBIGUOUS_KINDS[number % len(AMBIGUOUS_KINDS)]
+        name = GOOD_KINDS[number % len(GOOD_KINDS)]
         campaign = ambiguous.campaign(monkeypatch, name, 90_000 + number)
         result = identify(campaign, ambiguous.prior(name), IdentificationOptions(seed=number))
         if not result.good:

@@ -152,12 +152,8 @@ def test_objective_terms_with_weight_zero_are_ignored():
     errors, excesses, swings, noise = [0.1, -0.2], [0.3, 0.4], [0.5, 0.6], 3.0
     terms = *map(padded, (errors, excesses, swings)), np.arange(SLOTS) < 2, np.asarray(noise)
     none = *[padded([])] * 3, np.asarray(0.0)
-    whole, _ = compute_residuals_of(
-        ObjectiveTerms("rms", True, True, True), stacked([Objective()]), terms, none
-    )
-    plain, _ = compute_residuals_of(
-        ObjectiveTerms("rms", False, False, False), stacked([Objective()]), terms, none
-    )
+    whole, _ = residuals(ObjectiveTerms("rms", True, True, True), stacked([Objective()]), terms, none)
+    plain, _ = residuals(ObjectiveTerms("rms", False, False, False), stacked([Objective()]), terms, none)
     assert len(whole) == 3 * len(plain) + 1 and not whole[len(plain) :].any()
     np.testing.assert_array_equal(whole[: len(plain)], plain)
 
@@ -275,7 +271,7 @@ def test_failed_contacts_increase_objective_with_zero_derivative(batch, known_re
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)
-def compute_residuals_of(static, weights, terms, tangents):
+def residuals(static, weights, terms, tangents):
     """Return residuals and derivative of one problem from its errors, excesses, variation and noise."""
     *contacts, wanted, noise = terms
 
@@ -296,7 +292,7 @@ def single_residuals(objective, errors, excesses=(), noise=1.0, chatter=(), tang
     terms = padded(errors), padded(excesses), padded(chatter), wanted, np.asarray(noise)
     tangents = *map(padded, tangents[:-1]), np.asarray(tangents[-1])
     static = join_terms([objective])
-    return tuple(map(np.asarray, compute_residuals_of(static, stacked([objective]), terms, tangents)))
+    return tuple(map(np.asarray, residuals(static, stacked([objective]), terms, tangents)))
 
 
 def sum_of_squares(*arguments):

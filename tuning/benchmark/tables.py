@@ -31,8 +31,7 @@ WINNER_MARK = "*"  # marks the metric of a compensator that is significantly bet
 def find_winners(results: Sequence[LawMetrics], which: str = TUNED_GAINS) -> dict[str, str | None]:
     """Return for each metric the compensator that is significantly the best on one mechanism, or None.
 
-    The metrics of a compensator are those with the gains `which` or, if it lacks these gains, with the gains
-    of the literature.
+    A compensator without the gains `which` is compared with its gains from the literature.
     """
     by_law = {result.law: choose_best_metrics(result, which) for result in results}
     return {name: find_winner(name, {law: m[name] for law, m in by_law.items()}) for name in METRIC_HEADINGS}

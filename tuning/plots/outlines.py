@@ -22,8 +22,8 @@ POINT_MARK_SIZE = 0.02  # half size of the cross that marks a point, divided by 
 def outlines(groups: Sequence[ContactGroup]) -> tuple[list[Polyline], list[Polyline]]:
     """Return the outlines of target and chaser as lines, each (points, 3) [m].
 
-    The points are in frame T (docking interface of the target) and C (of the chaser). The shapes are those of
-    the first batch element. A line that several shapes share occurs once.
+    The frames are T (docking interface of the target) and C (of the chaser). Only the shapes of the first
+    batch element are used. A line that several shapes share occurs once.
     """
     pairs = [pair for group in groups for pair in _shape_pairs(group.candidates)]
     corners = np.concatenate([np.zeros((0, 3)), *(_corners(shape) for pair in pairs for shape in pair)])

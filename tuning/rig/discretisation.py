@@ -43,8 +43,7 @@ class DiscreteSimulator(NamedTuple):
 def split_delay(delay: float, period: float) -> tuple[int, float]:
     """Return the time of a sample that is `delay` [s] old, as a number of whole intervals and a fraction.
 
-    The sample lies this number of sampling intervals before the current one, at the fraction in (0, 1] after
-    the start of its interval.
+    The fraction is in (0, 1] and measured from the start of the sampling interval that contains the sample.
     """
     periods = delay / period
     whole = math.floor(periods + DELAY_ROUNDING_TOLERANCE)

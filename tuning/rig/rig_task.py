@@ -54,8 +54,7 @@ class RigTask:
         seed: seed of the sensor noise and of the phases.
         stroke: lowest and highest position of the drives [m].
         resets: whether to reset a controller that trips because of old commands. This applies if a command
-            was older than `MAX_COMMAND_AGE` periods and `TRIPS_BY_OLD_COMMANDS` contains the reason for the
-            trip.
+            was older than `MAX_COMMAND_AGE` periods and `TRIPS_BY_OLD_COMMANDS` contains the trip's reason.
 
     Attributes:
         tripped: reason for the controller's trip; empty if it has not tripped.

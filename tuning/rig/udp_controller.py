@@ -19,8 +19,7 @@ numerical model M x'' = -F_c, once per period.
 The process records the time of each tick, from the arrival of the packet to the answer, and its CPU time. It
 writes both at the end. If a tick used too much CPU time (`MAX_CPU_SHARE`), the process replays all packets at
 the end. If the controller was the cause, the tick is slow again in the replay. If an interrupt or another
-virtual machine was the cause, the tick is not slow again. With `--empty`, the process answers at once and
-computes nothing.
+virtual machine was the cause, it is fast. With `--empty`, the process answers at once and computes nothing.
 """
 
 import argparse

@@ -70,9 +70,7 @@ class Growth(NamedTuple):
 
     spectral_radius: float  # growth factor of the amplitude per control period [1]
     per_second: float  # growth rate ln(spectral radius)/T [1/s]
-    per_half_oscillation: (
-        float | None
-    )  # growth factor of the amplitude per half oscillation [1]; None if none
+    per_half_oscillation: float | None  # growth factor per half oscillation [1]; None if there is none
     frequency: float  # frequency of the oscillation [Hz]
     by_gain: dict[str, float]  # derivative of the radius with respect to each gain [1/unit of the gain]
 

@@ -224,8 +224,8 @@ def _run_tiles(
 ) -> np.ndarray:
     """Simulate all runs in tiles, and return the results of `_worst_contact`, (5, lanes).
 
-    A tile consists of runs that are computed together. Each tile contains both long and short runs, so that
-    all tiles take a similar time.
+    Each tile (runs that are computed together) contains both long and short runs, for a similar time per
+    tile.
     """
     loop = build_loop(mechanism, compensator, scenarios)
     order = np.argsort(ONE_AXIS.expected_duration(scenarios))

@@ -3,13 +3,13 @@
     rms, p99, worst      rms, 99th percentile and maximum of the restitution error |e - e*| of all contacts
     failures             fraction of scenarios with a contact that does not end, has an error above the limit,
                          or violates the bounds on real peak force and duration
-    early, late          transparency to a push at 25 % and at 75 % of the contact; the best value is 1 slope
-    slope of e against e* in scenarios with damping perturbations; the best value is 1 peak
-    99th percentile of (peak of the force command) / (peak force of the ideal contact) peak_force_ratio
-    99th percentile of (real peak force) / (peak force of the ideal contact) duration_ratio       99th
-    percentile of (duration of the contact) / (duration of the ideal contact) trajectory           rms of
-    (model position - ideal contact's position) / (depth of the ideal contact) noise
-    amplification of white force noise, computed from the gains, without an interval
+    early, late          transparency to a push at 25 % and at 75 % of the contact; the best value is 1
+    slope                slope of e against e* in scenarios with damping perturbations; the best value is 1
+    peak                 99th percentile of (peak of the force command) / (peak force of the ideal contact)
+    peak_force_ratio     99th percentile of (real peak force) / (peak force of the ideal contact)
+    duration_ratio       99th percentile of (duration of the contact) / (duration of the ideal contact)
+    trajectory           rms of (model position - ideal position) / (depth of the ideal contact)
+    noise                amplification of white force noise, computed from the gains, without an interval
 
 Most intervals are bootstrap intervals. They resample whole scenarios, because the contacts of a scenario are
 not independent. The interval of `failures` is a Clopper-Pearson interval.

@@ -46,9 +46,7 @@ class ControllerStop(msgspec.Struct, frozen=True, kw_only=True):
     fault: str  # name of the fault, as in `jaxhil.rig.faults`
     by: str  # part of the controller that raises the fault: "watchdog" or "guard"
     tripped: bool  # True if the controller trips; False if it only replaces a reading or limits a command
-    contact: (
-        int  # number, from 1, of the audited contact if the audit acts, else of the current or next contact
-    )
+    contact: int  # number, from 1, of the contact; for a trip by an audit, of the audited contact
     tick: int  # tick of the run, from 0
     time: float  # time since the start of the run [s]
     found: float | None  # value that is compared with the limit [`unit`]; None if there is no such number

@@ -71,8 +71,7 @@ def calibrate(
 
     Args:
         loaded: gain file.
-        store: sweep whose scenarios are simulated again; it must have used this gain file. None: draw new
-            scenarios.
+        store: sweep of this gain file whose scenarios are simulated again. None: draw new scenarios.
         scenarios: number of scenarios. Default: all scenarios of the sweep, or 2048 draws.
         limit: limit of the restitution error [1]. Default: the limit of the sweep, or 0.01.
         lanes: number of scenarios that are simulated together.
@@ -299,9 +298,7 @@ def _choose_scenarios(
     manifest = store.manifest
     if manifest.gains_sha256 != loaded.document["sha256"]:
         found, allowed = manifest.gains_sha256[:12], loaded.document["sha256"][:12]
-        raise InputError(
-            f"{store.folder}: gains_sha256: found {found}..., expected {allowed}... of this gain file"
-        )
+        raise InputError(f"{store.folder}: gains_sha256: found {found}..., expected {allowed}...")
     stored = count_stored_scenarios(store)
     if scenarios is not None and scenarios > stored:
         raise InputError(f"--scenarios: found {scenarios}, expected at most {stored} (those of the sweep)")

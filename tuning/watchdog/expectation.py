@@ -4,8 +4,8 @@ The expected restitution is a polynomial in p = sqrt(k_0/k) - 1, w = v/v_0 - 1 a
 is the approach speed, M the equivalent mass, k and b are the stiffness and damping that the watchdog
 estimates (`jaxhil.rig.watchdog`), and k_0 and v_0 are reference values. An unknown delay delta of the force
 changes the estimate of k only by the factor cos(omega delta), but the estimate of b by -k delta, which the
-rig cannot distinguish from damping. The polynomial therefore contains b only if this reduces the error for
-contacts that were not part of the fit.
+rig cannot distinguish from damping. The polynomial contains b only if this reduces the error for other
+contacts.
 """
 
 from collections.abc import Sequence
