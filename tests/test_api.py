@@ -103,7 +103,7 @@ ANYTHING = st.one_of(
 @hypothesis.given(
     path=st.one_of(st.sampled_from(["approach.velocity", "contact.law", "rig"]), ANYTHING), value=ANYTHING
 )
-def test_load_accepts_or_rejects_any_override_in_one_line(path, value):
+def test_load_applies_any_override_or_raises_one_line_error(path, value):
     try:
         overrides = {path: value}
     except TypeError:

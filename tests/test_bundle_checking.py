@@ -261,7 +261,7 @@ def test_bundle_check_detects_every_flipped_bit(files, folder, flips):
     assert check_bundle(folder).reasons == []
 
 
-def test_write_bundle_replaces_only_an_unmodified_bundle(files, folder, tmp_path):
+def test_only_an_unmodified_bundle_is_replaced(files, folder, tmp_path):
     placed(folder, files)
     secret = tmp_path / "secret"
     secret.mkdir()
@@ -293,7 +293,7 @@ def test_write_bundle_replaces_only_an_unmodified_bundle(files, folder, tmp_path
     assert sorted(os.listdir(tmp_path)) == ["bundle", "secret"]
 
 
-def test_write_bundle_keeps_file_added_during_replacement(files, folder, monkeypatch):
+def test_file_added_during_replacement_of_bundle_is_kept(files, folder, monkeypatch):
     placed(folder, files)
 
     def late(new, target):

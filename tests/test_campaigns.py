@@ -9,7 +9,7 @@ import pytest
 
 
 @pytest.mark.parametrize("name", ("third_order", "lagging", "hertz", "resonance", "stiffnesses", "dead_zone"))
-def test_simulated_campaign_contact_matches_oracle(name):
+def test_contacts_of_simulated_campaign_match_oracle(name):
     kind = campaigns.KINDS[name]
     sensors = {
         sensor: {key: value for key, value in kind.rig[sensor].items() if key != "noise_std"}

@@ -63,7 +63,7 @@ def test_simulate_exit_code_depends_on_error_limit(jaxhil, tmp_path):
     assert "divergence" in ran.out and "0.1" in ran.out
 
 
-def test_simulate_set_option_changes_mechanism(jaxhil):
+def test_set_option_of_simulate_command_changes_the_mechanism(jaxhil):
     ran = jaxhil("simulate", "rig-300kg", "--json", "--set", "approach.velocity=0.01", "--set", "name=other")
     document = ran.document
     assert document["mechanism"] == "other"
@@ -108,7 +108,7 @@ def test_tune_command_writes_gains_and_plots(jaxhil, tuned):
     )
 
 
-def test_tune_command_reports_tables_or_json(jaxhil, table, tmp_path):
+def test_tune_command_prints_tables_or_json_if_requested(jaxhil, table, tmp_path):
     tuned, code, out, err = table
     assert code == 1 and out.startswith("rig-300kg: equivalent mass 300 kg; contact at 3 Hz, ")
     words = ("before", "literature", "tuned", "rms", "99th", "chatter", "lead_filter", "step limit")
@@ -127,7 +127,7 @@ def test_tune_command_reports_tables_or_json(jaxhil, table, tmp_path):
     assert json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())["sha256"] == again["sha256"]
 
 
-def test_tune_json_states_sensor_noise(jaxhil, tmp_path):
+def test_json_output_of_tune_states_sensor_noise(jaxhil, tmp_path):
     ran = jaxhil("tune", "suite-noisy", "--compensator", "none", "-o", tmp_path, "--json", *TINY)
     (entry,) = ran.document["mechanisms"]
     assert entry["sensor_noise"] is True
@@ -184,7 +184,7 @@ def test_tune_accepts_folder_of_mechanism_files(jaxhil, tmp_path):
 
 
 @pytest.mark.slow
-def test_tune_from_earlier_gains_is_never_worse_than_those_gains(jaxhil, tuned, tmp_path):
+def test_tuning_from_earlier_gains_is_never_worse_than_these_gains(jaxhil, tuned, tmp_path):
     arguments = ["tune", "rig-300kg", "--compensator", "phase_lead", "-o", tmp_path, *TINY]
     cold = jaxhil(*arguments, "--json").document["mechanisms"][0]
     assert cold["carried_over"] == []

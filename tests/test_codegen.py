@@ -197,7 +197,7 @@ def same(actual: float, expected: float) -> bool:
 
 @needs_compiler
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda function: function.__name__)
-def test_c99_function_equals_python_to_the_bit_or_fails_where_python_raises(function, tmp_path):
+def test_c99_function_equals_python_and_fails_where_python_raises(function, tmp_path):
     guarded = caught(function)
     program = CProgram("t_", public={guarded: "t_guarded"})
     program.add(guarded)

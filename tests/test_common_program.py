@@ -54,7 +54,7 @@ def test_common_program_includes_every_contact_law():
     assert set(groups[0][1].laws) == set(CONTACT_LAWS)
 
 
-def test_mechanisms_with_different_numbers_of_surfaces_or_orders_share_no_program():
+def test_mechanisms_with_different_surfaces_or_model_orders_share_no_program():
     others = [
         mechanism({}),
         mechanism({"clearance": 0.02}),

@@ -79,7 +79,7 @@ class Known(NamedTuple):
     damping: Array
 
 
-def test_compensator_that_replays_the_reference_has_zero_transparency(monkeypatch):
+def test_compensator_that_replays_ideal_contact_has_zero_transparency(monkeypatch):
     monkeypatch.setitem(compensators.COMPENSATORS, "played_back", PlayedBack())
 
     def evaluate_with_plant(loop, gains, scenarios):
@@ -95,7 +95,7 @@ def test_compensator_that_replays_the_reference_has_zero_transparency(monkeypatc
     assert abs(figures["early"].value) < 1e-6 and abs(figures["late"].value) < 1e-6
 
 
-def test_uncompensated_delay_error_matches_closed_form():
+def test_error_of_uncompensated_delay_matches_closed_form():
     """For a pure force delay and an ideal simulator, e = |S'(t_s + tau)| (model.md, section 6)."""
     tau = 0.004
     raw = mechanism({}, IDEAL, tau, period=2.5e-4)

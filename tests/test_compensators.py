@@ -94,7 +94,7 @@ def some_gains(name, shape=()):
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_compensator_reads_position_only_if_declared(name):
+def test_compensator_that_reads_position_declares_this(name):
     signals, constants = readings()
     blind = signals._replace(position_measured=jnp.full_like(signals.position_measured, jnp.nan))
     seeing, unseeing = (

@@ -225,7 +225,7 @@ def test_six_axis_off_centre_impulse_follows_effective_mass(run):
     np.testing.assert_allclose(after, 0.002, rtol=1e-3)
 
 
-def test_six_axis_couple_oscillates_with_reduced_inertia(run):
+def test_pure_moment_of_six_axis_contact_acts_on_reduced_inertia(run):
     seen, _, step = run
     inertia = 1100.0 * 180 / (1100 + 180)
     frequency = np.sqrt(2 * 1e6 * 0.6**2 / inertia)

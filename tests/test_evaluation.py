@@ -111,7 +111,7 @@ def tiled(scenarios):
     )
 
 
-def test_batch_tiles_contain_scenarios_of_equal_delay_and_similar_duration():
+def test_tiles_of_a_batch_contain_scenarios_of_equal_delay_and_similar_duration():
     delays, durations = tiled(setting("none", lanes=4096)[2])
     assert np.sum(np.ptp(delays, axis=-1) > 0) < len(np.unique(delays)) == 2
     assert np.mean(np.ptp(durations, axis=-1)) < 0.1 * np.ptp(durations)

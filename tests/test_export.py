@@ -125,7 +125,7 @@ def test_export_is_reproducible_for_equal_gains_and_seed():
     assert {name for name in first if first[name] != other[name]} == {"vectors.csv", "manifest.json"}
 
 
-def test_replace_limits_updates_digest_and_stores_alarm_rates():
+def test_replacement_of_limits_updates_digest_and_stores_alarm_rates():
     made = document()
     changed = replace_limits(made, {"force_limit": 900.0, "velocity_limit": None}, {"limit": 0.01})
     assert changed["limits"] == {
@@ -239,7 +239,7 @@ def test_export_leaves_third_party_folder_unchanged(jaxhil, gains, tmp_path):
 
 
 @pytest.mark.parametrize("before", [False, True])
-def test_write_bundle_keeps_old_bundle_after_failed_write(tmp_path, monkeypatch, before):
+def test_failed_write_of_bundle_keeps_the_old_bundle(tmp_path, monkeypatch, before):
     folder = tmp_path / "bundle"
     if before:
         placed(folder)
@@ -280,14 +280,14 @@ def test_write_bundle_keeps_old_bundle_after_failed_write(tmp_path, monkeypatch,
     assert {*os.listdir(tmp_path)} - {"file"} == {"bundle"} and (folder / "manifest.json").exists()
 
 
-def test_write_bundle_replaces_bundle_in_one_step(tmp_path, monkeypatch):
+def test_bundle_is_replaced_in_one_step(tmp_path, monkeypatch):
     folder = placed(tmp_path / "bundle")
     monkeypatch.setattr(os, "replace", lambda *_: pytest.fail("a moment without a bundle"))
     write_bundle(folder, {**small_files(), "new": b"new"})
     assert (folder / "new").read_bytes() == b"new" and os.listdir(tmp_path) == ["bundle"]
 
 
-def test_write_bundle_follows_link_to_folder(tmp_path):
+def test_bundle_is_written_through_link_to_folder(tmp_path):
     (tmp_path / "there").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "there")
     write_bundle(tmp_path / "link", small_files())

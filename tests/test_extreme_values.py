@@ -56,7 +56,7 @@ def check_simulate(command, name, changes):
 
 @pytest.mark.parametrize("every", [SAMPLE, pytest.param(1, marks=pytest.mark.slow)], ids=["some", "all"])
 @pytest.mark.parametrize("which", OTHERS)
-def test_extreme_values_are_loaded_or_rejected_in_one_line(which, every):
+def test_extreme_values_are_loaded_or_rejected_with_one_line_message(which, every):
     name, others = OTHERS[which]
     first = [*OTHERS].index(which) % every
     for key, value in list(itertools.product(KEYS, VALUES))[first::every]:
@@ -81,7 +81,7 @@ def test_extreme_values_are_loaded_or_rejected_in_one_line(which, every):
         *("rig.simulator.natural_frequency=1e9", "rig.simulator.natural_frequency=1e-100"),
     ],
 )
-def test_simulate_runs_or_rejects_extreme_value_in_one_line(jaxhil, change):
+def test_extreme_value_is_simulated_or_rejected_with_one_line_message(jaxhil, change):
     check_simulate(jaxhil, "rig-300kg", ["uncertainty={}", change])
 
 
@@ -93,7 +93,7 @@ def test_load_rejects_mechanism_with_very_long_list():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", OTHERS)
-def test_simulate_runs_or_rejects_every_extreme_value_in_one_line(jaxhil, which):
+def test_every_extreme_value_is_simulated_or_rejected_with_one_line_message(jaxhil, which):
     name, others = OTHERS[which]
     for key, value in itertools.product(KEYS, VALUES):
         for changes in overrides(others, key, value):

@@ -70,7 +70,7 @@ def test_smaller_generated_family_is_prefix_of_larger_family(members):
         assert family(number) == members[:number]
 
 
-def test_generated_mechanism_values_lie_within_and_fill_their_ranges(members):
+def test_values_of_generated_mechanisms_fill_their_ranges(members):
     drawn = {
         "mass": [m.bodies.mass for m in members],
         "velocity": [m.approach.velocity for m in members],

@@ -66,7 +66,7 @@ class Early(NoCompensator):
         return signals.force_measured + jnp.maximum(signals.position_desired, 0), state
 
 
-def test_skipped_approach_is_disabled_for_compensators_active_before_contact():
+def test_approach_is_not_skipped_for_compensators_active_before_contact():
     """Include a compensator that wraps an ordinary one."""
     loop, _, _ = case("virtual_contact")
     assert not loop.is_idle_in_flight

@@ -106,7 +106,7 @@ def test_gain_file_is_unchanged_after_failed_write(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["gains.json"]
 
 
-def test_gain_file_write_rejects_missing_folder(tmp_path):
+def test_write_of_gain_file_to_missing_folder_is_rejected(tmp_path):
     with pytest.raises(InputError, match="cannot be written: No such file or directory"):
         write_gain_file(tmp_path / "nowhere" / "gains.json", make())
 
@@ -272,7 +272,7 @@ JSON = st.recursive(
 
 @settings(max_examples=200, deadline=None)
 @given(st.sampled_from([path for path in places(DOCUMENT) if path]), JSON)
-def test_gain_file_accepts_or_rejects_any_change_in_one_line(path, value):
+def test_any_changed_gain_file_is_accepted_or_rejected_with_one_line_message(path, value):
     document = copy.deepcopy(DOCUMENT)
     table = document
     for key in path[:-1]:

@@ -182,7 +182,7 @@ def sweep():
     return delay, *map(np.asarray, both(jnp.asarray(delay)))
 
 
-def test_restitution_is_continuous_in_the_identification_delay(sweep):
+def test_restitution_is_continuous_function_of_identification_delay(sweep):
     delay, restitution, slope = sweep
     steps = np.diff(restitution)
     assert np.abs(restitution[-1] - restitution[0]) > 0.01

@@ -74,7 +74,7 @@ DEFECTS = {"hold": "command hold", "sign": "sign of the force", "scale": "scale"
         *(pytest.param(*defect, marks=pytest.mark.slow) for defect in DEFECTS.items()),
     ],
 )
-def test_identify_reports_defect_of_rig_with_bad_verdict(wrong, worst):
+def test_identify_reports_defect_of_rig_and_verdict_is_bad(wrong, worst):
     campaign = campaigns.campaign("resonance" if wrong == "order" else "clean", 1, speeds=FEW)
     options = IdentificationOptions(law="kelvin_voigt", order=2 if wrong == "order" else None)
     runs = campaign.runs

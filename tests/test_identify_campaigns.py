@@ -154,7 +154,7 @@ def test_identify_detects_every_drift():
         assert not result.good
 
 
-def test_identify_delay_and_lag_errors_reach_cramer_rao_bound():
+def test_errors_of_identified_delay_and_lag_reach_cramer_rao_bound():
     true = np.array([0.0025, 0.0016, 0.0, 1.2e5, 650.0, 0.0])
     steps = np.array([2e-6, 2e-6, 2e-8, 10.0, 0.1, 0.01])
     off, bounds = [], []

@@ -145,7 +145,7 @@ KINDS = ["jitter", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("no
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_read_campaign_recovers_signals_of_independent_rig(jaxhil, kind, tmp_path):
+def test_signals_of_independent_rig_are_recovered_from_its_logs(jaxhil, kind, tmp_path):
     campaign = campaigns.campaign(kind, 1, speeds=FEW, seconds=20.0)
     write(tmp_path, campaign, campaigns.KINDS[kind].jitter)
     recovered = read_campaign(logs(tmp_path), load_mapping(drafted(jaxhil, tmp_path)))

@@ -82,7 +82,7 @@ def test_lag_filter_weights_are_exact_for_contact_onset_within_a_period():
         assert begin_weight * 3.0 + end_weight * 5.0 == pytest.approx(exact, rel=1e-9)
 
 
-def test_contact_fit_for_white_noise_equals_general_filtered_computation():
+def test_contact_fit_is_equal_with_and_without_noise_filter_for_white_noise():
     plain = problem("stiffnesses", kelvin_voigt(), speeds=(0.006, 0.012, 0.003))
     filtered = ContactProblem(plain.motion, plain.readings, plain.law, None)
     filtered.is_unfiltered, filtered.needed_rows = False, np.arange(plain.readings.counts.size)

@@ -179,7 +179,7 @@ def test_sequential_interval_is_intersection_of_all_looks_unless_it_is_empty():
     assert SequentialState() == SequentialState(0, 0, 0.0, 1.0, 0.95)
 
 
-def test_scenarios_needed_is_the_smallest_sufficient_number():
+def test_required_number_of_scenarios_is_the_smallest_sufficient_number():
     needed = estimate_sequence_scenarios(0.01, 0.001)
     assert confidence_sequence(0.01 * needed, needed).width <= 0.001
     assert confidence_sequence(0.01 * 0.9 * needed, 0.9 * needed).width > 0.001

@@ -20,7 +20,7 @@ from jaxhil.rig.law_status import MAX_DOUBTFUL_SHARE
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suite", ["noisy", "hertz", "hardening", "layered", "fast"])
-def test_share_of_doubtful_ticks_distinguishes_too_short_contacts(suite):
+def test_share_of_doubtful_ticks_identifies_contacts_that_are_too_short(suite):
     """Print the share of doubtful ticks; check the gap that contains `MAX_DOUBTFUL_SHARE`.
 
     A contact is too short if the compensator reports so on any tick.
@@ -135,7 +135,7 @@ def test_contact_with_status_identified_is_accurate_for_damper_with_unmodelled_l
 
 
 @pytest.mark.slow
-def test_slow_contacts_get_status_identified_by_impulse_ledger():
+def test_slow_contacts_with_impulse_ledger_have_status_identified():
     changes = ("contact.stiffness=[8000.0]",)
     mechanism_known = load("suite-noisy", list(changes)).mechanism
     for index, mechanism in enumerate(contacts_of("noisy", 9, 25, changes)):

@@ -41,7 +41,7 @@ def model(integrator, row, sign=1):
 
 @pytest.mark.parametrize("integrator", ["semi_implicit_euler", "zoh", "explicit_euler"])
 @pytest.mark.parametrize("row", ["tick", "sent"])
-def test_log_readings_of_another_tick_are_detected_for_any_integrator(tmp_path, integrator, row):
+def test_log_readings_assigned_to_wrong_tick_are_detected_for_any_integrator(tmp_path, integrator, row):
     path = write_csv(tmp_path / "a.csv", model(integrator, row))
     assert read(path, timing={"row": row}).runs[0].kind == "contact"
     other = "tick" if row == "sent" else "sent"

@@ -220,7 +220,7 @@ def test_log_channels_that_begin_at_different_times_are_aligned(tmp_path, name, 
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_log_channels_with_other_rates_or_clocks_are_read_or_refused_in_one_line(tmp_path):
+def test_log_channels_with_other_rates_or_clocks_are_read_or_refused(tmp_path):
     path, columns = mdf_of_groups(tmp_path / "a.mf4", LOG, 0.005)
     with pytest.raises(InputError, match=r'timing.clock: found "index", expected "stamps", because '):
         read(path, **columns, timing={"clock": "index"})

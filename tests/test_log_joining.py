@@ -105,7 +105,7 @@ def test_gap_in_a_log_channel_drops_the_rows_within_the_gap():
         (None, "column 'F': found no stamps, expected stamps"),
     ],
 )
-def test_log_channel_with_incompatible_clock_is_refused_by_name(stamps, reason):
+def test_log_channel_with_incompatible_clock_is_named_in_error(stamps, reason):
     rows = PERIOD * np.arange(ROWS)
     columns = {"position_desired": rows, "force_measured": rows}
     with pytest.raises(InputError) as caught:
@@ -207,7 +207,9 @@ HOSTILE = st.one_of(
     rate=st.sampled_from([1e-9, 1e-4, 1e-3, 1.4e-3, 1e9]),
     whose=st.sampled_from(["position_desired", "force_measured"]),
 )
-def test_log_channel_with_any_clock_is_aligned_or_refused_in_one_line(place, value, count, rate, whose):
+def test_log_channel_with_any_clock_is_aligned_or_refused_with_one_line_message(
+    place, value, count, rate, whose
+):
     rows = {"position_desired": PERIOD * np.arange(300), "force_measured": rate * np.arange(count)}
     if len(rows[whose]):
         rows[whose][place % len(rows[whose])] = value

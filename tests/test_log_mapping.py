@@ -117,7 +117,7 @@ def test_unusable_mapping_is_refused(path, value, reason):
     assert str(caught.value).isprintable()
 
 
-def test_value_missing_from_both_mapping_and_prior_is_refused(tmp_path):
+def test_value_missing_from_both_mapping_and_prior_is_named_in_error(tmp_path):
     log = tmp_path / "free_1.csv"
     log.touch()
     cases = [

@@ -143,7 +143,7 @@ def test_undetermined_tick_of_log_readings_is_reported(tmp_path):
     )
 
 
-def test_compensator_damping_and_dead_zone_are_not_mistaken_for_wrong_unit(tmp_path):
+def test_damping_by_compensator_and_dead_zone_are_not_mistaken_for_wrong_unit(tmp_path):
     log = touches(1, speed=12e-3, noise=0.0)
     dead = log | {"F": np.sign(log["F"]) * np.maximum(np.abs(log["F"]) - 45.0, 0.0)}
     impulse = np.sum(dead["F"]) / np.sum(log["F"])

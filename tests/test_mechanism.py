@@ -231,7 +231,7 @@ def test_mechanism_values_that_overflow_or_underflow_in_products_are_refused(val
     ),
     st.data(),
 )
-def test_any_value_of_any_mechanism_key_is_accepted_or_refused_in_one_line(value, data):
+def test_any_value_of_any_mechanism_key_is_accepted_or_refused_with_one_line_message(value, data):
     path = data.draw(st.sampled_from([*leaves(), *(table[:-1] for table in tables() if table)]))
     raw = changed({path: value})
     try:

@@ -158,7 +158,7 @@ def test_truncated_mechanism_file_is_refused_unless_still_complete(written, cut)
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(noise=st.binary(max_size=40), position=st.integers(0, len(TEXT)))
-def test_damaged_mechanism_file_is_read_or_refused_in_one_line(written, noise, position):
+def test_damaged_mechanism_file_is_read_or_refused_with_one_line_message(written, noise, position):
     data = TEXT.encode()
     path = written(data[:position] + noise + data[position:])
     try:

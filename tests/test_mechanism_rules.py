@@ -142,7 +142,7 @@ def test_mechanism_of_every_contact_law_and_simulator_survives_json_round_trip(c
         ),
     ],
 )
-def test_clearance_must_exceed_model_and_hardware_positions_at_start(changes, lag):
+def test_clearance_too_small_for_starting_positions_is_refused(changes, lag):
     # Free approach and phase, then latency, transport delay and lag of x_a.
     start = 0.005 * (0.02 + 0.001 + 0.001 + 0.004 + lag)
     changes = changes | {"rig.contact_plane": ...}
@@ -194,7 +194,7 @@ def test_contact_plane_beyond_starting_position_is_refused(side):
         ([1.0, 1.0], np.poly(-np.ones(20)).tolist(), None),
     ],
 )
-def test_unusable_transfer_function_is_refused_by_key(numerator, denominator, key):
+def test_key_of_unusable_transfer_function_is_named_in_error(numerator, denominator, key):
     # The contact has a single surface, because some of these lags exceed any gap.
     changes = {**TRANSFER_FUNCTION, "contact.clearance": ...}
     changes |= {"rig.simulator.numerator": numerator, "rig.simulator.denominator": denominator}

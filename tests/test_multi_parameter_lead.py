@@ -67,7 +67,7 @@ def test_simulated_loop_has_the_pole_placed_by_lead():
     np.testing.assert_allclose(np.exp(result), np.tile(DESIRED, 2), rtol=0, atol=1e-5)
 
 
-def test_contact_under_placed_pole_has_the_desired_restitution():
+def test_contact_with_placed_pole_has_the_desired_restitution():
     phases, periods = np.array([0.05, 0.1, 0.2, 0.4]), np.array([5e-4, 2.5e-4])
     gains, phase = place_poles(phases)
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, IDEAL, 0.0, period=periods[1]))

@@ -59,7 +59,7 @@ def test_every_optimisation_start_has_history_and_status(solved):
     assert any(start.status == GIVEN_UP for starts in solved for start in starts)
 
 
-def test_every_task_of_a_batch_reaches_same_optimum_as_alone(tasks, solved):
+def test_every_task_of_a_batch_reaches_the_optimum_of_a_separate_run(tasks, solved):
     for task, together in zip(tasks, solved, strict=True):
         (alone,) = solve_tasks([task], spread([task]), STEPS)
         best = min(start.rms for start in alone)

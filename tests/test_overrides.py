@@ -179,7 +179,7 @@ def test_error_in_mechanism_file_is_not_attributed_to_an_override(written):
 
 @settings(deadline=None)
 @given(st.text(max_size=60) | st.from_regex(r"(contact|rig\.simulator)\.[a-z_.\[\]0-9]*=.*"))
-def test_any_override_is_applied_or_refused_in_one_line(text):
+def test_any_override_is_applied_or_refused_with_one_line_message(text):
     try:
         load("varying", [text])
     except InputError:

@@ -91,7 +91,7 @@ def test_progress_shows_elapsed_time_before_first_work_is_reported(clock, capsys
     assert lines(capsys) == ["0:00:21 so far"]
 
 
-def test_progress_is_silent_unless_requested(clock, capsys):
+def test_progress_is_printed_only_on_request(clock, capsys):
     with terminal.show_progress(2, "parts", shown=False) as bar:
         bar.advance(1, "one")
         clock[0] += 100

@@ -68,7 +68,7 @@ def test_gain_file_with_any_field_mutated_is_refused(place, value, remove):
 
 @given(value=JSON_VALUES, path=st.sampled_from([p for n, p in SIGNED if n == "response_error"]))
 @settings(max_examples=300, deadline=None)
-def test_changed_gain_file_with_valid_digest_loads_or_is_refused_in_one_line(path, value):
+def test_changed_gain_file_with_valid_digest_loads_or_is_refused_with_one_line_message(path, value):
     document = gain_document()
     at(document, path[:-1])[path[-1]] = value
     try:

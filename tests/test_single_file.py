@@ -125,7 +125,7 @@ def run_source(text):
     return namespace
 
 
-def test_single_file_runtime_contains_imports_of_its_compensator_alone(package):
+def test_single_file_runtime_contains_only_imports_its_compensator_needs(package):
     made = package(
         shared="import math as m\nSHARED = 4 * m.floor(1.5)  # a comment stays\n",
         second="from .registry import register\nfrom .shared import SHARED\n\n@register('second')\n"

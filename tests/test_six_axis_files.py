@@ -237,7 +237,7 @@ PLACES = [(name, path) for name, raw in RAW.items() for path in places(raw)]
 
 @settings(deadline=None, max_examples=40)
 @given(place=st.sampled_from(PLACES), junk=JUNK, sibling=st.sampled_from(PLACES))
-def test_any_six_axis_mechanism_table_is_read_or_refused_in_one_line(place, junk, sibling):
+def test_any_six_axis_mechanism_table_is_read_or_refused_with_one_line_message(place, junk, sibling):
     """Replace one value by a value of any type, or by a value from elsewhere in the files."""
     name, path = place
     for value in (junk, at(RAW[sibling[0]], sibling[1])):

@@ -280,7 +280,7 @@ def test_simulate_reports_shapes_that_pass_through_each_other():
 
 
 @pytest.mark.slow
-def test_hexapod_run_ends_at_the_tick_at_which_a_leg_exceeds_its_length():
+def test_hexapod_run_ends_if_a_leg_exceeds_its_maximum_length():
     free = {**APART, "start.duration": 0.2, "start.chaser.position": [0.0, 0.0, 6.3]}
     free |= {"start.chaser.velocity": [0.0, 0.0, 0.5], "contact": {}, "rig.simulator.stroke": [1.6, 2.17]}
     mechanism = load_any("hydraulic-hexapod", free).mechanism

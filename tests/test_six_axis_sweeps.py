@@ -38,7 +38,7 @@ def local_sweep(gains):
     return tuning.sweep(gains, **ASKED, folder=gains.parent / "store")
 
 
-def test_six_axis_scenario_replays_to_the_bit(local_sweep, jaxhil, tmp_path):
+def test_replay_of_six_axis_scenario_is_bit_identical(local_sweep, jaxhil, tmp_path):
     ran = jaxhil("replay", local_sweep.folder, 7, "--json", "--plot", tmp_path / "7.png")
     assert ran.code == 0, ran.err
     document, row = json.loads(ran.out), read_row(read_store(local_sweep.folder), 7)

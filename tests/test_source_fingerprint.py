@@ -22,7 +22,7 @@ class Mine:
 """
 
 
-def test_fingerprint_covers_every_source(tmp_path, monkeypatch):
+def test_fingerprint_covers_every_source_file(tmp_path, monkeypatch):
     digests = [sources_sha256()]
     for text in ("one = 1", "one = 2"):
         package = tmp_path / text.replace(" ", "")

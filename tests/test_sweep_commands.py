@@ -321,7 +321,7 @@ def test_sweep_and_replay_refuse_impossible_arguments(jaxhil, gains, store, tmp_
     assert not (tmp_path / "new").exists()
 
 
-def test_jax_is_configured_before_import_by_sweep_command():
+def test_sweep_command_configures_jax_before_importing_it():
     # XLA reads its flags, which affect the last bits of every row, when it starts.
     program = (
         "import sys, tuning.cli.commands.sweep, tuning.cli.commands.replay; sys.exit('jax' in sys.modules)"

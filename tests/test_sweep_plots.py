@@ -172,7 +172,7 @@ def test_plotted_points_are_the_first_scenarios_and_the_first_failures(usual, fe
     np.testing.assert_array_equal(result.points.inputs[1], 1e3 * rows["rig.force_sensor.delay"][wanted])
 
 
-def test_convergence_plot_ends_at_the_verdict(swept):
+def test_convergence_plot_ends_at_the_probability_of_the_verdict(swept):
     made, mechanism, rows = swept
     plan = plan_statistics(made, mechanism, rows)
     result = accumulated(plan, rows, [(0, NUMBER)])

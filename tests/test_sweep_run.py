@@ -121,7 +121,7 @@ def test_killed_and_resumed_sweep_gives_store_of_uninterrupted_sweep(uninterrupt
     assert list_different_columns(all_rows(store), rows) == []
 
 
-def test_any_sweep_row_replays_to_the_bit(uninterrupted_sweep):
+def test_replay_of_any_sweep_row_is_bit_identical(uninterrupted_sweep):
     store, rows, _, _ = uninterrupted_sweep
     for index in np.random.default_rng(0).integers(0, 300, 6):
         result = replay_scenario(read_store(store.folder), int(index))

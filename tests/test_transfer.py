@@ -229,7 +229,7 @@ def test_later_tuning_blocks_start_at_results_of_similar_earlier_mechanisms(in_b
     assert in_blocks(starts=2) == [[], [], ["3e5"]]
 
 
-def test_starting_gains_from_user_precede_transferred_gains_after_literature_gains(in_blocks):
+def test_starting_gains_are_first_literature_then_user_then_transferred_gains(in_blocks):
     file = EarlierGains(claw("contact.stiffness=[1.1e5]"), {}, "file")
     assert in_blocks(3, [file]) == [["file"], ["file"], ["file", "3e5"]]
     assert in_blocks(2, [file]) == in_blocks(1, [file]) == [["file"]] * 3

@@ -65,7 +65,7 @@ def test_contact_with_probe_push_has_restitution_of_pushed_ideal_contact():
             assert abs(expected[lane] - probed.plain[lane]) > 0.01
 
 
-def test_probed_scenario_copies_have_zero_error_on_an_ideal_rig():
+def test_transparency_probes_have_zero_error_on_an_ideal_rig():
     spread = {"contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
     made = validated({**mechanism({}, IDEAL, 0.0, period=5e-5), "uncertainty": spread})
     probed = build_probed_scenarios(made, draw(made, 16, 0))
@@ -77,7 +77,7 @@ def test_probed_scenario_copies_have_zero_error_on_an_ideal_rig():
     assert [one.value for one in figures.values()] == pytest.approx([1] * 4, abs=2e-3)
 
 
-def test_first_scenarios_of_a_batch_contain_every_kind_of_probed_copy():
+def test_first_lanes_of_a_batch_contain_every_kind_of_probe():
     assert list(mask_probes(8)) == [False, True, True, True] * 2
     probed = build_probed_scenarios(DAMPED, draw(DAMPED, 5, 1)).scenarios
     damping = np.asarray(probed.contact.damping)[0]
@@ -89,7 +89,7 @@ def test_first_scenarios_of_a_batch_contain_every_kind_of_probed_copy():
     np.testing.assert_array_equal(pushed, np.arange(20) % LANES_PER_SCENARIO % 3 > 0)
 
 
-def test_only_anticipating_compensators_are_probed_by_default():
+def test_only_compensators_that_predict_contacts_are_probed_by_default():
     weighed = [name for name in COMPENSATORS if choose_default_weights(name)]
     assert (
         weighed

@@ -83,7 +83,7 @@ def test_udp_rig_compensates_for_lost_and_late_packets(varying, drops, ticks):
     assert rig.commanded.not_finite == rig.commanded.beyond_limits == 0
 
 
-def test_contacts_without_status_identified_are_counted_over_udp():
+def test_udp_controller_counts_contacts_without_status_identified():
     mechanism = load("suite-fast", ["contact.stiffness=[884316.0]"]).mechanism
     gains = literature_gains(mechanism, "impulse_ledger")
     rig, task, answers = packets(mechanism, controller(mechanism, "impulse_ledger", gains), 900)

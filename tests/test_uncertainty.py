@@ -81,7 +81,7 @@ def test_contact_phases_are_uniform_and_independent_for_every_contact():
 
 
 @pytest.mark.parametrize("draws", [draw, draw_quasi_random])
-def test_uncertain_list_entries_scale_jointly_or_independently(draws):
+def test_uncertain_list_entries_scale_jointly_unless_declared_independent(draws):
     entry = {"distribution": "loguniform", "factor": [0.3, 3.0]}
     joint = draws(mechanism_with("contact.stiffness", entry), 4096, 1)["contact.stiffness"]
     assert joint.shape == (4096, 3)

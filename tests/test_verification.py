@@ -56,7 +56,7 @@ def varying():
 @pytest.mark.parametrize(
     "case", [pytest.param(case, marks=pytest.mark.slow if case == "rattling" else ()) for case in CASES]
 )
-def test_verification_passes_agreeing_controllers(case):
+def test_verification_passes_if_controllers_agree(case):
     loaded = loaded_gains(*CASES[case])
     messages = []
     report = verify(loaded, scenarios=4, seed=1, progress=messages.append)
@@ -74,7 +74,7 @@ def test_verification_passes_agreeing_controllers(case):
     assert msgspec.convert(msgspec.json.decode(msgspec.json.encode(report)), type(report)) == report
 
 
-def test_verification_record_equals_rollout(varying):
+def test_record_for_verification_equals_rollout(varying):
     batch = nominal_and_draws(varying.mechanism, 4, seed=1)
     metrics, lanes = record_lanes(varying, batch)
     assert np.all(metrics.status[:3] == OK)

@@ -137,7 +137,7 @@ def mat_value(content):
     return struct.unpack(f"<{len(parts[3][1]) // 8}d", parts[3][1])
 
 
-def test_matlab_struct_follows_the_description_of_the_format():
+def test_matlab_file_follows_published_description_of_the_format():
     made = document([*AWKWARD, 1.0, 2.0, 3.0, 4.0], [None, 2.5])
     content = matlab_files(made)["gains.mat"]
     assert content[124:128] == b"\x00\x01IM"
