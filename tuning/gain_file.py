@@ -1,9 +1,8 @@
 """Writing of gain files (`schema = "jaxhil/gains/1"`), which later commands and the rig read.
 
-A gain file contains a compensator's gains with their units and bounds, the mechanism for which they were
-tuned, the ranges of the scenarios on which they were evaluated, and the resulting metrics. `build_document`
-builds the content, `write_gain_file` writes the file with a checksum, and
-`jaxhil.simulation.gain_file.load_gain_file` reads it.
+A gain file contains a compensator's gains with units and bounds, the mechanism for which they were tuned, the
+ranges of the scenarios on which they were evaluated, and the metrics. `build_document` builds the content,
+`write_gain_file` writes the file with a checksum, and `jaxhil.simulation.gain_file.load_gain_file` reads it.
 """
 
 import json

@@ -297,7 +297,6 @@ def _table_width(table: Table, console: Console) -> int:
 
 
 def _format_duration(seconds: float) -> str:
-    """Return a duration [s] as text in the form h:mm:ss."""
     rounded = round(seconds)
     return f"{rounded // 3600}:{rounded // 60 % 60:02d}:{rounded % 60:02d}"
 
@@ -310,7 +309,6 @@ class _Console(Console):
 
 
 def _make_console(stream) -> Console:
-    """Return a console that prints to a stream."""
     # Names come from files and must not be interpreted as markup.
     console = _Console(file=stream, markup=False, emoji=False, highlight=False)
     if not console.is_terminal:

@@ -41,7 +41,6 @@ class ComparedMetric(float):
     high: float
 
     def __new__(cls, value: float, low: float, high: float) -> "ComparedMetric":
-        """Create a number with its confidence interval."""
         number = super().__new__(cls, value)
         number.low, number.high = low, high
         return number

@@ -205,8 +205,7 @@ def _calibrate_limits(
 ):
     """Compute the watchdog's limits, and its rates of false and missed alarms.
 
-    `replaced` contains the limits that the user set, and `allowed` the acceptable rates of false and of
-    missed alarms.
+    `replaced` contains the limits that the user set; `allowed` contains the acceptable rates of both alarms.
     """
     from tuning.watchdog.calibration import DEFAULT_DRAWS, calibrate, count_stored_scenarios
     from tuning.watchdog.fault_injection import INJECTED_FAULTS, count_fault_scenarios

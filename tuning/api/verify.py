@@ -69,8 +69,7 @@ def verify(path: Any, *, progress: bool = False, **options: Any) -> Verification
     """Check that the rig's controller code (runtime) returns the same force commands as the simulation.
 
     The runtime gets the sensor signals of simulated runs. The self-test of a bundle runs first. Code of a
-    bundle is run only if the bundle equals, byte for byte, a new export of its gains by this version of
-    jaxhil.
+    bundle runs only if the bundle equals, byte for byte, this version's export of its gains.
 
     Args:
         path: path of a bundle, of a gain file, or of the folder of a gain file; or a result of `tuning.tune`.

@@ -1,8 +1,7 @@
 """Distribution of work units to the workers of a dask.distributed cluster.
 
-If a worker dies, its units are computed by another worker. If several workers have died while they computed
-the same unit, or if there is no worker, this process computes the unit. The workers run
-`tuning.caches.worker`.
+If a worker dies, another one computes its units. If several workers have died while they computed the same
+unit, or if there is no worker, this process computes the unit. The workers run `tuning.caches.worker`.
 """
 
 import asyncio
@@ -121,9 +120,8 @@ class ClusterWorkers:
         """Call `function` for every work unit on the workers; yield (name, result) of each finished unit.
 
         Workers can join later. `function` must be defined at the top level of a module. `label` is a unique
-        name of this work. Unless `setting` is None, every worker must have the same code, package versions
-        and XLA flags as `setting`. Raise `InputError` if a worker does not, or if the connection to the
-        scheduler is lost.
+        name of this work. Raise `InputError` if the connection to the scheduler is lost, or if code, package
+        versions or XLA flags of a worker differ from `setting`, unless it is None.
         """
         with _raise_if_lost(self._address):
             from cloudpickle import dumps  # pyright: ignore[reportMissingImports]

@@ -1,9 +1,8 @@
 """One compiled program for mechanisms that differ in contact law, number of segments or number of contacts.
 
-In this program these properties are arrays with one value per lane (element of the batch). The program
-contains every optional part of the loop that at least one mechanism needs; neutral parameters disable the
-part for the other mechanisms. Mechanisms with two contact surfaces share another program, because the second
-surface slows every lane.
+In this program these properties are arrays with one value per lane (batch element). The program contains
+every optional part of the loop that a mechanism needs; neutral parameters disable it for the others.
+Mechanisms with two contact surfaces share another program, because the second surface slows every lane.
 """
 
 import dataclasses

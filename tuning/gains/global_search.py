@@ -14,8 +14,7 @@ from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import search_globally
 
 EVALUATION_FACTOR = 50
-# minimum number of lanes in a call of the compiled program; large calls take less time per lane
-MIN_LANES_PER_CALL = 8192
+MIN_LANES_PER_CALL = 8192  # minimum number of lanes in a call; large calls take less time per lane
 
 
 class GlobalComparison(NamedTuple):

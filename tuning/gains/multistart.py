@@ -43,8 +43,7 @@ from tuning.gains.tasks import TuneTask, list_tuned_gains
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import polish
 
-# factor on the number of derivative-free evaluations if there is a user's function
-NONSMOOTH_POLISH_FACTOR = 3
+NONSMOOTH_POLISH_FACTOR = 3  # factor on derivative-free evaluations with a user's function
 MAX_START_BATCHES = 4  # largest number of batches of starts
 MIN_AGREEING_STARTS = 3  # starts that must reach the best value; two can reach the same poor minimum
 AGREEMENT_TOLERANCE = 0.005  # largest relative difference between values of the same minimum
@@ -103,8 +102,7 @@ def find_gains(
                 validation, i, search.starts, agreed, settings.seed, objective
             )
             search.evaluations += more
-    # With probes, if the starts agree, polishing changes the value less than a different draw of scenarios
-    # would.
+    # With probes, if the starts agree, polishing changes the value less than other scenarios would.
     polishing = 0 if probed and not unfinished else settings.polish * len(validation.names)
     if objective.function is not None:
         # A user's function may have many kinks, for example if it is the maximum of several metrics.
@@ -137,8 +135,7 @@ def _search_quieter_gains(
     """Search for quieter gains, starting from the most accurate gains.
 
     Tasks whose error exceeds the limit are skipped. The number of starts equals that of the first batch, so
-    that the compiled program is reused. Return, by task index, the objective and the point that each start
-    reached.
+    that the program is reused. Return, by task index, the objective and the point that each start reached.
     """
     tasks, objective = validation.tasks, settings.objective
     best = [ranked[0] if (ranked := _rank_starts(search.starts)) else None for search in searches]

@@ -31,9 +31,8 @@ from tuning.optimisation.solution import SOLVER_STATUSES, SolverResult
 from tuning.optimisation.unit_box import GainBounds
 from tuning.transparency.probes import LANES_PER_SCENARIO
 
-MIN_PROBLEMS_PER_CALL, MAX_PROBLEMS_PER_CALL = 4, 32  # limits on the number of problems per call
-# lanes that a device computes together (tile); the data of more lanes exceed the processor's cache
-LANES_PER_TILE = 64
+MIN_PROBLEMS_PER_CALL, MAX_PROBLEMS_PER_CALL = 4, 32  # limits of problems per call
+LANES_PER_TILE = 64  # lanes that a device computes together; more would exceed the processor's cache
 STEPS_BEFORE_SELECTION = 8  # solver steps of the first round
 MAX_CONTINUED_STARTS = 3  # number of starts per task that continue after the first round
 MAX_STEPS_PER_CALL = 32  # largest number of solver steps in one call
@@ -161,8 +160,8 @@ def compute_inverse_hessian(
     """Return the inverse Hessian of the objective, relative to its value, in unit coordinates.
 
     `curvature` is J^T J and `value` the objective. The inverse Hessian describes the region in which the
-    objective rises little. No eigenvalue exceeds (1/4)^2, so that the standard deviation of a gain is at most
-    a quarter of its range.
+    objective rises little. No eigenvalue exceeds (1/4)^2: the standard deviation of a gain is at most a
+    quarter of its range.
     """
     # If a derivative has overflowed, the curvature is unknown and replaced by 0.
     curvature = np.where(np.all(np.isfinite(curvature)), curvature, 0.0)
@@ -228,8 +227,7 @@ def _choose_call_size(number: int) -> int:
 def assign_to_devices(size: int) -> np.ndarray:
     """Return which problem each position of a call holds, so that all devices take about equally long.
 
-    Problems are sorted by duration and distributed to the devices in turn. The positions of a device are
-    adjacent.
+    Problems are sorted by duration and dealt to the devices in turn; a device's positions are adjacent.
     """
     devices = math.gcd(jax.device_count(), size)
     return np.arange(size).reshape(-1, devices).T.ravel()

@@ -94,8 +94,7 @@ class Objective:
     # probes. divergence_weight has no effect on the function.
     function: MetricsFunction | None = None
     limit: float = 0.01  # limit of the error [1], the unit of the weights of command, noise and chatter
-    # metric [1] below which almost only the penalties count; None: no tolerance
-    tolerance: float | None = None
+    tolerance: float | None = None  # metric [1] below which mainly the penalties count; None: no tolerance
 
     def __post_init__(self):
         if self.name not in OBJECTIVE_NAMES:
@@ -144,8 +143,7 @@ class ObjectiveTerms(NamedTuple):
 class ObjectiveWeights(NamedTuple):
     """Weights of each problem's objective (terms C, N, S and H of `Objective`), arguments of the program."""
 
-    # weight of squared positive errors, divided by that of negative ones [1]
-    divergence: Float[Array, "*problems"]
+    divergence: Float[Array, "*problems"]  # weight of squared positive errors / that of negative ones [1]
     command: Float[Array, "*problems"]  # weight of the excess peak command C [1]
     noise: Float[Array, "*problems"]  # weight of the excess noise amplification N [1]
     chatter: Float[Array, "*problems"]  # weight of the chatter S [1]
@@ -364,7 +362,6 @@ def evaluate_objective(
 def _compute_metric(
     objective: Objective, error: Float[np.ndarray, "*points contacts"]
 ) -> Float[np.ndarray, "*points"]:
-    """Return the objective's metric of the restitution errors, without penalties [1]."""
     size = np.abs(np.where(error > 0, math.sqrt(objective.divergence_weight) * error, error))
     if objective.name == "rms":
         return _compute_rms(size)

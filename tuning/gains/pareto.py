@@ -49,8 +49,7 @@ class ParetoPoint(NamedTuple):
     """Point of a Pareto front: gains and their metrics on fresh scenarios."""
 
     gains: dict[str, float]  # all gains of the compensator
-    # weight of the second criterion in tuning [1]; None for gains that were tuned without it
-    weight: float | None
+    weight: float | None  # weight of the second criterion in tuning [1]; None if it was not used
     # second criterion [1]: the amplification of the force sensor's noise, the 99th percentile of the peak
     # command divided by the ideal contact's peak force, or the rms error of the transparency probes
     cost: float
@@ -78,7 +77,6 @@ class _FrontGroup(NamedTuple):
 
     @property
     def settings(self) -> TuneSettings:
-        """Return the settings of the earlier tuning, which are the same for all mechanisms."""
         return self.tuned[0].settings
 
     @property
@@ -96,7 +94,6 @@ class _FrontGroup(NamedTuple):
 
     @property
     def runs(self) -> int:
-        """Return the approximate number of simulated runs that the fronts need."""
         searched = estimate_ladder_runs(self.tasks, self.number, self.settings)
         return searched + _count_evaluation_runs(self.tasks, self.settings, self.number)
 

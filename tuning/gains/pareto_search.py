@@ -25,9 +25,8 @@ from tuning.gains.validation import Validation
 # Smallest and largest weighted second criterion of accurate gains, divided by their error [1].
 # The first ladder extends to a larger weight, since the solver otherwise finds no quiet, inaccurate gains.
 LADDER_ENDS, FIRST_LADDER_ENDS = (0.5, 10.0), (1.0, 100.0)
-MAX_ACCURATE_ERROR_RATIO = 1.05  # largest error of accurate gains, as a multiple of the least error
-# least noise amplification minus 1 that scales a ladder; a smaller one counts as this value [1]
-MIN_NOISE_EXCESS = 0.1
+MAX_ACCURATE_ERROR_RATIO = 1.05  # largest error of accurate gains / least error
+MIN_NOISE_EXCESS = 0.1  # minimum noise amplification minus 1 in the scale of a ladder [1]
 MAX_NEIGHBOUR_SEARCHES = 4  # largest number of passes that start from the gains of neighbouring weights
 MIN_IMPROVEMENT = 1e-3  # minimum relative improvement of a point that leads to a further pass
 
@@ -39,8 +38,7 @@ class ParetoCriterion(NamedTuple):
     weight: str  # name of the field of `Objective` that weights the criterion
     cost: str  # name in JSON files
     words: str  # name in sentences
-    # least value of the criterion's term [1] that scales a ladder; a smaller one counts as this value
-    least: float
+    least: float  # minimum of the criterion's term in the scale of a ladder [1]
 
 
 NOISE_CRITERION = ParetoCriterion(

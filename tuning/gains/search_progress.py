@@ -35,12 +35,10 @@ class SearchProgress:
         self.say(text)
 
     def say(self, text: str) -> None:
-        """Show the description of the current stage."""
         self._text = f"{self.name}: {text}" if self.name else text
         self._show()
 
     def report_runs(self, runs: float) -> None:
-        """Report `runs` completed runs."""
         self._done += runs
         self._left = max(self._left - runs, 0.0)
         self._show()

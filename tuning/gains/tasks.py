@@ -68,7 +68,6 @@ class TuneTask:
 
     @property
     def model(self) -> RigModel:
-        """Return the model of the mechanism's rig."""
         return choose_rig_model(self.mechanism)
 
     @property
@@ -132,8 +131,7 @@ def has_sensor_noise(mechanism: AnyMechanism) -> bool:
 def group_by_program(loops: list[Any], scenarios: list[Any]) -> list[list[int]]:
     """Group loops that can share a compiled program; return the indices of each group.
 
-    The loops of a group differ only in the length of their delay lines; their arrays of scenarios have equal
-    shapes.
+    The loops of a group differ only in the length of delay lines; their scenario arrays have equal shapes.
     """
     groups: dict[Any, list[int]] = {}
     for index, (loop, batch) in enumerate(zip(loops, scenarios, strict=True)):
@@ -218,8 +216,7 @@ def _compute_time_limit(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*
     velocity = jnp.broadcast_to(scenarios.velocity, shape)
     reference = law.reference(parameters_by_slot(scenarios.contact), mass, velocity)
     longest = TIME_LIMIT_FACTOR * jnp.max(reference.duration, axis=0) + TIME_LIMIT_OFFSET
-    # With noise, the command does not decay, so that a contact ends only after the longest wait for its
-    # decay.
+    # With noise, the command does not decay: a contact ends only after the longest wait for its decay.
     sensor = scenarios.force_sensor
     longest = longest + jnp.where((sensor.noise_std != 0) | (sensor.bias != 0), MAX_DECAY_WAIT, 0.0)
     return jnp.minimum(longest, scenarios.time_limit)

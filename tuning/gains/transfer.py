@@ -43,7 +43,6 @@ class EarlierGains:
 
     @functools.cached_property
     def traits(self) -> MechanismTraits:
-        """Return the properties by which the mechanism is compared with others."""
         return compute_traits(self.mechanism)
 
 

@@ -108,7 +108,7 @@ class Validation:
         losses = np.empty((len(which), points))
         lanes = max(lanes, self.lanes * len(self.tasks))
         at_once = max(1, lanes // number)
-        # All calls have the same number of points per task, so that they can use the same scenarios in device
+        # All calls have the same number of points per task, so that they use the same scenarios in device
         # memory.
         tasks_per_call = min(len(which), at_once)
         points_per_call = at_once // tasks_per_call
@@ -173,8 +173,7 @@ class Validation:
         ended = self.tasks[0].model.begin_batch(self.loop, values, batch, read)
         if not noise:
             return lambda: (ended(), np.ones(shape))
-        # A point's amplification is the mean of its scenarios', as in
-        # `tuning.gains.objective.compute_residuals`.
+        # A point's amplification is the mean of its scenarios', as in `gains.objective.compute_residuals`.
         constants = KnownConstants(
             jax.numpy.asarray(scenarios.control_period), jax.numpy.asarray(scenarios.clearance)
         )
@@ -210,7 +209,6 @@ class Validation:
     def coordinates(
         self, task: int, several: Sequence[Mapping[str, float]]
     ) -> Float[np.ndarray, "several gains"]:
-        """Convert several sets of gains to unit coordinates."""
         gains = np.array([[values[name] for name in self.names] for values in several])
         return to_coordinates(gains.reshape(len(several), len(self.names)), self.bounds[task])
 

@@ -1,9 +1,8 @@
 """Derivative-free optimisation in the unit box: local search by CMA-ES, and global search with restarts.
 
-Unlike gradient methods, these searches do not get stuck at kinks and can leave the nearest basin of
-attraction. The loss function maps NumPy arrays to NumPy arrays. All calls have the same number of points, so
-that a compiled function is compiled once. A point has unit coordinates: 0 is a gain's lower bound, 1 is the
-upper bound.
+Unlike gradient methods, these searches do not get stuck at kinks and can leave the nearest basin. The loss
+function maps NumPy arrays to NumPy arrays. All calls have the same number of points, so that a compiled
+function is compiled once. A point has unit coordinates: 0 is a gain's lower bound, 1 is the upper bound.
 """
 
 from collections.abc import Callable
@@ -248,8 +247,8 @@ def _evolve(state, points, constants, generation) -> _Generation:
         + constants.rank_mu * np.einsum("c,...ci,...cj->...ij", weights, steps, steps)
     )
     growth = constants.step_rate / constants.damping * (size / constants.length - 1)
-    # If the distribution is wider than the box, the reflected candidates are uniformly distributed and carry
-    # no information.
+    # If the distribution is wider than the box, the reflected candidates are uniform and carry no
+    # information.
     step = np.clip(state.step * np.exp(np.minimum(growth, 1)), 1e-12, 0.5)
     root, inverse_root = _compute_square_roots(covariance)
     return _Generation(

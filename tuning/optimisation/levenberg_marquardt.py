@@ -113,8 +113,7 @@ def _with_jacobian(residuals, free, arguments, tile=None):
     """Return a function that computes (residuals, loss) of one problem, for `jax.vmap` with all problems.
 
     The function's derivative multiplies by a Jacobian that is computed once, in forward mode, for `tile`
-    problems at a time. `free` and `arguments` are examples of the function's arguments, with a leading axis
-    of problems.
+    problems at a time. `free` and `arguments` are examples of its arguments with a leading axis of problems.
     """
 
     def value_and_jacobian(free, arguments):
@@ -281,7 +280,6 @@ class _LossRecordingSolver(optx.AbstractLeastSquaresSolver):
 
 
 def _find_status(result, converged, loss):
-    """Convert a result of optimistix to an index into `SOLVER_STATUSES`."""
     ended = (result == optx.RESULTS.successful) | (result == optx.RESULTS.nonlinear_max_steps_reached)
     status = jnp.where(ended, jnp.where(converged, 0, 1), 3)
     return jnp.where(jnp.isfinite(loss), status, 2).astype(jnp.int32)

@@ -26,7 +26,6 @@ class ErrorIntervals(NamedTuple):
     p99: Interval  # interval of the 99th percentile [1]
 
     def plain(self) -> dict[str, dict[str, float]]:
-        """Return the intervals as JSON data."""
         return {name: interval._asdict() for name, interval in self._asdict().items()}
 
 

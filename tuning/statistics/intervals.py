@@ -24,8 +24,7 @@ from scipy import special
 
 CONFIDENCE_LEVEL = 0.95
 BETA_PRIOR = 0.5  # both parameters of the beta mixture [1], as in Jeffreys' prior
-# Minimum number of failures, and of successes, in all replicates; below it, Student's interval alone is not
-# valid.
+# Least numbers of failures and successes in all replicates for which Student's interval alone is valid.
 MIN_STUDENT_FAILURES = 100
 _BISECTION_STEPS = 62  # number of bisections; they reduce an interval of length 1500 to a rounding error
 
@@ -39,7 +38,6 @@ class IntervalEstimate(NamedTuple):
 
     @property
     def width(self) -> np.ndarray:
-        """Return the width of the interval."""
         return self.high - self.low
 
 

@@ -34,8 +34,7 @@ from tuning.statistics.intervals import CONFIDENCE_LEVEL, binomial_interval, log
 
 PerformanceFunction = Callable[[np.ndarray], np.ndarray]
 
-# conditional probability of each level [1]; values from 0.1 to 0.3 are about equally efficient
-LEVEL_PROBABILITY = 0.1
+LEVEL_PROBABILITY = 0.1  # probability of each level [1]; 0.1 to 0.3 are about equally efficient
 CHAIN_LENGTH = round(1.0 / LEVEL_PROBABILITY)  # number of scenarios in each Markov chain, including its start
 TARGET_ACCEPTANCE = 0.44  # acceptance rate to which sigma is adapted (Papaioannou et al. 2015) [1]
 INITIAL_SIGMA, MIN_SIGMA = 0.6, 1e-4  # initial and smallest step size sigma of the Markov chains [1]

@@ -1,7 +1,6 @@
 """Monte Carlo sweeps: many random scenarios, computed in chunks, and stored so that a sweep can resume.
 
-This module defines the allowed values of options. It does not import JAX, because some options configure JAX
-before it is imported.
+This module defines allowed values of options without importing JAX, which some of the options configure.
 """
 
 SAMPLINGS = ("random", "sobol")

@@ -76,8 +76,7 @@ def _check_rows(manifest: Manifest, part: int, table: Any) -> dict[str, np.ndarr
         return None
     mechanism = load_gains(manifest).mechanism
     if isinstance(mechanism, SixAxisMechanism):
-        # The sensor's range is that of the smallest force channel; a channel's range is drawn or else
-        # nominal.
+        # The sensor's range is the smallest range of its force channels, each of them drawn or nominal.
         forces = [f"{FORCE_RANGE_KEY}_{axis}" for axis in (1, 2, 3)]
         ranges = zip(forces, mechanism.rig.force_sensor.range[:3], strict=True)
         values = (rows.get(name, nominal) for name, nominal in ranges)

@@ -36,7 +36,6 @@ class SweepProgram(NamedTuple):
 
     @property
     def model(self) -> RigModel:
-        """Return the model of the mechanism's rig."""
         return choose_rig_model(self.mechanism)
 
 

@@ -1,8 +1,8 @@
 """Columns of a sweep's store, with names, units and descriptions.
 
-A metric has one column per contact (`error_1`, `error_2`, ...) or, for six axes, per episode. An episode is a
-contact with all its touches, until the bodies are free again. A drawn key that is a list has one column per
-entry (`contact.stiffness_1`). A metric that a failed or unreached contact does not have is null.
+A metric has one column per contact (`error_1`, `error_2`, ...) or, for six axes, per episode: a contact with
+all its touches. A drawn list has one column per entry (`contact.stiffness_1`). A metric that a failed or
+unreached contact does not have is null.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -76,9 +76,7 @@ CONTACT_METRICS = (
     ContactMetric("reference_peak_force", "N", "largest force of the ideal contact"),
     ContactMetric("peak_command", "N", "largest force on the numerical model"),
     ContactMetric("peak_ratio", "1", "peak command divided by the ideal contact's peak force"),
-    ContactMetric(
-        "position_shortfall", "m", "largest part of a command that the motion simulator's limits cut off"
-    ),
+    ContactMetric("position_shortfall", "m", "largest part of a command that the limits cut off"),
     ContactMetric("duration", "s", "duration of the contact"),
     ContactMetric("reference_duration", "s", "duration of the ideal contact; infinite if it never ends"),
     ContactMetric("approach_velocity", "m/s", "speed at the onset of the contact"),

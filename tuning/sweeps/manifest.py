@@ -71,7 +71,6 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def axes(self) -> int:
-        """Return the number of axes, 1 or 6."""
         return self.gain_file.get("axes", 1)
 
     def chunk_range(self, part: int) -> tuple[int, int]:

@@ -46,7 +46,6 @@ def run_batch(sweep: SweepProgram, points: np.ndarray, noise: np.ndarray) -> Row
 
 
 def run_locally(sweep: SweepProgram, batches: Iterable[PointBatch]) -> Iterator[tuple[str, Rows]]:
-    """Run batches one after the other in this process."""
     return ((batch.name, run_batch(sweep, batch.points, batch.noise)) for batch in batches)
 
 

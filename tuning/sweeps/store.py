@@ -59,7 +59,6 @@ class SweepStore(NamedTuple):
     manifest: Manifest
 
     def chunk_path(self, part: int) -> Path:
-        """Return the path of the file of chunk number `part`."""
         return self.folder / CHUNK_FOLDER / f"part-{part:06d}.parquet"
 
 

@@ -29,9 +29,8 @@ PLOTS = ("bode.png", "delay.png", "contacts.png", "residuals.png", "compare.png"
 def run(options: IdentifyOptions) -> int:
     """Identify the mechanism from logs, and write and print the result.
 
-    The options `--guess`, `--design` and `--check` replace the identification: they draft a mapping, design
-    rig commands, or check a mechanism. Return the exit code: 1 if the model does not explain the logs, else
-    0.
+    `--guess`, `--design` and `--check` replace the identification: they draft a mapping, design rig commands,
+    or check a mechanism. Return exit code 1 if the model does not explain the logs, else 0.
     """
     logs = [Path(log) for log in options.logs]
     if options.guess:

@@ -21,8 +21,7 @@ MAX_TABLE_ROWS = 12  # largest number of contacts in the printed table
 def run(options: RigOptions) -> int:
     """Run an empty loop, which only exchanges packets, then the controller, and print the result.
 
-    Return exit code 0 if the verdict is good, else 1. If the user interrupts the run, raise KeyboardInterrupt
-    after printing.
+    Return exit code 0 if the verdict is good, else 1. After an interrupted run, raise KeyboardInterrupt.
     """
     arguments.check_limit(options.limit)
     arguments.check_integers(0, seed=options.seed)

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
 PLOTS = ("errors.png", "contact.png", "loss.png", "pareto.png")
 OVERVIEW_FILE = "overview.png"
-# largest number of mechanisms with plots of their own; more share an overview plot
-MAX_PLOTTED_MECHANISMS = 4
+MAX_PLOTTED_MECHANISMS = 4  # if there are more, all share an overview plot
 
 
 def run(options: Tune) -> int:
