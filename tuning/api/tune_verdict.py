@@ -51,7 +51,7 @@ def is_good(result: "TuneResult", limit: float) -> bool:
 
 
 def _evaluated_errors(result: "TuneResult") -> list["ErrorMetrics"]:
-    """Return the tuned gains' error metrics and, if the mechanism has sensor noise, those without noise."""
+    """Return the tuned gains' error metrics; if the mechanism has noise, also the metrics without noise."""
     return [result.figures["tuned"], *([result.without_noise] if result.without_noise else [])]
 
 

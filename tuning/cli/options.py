@@ -107,8 +107,8 @@ class Tune(TuneOptions):
     Writes DIR/NAME/gains.json and plots for each mechanism NAME. The exit code is 1 if, with or without
     sensor noise, a contact does not end, the rms error exceeds the limit, or more than 1 % of the real
     contacts have a peak force above 2 times or a duration outside 0.5 to 2 times the ideal contact's. Warns
-    if the force command exceeds 1.5 times the ideal peak force, or amplifies the sensor noise more than
-    twice.
+    if the force command exceeds 1.5 times the ideal peak force, or amplifies the sensor noise by more than a
+    factor of 2.
     """
 
     files: Files = ()

@@ -2,7 +2,7 @@
 
 In this program these properties are arrays with one value per lane (batch element). The program contains
 every optional part of the loop that a mechanism needs; neutral parameters disable it for the others.
-Mechanisms with two contact surfaces share another program, because the second surface slows every lane.
+Mechanisms with two contact surfaces have a separate program, because the second surface slows every lane.
 """
 
 import dataclasses

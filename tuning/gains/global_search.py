@@ -35,7 +35,7 @@ def compare_with_global_search(
     settings: TuneSettings,
     factor: int = EVALUATION_FACTOR,
 ) -> GlobalComparison | None:
-    """Compare tuned gains with a search of `factor` times as many evaluations; None without tuned gains."""
+    """Compare tuned gains with a search of `factor` times the evaluations of tuning; None without gains."""
     if found.best is None:
         return None
 

@@ -286,7 +286,7 @@ def _restart_stuck_starts(
     seed: int,
     objective: Objectives,
 ) -> tuple[list[StartResult], int]:
-    """Improve every solver result that is worse than the best one by a derivative-free search.
+    """Use a derivative-free search to improve every solver result that is worse than the best one.
 
     The solver can get stuck at the kink of the objective where the compensator's correction reaches its
     limit. Return all results, and the number of evaluations of the search.

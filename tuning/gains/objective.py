@@ -141,7 +141,7 @@ class ObjectiveTerms(NamedTuple):
 
 
 class ObjectiveWeights(NamedTuple):
-    """Weights of each problem's objective (terms C, N, S and H of `Objective`), arguments of the program."""
+    """Weights of the terms C, N, S and H of `Objective` for each problem: arguments of the program."""
 
     divergence: Float[Array, "*problems"]  # weight of squared positive errors / that of negative ones [1]
     command: Float[Array, "*problems"]  # weight of the excess peak command C [1]
@@ -336,10 +336,10 @@ def evaluate_objective(
 ) -> Float[np.ndarray, "*points"]:
     """Compute the exact objective J [1] of each point.
 
-    `errors`, `excesses` and `chatter` are the terms of `compute_contact_terms` for the wanted contacts; None
-    counts as 0. `errors` exclude the contacts of transparency probes, which are in `probe_errors`. A
-    non-finite number counts as `FAILED_CONTACT_ERROR`. `value` is the value of the user's function, which
-    replaces the metric.
+    `errors`, `excesses` and `chatter` are terms of `compute_contact_terms` for existing contacts; None counts
+    as 0. `errors` exclude the contacts of transparency probes, which are in `probe_errors`. A non-finite
+    number counts as `FAILED_CONTACT_ERROR`. `value` is the value of the user's function, which replaces the
+    metric.
     """
     terms = errors, excesses, chatter, probe_errors
     error, excess, swings, transparency = (

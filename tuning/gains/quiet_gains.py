@@ -47,7 +47,7 @@ class CommandExcess(NamedTuple):
 
 
 def is_quiet_search_needed(task: TuneTask, settings: TuneSettings) -> bool:
-    """Return whether quiet gains are requested, a sensor has noise, and gains affect its amplification."""
+    """Return whether quiet gains are requested, a sensor has noise, and gains affect the noise."""
     return (
         settings.quiet
         and isinstance(task.mechanism, Mechanism)
@@ -62,7 +62,7 @@ def compute_training_tolerance(limit: float, scenarios: int) -> float:
 
 
 def build_least_error_objective(objective: Objective) -> Objective:
-    """Return the objective of accurate gains; its tolerance of 0 lets both searches share a program."""
+    """Return the objective of accurate gains; a tolerance of 0 lets it share the quiet search's program."""
     return replace(objective, tolerance=0.0)
 
 

@@ -30,7 +30,7 @@ class SearchProgress:
         self.begin(text, 0.0)
 
     def begin(self, text: str, left: float) -> None:
-        """Begin a stage; `left` runs of the current group remain, which include those of the stage."""
+        """Begin a stage; `left` runs of the current group remain, including those of the stage."""
         self._left = left
         self.say(text)
 

@@ -107,7 +107,7 @@ def find_nearest(mechanism: Mechanism, tuned: Sequence[EarlierGains]) -> Earlier
 def find_nearest_of_each(
     mechanism: AnyMechanism, sources: Sequence[Sequence[EarlierGains]]
 ) -> list[EarlierGains]:
-    """Return the nearest gains of each list in `sources`; nothing for six axes, which have no distance."""
+    """Return the nearest gains of each list in `sources`; none for six axes, without a distance measure."""
     if not isinstance(mechanism, Mechanism):
         return []
     return [find_nearest(mechanism, tuned) for tuned in sources]

@@ -87,7 +87,7 @@ def compute_error_intervals(
 
 
 def _resample_percentile(magnitudes, good, share, resamples, generator):
-    """Return the quantile of order `share` of the good contacts' magnitudes in each resample, (resamples,).
+    """Return the quantile of order `share` of the |error| of ended contacts in each resample, (resamples,).
 
     A resample counts how often each scenario was drawn. Only the largest magnitudes are used, because the
     quantile lies among them.

@@ -93,7 +93,7 @@ def subset_simulation(
     level: float = CONFIDENCE_LEVEL,
     levels: int = MAX_LEVELS,
 ) -> SubsetSimulation:
-    """Estimate by subset simulation the probability that performance(u) > limit, for standard normals u.
+    """Estimate by subset simulation the probability that performance(u) > limit; u are standard normals.
 
     The method fails if the performance does not show how close a scenario is to failure. Examples are
     plateaus, and regions of failure to which no slope leads. A second region of failure may become relevant

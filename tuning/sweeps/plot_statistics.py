@@ -225,7 +225,7 @@ def _select_first_points(points: PlotPoints) -> PlotPoints:
 def _compute_rank_correlations(
     mechanism: AnyMechanism, path: str, rows: Rows, size: np.ndarray
 ) -> np.ndarray:
-    """Return |rank correlation| (Spearman 1904) of each input entry and `size`; NaN if one is constant."""
+    """Return |rank correlation| (Spearman 1904) of `size` with each input entry; NaN if one is constant."""
     _, low, high = _find_input_range(mechanism, path)
 
     def ranks(values: np.ndarray) -> np.ndarray:

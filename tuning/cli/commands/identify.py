@@ -241,7 +241,7 @@ def _parse_order(options: IdentifyOptions) -> int | None:
 
 
 def _parse_fixed_values(options: IdentifyOptions) -> dict[str, Any]:
-    """Parse the options `--fix KEY=VALUE` to values by key; raise `InputError` for wrong texts."""
+    """Return values by key from the options `--fix KEY=VALUE`; raise `InputError` for wrong texts."""
     fixed: dict[str, Any] = {}
     for text in options.fix:
         try:

@@ -1,4 +1,4 @@
-"""Command `jaxhil mechanisms`: lists the built-in mechanism files and suites, or prints their JSON Schema."""
+"""Command `jaxhil mechanisms`: lists built-in mechanisms and sets of them, or prints the JSON Schema."""
 
 import math
 from typing import Any
