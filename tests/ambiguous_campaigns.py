@@ -75,7 +75,7 @@ def numbers(mechanism, position_delay):
 def deviations(name, written, compensator, gains):
     """Return the errors of e and e - e* of each mechanism, compared with the true rig, (mechanisms, 2).
 
-    All mechanisms run with the same gains in the simulation of `jaxhil`; e is the mean over contact phases.
+    All mechanisms run with the same gains in the simulation of `jaxhil`; e is averaged over contact phases.
     """
     true = truth(name)
     voigt = [index for index, one in enumerate(written) if one.contact.law == true.contact.law]

@@ -17,7 +17,7 @@ class Kind:
     lost: float = 0.0  # share of rows lost
     block: int = 0  # consecutive rows lost in the middle of the free motion
     amplitude: float = 0.0008  # m, rms of the multisine
-    drift: float = 0.0  # relative increase of the stiffness over all contacts
+    drift: float = 0.0  # relative increase of the stiffness from first to last contact
     mass: float = 350.0
 
 

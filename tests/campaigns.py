@@ -295,7 +295,7 @@ def _press_run(kind, rng, seconds=30.0, depth=0.0008, rms=5e-5):
     sensor = rig["force_sensor"]
     actual = _position(plant, command, _total_delay(rig) / T)
     lag = (rig["simulator"].get("delay", 0.0) + sensor.get("delay", 0.0)) / T
-    # The time step limits the press velocity, so that the press never leaves the contact.
+    # The time step limits the velocity, so that the press run never leaves the contact.
     near = 1e-3
     law = Law(kind.contact, rig.get("contact_plane", 0.0))
 

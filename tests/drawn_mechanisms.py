@@ -1,4 +1,4 @@
-"""Random mechanisms over the whole allowed range, and their results in the oracle.
+"""Random mechanisms from the whole allowed range, and their results in the oracle.
 
 A form, given by its index, has the properties that determine a compiled program: contact law, motion
 simulator, hold, latency, integrator, and ranges of the poles and of the sensor's lag. Mechanisms of one form

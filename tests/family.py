@@ -3,10 +3,10 @@
 Each member is the text of a mechanism file, made from one point of a scrambled Sobol sequence: contact law,
 contact frequency (log-uniform), damping ratio (0 for an eighth of them), delays, motion simulator, mass and
 approach speed. A shorter family is the beginning of a longer one. `python -m tests.family FOLDER` writes it.
-The contact frequency f [Hz] is that of the undamped contact, which lasts 1/(2 f) for every contact law; for a
-linear contact f = sqrt(k/M)/(2 pi). The damping ratio xi is that of a linear contact of this frequency, b = 2
-xi M (2 pi f). For Hunt-Crossley, chi = pi xi / v, which has the same loss to first order in xi (e is exp(-pi
-xi) for the linear contact, 1 - chi v here).
+The contact frequency f [Hz] is the frequency for which the undamped contact lasts 1/(2 f); for a linear
+contact f = sqrt(k/M)/(2 pi). The damping ratio xi belongs to a linear contact of this frequency, b = 2 xi M
+(2 pi f). For Hunt-Crossley, chi = pi xi / v, which has the same loss to first order in xi (e is exp(-pi xi)
+for the linear contact, 1 - chi v here).
 """
 
 import argparse

@@ -28,8 +28,8 @@ def limited_controller(loaded: LoadedGains, limits: Mapping[str, Mapping[str, An
 def replay_lane(controller: Controller, signals: RecordedSignals, lane: int, mass: float) -> Tripped | None:
     """Feed one lane's record to the controller; return None if it never trips.
 
-    The motion of the numerical model is that of the record, also after a trip. At the end the next contact is
-    announced, as between the contacts of a run.
+    The numerical model moves as recorded, even after a trip. At the end the next contact is announced, as
+    between the contacts of a run.
     """
     if not controller.reset():
         raise ValueError("the controller's emergency stop is active")

@@ -160,7 +160,7 @@ def test_c99_controller_commands_zero_force_if_delay_exceeds_delay_line(law, del
             results[:, c99_cases.RESULT.index("cause")] == UNUSABLE
         )
         assert np.all(results[:, c99_cases.RESULT.index("law_status")] == UNSTATED)
-        # The drives hold the first position read, or else that of the numerical model.
+        # The drives hold the first position reading or, without one, the position of the numerical model.
         commanded = rows[:, 0] != c99_cases.STEP_ONLY
         assert len(np.unique(results[commanded, 1])) == 1
 

@@ -74,7 +74,7 @@ def test_c99_controller_has_no_static_data_and_calls_only_math_functions(law, co
 
 
 def compilers(*names: str):
-    """Parametrise a test over these compilers; skip those that are not installed."""
+    """Run a test with each of these compilers; skip compilers that are not installed."""
     cases = [
         pytest.param(name, marks=pytest.mark.skipif(shutil.which(name) is None, reason=f"no {name} here"))
         for name in names

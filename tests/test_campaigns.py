@@ -28,7 +28,7 @@ def test_contacts_of_simulated_campaign_match_oracle(name):
         kind, [0.006], [0], [0.4], np.random.default_rng(0), seconds, lead=0.02, damping=0, noise=False
     )
     assert signals["force_measured"].max() > 40.0
-    # The oracle's lag is exact; the generator integrates numerically over a force that begins with a jump.
+    # The oracle's lag is exact; the generator integrates numerically a force that begins with a jump.
     force, position = (0.02, 1e-8) if name == "lagging" else (1e-11, 1e-16)
     for theirs, ours, error in (
         ("x_desired", "position_desired", position),

@@ -231,7 +231,7 @@ CLAMP_PHASES = np.array([0.05, 0.1, 0.2])
 
 
 def clamped_and_not(name, law, blind, gains, **leaves):
-    """Return the mean restitution over contact phases without and with the clamp, per CLAMP_PHASES."""
+    """Return the restitution without and with the clamp, averaged over the contact phases CLAMP_PHASES."""
     parsed = validated(mechanism({"stiffness": [STIFFNESS]}, IDEAL, 0.0, period=FINE))
     leaves = {key: np.repeat(value, len(PHASES)) for key, value in leaves.items()}
     gains = {key: np.repeat(value, len(PHASES)) if np.ndim(value) else value for key, value in gains.items()}

@@ -79,7 +79,7 @@ def test_sum_of_contact_gate_equals_contact_time_and_gate_lags_one_period(gates)
 def test_contact_gate_is_1_in_contact_0_outside_and_triangular_between(gates):
     result = gates(crossing(PHASES, PHASES + 20))
     age = TICKS[1:, None] - PHASES
-    # The integral of the triangle over the time since the onset, up to two periods.
+    # The integral of the triangle from the onset to this tick, at most two periods.
     entered = np.where(age < 1, age**2 / 2, 1 - (2 - age) ** 2 / 2)
     entered = np.where(age < 0, 0, np.where(age > 2, 1, entered))
     early = TICKS[1:] < 15

@@ -186,7 +186,7 @@ def test_restitution_is_continuous_function_of_identification_delay(sweep):
     delay, restitution, slope = sweep
     steps = np.diff(restitution)
     assert np.abs(restitution[-1] - restitution[0]) > 0.01
-    # Each step equals the integral of the derivative over it: there is no jump.
+    # The change in each step equals the integral of the derivative: there is no jump.
     expected = np.diff(delay) * (slope[1:] + slope[:-1]) / 2
     np.testing.assert_allclose(steps, expected, rtol=0, atol=1e-6)
     np.testing.assert_allclose(steps.sum(), expected.sum(), rtol=1e-4)

@@ -1,8 +1,8 @@
 """Closed loop compared with the closed forms of model.md, section 6, and with SciPy for T -> 0.
 
-The order of convergence is that of the error's root mean square over contact phases, and, with a delay, over
-contact frequencies within 10 %: at a single frequency the last sample before separation falls differently for
-each T, and the error varies irregularly.
+The order of convergence refers to the root mean square of the error for several contact phases and, with a
+delay, several contact frequencies within 10 %. At a single frequency, the error varies irregularly with T,
+because the last sample before separation lies differently.
 """
 
 from math import pi

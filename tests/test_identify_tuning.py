@@ -34,8 +34,8 @@ def error(mechanism, compensator, gains):
 def truth_within_bound(truth, identified):
     """Return the true rig with the force delay off by 1.2 times the least standard deviation.
 
-    The least standard deviation is the bound of `test_identify_campaigns`; the sign is that of the identified
-    error. Contacts determine delay and lag only through B - K (tau_f + T_s), so the damping compensates for
+    The least standard deviation is the bound of `test_identify_campaigns`; the identified error gives the
+    sign. Contacts determine delay and lag only through B - K (tau_f + T_s), so the damping compensates for
     the delay error.
     """
     off = force_age(identified) - force_age(truth)
@@ -96,7 +96,7 @@ GOOD_KINDS = ("plain", "no delay", "undamped", "lost rows")  # kinds for which s
 
 
 def test_gains_tuned_on_files_with_good_verdict_have_little_additional_error(monkeypatch):
-    """Priors lack damping, lag, delay and dead zone; e* is that of the true mechanism.
+    """Priors lack damping, lag, delay and dead zone; e* is computed for the true mechanism.
 
     Tuning takes the quietest gains within the error limit on the file. On the true rig their error may reach
     this limit, while gains tuned on the true rig have smaller errors: these contacts determine the force

@@ -68,7 +68,7 @@ def test_binomial_interval_covers_truth_over_repeated_sweeps(probability, capsys
 
 
 def test_confidence_sequence_equals_mixture_martingale():
-    """Compute the mixture likelihood relative to that of p by quadrature."""
+    """Compute the ratio of the mixture likelihood to the likelihood of p by quadrature."""
     failures, number = 3, 50
     result = confidence_sequence(failures, number)
     prior = stats.beta(0.5, 0.5)
@@ -121,7 +121,7 @@ def ever_outside(interval, probability):
 
 @pytest.mark.parametrize("probability", PROBABILITIES)
 def test_confidence_sequence_has_stated_coverage_for_any_stopping_rule(probability, capsys):
-    """The coverage holds even for a stop at the worst of 150 looks, unlike that of exact intervals."""
+    """Unlike exact intervals, these keep their coverage even for a stop at the worst of 150 looks."""
     failures, number = walks(probability)
     missed = np.mean(ever_outside(of_each(confidence_sequence, failures, number), probability))
     peeked = np.mean(ever_outside(of_each(binomial_interval, failures, number), probability))

@@ -29,7 +29,7 @@ def at(position, theta):
 
 
 def test_latch_captures_and_holds_bodies_that_are_deep_enough_and_aligned():
-    """The force is zero before and at the capture, then that of a spring."""
+    """The force is zero until the capture; then it is the force of a spring."""
     one = latch(False)
     still = Twist(place([0, 0, 0], BATCH), place([0, 0, 0], BATCH))
     state = init_latch(one, at([0, 0, 0.01], [0, 0, 0]))

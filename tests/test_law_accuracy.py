@@ -1,8 +1,7 @@
 """Errors of the impulse ledger with one set of gains, on scenarios outside the built-in mechanism sets.
 
-Surface, sensor offset, preload, friction, duration and control period differ from those of the built-in sets.
-`pytest -m slow -s tests/test_law_accuracy.py` prints root mean square, 99th percentile and maximum of |e -
-e*| in %.
+Surface, sensor offset, preload, friction, duration and control period differ from the built-in sets. `pytest
+-m slow -s tests/test_law_accuracy.py` prints root mean square, 99th percentile and maximum of |e - e*| in %.
 """
 
 from collections.abc import Mapping

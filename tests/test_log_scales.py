@@ -152,7 +152,7 @@ def test_damping_by_compensator_and_dead_zone_are_not_mistaken_for_wrong_unit(tm
     assert "times the impulse" in refused(tmp_path, scaled(dead, F=1 / LBF), **NO_COMMAND)
 
 
-# If rounding dominates differences over few rows, these alone favour the wrong row convention.
+# If rounding dominates differences of nearby rows, these alone favour the wrong row convention.
 @example(factor=1.0, quantum=1e-8, noise=0.0, lost=0.1, seed=1)
 @settings(deadline=None, max_examples=25)
 @given(

@@ -33,7 +33,7 @@ def excess(commands, touching):
 
     def tick(watch, now):
         command, touches = now
-        # The model reverses immediately, so that the subsequent rest ends the contact.
+        # The model reverses immediately, so that the contact ends during the ticks without force.
         signals = Signals(zeros, zeros, zeros - 1, zeros, jnp.zeros(1, jnp.int32))
         plant_signals = PlantSignals(jnp.where(touches, 10.0, 0.0)[None], None, None, None)
         return record_contact(LOOP, rules, watch, signals, plant_signals, command[None], None), None

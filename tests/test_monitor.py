@@ -72,7 +72,7 @@ def test_monitor_reports_no_deviation_for_exact_file_without_noise(name):
     assert (
         is_finite[:4].all() and is_finite[BIAS_INDEX] == (name != "dead_zone") and not is_finite[NOISE_INDEX]
     )
-    # The generator's lag is a quadrature over a force that begins with a jump.
+    # The generator integrates numerically the lag of a force that begins with a jump.
     allowed = 2e4 if name == "lagging" else 1.0
     bound = allowed * np.array([1e-9, 1e-5, 5e-8, 1e-9, 1e-9, np.inf, 1e-9])
     assert np.all(np.abs(np.nan_to_num(value)) < bound)

@@ -14,7 +14,7 @@ from tuning.identification.monitor.metrics import METRIC_NAMES
 CUSUM_LIMIT, AVERAGE_LIMIT = (
     9.0,
     4.07,
-)  # with 0.5 allowed and weight 0.2; together as rare as `ALARM_THRESHOLD`
+)  # CUSUM (allowance 0.5), average (weight 0.2); joint false-alarm rate as for `ALARM_THRESHOLD`
 
 
 def test_monitor_change_point_equals_calculation_by_hand():

@@ -44,7 +44,8 @@ PERIODS = np.r_[PERIOD, PERIOD / 2, PERIOD / 4, [1e-3] * 3]
 SHARE = np.array([1.0] * 3 + [SHARES[name] for name in INTEGRATORS])
 LANES = len(SHARE)
 
-# The target's principal moments, and axes that are not those of the body; the chaser is axisymmetric.
+# The target's principal moments, and its principal axes, which differ from the body axes; the chaser is
+# axisymmetric.
 MOMENTS, AXES = np.array([1400.0, 1100.0, 800.0]), Rotation.from_rotvec([0.3, -0.5, 0.2])
 SYMMETRIC = np.array([150.0, 150.0, 110.0])
 MASSES = np.array([1800.0, 420.0])

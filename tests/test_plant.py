@@ -30,7 +30,7 @@ AGAINST_THE_ORACLE = (
     *("depth-damped, linear spring, lag", "elastoplastic, lag", "rattling, elastoplastic"),
     *("contact plane deeper", "rattling, contact plane nearer", "elastoplastic, contact plane nearer"),
 )
-# The oracle uses parabolas for the force behind a lagging sensor.
+# The oracle uses parabolas for the output of a lagging sensor.
 LAGGED = 1e-7
 
 

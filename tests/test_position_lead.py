@@ -44,7 +44,7 @@ DELAY = 0.005
 
 @functools.cache
 def restitutions():
-    """Return mean restitutions over the contact phase, (3, periods).
+    """Return restitutions, averaged over contact phases, (3, periods).
 
     The rows are: exact inverse, no lead, and exact inverse with a force delay.
     """

@@ -183,7 +183,7 @@ class Scene(NamedTuple):
 
 
 def test_resumed_comparison_computes_only_missing_results(tmp_path, monkeypatch):
-    """The metrics are artificial; grouping, saving and reading are those of the program."""
+    """The metrics are artificial; the program groups, saves and reads them."""
     names = ["rig-300kg", "suite-noisy", "varying"]
     mechanisms = [load(name).mechanism for name in names]
     groups = [[mechanisms[i] for i in group] for group, _ in group_by_common_program(mechanisms)]

@@ -38,7 +38,7 @@ from jaxhil.simulation.rollout import rollout, run_contacts, segment_length
 from jaxhil.simulation.scenario import build_scenarios
 from jaxhil.simulation.sensors import draw_noise
 
-# Restitution tolerance: the oracle uses parabolas for the force behind a lagging sensor.
+# Restitution tolerance: the oracle uses parabolas for the output of a lagging sensor.
 ACCURACY = {
     name: 1e-7 for name, case in CASES.items() if "time_constant" in case.mechanism["rig"]["force_sensor"]
 }

@@ -17,7 +17,7 @@ from tuning.bundle import selftest
 from tuning.bundle.manifest import is_text
 
 MUTATIONS = 50  # mutations of each text file
-OWN_MUTATIONS = 40  # mutations of the self-test itself, each in a process of its own
+OWN_MUTATIONS = 40  # mutations of the self-test itself, each in a separate process
 
 
 @pytest.fixture(scope="module")

@@ -43,6 +43,6 @@ def test_sensor_noise_samples_are_normally_distributed(dtype, largest):
     assert drawn.dtype == dtype
     samples = np.asarray(drawn, float)
     assert kstest(samples.ravel(), "norm").pvalue > 0.01
-    # The kurtosis shows the tails; that of a normal sample is 3 +- sqrt(96 / number).
+    # The kurtosis shows the tails; a normal sample has the kurtosis 3 +- sqrt(96 / number).
     assert np.mean(samples**4) == pytest.approx(3, abs=4 * np.sqrt(96 / samples.size))
     assert 4 < np.abs(samples).max() < largest

@@ -1,4 +1,4 @@
-"""Metrics of a contact over the whole range of mechanisms, compared with the event-accurate oracle."""
+"""Metrics of a contact for the whole range of mechanisms, compared with the event-accurate oracle."""
 
 from typing import Any
 

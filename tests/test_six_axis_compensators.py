@@ -53,7 +53,7 @@ def recorded(changes, gains=None, compensator="recorder"):
 
 @pytest.fixture
 def poses(monkeypatch):
-    """Return a function for the poses that a compensator reads and those of the hardware, (ticks, 6)."""
+    """Return a function that returns the measured poses and the poses of the hardware, (ticks, 6)."""
     monkeypatch.setitem(SIX_AXIS_COMPENSATORS, "recorder", Recorder())
 
     def of(changes):

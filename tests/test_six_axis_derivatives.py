@@ -30,7 +30,7 @@ STEP = 2e-5  # relative step; so small that few touches move to another tick
 BY = ("stiffness", "dissipation", "friction", "force delay", "axes' delays", "axes' frequencies")
 POINTS = np.array([[1.0, -0.5, -0.5], [0.0, 0.866, -0.866], [0.0, 0.0, 0.0]])  # on the ring
 HALF_ANGLE = 0.75  # rad, half cone angle of the drogue
-AWAY = 10.0  # m, distance of candidates that are unused in a lane
+AWAY = 10.0  # m, distance of shapes that are unused in a lane
 
 
 def contact(scales):

@@ -1,4 +1,4 @@
-"""Six-axis impulse ledger: errors compared with those of a lead, and no command without contact."""
+"""Six-axis impulse ledger: smaller errors than with a lead, and no command without contact."""
 
 import jax
 import jax.numpy as jnp

@@ -229,7 +229,7 @@ def check_table(ticks, mechanism, final):
     np.testing.assert_allclose(change, period * force, atol=1e-9 * np.abs(force).max())
     np.testing.assert_allclose(mechanism.target.mass * np.diff(velocities["target"], axis=0), -change,
                                atol=1e-9 * np.abs(force).max())  # fmt: skip
-    # The real contact force is nonzero if a candidate penetrates.
+    # The real contact force is nonzero if a pair of shapes penetrates.
     depths = [ticks[name] for name in ticks.dtype.names if name.startswith("depth_")]
     forces = [ticks[name] for name in ticks.dtype.names if name.startswith("force_")]
     assert len(depths) == len(forces) > 0 and np.any(np.array(forces)[np.array(depths) > 0] > 0)

@@ -10,7 +10,7 @@ from jaxhil.laws.compensators import COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import builtin_names, load
 from tuning.gains.pareto_search import compute_noise_amplification as pareto_amplification
 
-# Lag of the motion simulator and delay of the force [s]; the first pair is that of model.md.
+# Lag of the motion simulator and delay of the force [s]; the first pair is used in model.md.
 LAGS = np.array([[0.010, 0.008], [0.010, 0.002], [0.004, 0.008], [0.015, 0.0]])
 SMITH = {"smith_predictor": 1.0, "smith_hybrid": 0.5}
 

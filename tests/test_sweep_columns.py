@@ -104,7 +104,7 @@ def test_force_beyond_the_sensor_range_counts_as_saturation():
 def test_reached_limit_of_the_motion_simulator_counts_as_saturation():
     errors, status = [[0.0, 0.5, 0.0], [0.0, 0.0, NAN]], [[OK] * 3, [OK, OK, TIMEOUT]]
     result = rows(errors, status, shortfall=1e-9)
-    # Saturation ranks above an error and below a contact without end, for which it is also known.
+    # Saturation ranks above an error and below a contact that does not end.
     assert outcomes(result) == ["saturated", "saturated", "timeout"] and result["failed"].all()
     np.testing.assert_array_equal(result["position_shortfall_2"], 1e-9)
     assert outcomes(rows(errors, status)) == ["good", "error beyond limit", "timeout"]

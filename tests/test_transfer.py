@@ -140,7 +140,7 @@ def test_transferred_gains_keep_relative_position_to_literature_and_range():
     target = claw("contact.stiffness=[497420.0]", "rig.force_sensor.delay=0.01", "rig.control_period=0.002")
     gains = {**literature_gains(source, "response_error"), "initial_stiffness": 1e5, "lead_filter": 1.5e-3}
     transferred = transfer_gains("response_error", {**gains, "phase_lead": 0.0054}, source, target)
-    # The range is 2 tau + 0.02 s, of which 1.4 ms beyond the delay are a twentieth.
+    # The range is 2 tau + 0.02 s; a lead of 1.4 ms beyond the delay is a twentieth of the range.
     assert transferred["phase_lead"] == pytest.approx(0.01 + 0.05 * 0.04, rel=1e-12)
     assert transferred["initial_stiffness"] == pytest.approx(4e5, rel=1e-12)
     # The literature's filter time is one period; 1.5 times this value, on a logarithmic scale.
@@ -180,7 +180,7 @@ def test_starting_gains_from_user_replace_the_last_random_starts(task, validatio
     (points,) = choose_starts(validation, 3, 0, first=[[gains]])
     np.testing.assert_array_equal(points[:2], usual[:2])
     assert validation.gains(0, points[2]) == pytest.approx(gains, rel=1e-12)
-    # The first loss is that of exactly these gains.
+    # The first loss belongs to exactly these gains.
     (starts,) = solve_tasks([task], [points], 6)
     errors = np.where(task.scenarios.contacts > 0, evaluate(task.loop, gains, task.scenarios).error[0], 0)
     assert starts[2].history[0] == pytest.approx(evaluate_objective(RMS_OBJECTIVE, errors), rel=1e-9)

@@ -49,7 +49,7 @@ def test_contact_that_hardware_never_touches_has_status_not_reached(noise):
 def test_contact_has_status_not_reached_if_only_sensor_bias_reverses_model(noise):
     """Use a bias of 70 N or 40 N.
 
-    The first reverses the model 0.09 mm before the surface, the second 0.2 mm behind the surface.
+    The first reverses the model 0.09 mm before it reaches the surface, the second 0.2 mm beyond the surface.
     """
     for bias in (70.0, 40.0):
         result = run(rig(1.2 * DEEPEST, bias=bias, noise_std=noise))

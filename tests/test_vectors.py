@@ -71,7 +71,7 @@ def test_recorded_vectors_contain_simulation_and_agree_with_runtime(loaded, vect
 
 
 def test_model_motion_in_vectors_equals_simulation(vectors):
-    """Position and velocity after a tick equal those of the next tick, to rounding."""
+    """Position and velocity after a tick equal the values before the next tick, to rounding."""
     for rows in list(runs_of(vectors).values())[:3]:
         for row, following in itertools.pairwise(rows):
             if following.event == 0:

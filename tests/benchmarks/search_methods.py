@@ -1,8 +1,8 @@
-"""Optimisers that users would choose, run until a time limit, and a record of their best loss over time.
+"""Optimisers that users would choose, run until a time limit, and a record of their best loss.
 
 Each optimiser is called with the loss of many points, a starting point in the unit box, and a seed. It
-restarts if it converges before the time limit. Settings are those of its authors or package unless a comment
-says otherwise.
+restarts if it converges before the time limit. Settings are the defaults of its authors or package, unless a
+comment says otherwise.
 """
 
 import time

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.benchmark
 MEMBERS = 3, 8, 9, 18, 19, 20, 37, 48
 STARTS = 8
 SEED = 0  # seed of the starts
-BUDGET = 1.0  # time limit of other optimisers relative to that of tuning
+BUDGET = 1.0  # time limit of other optimisers, divided by the time of tuning
 SHARE, COST = 0.9, 0.5  # limits: share of successful starts; rollouts and seconds relative to the best other
 
 NAMES = [mechanism.name for i, mechanism in enumerate(family()) if i in MEMBERS]

@@ -59,7 +59,7 @@ def case(compensator, lanes, names=("varying",)):
 
 @partial(jax.jit, static_argnums=0)
 def ticks_run(loop, common, per_lane, scenarios):
-    """Return the ticks that each tile of `shard` runs, (devices, tiles): those of its slowest lane."""
+    """Return the ticks of the slowest lane in each tile of `shard`, (devices, tiles)."""
 
     def of_tile(arguments):
         gains, scenario = arguments

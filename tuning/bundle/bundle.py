@@ -130,7 +130,7 @@ def check_same_mechanism(folder: Path, name: str) -> None:
     try:
         earlier = read_gain_document(folder / "gains.json")["mechanism"]["name"]
     except (GainFileError, KeyError, TypeError):
-        return  # there is no bundle, or a changed bundle, for which `check_bundle_folder` raises an error
+        return  # there is no bundle, or one that was changed (`check_bundle_folder` reports this)
     if earlier != name:
         raise InputError(
             f"{to_one_line(str(folder))}: found a bundle of the mechanism {format_value(earlier)}, expected "

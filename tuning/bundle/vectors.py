@@ -220,7 +220,7 @@ def _run_controller(
     mass: float,
     gain_file: GainFile,
 ) -> tuple[list[VectorRow], list[tuple[float, float]], list[int]]:
-    """Run the controller over the inputs.
+    """Run the controller with the inputs.
 
     Return, for each tick, the row of the test vectors, the identified stiffness [N/m] and damping [N s/m],
     and the bits of the faults that change a command.

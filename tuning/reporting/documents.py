@@ -121,7 +121,7 @@ class IdentificationDocument(Struct):
     estimates: list[EstimateEntry]
     checks: list[CheckEntry]
     effect: float | None  # possible change of e caused by unexplained effects and uncertainty [1]
-    limit: float | None  # smallest effect for which the verdict is bad [1]
+    limit: float | None  # the verdict is good only if the effect is below this limit [1]
     verdict: str
     reason: str
     notes: list[str]
@@ -193,7 +193,7 @@ class ComparisonDocument(Struct):
     limit: float | None  # restitution error above which a scenario fails [1]
     seed: int
     scenarios: int  # number of scenarios for the tuning
-    judged: int  # number of fresh scenarios for the evaluation
+    judged: int  # number of evaluation scenarios, which are not used for tuning
     tuned: bool  # whether compensators without settings were tuned
     mechanisms: list[ComparedMechanism]
 
@@ -220,7 +220,7 @@ class Theory(Struct):
 
 
 class RadiusOfMap(Struct):
-    """Spectral radius of the loop in contact, on a grid that may be coarser than that of the map."""
+    """Spectral radius of the loop in contact, on a grid that may be coarser than the map."""
 
     x: list[float] | None = None  # values along x
     y: list[float] | None = None  # values along y

@@ -1,6 +1,6 @@
 """Detection of the onset and end of contacts, and computation of their restitution, in plain Python.
 
-The rules are those of `notebooks/guide/model.md`, section 2. `jaxhil.simulation.metrics` applies the same
+It follows the rules in section 2 of `notebooks/guide/model.md`. `jaxhil.simulation.metrics` applies the same
 rules to batches, but is too slow for a real-time loop.
 """
 

@@ -31,7 +31,7 @@ class Injection(NamedTuple):
 
 
 class Network:
-    """UDP connection to one address, with injected faults. All times are those of `time.monotonic_ns`.
+    """UDP connection to one address, with injected faults; the clock is `time.monotonic_ns`.
 
     The argument `number_of` is a function that returns the number of the packet that an answer belongs to, or
     None if the received bytes are not an answer.

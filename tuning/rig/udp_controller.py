@@ -1,4 +1,4 @@
-"""Process of the controller, which answers sensor packets with position commands over UDP on loopback.
+"""Controller's process: it answers sensor packets with position commands, via UDP on the loopback device.
 
     python -I udp_controller.py [--port 0] [--record ticks.json] [--empty] ...
 

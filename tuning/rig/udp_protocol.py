@@ -31,9 +31,8 @@ FLAGS = READY | TRIPPED | TARING | EMPTY_LOOP
 # Reading, little-endian: mark, version, event, session number, sequence number, run, tick, time [s],
 # force [N], position [m], start position [m], start velocity [m/s].
 READING_FORMAT = struct.Struct("<4sBBxxQIIIxxxx5d")
-# Answer, little-endian: mark, version, flags, session number, sequence number, run, tick,
-# position command [m], command rate [m/s], position [m], velocity [m/s], force command [N], faults,
-# reason of a trip.
+# Answer, little-endian: mark, version, flags, session number, sequence number, run, tick, position command
+# [m], command rate [m/s], position [m], velocity [m/s], force command [N], faults, reason for a trip.
 ANSWER_FORMAT = struct.Struct("<4sBBxxQIII4xdddddQ96s")
 # Request and its answer, little-endian: mark, version, random number of the rig, session number (0 in the
 # request).
@@ -238,7 +237,7 @@ class NumericalModel:
         self.position, self.velocity, self.acceleration = position, velocity, 0.0
 
     def integrate(self, force: float) -> None:
-        """Integrate the motion over one control period under the force command F_c [N]."""
+        """Integrate the motion for one control period, with the force command F_c [N]."""
         period, velocity = self._period, self.velocity
         acceleration = -force / self._mass
         self.velocity = velocity + period * acceleration

@@ -45,7 +45,7 @@ class NominalMargin(NamedTuple):
 
 
 class SpectralRadii(NamedTuple):
-    """Spectral radius of the loop in contact, on a grid that may be coarser than that of the map."""
+    """Spectral radius of the loop in contact, on a grid that may be coarser than the map."""
 
     x: np.ndarray  # values along x, (columns,)
     y: np.ndarray  # values along y, (rows,)

@@ -1,6 +1,6 @@
 """Damping perturbations: scenarios of the same mechanism with additional damping.
 
-The slope of e against e* measures how a compensator responds to damping for which it was not tuned. An
+The slope of e against e* measures how a compensator responds to damping that its tuning did not include. An
 elastic mechanism alone cannot show this, because its e* is always 1. The additional damping of scenario i
 dissipates as much energy as an oscillator with the damping ratio zeta_i, which has e* = exp(-pi zeta_i). The
 values zeta_i are spread evenly from 0 to `MAX_DAMPING_RATIO`. `ContactLaw.perturb_damping` converts them to

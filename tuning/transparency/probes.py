@@ -49,7 +49,7 @@ class ProbedScenarios(NamedTuple):
 def choose_default_weights(compensator: str, axes: int = 1) -> dict[str, float]:
     """Return the default weights of `tuning.gains.objective.Objective` for a compensator, by name.
 
-    If the compensator predicts the contact, the errors of probes have the same weight as those of scenarios.
+    If the compensator predicts the contact, the errors of probes and of scenarios have the same weight.
     Excess force is penalised, because such a compensator can correct a late response by a short, large force,
     which the restitution error alone would reward. For other compensators the dictionary is empty.
     """

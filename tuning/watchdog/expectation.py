@@ -81,7 +81,7 @@ def fit_expectation(
     Args:
         features: stiffness, damping and approach speed of the contacts.
         reference: restitution e* of the ideal contacts, (contacts,).
-        run: number of the run to which each contact belongs, (contacts,).
+        run: number of each contact's run, (contacts,).
         mass: equivalent mass [kg].
         sufficient: rms residual [1] at which a set of terms is sufficient.
     """

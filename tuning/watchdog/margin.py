@@ -56,7 +56,7 @@ def choose_restitution_margin(
         expectation: expected restitution of the watchdog.
         limit: limit of the restitution error [1].
         mass: equivalent mass [kg].
-        fitted: runs to which the expectation was fitted, (lanes,).
+        fitted: whether the expectation was fitted to each run, (lanes,).
         false_alarms: largest acceptable rate of false alarms [1].
     """
     expected = expected_restitution(expectation, extract_features(runs.audited), mass)
