@@ -164,7 +164,7 @@ def test_stability_map_has_the_requested_axes(ideal):
         (("contact.stifness", "rig.force_sensor.delay"), "--x: found 'contact.stifness'"),
         (("contact.stiffness=2:1", "rig.force_sensor.delay"), "LOW < HIGH"),
         (("contact.stiffness=-1:1", "rig.force_sensor.delay"), "contact.stiffness[0]: found -1.0"),
-        (("contact.stiffness[3]", "rig.force_sensor.delay"), "--x contact.stiffness[3]: found a value"),
+        (("contact.stiffness[3]", "rig.force_sensor.delay"), "--x contact.stiffness[3]: found the shape"),
         (("contact.stiffness", "contact.stiffness"), "--y: found contact.stiffness"),
         (("contact.stiffness", "rig.force_sensor.bias"), "expected rig.force_sensor.bias=LOW:HIGH"),
         (("contact.stiffness", "gains.lead"), "--y: found 'gains.lead', expected no gain"),

@@ -1,7 +1,7 @@
 """Detection of the onset and end of contacts, and computation of their restitution, in plain Python.
 
-It follows the rules in section 2 of `notebooks/guide/model.md`. `jaxhil.simulation.metrics` applies the same
-rules to batches, but is too slow for a real-time loop.
+The rules are in section 2 of `notebooks/guide/model.md`. `jaxhil.simulation.metrics` applies the same rules
+to batches, but is too slow for a real-time loop.
 """
 
 import math

@@ -68,8 +68,8 @@ def compute_metrics(
     magnitudes = np.abs(plain.error[good])
     ends = compute_error_intervals(plain.error, good, seed=seed)
     if np.any(plain.wanted & ~good):
-        # Some contacts did not end. A compensator whose contacts all end cannot be compared with the others
-        # alone.
+        # Some contacts did not end. The errors of the others cannot be compared with the errors of a
+        # compensator with which all contacts end.
         ends = ErrorIntervals(UNDEFINED_INTERVAL, UNDEFINED_INTERVAL)
     beyond = good & ((np.abs(plain.error) > limit) | plain.unlike)
     has_failed = np.any((plain.wanted & ~good) | beyond, axis=0)
