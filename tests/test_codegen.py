@@ -18,7 +18,7 @@ from jaxhil.rig.types import Positive
 needs_compiler = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 NUMBERS = (0.0, -0.0, 0.5, 1.0, -1.0, 1.5, -2.5, 2.5, 7.0, -7.3, 1e-320, 1e300, -1e300, inf, -inf, nan)
 FAILED = 12345.0
-WEIGHTS = (0.5, -2.0, 3.0)  # of a reading
+WEIGHTS = (0.5, -2.0, 3.0)  # weights of readings in a sum
 HEADER = "#include <math.h>\n#include <stdbool.h>\n#include <stddef.h>\n#include <stdint.h>\n"
 STRICT = ("-O2", "-Wconversion", "-Wshadow", "-Wno-unused-function", "-shared", "-fPIC")
 

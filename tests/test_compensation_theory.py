@@ -137,7 +137,7 @@ def test_contact_stability_changes_at_critical_lag():
     assert np.all(result[:2] < -0.007) and abs(result[2]) < 1e-6 and np.all(result[3:] > 0.007)
 
 
-# First-order lead: omega tau, and the damping as a multiple of the critical one.
+# First-order lead: omega tau, and the damping as a multiple of the critical damping.
 LEADS = np.array([[0.1, 0], [0.2, 0], [0.3, 0], *([a, m] for a in (0.4, 0.6) for m in (0.8, 1.0, 1.2))]).T
 
 

@@ -243,7 +243,8 @@ def test_six_axis_ball_slides_or_rolls_as_in_closed_form(run, request):
     sliding, rolling = seen["sliding"]["twist"][-1], seen["rolling"]["twist"][-1]
     np.testing.assert_allclose(sliding[2], 0.1, rtol=1e-6)
     np.testing.assert_allclose(sliding[0], 0.5 - 0.2 * 2 * 0.1, rtol=1e-4)
-    # The penetration, at most v_n sqrt(m/k), shortens the lever: 10/49 v_t times its share of the radius.
+    # The penetration, at most v_n sqrt(m/k), shortens the lever arm by its share of the radius, and the speed
+    # by 10/49 v_t times this share.
     shorter = 10 / 49 * 0.3 * 1e-3 / 0.1
     # The ball spins about y as in rolling; a remaining slip changes the speed by 2/7 of the slip.
     slip = rolling[0] - 0.1 * seen["rolling"]["angular"][-1, 1]

@@ -84,7 +84,7 @@ def test_elastoplastic_contact_closed_form_matches_integration():
         np.testing.assert_allclose(got, wanted, rtol=1e-8)
 
 
-# Preload and friction [N]: a spring alone, either, both, and more friction than preload.
+# Preload and friction [N]: neither, only one of them, both, and more friction than preload.
 PRELOADS = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 6.0], [10.0, 6.0], [3.0, 6.0], [200.0, 1.0]]).T
 
 

@@ -87,7 +87,7 @@ def test_stability_map_growth_rate_agrees_with_closed_forms():
     assert np.isnan(restitution_by_series(np.array([-0.1, 1.5]))).all() and restitution_by_series(
         np.zeros(1)
     ) == pytest.approx(1)
-    # s^2 = -omega^2 e^(-s tau), time in units of 1/omega: growth and oscillation give the root back.
+    # s^2 = -omega^2 e^(-s tau), time in units of 1/omega: growth and frequency determine the root.
     for phase in phases:
         ratio = math.log(restitution_by_root(phase)) / math.pi
         root = solved_root(phase)

@@ -143,7 +143,7 @@ def test_mechanism_of_every_contact_law_and_simulator_survives_json_round_trip(c
     ],
 )
 def test_clearance_too_small_for_starting_positions_is_refused(changes, lag):
-    # Free approach and phase, then latency, transport delay and lag of x_a.
+    # Distances: free approach, contact phase, command latency, transport delay and lag of x_a.
     start = 0.005 * (0.02 + 0.001 + 0.001 + 0.004 + lag)
     changes = changes | {"rig.contact_plane": ...}
     assert from_plain_data(changed(changes | {"contact.clearance": start * (1 + 1e-9)}), "f")
@@ -166,7 +166,7 @@ def test_velocity_limit_below_the_approach_speed_is_refused():
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_contact_plane_beyond_starting_position_is_refused(side):
-    # Free approach and phase, then latency, transport delay and lag of x_a.
+    # Distances: free approach, contact phase, command latency, transport delay and lag of x_a.
     plane = side * (0.02 - 0.99 * 0.005 * (0.026 + 2 * 0.8 / (2 * math.pi * 10.0)))
     changes = {"contact.clearance": 0.02}
     assert from_plain_data(changed(changes | {"rig.contact_plane": 0.99 * plane}), "f")

@@ -87,7 +87,7 @@ def test_monitor_deviations_of_matching_rig_scatter_as_predicted():
 
 
 CHANGES = {
-    # changed value; the metric that shows it, by how much, and its tolerance
+    # rig with a changed value, metric that shows the change, expected value of this metric, and tolerance
     "stiffness": (replace(CLEAN, contact=campaign_kinds.voigt((1.236e5,))), "stiffness", 0.03, 0.003),
     "delay": (changed_kind(CLEAN, force_sensor={"delay": 0.0043}), "apparent damping", -72.0, 12.0),
     "motion": (changed_kind(CLEAN, simulator={"delay": 0.0047}), "lag of motion", 4e-4, 6e-5),

@@ -107,7 +107,7 @@ def test_identification_increases_noise_amplification_early_in_contact():
         expected = amplify("response_error", gains)[0] * DEVIATION
         return gains, np.array([np.sqrt(np.mean(span**2)) for span in spans]) / expected
 
-    # tenths of the contact
+    # The noise level is an array with one value for each tenth of the contact.
     np.testing.assert_allclose(noise(**LEAD_ALONE)[1], 1, atol=0.1)
     gains, noise_level = noise()
     covariance = gains["stiffness_covariance"]

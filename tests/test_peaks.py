@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxhil.sixdof.peaks import higher, no_peak
 
-# Times with unequal steps [s]; every lane begins at another place in them.
+# Times with unequal steps [s]; every lane begins at a different index.
 TIMES = np.cumsum(np.tile([0.02, 0.03, 0.05], 22))[:, None] + np.linspace(0, 0.02, 5)
 
 

@@ -44,7 +44,7 @@ ACCURACY = {
 }
 # The oracle uses a cubic for the motion near the deepest point.
 ACCURACY |= {name: 1e-7 for name in CASES if "elastoplastic" in name}
-# Corners of layers, and the sampling interval in which a contact ends, are not split.
+# The simulation does not divide sampling intervals at the corners of layers and at the end of a contact.
 WORK_ACCURACY = {
     "layers": 1e-4,
     "damped layers": 1e-4,

@@ -5,7 +5,7 @@ import pytest
 
 from tuning.optimisation.sensitivity import LOSS_RISE, compute_gain_tolerance
 
-STIFF_ENOUGH = 0.05  # the box constraint changes the region by the square of this
+STIFF_ENOUGH = 0.05  # largest gain tolerance [unit box] for a stiff gain, on which the box has little effect
 
 
 def quadratic():
@@ -16,7 +16,7 @@ def quadratic():
 def test_gain_tolerance_is_change_that_raises_loss_by_stated_amount():
     jacobian, loss = np.array([[50.0, 0.0], [0.0, 20.0]]), 0.5
     result = compute_gain_tolerance(jacobian, loss)
-    # d^2 J^2 / 2 = rise * loss, in a box of one.
+    # The change d satisfies d^2 J^2 / 2 = rise * loss, within the unit box.
     allowed = np.sqrt(2 * LOSS_RISE * loss) / np.array([50.0, 20.0])
     np.testing.assert_allclose(result.alone, 1 / np.hypot(1 / allowed, 1), rtol=1e-12)
     np.testing.assert_allclose(result.together, result.alone, rtol=1e-12)

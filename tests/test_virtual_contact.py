@@ -26,7 +26,7 @@ def test_virtual_contact_has_an_imaginary_root_at_the_stability_limit(mass, freq
     root = 1j * critical
     value = mass * root**2 + damping * root + stiffness * cmath.exp(-root * delay)
     assert abs(value) <= 1e-9 * stiffness and damping >= 0 and 0 < critical <= frequency
-    # Lowest frequency of a solution of the condition.
+    # Lowest frequency that satisfies the condition.
     below = critical * np.linspace(0, 0.999, 50)
     assert np.all(np.cos(below * delay) > (below / frequency) ** 2)
 
