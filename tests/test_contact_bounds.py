@@ -95,7 +95,7 @@ def test_verify_reports_excessive_peak_force_of_closed_loop(slow_simulator):
     # The duration of the closed loop is a whole number of control periods.
     sample = mechanism.rig.control_period * simulated.duration_ratio / simulated.duration
     assert contact.duration_ratio == pytest.approx(simulated.duration_ratio, abs=sample)
-    reason = f"closed loop, contact 1: found a real peak force of {contact.peak_force_ratio:.3g} times"
+    reason = f"closed loop, contact 1: found {contact.peak_force_ratio:.3g} times the peak force"
     assert not report.verdict and report.reasons[0].startswith(reason)
 
 

@@ -80,7 +80,7 @@ def test_verify_refuses_signature_of_another_key_or_manifest(key, folder, tmp_pa
     assert check_bundle(folder, by_key).signature == "valid for the given key"
     (tmp_path / "other.pem").write_bytes(as_public(Ed25519PrivateKey.generate()))
     result = tuning.verify(folder, key=tmp_path / "other.pem")
-    expected = "manifest.sig: found another signature, expected one of the manifest by the given key"
+    expected = "manifest.sig: found another signature, expected the signature by the given key"
     assert not result.good and result.reasons == [expected] and result.document["self_test"] == []
     # Update all checksums after a change, as is possible without the key; only the signature is wrong.
     files = small_files()

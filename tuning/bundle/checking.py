@@ -119,7 +119,7 @@ def _check_manifest(folder: Path, signed_by: SignatureCheck | None) -> BundleChe
             state = NOT_SIGNED if signature is None else NOT_SIGNED_BY_KEY
             signer = "no signature" if signature is None else "another signature"
             reasons.insert(
-                0, f"{selftest.SIGNATURE_FILE}: found {signer}, expected one of the manifest by the given key"
+                0, f"{selftest.SIGNATURE_FILE}: found {signer}, expected the signature by the given key"
             )
     if len(reasons) > MAX_REASONS:
         reasons[MAX_REASONS:] = [f"and {len(reasons) - MAX_REASONS} more"]

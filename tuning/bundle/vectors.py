@@ -306,7 +306,7 @@ def _disagreement(name: str, unit: str, found: np.ndarray, simulated: np.ndarray
         return None
     tick = int(wrong[0])
     return (
-        f"tick {tick}: {name} found {found[tick].item()!r} {unit}, simulated {simulated[tick].item()!r} "
-        f"{unit}: they differ by {error[tick]:.1e} of the command's range {span:.4g} {unit}, "
-        f"expected {REPLAY_LIMIT:.0e}"
+        f"tick {tick}: {name}: found {found[tick].item()!r} {unit}, expected {simulated[tick].item()!r} "
+        f"{unit} (simulation): the difference is {error[tick]:.1e} of the command's range {span:.4g} {unit}, "
+        f"expected {REPLAY_LIMIT:.0e} or less"
     )

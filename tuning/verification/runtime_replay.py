@@ -126,8 +126,8 @@ def verify(
     comparisons = [_compare_contact(outcome, metrics, contact) for contact in range(contacts)]
     stopped = [] if stop is None else [f"closed loop: {stop.text}"]
     unlike = [
-        f"closed loop, contact {number}: found a real peak force of {contact.peak_force_ratio:.3g} times and "
-        f"a duration of {contact.duration_ratio:.3g} times the ideal contact's, expected "
+        f"closed loop, contact {number}: found {contact.peak_force_ratio:.3g} times the peak force and "
+        f"{contact.duration_ratio:.3g} times the duration of the ideal contact, expected "
         f"{CONTACT_BOUNDS_SHORT_TEXT}"
         for number, contact in enumerate(comparisons, start=1)
         if outcome.unlike[number - 1, 0]
