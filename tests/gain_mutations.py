@@ -35,18 +35,18 @@ def numbers_changed(rng: random.Random) -> dict[str, Any]:
         if kind == "gain" and document["gains"]:
             name = rng.choice(list(document["gains"]))
             one = COMPENSATORS[document["compensator"]].gains[name]
-            value = wild(rng, document["gains"][name]["value"], one.lowest, one.highest)
+            value = any_number(rng, document["gains"][name]["value"], one.lowest, one.highest)
             document["gains"][name] |= {"value": value, "lower": value, "upper": value}
         elif kind == "limit" and document.get("limits"):
             name = rng.choice(list(document["limits"]))
             one = LIMITS[name]
-            value = wild(rng, document["limits"][name]["value"] or 1.0, one.lowest, one.highest)
+            value = any_number(rng, document["limits"][name]["value"] or 1.0, one.lowest, one.highest)
             document["limits"][name]["value"] = rng.choice((None, value, value, value))
         elif kind == "period":
-            value = wild(rng, 1e-3, *CONTROL_PERIODS)
+            value = any_number(rng, 1e-3, *CONTROL_PERIODS)
             document["control_period"] = document["mechanism"]["rig"]["control_period"] = value
         elif kind == "clearance":
-            document["mechanism"]["contact"]["clearance"] = wild(rng, 1e-3, *DISTANCES)
+            document["mechanism"]["contact"]["clearance"] = any_number(rng, 1e-3, *DISTANCES)
     return document
 
 
@@ -89,7 +89,7 @@ def text_of(document: dict[str, Any], rng: random.Random) -> str:
     return text
 
 
-def wild(rng: random.Random, usual: float, lowest: float, highest: float) -> float:
+def any_number(rng: random.Random, usual: float, lowest: float, highest: float) -> float:
     """Draw a number: of any size, near the usual value, or near an end of the admitted range."""
     kind = rng.randrange(5)
     if kind == 0:

@@ -15,19 +15,19 @@ GAINS = nominal_gains(MECHANISM, "dead_zone_observer")
 
 
 @pytest.fixture(scope="module")
-def led():
+def lead_metrics():
     """Run phase lead alone, with a negligible dead zone and with the nominal dead zone."""
     scenario = spread(MECHANISM, 2, force_sensor__dead_zone=np.array([1e-9, DEAD_ZONE]))
     return first_contact(MECHANISM, scenario, "phase_lead", nominal_gains(MECHANISM, "phase_lead"))
 
 
-def test_force_sensor_dead_zone_shifts_the_apparent_surface(led):
+def test_force_sensor_dead_zone_shifts_the_apparent_surface(lead_metrics):
     """A dead zone of dz newtons shifts the surface by dz/k; the rebound speed is the same."""
-    assert led["restitution"][1] == pytest.approx(led["restitution"][0], abs=1e-4)
-    assert led["peak_force"][1] - led["peak_force"][0] == pytest.approx(DEAD_ZONE, rel=1e-3)
+    assert lead_metrics["restitution"][1] == pytest.approx(lead_metrics["restitution"][0], abs=1e-4)
+    assert lead_metrics["peak_force"][1] - lead_metrics["peak_force"][0] == pytest.approx(DEAD_ZONE, rel=1e-3)
 
 
-def test_dead_zone_observer_removes_dead_zone_error(led):
+def test_dead_zone_observer_removes_dead_zone_error(lead_metrics):
     """The error falls to 1 % with the right stiffness, to 10 % with 30 % stiffness error."""
     lag = 1 / (2 * math.pi * GAINS["observer_bandwidth"])
     assert GAINS["identification_delay"] == pytest.approx(DELAY - lag, rel=1e-12)
@@ -35,8 +35,8 @@ def test_dead_zone_observer_removes_dead_zone_error(led):
     alignment = np.array([*[GAINS["identification_delay"]] * 4, DELAY])
     changed = {"observer_stiffness": stiffness, "identification_delay": alignment}
     result = first_contact(MECHANISM, spread(MECHANISM, 5), "dead_zone_observer", GAINS | changed)
-    remaining_error = (result["peak_force"] - led["peak_force"][0]) / DEAD_ZONE
-    moved = result["restitution"] - led["restitution"][0]
+    remaining_error = (result["peak_force"] - lead_metrics["peak_force"][0]) / DEAD_ZONE
+    moved = result["restitution"] - lead_metrics["restitution"][0]
     print(remaining_error, moved)
     assert (
         abs(remaining_error[0]) < 0.01

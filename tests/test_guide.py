@@ -116,7 +116,7 @@ def numbers(words):
     return [float(number) for number in re.findall(r"\d+\.\d+", words)]
 
 
-def grown(root):
+def restitution_of(root):
     """Return the restitution that corresponds to a root of the characteristic equation."""
     return math.exp(math.pi * root.real / abs(root.imag))
 
@@ -138,7 +138,7 @@ def test_guide_closed_forms_of_delay_are_correct(model):
     phases = np.array([0.05, 0.2])
     roots = 2 / phases * lambertw(0.5j * phases)
     first_order = np.exp(np.pi * phases / 2)
-    expected = [grown(roots[0]), 0.05, grown(roots[1]), 0.2, *first_order]
+    expected = [restitution_of(roots[0]), 0.05, restitution_of(roots[1]), 0.2, *first_order]
     assert result == pytest.approx(expected, abs=5e-7)
 
 
@@ -151,12 +151,12 @@ def test_guide_closed_forms_of_damping_are_correct(model):
 def test_guide_numbers_of_lead_and_smith_predictor_are_correct(model):
     phase = 0.2
     root = root_of(lambda s: s**2 + (1 + phase * s) * cmath.exp(-s * phase), 1j)
-    assert grown(root) - 1 == pytest.approx(math.expm1(math.pi / 6 * phase**3), rel=0.03)
+    assert restitution_of(root) - 1 == pytest.approx(math.expm1(math.pi / 6 * phase**3), rel=0.03)
 
     omega, lag, delay = 6 * math.pi, 0.010, 0.008
 
     def remaining(forward):
-        return grown(
+        return restitution_of(
             root_of(lambda s: s**2 + omega**2 * forward(s) * cmath.exp(-s * (lag + delay)), 1j * omega)
         )
 

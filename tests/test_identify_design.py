@@ -93,7 +93,7 @@ def test_excitation_design_is_more_informative_than_flat_spectrum(planned):
     assert planned.flat > 1.5
 
 
-def spread(planned, repeats):
+def scatter_over_campaigns(planned, repeats):
     """Return standard deviations of motion parameters over campaigns, relative to the predicted values."""
     timing, rows = CampaignTiming(1e-3, "linear", 0, "tick"), []
     for seed in range(repeats):
@@ -124,7 +124,7 @@ def test_excitation_design_predicts_scatter_over_many_campaigns():
     assert max(planned.free.crest, planned.press.crest) < 1.8
     print("slopes", np.round(planned.slopes.mean(axis=0), 9).tolist(), "flat over best", planned.flat)
     np.testing.assert_allclose(planned.slopes.mean(axis=0), SLOPES[0], rtol=0.2, atol=1e-6)
-    ratio, _ = spread(planned, 100)
+    ratio, _ = scatter_over_campaigns(planned, 100)
     print("free: std over predicted", ratio)
     assert np.all(np.abs(ratio - 1.0) < 0.25)
     timing, kind = CampaignTiming(1e-3, "linear", 0, "tick"), campaigns.KINDS["clean"]

@@ -60,7 +60,7 @@ def noise(size):
     return lambda values: values + size * np.random.default_rng(0).standard_normal(len(values))
 
 
-def swapped(first, second):
+def swap_columns(first, second):
     return lambda day: {name: {**table, first: table[second], second: table[first]}
                         for name, table in changed(day, "", None).items()}  # fmt: skip
 
@@ -73,8 +73,8 @@ REFUSED = {
     "the force's sign": (lambda day: changed(day, FORCE, np.negative), "expected the other sign"),
     "N for kN": (lambda day: changed(day, FORCE, lambda values: 1e3 * values), "force in N, read as kN"),
     "m for mm": (lambda day: changed(day, COMMAND, lambda values: 1e-3 * values), "is its unit right?"),
-    "position and command": (swapped(COMMAND, POSITION), "are the two swapped?"),
-    "force and position": (swapped(FORCE, POSITION), "is its unit right?"),
+    "position and command": (swap_columns(COMMAND, POSITION), "are the two swapped?"),
+    "force and position": (swap_columns(FORCE, POSITION), "is its unit right?"),
     "commands held for 2 rows": (lambda day: changed(day, COMMAND, held(2)), "a new command every 2 rows"),
     "commands held for 4 rows": (lambda day: changed(day, COMMAND, held(4)), "a new command every 4 rows"),
     "commands against forces": (
@@ -105,7 +105,7 @@ def test_identify_command_rejects_corrupted_logs_in_one_line(jaxhil, day, tmp_pa
     assert words in ran.err and not list((tmp_path / "out").glob("*"))
 
 
-def late(day):
+def add_late_run(day):
     """Add a second free run whose readings are delayed by 3 ms."""
     run = day["free_01.csv"]
     return {**day, "free_99.csv": {**run, POSITION: np.roll(run[POSITION], 3)}}
@@ -125,7 +125,7 @@ BAD = {
         lambda day: changed(day, FORCE, lambda values: values + 1e-2 * np.arange(len(values)) / 400.0),
         "does not explain",
     ),
-    "two rigs": (late, "motion model"),
+    "two rigs": (add_late_run, "motion model"),
     "free motion alone": (only("free"), "nor a prior tell contact.stiffness"),
     "touches alone": (only("contact"), "nor a prior tell rig.simulator"),
     "rest alone": (only("rest"), "nor a prior tell rig.simulator"),

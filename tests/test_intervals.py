@@ -109,7 +109,7 @@ def walks(probability, repeats=1000, looks=150, step=25):
     return failures, np.broadcast_to(step * np.arange(1, looks + 1), failures.shape)
 
 
-def of_each(interval, failures, number):
+def at_looks(interval, failures, number):
     """Return the interval at every interim look; equal counts are computed only once."""
     pairs, which = np.unique(np.stack([failures.ravel(), number.ravel()]), axis=1, return_inverse=True)
     return IntervalEstimate(*(part[which].reshape(failures.shape) for part in interval(*pairs)))
@@ -123,8 +123,8 @@ def ever_outside(interval, probability):
 def test_confidence_sequence_has_stated_coverage_for_any_stopping_rule(probability, capsys):
     """Unlike exact intervals, these keep their coverage even for a stop at the worst of 150 looks."""
     failures, number = walks(probability)
-    missed = np.mean(ever_outside(of_each(confidence_sequence, failures, number), probability))
-    peeked = np.mean(ever_outside(of_each(binomial_interval, failures, number), probability))
+    missed = np.mean(ever_outside(at_looks(confidence_sequence, failures, number), probability))
+    peeked = np.mean(ever_outside(at_looks(binomial_interval, failures, number), probability))
     with capsys.disabled():
         print(f"\nworst look, p = {probability}: coverage {1 - missed:.3f}, exact {1 - peeked:.3f}", end="")
     assert 1 - missed >= 0.95
@@ -136,7 +136,7 @@ def test_confidence_sequence_has_stated_coverage_if_stopped_at_a_width(probabili
     rng = np.random.default_rng(2)
     failures = np.cumsum(rng.binomial(100, probability, (1000, 150)), axis=1)
     number = np.broadcast_to(100 * np.arange(1, 151), failures.shape)
-    looks = of_each(confidence_sequence, failures, number)
+    looks = at_looks(confidence_sequence, failures, number)
     # `update_sequence` does this look by look; here for all sweeps at once.
     low, high = np.maximum.accumulate(looks.low, axis=1), np.minimum.accumulate(looks.high, axis=1)
     assert np.mean(np.any(low > high, axis=1)) < 0.01

@@ -19,7 +19,7 @@ PERIOD, VELOCITY_LIMIT, ACCELERATION_LIMIT = 1e-3, 0.02, 0.5
 
 
 @jax.jit
-def follow(targets, velocity_limit, acceleration_limit):
+def limit_commands(targets, velocity_limit, acceleration_limit):
     """Return the limited commands c(n), n >= 1, of a model at `targets` that starts in uniform motion."""
 
     def tick(carry, pair):
@@ -35,10 +35,10 @@ def follow(targets, velocity_limit, acceleration_limit):
     return jax.lax.scan(tick, (targets[0], targets[1] - targets[0]), pairs)[1]
 
 
-def limited(targets, velocity_limit=np.inf, acceleration_limit=np.inf):
-    """Return the result of `follow`, preceded by the initial position."""
+def limited_motion(targets, velocity_limit=np.inf, acceleration_limit=np.inf):
+    """Return the result of `limit_commands`, preceded by the initial position."""
     limits = np.array([velocity_limit, acceleration_limit], np.asarray(targets).dtype)
-    return np.concatenate([targets[:1], np.asarray(follow(jnp.asarray(targets), *limits))])
+    return np.concatenate([targets[:1], np.asarray(limit_commands(jnp.asarray(targets), *limits))])
 
 
 def moves(speeds):
@@ -50,7 +50,7 @@ def moves(speeds):
 def test_command_velocity_and_acceleration_limits_hold_for_any_motion(speeds):
     # The drives can reach the initial speed.
     speeds[0] = np.clip(speeds[0], -VELOCITY_LIMIT, VELOCITY_LIMIT)
-    commands = limited(moves(np.repeat(speeds, 12)), VELOCITY_LIMIT, ACCELERATION_LIMIT)
+    commands = limited_motion(moves(np.repeat(speeds, 12)), VELOCITY_LIMIT, ACCELERATION_LIMIT)
     steps = np.diff(commands)
     assert np.abs(steps).max() <= VELOCITY_LIMIT * PERIOD * (1 + 1e-9)
     assert np.abs(np.diff(steps)).max() <= ACCELERATION_LIMIT * PERIOD**2 * (1 + 1e-9)
@@ -60,7 +60,7 @@ def gap(distance, speed=0.0):
     """Return the distance of the command from a target that jumps by `distance` at constant speed."""
     targets = moves(np.full(800, speed))
     targets[2:] += distance
-    return (targets - limited(targets, VELOCITY_LIMIT, ACCELERATION_LIMIT)) * np.sign(distance)
+    return (targets - limited_motion(targets, VELOCITY_LIMIT, ACCELERATION_LIMIT)) * np.sign(distance)
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.003, -0.004])
@@ -86,7 +86,7 @@ def test_limited_command_reaches_displaced_target_in_fewest_periods(count, spare
     change = ACCELERATION_LIMIT * PERIOD**2
     distance = (count**2 - spare * (2 * count - 2 if count > 1 else 1)) * change
     targets = np.r_[0.0, 0.0, np.full(200, distance)]
-    commands = limited(targets, acceleration_limit=ACCELERATION_LIMIT)
+    commands = limited_motion(targets, acceleration_limit=ACCELERATION_LIMIT)
     steps = np.count_nonzero(np.abs(commands - distance)[2:] > 1e-12 * change + 1e-15)
     assert steps <= 2 * count - 2
 
@@ -98,7 +98,7 @@ def test_limited_command_stops_in_the_minimum_time(limit):
     The time until 0.99 x is shorter by sqrt(2 x/a)/10; times are whole periods.
     """
     distance = 1e-4
-    commands = limited(np.r_[0.0, 0.0, np.full(600, distance)], acceleration_limit=limit)
+    commands = limited_motion(np.r_[0.0, 0.0, np.full(600, distance)], acceleration_limit=limit)
     ticks = np.argmax(commands > 0.99 * distance) - 1
     fastest = (2 - 0.1 * np.sqrt(2)) * np.sqrt(distance / limit) / PERIOD
     assert fastest - 1 <= ticks <= 1.05 * fastest + 2
@@ -113,10 +113,10 @@ def test_command_limits_that_are_not_reached_leave_commands_bit_identical(offset
     loose = margin * np.abs(steps).max() / PERIOD, margin * np.abs(np.diff(steps)).max() / PERIOD**2
     targets = smooth.astype(dtype)
     for limits in (loose, (loose[0], np.inf), (np.inf, loose[1])):
-        np.testing.assert_array_equal(limited(targets, *limits), targets)
+        np.testing.assert_array_equal(limited_motion(targets, *limits), targets)
     # A limit that is lower by this amount does bind.
-    assert np.abs(limited(targets, loose[0] / margin**2, np.inf) - targets).max() > 1e-6
-    assert np.abs(limited(targets, np.inf, loose[1] / margin**2) - targets).max() > 1e-7
+    assert np.abs(limited_motion(targets, loose[0] / margin**2, np.inf) - targets).max() > 1e-6
+    assert np.abs(limited_motion(targets, np.inf, loose[1] / margin**2) - targets).max() > 1e-7
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -126,7 +126,7 @@ def test_command_limit_that_is_just_reached_does_not_change_the_command(origin, 
     targets = np.full(400, origin - 0.004, dtype)
     for n in range(1, len(targets)):
         targets[n] = targets[n - 1] + period * speed
-    np.testing.assert_array_equal(limited(targets, speed, ACCELERATION_LIMIT), targets)
+    np.testing.assert_array_equal(limited_motion(targets, speed, ACCELERATION_LIMIT), targets)
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -134,7 +134,7 @@ def test_command_limit_that_is_just_reached_does_not_change_the_command(origin, 
 def test_limited_command_equals_target_to_the_bit_after_reaching_the_target(distance, speed, origin):
     targets = origin + moves(np.full(800, speed))
     targets[2:] += distance
-    commands = limited(targets, VELOCITY_LIMIT, ACCELERATION_LIMIT)
+    commands = limited_motion(targets, VELOCITY_LIMIT, ACCELERATION_LIMIT)
     np.testing.assert_array_equal(commands[-50:], targets[-50:])
 
 

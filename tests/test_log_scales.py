@@ -26,7 +26,7 @@ def rounded(log, **quanta):
     return log | {name: quantum * np.round(log[name] / quantum) for name, quantum in quanta.items()}
 
 
-def lose(log, share, seed=0):
+def drop_rows(log, share, seed=0):
     """Drop some rows."""
     rows = np.random.default_rng(seed).uniform(size=len(log["t"])) >= share
     return {name: column[rows] for name, column in log.items()}
@@ -92,10 +92,10 @@ def test_mass_error_of_a_few_percent_is_detected_from_log(tmp_path):
 
 
 REAL = {
-    "lost rows": lambda log: lose(log, 0.01),
-    "lost rows and jitter": lambda log: scatter(lose(log, 0.01), 5e-5),
-    "many lost rows": lambda log: lose(log, 0.05),
-    "samples that scatter": lambda log: lose(scatter(log, 5e-5, samples=True), 0.01),
+    "lost rows": lambda log: drop_rows(log, 0.01),
+    "lost rows and jitter": lambda log: scatter(drop_rows(log, 0.01), 5e-5),
+    "many lost rows": lambda log: drop_rows(log, 0.05),
+    "samples that scatter": lambda log: drop_rows(scatter(log, 5e-5, samples=True), 0.01),
     "1 mN and 1 nm": lambda log: rounded(log, Fc=1e-3, xd=1e-9),
     "0.1 N and 0.1 um": lambda log: rounded(log, Fc=0.1, xd=1e-7, vd=1e-6),
     "float32": lambda log: (

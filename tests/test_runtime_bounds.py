@@ -16,7 +16,7 @@ from jaxhil.rig.bounds import CONTROL_PERIODS, FORCES
 from jaxhil.rig.limits import LIMITS
 
 
-def beyond(mechanism: Mechanism) -> list[tuple]:
+def rejected(mechanism: Mechanism) -> list[tuple]:
     """Return the bounds and nominal values of gains that are not accepted."""
     result = []
     for name, law in COMPENSATORS.items():
@@ -29,11 +29,11 @@ def beyond(mechanism: Mechanism) -> list[tuple]:
 
 @pytest.mark.parametrize("mechanism", [*builtin_names(), *suite_names()])
 def test_runtime_bounds_accept_nominal_gains_of_every_builtin_mechanism(mechanism):
-    assert beyond(load(mechanism).mechanism) == []
+    assert rejected(load(mechanism).mechanism) == []
 
 
 def test_runtime_bounds_accept_nominal_gains_of_generated_mechanisms():
-    assert [beyond(mechanism) for mechanism in family()] == [[]] * len(family())
+    assert [rejected(mechanism) for mechanism in family()] == [[]] * len(family())
 
 
 def test_runtime_bounds_accept_gains_of_every_compensator_setting():
@@ -87,7 +87,7 @@ def test_runtime_bounds_accept_nominal_gains_of_any_realistic_rig(
             "uncertainty": {},
         }
     )
-    assert beyond(from_plain_data(raw, "rig")) == []
+    assert rejected(from_plain_data(raw, "rig")) == []
 
 
 def test_runtime_bounds_are_finite_and_every_limit_has_a_default():

@@ -32,7 +32,7 @@ def paths(node: Any, path: tuple = ()) -> list[tuple]:
     return result
 
 
-def at(document: Any, path: tuple) -> Any:
+def value_at(document: Any, path: tuple) -> Any:
     for key in path:
         document = document[key]
     return document
@@ -56,7 +56,7 @@ JSON_VALUES = st.recursive(
 def test_gain_file_with_any_field_mutated_is_refused(place, value, remove):
     name, path = place
     document = gain_document(name)
-    container, key = at(document, path[:-1]), path[-1]
+    container, key = value_at(document, path[:-1]), path[-1]
     if remove:
         del container[key]
     elif json.dumps(container[key], sort_keys=True) == json.dumps(value, sort_keys=True):
@@ -70,7 +70,7 @@ def test_gain_file_with_any_field_mutated_is_refused(place, value, remove):
 @settings(max_examples=300, deadline=None)
 def test_changed_gain_file_with_valid_digest_loads_or_is_refused_with_one_line_message(path, value):
     document = gain_document()
-    at(document, path[:-1])[path[-1]] = value
+    value_at(document, path[:-1])[path[-1]] = value
     try:
         sign(document)
     except ValueError:
@@ -112,7 +112,7 @@ def change(*path_and_value: Any) -> dict[str, Any]:
     """Return a response-error document with one entry replaced, or removed for `...`."""
     *path, key, value = path_and_value
     document = gain_document()
-    container = at(document, tuple(path))
+    container = value_at(document, tuple(path))
     if value is ...:
         del container[key]
     else:

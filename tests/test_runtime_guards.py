@@ -32,7 +32,7 @@ from jaxhil.rig.faults import (
 from jaxhil.rig.limits import LIMITS
 
 
-def fly(controller: Controller, ticks: int, start: float = -0.02) -> float:
+def simulate_flight(controller: Controller, ticks: int, start: float = -0.02) -> float:
     """Simulate uniform motion out of contact; return the next time and position."""
     for n in range(ticks):
         position = start + 5e-6 * n
@@ -103,7 +103,7 @@ def test_constant_force_in_contact_raises_force_stuck_fault(side):
 
 def test_constant_position_while_model_moves_raises_position_stuck_fault():
     controller = limited()
-    fly(controller, 30)
+    simulate_flight(controller, 30)
     for n in range(30, 60):
         controller.step(0.0, -0.02 + 5e-6 * n, 5e-3, -0.02, n * PERIOD)
         if controller.faults:
@@ -237,7 +237,7 @@ def test_command_velocity_is_limited_and_persistent_excess_trips():
 
 def test_reset_after_trip_causes_no_jump_of_position_command():
     controller = limited()
-    fly(controller, 20)
+    simulate_flight(controller, 20)
     controller.emergency_stop(True)
     command = [controller.position_command(-0.01, 0.0, 0.0) for _ in range(100)][-1]
     assert controller.at_rest and not controller.reset()
@@ -263,7 +263,7 @@ def test_reset_after_trip_causes_no_jump_of_position_command():
 
 def test_next_contact_starts_at_model_position_except_after_trip():
     controller = limited()
-    fly(controller, 20)
+    simulate_flight(controller, 20)
     controller.next_contact()
     controller.step(0.0, -0.03, 5e-3, -0.03, 7.0)
     assert controller.position_command(-0.03, 5e-3, 0.0) == -0.03

@@ -35,7 +35,7 @@ def test_numbers_in_guide_stand_below_the_command_that_prints_them(page):
             assert COMMAND.search(section), block[2]
 
 
-def shown(page):
+def read_commands(page):
     """Return the commands of a page with the lines below each, in order."""
     text = page.read_text(encoding="utf-8")
     for block in BLOCK.finditer(text):
@@ -51,7 +51,7 @@ def test_commands_in_guide_print_the_output_shown(tmp_path):
     names = {"jaxhil": [sys.executable, "-m", "tuning"], "python": [sys.executable]}
     printed: dict[str, list[str]] = {}
     for page in [*(GUIDE / f"{name}.md" for name in ORDER), ROOT / "README.md"]:
-        for command, lines in shown(page):
+        for command, lines in read_commands(page):
             first, *others = shlex.split(command)
             if others[0] in LEFT_OUT:
                 continue
@@ -62,8 +62,8 @@ def test_commands_in_guide_print_the_output_shown(tmp_path):
                 )  # fmt: skip
                 assert ran.returncode == ("Bad:" in lines), ran.stderr
                 printed[command] = [line.rstrip() for line in ran.stdout.splitlines()]
-            result = {words(line) for line in printed[command]}
-            missing = [line for line in lines.splitlines() if words(line) not in result]
+            result = {words_of(line) for line in printed[command]}
+            missing = [line for line in lines.splitlines() if words_of(line) not in result]
             assert not missing, f"{page.name}: {command}: {missing}\n" + "\n".join(printed[command])
             for line in set(lines.splitlines()) - set(printed[command]):
                 print(f"\n{page.name}: {line}", end="")
@@ -76,7 +76,7 @@ def test_commands_of_guide_page_on_logs_print_the_output_shown(tmp_path):
     write(tmp_path / "day1", campaigns.campaign("clean", 0))
     environment = {**os.environ, "COLUMNS": "110"}
     environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    for command, lines in shown(GUIDE / "from_logs.md"):
+    for command, lines in read_commands(GUIDE / "from_logs.md"):
         if "day1" in command:
             ran = subprocess.run(
                 command.replace("jaxhil", f"{sys.executable} -m tuning", 1), shell=True, cwd=tmp_path,
@@ -84,7 +84,7 @@ def test_commands_of_guide_page_on_logs_print_the_output_shown(tmp_path):
             )  # fmt: skip
             assert ran.returncode == 0, ran.stderr
             result = ran.stdout.splitlines()
-            assert {words(line) for line in lines.splitlines()} <= {words(line) for line in result}
+            assert {words_of(line) for line in lines.splitlines()} <= {words_of(line) for line in result}
             print("\n" + "\n".join(line.rstrip() for line in result), end="")
         if "--guess" in command:
             # Values that only the rig's owner knows.
@@ -92,6 +92,6 @@ def test_commands_of_guide_page_on_logs_print_the_output_shown(tmp_path):
             (tmp_path / "logs.toml").write_text(draft.replace("# equivalent_mass", "equivalent_mass"))
 
 
-def words(line):
+def words_of(line):
     """Return a line without its numbers."""
     return " ".join(NUMBER.sub("N", line).split())

@@ -120,7 +120,7 @@ def test_six_axis_metrics_do_not_depend_on_start_time_of_run(evaluated):
 
 
 @partial(jax.jit, static_argnums=0)
-def followed(loop, given):
+def record_touches(loop, given):
     """Return touches and energies at every tick, of the rig and of the ideal contact.
 
     For the rig these are touches of the hardware, and the energy of the numerical model before the tick.
@@ -142,7 +142,7 @@ def followed(loop, given):
 @pytest.fixture(scope="module")
 def ticks():
     scenarios = scenario()
-    return [np.asarray(part) for part in followed(build_loop(scenarios, **STATIC), scenarios)]
+    return [np.asarray(part) for part in record_touches(build_loop(scenarios, **STATIC), scenarios)]
 
 
 def last_touches(touches):

@@ -240,9 +240,9 @@ PLACES = [(name, path) for name, raw in RAW.items() for path in places(raw)]
 def test_any_six_axis_mechanism_table_is_read_or_refused_with_one_line_message(place, junk, sibling):
     """Replace one value by a value of any type, or by a value from elsewhere in the files."""
     name, path = place
-    for value in (junk, at(RAW[sibling[0]], sibling[1])):
+    for value in (junk, value_at(RAW[sibling[0]], sibling[1])):
         raw = copy.deepcopy(RAW[name])
-        at(raw, path[:-1])[path[-1]] = value
+        value_at(raw, path[:-1])[path[-1]] = value
         try:
             mechanism = any_from_plain_data(raw, "f")
         except InputError as error:
@@ -251,7 +251,7 @@ def test_any_six_axis_mechanism_table_is_read_or_refused_with_one_line_message(p
             assert any_from_plain_data(to_plain_data(mechanism), "f") == mechanism
 
 
-def at(node, path):
+def value_at(node, path):
     for part in path:
         node = node[part]
     return node

@@ -49,7 +49,7 @@ def start(pair):
     return States(target, build_state(pair.chaser, at, moving[0], turned, moving[1]))
 
 
-def after(pair, states, group):
+def collide(pair, states, group):
     """Return the states of the bodies after the contact, and the lost energy."""
     space, time, longest = Space(pair, (group,), ()), lanes(DURATION, BATCH), lanes(1e-3, BATCH)
 
@@ -77,19 +77,19 @@ def test_six_axis_contact_is_invariant_to_frames_and_exchange_of_bodies():
     before = start(pair)
     drogue = Drogue(0.75 * ONE, 0.04 * ONE, 0 * ONE)
     probe = jnp.zeros((3, 1, 1))
-    expected, lost = after(pair, before, spheres(probe, 0.02 * ONE, drogue, "hunt_crossley", LAW, RUBBING))
+    expected, lost = collide(pair, before, spheres(probe, 0.02 * ONE, drogue, "hunt_crossley", LAW, RUBBING))
     assert float(lost[0]) > 0.01
     swapped = Pair(pair.chaser, pair.target)
     contact = ContactGroup(
         TargetSpheres(points, 0.02 * ONE, drogue), CONTACT_LAWS["hunt_crossley"], LAW, RUBBING
     )
-    result, other = after(swapped, States(before.chaser, before.target), contact)
+    result, other = collide(swapped, States(before.chaser, before.target), contact)
     close(result[::-1], expected, before)
     np.testing.assert_allclose(other, lost, rtol=1e-8)
-    close(*elsewhere(pair, before), before)
+    close(*contact_in_moved_frames(pair, before), before)
 
 
-def elsewhere(pair, before):
+def contact_in_moved_frames(pair, before):
     """Return a ball's contact with an oblique plane, with original and with moved frames."""
     normal, centre = place([[0.2], [-0.1], [0.97]], BATCH), place([[0.1], [0.2], [0.05]], BATCH)
     normal = (1 / np.sqrt(0.2**2 + 0.1**2 + 0.97**2)) * normal
@@ -98,7 +98,7 @@ def elsewhere(pair, before):
     def result(pair, centre, on_it, normal):
         shape = Plane(on_it, normal)
         group = spheres(components(centre), radius, shape, "hunt_crossley", LAW, RUBBING)
-        return after(pair, before, group)[0]
+        return collide(pair, before, group)[0]
 
     expected = result(pair, centre, on_it, normal)
     moves = [((0.3, -0.1, 0.2), (0.4, 0.2, -0.7)), ((-0.2, 0.1, 0.15), (-0.3, 0.5, 0.1))]

@@ -36,12 +36,12 @@ ENDS = [
 @pytest.mark.parametrize("tethers", [0, 1, 3])
 def test_six_axis_twists_agree_with_mujoco(tethers):
     duration = DURATION if tethers else 5.0
-    result, expected = ours(tethers, duration), mujocos(tethers, duration)
+    result, expected = simulate_tethers(tethers, duration), mujocos(tethers, duration)
     assert (expected[5] < 0.03) == (tethers > 0)  # the chaser's velocity along z, 0.05 m/s without tethers
     np.testing.assert_allclose(result, expected, atol=1e-7 * np.max(np.abs(expected)))
 
 
-def ours(tethers, duration):
+def simulate_tethers(tethers, duration):
     """Return velocities of both bodies (world axes), then angular velocities (body axes)."""
     bodies = Pair(*(
         plain_body(mass, inertia, (0, 0, 0), BATCH) for mass, inertia in zip(MASSES, FULL, strict=True)

@@ -66,7 +66,7 @@ def test_hexapod_pose_derivatives_agree_with_differences():
     assert np.max(np.abs(result)) > 0.1
 
 
-def moved(kinematics, axes, amplitude):
+def oscillate(kinematics, axes, amplitude):
     """Return the coordinates at the sensor for an oscillating command."""
     shape = jnp.asarray([1.0, -0.5, 0.7, 0.8, 0.6, -0.9])[:, None] * jnp.ones((6, 2))
     number = kinematics.command(shape).shape[0]
@@ -88,7 +88,7 @@ def moved(kinematics, axes, amplitude):
 def test_hexapod_with_equal_legs_equals_task_space_simulator_for_small_strokes():
     """The difference is of second order in the stroke."""
     both = [
-        [np.asarray(jax.jit(moved, static_argnums=(1, 2))(one, 12.0, size)) for size in (1e-2, 1e-3)]
+        [np.asarray(jax.jit(oscillate, static_argnums=(1, 2))(one, 12.0, size)) for size in (1e-2, 1e-3)]
         for one in (hexapod(), TaskSpace())
     ]
     large, small = (np.max(np.abs(a - b)) for a, b in zip(*both, strict=True))
@@ -98,11 +98,11 @@ def test_hexapod_with_equal_legs_equals_task_space_simulator_for_small_strokes()
 
 def test_two_equal_robots_move_like_a_single_robot():
     share = lanes([0.2, 0.3, 0.0, 0.7, 1.0, 0.5], BATCH)
-    one, two = (jax.jit(moved, static_argnums=(1, 2)) for _ in range(2))
+    one, two = (jax.jit(oscillate, static_argnums=(1, 2)) for _ in range(2))
     expected = np.asarray(one(TaskSpace(), 12.0, 0.01))
     np.testing.assert_allclose(two(TwoRobots(share), 12.0, 0.01), expected, atol=1e-14)
     # A slow second robot changes the motion by its share.
     slow = jnp.concatenate([lanes([12.0] * 6, BATCH), lanes([3.0] * 6, BATCH)])
-    result = np.asarray(jax.jit(lambda share: moved(TwoRobots(share), slow, 0.01))(share))
+    result = np.asarray(jax.jit(lambda share: oscillate(TwoRobots(share), slow, 0.01))(share))
     apart = np.max(np.abs(result - expected), axis=(0, 2))
     assert apart[2] < 1e-14 and np.all(apart[[0, 1, 3, 4, 5]] > 1e-5)

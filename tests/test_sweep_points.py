@@ -14,7 +14,7 @@ NUMBER = 100
 
 
 @pytest.fixture(scope="module")
-def asked():
+def simulated_points():
     """Return a sweep, points, noise indices, and the results."""
     sweep = build_sweep(manifest(case(force_sensor={"noise_std": 1.0})))
     inputs = np.random.default_rng(0).uniform(size=(NUMBER, 3))
@@ -22,9 +22,9 @@ def asked():
     return sweep, inputs, noise, run_points(sweep, inputs, noise)
 
 
-def test_finished_study_points_are_not_simulated_again(asked, tmp_path, monkeypatch):
+def test_finished_study_points_are_not_simulated_again(simulated_points, tmp_path, monkeypatch):
     monkeypatch.setattr(point_batches, "MIN_POINTS_PER_BATCH", 8)
-    *what, rows = asked
+    *what, rows = simulated_points
     ran, result = [], []
 
     def interrupted(sweep, pieces):
@@ -45,16 +45,16 @@ def test_finished_study_points_are_not_simulated_again(asked, tmp_path, monkeypa
     assert again.checkpoints.other == []
 
 
-def test_study_points_with_other_noise_are_simulated_again(asked, tmp_path):
-    sweep, inputs, noise, rows = asked
+def test_study_points_with_other_noise_are_simulated_again(simulated_points, tmp_path):
+    sweep, inputs, noise, rows = simulated_points
     running = LOCAL_RUN._replace(checkpoints=Checkpoints(tmp_path / "kept", resume=True))
     run_points(sweep, inputs, noise, running)
     other = run_points(sweep, inputs, noise + 1, running)
     assert np.any(other["worst_error"] != rows["worst_error"])
 
 
-def test_equal_study_points_are_simulated_only_once(asked):
-    sweep, inputs, noise, rows = asked
+def test_equal_study_points_are_simulated_only_once(simulated_points):
+    sweep, inputs, noise, rows = simulated_points
     ran = []
     twice = run_points(
         sweep,

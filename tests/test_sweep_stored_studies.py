@@ -32,12 +32,12 @@ NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 COUNTS = st.integers(0, 2**40)
 
 
-def same(one, other):
+def are_equal(one, other):
     """Return whether named tuples are equal to the bit: texts, numbers, arrays, NaN and the sign of 0."""
     if isinstance(one, np.ndarray):
         return (one.shape, one.dtype, one.tobytes()) == (other.shape, other.dtype, other.tobytes())
     if isinstance(one, tuple):
-        return type(one) is type(other) and len(one) == len(other) and all(map(same, one, other))
+        return type(one) is type(other) and len(one) == len(other) and all(map(are_equal, one, other))
     return type(one) is type(other) and repr(one) == repr(other)
 
 
@@ -93,13 +93,13 @@ def unwritten(*words):
 @given(drivers())
 def test_sobol_study_file_is_read_as_written(found):
     request = IndicesRequest(128)
-    assert same(decode_study(MANIFEST, request, encode_study(MANIFEST, request, found)), found)
+    assert are_equal(decode_study(MANIFEST, request, encode_study(MANIFEST, request, found)), found)
 
 
 @given(RARE)
 def test_rare_event_study_file_is_read_as_written(found):
     request = RareFailureRequest(1.5, replicates=REPLICATES)
-    assert same(decode_study(MANIFEST, request, encode_study(MANIFEST, request, found)), found)
+    assert are_equal(decode_study(MANIFEST, request, encode_study(MANIFEST, request, found)), found)
 
 
 @given(st.sampled_from(REQUESTS), st.binary(max_size=300))
@@ -114,7 +114,7 @@ def test_study_file_with_any_flipped_bit_is_ignored(study, data):
     content = bytearray(encode_study(MANIFEST, request, result))
     content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
     read = decode_study(MANIFEST, request, bytes(content))
-    assert read is None or same(read, result)
+    assert read is None or are_equal(read, result)
 
 
 JSON = st.recursive(
@@ -151,14 +151,14 @@ def test_study_result_that_json_cannot_express_is_not_written(store):
 def test_stored_study_equals_result_of_a_new_run(store, sweep):
     first, again = (compute_error_indices(sweep, 8) for _ in range(2))
     write_study(store, IndicesRequest(8), first)
-    assert same(read_study(store, IndicesRequest(8)), again)
+    assert are_equal(read_study(store, IndicesRequest(8)), again)
     content = study_path(store, IndicesRequest(8)).read_bytes()
     write_study(store, IndicesRequest(8), again)
     assert study_path(store, IndicesRequest(8)).read_bytes() == content
 
     first, again = (estimate_rare_failure(sweep, 2.0, samples=20, replicates=2) for _ in range(2))
     write_study(store, RareFailureRequest(2.0, 20, 2), first)
-    assert same(read_study(store, RareFailureRequest(2.0, 20, 2)), again)
+    assert are_equal(read_study(store, RareFailureRequest(2.0, 20, 2)), again)
     content = study_path(store, RareFailureRequest(2.0, 20, 2)).read_bytes()
     write_study(store, RareFailureRequest(2.0, 20, 2), again)
     assert study_path(store, RareFailureRequest(2.0, 20, 2)).read_bytes() == content
@@ -170,10 +170,10 @@ def test_study_result_without_variance_or_failures_is_stored(tmp_path):
     nothing = estimate_rare_failure(still, 1e9, samples=20, replicates=2)
     assert nothing.probability == 0 and nothing.coefficient_of_variation == math.inf
     write_study(store, RareFailureRequest(1e9, 20, 2), nothing)
-    assert same(read_study(store, RareFailureRequest(1e9, 20, 2)), nothing)
+    assert are_equal(read_study(store, RareFailureRequest(1e9, 20, 2)), nothing)
     constant = ErrorIndices((InputIndices("approach.phase", *[math.nan, 0.0, 1.0] * 2),), 15.0, 6, 0)
     write_study(store, IndicesRequest(2), constant)
-    assert same(read_study(store, IndicesRequest(2)), constant)
+    assert are_equal(read_study(store, IndicesRequest(2)), constant)
 
 
 def test_stored_study_of_other_arguments_or_another_sweep_is_not_used(store):

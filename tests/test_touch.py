@@ -98,7 +98,7 @@ def pose_and_twist():
     return pose, Twist(place(0.3, -0.2, -0.5), place(0.7, 0.1, -0.4))
 
 
-def moved(pose, twist, time):
+def move_pose(pose, twist, time):
     """Return the pose a short time later."""
     turn = exponential(time * twist.angular)
     w = turn.w * pose.attitude.w - jnp.sum(components(turn.v) * components(pose.attitude.v), axis=0)
@@ -123,7 +123,7 @@ def test_penetration_rate_is_derivative_of_depth_and_slip_is_tangential(name):
     pose, twist = pose_and_twist()
     touch = candidates.touch(pose)
     rate, slip = motion_at(touch, pose, twist)
-    _, slope = jax.jvp(lambda time: candidates.touch(moved(pose, twist, time)).depth, (0.0,), (1.0,))
+    _, slope = jax.jvp(lambda time: candidates.touch(move_pose(pose, twist, time)).depth, (0.0,), (1.0,))
     np.testing.assert_allclose(rate, slope, rtol=1e-9)
     assert abs(np.sum(components(slip) * components(touch.normal))) < 1e-15
 

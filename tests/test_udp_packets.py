@@ -122,17 +122,17 @@ def test_session_is_opened_only_by_a_session_request(packet):
     assert (answer is not None) == (len(packet) == 24 and packet[:5] == encode_session_request(3)[:5])
 
 
-def newer(sequence: SequenceFilter, *numbers: int) -> list[bool]:
+def accept_numbers(sequence: SequenceFilter, *numbers: int) -> list[bool]:
     return [sequence.is_newer(number & 0xFFFFFFFF) for number in numbers]
 
 
 @pytest.mark.parametrize("start", [0, 2**31 - 5, 2**32 - 5, 12345])
 def test_packet_sequence_numbers_order_packets_across_wrap_around(start):
     sequence = SequenceFilter(start - 1)
-    assert newer(sequence, start, start + 1, start + 4) == [True] * 3
-    assert newer(sequence, start + 4, start + 3, start, start - 1) == [False] * 4
+    assert accept_numbers(sequence, start, start + 1, start + 4) == [True] * 3
+    assert accept_numbers(sequence, start + 4, start + 3, start, start - 1) == [False] * 4
     assert (
-        newer(sequence, start + 5, start + 5 + MAX_SEQUENCE_STEP, start + 10 + MAX_SEQUENCE_STEP)
+        accept_numbers(sequence, start + 5, start + 5 + MAX_SEQUENCE_STEP, start + 10 + MAX_SEQUENCE_STEP)
         == [True] * 3
     )
 
@@ -141,7 +141,7 @@ def test_packet_sequence_numbers_order_packets_across_wrap_around(start):
 def test_packet_with_any_sequence_number_outdates_at_most_one_window_of_packets(newest, wild):
     sequence = SequenceFilter(newest)
     sequence.is_newer(wild)
-    following = newer(sequence, *range(newest + 1, newest + MAX_SEQUENCE_STEP + 3))
+    following = accept_numbers(sequence, *range(newest + 1, newest + MAX_SEQUENCE_STEP + 3))
     first = following.index(True)
     # The following packets are accepted at once; if `wild` lies within the window, from its number on.
     assert first <= MAX_SEQUENCE_STEP and all(following[first:])
@@ -151,8 +151,8 @@ def test_packet_with_any_sequence_number_outdates_at_most_one_window_of_packets(
 def test_first_packet_after_a_long_loss_is_also_dropped():
     for gap in (MAX_SEQUENCE_STEP + 1, 10**6, 2**31 - 10):
         sequence = SequenceFilter(5)
-        assert newer(sequence, 5 + gap, 6 + gap, 7 + gap) == [False, True, True]
+        assert accept_numbers(sequence, 5 + gap, 6 + gap, 7 + gap) == [False, True, True]
     # Two arbitrary numbers that are not consecutive.
-    assert newer(SequenceFilter(5), 2**30, 2**29, 2**28, 6) == [False, False, False, True]
+    assert accept_numbers(SequenceFilter(5), 2**30, 2**29, 2**28, 6) == [False, False, False, True]
     # Never an older number, which may be a replay of earlier packets.
-    assert not any(newer(SequenceFilter(2**31), *range(1000)))
+    assert not any(accept_numbers(SequenceFilter(2**31), *range(1000)))
