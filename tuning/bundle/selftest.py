@@ -30,8 +30,8 @@ MAX_FILES, MAX_BUNDLE_BYTES, MAX_TEXT_BYTES = (
     1 << 23,
 )  # of a bundle, and bytes of a text file in it
 SCHEMA = "jaxhil/bundle/1"
-# Largest difference between runtime and simulation, divided by the range of a run's commands [1]. They
-# compute in a different order, so that they differ by rounding errors.
+# Largest difference between runtime and simulation, divided by the range of a run's commands [1]. Both
+# compute in a different order, so that rounding errors differ.
 MAX_SIMULATION_ERROR = 1e-11
 MAX_REPORTED_DIFFERENCES = 8  # largest number of reported differences in one file
 C_SOURCES = ("c99/test_vectors.c", "c99/jaxhil_controller.c")

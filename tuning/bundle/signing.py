@@ -89,5 +89,4 @@ def _read_key(path: Path, expected: str, load: Callable[[bytes], Any]) -> Any:
 
 
 def _key_error(path: Path, found: str, expected: str) -> InputError:
-    """Return the error that describes an unusable key file."""
     return InputError(f"{to_one_line(str(path))}: found {found}, expected {expected}")

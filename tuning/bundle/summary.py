@@ -106,7 +106,6 @@ def _error_table(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _gain_table(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the HTML lines of the table of gains."""
     rows = [
         (
             name,
@@ -123,7 +122,6 @@ def _gain_table(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _limit_table(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the HTML lines of the table of limits."""
     limits = _active_limits(document)
     if not limits:
         yield "<h2>Limits</h2><p>None in the gain file: the controller's widest limits hold.</p>"

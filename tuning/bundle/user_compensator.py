@@ -55,7 +55,6 @@ def _class_text(law: type) -> str:
 
 
 def _is_import(statement: ast.stmt) -> bool:
-    """Return whether a statement is an import."""
     return isinstance(statement, (ast.Import, ast.ImportFrom))
 
 

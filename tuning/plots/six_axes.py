@@ -85,7 +85,7 @@ def find_time_origin(recorded: Recorded) -> tuple[int, str]:
 
 
 def _find_shown_instants(recorded: Recorded) -> tuple[tuple[str, int], ...]:
-    """Return description and tick of the two instants for which the mechanism is drawn."""
+    """Return description and tick of the two instants at which the mechanism is drawn."""
     touching = np.flatnonzero(np.any(recorded.depth > 0, axis=1))
     if not len(touching):
         return ("start", 0), ("end", len(recorded.time) - 1)

@@ -264,7 +264,6 @@ def _format_metric(metric: MetricEntry | None) -> str:
 
 
 def _format_margin(margin: MarginOfMap) -> str:
-    """Return the range of a margin as text."""
     low = "below the map" if margin.low is None else format_number(margin.low)
     high = "above the map" if margin.high is None else format_number(margin.high)
     return f"from {low} to {high}"

@@ -328,7 +328,6 @@ def _describe_distribution(uncertain: Uncertainty, unit: str) -> str:
 
 
 def _format_value(value: Any) -> str:
-    """Return the value of a parameter as text: a number, or up to eight entries of a list."""
     if isinstance(value, (list, tuple)):
         entries = [_format_value(entry) for entry in value[:8]]
         return ", ".join(entries) + (f", ... ({len(value)} in all)" if len(value) > len(entries) else "")

@@ -197,7 +197,7 @@ class RigTask:
     def _finish_contact(self, contact: RigContact) -> None:
         """Store a contact that has ended and prepare the next one."""
         if self.tripped:
-            # After a trip the rig keeps moving, but its contacts no longer evaluate the controller.
+            # After a trip, the rig keeps moving, but its contacts are not used to evaluate the controller.
             if all(c.status != "tripped" for c in self._contacts):
                 self._store(contact._replace(status="tripped", restitution=math.nan))
             return

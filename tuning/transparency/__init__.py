@@ -1,4 +1,4 @@
-"""Transparency of a compensator: how much its results depend on the hardware, and not on expectations.
+"""Transparency of a compensator: how much its results depend on the hardware instead of expectations.
 
 Two perturbations measure the transparency: pushes on the hardware, and additional damping of the mechanism.
 """

@@ -60,12 +60,12 @@ class LaneReplay(msgspec.Struct, frozen=True):
 
 
 class ContactComparison(msgspec.Struct, frozen=True):
-    """Comparison of one nominal contact with the runtime and with the JAX controller in the loop."""
+    """Comparison of one nominal contact in two loops: with the runtime, and with the JAX controller."""
 
     restitution: float | None  # restitution with the runtime [1]; None if the contact does not end
     simulated_restitution: float | None  # JAX controller's restitution [1]; None if the contact does not end
-    status: str  # status of the contact with the runtime, as in `jaxhil.simulation.metrics`
-    simulated_status: str  # status of the contact with the JAX controller
+    status: str  # contact's status (`jaxhil.simulation.metrics`) if the runtime controls it
+    simulated_status: str  # contact's status if the JAX controller controls it
     peak_force_ratio: float | None = None  # peak force with the runtime / peak force of the ideal contact [1]
     duration_ratio: float | None = None  # duration with the runtime / duration of the ideal contact [1]
 

@@ -18,7 +18,7 @@ POLYNOMIAL_TERMS = ("1", "p", "pp", "ppp", "w", "ww", "pw", "z", "zz", "pz", "wz
 # Sets of terms, simplest first. `fit_expectation` selects the first sufficient set.
 TERM_SETS = (("1",), ("1", "p", "pp", "ppp"), POLYNOMIAL_TERMS[:7], POLYNOMIAL_TERMS)
 MAX_RESIDUAL_RATIO = 1.25  # largest rms residual of a sufficient set / smallest rms residual [1]
-RANGE_EXTENSION = 0.1  # extension of a fitted range on each side, divided by its width [1]
+RANGE_EXTENSION = 0.1  # extension of a fitted range on each side, divided by the range's width [1]
 SINGULAR_VALUE_CUTOFF = 1e-9  # singular values below this, relative to the largest, count as 0 [1]
 
 
