@@ -102,6 +102,7 @@ def _ideal_metrics(scenario: Scenario) -> Metrics:
         touches=none,
         duration=zero,
         peak_force=zero,
+        peak_command=zero,
         peak_moment=zero,
         penetration=zero,
         status=none + REBOUNDED,

@@ -50,6 +50,7 @@ class Metrics(NamedTuple):
     energy_change: Float[Array, "..."]  # change of the bodies' kinetic energy [J]
     reference_energy_change: Float[Array, "..."]  # change of the kinetic energy in the ideal contact [J]
     peak_force: Float[Array, "..."]  # peak force of the real contact [N]
+    peak_command: Float[Array, "..."]  # largest force on the numerical model [N]
     reference_peak_force: Float[Array, "..."]  # peak force of the ideal contact [N]
     peak_moment: Float[Array, "..."]  # largest moment about T's origin in the real contact [N m]
     reference_peak_moment: Float[Array, "..."]  # largest moment about T's origin, ideal contact [N m]
@@ -129,6 +130,7 @@ def judge(bodies: Pair, episodes: Episode) -> Metrics:
         energy_change=change,
         reference_energy_change=changed,
         peak_force=episodes.peak_force,
+        peak_command=episodes.peak_command,
         reference_peak_force=past.peak_force,
         peak_moment=episodes.peak_moment,
         reference_peak_moment=past.peak_moment,

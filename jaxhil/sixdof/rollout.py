@@ -50,6 +50,7 @@ class Episode(NamedTuple):
     touches: Int[Array, "episodes *batch"]  # number of touches of the hardware's shapes
     duration: Float[Array, "episodes *batch"]  # time during which the hardware touches [s]
     peak_force: Float[Array, "episodes *batch"]  # peak force of the real contact [N]
+    peak_command: Float[Array, "episodes *batch"]  # largest force on the numerical model [N]
     peak_moment: Float[Array, "episodes *batch"]  # largest moment about T's origin in the real contact [N m]
     penetration: Float[Array, "episodes *batch"]  # largest penetration, divided by the shapes' size [1]
     status: Int[Array, "episodes *batch"]  # index of `STATUS_NAMES`
@@ -161,6 +162,7 @@ def _episode(
         touches=watch.touches,
         duration=watch.touched.astype(period.dtype) * period,
         peak_force=watch.force.largest,
+        peak_command=watch.highest[0],
         peak_moment=watch.moment.largest,
         penetration=watch.penetration,
         status=jnp.where(over, REBOUNDED, MISS).astype(jnp.int32),

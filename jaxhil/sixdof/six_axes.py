@@ -133,8 +133,7 @@ def _compute_ideal_contacts(_: SixAxes, scenarios: Any) -> tuple[Array, ...]:
 def outcome_of(episodes: Metrics, scenario: Scenario) -> Outcome:
     """Convert the metrics of episodes to an outcome, whose arrays contain every episode twice.
 
-    The first half has the energy errors, the second half the twist errors. Peak command and chatter are not
-    computed with six axes: they are the peak force of the real contact, and 0.
+    The first half has the energy errors, the second half the twist errors. The chatter is 0.
     """
     # A draw that misses the target has no contact to evaluate.
     begins = jnp.isfinite(scenario.start.chaser.position.z)
@@ -150,7 +149,7 @@ def outcome_of(episodes: Metrics, scenario: Scenario) -> Outcome:
         restitution=episodes.restitution,
         approach_velocity=episodes.approach_velocity,
         peak_force=episodes.peak_force,
-        peak_command=episodes.peak_force,
+        peak_command=episodes.peak_command,
         excess_variation=zero,
         position_shortfall=zero,
         duration=episodes.duration,
@@ -161,7 +160,7 @@ def outcome_of(episodes: Metrics, scenario: Scenario) -> Outcome:
         status=status,
         ticks=0 * status,
     )
-    ratio = episodes.peak_force / jnp.where(
+    ratio = episodes.peak_command / jnp.where(
         episodes.reference_peak_force > 0, episodes.reference_peak_force, jnp.nan
     )
     both = Outcome(

@@ -10,6 +10,7 @@ from tyro.conf import arg
 
 from jaxhil.errors import to_one_line
 from jaxhil.mechanism.file import AnyMechanism
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from tuning.api import arguments, tune_pareto
 from tuning.api.arguments import ArgumentError
 from tuning.api.options import (
@@ -148,8 +149,10 @@ class TuneOptions:
     def check_mechanism(self, mechanism: AnyMechanism) -> None:
         """Raise `InputError` if an option does not support the number of axes of the mechanism."""
         arguments.check_supports_mechanism(self.compensator, mechanism)
-        options = ("setting", "start", "noise_weight", "chatter_weight", "transparency_weight", "pareto")
+        options = ("setting", "start", "noise_weight", "chatter_weight", "transparency_weight")
         arguments.check_one_axis_arguments(mechanism, **{name: getattr(self, name) for name in options})
+        if self.pareto and isinstance(mechanism, SixAxisMechanism):
+            tune_pareto.check_six_axis_cost(self.pareto_against)
         if callable(self.objective):
             arguments.check_one_axis_arguments(mechanism, objective=self.objective)
 

@@ -30,12 +30,19 @@ def check_pareto_options(number: Any, against: Any, compensator: str) -> None:
 
     if against is not None:
         arguments.check_choice(tuple(PARETO_CRITERIA), pareto_against=against)
-    if select_cost_axis(against, compensator) is None:
+    axes = 1 if compensator in arguments.compensator_names() else 6
+    if select_cost_axis(against, compensator, axes) is None:
         reason = "its amplification of sensor noise does not depend on its gains"
         raise ArgumentError("pareto", str(number), f"0 for {compensator}: {reason}")
 
 
-def select_cost_axis(against: str | None, compensator: str) -> "ParetoCriterion | None":
+def check_six_axis_cost(against: Any) -> None:
+    """Raise `InputError` unless the cost of a Pareto front exists with six axes."""
+    if against not in (None, "peak"):
+        raise ArgumentError("pareto_against", str(against), "peak, the only cost in six axes")
+
+
+def select_cost_axis(against: str | None, compensator: str, axes: int = 1) -> "ParetoCriterion | None":
     """Return the cost that the front trades off against the error; None if the gains do not affect it."""
     from tuning.gains.pareto_search import (
         NOISE_CRITERION,
@@ -45,7 +52,7 @@ def select_cost_axis(against: str | None, compensator: str) -> "ParetoCriterion 
     )
 
     if against is None:
-        return choose_default_criterion(compensator)
+        return choose_default_criterion(compensator, axes)
     axis = PARETO_CRITERIA[against]
     return None if axis == NOISE_CRITERION and not has_noise_trade_off(compensator) else axis
 
@@ -71,12 +78,15 @@ def compute_fronts(
     Yields:
         Index into `tuned`, and the points of the front.
     """
+    from jaxhil.laws.compensators import axes_of
     from tuning.caches.checkpoints import NO_CHECKPOINTS
     from tuning.gains.pareto import compute_fronts
     from tuning.gains.search_progress import SearchProgress
 
     results = [gains.found for gains in tuned]
-    axis: Any = select_cost_axis(against, tuned[0].compensator) if tuned else None
+    axis: Any = None
+    if tuned:
+        axis = select_cost_axis(against, tuned[0].compensator, axes_of(tuned[0].mechanism))
     work = SearchProgress(
         lambda text, share, before: bar.tell(text, share * len(results), before * len(results))
     )

@@ -41,8 +41,8 @@ def command_metrics(result: "TuneResult") -> CommandMetrics:
 def is_good(result: "TuneResult", limit: float) -> bool:
     """Return whether the verdict on the tuned gains is good, both with and without sensor noise.
 
-    The verdict is good if all contacts ended, the rms error is within the limit, and at most
-    `MAX_UNLIKE_SHARE` of the real contacts differ too much from the ideal contacts.
+    The verdict is good if all contacts ended, the rms error (in six axes that of the twist) is within the
+    limit, and at most `MAX_UNLIKE_SHARE` of the real contacts differ too much from the ideal contacts.
     """
     return all(
         errors.failed == 0 and errors.rms <= limit and errors.unlike <= MAX_UNLIKE_SHARE
@@ -79,6 +79,8 @@ def command_warnings(result: "TuneResult", command: CommandMetrics) -> tuple[str
 
 def describe_verdict(result: "TuneResult", limit: float) -> str:
     """Return the verdict as sentences: errors and limit, metrics of the command, and real contacts."""
+    from jaxhil.rig_models import choose_rig_model
+
     tuned, noise_free, command = result.figures["tuned"], result.without_noise, command_metrics(result)
     low, high = result.intervals.rms if result.intervals else (math.nan, math.nan)
     interval = f" (95 %: {low:.2g} to {high:.2g})" if math.isfinite(low + high) else ""
@@ -93,7 +95,8 @@ def describe_verdict(result: "TuneResult", limit: float) -> str:
 
         ended = f"did not end well within {MAX_CONTACT_DURATION:g} s"
         return f"Bad: {failed} contacts {ended} with the tuned gains{where}; {command_text}."
-    error = f"the tuned rms error {tuned.rms:.2g}{interval}"
+    name = choose_rig_model(result.mechanism).verdict_error.replace("_", " ")
+    error = f"the tuned rms {name} {tuned.rms:.2g}{interval}"
     if noise_free is not None:
         error += f", {noise_free.rms:.2g} without noise,"
     real = _describe_real_contacts(max(_evaluated_errors(result), key=lambda errors: errors.unlike))

@@ -122,20 +122,16 @@ class TunedGains:
     @functools.cached_property
     def document(self) -> dict[str, Any]:
         """Return the content of the gain file."""
-        from tuning.gain_file import build_document, six_axis_validity_envelope, validity_envelope
+        from tuning.gain_file import build_document
         from tuning.transparency.pushes import PUSH_DEFINITION
 
         result = self.found
-        if isinstance(result.mechanism, SixAxisMechanism):
-            envelope = six_axis_validity_envelope(result.scenarios, result.outcomes["tuned"])
-        else:
-            envelope = validity_envelope(result.mechanism, result.scenarios)
         return build_document(
             result.compensator,
             result.gains,
             result.mechanism,
             self.mechanism_sha256,
-            envelope,
+            _validity_envelope(result),
             {
                 "nominal": result.nominal,
                 "robust": result.figures,
@@ -163,6 +159,15 @@ class TunedGains:
         from tuning.gain_file import write_gain_file
 
         write_gain_file(arguments.check_path("path", path), self.document)
+
+
+def _validity_envelope(result: "TuneResult") -> dict[str, Any]:
+    """Return the ranges of the fresh scenarios, for the gain file."""
+    from tuning.gain_file import six_axis_validity_envelope, validity_envelope
+
+    if isinstance(result.mechanism, SixAxisMechanism):
+        return six_axis_validity_envelope(result.scenarios, result.outcomes["tuned"])
+    return validity_envelope(result.mechanism, result.scenarios)
 
 
 @dataclass(frozen=True)
@@ -207,10 +212,9 @@ class TradedGains:
     @functools.cached_property
     def document(self) -> dict[str, Any]:
         """Return the content of the gain file."""
-        from tuning.gain_file import build_document, validity_envelope
+        from tuning.gain_file import build_document
 
         result, point = self.tuned.found, self.point
-        mechanism: Any = result.mechanism
         figures: dict[str, Any] = {
             "nominal": {**result.nominal, "tuned": point.nominal},
             "robust": {**result.figures, "tuned": point.figures},
@@ -223,7 +227,7 @@ class TradedGains:
             point.gains,
             result.mechanism,
             self.tuned.mechanism_sha256,
-            validity_envelope(mechanism, result.scenarios),
+            _validity_envelope(result),
             {**figures, "pareto": self.traded},
             result.settings.seed,
             {},

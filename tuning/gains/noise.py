@@ -5,7 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.laws.compensators import COMPENSATORS, axes_of
 from jaxhil.laws.simulation_base import Compensator, KnownConstants
 
 
@@ -16,7 +16,9 @@ def has_noise_trade_off(compensator: str) -> bool:
 
 
 def compute_noise_amplification(mechanism: Any, compensator: str, gains: Mapping[str, float]) -> float:
-    """Return a compensator's amplification of force sensor noise [1] for a one-axis mechanism."""
+    """Return a compensator's amplification of force sensor noise [1]; 1 for a six-axis mechanism."""
+    if axes_of(mechanism) != 1:
+        return 1.0
     period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
     constants = KnownConstants(jnp.asarray(period), jnp.asarray(clearance))
     values = {name: jnp.asarray(value) for name, value in gains.items()}

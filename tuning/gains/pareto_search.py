@@ -53,8 +53,13 @@ TRANSPARENCY_CRITERION = ParetoCriterion(
 PARETO_CRITERIA = {axis.name: axis for axis in (NOISE_CRITERION, PEAK_CRITERION, TRANSPARENCY_CRITERION)}
 
 
-def choose_default_criterion(compensator: str) -> ParetoCriterion | None:
-    """Return a compensator's second criterion in Pareto fronts: noise, else the peak command, else None."""
+def choose_default_criterion(compensator: str, axes: int = 1) -> ParetoCriterion | None:
+    """Return a compensator's second criterion in Pareto fronts: noise, else the peak command, else None.
+
+    With six axes it is the peak command, because the noise amplification is unknown.
+    """
+    if axes != 1:
+        return PEAK_CRITERION
     if has_noise_trade_off(compensator):
         return NOISE_CRITERION
     return PEAK_CRITERION if COMPENSATORS[compensator].anticipates else None

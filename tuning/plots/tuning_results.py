@@ -77,6 +77,12 @@ def six_axis_errors_plot(result: TuneResult, limit: float) -> Figure:
     return figure
 
 
+def _error_name(result: TuneResult) -> str:
+    """Return the name of the error that decides the verdict."""
+    name = choose_rig_model(result.mechanism).verdict_error
+    return "restitution error" if name == "error" else name.replace("_", " ")
+
+
 def _draw_shares(axes: Axes, outcomes: Mapping[str, Any], limit: float) -> None:
     """Plot, against the error, the fraction of contacts with a larger error, for each set of gains."""
     shown_errors: list[float] = [limit] if 0 < limit < np.inf else []
@@ -158,12 +164,12 @@ def overview_plot(results: Sequence[TuneResult], limit: float) -> Figure:
 
 @matplotlib.style.context("default")
 def front_plot(front: ParetoFront, result: TuneResult, limit: float) -> Figure:
-    """Plot a Pareto front of restitution error and cost, with numbered points.
+    """Plot a Pareto front of error and cost, with numbered points.
 
     The literature's gains and the gains tuned for the least error are also shown.
     """
     figure = create_figure(
-        (7, 5), f"{result.mechanism.name}: restitution error against {front.axis.name}, fresh scenarios"
+        (7, 5), f"{result.mechanism.name}: {_error_name(result)} against {front.axis.name}, fresh scenarios"
     )
     axes = figure.subplots()
     best = sorted((point for point in front.points if point.on_front), key=lambda point: point.cost)
@@ -191,7 +197,7 @@ def front_plot(front: ParetoFront, result: TuneResult, limit: float) -> Figure:
     _set_log_scale(axes, "y", [point.error for point in (*front.points, front.literature, front.tuned)])
     axes.margins(0.08, 0.12)
     name = result.settings.objective.name
-    axes.set(xlabel=f"{front.axis.words} [1]", ylabel=f"{name} of e - e* [1]")
+    axes.set(xlabel=f"{front.axis.words} [1]", ylabel=f"{name} of the {_error_name(result)} [1]")
     finish_axes(axes, "best")
     return figure
 

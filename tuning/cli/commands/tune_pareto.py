@@ -59,7 +59,8 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
     weight = axis.weight.replace("_", " ")
     headings = ["point", weight, axis.name, *([] if _is_rms_objective(result) else ["objective"])]
     table = terminal.build_table(
-        f"{result.mechanism.name}: restitution error against {axis.words}, "
+        f"{result.mechanism.name}: {'twist' if 'twist_error' in entry else 'restitution'} error against "
+        f"{axis.words}, "
         f"{options.validation} fresh scenarios",
         [*headings, "rms", "99th pct", "max", "not ended", ""],
         rows,
