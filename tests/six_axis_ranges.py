@@ -1,11 +1,20 @@
 """Built-in six-axis mechanisms with the wide ranges on which their compensators are evaluated."""
 
+from pathlib import Path
+
 from jaxhil.mechanism.file import load_any
+
+WIDE = Path(__file__).parent / "data" / "wide_ranges"  # files of the built-ins with wide ranges and noise
 
 OFFSETS = {"ring-capture": 0.01, "probe-drogue": 0.05}  # m; for larger offsets the ring misses the hooks
 ATTITUDES = {"ring-capture": 0.005, "hydraulic-hexapod": 0.015}  # rad
 NOISE = {"force": 0.5, "torque": 0.05}  # N, N m
 POSE_NOISE = {"translation": 5e-6, "rotation": 1e-5}  # m, rad
+
+
+def load_wide(name):
+    """Return a built-in with the ranges and the noise of its file in `WIDE`."""
+    return load_any(WIDE / f"{name}.toml").mechanism
 
 
 def uniform(size, middle=0.0, **more):
