@@ -89,7 +89,8 @@ class Reference:
         assert math.isfinite(command)
         if where is None:
             # The drive position is unknown, so the command must be out of contact.
-            assert abs(deflection(command, self.clearance)) <= most or limits["command_lowest"] > 0.0
+            out_of_contact = abs(deflection(command, self.clearance)) <= most
+            assert out_of_contact or not limits["command_lowest"] <= 0.0 <= limits["command_highest"]
         else:
             assert abs(command - where) <= far * (1 + 1e-9) + 1e-14 * abs(where)
             low, high = limits["command_lowest"], limits["command_highest"]

@@ -119,8 +119,8 @@ def test_interrupted_rig_command_reports_measurements_so_far(tmp_path):
         seen.append(line)
         if "empty loop" in line:
             break
-    # Interrupt during the empty loop: the run is never reached.
-    time.sleep(0.5)
+    # Interrupt during the empty loop of 12 s: the run is never reached.
+    time.sleep(3.0)
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=60)
     assert process.returncode == 130, (seen, error)
