@@ -196,8 +196,9 @@ def front_plot(front: ParetoFront, result: TuneResult, limit: float) -> Figure:
     _set_log_scale(axes, "x", [point.cost for point in (*front.points, front.literature, front.tuned)])
     _set_log_scale(axes, "y", [point.error for point in (*front.points, front.literature, front.tuned)])
     axes.margins(0.08, 0.12)
-    name = result.settings.objective.name
-    axes.set(xlabel=f"{front.axis.words} [1]", ylabel=f"{name} of the {_error_name(result)} [1]")
+    name, error = result.settings.objective.name, _error_name(result)
+    error = "e - e*" if error == "restitution error" else f"the {error}"
+    axes.set(xlabel=f"{front.axis.words} [1]", ylabel=f"{name} of {error} [1]")
     finish_axes(axes, "best")
     return figure
 
