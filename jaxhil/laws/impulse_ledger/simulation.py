@@ -58,7 +58,7 @@ GAINS: tuple[Gain, ...] = (
     _prior("force_noise_floor", 2e-3, 10.0, 0.011, lambda m: not m.rig.force_sensor.noise_std),
     _prior("prior_stiffness", 0.1, 1e3, 10.0, lambda m: False),
     _prior("prior_stiffness_spread", 1.0, 1e3, 80.0),
-    _prior("prior_slope_spread", 1.0, 1e3, 120.0),
+    _prior("prior_slope_spread", 1.0, 1e3, 200.0),
     _prior("prior_damping_spread", 0.01, 20.0, 1.0),
     _prior("prior_depth_damping_spread", 1e-3, 20.0, 0.15),
     rig_gain(
