@@ -153,10 +153,17 @@ class Axis:
         return np.array([state[0], state[1], (self.flow @ state)[1]])
 
 
-def on_the_rig(case, ticks):
-    """Return the bodies of the numerical model after the given number of ticks."""
+def on_the_rig(case, ticks, controller=None):
+    """Return the bodies of the numerical model after the given number of ticks.
+
+    A controller's `step(wrench, pose, twist, measured)` changes the wrench, and its
+    `pose_command(pose, twist)` the command; `leads` are the times by which it leads the coordinates before
+    the first tick.
+    """
     bodies, period = case["start"], case["period"]
     at, rates = command(case, bodies)
+    if controller is not None:
+        at = at + controller.leads * rates
     axes = [
         Axis(*numbers, period, x, rate)
         for *numbers, x, rate in zip(case["frequency"], case["ratio"], at, rates, strict=True)
@@ -174,10 +181,25 @@ def on_the_rig(case, ticks):
         if case["tool"] is not None:
             measured, *_ = seen(tick * period, case["position_delay"])
             force, moment = sensor_reading(case, x, rotation, w, rate, bend, force, moment, measured)
+        if controller is not None:
+            measured, *_ = seen(tick * period, case["position_delay"])
+            result = controller.step(
+                [*force, *moment], *coordinates_and_twist(case, bodies), measured.tolist()
+            )
+            force, moment = np.array(result[:3]), np.array(result[3:])
         bodies = moved(case, bodies, force, moment)
-        for axis, value in zip(axes, command(case, bodies)[0], strict=True):
+        sent = command(case, bodies)[0]
+        if controller is not None:
+            sent = controller.pose_command(*coordinates_and_twist(case, bodies))
+        for axis, value in zip(axes, sent, strict=True):
             axis.send(value)
     return bodies
+
+
+def coordinates_and_twist(case, bodies):
+    """Return the coordinates of frame C in frame T, and the twist, six numbers each."""
+    _, _, v, w, *_ = relative(case, bodies)
+    return command(case, bodies)[0].tolist(), [*v.tolist(), *w.tolist()]
 
 
 def sensor_reading(case, x, rotation, w, rate, bend, force, moment, measured):

@@ -11,7 +11,6 @@ arithmetic: Parker, Pierce and Eggert 2000).
 
 import functools
 import math
-import random
 from typing import NamedTuple
 
 import jax
@@ -22,6 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from jax import lax
+from jittered import Jittered
 
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.simulation_base import KnownConstants, Signals
@@ -101,28 +101,6 @@ def lane_replays(name: str, readings: Readings, ticks: list[int] | None = None) 
         gain_file = GainFile(name, gains, period, clearance, UNLIMITED)
         lanes.append(replay_lane(LaneRecord(signals, command[:end, lane], seen, False), gain_file))
     return lanes
-
-
-class Jittered(float):
-    """Float whose results are randomly rounded to a neighbouring value."""
-
-    generator = random.Random(0)
-
-
-def _jittered(operation):
-    def operate(self, other):
-        if isinstance(other, np.ndarray):
-            return NotImplemented
-        towards = Jittered.generator.choice((-math.inf, None, math.inf))
-        result = operation(float(self), float(other))
-        # A result of 0 is exact.
-        return Jittered(result if towards is None or result == 0 else math.nextafter(result, towards))
-
-    return operate
-
-
-for _name in ("add", "radd", "sub", "rsub", "mul", "rmul", "truediv", "rtruediv"):
-    setattr(Jittered, f"__{_name}__", _jittered(getattr(float, f"__{_name}__")))
 
 
 def rounding_spread(name: str, readings: Readings, lane: int, ticks: int) -> float:

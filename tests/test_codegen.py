@@ -462,3 +462,40 @@ def test_c99_output_is_deterministic():
         return tuple(program.output())
 
     assert text() == text() and math.isfinite(len(text()[1]))
+
+
+class Constants(NamedTuple):
+    """Record of which a function uses some fields, in another order."""
+
+    first: float
+    rows: Annotated[list[list[float]], 2, 3]
+    last: Annotated[list[float], 3]
+
+
+def weighed(constants: Constants, a: float) -> float:
+    _, middle, _ = constants.last
+    return a * middle + constants.rows[1][2]
+
+
+@needs_compiler
+def test_c99_record_has_all_fields_in_order_and_unused_names_are_left_out(tmp_path):
+    program = CProgram("test_", public={weighed: "test_weighed"})
+    program.add(weighed)
+    code = program.output()
+    fields = "double first;\n    double rows[2][3];\n    double last[3];"
+    assert fields in code.declarations and "double _" not in code.definitions
+    library = compiled(tmp_path, program)
+
+    class Struct(ctypes.Structure):
+        _fields_ = (
+            ("first", ctypes.c_double),
+            ("rows", ctypes.c_double * 3 * 2),
+            ("last", ctypes.c_double * 3),
+        )
+
+    values = Constants(1.0, [[2.0, 3.0, 4.0], [5.0, 6.0, 7.0]], [8.0, 9.0, 10.0])
+    rows = (ctypes.c_double * 3 * 2)(*((ctypes.c_double * 3)(*row) for row in values.rows))
+    library.test_weighed.restype = ctypes.c_double
+    library.test_weighed.argtypes = (Struct, ctypes.c_double)
+    packed = Struct(values.first, rows, (ctypes.c_double * 3)(*values.last))
+    assert library.test_weighed(packed, 0.3) == weighed(values, 0.3)

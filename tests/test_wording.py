@@ -62,7 +62,9 @@ def test_variables_have_no_meaningless_names(package):
 def concept(path: Path) -> str:
     """Return the concept of a file's classes; variants of a concept may share class names."""
     relative = path.relative_to(ROOT).as_posix()
-    if relative.startswith("jaxhil/laws/") or relative in ("jaxhil/rig/filters.py", "jaxhil/rig/registry.py"):
+    if relative.startswith("jaxhil/laws/") or re.fullmatch(
+        r"jaxhil/rig/(six_axes/)?(filters|registry)\.py", relative
+    ):
         return "compensator"
     if relative.startswith(("jaxhil/sixdof/", "jaxhil/mechanism/", "jaxhil/simulation/")):
         return "rig model"

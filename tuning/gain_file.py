@@ -56,7 +56,7 @@ def build_document(
         "schema": SCHEMA,
         "compensator": compensator,
         "gains": {gain.name: _gain_entry(gain, gains[gain.name], mechanism) for gain in law},
-        **({"axes": 6} if isinstance(mechanism, SixAxisMechanism) else {}),
+        **_six_axis_entries(mechanism),
         "control_period": mechanism.rig.control_period,
         "mechanism": to_plain_data(mechanism),
         "mechanism_sha256": mechanism_sha256,
@@ -68,6 +68,15 @@ def build_document(
         "timings": to_json_data(timings),
     }
     return {**document, "sha256": digest(document)}
+
+
+def _six_axis_entries(mechanism: AnyMechanism) -> dict[str, Any]:
+    """Return the entries that only a gain file in six axes has."""
+    if not isinstance(mechanism, SixAxisMechanism):
+        return {}
+    from jaxhil.sixdof.model_constants import model_constants
+
+    return {"axes": 6, "constants": model_constants(mechanism)}
 
 
 def write_gain_file(path: str | os.PathLike[str], document: Mapping[str, Any]) -> None:

@@ -112,7 +112,11 @@ class StructLowering:
         if hinted is None:
             found = f"{name} of {type_.of.__name__}, which has no known type"
             raise body.refuse(node, found, "an assignment in `__init__`, or an annotation in the class")
-        return self.fields.setdefault(type_.of, {}).setdefault(name, hinted)
+        fields = self.fields.setdefault(type_.of, {})
+        # A record has all its fields, in order, because its initialisers name none.
+        for other in getattr(type_.of, "_fields", ()):
+            fields.setdefault(other, type_of_annotation(hints[other], self.bindings) or hinted)
+        return fields.setdefault(name, hinted)
 
     def known_field(self, body: "Lowering", owner: CExpression, target: ast.Attribute) -> CExpression | None:
         """Return the C expression for an attribute; None if the type of the attribute is not yet known."""

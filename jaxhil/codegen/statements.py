@@ -93,6 +93,8 @@ class BodyLowering(CallLowering):
             found = f"{len(target.elts)} targets for {len(values)} values"
             raise self.refuse(node, found, "as many targets as values")
         for element, value in zip(target.elts, values, strict=True):
+            if getattr(element, "id", "") == "_":
+                continue
             if value.type.kind in ("object", "list") and isinstance(element, ast.Name):
                 self._alias(node, element, value)
             else:

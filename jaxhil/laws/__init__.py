@@ -1,9 +1,10 @@
 """Compensators, one folder each: `simulation.py` is the JAX version, `rig.py` the class that the rig runs.
 
-`simulation_six_axes.py` is the JAX version for six axes of motion; a folder may contain it alone, or in
-addition to the files for one axis. The files define which compensators exist; there is no list of names. Each
-JAX file assigns the compensator to `COMPENSATOR`, and `rig.py` registers its class with `@register(NAME)`.
-The folder `shared` contains parts that several compensators use. Importing this package, or any `rig.py`,
+`simulation_six_axes.py` and `rig_six_axes.py` are the versions for six axes of motion; a folder may contain
+them alone, or in addition to the files for one axis. The files define which compensators exist; there is no
+list of names. Each JAX file assigns the compensator to `COMPENSATOR`. `rig.py` registers its class with
+`@register(NAME)`, and `rig_six_axes.py` with `@register_six_axes(NAME)`. The folder `shared` contains parts
+that several compensators use. Importing this package, or any file of the rig,
 does not import JAX.
 """
 

@@ -12,6 +12,7 @@ from math import isfinite, nan
 from typing import Any
 
 from jaxhil.rig.clock import Clock
+from jaxhil.rig.conversion import as_float
 from jaxhil.rig.errors import format_value, make_gain_file_error
 from jaxhil.rig.faults import (
     CLOCK,
@@ -200,7 +201,7 @@ class Controller:
         """
         if self.cause:
             return True
-        over = self._tare.take(force_measured if type(force_measured) is float else _float(force_measured))
+        over = self._tare.take(force_measured if type(force_measured) is float else as_float(force_measured))
         if self._tare.fatal:
             self._fail(TARE, f"reading {force_measured!r}")
         return over
@@ -227,19 +228,19 @@ class Controller:
         forces, inputs = self._forces, self._inputs
         self.faults = 0
         # The rig usually passes floats: to skip their conversion saves time.
-        measured = position_measured if type(position_measured) is float else _float(position_measured)
+        measured = position_measured if type(position_measured) is float else as_float(position_measured)
         inputs.locate(measured)
         if self.cause:
             forces.fade()
             return forces.output
         faults = fatal = 0
         if time is not None:
-            faults = self._clock.tick(time if type(time) is float else _float(time))
+            faults = self._clock.tick(time if type(time) is float else as_float(time))
             if self._clock.fatal:
                 fatal = faults
-        reading = force_measured if type(force_measured) is float else _float(force_measured)
-        position = position_desired if type(position_desired) is float else _float(position_desired)
-        velocity = velocity_desired if type(velocity_desired) is float else _float(velocity_desired)
+        reading = force_measured if type(force_measured) is float else as_float(force_measured)
+        position = position_desired if type(position_desired) is float else as_float(position_desired)
+        velocity = velocity_desired if type(velocity_desired) is float else as_float(velocity_desired)
         faults |= inputs.check(reading, position, velocity, measured, self._tare.bias)
         fatal |= inputs.fatal
         law, watchdog = self._law, self._watchdog
@@ -283,10 +284,10 @@ class Controller:
         """
         positions, inputs = self._positions, self._inputs
         measured = inputs.located
-        position = position if type(position) is float else _float(position)
+        position = position if type(position) is float else as_float(position)
         if not self.cause:
-            velocity = velocity if type(velocity) is float else _float(velocity)
-            acceleration = acceleration if type(acceleration) is float else _float(acceleration)
+            velocity = velocity if type(velocity) is float else as_float(velocity)
+            acceleration = acceleration if type(acceleration) is float else as_float(acceleration)
             command = self._sent(position, velocity, acceleration)
             faults = positions.limit(command, position, measured, inputs.is_located)
             self.faults |= faults
@@ -375,14 +376,6 @@ class Controller:
         self.seen |= self.faults
 
 
-def _float(value: Any) -> float:
-    """Convert the value to a float; return NaN if this is not possible."""
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        return nan
-
-
 READING_NAMES = "time", "force_measured", "position_desired", "velocity_desired", "position_measured"
 
 
@@ -396,6 +389,6 @@ def _detail(fatal: int, watchdog: Watchdog, values: tuple[Any, ...]) -> str:
             for item in zip(READING_NAMES, values, strict=True)
             if item[1] is not None or item[0] != "time"
         )
-        invalid = (item for item in items if not isfinite(_float(item[1])))
+        invalid = (item for item in items if not isfinite(as_float(item[1])))
         return ", ".join(f"{name} is {format_value(value)}" for name, value in invalid)
     return ""

@@ -6,6 +6,7 @@ Documentation, exports and error texts are made from `FAULTS`. The bits are the 
 A *trip* is latched until `reset`: the force ramps to 0 and the position command comes to rest out of contact.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 
@@ -43,46 +44,46 @@ LAW_IN_DOUBT = 0x200000
 EARLY_TICK = 0x400000
 UNUSABLE = 1 << 30  # only in C: gains or limits are invalid; Python raises an error instead
 
-_BRIDGED = "the last good reading is used; more than `held_readings` successive bad readings trip"
-_BRIDGED_AFTER_FIRST = f"{_BRIDGED}, and so does a bad reading on a run's first tick"
-_TRIPS = "trips"
+BRIDGED = "the last good reading is used; more than `held_readings` successive bad readings trip"
+BRIDGED_AFTER_FIRST = f"{BRIDGED}, and so does a bad reading on a run's first tick"
+TRIPS = "trips"
 
 FAULTS = (
-    Fault(FORCE_NOT_FINITE, "force_not_finite", "the measured force is not a finite number", _BRIDGED),
+    Fault(FORCE_NOT_FINITE, "force_not_finite", "the measured force is not a finite number", BRIDGED),
     Fault(
         POSITION_NOT_FINITE,
         "position_not_finite",
         "the measured position is not a finite number",
-        _BRIDGED_AFTER_FIRST,
+        BRIDGED_AFTER_FIRST,
     ),
     Fault(
         MODEL_NOT_FINITE,
         "model_not_finite",
         "the numerical model's position, velocity or acceleration is not a finite number",
-        _TRIPS,
+        TRIPS,
     ),
     Fault(
-        FORCE_OUT_OF_RANGE, "force_out_of_range", "the measured force is at or beyond `force_range`", _BRIDGED
+        FORCE_OUT_OF_RANGE, "force_out_of_range", "the measured force is at or beyond `force_range`", BRIDGED
     ),
     Fault(
         POSITION_OUT_OF_RANGE,
         "position_out_of_range",
         "the measured position is outside `measured_lowest` to `measured_highest`",
-        _BRIDGED_AFTER_FIRST,
+        BRIDGED_AFTER_FIRST,
     ),
     Fault(
         FORCE_STUCK,
         "force_stuck",
         "in contact, the force reading has not changed by a bit while the measured position moved by more "
         "than `force_stuck_travel` (with a force of 0: moved deeper by more than this travel)",
-        _TRIPS,
+        TRIPS,
     ),
     Fault(
         POSITION_STUCK,
         "position_stuck",
         "the position reading has not changed by a bit while the numerical model moved by more than "
         "`position_stuck_travel`",
-        _TRIPS,
+        TRIPS,
     ),
     Fault(
         FORCE_IN_FLIGHT,
@@ -110,16 +111,16 @@ FAULTS = (
         "clock",
         "the tick's time is not finite or not later than the last tick's; or within about 100 ticks (with "
         "missed ticks) the time has drifted by more than 1.5 periods from the number of ticks",
-        _TRIPS,
+        TRIPS,
     ),
-    Fault(FORCE_LIMIT, "force_limit", "the compensated force is beyond `force_limit`", _TRIPS),
+    Fault(FORCE_LIMIT, "force_limit", "the compensated force is beyond `force_limit`", TRIPS),
     Fault(
         FORCE_SLEW,
         "force_slew",
         "the compensated force changes faster than `force_slew`",
         "the change is limited; more than `limited_in_a_row` successive limited changes trip",
     ),
-    Fault(STROKE, "stroke", "the position command is outside `command_lowest` to `command_highest`", _TRIPS),
+    Fault(STROKE, "stroke", "the position command is outside `command_lowest` to `command_highest`", TRIPS),
     Fault(
         VELOCITY_LIMIT,
         "velocity_limit",
@@ -127,34 +128,34 @@ FAULTS = (
         "the change is limited; more than `limited_in_a_row` successive limited changes trip, except while "
         "the command approaches the numerical model at the beginning of a run and after `reset`",
     ),
-    Fault(COMMAND_NOT_FINITE, "command_not_finite", "the compensated force is not a finite number", _TRIPS),
+    Fault(COMMAND_NOT_FINITE, "command_not_finite", "the compensated force is not a finite number", TRIPS),
     Fault(
         RESTITUTION,
         "restitution",
         "watchdog: a contact's restitution differs from the expected restitution by more than "
         "`restitution_margin`",
-        _TRIPS,
+        TRIPS,
     ),
     Fault(
         ENERGY_BALANCE,
         "energy_balance",
         "watchdog: during a contact, the change of the numerical model's kinetic energy differs from the "
         "work of the controller's force: the model integrates a different force",
-        _TRIPS,
+        TRIPS,
     ),
     Fault(
         CONTACT_TOO_LONG,
         "contact_too_long",
         "watchdog: a contact has lasted longer than `longest_contact`",
-        _TRIPS,
+        TRIPS,
     ),
-    Fault(EMERGENCY_STOP, "emergency_stop", "the rig has called `emergency_stop(True)`", _TRIPS),
+    Fault(EMERGENCY_STOP, "emergency_stop", "the rig has called `emergency_stop(True)`", TRIPS),
     Fault(
         TARE,
         "tare",
         "the force readings of a tare are not finite, differ by more than `tare_spread`, or have a mean "
         "beyond `bias_limit`",
-        _TRIPS,
+        TRIPS,
     ),
     Fault(
         LAW_IN_DOUBT,
@@ -173,6 +174,6 @@ FAULTS = (
 )
 
 
-def fault_names(bits: int) -> list[str]:
-    """Return the names of the faults whose bits are set."""
-    return [fault.name for fault in FAULTS if bits & fault.bit]
+def fault_names(bits: int, faults: Sequence[Fault] = FAULTS) -> list[str]:
+    """Return the names of the faults whose bits are set; `faults` are those of the controller."""
+    return [fault.name for fault in faults if bits & fault.bit]

@@ -5,7 +5,7 @@ set a limit beyond its bounds. A limit that is missing or null has its default, 
 widest value that the bounds allow (`bounds`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ HELD_READINGS = 0.0, 1000.0  # successive ticks
 TICK_COUNTS = 0.0, 1e6  # ticks; the upper bound exceeds the longest gap that the clock counts
 # [1]; ratios of energies or restitutions. No ratio reaches the upper bound, even in a very slow approach.
 RATIOS = 0.0, 1e300
-FEATURES = -1e3, 1e3  # [1]; p, w and z of the expected restitution (`watchdog`)
+FEATURE_BOUNDS = -1e3, 1e3  # [1]; p, w and z of the expected restitution (`watchdog`)
 COEFFICIENTS = -1e9, 1e9  # [1]; coefficients of the polynomial in p, w and z
 
 
@@ -92,12 +92,12 @@ LIMITS: dict[str, Limit] = {
     "alignment": Limit("s", 0.0, *TIMES, "delay of the force reading relative to the position reading"),
     "reference_stiffness": Limit("N/m", 1.0, 1e-3, STIFFNESSES[1], "stiffness at which softness p is 0"),
     "reference_velocity": Limit("m/s", 1.0, 1e-6, SPEEDS[1], "approach speed at which speed w is 0"),
-    "softness_lowest": Limit("1", 0.0, *FEATURES, "lower bound of the softness p"),
-    "softness_highest": Limit("1", 0.0, *FEATURES, "upper bound of the softness p"),
-    "speed_lowest": Limit("1", 0.0, *FEATURES, "lower bound of the relative speed w"),
-    "speed_highest": Limit("1", 0.0, *FEATURES, "upper bound of the relative speed w"),
-    "loss_lowest": Limit("1", 0.0, *FEATURES, "lower bound of the damping ratio z"),
-    "loss_highest": Limit("1", 0.0, *FEATURES, "upper bound of the damping ratio z"),
+    "softness_lowest": Limit("1", 0.0, *FEATURE_BOUNDS, "lower bound of the softness p"),
+    "softness_highest": Limit("1", 0.0, *FEATURE_BOUNDS, "upper bound of the softness p"),
+    "speed_lowest": Limit("1", 0.0, *FEATURE_BOUNDS, "lower bound of the relative speed w"),
+    "speed_highest": Limit("1", 0.0, *FEATURE_BOUNDS, "upper bound of the relative speed w"),
+    "loss_lowest": Limit("1", 0.0, *FEATURE_BOUNDS, "lower bound of the damping ratio z"),
+    "loss_highest": Limit("1", 0.0, *FEATURE_BOUNDS, "upper bound of the damping ratio z"),
     "expected_1": Limit("1", 1.0, *COEFFICIENTS, "expected restitution at p = w = z = 0"),
     **{
         f"expected_{term}": Limit(
@@ -108,17 +108,37 @@ LIMITS: dict[str, Limit] = {
 }
 
 
+# Pairs of limits of which the first is below the second, or not above it.
+RANGES = (("measured_lowest", "measured_highest"), ("command_lowest", "command_highest"))
+ORDER = (("retreat_velocity", "velocity_limit"),)
+
+
 def complete_limits(limits: Mapping[str, float]) -> dict[str, float]:
     """Add the defaults of missing limits. Raise ValueError if two limits contradict each other."""
-    values = {name: limits.get(name, limit.default) for name, limit in LIMITS.items()}
-    for low, high in (("measured_lowest", "measured_highest"), ("command_lowest", "command_highest")):
+    return complete_limit_table(limits, LIMITS, RANGES, ORDER)
+
+
+def complete_limit_table(
+    limits: Mapping[str, float],
+    table: Mapping[str, Limit],
+    ranges: Sequence[tuple[str, str]],
+    order: Sequence[tuple[str, str]],
+) -> dict[str, float]:
+    """Add the defaults of missing limits to those of a table. Raise ValueError if two limits contradict.
+
+    Args:
+        limits: limits that have been set, by name.
+        table: all limits by name.
+        ranges: pairs of limits of which the first is below the second.
+        order: pairs of limits of which the first is not above the second.
+    """
+    values = {name: limits.get(name, limit.default) for name, limit in table.items()}
+    for low, high in ranges:
         if not values[low] < values[high]:
             raise ValueError(f"{low} {values[low]!r} is not below {high} {values[high]!r}")
-    if values["retreat_velocity"] > values["velocity_limit"]:
-        raise ValueError(
-            f"retreat_velocity {values['retreat_velocity']!r} is above velocity_limit "
-            f"{values['velocity_limit']!r}"
-        )
+    for low, high in order:
+        if values[low] > values[high]:
+            raise ValueError(f"{low} {values[low]!r} is above {high} {values[high]!r}")
     return values
 
 

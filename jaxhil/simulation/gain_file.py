@@ -22,6 +22,8 @@ from jaxhil.rig import GainFileError
 from jaxhil.rig.gain_file import check_gain_document, read_gain_document
 from jaxhil.rig.registry import COMPENSATORS as RUNTIME_COMPENSATORS
 from jaxhil.rig.registry import GainSpecification
+from jaxhil.rig.six_axes import SIX_AXIS_COMPENSATORS as RUNTIME_SIX_AXIS_COMPENSATORS
+from jaxhil.rig.six_axes.gain_file import check_six_axis_document
 
 # [1]; relative tolerance of bounds, which other machines may round differently
 BOUND_TOLERANCE = 1e-9
@@ -68,6 +70,8 @@ def check_document(
         checked = check_gain_document(
             document, source, _gains_without_runtime(axes), (1, 6) if any_axes else (1,)
         )
+        if axes == 6 and checked.compensator in RUNTIME_SIX_AXIS_COMPENSATORS:
+            check_six_axis_document(document, source)
     except GainFileError as error:
         raise InputError(str(error)) from None
     for key, (fits, allowed) in _REQUIRED_KEYS.items():

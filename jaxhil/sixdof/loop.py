@@ -73,6 +73,8 @@ class Loop(eqx.Module):
     # whether the force sensor has a quantum, a dead zone or a range
     has_sample_effects: bool = eqx.field(static=True, default=True)
     has_pose_errors: bool = eqx.field(static=True, default=False)  # whether the pose has noise or a quantum
+    # whether the pose is measured even if neither the sensor's tool nor the compensator needs it
+    measures_pose: bool = eqx.field(static=True, default=False)
     # length of the compensator's own delay line [control periods], a power of two
     controller_ring: int = eqx.field(static=True, default=1)
     # name of the compensator, one of `SIX_AXIS_COMPENSATORS`
@@ -128,7 +130,21 @@ class Tick(NamedTuple):
     contact: Wrench  # wrench of contacts and latches at the sampling instant
     forces: tuple[Forces, ...]  # contact forces of each group at the sampling instant
     held: tuple[Held, ...]  # states of the latches
+    signals: SixAxisSignals  # inputs of the compensator
     command: Wrench  # wrench command, which acts on the numerical model
+    sent: Float[Array, "6 *batch"]  # pose command after the tick [m, rad]
+
+
+class Sensed(NamedTuple):
+    """Real contact and sensor readings of a tick."""
+
+    motion: Moving  # motion of the hardware at the force sensor's sampling instant
+    contact: Wrench  # wrench of contacts and latches at the sampling instant
+    forces: tuple[Forces, ...]  # contact forces of each group at the sampling instant
+    memories: tuple[Memory, ...]  # next states of the contact laws
+    held: tuple[Held, ...]  # next states of the latches
+    lag: tuple[Wrench, Wrench] | None  # next state of the force sensor's lag
+    signals: SixAxisSignals  # inputs of the compensator
 
 
 def build_loop(scenario: Scenario, **static: Any) -> Loop:
@@ -165,7 +181,7 @@ def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
         period,
         loop.hold,
         has_tool,
-        has_tool or law.reads_pose,
+        has_tool or law.reads_pose or loop.measures_pose,
     )
     full = {name: jnp.zeros_like(period) + value for name, value in gains.items()}
     constants = controller_constants(scenario, has_tool)
@@ -236,6 +252,32 @@ def run(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[RunSt
 
 def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
     """Simulate one control period; return the next state and the record of the tick."""
+    sensed, law = sense(loop, rig, state), SIX_AXIS_COMPENSATORS[loop.compensator]
+    # The compensator of a sensor without a tool is given the measured pose only if it reads it.
+    signals = sensed.signals
+    signals = signals if law.reads_pose else signals._replace(pose_measured=None)
+    commands, law_state = law.step(rig.prepared, state.controller.law, signals, state.tick)
+    command = jax.tree.unflatten(jax.tree.structure(sensed.contact), commands)
+    states, position, rates, twist = integrate(loop, rig, state, command)
+    sent = law.pose_command(rig.gains, position, rates)
+    after = actuated(loop, rig, state, sensed, (states, position, twist), sent)
+    seen = Tick(
+        states=state.states,
+        pose=sensed.motion.pose,
+        twist=sensed.motion.twist,
+        contact=sensed.contact,
+        forces=sensed.forces,
+        held=sensed.held,
+        signals=sensed.signals,
+        command=command,
+        sent=sent,
+    )
+    controller = NumericalController(sensed.lag, law_state)
+    return after._replace(controller=controller), seen
+
+
+def sense(loop: Loop, rig: Rig, state: RunState) -> Sensed:
+    """Return the real contact at a tick, and the readings of force sensor and position sensor."""
     samples = sampled(rig.axes, state.hardware, state.tick)
     motion = moving(rig.kinematics.coordinates(samples.motion, state.near))
     pose, twist, _ = motion
@@ -246,25 +288,56 @@ def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
         contact = jax.tree.map(jnp.add, contact, latch_force)
         latched.append(latch_state)
     measured = None if samples.measured is None else _measured_pose(loop, rig, state, samples.measured)
-    command, controller = _control(loop, rig, state, contact, motion, measured)
-    states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
-    position, rates, model_twist = model_motion(rig.bodies, states)
-    sent = rig.kinematics.command(
-        SIX_AXIS_COMPENSATORS[loop.compensator].pose_command(rig.gains, position, rates)
+    wrench, lag = _measured_wrench(loop, rig, state, contact, motion, measured)
+    first = 0 if rig.kinematics.is_linear else SETTLING_TICKS
+    signals = SixAxisSignals(
+        wrench=tuple(jax.tree.leaves(wrench)),
+        pose_desired=state.near,
+        twist_desired=state.twist,
+        pose_measured=measured,
+        age=jnp.zeros(rig.period.shape, jnp.int32) + (state.tick - first),
     )
-    hardware = actuate(rig.axes, state.hardware, state.tick, sent, loop.hold, loop.latency)
-    seen = Tick(state.states, pose, twist, contact, forces, tuple(latched), command)
-    after = RunState(
+    return Sensed(motion, contact, forces, memories, tuple(latched), lag, signals)
+
+
+def integrate(loop: Loop, rig: Rig, state: RunState, command: Wrench) -> tuple[States, Array, Array, Array]:
+    """Return the numerical model's next states, their coordinates with rates, and twist (6, *batch)."""
+    states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
+    return states, *model_motion(rig.bodies, states)
+
+
+def actuated(
+    loop: Loop,
+    rig: Rig,
+    state: RunState,
+    sensed: Sensed,
+    model: tuple[States, Array, Array],
+    sent: Float[Array, "6 *batch"],
+) -> RunState:
+    """Return the state after a tick, with the compensator's old state.
+
+    Args:
+        loop: structure of the loop.
+        rig: constants of the run.
+        state: state before the tick.
+        sensed: real contact and readings of the tick.
+        model: next states of the numerical model, their coordinates and twist.
+        sent: pose command [m, rad].
+    """
+    states, position, twist = model
+    hardware = actuate(
+        rig.axes, state.hardware, state.tick, rig.kinematics.command(sent), loop.hold, loop.latency
+    )
+    return RunState(
         states=states,
         near=position,
-        twist=model_twist,
+        twist=twist,
         hardware=hardware,
-        memories=memories,
-        held=tuple(latched),
-        controller=controller,
+        memories=sensed.memories,
+        held=sensed.held,
+        controller=state.controller._replace(lag=sensed.lag),
         tick=state.tick + 1,
     )
-    return after, seen
 
 
 def model_motion(bodies: Pair, states: States) -> tuple[Array, Array, Array]:
@@ -305,10 +378,10 @@ def _measured_pose(loop: Loop, rig: Rig, state: RunState, measured: Array) -> Ar
     return quantise(noisy, rig.sensor.position_quantum)
 
 
-def _control(
+def _measured_wrench(
     loop: Loop, rig: Rig, state: RunState, contact: Wrench, motion: Moving, measured: Array | None
-) -> tuple[Wrench, NumericalController]:
-    """Simulate force sensor and compensator; return the wrench command and the next states of both."""
+) -> tuple[Wrench, tuple[Wrench, Wrench] | None]:
+    """Return the measured wrench about T's origin, and the next state of the sensor's lag."""
     sensor, last = rig.sensor, state.controller
     if motion.acceleration is None:
         raw = read_fixed(contact, sensor.mounting)
@@ -320,25 +393,13 @@ def _control(
     reading = sample(lagged, sensor.errors, noise, loop.has_sample_effects)
     unbiased: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
     if motion.acceleration is None:
-        contact = undo_fixed(unbiased, sensor.mounting)
+        wrench = undo_fixed(unbiased, sensor.mounting)
     else:
         assert measured is not None
         pose = Pose(vector(measured[:3]), exponential(vector(measured[3:])))
         load = weight(sensor.assumed_tool, pose.attitude, sensor.assumed_gravity)
-        contact = undo_moving(unbiased, load, pose)
-    forces, structure = jax.tree.flatten(contact)
-    law = SIX_AXIS_COMPENSATORS[loop.compensator]
-    first = 0 if rig.kinematics.is_linear else SETTLING_TICKS
-    signals = SixAxisSignals(
-        wrench=tuple(forces),
-        pose_desired=state.near,
-        twist_desired=state.twist,
-        pose_measured=measured if law.reads_pose else None,
-        age=jnp.zeros(rig.period.shape, jnp.int32) + (state.tick - first),
-    )
-    commands, law_state = law.step(rig.prepared, last.law, signals, state.tick)
-    command = structure.unflatten(commands)
-    return command, NumericalController(None if last.lag is None else (raw, lagged), law_state)
+        wrench = undo_moving(unbiased, load, pose)
+    return wrench, None if last.lag is None else (raw, lagged)
 
 
 def _lagged_reading(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:

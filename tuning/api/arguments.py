@@ -276,11 +276,11 @@ def find_gain_file(value: Any, argument: str = "gains") -> Path:
     return path
 
 
-def check_has_runtime(compensator: str) -> None:
+def check_has_runtime(compensator: str, axes: int = 1) -> None:
     """Raise `InputError` if the compensator was registered without a runtime class for the rig."""
-    from jaxhil.rig import COMPENSATORS
+    from tuning.bundle.controller_kind import kind_of
 
-    if compensator not in COMPENSATORS:
+    if compensator not in kind_of({"axes": axes}).compensators:
         raise InputError(
             f"{compensator}: found no runtime class for the rig, expected a compensator that was registered "
             "with a runtime class: jaxhil.register(compensator, runtime=...)"

@@ -11,6 +11,7 @@ from tyro.conf import arg
 
 from jaxhil.errors import format_value
 from jaxhil.rig.limits import LIMITS
+from jaxhil.rig.six_axes.limits import SIX_AXIS_LIMITS
 from jaxhil.simulation.jax_environment import jax_context
 from tuning import terminal
 from tuning.api import arguments
@@ -70,6 +71,7 @@ class ExportResult:
         return list(self.document["unknown"])
 
 
+ALL_LIMITS = {**SIX_AXIS_LIMITS, **LIMITS}  # of one axis and of six
 ProbabilityRange = AllowedValues(0.0, 1.0, words="0 to 1")
 
 
@@ -151,8 +153,10 @@ def export(
     check_bundle_folder(target)
     key = None if settings.sign is None else load_signer(arguments.check_path("sign", settings.sign))
     with jax_context():
-        loaded = arguments.load_gains(path)
-        arguments.check_has_runtime(loaded.compensator)
+        loaded = arguments.load_gains(path, any_axes=True)
+        axes = loaded.document.get("axes", 1)
+        arguments.check_has_runtime(loaded.compensator, axes)
+        _check_limit_names(user_limits, axes)
         check_same_mechanism(target, loaded.mechanism.name)
         format_names = _select_formats(formats)
         allowed = settings.false_alarms, settings.missed
@@ -207,6 +211,8 @@ def _calibrate_limits(
 
     `replaced` contains the limits that the user set; `allowed` contains the acceptable rates of both alarms.
     """
+    if loaded.document.get("axes", 1) == 6:
+        return _calibrate_six_axes(loaded, sweep, replaced, allowed, progress)
     from tuning.watchdog.calibration import DEFAULT_DRAWS, calibrate, count_stored_scenarios
     from tuning.watchdog.fault_injection import INJECTED_FAULTS, count_fault_scenarios
     from tuning.watchdog.verdict import AllowedAlarmRates
@@ -224,6 +230,30 @@ def _calibrate_limits(
                 progress=bar.advance,
                 faulty=faulty,
             )
+
+
+def _calibrate_six_axes(
+    loaded, sweep: Any, replaced: dict[str, float | None], allowed: tuple[float, float], progress: bool
+):
+    """Compute the limits in six axes, as `_calibrate_limits` does on one axis."""
+    from tuning.watchdog.six_axes import SIX_AXIS_DRAWS, calibrate_six_axes
+    from tuning.watchdog.verdict import AllowedAlarmRates
+
+    if sweep is not None:
+        raise ArgumentError("sweep", "a sweep", "none: limits in six axes are computed from fresh draws")
+    with terminal.show_progress(SIX_AXIS_DRAWS, "runs", progress) as bar:
+        bar.reach(0, "computing the limits")
+        return calibrate_six_axes(loaded, replaced, AllowedAlarmRates(*allowed), bar.advance)
+
+
+def _check_limit_names(limits: Mapping[str, Any], axes: int) -> None:
+    """Raise `InputError` if one of the limits is not a limit for so many axes."""
+    from tuning.bundle.controller_kind import kind_of
+
+    table = kind_of({"axes": axes}).limits
+    for name in limits:
+        if name not in table:
+            raise ArgumentError("limits", format_value(name), f"one of {', '.join(table)}")
 
 
 @contextmanager
@@ -247,16 +277,16 @@ def _parse_limits(limits: Any) -> dict[str, float | None]:
     if not isinstance(limits, Mapping):
         raise ArgumentError("limits", format_value(limits), "limits by name")
     for name, value in limits.items():
-        if name not in LIMITS:
+        if name not in ALL_LIMITS:
             raise ArgumentError("limits", format_value(name), f"one of {', '.join(LIMITS)}")
-        if value is not None and not (arguments.is_number(value) and LIMITS[name].admits(value)):
+        if value is not None and not (arguments.is_number(value) and ALL_LIMITS[name].admits(value)):
             raise ArgumentError("limits", format_value(value), allowed_values(name), name)
     return {name: None if value is None else float(value) for name, value in limits.items()}
 
 
 def allowed_values(name: str) -> str:
     """Return a text that describes the allowed values of the limit `name`."""
-    limit = LIMITS[name]
+    limit = ALL_LIMITS[name]
     return f"a finite number from {limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
 
 

@@ -129,15 +129,18 @@ def _verify_gains(gains: Any, document: dict[str, Any], scenarios: int, seed: in
     with jax_context():
         import msgspec
 
-        from tuning.verification.runtime_replay import verify
-
         try:
-            loaded = arguments.load_gains(gains)
+            loaded = arguments.load_gains(gains, any_axes=True)
         except InputError as error:
             return {**document, "verdict": False, "reasons": [str(error)]}
-        arguments.check_has_runtime(loaded.compensator)
+        axes = loaded.document.get("axes", 1)
+        arguments.check_has_runtime(loaded.compensator, axes)
+        if axes == 6:
+            from tuning.verification.six_axes import verify_six_axes as compare
+        else:
+            from tuning.verification.runtime_replay import verify as compare
         with terminal.show_stages(3, progress) as stages:
-            result = verify(loaded, scenarios, seed, stages.begin)
+            result = compare(loaded, scenarios, seed, stages.begin)
         return {**document, "mechanism": loaded.mechanism.name, **msgspec.to_builtins(result)}
 
 

@@ -23,9 +23,9 @@ from jaxhil.files import (
 )
 from jaxhil.rig import GainFileError, digest
 from jaxhil.rig.gain_file import read_gain_document
-from jaxhil.rig.limits import LIMITS
 from tuning.bundle import selftest
 from tuning.bundle.content import bundle_files
+from tuning.bundle.controller_kind import ONE_AXIS, kind_of
 from tuning.bundle.manifest import is_bundle
 from tuning.verification.stops import ControllerStop
 
@@ -72,19 +72,31 @@ def build_bundle(
         InputError: If the runtime refuses the limits, or the compensator does not support a format.
     """
     from jaxhil.simulation.gain_file import check_document
-    from tuning.bundle.vectors import format_csv, make_vectors
 
     exported = replace_limits(document, limits, rates)
-    loaded = check_document(exported)
+    loaded = check_document(exported, any_axes=True)
     progress("recording test vectors")
-    vectors = make_vectors(loaded, seed)
+    vectors, text = _make_vectors(loaded, seed)
     progress("writing the bundle")
-    files = bundle_files(exported, formats, format_csv(vectors.rows).encode("ascii"))
+    files = bundle_files(exported, formats, text.encode("ascii"))
     if sign is not None:
         files[selftest.SIGNATURE_FILE] = sign(files[selftest.MANIFEST_FILE])
     runs = len({row.run for row in vectors.rows})
     comparison = vectors.ended, vectors.reasons, vectors.stop, vectors.passing
     return Bundle(exported, files, len(vectors.rows), runs, *comparison)
+
+
+def _make_vectors(loaded: Any, seed: int) -> tuple[Any, str]:
+    """Return the test vectors of a gain file, and the text of vectors.csv."""
+    if kind_of(loaded.document) is ONE_AXIS:
+        from tuning.bundle.vectors import format_csv, make_vectors
+
+        vectors = make_vectors(loaded, seed)
+        return vectors, format_csv(vectors.rows)
+    from tuning.bundle.vectors_six_axes import format_six_axis_csv, make_six_axis_vectors
+
+    vectors = make_six_axis_vectors(loaded, seed)
+    return vectors, format_six_axis_csv(vectors.rows)
 
 
 def replace_limits(
@@ -100,13 +112,15 @@ def replace_limits(
     if limits is None:
         return dict(document)
     figures = {**document["figures"], **({"watchdog": rates} if rates else {})}
-    changed = {**document, "limits": build_limits_section(limits), "figures": figures}
+    axes = document.get("axes", 1)
+    changed = {**document, "limits": build_limits_section(limits, axes), "figures": figures}
     return {**changed, "sha256": digest(changed)}
 
 
-def build_limits_section(limits: Mapping[str, float | None]) -> dict[str, dict[str, Any]]:
+def build_limits_section(limits: Mapping[str, float | None], axes: int = 1) -> dict[str, dict[str, Any]]:
     """Return the section `limits` of a gain file, with value and unit of each limit by its name."""
-    return {name: {"value": value, "unit": LIMITS[name].unit} for name, value in limits.items()}
+    table = kind_of({"axes": axes}).limits
+    return {name: {"value": value, "unit": table[name].unit} for name, value in limits.items()}
 
 
 def check_bundle_folder(folder: Path) -> None:

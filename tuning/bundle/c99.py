@@ -16,43 +16,22 @@ from typing import Any
 
 from jaxhil.codegen import CProgram, SubsetError
 from jaxhil.errors import InputError, to_one_line
-from jaxhil.rig.controller import Controller
-from jaxhil.rig.faults import FAULTS
-from jaxhil.rig.gain_file import GainFile, check_gain_document
-from jaxhil.rig.inputs import Tare
 from jaxhil.rig.law_status import STATUSES, ContactCount
-from jaxhil.rig.limits import LIMITS
-from jaxhil.rig.registry import COMPENSATORS, Compensator
 from tuning.bundle.c99_tables import (
     UNUSABLE,
+    constants_check,
     faults_fragment,
     gain_file_constants,
     gains_fragment,
     limits_fragment,
     statuses_fragment,
 )
+from tuning.bundle.controller_kind import ONE_AXIS, ControllerKind, kind_of
 
 HEADER_FILE, SOURCE_FILE = "jaxhil_controller.h", "jaxhil_controller.c"
 GAINS_FILE, TEST_FILE = "jaxhil_gains.h", "test_vectors.c"
 COMPILER_FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 TEST_PROGRAM_FOLDER = resources.files("tuning") / "bundle"
-# Names in C of the controller's methods and properties, in the order of the header.
-PUBLIC_METHODS = {
-    "tare": "tare",
-    "step": "step",
-    "position_command": "position_command",
-    "emergency_stop": "emergency_stop",
-    "reset": "reset",
-    "next_contact": "next_contact",
-    "tripped": "tripped",
-    "at_rest": "at_rest",
-    "bias": "bias",
-    "missed_ticks": "missed_ticks",
-    "late_ticks": "late_ticks",
-    "force_delay": "force_delay",
-    "_status": "law_status",
-    "_last_count": "last_contact",
-}
 
 _DELAY_LINE_LENGTH = re.compile(r"\bJAXHIL_([A-Z0-9_]+)_SAMPLES\b")
 
@@ -62,7 +41,7 @@ _HEADER_TEMPLATE = """\
  * It is written in C99, allocates no memory, and uses no library but math.h. The caller owns the struct:
  *
  *     static jaxhil_controller controller;
- *     jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits);
+ *     jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits{exported});
  *
  * Compile with -ffp-contract=off, and never with -ffast-math or a part of it. Then the results equal those of
  * the Python runtime to the last bit, which test_vectors.c checks. The headers are also valid C++ (C++11).
@@ -137,11 +116,13 @@ _GAINS_TEMPLATE = """\
 
 
 _PROTOTYPES_TEMPLATE = """
-/* Initialise the controller with these gains and limits. Return false if a value is out of its range, or if a
+/* Initialise the controller with these {structs}. Return false if a value is out of its range, or if a
  * delay is longer than the delay lines of this code: the controller then stays tripped, with the cause
  * JAXHIL_UNUSABLE. */
-bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains, const jaxhil_limits *limits);
+bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains, const jaxhil_limits *limits{more});
+"""
 
+_IDENTIFIED_PROTOTYPE = """
 /* Get the identified stiffness [N/m] and damping [N s/m]; both are 0 without an identification. */
 void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, double *damping);
 """
@@ -154,30 +135,32 @@ static void jaxhil_clear(jaxhil_controller *controller) {{
     }}
 }}
 
-bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains, const jaxhil_limits *limits) {{
-    bool error = !(jaxhil_gains_admitted(gains) && jaxhil_limits_fit(limits));
+bool jaxhil_init(jaxhil_controller *controller, const jaxhil_gains *gains,
+                 const jaxhil_limits *limits{more}) {{
+    bool error = !(jaxhil_gains_admitted(gains) && jaxhil_limits_fit(limits){admitted});
     jaxhil_clear(controller);
     if (!error) {{
-        jaxhil_law_init(&controller->law, gains, gains->control_period, gains->clearance{law_error});
+        jaxhil_law_init(&controller->law, gains, {law_arguments}{law_error});
     }}
     if (!error) {{
-        jaxhil_controller_guard(controller, limits, gains->control_period, gains->clearance, &error);
+        jaxhil_controller_guard(controller, limits, {guard_arguments}{guard_error});
     }}
     if (error) {{
-        bool ignored = false;
-        jaxhil_clear(controller);
-        jaxhil_controller_guard(controller, &jaxhil_no_limits, 1.0, INFINITY, &ignored);
+        {ignored}jaxhil_clear(controller);
+        jaxhil_controller_guard(controller, &jaxhil_no_limits, {unusable_arguments}{ignored_error});
         jaxhil_controller_fail(controller, JAXHIL_UNUSABLE);{unstated}
     }}
     return !error;
 }}
+"""
 
-void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, double *damping) {{
+_IDENTIFIED = """
+void jaxhil_identified(const jaxhil_controller *controller, double *stiffness, double *damping) {
     double identified[2];
     jaxhil_controller_identified(controller, identified);
     *stiffness = identified[0];
     *damping = identified[1];
-}}
+}
 """
 
 
@@ -198,61 +181,107 @@ def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> 
         InputError: If the compensator contains Python code that cannot be translated to C. The message names
             file and line.
     """
-    gain_file = check_gain_document(document, source)
-    Controller(gain_file, source)  # raises an error if a delay is too long for every delay line
+    kind = kind_of(document)
+    gain_file = kind.check_document(document, source)
+    kind.controller(gain_file, source)  # raises an error if a delay is too long for every delay line
     law = gain_file.compensator
-    declarations, definitions = _generate_code(law, COMPENSATORS[law])
+    declarations, definitions = _generate_code(law, kind.compensators[law], kind.axes)
     return {
         HEADER_FILE: _HEADER_TEMPLATE.format(
-            law=law, lengths=_define_lengths(declarations, gain_file), declarations=declarations
+            law=law,
+            lengths=_define_lengths(declarations, gain_file),
+            declarations=declarations,
+            exported="" if kind is ONE_AXIS else ",\n *                 &jaxhil_exported_constants",
         ),
         SOURCE_FILE: _SOURCE_TEMPLATE.format(definitions=definitions),
         GAINS_FILE: _GAINS_TEMPLATE.format(
-            law=law, digest=document["sha256"], constants=gain_file_constants(gain_file)
+            law=law, digest=document["sha256"], constants=gain_file_constants(gain_file, kind)
         ),
-        TEST_FILE: (TEST_PROGRAM_FOLDER / TEST_FILE).read_text(encoding="utf-8"),
+        TEST_FILE: (TEST_PROGRAM_FOLDER / kind.test_program).read_text(encoding="utf-8"),
     }
 
 
 @functools.cache
-def _generate_code(law: str, class_: type[Compensator]) -> tuple[str, str]:
+def _generate_code(law: str, class_: type[Any], axes: int) -> tuple[str, str]:
     """Return the C declarations and definitions of the controller with the compensator `law`."""
-    signs = {
-        "gains": {name: _sign_condition(gain.lowest) for name, gain in class_.gains.items()},
-        "limits": {name: _sign_condition(limit.lowest) for name, limit in LIMITS.items()},
-    }
-    enumerators = {fault.name.upper(): fault.bit for fault in FAULTS} | {"UNUSABLE": UNUSABLE}
-    enumerators |= {status.name.upper(): status.number for status in STATUSES}
-    methods = {name: vars(Controller)[name] for name in PUBLIC_METHODS}
+    kind = kind_of({"axes": axes})
+    members = {name: vars(kind.controller)[name] for name in kind.methods}
     functions: dict[str, Any] = {
-        name: member.fget if isinstance(member, property) else member for name, member in methods.items()
+        name: member.fget if isinstance(member, property) else member for name, member in members.items()
     }
-    program = CProgram(
-        "jaxhil_",
-        structs=signs,
-        names={class_: "law", ContactCount: "contact_record", Tare: "bias_tare"},
-        public={functions[name]: f"jaxhil_{named}" for name, named in PUBLIC_METHODS.items()},
-        bindings={Compensator: class_},
-        enumerators=enumerators,
-    )
+    program = _program(class_, kind, functions)
     try:
         constructor = program.add(class_.__init__, class_)
-        program.add(vars(Controller)["_guard"], Controller)
+        guard = program.add(vars(kind.controller)["_guard"], kind.controller)
         for function in functions.values():
-            program.add(function, Controller)
-        program.add(vars(Controller)["identified"].fget, Controller)
+            program.add(function, kind.controller)
+        if kind is ONE_AXIS:
+            program.add(vars(kind.controller)["identified"].fget, kind.controller)
         output = program.output()
     except SubsetError as error:
         raise InputError(
             to_one_line(f"c99: {law}: {error}; use `--format csv` to export without C code")
         ) from None
-    tables = [gains_fragment(law), limits_fragment(), faults_fragment(), statuses_fragment()]
+    tables = [
+        gains_fragment(law, kind), limits_fragment(kind), faults_fragment(kind.faults), statuses_fragment(),
+    ]  # fmt: skip
     declared = "\n".join(f"{table.comment}\n{table.declarations}" for table in tables)
     defined = "\n".join(table.definitions for table in tables if table.definitions)
+    if kind.constants is not None:
+        defined = f"{defined}\n{constants_check()}"
     has_status = "status" in program.fields.get(class_, {})  # else it is a constant
-    unstated = "\n        controller->law.status = JAXHIL_UNSTATED;" * has_status
-    init = _INIT_TEMPLATE.format(law_error=", &error" if constructor.fails else "", unstated=unstated)
-    return f"{declared}{output.declarations}{_PROTOTYPES_TEMPLATE}", f"{defined}\n{output.definitions}{init}"
+    prototypes, init = _initialisation(kind, constructor.fails, guard.fails, has_status)
+    return f"{declared}{output.declarations}{prototypes}", f"{defined}\n{output.definitions}{init}"
+
+
+def _program(class_: type[Any], kind: ControllerKind, functions: Mapping[str, Any]) -> CProgram:
+    """Return the empty C program of a controller with a compensator's class."""
+    enumerators = {fault.name.upper(): fault.bit for fault in kind.faults} | {"UNUSABLE": UNUSABLE}
+    enumerators |= {status.name.upper(): status.number for status in STATUSES}
+    return CProgram(
+        "jaxhil_",
+        structs={
+            "gains": {name: _sign_condition(gain.lowest) for name, gain in class_.gains.items()},
+            "limits": {name: _sign_condition(limit.lowest) for name, limit in kind.limits.items()},
+        },
+        names={class_: "law", ContactCount: "contact_record", **kind.c_names},
+        public={functions[name]: f"jaxhil_{c_name}" for name, c_name in kind.methods.items()},
+        bindings={kind.protocol: class_},
+        enumerators=enumerators,
+    )
+
+
+def _initialisation(
+    kind: ControllerKind, law_fails: bool, guard_fails: bool, has_status: bool
+) -> tuple[str, str]:
+    """Return prototypes and definitions of the functions that Python has in `__init__`.
+
+    Args:
+        kind: kind of controller.
+        law_fails: whether the compensator's constructor has an error flag.
+        guard_fails: likewise for the controller's guards.
+        has_status: whether the compensator has a status.
+    """
+    is_one_axis = kind is ONE_AXIS
+    period, clearance = "gains->control_period", ", gains->clearance"
+    more = "" if is_one_axis else ",\n                 const jaxhil_constants *constants"
+    init = _INIT_TEMPLATE.format(
+        more=more,
+        admitted="" if is_one_axis else " && jaxhil_constants_fit(constants)",
+        law_arguments=f"{period}{clearance}" if is_one_axis else f"*constants, {period}",
+        law_error=", &error" * law_fails,
+        guard_arguments=f"{period}{clearance}" if is_one_axis else f"*constants, {period}",
+        guard_error=", &error" * guard_fails,
+        unusable_arguments="1.0, INFINITY" if is_one_axis else "*constants, 1.0",
+        ignored="bool ignored = false;\n        " * guard_fails,
+        ignored_error=", &ignored" * guard_fails,
+        unstated="\n        controller->law.status = JAXHIL_UNSTATED;" * has_status,
+    )
+    structs = "gains and limits" if is_one_axis else "gains, limits and constants"
+    prototypes = _PROTOTYPES_TEMPLATE.format(more=more, structs=structs)
+    if is_one_axis:
+        return f"{prototypes}{_IDENTIFIED_PROTOTYPE}", f"{init}{_IDENTIFIED}"
+    return prototypes, init
 
 
 def _sign_condition(lowest: float) -> str:
@@ -260,7 +289,7 @@ def _sign_condition(lowest: float) -> str:
     return "> 0" if lowest > 0.0 else ">= 0" if lowest >= 0.0 else ""
 
 
-def _define_lengths(declarations: str, gain_file: GainFile) -> str:
+def _define_lengths(declarations: str, gain_file: Any) -> str:
     """Return the C macros that define the number of samples in each delay line."""
     lines = []
     delays = {**gain_file.limits, **gain_file.gains}

@@ -7,25 +7,19 @@ starts with control period and clearance, which the compensators also need.
 
 import math
 import textwrap
-from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from jaxhil.rig.bounds import CONTROL_PERIODS, DISTANCES, format_range
-from jaxhil.rig.faults import FAULTS, UNUSABLE
-from jaxhil.rig.gain_file import GainFile
+from jaxhil.rig.faults import UNUSABLE, Fault
 from jaxhil.rig.law_status import STATUSES
-from jaxhil.rig.limits import LIMITS
-from jaxhil.rig.registry import COMPENSATORS
+from jaxhil.rig.limits import Limit
+from jaxhil.rig.registry import GainSpecification
+from jaxhil.rig.six_axes.gain_file import MATRIX_ENTRIES
+from tuning.bundle.controller_kind import ControllerKind
 
 MAX_LINE_WIDTH = 110
-
-
-# Relations between limits that `jaxhil.rig.limits.complete` checks, besides the range of each limit.
-_LIMIT_RELATIONS = (
-    "limits->measured_lowest < limits->measured_highest",
-    "limits->command_lowest < limits->command_highest",
-    "!(limits->retreat_velocity > limits->velocity_limit)",
-)
+CLEARANCE_ENTRY = f"m, {format_range(*DISTANCES)}, between two surfaces; infinite for one surface"
 
 
 class CFragment(NamedTuple):
@@ -44,15 +38,15 @@ def format_double(value: float) -> str:
     return text if "." in text or "e" in text else f"{text}.0"
 
 
-def gains_fragment(law: str) -> CFragment:
+def gains_fragment(law: str, kind: ControllerKind) -> CFragment:
     """Return the C struct `jaxhil_gains` of the compensator `law`, and a function that checks its values."""
-    clearance = f"(({_range_condition('clearance', *DISTANCES)}) || gains->clearance == INFINITY)"
-    entries = [
-        ("control_period", f"s, {format_range(*CONTROL_PERIODS)}"),
-        ("clearance", f"m, {format_range(*DISTANCES)}, between two surfaces; infinite for one surface"),
-    ]
-    checks = [_range_condition("control_period", *CONTROL_PERIODS), clearance]
-    for name, gain in COMPENSATORS[law].gains.items():
+    entries = [("control_period", f"s, {format_range(*CONTROL_PERIODS)}")]
+    checks = [_range_condition("control_period", *CONTROL_PERIODS)]
+    if kind.axes == 1:
+        entries.append(("clearance", CLEARANCE_ENTRY))
+        checks.append(f"(({_range_condition('clearance', *DISTANCES)}) || gains->clearance == INFINITY)")
+    gains: Mapping[str, GainSpecification] = kind.compensators[law].gains
+    for name, gain in gains.items():
         entries.append((name, f"{gain.unit}, {format_range(gain.lowest, gain.highest)}"))
         checks.append(_range_condition(name, gain.lowest, gain.highest))
     return CFragment(
@@ -62,28 +56,31 @@ def gains_fragment(law: str) -> CFragment:
     )
 
 
-def limits_fragment() -> CFragment:
+def limits_fragment(kind: ControllerKind) -> CFragment:
     """Return the C struct `jaxhil_limits`, a function that checks its values, and the default limits."""
+    limits: Mapping[str, Limit] = kind.limits
+    relations = [f"limits->{low} < limits->{high}" for low, high in kind.ranges]
+    relations += [f"!(limits->{low} > limits->{high})" for low, high in kind.order]
     entries = [
         (name, f"{limit.unit}, {format_range(limit.lowest, limit.highest)}: {limit.meaning}")
-        for name, limit in LIMITS.items()
+        for name, limit in limits.items()
     ]
-    checks = [_range_condition(name, limit.lowest, limit.highest, "limits") for name, limit in LIMITS.items()]
+    checks = [_range_condition(name, limit.lowest, limit.highest, "limits") for name, limit in limits.items()]
     defaults = _initialisers(
-        {name: limit.default for name, limit in LIMITS.items()},
-        {name: limit.unit for name, limit in LIMITS.items()},
+        {name: limit.default for name, limit in limits.items()},
+        {name: limit.unit for name, limit in limits.items()},
     )
     return CFragment(
         "/* Limits of the controller; a gain file cannot change their ranges. */\n",
         _define_struct("jaxhil_limits", entries),
         f"static const jaxhil_limits jaxhil_no_limits = {{\n{defaults}}};\n\n"
-        + _check_function("jaxhil_limits_fit", "jaxhil_limits", "limits", [*checks, *_LIMIT_RELATIONS]),
+        + _check_function("jaxhil_limits_fit", "jaxhil_limits", "limits", [*checks, *relations]),
     )
 
 
-def faults_fragment() -> CFragment:
+def faults_fragment(faults: Sequence[Fault]) -> CFragment:
     """Return a C enumeration of the faults' bits, and a function that returns the name of a fault."""
-    named = [(f"JAXHIL_{fault.name.upper()}", fault) for fault in FAULTS]
+    named = [(f"JAXHIL_{fault.name.upper()}", fault) for fault in faults]
     lines = []
     for name, fault in named:
         lines.append(_format_comment(f"{fault.condition}; reaction: {fault.reaction}", "    "))
@@ -124,21 +121,54 @@ def statuses_fragment() -> CFragment:
     )
 
 
-def gain_file_constants(gain_file: GainFile) -> str:
-    """Return C constants with the gains and limits of a gain file (`jaxhil_gains`, `jaxhil_limits`)."""
-    units = {"control_period": "s", "clearance": "m"}
-    units |= {name: gain.unit for name, gain in COMPENSATORS[gain_file.compensator].gains.items()}
-    gains = {
-        "control_period": gain_file.control_period,
-        "clearance": gain_file.clearance,
-        **{name: gain_file.gains[name] for name in COMPENSATORS[gain_file.compensator].gains},
-    }
-    limit_units = {name: limit.unit for name, limit in LIMITS.items()}
-    limits = {name: gain_file.limits[name] for name in LIMITS}
+def constants_check() -> str:
+    """Return a C function that checks the constants of the numerical model in six axes."""
+    lowest, highest = (format_double(bound) for bound in MATRIX_ENTRIES)
     return (
+        "static bool jaxhil_constants_fit(const jaxhil_constants *constants) {\n"
+        "    bool fit = constants->longest_delay >= 0.0 && isfinite(constants->longest_delay);\n"
+        "    for (int i = 0; i < 6; i++) {\n"
+        "        for (int j = 0; j < 6; j++) {\n"
+        + "".join(
+            f"            fit = fit && constants->{name}[i][j] >= {lowest} &&\n"
+            f"                  constants->{name}[i][j] <= {highest};\n"
+            for name in ("mass_matrix", "inverse_mass", "tool_correction")
+        )
+        + "        }\n"
+        "        fit = fit && constants->mass_matrix[i][i] > 0.0 && constants->inverse_mass[i][i] > 0.0;\n"
+        "    }\n"
+        "    return fit;\n"
+        "}\n"
+    )
+
+
+def gain_file_constants(gain_file: Any, kind: ControllerKind) -> str:
+    """Return C constants with the content of a gain file: gains, limits, and constants in six axes."""
+    specifications = kind.compensators[gain_file.compensator].gains
+    units = {"control_period": "s", **({"clearance": "m"} if kind.axes == 1 else {})}
+    units |= {name: gain.unit for name, gain in specifications.items()}
+    gains = {name: getattr(gain_file, name) for name in units if name not in specifications}
+    gains |= {name: gain_file.gains[name] for name in specifications}
+    limits = {name: gain_file.limits[name] for name in kind.limits}
+    limit_units = {name: limit.unit for name, limit in kind.limits.items()}
+    text = (
         f"static const jaxhil_gains jaxhil_exported_gains = {{\n{_initialisers(gains, units)}}};\n\n"
         f"static const jaxhil_limits jaxhil_exported_limits = {{\n{_initialisers(limits, limit_units)}}};\n"
     )
+    return text if kind.axes == 1 else f"{text}\n{_model_constants(gain_file.constants)}"
+
+
+def _model_constants(constants: Any) -> str:
+    """Return the C constant of the numerical model's constants."""
+    lines = []
+    for name, value in constants._asdict().items():
+        if isinstance(value, float):
+            lines.append(f"    {format_double(value)}, /* {name} */\n")
+            continue
+        rows = (", ".join(format_double(entry) for entry in row) for row in value)
+        joined = ",\n".join(f"        {{{row}}}" for row in rows)
+        lines.append(f"    /* {name} */\n    {{\n{joined}\n    }},\n")
+    return f"static const jaxhil_constants jaxhil_exported_constants = {{\n{''.join(lines)}}};\n"
 
 
 def _initialisers(values: Mapping[str, float], units: Mapping[str, str]) -> str:

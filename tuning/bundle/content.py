@@ -10,22 +10,24 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError
-from jaxhil.rig.limits import LIMITS
 from tuning.bundle import selftest
+from tuning.bundle.controller_kind import ONE_AXIS, kind_of
 from tuning.bundle.manifest import manifest_text
 
 TUNING_FOLDER = Path(__file__).parents[1]
 # Files that are copied unchanged into a bundle.
-COPIED_FILES = ("bundle/selftest.py", "rig/udp_controller.py", "rig/udp_protocol.py")
+SELFTEST = "bundle/selftest.py"
+UDP_FILES = ("rig/udp_controller.py", "rig/udp_protocol.py")  # of one axis
 
 
-def code_files(compensator: str) -> dict[str, bytes]:
+def code_files(compensator: str, axes: int = 1) -> dict[str, bytes]:
     """Return the Python files that every bundle of a compensator contains.
 
-    These are the runtime, the self-test and the UDP controller.
+    These are the runtime, the self-test and, for one axis, the UDP controller.
 
     Args:
         compensator: name of the compensator.
+        axes: number of axes of motion.
 
     Returns:
         Content of each file by its path in the bundle.
@@ -36,8 +38,11 @@ def code_files(compensator: str) -> dict[str, bytes]:
     """
     from tuning.bundle.single_file import build_runtime_source
 
-    copied = {Path(name).name: (TUNING_FOLDER / name).read_bytes() for name in COPIED_FILES}
-    return {"jaxhil_runtime.py": build_runtime_source(compensator).encode(), **copied}
+    kind = kind_of({"axes": axes})
+    names = (SELFTEST, *UDP_FILES) if kind is ONE_AXIS else (SELFTEST,)
+    copied = {Path(name).name: (TUNING_FOLDER / name).read_bytes() for name in names}
+    runtime = build_runtime_source(compensator, kind.package, kind.table)
+    return {"jaxhil_runtime.py": runtime.encode(), **copied}
 
 
 def bundle_files(
@@ -66,13 +71,14 @@ def bundle_files(
     gains = json.dumps(document, indent=2, sort_keys=True, allow_nan=False) + "\n"
     # Read the document back, so that all files have the key order of gains.json and not the caller's order.
     document = json.loads(gains)
+    table = kind_of(document).limits
     if limits := document.get("limits"):
-        document = {**document, "limits": {name: limits[name] for name in LIMITS if name in limits}}
+        document = {**document, "limits": {name: limits[name] for name in table if name in limits}}
     files = {
         "gains.json": gains.encode("ascii"),
         "vectors.csv": vectors,
         "summary.html": summary_html(document, plot),
-        **code_files(document["compensator"]),
+        **code_files(document["compensator"], document.get("axes", 1)),
     }
     for name in formats:
         files.update(WRITERS[name](document))

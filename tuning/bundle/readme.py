@@ -2,17 +2,19 @@
 
 import html
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any
 
 from jaxhil.errors import to_one_line
 from jaxhil.rig.bounds import FORCES, POSITIONS, SPEEDS
-from jaxhil.rig.faults import FAULTS
+from jaxhil.rig.faults import FAULTS, Fault
 from jaxhil.rig.law_status import STATUSES
+from tuning.bundle.controller_kind import ONE_AXIS, kind_of
 
 TEMPLATE = Path(__file__).parent / "bundle_readme.md"
+SIX_AXIS_TEMPLATE = Path(__file__).parent / "bundle_readme_six_axes.md"
 
 # Purpose of each file and folder in a bundle.
 FILE_DESCRIPTIONS = {
@@ -35,14 +37,16 @@ def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
     """Return the README of a bundle, in Markdown; `files` are the paths of the bundle's files."""
     present = {*(name.partition("/")[0] for name in files), "manifest.json"}
     table_rows = [f"| `{name}` | {text} |" for name, text in FILE_DESCRIPTIONS.items() if name in present]
-    return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
+    kind = kind_of(document)
+    template = TEMPLATE if kind is ONE_AXIS else SIX_AXIS_TEMPLATE
+    return Template(template.read_text(encoding="utf-8")).substitute(
         mechanism=_escape_text(to_one_line(document["mechanism"]["name"], 80)),
         compensator=document["compensator"],
         period=repr(document["control_period"]),
         digest=document["sha256"],
         content="\n".join(("| file | content |", "|---|---|", *table_rows)),
         statuses=status_table(),
-        faults=fault_table(),
+        faults=fault_table(kind.faults),
         outermost=f"forces to {FORCES[1]:g} N, positions to {POSITIONS[1]:g} m either way, position commands "
         f"that change by up to {SPEEDS[1]:g} m/s",
     )
@@ -54,12 +58,12 @@ def status_table() -> str:
     return "\n".join(("| status | meaning |", "|---|---|", *rows))
 
 
-def fault_table() -> str:
+def fault_table(faults: Sequence[Fault] = FAULTS) -> str:
     """Return a Markdown table of the controller's faults: bit, name, condition and reaction."""
     rows = [
         f"| `{fault.bit:#x}` | `{fault.name}` | {_escape_cell(fault.condition)} | "
         f"{_escape_cell(fault.reaction)} |"
-        for fault in FAULTS
+        for fault in faults
     ]
     return "\n".join(("| bit | fault | raised when | reaction |", "|---|---|---|---|", *rows))
 

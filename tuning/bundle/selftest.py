@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import zlib
+from collections import namedtuple
 
 MANIFEST_FILE, SIGNATURE_FILE, PYTHON_CACHE = "manifest.json", "manifest.sig", "__pycache__/"
 PATH_PATTERN = re.compile(
@@ -30,9 +31,6 @@ MAX_FILES, MAX_BUNDLE_BYTES, MAX_TEXT_BYTES = (
     1 << 23,
 )  # of a bundle, and bytes of a text file in it
 SCHEMA = "jaxhil/bundle/1"
-# Largest difference between runtime and simulation, divided by the range of a run's commands [1]. Both
-# compute in a different order, so that rounding errors differ.
-MAX_SIMULATION_ERROR = 1e-11
 MAX_REPORTED_DIFFERENCES = 8  # largest number of reported differences in one file
 C_SOURCES = ("c99/test_vectors.c", "c99/jaxhil_controller.c")
 C_FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
@@ -40,6 +38,28 @@ VECTOR_COLUMNS = (
     "run,event,force_measured,position_desired,velocity_desired,position_measured,time,position,velocity,"
     "acceleration,force_command,position_command,faults,force_simulated"
 )
+VECTORS_BEFORE_TIME = ("wrench_measured", "pose_desired", "twist_desired", "pose_measured")
+VECTORS_AFTER_TIME = ("pose", "twist", "wrench_command", "pose_command")
+COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
+SIX_AXIS_VECTOR_COLUMNS = ",".join(
+    [
+        "run,event",
+        *(f"{name}_{axis}" for name in VECTORS_BEFORE_TIME for axis in COORDINATES),
+        "time",
+        *(f"{name}_{axis}" for name in VECTORS_AFTER_TIME for axis in COORDINATES),
+        "faults",
+        *(f"wrench_simulated_{axis}" for axis in COORDINATES),
+    ]
+)
+# Layout of vectors.csv for a controller: its columns; numbers of each quantity; number of quantities after
+# the time that describe the model's motion; the method that commands the drives; parts of a force command
+# with a common range and unit; largest difference between runtime and simulation, divided by the range of a
+# run's commands [1] (the simulation rounds in another order).
+Layout = namedtuple("Layout", "columns width motions method parts error")
+LAYOUTS = {
+    "Controller": Layout(VECTOR_COLUMNS, 1, 3, "position_command", ((0, 1, "N"),), 1e-11),
+    "Controller6": Layout(SIX_AXIS_VECTOR_COLUMNS, 6, 2, "pose_command", ((0, 3, "N"), (3, 6, "N m")), 1e-9),
+}
 
 
 def main(arguments, folder):
@@ -215,7 +235,7 @@ def check_runtime(folder, found, damaged):
     try:
         # An import statement could load a cached older version, and does not find this folder with -I.
         exec(compile(found["jaxhil_runtime.py"], "jaxhil_runtime.py", "exec"), runtime)
-        if not {"Controller", "GainFileError"} <= {*runtime}:
+        if "GainFileError" not in runtime or not {*LAYOUTS} & {*runtime}:
             raise NameError("Controller or GainFileError is missing")
     except BaseException as error:
         return report_failure("jaxhil_runtime.py", f"cannot be executed: {describe_error(error)}")
@@ -225,13 +245,19 @@ def check_runtime(folder, found, damaged):
 def check_gains(folder, runtime):
     """Check that the controller accepts the gain file."""
     try:
-        controller = runtime["Controller"].from_file(os.path.join(folder, "gains.json"))
+        controller = runtime[controller_name(runtime)].from_file(os.path.join(folder, "gains.json"))
     except runtime["GainFileError"] as error:
         return report_failure("gains.json", escape_unprintable(str(error)))
     except BaseException as error:
         return report_failure("gains.json", f"cannot be loaded: {describe_error(error)}")
-    period, laws = controller.control_period, runtime.get("COMPENSATORS", ())
+    period = controller.control_period
+    laws = runtime.get("COMPENSATORS") or runtime.get("SIX_AXIS_COMPENSATORS", ())
     return report_pass("gains.json", f"loads: {' '.join(laws)}, control period {period!r} s")
+
+
+def controller_name(runtime):
+    """Return the name of the runtime's controller."""
+    return next(name for name in LAYOUTS if name in runtime)
 
 
 def check_vectors(folder, found, runtime):
@@ -240,7 +266,8 @@ def check_vectors(folder, found, runtime):
     Every command must equal the recorded command to the last bit, and be close to the simulated command.
     """
     try:
-        rows = list(read_vectors(found["vectors.csv"].decode("ascii")))
+        layout = LAYOUTS[controller_name(runtime)]
+        rows = list(read_vectors(found["vectors.csv"].decode("ascii"), layout))
     except Exception as error:
         return report_failure("vectors.csv", f"cannot be read: {describe_error(error)}")
     if not rows:
@@ -254,23 +281,28 @@ def check_vectors(folder, found, runtime):
     if different:
         return report_failure("vectors.csv", f"{len(different)} of {len(rows)} ticks differ")
     report_pass("vectors.csv", f"{len(rows)} ticks of {len(runs)} runs, the same bit for bit")
-    return check_simulated(runs)
+    return check_simulated(runs, layout)
 
 
-def check_simulated(runs):
+def check_simulated(runs, layout):
     """Compare the force commands of each run with the simulated force commands."""
     largest, compared = 0.0, 0
     for run, ticks in runs.items():
-        stated = [tick for tick in ticks if not math.isnan(tick[2])]
-        expected = [0.0, *(simulated for _, _, simulated in stated)]
-        compared, span = compared + len(stated), max(expected) - min(expected)
-        for number, force, simulated in stated:
-            error = abs(force - simulated)
-            if not error <= MAX_SIMULATION_ERROR * span:
-                text = f"run {run}: force command: found {force!r} N, expected {simulated!r} N"
-                limit = f"within {MAX_SIMULATION_ERROR} of the range {span!r} N"
-                return report_failure("vectors.csv", f"line {number}: {text} {limit}")
-            largest = max(largest, error / span if span else 0.0)
+        stated = [tick for tick in ticks if not any(map(math.isnan, tick[2]))]
+        compared += len(stated)
+        for first, last, unit in layout.parts:
+            expected = [0.0, *(value for tick in stated for value in tick[2][first:last])]
+            span = max(expected) - min(expected)
+            for number, forces, commands in stated:
+                for force, simulated in zip(forces[first:last], commands[first:last], strict=True):
+                    error = abs(force - simulated)
+                    if not error <= layout.error * span:
+                        text = (
+                            f"run {run}: force command: found {force!r} {unit}, expected {simulated!r} {unit}"
+                        )
+                        limit = f"within {layout.error} of the range {span!r} {unit}"
+                        return report_failure("vectors.csv", f"line {number}: {text} {limit}")
+                    largest = max(largest, error / span if span else 0.0)
     text = f"{compared} ticks, forces agree with the simulation within {largest:.1e} of their range"
     return (
         report_pass("vectors.csv", text)
@@ -279,12 +311,12 @@ def check_simulated(runs):
     )
 
 
-def read_vectors(text):
+def read_vectors(text, layout=LAYOUTS["Controller"]):
     """Yield (line number, list of numbers) for each row of vectors.csv; an empty field becomes None."""
     lines = text.split("\n")
-    if lines[0].rstrip("\r") != VECTOR_COLUMNS:
-        raise ValueError(f"line 1: unknown columns, expected {VECTOR_COLUMNS}")
-    width = VECTOR_COLUMNS.count(",") + 1
+    if lines[0].rstrip("\r") != layout.columns:
+        raise ValueError(f"line 1: unknown columns, expected {layout.columns}")
+    width, time = layout.columns.count(",") + 1, 2 + 4 * layout.width
     for number, line in enumerate(lines[1:], start=2):
         if number == len(lines) and not line:
             return
@@ -292,7 +324,7 @@ def read_vectors(text):
             row = [float(field) if field else None for field in line.rstrip("\r").split(",")]
         except ValueError:
             row = []
-        if len(row) != width or any(value is None for index, value in enumerate(row) if index != 6):
+        if len(row) != width or any(value is None for index, value in enumerate(row) if index != time):
             raise ValueError(f"line {number}: not a row of {width} numbers")
         yield number, row
 
@@ -300,32 +332,45 @@ def read_vectors(text):
 def replay_vectors(rows, gains, runtime):
     """Replay all rows of vectors.csv through the runtime's controller with the gain file `gains`.
 
-    Return for each run the list of (line number, force command, simulated force command), as a dictionary,
-    and descriptions of the differences from the recorded commands.
+    Return a dictionary of lists of (line number, force command, simulated force command) for each run, each
+    command as a list of numbers, and descriptions of the differences from the recorded commands.
     """
-    controller, runs, different = None, {}, []
+    name = controller_name(runtime)
+    layout, controller, runs, different = LAYOUTS[name], None, {}, []
+    width, time = layout.width, 2 + 4 * layout.width
+    after = time + 1 + layout.motions * width
+    columns = layout.columns.split(",")[after : after + 2 * width + 1]
     for number, row in rows:
-        run, event, force, position, velocity, measured, time, *motion = row[:10]
+        run, event = row[:2]
         if event == 1:
-            controller = runtime["Controller"].from_file(gains)
+            controller = runtime[name].from_file(gains)
         elif controller is None or event not in (0, 2):
             raise ValueError(
                 f"line {number}: event: found {event!r}, expected 0, 1 or 2, and 1 in the first row"
             )
         elif event == 2:
             controller.next_contact()
-        command = controller.step(force, position, velocity, measured, time)
+        command = controller.step(*quantities(row[2:time], width), row[time])
+        sent = getattr(controller, layout.method)(*quantities(row[time + 1 : after], width))
+        command, sent = ([command], [sent]) if width == 1 else (command, sent)
         # The faults are integers in the file, and are compared as floats like all other columns.
-        found = command, controller.position_command(*motion), float(controller.faults)
+        found = [*command, *sent, float(controller.faults)]
         texts = [
-            f"{name}: found {value!r}, expected {expected!r}"
-            for name, value, expected in zip(VECTOR_COLUMNS.split(",")[10:13], found, row[10:13], strict=True)
+            f"{column}: found {value!r}, expected {expected!r}"
+            for column, value, expected in zip(columns, found, row[after:], strict=False)
             if not are_same_bits(value, expected)
         ]
         if texts:
             different.append(f"line {number}, run {int(run)}: {', '.join(texts)}")
-        runs.setdefault(int(run), []).append((number, command, row[13]))
+        runs.setdefault(int(run), []).append((number, command, row[-width:]))
     return runs, different
+
+
+def quantities(row, width):
+    """Return the quantities of a row: numbers, or lists of `width` numbers."""
+    if width == 1:
+        return row
+    return [row[index : index + width] for index in range(0, len(row), width)]
 
 
 def are_same_bits(found, expected):

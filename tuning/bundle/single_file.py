@@ -32,12 +32,15 @@ class ModuleSource(NamedTuple):
     omitted_statements: tuple[ast.stmt, ...]
 
 
-def build_runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> str:
+def build_runtime_source(
+    compensator: str, package: ModuleType = jaxhil.rig, table: str = "COMPENSATORS"
+) -> str:
     """Return the source code of `jaxhil_runtime.py`: the public names of `package` and one compensator.
 
     Args:
         compensator: name of the compensator.
         package: package of the runtime.
+        table: name of the table of compensators in the package's module `registry`.
 
     Returns:
         Python source code.
@@ -49,7 +52,8 @@ def build_runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> 
             modules must not define the same name.
     """
     root = package.__name__.partition(".")[0]
-    class_ = importlib.import_module(f"{package.__name__}.registry").COMPENSATORS[compensator]
+    registry = importlib.import_module(f"{package.__name__}.registry")
+    class_ = getattr(registry, table)[compensator]
     law, generated = class_.__module__, {}
     if law.partition(".")[0] != root:
         generated[law] = parse_source(module_text(class_, compensator), law, f"{compensator}.py", root)
@@ -57,6 +61,7 @@ def build_runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> 
     sources = _sort_by_imports([law, *_public_modules(offered)], generated)
     _check_unique(sources)
     public = [name for name in _public_names(offered) if name in offered.inside]
+    controller = next(name for name in public if name.startswith("Controller"))
     imports = {line for source in sources for line in source.outside}
     needed = " and NumPy" if any("numpy" in line for line in imports) else ", and no other package"
     lines = [
@@ -64,7 +69,7 @@ def build_runtime_source(compensator: str, package: ModuleType = jaxhil.rig) -> 
         "",
         f"`jaxhil export` made this file from the modules of jaxhil. It needs Python 3.11 or later{needed}.",
         "",
-        "    controller = Controller.from_file('gains.json')",
+        f"    controller = {controller}.from_file('gains.json')",
         '"""',
         "",
         *sorted(imports, key=lambda line: ("numpy" in line, line.startswith("from"), line)),

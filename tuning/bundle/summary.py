@@ -30,6 +30,12 @@ td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
 td, th { white-space: nowrap; } img { width: 100%; margin-top: 2mm; } .note { color: #333; }
 """
 
+# Keys of the figures with errors of fresh scenarios, and titles of their tables, by number of axes.
+ERROR_TABLES = {
+    1: (("robust", "Restitution error |e - e*| [1]"),),
+    6: (("twist_error", "Twist error [1]"), ("energy_error", "Energy error [1]")),
+}
+
 
 def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> bytes:
     """Return the HTML page that summarises a checked gain document.
@@ -39,19 +45,21 @@ def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> byt
     mechanism = document["mechanism"]
     name = escape(to_one_line(mechanism["name"], 80))
     plot = base64.b64encode(summary_png(document) if drawn is None else drawn).decode("ascii")
+    error_tables = ERROR_TABLES[document.get("axes", 1)]
+    error_name = error_tables[0][1].partition(" |")[0]
     versions = ", ".join(f"{key} {value}" for key, value in document["versions"].items())
     parts = [
         "<!DOCTYPE html>",
         f'<html lang="en"><head><meta charset="utf-8"><title>{name}: controller for the rig</title>',
         f"<style>{PAGE_STYLE}</style></head><body>",
         f"<h1>{name}: compensator {escape(document['compensator'])}</h1>",
-        f"<p>{escape(describe_mechanism(mechanism))}</p>",
+        f"<p>{escape(describe_mechanism(mechanism, document.get('axes', 1)))}</p>",
         f"<p>Control period {_format_number(1e3 * document['control_period'])} ms. "
         f"Tuned {escape(to_one_line(document['created'], 40))}; seed {document['seed']}; "
         f"{escape(to_one_line(versions, 200))}.<br>",
         f"SHA-256 of the gains' content <code>{escape(document['sha256'])}</code></p>",
-        f'<img alt="Restitution error, and ranges of the uncertainty" src="data:image/png;base64,{plot}">',
-        *_error_table(document),
+        f'<img alt="{error_name}, and ranges of the uncertainty" src="data:image/png;base64,{plot}">',
+        *(line for table in error_tables for line in _error_table(document, *table)),
         '<div class="columns"><div>',
         *_gain_table(document),
         *_watchdog_section(document),
@@ -63,8 +71,10 @@ def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> byt
     return ("\n".join(parts) + "\n").encode()
 
 
-def describe_mechanism(mechanism: Mapping[str, Any]) -> str:
+def describe_mechanism(mechanism: Mapping[str, Any], axes: int = 1) -> str:
     """Return a sentence that describes the mechanism and the rig."""
+    if axes == 6:
+        return _describe_six_axes(mechanism)
     bodies, contact, rig = mechanism["bodies"], mechanism["contact"], mechanism["rig"]
     mass = bodies.get("equivalent_mass")
     text = f"{_format_number(mass)} kg" if mass else f"bodies of {_format_list(bodies.values())} kg"
@@ -81,9 +91,28 @@ def describe_mechanism(mechanism: Mapping[str, Any]) -> str:
     )
 
 
-def _error_table(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the HTML lines of the table of restitution errors in fresh scenarios."""
-    robust = document["figures"].get("robust")
+def _describe_six_axes(mechanism: Mapping[str, Any]) -> str:
+    """Return a sentence that describes a mechanism and its rig in six axes."""
+    rig = mechanism["rig"]
+    delays = _format_list((1e3 * delay for delay in _flatten([rig["simulator"].get("delay", 0.0)])), 6)
+    approach = mechanism.get("approach")
+    speed = f" at {_format_list(approach['velocity'])} m/s" if approach else ""
+    contacts = ", ".join(
+        f"{to_one_line(name, 30)} ({str(contact['law']).replace('_', ' ')})"
+        for name, contact in (mechanism.get("contact") or {}).items()
+    )
+    return (
+        f"Six axes: target of {_format_number(mechanism['target']['mass'])} kg, chaser of "
+        f"{_format_number(mechanism['chaser']['mass'])} kg{speed}; contacts {contacts or 'none'}; motion "
+        f"simulator {rig['simulator']['model'].replace('_', ' ')}, delays {delays} ms; force sensor on the "
+        f"{rig['force_sensor'].get('side', 'fixed')} side, delay "
+        f"{_format_number(1e3 * rig['force_sensor'].get('delay', 0.0))} ms."
+    )
+
+
+def _error_table(document: Mapping[str, Any], key: str, title: str) -> Iterator[str]:
+    """Yield the HTML lines of the table of errors in fresh scenarios with a key of the figures."""
+    robust = document["figures"].get(key)
     rows = []
     for name, errors in robust.items() if isinstance(robust, Mapping) else ():
         if name in CURVE_LABELS and isinstance(errors, Mapping):
@@ -96,13 +125,13 @@ def _error_table(document: Mapping[str, Any]) -> Iterator[str]:
         heads = (
             "fresh scenarios",
             *ERROR_STATISTICS.values(),
-            "mean e - e*",
+            "mean",
             "peak force / reference",
             "not ended",
         )
-        yield from _html_table("Restitution error |e - e*| [1]", heads, rows)
+        yield from _html_table(title, heads, rows)
     else:
-        yield "<p>The gain file contains no restitution errors.</p>"
+        yield f"<p>The gain file contains no {title.partition(' |')[0].removesuffix(' [1]').lower()}s.</p>"
 
 
 def _gain_table(document: Mapping[str, Any]) -> Iterator[str]:

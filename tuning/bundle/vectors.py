@@ -11,7 +11,7 @@ import io
 import random
 from collections.abc import Iterator, Sequence
 from math import inf, nan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -80,7 +80,7 @@ class VectorRow(NamedTuple):
 class RecordedVectors(NamedTuple):
     """Test vectors, and the comparison of the recorded runs with the simulation."""
 
-    rows: list[VectorRow]  # rows of all runs
+    rows: list[Any]  # rows of all runs: `VectorRow`, or in six axes `vectors_six_axes.SixAxisRow`
     mass: float  # equivalent mass in the nominal run [kg]
     # for each recorded run, the reason if its comparison with the simulation ended early, else None
     ended: list[str | None]

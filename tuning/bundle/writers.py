@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxhil.errors import InputError, format_value
-from jaxhil.rig.limits import LIMITS
+from tuning.bundle.controller_kind import kind_of
 
 ROS2_NODE = "/jaxhil_controller"
 MAX_MATLAB_NAME_LENGTH = 63  # longest name of a struct's field in MATLAB [characters]
@@ -39,8 +39,11 @@ def gain_entries(document: Mapping[str, Any]) -> dict[str, GainOrLimit]:
 
 def limit_entries(document: Mapping[str, Any]) -> dict[str, GainOrLimit]:
     """Return the limits of a gain document by name; empty if the document has no limits."""
+    table = kind_of(document).limits
     return {
-        name: GainOrLimit(_limit_value(name, limit["value"]), limit["unit"])
+        name: GainOrLimit(
+            table[name].default if limit["value"] is None else float(limit["value"]), limit["unit"]
+        )
         for name, limit in document.get("limits", {}).items()
     }
 
@@ -146,11 +149,6 @@ WRITERS: dict[str, Callable[[Mapping[str, Any]], dict[str, bytes]]] = {
     "csv": csv_files,
     "c99": c99_files,
 }
-
-
-def _limit_value(name: str, value: float | None) -> float:
-    """Return the value of a limit; for None its default, the widest limit."""
-    return LIMITS[name].default if value is None else float(value)
 
 
 def _format_cell(value: float | str | None) -> str:

@@ -47,10 +47,12 @@ def summary_png(document: Mapping[str, Any]) -> bytes:
 
 def _draw_errors(axes: Axes, document: Mapping[str, Any]) -> None:
     """Draw bars of each set of gains' errors, in the nominal run and in scenarios not used for tuning."""
-    groups = _error_groups(document["figures"])
+    is_one_axis = document.get("axes", 1) == 1
+    groups = _error_groups(document["figures"], "robust" if is_one_axis else "twist_error")
+    title, label = ("Restitution error |e - e*|", "|e - e*| [1]") if is_one_axis else ("Twist error",) * 2
     series = [name for name in COLOURS if any(name in values for _, values in groups)]
     width = 0.8 / max(1, len(series))
-    axes.set_title("Restitution error |e - e*|", fontsize=10, loc="left", y=1.13)
+    axes.set_title(title, fontsize=10, loc="left", y=1.13)
     for index, name in enumerate(series):
         heights = [(i, values[name]) for i, (_, values) in enumerate(groups) if name in values]
         centres = [i + (index - (len(series) - 1) / 2) * width for i, _ in heights]
@@ -61,7 +63,7 @@ def _draw_errors(axes: Axes, document: Mapping[str, Any]) -> None:
         axes.bar_label(bars, [f"{value:.2g}" for _, value in heights], fontsize=6, padding=1)
     axes.set_xticks(range(len(groups)), [label for label, _ in groups], fontsize=8)
     axes.tick_params(axis="y", labelsize=8)
-    axes.set_ylabel("|e - e*| [1]", fontsize=9)
+    axes.set_ylabel(label, fontsize=9)
     finish_axes(axes, None)
     axes.grid(False, axis="x")
     positive = [value for _, values in groups for value in values.values() if value > 0]
@@ -76,12 +78,15 @@ def _draw_errors(axes: Axes, document: Mapping[str, Any]) -> None:
         axes.legend(ncols=3, fontsize=8, frameon=False, **legend_place)
 
 
-def _error_groups(metrics: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:
-    """Return for each group of bars its label, and the error [1] of each set of gains."""
+def _error_groups(metrics: Mapping[str, Any], robust: str) -> list[tuple[str, dict[str, float]]]:
+    """Return for each group of bars its label, and the error [1] of each set of gains.
+
+    `robust` is the key of the errors in scenarios that were not used for tuning.
+    """
     groups = []
     for kind, key, label in (
         ("nominal", "rms", "nominal run,\nrms"),
-        *(("robust", key, f"scenarios,\n{text}") for key, text in ERROR_STATISTICS.items()),
+        *((robust, key, f"scenarios,\n{text}") for key, text in ERROR_STATISTICS.items()),
     ):
         errors = metrics.get(kind, {})
         values = {

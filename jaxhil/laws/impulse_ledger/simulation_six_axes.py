@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from jaxhil.lanes import select_lanes
 from jaxhil.laws.impulse_ledger.six_axes.booking.simulation import follow, onset
+from jaxhil.laws.impulse_ledger.six_axes.constants import LONG_AGO
 from jaxhil.laws.impulse_ledger.six_axes.gains import GAINS
 from jaxhil.laws.impulse_ledger.six_axes.reading.simulation import read, record
 from jaxhil.laws.impulse_ledger.six_axes.simulation import wrench_at_target
@@ -22,7 +23,6 @@ from jaxhil.laws.shared import nominal_values
 from jaxhil.laws.simulation_base import Gain
 from jaxhil.laws.six_axis_base import SixAxisCompensator
 
-LONG_AGO = 1e9  # ticks; at the beginning of a run, the last contact counts as this long ago
 SPREADS = "stiffness_spread", "damping_spread", "force_spread", "curvature_spread"
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from jaxhil.errors import InputError, format_value
 from jaxhil.rig.limits import LIMITS
 from tuning import terminal
-from tuning.api.export import ExportOptions, allowed_values, export
+from tuning.api.export import ALL_LIMITS, ExportOptions, allowed_values, export
 from tuning.cli.options_rig import Export
 
 
@@ -39,7 +39,7 @@ def _parse_limits(settings: tuple[str, ...]) -> dict[str, float | None]:
     replaced: dict[str, float | None] = {}
     for words in settings:
         name, _, text = words.partition("=")
-        if name not in LIMITS:
+        if name not in ALL_LIMITS:
             raise InputError(
                 f"--set: found {format_value(words)}, expected LIMIT=VALUE with LIMIT "
                 f"one of {', '.join(LIMITS)}"
@@ -48,7 +48,7 @@ def _parse_limits(settings: tuple[str, ...]) -> dict[str, float | None]:
             value = None if text == "none" else float(text)
         except ValueError:
             value = math.nan
-        if value is not None and not LIMITS[name].admits(value):
+        if value is not None and not ALL_LIMITS[name].admits(value):
             raise InputError(f"--set: found {format_value(words)}, expected {allowed_values(name)}")
         replaced[name] = value
     return replaced

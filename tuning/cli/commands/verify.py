@@ -29,13 +29,39 @@ def _format_exponential(value: float | None) -> str:
     return "-" if value is None else f"{value:.1e}"
 
 
+def _six_axis_tables(document: dict[str, Any]) -> list[Any]:
+    """Return the tables of replayed runs and of the closed loop in six axes."""
+    closed = document["closed_loop"]
+    twists = zip(("vx", "vy", "vz", "wx", "wy", "wz"), closed["found"], closed["simulated"], strict=True)
+    return [
+        terminal.build_table(
+            f"{document['mechanism']}, {document['compensator']}: recorded runs through the runtime",
+            ["run", "ticks", "largest difference of wrenches", "of poses"],
+            [
+                (
+                    *("nominal" if number == 0 else f"draw {number}", lane["ticks"]),
+                    *(_format_exponential(lane["difference"]), _format_exponential(lane["pose_difference"])),
+                )
+                for number, lane in enumerate(document["replay"])
+            ],
+        ),
+        terminal.build_table(
+            f"Final twist of the nominal run with the runtime in the loop ({closed['status']})",
+            ["", "found", "simulated"],
+            [(name, *(terminal.format_number(value, 9) for value in values)) for name, *values in twists],
+        ),
+    ]
+
+
 def _print(document: dict[str, Any]) -> None:
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_SHORT_TEXT
 
     tables: list[Any] = list(document.get("self_test", ()))
     if "signature" in document:
         tables.append(f"Signature: {document['signature']}.")
-    if "replay" in document:
+    if document.get("axes") == 6:
+        tables += _six_axis_tables(document)
+    elif "replay" in document:
         tables += [
             terminal.build_table(
                 f"{document['mechanism']}, {document['compensator']}: runs replayed by the runtime",
@@ -67,7 +93,12 @@ def _print(document: dict[str, Any]) -> None:
                 texts=(5, 6),
             ),
         ]
-    if document["verdict"]:
+    if document["verdict"] and document.get("axes") == 6:
+        lines = [
+            f"Good: commands agree to {document['replay_limit']:.0e} of their range, the final twist to "
+            f"{document['closed_loop_limit']:.0e}."
+        ]
+    elif document["verdict"]:
         lines = [
             f"Good: commands agree to {document['replay_limit']:.0e} of their range, restitutions to "
             f"{document['closed_loop_limit']:.0e}; real contact: {CONTACT_BOUNDS_SHORT_TEXT}."

@@ -23,3 +23,6 @@ BRIDGE_STEPS = 12  # number of integration steps from the last reading to the pr
 AHEAD = 0.5  # control periods; the prediction ends in the middle of the command's period
 HIGHEST = 2.0  # [1]; limit on the predicted force, divided by the larger of expected and measured peak
 LEAST_STIFFNESS = 100.0  # 1/s^2; lower bound of the stiffness in the limit of the correction
+LONG_AGO = 1e9  # ticks; at the beginning of a run, the last contact counts as this long ago
+FEW_READINGS = 5.0  # minimum number of readings of the tangent model; with fewer the status is `unsure`
+LATE = 0.8  # [1]; limit on D divided by the contact's duration; beyond it the status is `too_short`

@@ -1,0 +1,210 @@
+"""Booking of impulses: onset, reference trajectory at the model's time, bridge, and command."""
+
+from math import sqrt
+
+from jaxhil.laws.impulse_ledger.six_axes.constants import (
+    AHEAD,
+    HIGHEST,
+    LEAST_SHARE,
+    LEAST_SPEED,
+    LEAST_STIFFNESS,
+    LEAST_TWIST,
+    TURNED,
+)
+from jaxhil.laws.impulse_ledger.six_axes.reading.rig import LONGEST_RECALL, ModelRows, SixAxisReader
+from jaxhil.laws.impulse_ledger.six_axes.tangent_model.rig import TangentModel
+from jaxhil.rig.six_axes.registry import ModelConstants
+from jaxhil.rig.six_axes.vectors import AXES, Matrix, Vector, add_multiple, dot, multiply, product, subtract
+from jaxhil.rig.types import Gains, Positive
+
+
+class Ledger:
+    """State of one contact, and the impulse that the numerical model still owes.
+
+    Attributes:
+        delay: D [ticks].
+        tangent: model of the contact along its direction.
+        is_limited: whether the last correction was at its limit.
+    """
+
+    __slots__ = (
+        "_command", "_corrected", "_correction_limit", "_deeper", "_direction", "_drift", "_impulse",
+        "_inverse", "_least_delay", "_longest", "_mass", "_mixed", "_modelled", "_path", "_peak",
+        "_period", "_pole", "_position_gain", "_speed", "_unpaid", "_velocity_gain", "delay", "is_limited",
+        "tangent",
+    )  # fmt: skip
+    _period: Positive
+    _inverse: Matrix
+    _mass: Matrix
+
+    def __init__(self, gains: Gains, constants: ModelConstants, period: Positive) -> None:
+        self._period = period
+        self._mass = constants.mass_matrix
+        self._inverse = constants.inverse_mass
+        self._velocity_gain = gains["velocity_gain"]
+        self._position_gain = gains["position_gain"]
+        self._correction_limit = gains["correction_limit"]
+        self._pole = gains["direction_pole"]
+        self._least_delay = gains["identification_delay"] / period
+        self._longest = constants.longest_delay / period
+        if not self._longest <= LONGEST_RECALL:
+            raise ValueError(f"a delay of {self._longest!r} periods, expected at most {LONGEST_RECALL!r}")
+        self.tangent = TangentModel(gains, period)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all contacts."""
+        self.delay = 0.0
+        self.is_limited = False
+        self._speed = 1.0  # v_0, approach speed along the direction
+        self._impulse = [0.0] * AXES  # I_r, impulse of the reference up to t - D
+        self._drift = [0.0] * AXES  # eps, pose of the model at t - D minus that of the reference
+        self._mixed = [0.0] * AXES  # filtered wrench, with continuous sign
+        self._direction = [0.0] * AXES  # w
+        self._modelled = [0.0] * AXES  # direction for which the tangent model began
+        self._unpaid = [0.0] * AXES  # L
+        self._command = [0.0] * AXES
+        self._corrected = 0.0  # F_r, force on the reference
+        self._deeper = 0.0  # depth of the hardware beyond that of the reference
+        self._path = 0.0  # X, depth of the hardware along the direction since the onset
+        self._peak = 0.0  # largest force so far, per unit mass
+        self.tangent.restart()
+
+    def begin(self, reader: SixAxisReader, pose_desired: Vector, twist_desired: Vector) -> None:
+        """Begin a contact with the reader's reading (b); `follow` sets its impulse."""
+        wrench = list(reader.wrench)
+        direction = multiply(1.0 / self._size(wrench), wrench)
+        if not reader.is_recent:
+            if reader.has_flown:
+                self._approach(direction, reader.lag, reader.twist)
+            else:
+                self._approach(direction, subtract(pose_desired, reader.pose), twist_desired)
+            reader.tool = 0.0
+        self._mixed = wrench
+        self._direction = direction
+        self._modelled = list(direction)
+        self._drift = [0.0] * AXES
+        self._path = 0.0
+        self._peak = 0.0
+
+    def _approach(self, direction: Vector, lag: Vector, twist: Vector) -> None:
+        """Set delay and approach speed from lag and twist of free flight."""
+        momentum = product(self._mass, twist)
+        whole = dot(twist, momentum)
+        speed = sqrt(whole) if whole > 0.0 else 0.0
+        closing = -dot(direction, twist)
+        # Where the contact is across the motion, the delay is the mean over all directions.
+        delay = dot(lag, momentum) / (whole + LEAST_TWIST * LEAST_TWIST)
+        if closing > LEAST_SHARE * speed + LEAST_TWIST:
+            delay = -dot(direction, lag) / closing
+        self.delay = min(max(delay / self._period, self._least_delay), self._longest)
+        self._speed = max(closing, LEAST_SPEED * speed + LEAST_TWIST)
+
+    def follow(self, reader: SixAxisReader, commanded: Vector, begins: bool) -> Vector:
+        """Return the command about C's origin after a reading.
+
+        Args:
+            reader: reader with the reading of this tick.
+            commanded: I_c, impulse commanded so far [N s, N m s].
+            begins: whether the contact begins with this reading.
+        """
+        recalled = reader.recall_model(self.delay)
+        if begins:
+            self._impulse = list(recalled[12:18])
+        self._turn(reader, begins)
+        wrench, direction = reader.wrench, self._direction
+        force = dot(wrench, product(self._inverse, direction))
+        self._book(reader, recalled, force)
+        self._peak = max(self._peak, abs(force))
+        stiffness = max(self.tangent.stiffness, LEAST_STIFFNESS)
+        self._unpaid = subtract(commanded, self._impulse)
+        self._command = [0.0] * AXES
+        gain = 0.0
+        if reader.loud:
+            ahead = (self.delay + AHEAD) * self._period
+            rest = add_multiple(wrench, -force, direction)
+            last = 0.0
+            if self._corrected != 0.0:
+                gain = self._position_gain
+                last = self._bridge(recalled, min(force, 0.0), stiffness, ahead)
+            self._unpaid = add_multiple(self._unpaid, -ahead, rest)
+            self._command = add_multiple(rest, last, direction)
+        reader.weigh_tool()
+        # Command (e).
+        pulled = add_multiple(self._unpaid, gain, product(self._mass, self._drift))
+        return add_multiple(self._command, 1.0, self._correction(pulled, stiffness))
+
+    def _book(self, reader: SixAxisReader, recalled: ModelRows, force: float) -> None:
+        """Update the tangent model, and book the impulse of the reference at its own time t - D (c)."""
+        period, direction, tangent = self._period, self._direction, self.tangent
+        rate = -dot(direction, reader.moved) / period
+        if reader.loud:
+            tangent.learn(self._path, rate, force, reader.variance, self._speed)
+        tangent.settle(self._path, self._speed)
+        missing = product(self._inverse, subtract(recalled[12:18], self._impulse))
+        self._drift = add_multiple(self._drift, period, missing)
+        offset = subtract(reader.pose, recalled[0:6])
+        self._deeper = -(dot(direction, offset) + dot(direction, self._drift))
+        faster = rate + dot(direction, recalled[6:12]) - dot(direction, missing)
+        self._corrected = force
+        if reader.loud:
+            correction = tangent.restoring(-self._deeper) - tangent.damping * faster
+            self._corrected = max(force + correction, min(force, 0.0))
+        self._impulse = add_multiple(self._impulse, period, reader.wrench)
+        self._impulse = add_multiple(self._impulse, period * (self._corrected - force), direction)
+
+    def _bridge(self, recalled: ModelRows, least: float, stiffness: float, ahead: float) -> float:
+        """Bridge from t - D to the middle of the command's period (d); return the last force."""
+        direction, tangent = self._direction, self.tangent
+        missing = product(self._inverse, subtract(recalled[12:18], self._impulse))
+        velocity = dot(direction, missing) - dot(direction, recalled[6:12])
+        tangent.bridge(self._corrected, least, self._deeper, velocity, ahead)
+        self._unpaid = add_multiple(self._unpaid, -tangent.impulse, direction)
+        expected = max(sqrt(stiffness) * self._speed, self._peak)
+        return min(tangent.force, HIGHEST * expected)
+
+    def unpaid_share(self) -> float:
+        """Return the size of the unpaid impulse over that of the reference's."""
+        return self._size(self._unpaid) / self._size(self._impulse)
+
+    def _turn(self, reader: SixAxisReader, begins: bool) -> None:
+        """Update the direction; begin the tangent model anew where it has turned.
+
+        The sign is continuous: a latch that pulls does not turn the direction.
+        """
+        if reader.loud and not begins:
+            old, pole = self._mixed, self._pole
+            along = dot(old, product(self._inverse, reader.wrench))
+            sign = -1.0 if along < 0.0 else 1.0
+            self._mixed = [
+                sign * now + pole * (before - sign * now)
+                for before, now in zip(old, reader.wrench, strict=True)
+            ]
+            self._direction = multiply(1.0 / self._size(self._mixed), self._mixed)
+        direction = self._direction
+        # Another surface, or another part of it, needs another model.
+        turns = begins
+        if reader.loud and not begins:
+            turns = dot(self._modelled, product(self._inverse, direction)) < TURNED
+        if turns:
+            self._modelled = list(direction)
+            self.tangent.restart()
+            self._path = 0.0
+        else:
+            self._path -= dot(direction, reader.moved)
+
+    def _correction(self, unpaid: Vector, stiffness: float) -> Vector:
+        """Return the wrench that pays the unpaid impulse, with limited size."""
+        wrench = multiply(-self._velocity_gain, unpaid)
+        limit = self._correction_limit * sqrt(stiffness) * self._speed
+        square = dot(wrench, product(self._inverse, wrench))
+        size = sqrt(square) if square > 0.0 else 0.0
+        self.is_limited = size > limit
+        if size > limit:
+            return multiply(limit / size, wrench)
+        return wrench
+
+    def _size(self, wrench: Vector) -> float:
+        """Return the size of a wrench, never 0."""
+        square = dot(wrench, product(self._inverse, wrench))
+        return sqrt(square) if square > 0.0 else 1.0

@@ -1,0 +1,218 @@
+"""Reading of a tick: delay line, pose filter, tool correction, gate, means over free flight."""
+
+from math import floor
+from typing import Annotated
+
+from jaxhil.laws.impulse_ledger.six_axes.constants import (
+    LEAST_RATE,
+    LONG_AGO,
+    LONGEST_FLIGHT,
+    LONGEST_MEAN,
+    ONSET_SIGMAS,
+    RECENT,
+)
+from jaxhil.rig.six_axes.registry import ModelConstants
+from jaxhil.rig.six_axes.vectors import (
+    AXES,
+    Matrix,
+    Vector,
+    add_multiple,
+    dot,
+    product,
+    subtract,
+    wrench_at_chaser,
+)
+from jaxhil.rig.types import Count, Gains, Index, Positive
+
+SAMPLES = 512  # ticks of the delay line, a power of two
+MASK = SAMPLES - 1
+LONGEST_RECALL = SAMPLES - 2.0  # ticks; a recalled sample lies between two stored ones
+ROWS = 4 * AXES  # filtered pose of the hardware, and pose, twist and impulse of the model
+MODEL_ROWS = 3 * AXES
+ModelRows = Annotated[list[float], MODEL_ROWS]
+
+
+class SixAxisReader:
+    """Readings of the impulse ledger in six axes; README.md of the parent folder states the equations.
+
+    Attributes:
+        wrench: W, about C's origin, without bias and tool [N, N m].
+        variance: variance of its size by noise.
+        pose: xi_a, measured pose as old as the wrench [m, rad].
+        moved: its change since the last tick.
+        loud: whether the wrench is that of a contact.
+        quiet: ticks since the last reading in contact.
+        tool: largest square of the tool's share of a reading in this contact.
+        has_flown: whether `lag` and `twist` are means over free flight.
+        lag: mean pose of the model minus that of the hardware, as old as the reading [m, rad].
+        twist: mean twist of the model [m/s, rad/s].
+    """
+
+    __slots__ = (
+        "_age", "_back", "_back_share", "_back_ticks", "_bias", "_filtered", "_first", "_flight_ticks",
+        "_force_variance", "_inverse", "_kept", "_longest_flight", "_mass", "_noise_angular",
+        "_noise_linear", "_period", "_pole", "_readings", "_rows", "_settle", "_tool_correction",
+        "_torque_variance", "lag", "loud", "moved", "pose", "quiet", "tool", "twist", "variance", "wrench",
+    )  # fmt: skip
+    _age: Count  # ticks since the run began
+    _period: Positive
+    _rows: Annotated[list[list[float]], SAMPLES, ROWS]
+    _back_ticks: Count
+    _inverse: Matrix
+    _mass: Matrix
+    _tool_correction: Matrix
+    lag: Vector
+    twist: Vector
+
+    def __init__(self, gains: Gains, constants: ModelConstants, period: Positive) -> None:
+        self._period = period
+        self._mass = constants.mass_matrix
+        self._inverse = constants.inverse_mass
+        self._tool_correction = constants.tool_correction
+        delay = gains["identification_delay"]
+        filter_lag = min(gains["pose_filter"], delay)
+        self._pole = filter_lag / (filter_lag + period)
+        self._kept = 1.0 / (1.0 - self._pole)
+        self._back = (delay - filter_lag) / period
+        if not self._back <= LONGEST_RECALL:
+            raise ValueError(f"a delay of {self._back!r} periods, expected at most {LONGEST_RECALL!r}")
+        self._back_ticks = floor(self._back)
+        self._back_share = self._back - self._back_ticks
+        self._force_variance = gains["force_noise"] * gains["force_noise"]
+        self._torque_variance = gains["torque_noise"] * gains["torque_noise"]
+        inverse = constants.inverse_mass
+        self._noise_linear = inverse[0][0] + inverse[1][1] + inverse[2][2]
+        self._noise_angular = inverse[3][3] + inverse[4][4] + inverse[5][5]
+        self._settle = gains["settle"]
+        self._longest_flight = LONGEST_FLIGHT / period
+        self._rows = [[0.0] * ROWS for _ in range(SAMPLES)]
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin another run."""
+        self._age = 0
+        self._bias = [0.0] * AXES
+        self._readings = 0.0
+        self._flight_ticks = 0.0
+        self._filtered = [0.0] * AXES
+        self._first = [0.0] * AXES
+        self.lag = [0.0] * AXES
+        self.twist = [0.0] * AXES
+        self.quiet = LONG_AGO
+        self.tool = 0.0
+        self.wrench = [0.0] * AXES
+        self.pose = [0.0] * AXES
+        self.moved = [0.0] * AXES
+        self.variance = 0.0
+        self.loud = False
+
+    @property
+    def has_flown(self) -> bool:
+        """Return whether `lag` and `twist` are means over free flight."""
+        return self._flight_ticks > 0.0
+
+    @property
+    def is_recent(self) -> bool:
+        """Return whether the hardware has been in contact a short time ago."""
+        return self.quiet * self._period < RECENT
+
+    def read(
+        self,
+        wrench: Vector,
+        pose_desired: Vector,
+        twist_desired: Vector,
+        pose_measured: Vector,
+        impulse: Vector,
+        in_contact: bool,
+    ) -> None:
+        """Take the inputs of a tick; arguments as in `SixAxisCompensator.step`.
+
+        `impulse` is the impulse commanded so far [N s, N m s], `in_contact` holds after the last tick.
+        """
+        begins = self._age == 0
+        period = self._period
+        pose = self._aligned(pose_desired, twist_desired, pose_measured, impulse)
+        if begins:
+            self.pose = add_multiple(pose, -period, twist_desired)
+        self.moved = subtract(pose, self.pose)
+        self.pose = pose
+        # The hardware accelerates by M^-1 W, and the sensor reads (1 - M_t M^-1) W (a).
+        corrected = product(self._tool_correction, wrench_at_chaser(wrench, pose))
+        unbiased = subtract(corrected, self._bias)
+        self.wrench = unbiased
+        square = pose[0] * pose[0] + pose[1] * pose[1] + pose[2] * pose[2]
+        moment = self._torque_variance + self._force_variance * square
+        self.variance = self._noise_linear * self._force_variance + self._noise_angular * moment
+        settles = self._age * period < self._settle
+        is_recent = self.is_recent
+        gate = ONSET_SIGMAS * ONSET_SIGMAS * self.variance
+        gate += LEAST_RATE * LEAST_RATE * dot(twist_desired, product(self._mass, twist_desired))
+        if in_contact or is_recent:
+            gate += self.tool
+        self.loud = not settles and dot(unbiased, product(self._inverse, unbiased)) > gate
+        if not in_contact and not self.loud:
+            self._fly(corrected, subtract(pose_desired, pose), twist_desired, not is_recent)
+        self._age += 1
+
+    def weigh_tool(self) -> None:
+        """Update the tool's share of the readings in this contact."""
+        share = subtract(product(self._tool_correction, self.wrench), self.wrench)
+        self.tool = max(self.tool, dot(share, product(self._inverse, share)))
+
+    def recall_model(self, ticks: float) -> ModelRows:
+        """Return pose, twist and impulse of the model so many ticks ago, linear between samples."""
+        whole = floor(ticks)
+        share = ticks - whole
+        newest = self._age - 1 - whole
+        newer = self._model_at(newest)
+        older = self._model_at(newest - 1)
+        return [new + share * (old - new) for new, old in zip(newer, older, strict=True)]
+
+    def _model_at(self, age: int) -> ModelRows:
+        """Return pose, twist and impulse of the model at a tick; before the first one in uniform motion."""
+        if age >= 0:
+            index: Index = age & MASK
+            return self._rows[index][AXES:ROWS]
+        first = self._rows[0]
+        passed = age * self._period
+        moved = [at + passed * rate for at, rate in zip(first[6:12], first[12:18], strict=True)]
+        return [*moved, *first[12:18], *[0.0] * AXES]
+
+    def _aligned(
+        self, pose_desired: Vector, twist_desired: Vector, pose_measured: Vector, impulse: Vector
+    ) -> Vector:
+        """Store this tick; return the filtered pose as old as the reading."""
+        age: Index = self._age & MASK
+        pole, period = self._pole, self._period
+        rows = self._rows
+        if self._age == 0:
+            # In uniform motion the filter lags by pole/(1 - pole) ticks.
+            self._filtered = add_multiple(pose_measured, -(period * self._kept), twist_desired)
+        self._filtered = [
+            at + pole * (old - at) for at, old in zip(pose_measured, self._filtered, strict=True)
+        ]
+        rows[age] = [*self._filtered, *pose_desired, *twist_desired, *impulse]
+        if self._age == 0:
+            self._first = list(self._filtered)
+        ago = self._back - self._age
+        if ago > 0.0:
+            return add_multiple(self._first, -(period * ago), twist_desired)
+        newer: Index = (self._age - self._back_ticks) & MASK
+        older: Index = (self._age - self._back_ticks - 1) & MASK
+        share = self._back_share
+        return [
+            new + share * (old - new) for new, old in zip(rows[newer][:AXES], rows[older][:AXES], strict=True)
+        ]
+
+    def _fly(self, wrench: Vector, lag: Vector, twist: Vector, is_uniform: bool) -> None:
+        """Update the bias by a reading of free flight, and lag and twist if the motion is uniform as well."""
+        self._readings = min(self._readings + 1.0, LONGEST_MEAN)
+        share = 1.0 / max(self._readings, 1.0)
+        self._bias = [mean + share * (now - mean) for mean, now in zip(self._bias, wrench, strict=True)]
+        if not is_uniform:
+            self._flight_ticks = 0.0
+            return
+        self._flight_ticks = min(self._flight_ticks + 1.0, self._longest_flight)
+        share = 1.0 / max(self._flight_ticks, 1.0)
+        self.lag = [mean + share * (now - mean) for mean, now in zip(self.lag, lag, strict=True)]
+        self.twist = [mean + share * (now - mean) for mean, now in zip(self.twist, twist, strict=True)]

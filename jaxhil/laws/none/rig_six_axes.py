@@ -1,0 +1,24 @@
+"""No compensation in six axes: the numerical model feels the measured wrench."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from jaxhil.rig.registry import GainSpecification
+from jaxhil.rig.six_axes.registry import ModelConstants, SixAxisCompensator, register_six_axes
+from jaxhil.rig.types import Gains, Positive
+
+
+@register_six_axes("none")
+class NoCompensation(SixAxisCompensator):
+    """Baseline W_c = W, whose contacts diverge because of the loop's delay."""
+
+    __slots__ = ()
+
+    gains: ClassVar[Mapping[str, GainSpecification]] = {}
+
+    def __init__(self, gains: Gains, constants: ModelConstants, period: Positive) -> None:
+        pass
+
+    def step(self, wrench, pose_desired, twist_desired, pose_measured):
+        """Return the measured wrench [N, N m]."""
+        return list(wrench)

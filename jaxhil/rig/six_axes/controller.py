@@ -1,0 +1,438 @@
+"""Controller in six axes that the rig calls once per control period.
+
+As on one axis (`jaxhil.rig.controller`) it checks the inputs, audits every contact, computes the wrench with
+the compensator that the gain file names, and limits the outputs. A trip is latched until `reset`: the wrench
+ramps to 0, and the pose command moves back along the way that it came. After construction no method raises,
+and each takes bounded time.
+"""
+
+import os
+from collections.abc import Mapping, Sequence
+from math import nan
+from typing import Any
+
+from jaxhil.rig.clock import Clock
+from jaxhil.rig.conversion import as_float
+from jaxhil.rig.errors import make_gain_file_error
+from jaxhil.rig.faults import CLOCK, EMERGENCY_STOP, LAW_IN_DOUBT, TARE, UNUSABLE, fault_names
+from jaxhil.rig.gain_document import read_gain_document
+from jaxhil.rig.law_status import STATUS_NAMES, UNSTATED, ContactCount, ContactRecord, contact_record
+from jaxhil.rig.six_axes.faults import SIX_AXIS_FAULTS
+from jaxhil.rig.six_axes.gain_file import SixAxisGainFile, check_six_axis_document
+from jaxhil.rig.six_axes.inputs import SixAxisInputGuard, WrenchTare
+from jaxhil.rig.six_axes.outputs import PoseGuard, WrenchGuard
+from jaxhil.rig.six_axes.registry import SIX_AXIS_COMPENSATORS, ModelConstants, SixAxisCompensator
+from jaxhil.rig.six_axes.vectors import AXES, Vector, coordinate_rates, is_finite
+from jaxhil.rig.six_axes.watchdog import SixAxisWatchdog
+from jaxhil.rig.types import Bits, Limits, Positive, SmallInt
+
+CHANNEL_NAMES = ("fx", "fy", "fz", "mx", "my", "mz", "x", "y", "z", "rx", "ry", "rz")
+
+
+class Controller6:
+    """Compensator in six axes with its gains, its guards and its state.
+
+    Attributes:
+        faults: bits of the faults of this tick (`faults.SIX_AXIS_FAULTS`).
+        seen: bits of the faults of all ticks since `reset`.
+        cause: bits of the faults that tripped the controller, 0 if none has.
+        channels: bits of the channels of sensors with a fault in this tick: wrench, then pose.
+    """
+
+    __slots__ = (
+        "_clock", "_command", "_detail", "_forces", "_inputs", "_law", "_period", "_poses", "_sent",
+        "_stopped", "_tare", "_watchdog", "cause", "faults", "seen",
+    )  # fmt: skip
+    cause: Bits
+    faults: Bits
+    seen: Bits
+    _command: Vector
+    _sent: Vector
+    _detail: str
+    _law: SixAxisCompensator
+    _period: Positive
+
+    def __init__(self, gain_file: SixAxisGainFile, source: str = "gain document") -> None:
+        law = SIX_AXIS_COMPENSATORS[gain_file.compensator]
+        period, constants = gain_file.control_period, gain_file.constants
+        self._period = period
+        try:
+            self._law = law(gain_file.gains, constants, period)
+        except ValueError as error:
+            raise make_gain_file_error(
+                source, "gains", str(error), "gains that fit the control period"
+            ) from None
+        self._guard(gain_file.limits, constants, period)
+
+    def _guard(self, limits: Limits, constants: ModelConstants, period: Positive) -> None:
+        """Create the guards of inputs, contacts and outputs, and reset the controller."""
+        self._period = period
+        self._clock = Clock(limits, period)
+        self._tare = WrenchTare(limits)
+        self._inputs = SixAxisInputGuard(limits)
+        self._watchdog = SixAxisWatchdog(limits, constants, period, self._law.status != UNSTATED)
+        self._forces = WrenchGuard(limits, period)
+        self._poses = PoseGuard(limits, period)
+        self._command = [0.0] * AXES
+        self._sent = [0.0] * AXES
+        self._stopped = False
+        self.cause = 0
+        self._restart()
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> "Controller6":
+        """Return the controller of a gain file.
+
+        Args:
+            path: path of the gain file.
+
+        Raises:
+            GainFileError: if the file is invalid.
+        """
+        source = os.fspath(path)
+        return cls(check_six_axis_document(read_gain_document(source), source), source)
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> "Controller6":
+        """Return the controller of a gain document.
+
+        Args:
+            document: content of a gain file.
+
+        Raises:
+            GainFileError: if the document is invalid.
+        """
+        return cls(check_six_axis_document(document))
+
+    @property
+    def control_period(self) -> float:
+        """Return the control period [s] for which the gains are valid."""
+        return self._period
+
+    @property
+    def tripped(self) -> bool:
+        """Return whether a fault has tripped the controller since the last `reset`."""
+        return self.cause != 0
+
+    @property
+    def channels(self) -> int:
+        """Return the bits of the sensors' channels with a fault in this tick: wrench, then pose."""
+        return self._inputs.channels
+
+    @property
+    def status(self) -> str:
+        """Return `ok`, or `tripped: ` and the cause."""
+        if not self.cause:
+            return "ok"
+        names = ", ".join(fault_names(self.cause, SIX_AXIS_FAULTS))
+        return f"tripped: {names}" + (f" ({self._detail})" if self._detail else "")
+
+    @property
+    def at_rest(self) -> bool:
+        """Return whether the pose command has come to rest after a trip."""
+        return self.cause != 0 and self._poses.at_rest
+
+    @property
+    def bias(self) -> Vector:
+        """Return the force sensor's bias [N, N m] by the last successful tare."""
+        return list(self._tare.bias)
+
+    @property
+    def missed_ticks(self) -> int:
+        """Return the number of missed ticks since `reset`, by the times passed to `step`."""
+        return self._clock.missed
+
+    @property
+    def late_ticks(self) -> int:
+        """Return the number of late ticks since `reset`, by the times passed to `step`."""
+        return self._clock.late
+
+    @property
+    def loop_delay(self) -> float:
+        """Return the lag [s] of the hardware behind the model in the last contact; 0 if unknown."""
+        return self._law.loop_delay
+
+    @property
+    def unpaid_impulse(self) -> float:
+        """Return the impulse that the last contact has left unpaid, over its impulse; 0 if unknown."""
+        return self._law.unpaid_impulse
+
+    @property
+    def law_status(self) -> str:
+        """Return the compensator's status of the last command, a name in `law_status.STATUSES`."""
+        return STATUS_NAMES[self._status()]
+
+    def _status(self) -> SmallInt:
+        """Return the number of the compensator's status of the last command."""
+        return self._law.status
+
+    @property
+    def last_contact(self) -> ContactRecord:
+        """Return the statuses of the last audited contact; its number is 0 before the first one."""
+        return contact_record(self._last_count())
+
+    def _last_count(self) -> ContactCount:
+        """Return the statuses of the last audited contact, which remain even after `reset`."""
+        return self._watchdog.record
+
+    @property
+    def last_audit(self) -> tuple[float, float, float]:
+        """Return error of the momentum, energy gain and unpaid impulse of the last audited contact [1]."""
+        watchdog = self._watchdog
+        return watchdog.momentum_error, watchdog.energy_gain, watchdog.unpaid_impulse
+
+    def tare(self, wrench: Sequence[float]) -> bool:
+        """Add one reading of the force sensor out of contact; return True once there are enough.
+
+        Call it once per tick before a run. The mean of the readings is then subtracted from every reading
+        until the next tare. Unusable readings trip the controller with the fault `tare`.
+
+        Args:
+            wrench: wrench reading [N, N m].
+        """
+        return self._take(as_vector(wrench))
+
+    def _take(self, wrench: Vector) -> bool:
+        """Add one reading of the force sensor out of contact; return true once there are enough."""
+        if self.cause:
+            return True
+        over = self._tare.take(wrench)
+        if self._tare.fatal:
+            self._fail(TARE, "a reading out of contact")
+        return over
+
+    def step(
+        self,
+        wrench: Sequence[float],
+        pose_desired: Sequence[float],
+        twist_desired: Sequence[float],
+        pose_measured: Sequence[float],
+        time: float | None = None,
+    ) -> Vector:
+        """Return the wrench W_c [N, N m] on the numerical model for this tick, about T's origin.
+
+        After a trip the wrench ramps to 0 and stays there until `reset`.
+
+        Args:
+            wrench: measured wrench on the chaser about T's origin, in T axes [N, N m].
+            pose_desired: coordinates of C against T in the numerical model [m, rad].
+            twist_desired: twist of C against T in the numerical model [m/s, rad/s].
+            pose_measured: coordinates of C against T on the hardware [m, rad].
+            time: time of this tick by the rig's clock [s], to detect missed and late ticks.
+        """
+        return self._step(
+            as_vector(wrench),
+            as_vector(pose_desired),
+            as_vector(twist_desired),
+            as_vector(pose_measured),
+            None if time is None else as_float(time),
+        )
+
+    def _step(
+        self,
+        wrench: Vector,
+        pose_desired: Vector,
+        twist_desired: Vector,
+        pose_measured: Vector,
+        time: float | None,
+    ) -> Vector:
+        """Return the wrench W_c [N, N m] on the numerical model for this tick, about T's origin.
+
+        After a trip the wrench ramps to 0 and stays there until `reset`. The arguments are the measured
+        wrench on the chaser about T's origin [N, N m], pose and twist of the numerical model [m, rad, m/s,
+        rad/s], the measured pose [m, rad], and the tick's time [s] or NULL.
+        """
+        forces, inputs = self._forces, self._inputs
+        self.faults = 0
+        inputs.locate(pose_measured)
+        if self.cause:
+            forces.fade()
+            return list(forces.output)
+        faults = 0
+        fatal = 0
+        if time is not None:
+            faults = self._clock.tick(time)
+            if self._clock.fatal:
+                fatal = faults
+        faults |= inputs.check(wrench, pose_desired, twist_desired, pose_measured, self._tare.bias)
+        fatal |= inputs.fatal
+        law, watchdog = self._law, self._watchdog
+        if watchdog.on and not fatal:
+            alarm = watchdog.tick(
+                forces.output,
+                law.status,
+                law.loop_delay,
+                law.unpaid_impulse,
+                inputs.wrench,
+                pose_desired,
+                twist_desired,
+            )
+            faults |= alarm
+            fatal = alarm & ~LAW_IN_DOUBT
+        if not fatal:
+            try:
+                computed = self._compute(pose_desired, twist_desired)
+            except Exception:  # of any compensator: the rig always needs a command
+                computed = False
+            if not computed:
+                self._command[0] = nan
+            faults |= forces.limit(self._command)
+            fatal = forces.fatal
+        self.faults = faults
+        self.seen |= faults
+        if fatal:
+            self._fail(fatal, self._describe(fatal))
+            forces.fade()
+        return list(forces.output)
+
+    def _compute(self, pose_desired: Vector, twist_desired: Vector) -> bool:
+        """Compute the compensator's wrench for the checked readings; return true."""
+        inputs = self._inputs
+        self._command = self._law.step(inputs.wrench, pose_desired, twist_desired, inputs.measured)
+        return True
+
+    def pose_command(
+        self, pose: Sequence[float], twist: Sequence[float], acceleration: Sequence[float] | None = None
+    ) -> Vector:
+        """Return the pose [m, rad] to command for the numerical model's motion after this tick's step.
+
+        Two commands in a row differ by at most `velocity_limit` and `angular_velocity_limit` times the
+        period. A run's first command differs as little from the measured pose; out of contact, where moving
+        drives lag behind, it may differ by `start_distance` and `start_angle`. Before a run's first `step`,
+        the model's pose stands for the measured one.
+
+        After a trip the commands brake and lead back along the way that they came, for
+        `retreat_distance`. They begin at the last command; without one, at the last measured pose.
+
+        Args:
+            pose: coordinates of C against T in the numerical model [m, rad].
+            twist: twist of C against T in the numerical model [m/s, rad/s].
+            acceleration: acceleration of the numerical model; no compensator needs it.
+        """
+        return self._pose_command(as_vector(pose), as_vector(twist))
+
+    def _pose_command(self, pose: Vector, twist: Vector) -> Vector:
+        """Return the pose [m, rad] to command for the numerical model's motion after this tick's step.
+
+        The arguments are coordinates [m, rad] and twist [m/s, rad/s] of C against T in the numerical model.
+        """
+        poses, inputs = self._poses, self._inputs
+        if not self.cause:
+            computed = is_finite(pose) and is_finite(twist)
+            if computed:
+                computed = self._try_lead(pose, twist)
+            if not computed:
+                self._sent[0] = nan
+            is_free = not self._law.is_acting
+            faults = poses.limit(self._sent, pose, inputs.located, inputs.is_located, is_free)
+            self.faults |= faults
+            self.seen |= faults
+            if not poses.fatal:
+                return list(poses.output)
+            self._fail(poses.fatal, "" if computed else "the numerical model's motion")
+        poses.retreat(inputs.located, pose)
+        return list(poses.output)
+
+    def _try_lead(self, pose: Vector, twist: Vector) -> bool:
+        """Compute the compensator's pose command; return whether it could."""
+        try:
+            computed = self._lead(pose, twist)
+        except Exception:  # of any compensator: the rig always needs a command
+            computed = False
+        return computed
+
+    def _lead(self, pose: Vector, twist: Vector) -> bool:
+        """Compute the compensator's pose command; return true."""
+        self._sent = self._law.pose_command(pose, coordinate_rates(pose, twist))
+        return True
+
+    def emergency_stop(self, active: bool) -> None:
+        """Set the state of the rig's emergency stop; an active stop trips the controller.
+
+        Call it with True while the stop is active (once is enough). The wrench ramps to 0 and the pose
+        command comes to rest; then `at_rest` is True and the drives may be switched off. Call it with False
+        after the stop is released. The trip stays latched until `reset`, which returns False before.
+
+        Args:
+            active: whether the stop is active.
+        """
+        self._stopped = bool(active)
+        if active:
+            self._fail(EMERGENCY_STOP, "")
+
+    def reset(self) -> bool:
+        """Restart everything but the tare; return False, without effect, while the emergency stop is active.
+
+        Wrench and pose command continue without a jump from their last values, within the limits. If the
+        drives have been moved since by other means, call `next_contact` as well.
+        """
+        if self._stopped or self.cause & UNUSABLE:
+            return False
+        self._restart()
+        return True
+
+    def _restart(self) -> None:
+        """Restart everything but the tare."""
+        self._law.reset()
+        self._clock.reset()
+        self._tare.restart()
+        self._inputs.restart()
+        self._watchdog.restart()
+        self._forces.restart()
+        self._poses.restart()
+        self.cause = 0
+        self.faults = 0
+        self.seen = 0
+        self._detail = ""
+
+    def next_contact(self) -> None:
+        """Begin a new run: restart filters, delay lines and estimates.
+
+        Call it when the rig has been moved to the start of the run: the first pose command continues from
+        the measured pose, not from the last command. A trip stays latched, and the time until the next tick
+        does not count as missed. A contact that is not over yet is audited first; its faults are in `faults`
+        until the next `step`.
+        """
+        if self.cause:
+            return
+        law = self._law
+        faults = self._watchdog.conclude(self._forces.output, law.status, law.unpaid_impulse)
+        self.faults = faults
+        self.seen |= faults
+        fatal = faults & ~LAW_IN_DOUBT
+        if fatal:
+            self._fail(fatal, self._describe(fatal))
+            return
+        law.next_contact()
+        self._clock.pause()
+        self._inputs.restart()
+        self._inputs.is_located = False
+        self._watchdog.restart()
+        self._poses.release()
+
+    def _describe(self, fatal: int) -> str:
+        """Return the channels with a fault, or the watchdog's audit, in words."""
+        if fatal & CLOCK:
+            return ""
+        bad = [name for n, name in enumerate(CHANNEL_NAMES) if self._inputs.channels >> n & 1]
+        if bad:
+            return ", ".join(bad)
+        return self._watchdog.detail(fatal)
+
+    def _fail(self, cause: int, detail: str) -> None:
+        """Trip the controller."""
+        # The first cause is the one to look at: later faults may be its consequences.
+        if not self.cause:
+            self.cause = cause
+            self._detail = detail
+        self.faults |= cause
+        self.seen |= self.faults
+
+
+def as_vector(values: Any) -> Vector:
+    """Convert six values to floats; return NaN for what is no number or not six."""
+    try:
+        vector = [value if type(value) is float else as_float(value) for value in values]
+    except TypeError:
+        return [nan] * AXES
+    return vector if len(vector) == AXES else [nan] * AXES

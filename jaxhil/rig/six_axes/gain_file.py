@@ -1,0 +1,107 @@
+"""Reader of gain files in six axes: returns checked numbers or raises a `GainFileError` of one line.
+
+Beside what a file of one axis has, it contains `constants`: what the controller knows of the numerical model
+and of the rig (`registry.ModelConstants`).
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from jaxhil.rig.bounds import TIMES
+from jaxhil.rig.errors import format_value, make_gain_file_error
+from jaxhil.rig.gain_document import (
+    check_form,
+    check_within,
+    read_control_period,
+    read_entry,
+    read_gains,
+    read_limits,
+    read_number,
+    read_object,
+)
+from jaxhil.rig.six_axes.limits import NO_SIX_AXIS_LIMITS, SIX_AXIS_LIMITS, complete_six_axis_limits
+from jaxhil.rig.six_axes.registry import SIX_AXIS_COMPENSATORS, ModelConstants
+from jaxhil.rig.six_axes.vectors import AXES, product
+
+MATRICES = ("mass_matrix", "inverse_mass", "tool_correction")
+MATRIX_ENTRIES = -1e9, 1e9  # lowest and highest entry, in SI units
+INVERSE_TOLERANCE = 1e-6  # largest entry of M M^-1 - 1, over the sizes of a row and a column
+
+
+class SixAxisGainFile(NamedTuple):
+    """Checked content of a gain file in six axes."""
+
+    compensator: str  # name
+    gains: Mapping[str, float]  # by name, in SI units
+    control_period: float  # [s]
+    constants: ModelConstants
+    limits: Mapping[str, float] = NO_SIX_AXIS_LIMITS  # by name, in SI units
+
+
+def check_six_axis_document(document: Mapping[str, Any], source: str = "gain document") -> SixAxisGainFile:
+    """Check a gain document in six axes and return what the controller needs of it.
+
+    Args:
+        document: content of a gain file.
+        source: name of the document in error messages.
+
+    Raises:
+        GainFileError: if the document is invalid.
+    """
+    check_form(document, source)
+    number = read_entry(document, "axes", source, "")
+    if number != AXES:
+        raise make_gain_file_error(source, "axes", format_value(number), str(AXES))
+    name = read_entry(document, "compensator", source, "")
+    if not isinstance(name, str) or name not in SIX_AXIS_COMPENSATORS:
+        allowed = f"one of {', '.join(SIX_AXIS_COMPENSATORS)}"
+        raise make_gain_file_error(source, "compensator", format_value(name), allowed)
+    gains = read_gains(document, name, SIX_AXIS_COMPENSATORS[name].gains, source)
+    period = read_control_period(document, source)
+    limits = read_limits(document, source, SIX_AXIS_LIMITS, complete_six_axis_limits)
+    return SixAxisGainFile(name, gains, period, _constants(document, source), limits)
+
+
+def _constants(document: Mapping[str, Any], source: str) -> ModelConstants:
+    """Return the constants of the numerical model and of the rig."""
+    entries = read_object(document, "constants", source, "")
+    for name in entries:
+        if name not in ModelConstants._fields:
+            allowed = ", ".join(ModelConstants._fields)
+            raise make_gain_file_error(source, "constants", f"an extra key {format_value(name)}", allowed)
+    mass, inverse, correction = (_matrix(entries, name, source) for name in MATRICES)
+    delay = read_number(
+        read_entry(entries, "longest_delay", source, "constants."), "constants.longest_delay", source
+    )
+    check_within(delay, *TIMES, "constants.longest_delay", source)
+    constants = ModelConstants(mass, inverse, correction, delay)
+    _check_inverse(constants, source)
+    return constants
+
+
+def _matrix(entries: Mapping[str, Any], name: str, source: str) -> list[list[float]]:
+    """Return a matrix of the constants as lists of floats."""
+    key, rows = f"constants.{name}", read_entry(entries, name, source, "constants.")
+    is_square = isinstance(rows, (list, tuple)) and len(rows) == AXES
+    if not is_square or not all(isinstance(row, (list, tuple)) and len(row) == AXES for row in rows):
+        raise make_gain_file_error(source, key, format_value(rows), f"{AXES} rows of {AXES} numbers")
+    matrix = [[read_number(entry, key, source) for entry in row] for row in rows]
+    for row in matrix:
+        for entry in row:
+            check_within(entry, *MATRIX_ENTRIES, key, source)
+    return matrix
+
+
+def _check_inverse(constants: ModelConstants, source: str) -> None:
+    """Raise GainFileError unless M has a positive diagonal and its inverse fits."""
+    mass, inverse = constants.mass_matrix, constants.inverse_mass
+    for i in range(AXES):
+        if not (mass[i][i] > 0.0 and inverse[i][i] > 0.0):
+            found = format_value(mass[i][i])
+            raise make_gain_file_error(source, "constants.mass_matrix", found, "a positive diagonal")
+        column = product(mass, [row[i] for row in inverse])
+        for j in range(AXES):
+            error = abs(column[j] - (1.0 if i == j else 0.0))
+            if not error <= INVERSE_TOLERANCE * max(1.0, (mass[j][j] * inverse[i][i]) ** 0.5):
+                allowed = "the inverse of constants.mass_matrix"
+                raise make_gain_file_error(source, "constants.inverse_mass", "another matrix", allowed)

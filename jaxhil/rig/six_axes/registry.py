@@ -1,0 +1,95 @@
+"""Interface of the rig's compensators in six axes, and the table of registered ones.
+
+A compensator is a class with the methods of `SixAxisCompensator`, from which it may inherit the defaults;
+`@register_six_axes(name)` adds it to the table under the name that gain files use.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import ClassVar, NamedTuple, Protocol, TypeVar
+
+from jaxhil.rig.law_status import OUT_OF_CONTACT, UNSTATED
+from jaxhil.rig.registry import GainSpecification
+from jaxhil.rig.six_axes.vectors import Matrix, Vector
+from jaxhil.rig.types import Gains, Positive
+
+
+class ModelConstants(NamedTuple):
+    """Constants of the numerical model and of the rig, which a gain file in six axes contains."""
+
+    mass_matrix: Matrix  # relative mass matrix M at the docked pose, about C's origin [kg, kg m, kg m^2]
+    inverse_mass: Matrix  # its inverse
+    # (1 - M_t M^-1)^-1, the contact's wrench per reading, about C's origin; the identity without a tool
+    tool_correction: Matrix
+    longest_delay: float  # upper bound of the loop's delay [s]
+
+
+class SixAxisCompensator(Protocol):
+    """Interface of a compensator in six axes, which the controller calls once per tick.
+
+    Args:
+        gains: gains by name, in SI units.
+        constants: constants of the numerical model and of the rig.
+        period: control period [s].
+    """
+
+    __slots__ = ()
+
+    gains: ClassVar[Mapping[str, GainSpecification]]
+    # Status of the last command, a number of `law_status`; either always UNSTATED or never.
+    status: int = UNSTATED
+
+    def __init__(self, gains: Gains, constants: ModelConstants, period: Positive) -> None: ...
+
+    @property
+    def loop_delay(self) -> float:
+        """Return the delay [s] of the hardware behind the model in the last contact; 0 if unknown."""
+        return 0.0
+
+    @property
+    def unpaid_impulse(self) -> float:
+        """Return the impulse that the last contact has left unpaid, over its impulse; 0 if none is known."""
+        return 0.0
+
+    @property
+    def is_acting(self) -> bool:
+        """Return whether the compensator acts in a contact, as far as it has a status."""
+        return self.status not in (UNSTATED, OUT_OF_CONTACT)
+
+    def step(
+        self, wrench: Vector, pose_desired: Vector, twist_desired: Vector, pose_measured: Vector
+    ) -> Vector:
+        """Return the wrench on the numerical model about T's origin [N, N m]; all arguments are finite.
+
+        Args:
+            wrench: measured wrench on the chaser about T's origin [N, N m].
+            pose_desired: coordinates of C against T in the numerical model [m, rad].
+            twist_desired: twist of C against T in the numerical model [m/s, rad/s].
+            pose_measured: coordinates of C against T on the hardware [m, rad].
+        """
+        ...
+
+    def pose_command(self, pose: Vector, rates: Vector) -> Vector:
+        """Return the pose to command [m, rad] for the model's new coordinates and their rates."""
+        return list(pose)
+
+    def reset(self) -> None:
+        """Restart everything."""
+
+    def next_contact(self) -> None:
+        """Restart filters and delay lines for another run."""
+        self.reset()
+
+
+AnySixAxisCompensator = TypeVar("AnySixAxisCompensator", bound=type[SixAxisCompensator])
+
+SIX_AXIS_COMPENSATORS: dict[str, type[SixAxisCompensator]] = {}
+
+
+def register_six_axes(name: str) -> Callable[[AnySixAxisCompensator], AnySixAxisCompensator]:
+    """Return a class decorator that adds a compensator to `SIX_AXIS_COMPENSATORS` under `name`."""
+
+    def enter(compensator: AnySixAxisCompensator) -> AnySixAxisCompensator:
+        SIX_AXIS_COMPENSATORS[name] = compensator
+        return compensator
+
+    return enter

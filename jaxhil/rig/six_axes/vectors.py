@@ -1,0 +1,131 @@
+"""Linear algebra in six axes: wrenches, poses and twists are lists of six floats (x, y, z, rx, ry, rz).
+
+All are in T axes (notebooks/guide/six_axes.md, section 1). Sums are added from the first term to the last.
+"""
+
+from collections.abc import Sequence
+from math import isfinite, sqrt
+from typing import Annotated
+
+AXES = 6
+COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
+LAG_LEADS = ("lag_lead_x", "lag_lead_y", "lag_lead_z", "lag_lead_rx", "lag_lead_ry", "lag_lead_rz")
+# (1 - t/2 cot(t/2))/t^2 as a power series of t^2: |B_2k|/(2k)! with Bernoulli's numbers B
+COTANGENT = (
+    1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 1307674368000, 1 / 74724249600,
+    3617 / 10670622842880000, 43867 / 5109094217170944000, 174611 / 802857662698291200000,
+)  # fmt: skip
+LAST_TERM = len(COTANGENT) - 1
+MAX_SQUARED_ANGLE = 10.0  # rad^2; beyond pi^2 there is no rotation vector, and the series is cut off
+
+Vector = Annotated[list[float], AXES]
+Matrix = Annotated[list[list[float]], AXES, AXES]
+
+
+def product(matrix: Matrix, vector: Vector) -> Vector:
+    """Return matrix times vector."""
+    x, y, z, rx, ry, rz = vector
+    return [row[0] * x + row[1] * y + row[2] * z + row[3] * rx + row[4] * ry + row[5] * rz for row in matrix]
+
+
+def dot(left: Vector, right: Vector) -> float:
+    """Return the scalar product."""
+    return (
+        left[0] * right[0]
+        + left[1] * right[1]
+        + left[2] * right[2]
+        + left[3] * right[3]
+        + left[4] * right[4]
+        + left[5] * right[5]
+    )
+
+
+def subtract(left: Vector, right: Vector) -> Vector:
+    """Return the difference left - right."""
+    return [a - b for a, b in zip(left, right, strict=True)]
+
+
+def add_multiple(left: Vector, factor: float, right: Vector) -> Vector:
+    """Return left + factor * right."""
+    return [a + factor * b for a, b in zip(left, right, strict=True)]
+
+
+def multiply(factor: float, vector: Vector) -> Vector:
+    """Return factor * vector."""
+    return [factor * entry for entry in vector]
+
+
+def wrench_at_chaser(wrench: Vector, pose: Vector) -> Vector:
+    """Return a wrench about C's origin from one about T's; `pose` are coordinates of C against T."""
+    fx, fy, fz, mx, my, mz = wrench
+    x, y, z = pose[:3]
+    return [fx, fy, fz, mx - (y * fz - z * fy), my - (z * fx - x * fz), mz - (x * fy - y * fx)]
+
+
+def wrench_at_target(wrench: Vector, pose: Vector) -> Vector:
+    """Return a wrench about T's origin from one about C's; `pose` are coordinates of C against T."""
+    fx, fy, fz, mx, my, mz = wrench
+    x, y, z = pose[:3]
+    return [fx, fy, fz, mx + (y * fz - z * fy), my + (z * fx - x * fz), mz + (x * fy - y * fx)]
+
+
+def coordinate_rates(pose: Vector, twist: Vector) -> Vector:
+    """Return the rates of the coordinates (p, theta) of a pose for a twist (v, w).
+
+    theta' = Jl(theta)^-1 w = w - theta x w/2 + c theta x (theta x w), with the inverse left Jacobian and
+    c = (1 - t/2 cot(t/2))/t^2, t = |theta|.
+    """
+    _, _, _, a, b, c = pose
+    x, y, z, u, v, w = twist
+    square = a * a + b * b + c * c
+    if not square < MAX_SQUARED_ANGLE:
+        square = MAX_SQUARED_ANGLE
+    weight = COTANGENT[LAST_TERM]
+    for index in range(LAST_TERM - 1, -1, -1):
+        weight = COTANGENT[index] + square * weight
+    first, second, third = b * w - c * v, c * u - a * w, a * v - b * u
+    return [
+        x,
+        y,
+        z,
+        u - 0.5 * first + weight * (b * third - c * second),
+        v - 0.5 * second + weight * (c * first - a * third),
+        w - 0.5 * third + weight * (a * second - b * first),
+    ]
+
+
+def lead_pose(leads: Vector, pose: Vector, rates: Vector) -> Vector:
+    """Return the pose led by the times `leads` [s] at these rates of its coordinates."""
+    return [at + lead * rate for at, lead, rate in zip(pose, leads, rates, strict=True)]
+
+
+def matrix_of(rows: Sequence[Sequence[float]]) -> list[list[float]]:
+    """Return a matrix as lists of floats."""
+    return [[float(entry) for entry in row] for row in rows]
+
+
+def is_finite(vector: Vector) -> bool:
+    """Return whether all entries are finite."""
+    a, b, c, x, y, z = vector
+    is_linear_finite = isfinite(a) and isfinite(b) and isfinite(c)
+    return is_linear_finite and isfinite(x) and isfinite(y) and isfinite(z)
+
+
+def is_within(vector: Vector, lowest: Vector, highest: Vector) -> bool:
+    """Return whether all entries are within their bounds; NaN is not."""
+    inside = True
+    for low, value, high in zip(lowest, vector, highest, strict=True):
+        inside = inside and low <= value <= high
+    return inside
+
+
+def length(pose: Vector, other: Vector) -> float:
+    """Return the distance [m] between the positions of two poses."""
+    x, y, z = pose[0] - other[0], pose[1] - other[1], pose[2] - other[2]
+    return sqrt(x * x + y * y + z * z)
+
+
+def angle(pose: Vector, other: Vector) -> float:
+    """Return the distance [rad] between the rotation vectors of two poses."""
+    x, y, z = pose[3] - other[3], pose[4] - other[4], pose[5] - other[5]
+    return sqrt(x * x + y * y + z * z)

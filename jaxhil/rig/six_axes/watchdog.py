@@ -1,0 +1,264 @@
+"""Watchdog in six axes: an audit of every contact, from the motion of the numerical model.
+
+A contact begins on the tick on which the compensator acts; for one without a status, on which a force beyond
+`fading` is measured. On that tick the lag of the hardware behind the model, as far as the compensator has
+measured it, must be within `lag_lowest` and `lag_highest`. The contact is audited once it has not been so for
+`settling`; at the latest when the next run is announced. With the twist V_in on the tick before the contact,
+V now, the relative mass matrix M, the controller's wrench W_c about C's origin and |W|^2 = W . M^-1 W, the
+audit asks:
+
+- Is the momentum consistent? |M (V - V_in) - T sum W_c| must be at most `momentum_error` times the impulse's
+  size and a twentieth of the momentum's. Otherwise the model integrates another wrench, or has another mass.
+- Is the contact passive? T sum W_c . V must be at most `energy_gain` times the kinetic energy before it,
+  V_in . M V_in/2.
+- Is the impulse paid? What the compensator still owes must be at most `unpaid_impulse` times its impulse.
+- Did the compensator identify the contact, by its own status (`law_status`)?
+"""
+
+from math import sqrt
+
+from jaxhil.rig.faults import CONTACT_TOO_LONG, LAW_IN_DOUBT
+from jaxhil.rig.law_status import IDENTIFIED, OUT_OF_CONTACT, UNSTATED, ContactCount, StatusCount
+from jaxhil.rig.six_axes.faults import ENERGY_GAIN, LAG, MOMENTUM, UNPAID_IMPULSE
+from jaxhil.rig.six_axes.registry import ModelConstants
+from jaxhil.rig.six_axes.vectors import (
+    AXES,
+    Matrix,
+    Vector,
+    add_multiple,
+    dot,
+    length,
+    product,
+    subtract,
+    wrench_at_chaser,
+)
+from jaxhil.rig.types import Count, Limits, Positive
+
+MOMENTUM_SHARE = 0.05  # of the momentum before a contact that counts as impulse: grazing touches have little
+
+
+class SixAxisWatchdog:
+    """Audit of one contact after another.
+
+    Attributes:
+        on: whether there is anything to audit.
+        contacts: number of audited contacts.
+        record: statuses of the last audited contact.
+        momentum_error: error of the momentum in that contact, over its impulse [1], until `restart`.
+        energy_gain: energy that the contact has released, over that of the approach [1], until `restart`.
+        unpaid_impulse: impulse that the contact has left unpaid, over its impulse [1], until `restart`.
+    """
+
+    __slots__ = (
+        "_energy_limit",
+        "_entry",
+        "_fading",
+        "_impulse",
+        "_inverse",
+        "_known",
+        "_lag_highest",
+        "_lag_lowest",
+        "_longest",
+        "_mass",
+        "_measured",
+        "_momentum_limit",
+        "_open",
+        "_period",
+        "_pose",
+        "_quiet",
+        "_quiet_ticks",
+        "_stated",
+        "_statuses",
+        "_ticks",
+        "_twist",
+        "_unpaid_limit",
+        "_work",
+        "contacts",
+        "energy_gain",
+        "momentum_error",
+        "on",
+        "record",
+        "unpaid_impulse",
+    )  # fmt: skip
+    _entry: Vector
+    _impulse: Vector
+    _inverse: Matrix
+    _mass: Matrix
+    _period: Positive
+    _pose: Vector
+    _twist: Vector
+    contacts: Count
+
+    def __init__(
+        self, limits: Limits, constants: ModelConstants, period: Positive, stated: bool = False
+    ) -> None:
+        self._stated = stated
+        self._statuses = StatusCount()
+        self._mass = constants.mass_matrix
+        self._inverse = constants.inverse_mass
+        self._period = period
+        self._fading = limits["fading"]
+        self._quiet_ticks = limits["settling"] / period
+        self._longest = limits["longest_contact"] / period
+        self._momentum_limit = limits["momentum_error"]
+        self._energy_limit = limits["energy_gain"]
+        self._unpaid_limit = limits["unpaid_impulse"]
+        self._lag_lowest = limits["lag_lowest"]
+        self._lag_highest = limits["lag_highest"]
+        self.on = stated or limits["fading"] > 0.0
+        self.restart()
+        self.contacts = 0
+        self.record = ContactCount(0, 0, 0, 0, 0, 0, OUT_OF_CONTACT, UNSTATED)
+
+    def restart(self) -> None:
+        """Forget the current contact and the motion so far, but not `contacts` and `record`."""
+        self._known = False
+        self._open = False
+        self._measured = False
+        self._entry = [0.0] * AXES
+        self._impulse = [0.0] * AXES
+        self._pose = [0.0] * AXES
+        self._twist = [0.0] * AXES
+        self._work = 0.0
+        self._quiet = 0.0
+        self._ticks = 0.0
+        self._statuses.restart()
+        self.momentum_error = 0.0
+        self.energy_gain = 0.0
+        self.unpaid_impulse = 0.0
+
+    def tick(
+        self,
+        previous: Vector,
+        status: int,
+        lag: float,
+        unpaid: float,
+        wrench: Vector,
+        pose: Vector,
+        twist: Vector,
+    ) -> int:
+        """Return the faults that this tick shows, 0 if none.
+
+        Args:
+            previous: wrench W_c of the tick before [N, N m].
+            status: the compensator's status of that wrench.
+            lag: lag of the hardware behind the model, as far as the compensator knows it [s]; else 0.
+            unpaid: impulse that the compensator's last contact has left unpaid, over its impulse [1].
+            wrench: measured wrench of this tick [N, N m].
+            pose: pose of the numerical model [m, rad].
+            twist: twist of the numerical model [m/s, rad/s].
+        """
+        if not self._known:
+            self._known = True
+            self._pose = list(pose)
+            self._twist = list(twist)
+        felt = length(wrench, [0.0] * AXES) > self._fading
+        acts = status != OUT_OF_CONTACT if self._stated else felt
+        fault = 0
+        if acts and not self._open:
+            self._begin()
+            if lag != 0.0 and not self._lag_lowest <= lag <= self._lag_highest:
+                fault = LAG
+        is_open = self._open
+        if is_open:
+            self._account(previous, twist)
+            self._statuses.take(status)
+            self._measured = self._measured or felt
+            self._ticks += 1.0
+        self._pose = list(pose)
+        self._twist = list(twist)
+        if not is_open:
+            return fault
+        if acts:
+            self._quiet = 0.0
+        else:
+            self._quiet += 1.0
+            if self._quiet == 1.0:
+                # The contact may have had several touches, of which the worst counts.
+                self.unpaid_impulse = max(self.unpaid_impulse, unpaid)
+            if self._quiet >= self._quiet_ticks:
+                return self._audit()
+        if self._ticks > self._longest:
+            fault |= CONTACT_TOO_LONG
+        return fault
+
+    def conclude(self, previous: Vector, status: int, unpaid: float) -> int:
+        """Audit the current contact, if there is one, and return the faults.
+
+        Args:
+            previous: wrench W_c of the last tick [N, N m].
+            status: the compensator's status of that wrench.
+            unpaid: impulse that the compensator's last contact has left unpaid, over its impulse [1].
+        """
+        if not self._open:
+            return 0
+        self._statuses.take(status)
+        impulse = product(self._inverse, wrench_at_chaser(previous, self._pose))
+        twist = add_multiple(self._twist, self._period, impulse)
+        self._account(previous, twist)
+        self._twist = twist
+        self.unpaid_impulse = max(self.unpaid_impulse, unpaid)
+        return self._audit()
+
+    def detail(self, fatal: int) -> str:
+        """Return the numbers of the last audit that belong to these faults, in words."""
+        numbers = {
+            MOMENTUM: f"error of the momentum {self.momentum_error:.4g}",
+            ENERGY_GAIN: f"energy released {self.energy_gain:.4g}",
+            UNPAID_IMPULSE: f"unpaid impulse {self.unpaid_impulse:.4g}",
+        }
+        text = ", ".join(text for bit, text in numbers.items() if fatal & bit)
+        return f"contact {self.contacts}: {text}" if text else ""
+
+    def _begin(self) -> None:
+        """Open a contact, which begins with the wrench that follows the last tick's twist."""
+        self._open = True
+        self._entry = list(self._twist)
+        self._impulse = [0.0] * AXES
+        self._work = 0.0
+        self._quiet = 0.0
+        self._ticks = 0.0
+        self._measured = False
+        self._statuses.restart()
+        self.unpaid_impulse = 0.0
+
+    def _account(self, previous: Vector, twist: Vector) -> None:
+        """Add impulse and work of the last tick's wrench, which has led to this twist."""
+        wrench = wrench_at_chaser(previous, self._pose)
+        self._impulse = add_multiple(self._impulse, self._period, wrench)
+        self._work += self._period * 0.5 * (dot(wrench, self._twist) + dot(wrench, twist))
+
+    def _audit(self) -> int:
+        """Close the contact; return its faults."""
+        self._open = False
+        self.contacts += 1
+        fault = 0
+        if self._stated:
+            self.record = self._statuses.count(self.contacts, self._measured)
+            if self.record.status != IDENTIFIED:
+                fault = LAW_IN_DOUBT
+        momentum = product(self._mass, self._entry)
+        whole = dot(self._entry, momentum)
+        error = subtract(product(self._mass, subtract(self._twist, self._entry)), self._impulse)
+        allowed = self._size(self._impulse) + MOMENTUM_SHARE * _root(whole)
+        size = self._size(error)
+        self.momentum_error = size / allowed if allowed > 0.0 else size
+        if not self.momentum_error <= self._momentum_limit:
+            fault |= MOMENTUM
+        self.energy_gain = 2.0 * self._work / whole if whole > 0.0 else self._work
+        if not self.energy_gain <= self._energy_limit:
+            fault |= ENERGY_GAIN
+        if not self.unpaid_impulse <= self._unpaid_limit:
+            fault |= UNPAID_IMPULSE
+        return fault
+
+    def _size(self, wrench: Vector) -> float:
+        """Return the size of a wrench or an impulse."""
+        return _root(dot(wrench, product(self._inverse, wrench)))
+
+
+def _root(square: float) -> float:
+    """Return the square root; 0 of what rounding has made negative."""
+    if square < 0.0:
+        return 0.0
+    return sqrt(square)

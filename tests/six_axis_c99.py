@@ -1,0 +1,182 @@
+"""The controller of six axes in C beside the one in Python: compiled, loaded, and both run on the same rows.
+
+A row is what happens in one tick (see `c99_driver_six_axes.c`), a result what either side makes of it.
+"""
+
+import ctypes
+import functools
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from c99_cases import (
+    COMMAND_FIRST,
+    HOSTILE,
+    NEXT_CONTACT,
+    RELEASE,
+    RESET,
+    STEP_ONLY,
+    STOP,
+    TARE,
+    compiled,
+    same_bits,
+)
+from six_axis_documents import LIMITS, six_axis_document
+from six_axis_records import random_readings
+
+from jaxhil.rig.law_status import STATUSES
+from jaxhil.rig.six_axes import Controller6
+from tuning.bundle.c99 import generate_c99
+
+DRIVER = Path(__file__).with_name("c99_driver_six_axes.c")
+SIX = ("x", "y", "z", "rx", "ry", "rz")
+RESULT = (
+    *(f"wrench_{axis}" for axis in SIX),
+    *(f"pose_{axis}" for axis in SIX),
+    *(f"bias_{axis}" for axis in SIX),
+    *("law_status", "faults", "seen", "cause", "channels", "missed_ticks", "late_ticks", "at_rest"),
+    *("tripped", "answer", "loop_delay", "unpaid_impulse", "momentum_error", "energy_gain", "unpaid"),
+    *("contact", "contact_status", "ticks", "unsure", "saturated", "too_short", "noisy"),
+)
+STATUS_NUMBERS = {status.name: status.number for status in STATUSES}
+WIDTH = 39
+_BUILT = tempfile.TemporaryDirectory(prefix="jaxhil-c99-six-axes-")
+
+
+class SixAxisBatch:
+    """The compiled controller of one document, which runs rows."""
+
+    def __init__(self, library):
+        self.library = ctypes.CDLL(str(library))
+        self.library.driver_size.restype = ctypes.c_size_t
+        self.library.driver_exported.restype = ctypes.c_size_t
+        self.library.driver_ticks.restype = ctypes.c_double
+        self.state = (ctypes.c_double * (self.library.driver_size() // 8 + 1))()
+
+    def run(self, rows):
+        """Begin anew and run the rows."""
+        assert self.library.driver_init(self.state)
+        results = np.empty((len(rows), len(RESULT)))
+        self.library.driver_run(self.state, ctypes.c_size_t(len(rows)), pointer(rows), pointer(results))
+        return results
+
+
+def pointer(values):
+    assert values.dtype == np.float64 and values.flags.c_contiguous
+    return values.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+
+
+def write_sources(folder, document):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in generate_c99(document).items():
+        (folder / name).write_text(text)
+    shutil.copy(DRIVER, folder)
+    return folder
+
+
+@functools.cache
+def built(name, wide=False):
+    """Return a compensator's document and its compiled controller; `wide` limits leave it alone."""
+    document = six_axis_document(name, limits={} if wide else LIMITS)
+    folder = write_sources(Path(_BUILT.name) / f"{name}{wide}", document)
+    library = compiled(folder, DRIVER.name, "driver.so", "-O2", "-shared", "-fPIC")
+    return document, SixAxisBatch(library)
+
+
+def rows_of(readings, period):
+    """Return rows for readings, four arrays (ticks, 6)."""
+    wrench, desired, twist, measured = readings
+    count = len(wrench) - 1
+    time = period * np.arange(count)[:, None]
+    head = np.zeros((count, 1))
+    columns = (
+        head,
+        wrench[:-1],
+        desired[:-1],
+        twist[:-1],
+        measured[:-1],
+        time,
+        head + 1,
+        desired[1:],
+        twist[1:],
+    )
+    return np.ascontiguousarray(np.concatenate(columns, axis=1))
+
+
+def drawn_rows(kind, count, rng, period=1e-3):
+    """Draw a `contact`, rows of `random` size, or `hostile` ones, with events now and then."""
+    readings = random_readings(rng, count + 1, period)
+    if rng.random() < 0.5:
+        # Within the limits of `LIMITS`, so that not every run ends with its first tick.
+        readings = (0.1 * readings[0], *(0.3 * part for part in readings[1:]))
+    rows = rows_of(readings, period)
+    if kind != "contact":
+        changed = rng.random((count, WIDTH - 1)) < rng.choice([0.001, 0.02, 0.3])
+        size = 10 ** rng.uniform(-12, 3, (count, WIDTH - 1))
+        rows[:, 1:] = np.where(changed, size * rng.standard_normal(size.shape), rows[:, 1:])
+        rows[:, 26] = rng.random(count) < 0.8
+        jitter = rng.choice([0.0, 0.3, -0.3, 2.0], count, p=[0.97, 0.01, 0.01, 0.01])
+        rows[:, 25] += period * jitter
+        begin, columns = int(rng.integers(count)), slice(*(((1, 7), (19, 25))[rng.integers(2)]))
+        rows[begin : begin + 300, columns] = rows[begin, columns]  # a sensor that hangs
+        if rng.random() < 0.3:
+            rows[:4, 0] = TARE
+            rows[:4, 1:7] = rng.choice([0.1, 10.0]) * rng.standard_normal((4, 6))
+    if kind == "hostile":
+        taken = rng.random((count, WIDTH - 1)) < rng.choice([0.0005, 0.01, 0.2])
+        taken[:, 25] = False
+        rows[:, 1:] = np.where(taken, rng.choice(HOSTILE, taken.shape), rows[:, 1:])
+        rows[:, 0] = rng.choice(
+            [0.0, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY],
+            count,
+            p=[0.93, 0.02, 0.01, 0.002, 0.008, 0.01, 0.01, 0.01],
+        )
+    return rows
+
+
+def in_python(document, rows):
+    """Return what the Python controller makes of the rows."""
+    rig = Controller6.from_dict(document)
+    watchdog = rig._watchdog
+    results = np.zeros((len(rows), len(RESULT)))
+    for row, result in zip(rows.tolist(), results, strict=True):
+        answer = _event(rig, row)
+        result[:6] = rig.step(row[1:7], row[7:13], row[13:19], row[19:25], row[25] if row[26] else None)
+        result[6:12] = [0.0] * 6 if row[0] == STEP_ONLY else rig.pose_command(row[27:33], row[33:39])
+        result[12:18] = rig.bias
+        number, status, *counts = rig.last_contact
+        result[18:] = (
+            *(STATUS_NUMBERS[rig.law_status], rig.faults, rig.seen, rig.cause, rig.channels),
+            *(rig.missed_ticks, rig.late_ticks, rig.at_rest, rig.tripped, answer),
+            *(rig.loop_delay, rig.unpaid_impulse),
+            *(watchdog.momentum_error, watchdog.energy_gain, watchdog.unpaid_impulse),
+            *(number, STATUS_NUMBERS[status], *counts),
+        )
+    return results
+
+
+def _event(rig, row):
+    code = row[0]
+    if code == RESET:
+        return rig.reset()
+    if code == TARE:
+        return rig.tare(row[1:7])
+    if code == COMMAND_FIRST:
+        return rig.pose_command(row[27:33], row[33:39])[2]
+    if code == NEXT_CONTACT:
+        rig.next_contact()
+    elif code in (STOP, RELEASE):
+        rig.emergency_stop(code == STOP)
+    return 0.0
+
+
+def assert_same(found, expected, rows):
+    """Raise AssertionError with the first tick and column in which C and Python differ."""
+    same = same_bits(np.ascontiguousarray(found), np.ascontiguousarray(expected))
+    if not same.all():
+        tick, column = (int(index) for index in np.argwhere(~same)[0])
+        raise AssertionError(
+            f"tick {tick}: {RESULT[column]}: C {found[tick, column]!r}, Python {expected[tick, column]!r}, "
+            f"row {rows[tick].tolist()}"
+        )

@@ -1,0 +1,131 @@
+"""The exported controller of six axes in the loop of an independent rig (`six_axis_oracle`), in Python and C.
+
+The rig is plain NumPy: its numerical model, motion simulator, contact and force sensor share no code with the
+package. The final twist of a contact must be that of `simulate`.
+"""
+
+import ctypes
+
+import c99_cases
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gain_documents import sign
+from scipy.spatial.transform import Rotation
+from six_axis_c99 import DRIVER, compiled, pointer, write_sources
+from six_axis_documents import six_axis_document
+from six_axis_oracle import on_the_rig, relative
+
+import jaxhil.rig.six_axes
+from jaxhil.laws.compensators import literature_gains
+from jaxhil.mechanism.file import load_any
+from jaxhil.simulation.jax_environment import jax_context
+from jaxhil.sixdof.building import build_scenarios
+from jaxhil.sixdof.loop import model_motion, run
+from tuning.bundle.single_file import build_runtime_source
+from tuning.verification.six_axis_replay import six_axis_loop
+
+TICKS = 240  # of a contact of probe-drogue and of the time until it is over
+LEADS = tuple(f"lag_lead_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
+OFFSETS = ((0.03, -0.025), (-0.01, 0.045))  # m
+
+
+def body(body, state):
+    """Position, velocity, attitude and angular velocity (body axes) of a body, as the oracle has them."""
+    quaternion = np.array(jax.tree.leaves(state.attitude))[:, 0]
+    attitude = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
+    position, velocity = (np.array(jax.tree.leaves(part))[:, 0] for part in (state.position, state.velocity))
+    spin = np.array(jax.tree.leaves(state.spin))[:, 0]
+    return position, velocity, attitude, np.linalg.solve(body, attitude.T @ spin)
+
+
+def case_of(mechanism, scenario):
+    """Return the oracle's case for probe-drogue."""
+    sensor, simulator = mechanism.rig.force_sensor, mechanism.rig.simulator
+    tip, tool = mechanism.contact["tip"], mechanism.rig.force_sensor.tool
+    inertias = [np.asarray(part.inertia, float) for part in (mechanism.target, mechanism.chaser)]
+    inertias = [np.diag(part) if part.ndim == 1 else part for part in inertias]
+    states = (scenario.start.target, scenario.start.chaser)
+    target = tip.target
+    return {
+        "masses": (mechanism.target.mass, mechanism.chaser.mass),
+        "inertias": inertias,
+        "interfaces": (mechanism.target.interface, mechanism.chaser.interface),
+        "start": [body(inertia, state) for inertia, state in zip(inertias, states, strict=True)],
+        "spheres": [(tip.chaser.centre, tip.chaser.radius)],
+        "shape": "drogue",
+        "numbers": (target.half_angle, target.bottom_radius, target.bottom),
+        "stiffness": tip.stiffness,
+        "exponent": tip.exponent or 1.5,
+        "damping": tip.damping,
+        "friction": tip.friction.coefficient,
+        "slip": tip.friction.slip,
+        "period": mechanism.rig.control_period,
+        "frequency": simulator.natural_frequency,
+        "ratio": np.broadcast_to(simulator.damping_ratio, 6),
+        "delays": simulator.delay,
+        "force_delay": sensor.delay,
+        "position_delay": mechanism.rig.position_sensor.delay,
+        "tool": (tool.mass, np.array(tool.com), np.diag(tool.inertia)),
+        "assumed": (tool.mass, np.array(tool.com)),
+        "gravity": np.array(sensor.gravity),
+    }
+
+
+class InPython:
+    """The controller of the single file."""
+
+    def __init__(self, document, leads):
+        namespace = {"__name__": "jaxhil_runtime"}
+        source = build_runtime_source(document["compensator"], jaxhil.rig.six_axes, "SIX_AXIS_COMPENSATORS")
+        exec(compile(source, "jaxhil_runtime.py", "exec"), namespace)
+        self.controller, self.leads = namespace["Controller6"].from_dict(document), leads
+        self.step, self.pose_command = self.controller.step, self.controller.pose_command
+
+
+class InC:
+    """The controller in C."""
+
+    def __init__(self, document, leads, folder):
+        library = compiled(
+            write_sources(folder, document), DRIVER.name, "driver.so", "-O2", "-shared", "-fPIC"
+        )
+        self.library, self.leads = ctypes.CDLL(str(library)), leads
+        self.library.driver_size.restype = ctypes.c_size_t
+        self.state = (ctypes.c_double * (self.library.driver_size() // 8 + 1))()
+        assert self.library.driver_init(self.state)
+
+    def step(self, *vectors):
+        arguments, result = [np.array(vector, float) for vector in vectors], np.empty(6)
+        self.library.jaxhil_step(self.state, *map(pointer, arguments), None, pointer(result))
+        return result.tolist()
+
+    def pose_command(self, *vectors):
+        arguments, result = [np.array(vector, float) for vector in vectors], np.empty(6)
+        self.library.jaxhil_pose_command(self.state, *map(pointer, arguments), pointer(result))
+        return result.tolist()
+
+
+@pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
+@pytest.mark.parametrize("name", ["impulse_ledger", pytest.param("phase_lead", marks=pytest.mark.slow)])
+def test_final_twist_is_that_of_simulate(name, tmp_path):
+    for offset in OFFSETS:
+        mechanism = load_any("probe-drogue", {"approach.offset": list(offset)}).mechanism
+        gains = literature_gains(mechanism, name)
+        leads = np.array([gains[lead] for lead in LEADS])
+        with jax_context():
+            scenario = build_scenarios(mechanism)
+            loop = six_axis_loop(mechanism, name, scenario)
+            arrays = {gain: jnp.asarray(value) for gain, value in gains.items()}
+            state, ticks = jax.jit(run, static_argnums=(0, 3))(loop, arrays, scenario, TICKS)
+            simulated = np.asarray(model_motion(scenario.bodies, state.states)[2])[:, 0]
+        before = np.asarray(ticks.signals.twist_desired)[0, :, 0]
+        assert np.linalg.norm((simulated - before)[:3]) > 0.01  # there was a contact
+        case, document = case_of(mechanism, scenario), sign(six_axis_document(name, **gains))
+        for controller in (InPython(document, leads), InC(document, leads, tmp_path / str(offset[0]))):
+            *_, v, w, _, _ = relative(case, on_the_rig(case, TICKS, controller))
+            for part, expected in ((v, simulated[:3]), (w, simulated[3:])):
+                error = np.max(np.abs(part - expected)) / np.max(np.abs(expected))
+                print(name, offset, type(controller).__name__, error)
+                assert error <= 1e-8

@@ -1,0 +1,210 @@
+"""Bundle of a rig in six axes: its files, its self-test in Python and C, and its verification."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import c99_cases
+import numpy as np
+import pytest
+from bundles import run_selftest
+from six_axis_documents import LIMITS, six_axis_document
+
+import tuning
+from jaxhil.errors import InputError
+from jaxhil.rig import digest
+from jaxhil.rig.six_axes import Controller6
+from jaxhil.rig.six_axes.faults import SIX_AXIS_FAULTS
+from jaxhil.rig.six_axes.gain_file import check_six_axis_document
+from jaxhil.rig.six_axes.limits import SIX_AXIS_LIMITS, complete_six_axis_limits
+from jaxhil.simulation.gain_file import check_document
+from jaxhil.simulation.jax_environment import jax_context
+from tuning.bundle.bundle import build_bundle, write_bundle
+from tuning.bundle.selftest import SIX_AXIS_VECTOR_COLUMNS
+from tuning.bundle.vectors_six_axes import compare_with_record, record_inputs, run_controller
+from tuning.verification.six_axes import run_six_axis_loop
+from tuning.verification.six_axis_replay import command_difference, compare_record, record_runs
+from tuning.watchdog.six_axes import DrawnRun, alarm_rates, calibrate_six_axes, longest_sum, signal_limits
+
+
+class Result:
+    """What `tuning.export` takes beside the path of a gain file."""
+
+    def __init__(self, document):
+        self.document = document
+
+
+@pytest.fixture(scope="module")
+def built():
+    with jax_context():
+        return build_bundle(six_axis_document(limits=LIMITS), ["ros2", "matlab", "csv", "c99"])
+
+
+@pytest.fixture
+def folder(built, tmp_path):
+    write_bundle(tmp_path / "bundle", built.files)
+    return tmp_path / "bundle"
+
+
+def test_bundle_has_every_file_and_its_vectors_agree_with_the_simulation(built):
+    assert built.reasons == [] and built.ended == [None] * 4 and built.runs == 52
+    assert {name.partition("/")[0] for name in built.files} == {
+        *("gains.json", "vectors.csv", "summary.html", "jaxhil_runtime.py", "selftest.py", "ros2.yaml"),
+        *("gains.mat", "gains.csv", "c99", "README.md", "manifest.json"),
+    }
+    readme, summary = (built.files[name].decode() for name in ("README.md", "summary.html"))
+    assert all(f"`{fault.name}`" in readme for fault in SIX_AXIS_FAULTS) and "Controller6" in readme
+    assert "Six axes: target of 1800 kg" in summary and "momentum_error" in summary
+    assert len(built.files["vectors.csv"]) < 8e6
+
+
+def test_selftest_passes_in_isolation_and_in_c(folder):
+    ran = subprocess.run(
+        [sys.executable, "-I", "-S", str(folder / "selftest.py")], capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0 and ran.stdout.endswith("PASSED\n"), ran.stdout + ran.stderr
+    if c99_cases.COMPILER is not None:
+        good, text = run_selftest(folder, "--c")
+        assert good and "c99: vectors.csv" in text
+
+
+@pytest.mark.parametrize("name", ["gains.json", "vectors.csv", "jaxhil_runtime.py", "c99/jaxhil_gains.h"])
+def test_selftest_notices_a_changed_digit(folder, name):
+    path = folder / name
+    content = bytearray(path.read_bytes())
+    digits = [index for index, byte in enumerate(content) if 0x30 <= byte <= 0x38]
+    content[digits[2 * len(digits) // 3]] += 1
+    path.write_bytes(content)
+    good, text = run_selftest(folder)
+    assert not good and f"FAIL  {name}" in text
+
+
+def test_test_program_in_c_notices_a_changed_bit(folder, tmp_path):
+    if c99_cases.COMPILER is None:
+        pytest.skip("no C compiler (cc) on this machine")
+    shutil.copytree(folder / "c99", tmp_path / "c99")
+    program = c99_cases.compiled(tmp_path / "c99", "test_vectors.c", "vectors", "jaxhil_controller.c")
+    lines = (folder / "vectors.csv").read_text().splitlines()
+    columns = SIX_AXIS_VECTOR_COLUMNS.split(",")
+    for column in ("wrench_command_z", "pose_command_rx", "faults"):
+        row, index = lines[120].split(","), columns.index(column)
+        value = float(row[index])
+        row[index] = repr(int(value) + 1) if column == "faults" else repr(float(np.nextafter(value, 1e9)))
+        changed = tmp_path / "changed.csv"
+        changed.write_text("\n".join([*lines[:120], ",".join(row), *lines[121:]]) + "\n")
+        ran = subprocess.run([str(program), str(changed)], capture_output=True, text=True)
+        assert ran.returncode == 1 and f"changed.csv:121: {column[:12]}" in ran.stdout
+    ran = subprocess.run([str(program), str(folder / "vectors.csv")], capture_output=True, text=True)
+    assert ran.returncode == 0
+
+
+def test_comparison_with_the_record_ends_at_a_fault_and_names_a_difference(built):
+    document = six_axis_document(limits={**LIMITS, "force_limit": 20.0})
+    with jax_context():
+        loaded = check_document(document, any_axes=True)
+        _, [record] = record_runs(loaded.mechanism, loaded.compensator, loaded.gains, 0, 0)
+    gain_file = check_six_axis_document(document)
+    rows, end, reason = compare_with_record(
+        run_controller(gain_file, list(record_inputs(0, record, 1e-3))), record
+    )
+    assert "force_limit" in end and reason is None
+    assert np.isnan(rows[-1].inputs.simulated).all() and not np.isnan(rows[0].inputs.simulated).any()
+    free = gain_file._replace(limits=complete_six_axis_limits({}))
+    changed = free._replace(gains={**free.gains, "velocity_gain": 201.0})
+    for other, agrees in ((free, True), (changed, False)):
+        rows = run_controller(other, list(record_inputs(0, record, 1e-3)))
+        assert (compare_with_record(rows, record)[2] is None) is agrees
+
+
+def test_gain_file_of_six_axes_is_checked_with_its_own_limits():
+    with jax_context():
+        loaded = check_document(six_axis_document(limits=LIMITS), any_axes=True)
+        assert loaded.compensator == "impulse_ledger"
+        with pytest.raises(InputError, match="axes"):
+            check_document(six_axis_document())
+        wrong = six_axis_document(limits=LIMITS)
+        wrong["limits"]["torque_range"]["unit"] = "N"
+        wrong["sha256"] = digest(wrong)
+        with pytest.raises(InputError, match=r"torque_range\.unit"):
+            check_document(wrong, any_axes=True)
+
+
+def test_export_rejects_limits_of_another_controller(tmp_path):
+    with pytest.raises(InputError, match="free_force"):
+        tuning.export(Result(six_axis_document()), tmp_path / "b", limits={"free_force": 1.0})
+    with pytest.raises(InputError, match="torque_limit"):
+        tuning.export(Result(six_axis_document()), tmp_path / "b", limits={"torque_limit": -1.0})
+
+
+def test_command_difference_is_over_the_range_of_force_or_moment():
+    expected = np.zeros((3, 6))
+    expected[1, 0], expected[2, 4] = 100.0, 2.0
+    found = expected.copy()
+    found[0, 2] += 1.0
+    found[1, 5] -= 0.1
+    np.testing.assert_allclose(command_difference(found, expected), [0.01, 0.05, 0])
+    assert command_difference(np.full((1, 6), 1.0), np.zeros((1, 6)))[0] == np.inf
+
+
+def test_longest_sum_is_that_of_successive_steps():
+    still = np.array([True, True, False, True, False, True, True, True])
+    assert longest_sum(np.arange(1.0, 9.0), still) == 6 + 7 + 8
+    assert longest_sum(np.ones(3), np.zeros(3, bool)) == 0.0
+
+
+def test_calibrated_limits_let_good_runs_pass_and_stop_a_wrong_mass():
+    with jax_context():
+        loaded = check_document(six_axis_document(), any_axes=True)
+        calibration = calibrate_six_axes(loaded, scenarios=64, seed=3)
+        assert {*calibration.limits} == {*SIX_AXIS_LIMITS}
+        complete_six_axis_limits({k: v for k, v in calibration.limits.items() if v is not None})
+        rates = calibration.rates
+        # Sixteen runs determine the limits, so that a few of the other runs exceed them.
+        assert rates["false_alarms"]["alarms"] <= 8 and rates["false_alarms"]["runs"] >= 40
+        (mass,) = rates["fault_runs"]
+        assert mass["alarms"] == 0 and mass["runs"] == rates["false_alarms"]["runs"]
+        assert rates["verdict"] in ("unknown", "bad")  # so few runs decide nothing
+        tight = {**calibration.limits, "force_limit": 1.0}
+        _, records = record_runs(loaded.mechanism, loaded.compensator, loaded.gains, 64, 3)
+    gain_file = check_six_axis_document(loaded.document)
+    stopped = alarm_rates(gain_file, tight, [DrawnRun(record, 0.01, True) for record in records])
+    assert stopped["false_alarms"]["alarms"] == len(records)
+    limits = signal_limits(records, 1e-3, loaded.mechanism)
+    assert limits["force_limit"] > 1.4 * max(np.max(np.abs(record.command[:, :3])) for record in records)
+
+
+@pytest.mark.slow
+def test_verify_agrees_in_closed_loop_and_notices_a_changed_digit(folder):
+    good = tuning.verify(folder, scenarios=3)
+    assert good.good and good.document["axes"] == 6
+    assert good.document["closed_loop"]["difference"] < 1e-10
+    path = folder / "gains.json"
+    document = json.loads(path.read_text())
+    document["gains"]["velocity_gain"]["value"] = 200.1
+    path.write_text(json.dumps(document))
+    bad = tuning.verify(folder, scenarios=3)
+    assert not bad.good and any("gains.json" in reason for reason in bad.reasons)
+
+
+@pytest.mark.slow
+def test_closed_loop_notices_another_controller():
+    document = six_axis_document()
+    with jax_context():
+        loaded = check_document(document, any_axes=True)
+        gain_file = check_six_axis_document(document)
+        changed = gain_file._replace(gains={**gain_file.gains, "velocity_gain": 180.0})
+        assert run_six_axis_loop(loaded, gain_file, 240).difference < 1e-10
+        assert run_six_axis_loop(loaded, changed, 240).difference > 1e-6
+        _, [record] = record_runs(loaded.mechanism, loaded.compensator, loaded.gains, 0, 0)
+        assert compare_record(Controller6(gain_file), record).difference < 1e-9
+        assert compare_record(Controller6(changed), record).difference > 1e-9
+
+
+@pytest.mark.slow
+def test_export_states_alarm_rates(tmp_path):
+    exported = tuning.export(Result(six_axis_document()), tmp_path / "bundle")
+    assert exported.verdict == "good", exported.reasons
+    rates = exported.document["rates"]
+    assert rates["false_alarms"]["high"] <= 0.01 and rates["fault_runs"][0]["high"] <= 0.02
+    assert tuning.verify(tmp_path / "bundle", scenarios=2).good

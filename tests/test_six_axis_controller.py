@@ -1,0 +1,477 @@
+"""Controller of a rig in six axes: guards, limits, watchdog, retreat, and hostile inputs."""
+
+import math
+
+import numpy as np
+import pytest
+from gain_documents import sign
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from six_axis_documents import LIMITS, six_axis_document
+from six_axis_ranges import NOISE, POSE_NOISE
+from six_axis_records import recorded
+
+from jaxhil.mechanism.file import load_any
+from jaxhil.rig.faults import fault_names
+from jaxhil.rig.six_axes import Controller6, GainFileError
+from jaxhil.rig.six_axes.faults import SIX_AXIS_FAULTS
+from jaxhil.rig.six_axes.limits import SIX_AXIS_LIMITS
+
+PERIOD = 1e-3
+ZERO = [0.0] * 6
+START = [0.01, -0.02, 0.05, 0.01, 0.0, -0.01]
+TWIST = [0.001, 0.0, -0.02, 0.002, 0.0, 0.0]
+
+
+def controller(compensator="impulse_ledger", **limits):
+    return Controller6.from_dict(six_axis_document(compensator, limits={**LIMITS, **limits}))
+
+
+def along(tick, pose=START, twist=TWIST):
+    """Return the pose in uniform motion."""
+    return [at + tick * PERIOD * rate for at, rate in zip(pose, twist, strict=True)]
+
+
+def fly(rig, ticks, first=0, wrench=ZERO, timed=False):
+    """Run free flight; return the pose commands."""
+    sent = []
+    for tick in range(first, first + ticks):
+        now = along(tick)
+        rig.step(wrench, now, TWIST, now, tick * PERIOD if timed else None)
+        sent.append(rig.pose_command(along(tick + 1), TWIST, ZERO))
+    return sent
+
+
+def names(rig):
+    return fault_names(rig.cause, SIX_AXIS_FAULTS)
+
+
+@pytest.fixture(scope="module")
+def records():
+    changes = {"rig.force_sensor.noise_std": NOISE, "rig.position_sensor.noise_std": POSE_NOISE}
+    return recorded(load_any("probe-drogue", changes).mechanism, "impulse_ledger", 3)
+
+
+def replay(rig, record, change=lambda tick, inputs: inputs):
+    """Run a controller over a record; return its commands and pose commands."""
+    commands, sent = [], []
+    rows = list(zip(*(column.tolist() for column in record[:4]), strict=True))
+    for tick, row in enumerate(rows):
+        inputs = change(tick, [list(vector) for vector in row])
+        commands.append(rig.step(*inputs, tick * PERIOD))
+        if tick + 1 < len(rows):
+            sent.append(rig.pose_command(rows[tick + 1][1], rows[tick + 1][2], ZERO))
+        if rig.tripped:
+            break
+    return np.array(commands), np.array(sent)
+
+
+def of_records(records, **limits):
+    document = six_axis_document(limits={**LIMITS, **limits}, **records.gains)
+    # The gains' bounds are those of the mechanism without noise.
+    return Controller6.from_dict(document)
+
+
+def test_controller_commands_are_those_of_the_record(records):
+    for record in records.lanes:
+        rig = of_records(records)
+        commands, sent = replay(rig, record)
+        assert rig.status == "ok" and rig.seen == 0
+        span = np.ptp(record.command)
+        np.testing.assert_allclose(commands, record.command, rtol=0, atol=1e-9 * span)
+        np.testing.assert_allclose(sent, record.sent[:-1], rtol=0, atol=1e-13)
+        assert 0 < rig.unpaid_impulse < 0.1 and 0.02 < rig.loop_delay < 0.035
+        rig.next_contact()
+        contact = rig.last_contact
+        assert contact.number >= 1 and contact.status == "identified" and not contact.in_doubt
+        assert rig.unpaid_impulse == rig.loop_delay == 0.0
+
+
+def test_every_output_is_a_new_list():
+    rig = controller("none")
+    first = rig.step([1.0, 0, 0, 0, 0, 0], START, TWIST, START)
+    first[0] = 1e9
+    assert rig.step([1.0, 0, 0, 0, 0, 0], START, TWIST, START)[0] == 1.0
+    pose = rig.pose_command(START, TWIST, ZERO)
+    pose[0] = 1e9
+    assert rig.pose_command(START, TWIST, ZERO)[0] == START[0]
+
+
+# Gain file
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda d: d.pop("constants"), "constants: found nothing"),
+        (lambda d: d.update(axes=1), "axes: found 1, expected 6"),
+        (lambda d: d["constants"].pop("mass_matrix"), "constants.mass_matrix: found nothing"),
+        (lambda d: d["constants"]["mass_matrix"].pop(), "6 rows of 6 numbers"),
+        (lambda d: d["constants"]["mass_matrix"][0].__setitem__(0, math.inf), "JSON"),
+        (lambda d: d["constants"]["inverse_mass"][2].__setitem__(2, 0.01), "the inverse of"),
+        (lambda d: d["constants"].update(more=1), "an extra key 'more'"),
+        (lambda d: d["constants"].update(longest_delay=3.0), "constants.longest_delay"),
+        (lambda d: d["limits"].update(stroke={"value": 1.0, "unit": "m"}), "an unknown limit"),
+        (lambda d: d["limits"]["force_range"].update(unit="N m"), "limits.force_range.unit"),
+        (lambda d: d["limits"]["command_lowest_x"].update(value=0.41), "is not below"),
+        (lambda d: d["gains"]["velocity_gain"].update(value=1e9, upper=1e9), "gains.velocity_gain"),
+        (lambda d: d.update(compensator="smith_predictor"), "compensator"),
+    ],
+)
+def test_gain_file_in_six_axes_rejects(change, message):
+    document = six_axis_document(limits=LIMITS)
+    change(document)
+    try:
+        document = sign(document)
+    except ValueError:
+        pass
+    with pytest.raises(GainFileError, match=message) as error:
+        Controller6.from_dict(document)
+    assert "\n" not in str(error.value)
+
+
+def test_changed_digit_is_noticed():
+    document = six_axis_document()
+    document["constants"]["mass_matrix"][0][0] *= 1 + 1e-15
+    with pytest.raises(GainFileError, match="sha256"):
+        Controller6.from_dict(document)
+
+
+def test_delay_longer_than_the_delay_line_is_rejected():
+    document = six_axis_document(identification_delay=0.52)
+    document["gains"]["identification_delay"]["upper"] = 1.0
+    with pytest.raises(GainFileError, match="periods"):
+        Controller6.from_dict(sign(document))
+
+
+# Guards
+
+
+@pytest.mark.parametrize("channel", range(6))
+@pytest.mark.parametrize(
+    "value, fault",
+    [(math.nan, "force_not_finite"), (math.inf, "force_not_finite"), (2e4, "force_out_of_range")],
+)
+def test_bad_wrench_channel_is_bridged_and_then_trips(channel, value, fault):
+    rig = controller()
+    fly(rig, 20)
+    wrench = list(ZERO)
+    wrench[channel] = value
+    fly(rig, 3, 20, wrench)
+    assert rig.status == "ok" and rig.channels == 1 << channel
+    assert fault_names(rig.faults, SIX_AXIS_FAULTS) == [fault]
+    fly(rig, 1, 23, wrench)
+    name = ("fx", "fy", "fz", "mx", "my", "mz")[channel]
+    assert rig.status == f"tripped: {fault} ({name})"
+
+
+@pytest.mark.parametrize("channel", range(6))
+@pytest.mark.parametrize("value, fault", [(math.nan, "position_not_finite"), (0.6, "position_out_of_range")])
+def test_bad_pose_is_bridged_and_then_trips(channel, value, fault):
+    rig = controller()
+    fly(rig, 20)
+    for tick in range(20, 24):
+        now = along(tick)
+        read = list(now)
+        read[channel] = value
+        assert not rig.tripped
+        rig.step(ZERO, now, TWIST, read)
+    assert names(rig) == [fault] and rig.channels == 64 << channel
+    # On a run's first tick there is nothing to bridge with.
+    other = controller()
+    other.step(ZERO, START, TWIST, read)
+    assert names(other) == [fault]
+
+
+@pytest.mark.parametrize("channel", range(6))
+def test_stuck_wrench_channel_trips_while_the_hardware_moves(channel):
+    rig = controller("none")
+    wrench = [0.0] * 6
+    wrench[channel] = 1.5
+    fly(rig, 40, wrench=wrench)
+    assert rig.status == "ok"
+    fly(rig, 20, 40, wrench)
+    assert names(rig) == ["force_stuck"]
+    # A reading of no force may last.
+    free = controller("none")
+    fly(free, 300)
+    assert free.status == "ok"
+
+
+def test_stuck_pose_trips_while_the_model_moves():
+    rig = controller("none")
+    for tick in range(60):
+        rig.step(ZERO, along(tick), TWIST, START)
+    assert names(rig) == ["position_stuck"] and "z" in rig.status
+
+
+def test_model_that_is_not_finite_trips():
+    rig = controller()
+    rig.step(ZERO, [math.nan, *START[1:]], TWIST, START)
+    assert names(rig) == ["model_not_finite"]
+    other = controller()
+    fly(other, 5)
+    other.pose_command([math.inf, *START[1:]], TWIST, ZERO)
+    assert names(other) == ["model_not_finite"]
+
+
+def test_clock_faults_are_those_of_one_axis():
+    rig = controller()
+    fly(rig, 5, timed=True)
+    now = along(5)
+    rig.step(ZERO, now, TWIST, now, 8 * PERIOD)
+    assert fault_names(rig.faults, SIX_AXIS_FAULTS) == ["missed_tick"] and rig.missed_ticks == 3
+    rig.step(ZERO, now, TWIST, now, 1.0)
+    assert names(rig) == ["missed_tick"]
+
+
+def test_wrong_arguments_trip_and_do_not_raise():
+    for wrong in (None, [1.0], ["a"] * 6, 5.0, [None] * 6):
+        rig = controller()
+        assert rig.step(ZERO, wrong, TWIST, START) == ZERO
+        assert names(rig) == ["model_not_finite"]
+        assert len(rig.pose_command(wrong, wrong, None)) == 6
+
+
+def test_tare_removes_the_bias():
+    rig = controller("none")
+    reading = [3.0, -2.0, 5.0, 0.5, 0.25, -0.125]
+    assert [rig.tare(reading) for _ in range(3)] == [False, False, True]
+    assert rig.bias == reading
+    assert rig.step(reading, START, TWIST, START) == ZERO
+    other = controller("none")
+    other.tare(ZERO)
+    other.tare([9.0, *ZERO[1:]])
+    assert other.tare(ZERO) and names(other) == ["tare"]
+
+
+def test_emergency_stop_is_latched_until_reset():
+    rig = controller()
+    fly(rig, 10)
+    rig.emergency_stop(True)
+    assert names(rig) == ["emergency_stop"] and rig.reset() is False
+    rig.emergency_stop(False)
+    assert rig.tripped and rig.reset() is True and rig.status == "ok"
+
+
+# Outputs
+
+
+def test_wrench_beyond_its_limit_trips_and_fades():
+    rig = controller("none", limited_in_a_row=1000.0)
+    for tick in range(20):
+        rig.step([0, 0, 900.0, 0, 0, 0], along(tick), TWIST, along(tick))
+    last = rig.step([0, 0, 1001.0, 0, 0, 0], along(20), TWIST, along(20))
+    assert names(rig) == ["force_limit"] and last[2] == 800.0
+    values = [rig.step(ZERO, along(20), TWIST, along(20))[2] for _ in range(10)]
+    np.testing.assert_allclose(values[:8], [700, 600, 500, 400, 300, 200, 100, 0], atol=1e-9)
+
+
+def test_command_outside_the_stroke_trips():
+    rig = controller()
+    fly(rig, 10)
+    rig.pose_command([0.41, *START[1:]], TWIST, ZERO)
+    assert names(rig) == ["stroke"]
+
+
+def test_retreat_leads_back_along_the_way_and_is_never_too_fast():
+    """Follow a curved approach, stop, and compare the way back with the way."""
+    rig = controller()
+    angle = np.linspace(0, 1.5, 600)
+    way = np.zeros((600, 6))
+    way[:, 0], way[:, 2] = 0.03 * np.sin(angle), 0.03 * np.cos(angle)
+    way[:, 4] = 0.05 * angle
+    twist = np.gradient(way, PERIOD, axis=0)
+    for at, rate in zip(way.tolist(), twist.tolist(), strict=True):
+        rig.step(ZERO, at, rate, at)
+        sent = [rig.pose_command(at, rate, ZERO)]
+    assert rig.status == "ok"
+    rig.emergency_stop(True)
+    while not rig.at_rest and len(sent) < 5000:
+        rig.step(ZERO, at, rate, at)
+        sent.append(rig.pose_command(at, rate, ZERO))
+    sent = np.array(sent)
+    steps = np.diff(sent, axis=0)
+    moved, turned = np.linalg.norm(steps[:, :3], axis=1), np.linalg.norm(steps[:, 3:], axis=1)
+    braking = int(np.argmin(moved > 1e-12))
+    speed = np.linalg.norm(twist[-1][:3])
+    assert braking > 10 and np.max(moved[:braking]) <= speed * PERIOD * (1 + 1e-6)
+    assert np.max(moved[braking:]) <= 0.02 * PERIOD * (1 + 1e-9)
+    assert np.max(turned[braking:]) <= 0.04 * PERIOD * (1 + 1e-9)
+    assert np.sum(moved[braking:]) == pytest.approx(0.01, abs=2e-5)
+    # Each point of the way back is near the way that it came, braking included.
+    all_points = np.concatenate([way, sent[: braking + 1]])
+    distance = [np.min(np.linalg.norm(all_points[:, :3] - point[:3], axis=1)) for point in sent[braking:]]
+    assert max(distance) < 5e-5
+    # It starts and stops within the deceleration.
+    change = np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1)
+    assert np.max(change[: braking - 1]) <= 0.5 * PERIOD**2 * (1 + 1e-6)
+
+
+def test_retreat_leads_back_along_a_rotation():
+    """A rotation of 1 rad counts as 0.02/0.04 m."""
+    rig = controller()
+    twist = [0.0, 0.0, 0.0, 0.0, 0.05, 0.0]
+    for tick in range(1000):
+        at = along(tick, ZERO, twist)
+        rig.step(ZERO, at, twist, at)
+        sent = rig.pose_command(at, twist, ZERO)
+    rig.emergency_stop(True)
+    angles = [sent[4]]
+    while not rig.at_rest and len(angles) < 5000:
+        rig.step(ZERO, at, twist, at)
+        angles.append(rig.pose_command(at, twist, ZERO)[4])
+    assert angles[-1] == pytest.approx(max(angles) - 0.01 / 0.5, abs=1e-4)
+    assert np.max(np.abs(np.diff(angles))) <= 0.05 * PERIOD * (1 + 1e-6)
+
+
+def test_first_command_continues_from_the_measured_pose():
+    rig = controller("none")
+    far = [at + 0.05 for at in START]
+    rig.step(ZERO, far, ZERO, START)
+    first = rig.pose_command(far, ZERO, ZERO)
+    assert np.linalg.norm(np.subtract(first, START)[:3]) <= 0.1 * PERIOD * (1 + 1e-9)
+    near = controller("none")
+    beside = [at + 0.001 for at in START]
+    near.step(ZERO, beside, ZERO, START)
+    assert near.pose_command(beside, ZERO, ZERO) == beside
+
+
+# Watchdog
+
+
+def test_watchdog_stops_a_model_with_another_mass(records):
+    document = six_axis_document(limits=LIMITS, **records.gains)
+    document["constants"]["mass_matrix"] = (1.2 * np.array(document["constants"]["mass_matrix"])).tolist()
+    document["constants"]["inverse_mass"] = (np.array(document["constants"]["inverse_mass"]) / 1.2).tolist()
+    rig = Controller6.from_dict(sign(document))
+    replay(rig, records.lanes[0])
+    rig.next_contact()
+    assert "momentum" in names(rig)
+
+
+def test_watchdog_stops_an_integrator_with_the_wrong_sign(records):
+    """The model of the record is not that of these commands."""
+    rig = of_records(records, unpaid_impulse=1e9)
+
+    def turned(tick, inputs):
+        inputs[0] = [-value for value in inputs[0]]
+        return inputs
+
+    replay(rig, records.lanes[0], turned)
+    rig.next_contact()
+    assert {"momentum", "energy_gain"} & {*names(rig)}
+
+
+def test_watchdog_states_the_lag(records):
+    rig = of_records(records, lag_highest=0.02)
+    replay(rig, records.lanes[0])
+    assert names(rig) == ["lag"]
+
+
+def test_watchdog_states_unpaid_impulse(records):
+    rig = of_records(records, unpaid_impulse=1e-6)
+    replay(rig, records.lanes[0])
+    rig.next_contact()
+    assert names(rig) == ["unpaid_impulse"] and "unpaid impulse" in rig.status
+
+
+def pushed(rig, force, ticks, factor=1.0):
+    """Push a model at 5 mm/s with a force; `factor` is that of the mass that it has too little."""
+    inverse = np.array(six_axis_document()["constants"]["inverse_mass"])
+    twist, wrench = np.array([0, 0, -0.005, 0, 0, 0]), np.array([0, 0, force, 0, 0, 0])
+    at = np.array([0, 0, 0.05, 0, 0, 0])
+    rig.step(ZERO, at.tolist(), twist.tolist(), at.tolist())
+    for tick in range(ticks + 40):
+        felt = wrench if tick < ticks else 0 * wrench
+        command = np.array(rig.step(felt.tolist(), at.tolist(), twist.tolist(), at.tolist()))
+        # Along z the lever is 0 at this pose, which hardly changes.
+        twist = twist + factor * PERIOD * inverse @ command
+        at = at + PERIOD * twist
+        at[:2] = 0
+    return rig
+
+
+def test_watchdog_stops_contact_that_releases_energy():
+    limits = {"force_stuck_travel": 1.0, "fading": 1.0}
+    assert pushed(controller("none", **limits), 30.0, 100).status == "ok"
+    rig = pushed(controller("none", **limits), 30.0, 150)
+    assert names(rig) == ["energy_gain"] and "energy released" in rig.status
+
+
+def test_watchdog_compares_impulse_and_momentum():
+    limits = {"force_stuck_travel": 1.0, "fading": 1.0, "energy_gain": 1e9}
+    assert pushed(controller("none", **limits), 30.0, 100, 1.03).status == "ok"
+    assert names(pushed(controller("none", **limits), 30.0, 100, 1.1)) == ["momentum"]
+
+
+def test_contact_may_not_last_too_long():
+    limits = {"force_stuck_travel": 1.0, "fading": 1.0, "longest_contact": 0.1}
+    assert names(pushed(controller("none", **limits), 10.0, 120)) == ["contact_too_long"]
+
+
+# Hostile inputs
+
+hostile = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from(
+    [0.0, -0.0, 1e308, 5e-324, math.nan, 0.05, -0.05, 0.3]
+)
+vectors = st.lists(hostile, min_size=6, max_size=6) | st.lists(st.floats(-0.05, 0.05), min_size=6, max_size=6)
+calls = st.lists(
+    st.tuples(
+        st.sampled_from(["step"] * 3 + ["timed", "pose", "pose", "pose"] + ["tare", "next", "reset"])
+        | st.sampled_from(["stop", "release"]),
+        st.tuples(vectors, vectors, vectors, vectors),
+        hostile,
+    ),
+    max_size=60,
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(calls=calls, name=st.sampled_from(["none", "phase_lead", "response_error", "impulse_ledger"]))
+def test_outputs_are_finite_and_within_limits_for_any_input(calls, name):
+    rig = controller(name)
+    wrench, sent, measured = np.zeros(6), None, None
+    most = np.array([100.0] * 3 + [30.0] * 3)
+    for call, values, number in calls:
+        if call in ("step", "timed"):
+            new = np.array(rig.step(*values, number if call == "timed" else None))
+            assert np.all(np.abs(new) <= [1000.0] * 3 + [300.0] * 3)
+            assert np.all(np.abs(new - wrench) <= most * (1 + 1e-12))
+            wrench = new
+            if np.all(np.abs(values[3]) <= 0.5):
+                measured = np.array(values[3])
+        elif call == "pose":
+            new = np.array(rig.pose_command(*values[:3]))
+            assert np.all(np.isfinite(new))
+            if sent is not None:
+                # Outside the stroke only if the drives were there when the run began, and never further out.
+                assert np.all((np.minimum(-0.4, sent) <= new) & (new <= np.maximum(0.4, sent)))
+                step = new - sent
+                assert np.linalg.norm(step[:3]) <= 1e-4 * (1 + 1e-9) + 1e-14
+                assert np.linalg.norm(step[3:]) <= 2e-4 * (1 + 1e-9) + 1e-14
+            elif measured is not None:
+                # The first command of a run is near the measured pose.
+                assert np.linalg.norm((new - measured)[:3]) <= 0.002 + 1e-12
+                assert np.linalg.norm((new - measured)[3:]) <= 0.002 + 1e-12
+            sent = new
+        elif call == "tare":
+            rig.tare(values[0])
+        elif call == "next":
+            if not rig.tripped:
+                # After the audit of an open contact the run may not have begun anew.
+                rig.next_contact()
+                if not rig.tripped:
+                    sent = measured = None
+            else:
+                rig.next_contact()
+        elif call == "reset":
+            rig.reset()
+        else:
+            rig.emergency_stop(call == "stop")
+        assert rig.tripped is (rig.status != "ok")
+        assert "\n" not in rig.status
+
+
+def test_every_limit_is_in_the_documents():
+    assert {*LIMITS} | {"late_fraction"} == {*SIX_AXIS_LIMITS}

@@ -1,0 +1,154 @@
+"""The rig's compensators in six axes agree with the JAX compensators on recorded and random readings."""
+
+import functools
+
+import numpy as np
+import pytest
+from six_axis_ranges import NOISE, POSE_NOISE
+from six_axis_records import (
+    RING,
+    random_readings,
+    recorded,
+    relative_difference,
+    rig_commands,
+    rounding_spread,
+    simulated_alone,
+)
+
+from jaxhil.laws import built_in_compensators
+from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS, literature_gains
+from jaxhil.mechanism.file import load_any, six_axis_names
+from jaxhil.rig.law_status import IDENTIFIED, OUT_OF_CONTACT, STATUS_NAMES
+from jaxhil.rig.six_axes import SIX_AXIS_COMPENSATORS as ON_THE_RIG
+from jaxhil.rig.six_axes import ModelConstants
+from jaxhil.rig.six_axes.vectors import coordinate_rates
+
+LIMIT = 1e-9  # of the commands' range
+NOISY = "probe-drogue"  # the mechanism that also has noise of force and pose
+LANES = 3
+MECHANISMS = six_axis_names()
+
+
+@functools.cache
+def of_ledger(name):
+    """Return the records of draws of a mechanism with the ledger."""
+    changes = {}
+    if name == NOISY:
+        changes = {"rig.force_sensor.noise_std": NOISE, "rig.position_sensor.noise_std": POSE_NOISE}
+    return recorded(load_any(name, changes).mechanism, "impulse_ledger", LANES)
+
+
+def test_every_built_in_compensator_has_a_rig_side_with_the_same_gains():
+    assert {*ON_THE_RIG} == {*built_in_compensators(6)}
+    mechanism = load_any("probe-drogue").mechanism
+    for name, law in SIX_AXIS_COMPENSATORS.items():
+        if name not in ON_THE_RIG:
+            continue  # registered by another test
+        specified = ON_THE_RIG[name].gains
+        assert {gain.name: gain.unit for gain in law.gains} == {k: gain.unit for k, gain in specified.items()}
+        for gain in law.gains:
+            for value in (gain.lower(mechanism), gain.nominal(mechanism), gain.upper(mechanism)):
+                assert specified[gain.name].admits(value), (name, gain.name, value)
+
+
+def check_agreement(name, gains, constants, period, readings, expected):
+    """Compare the rig's commands with the expected ones; return whether they magnify rounding."""
+    found, _ = rig_commands(name, gains, constants, period, readings)
+    difference = relative_difference(found, expected)
+    if difference <= LIMIT:
+        return False
+    spread = rounding_spread(name, gains, constants, period, readings)
+    assert difference <= 10 * spread, f"{name}: {difference}: rounding explains {spread}"
+    return True
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == NOISY else pytest.mark.slow) for name in MECHANISMS]
+)
+def test_commands_agree_on_recorded_ticks(name):
+    """Compare the ledger with its own record, and every compensator on the same readings."""
+    records = of_ledger(name)
+    period = records.mechanism.rig.control_period
+    for lane, record in enumerate(records.lanes):
+        readings, constants = record[:4], records.on_the_rig(lane)
+        assert np.any(record.command != 0)
+        commands, sent = rig_commands("impulse_ledger", records.gains, constants, period, readings)
+        assert relative_difference(commands, record.command) <= LIMIT
+        # The record's pose commands are for the motion after the tick.
+        np.testing.assert_allclose(sent[1:], record.sent[:-1], rtol=0, atol=1e-13)
+        for other in built_in_compensators(6):
+            gains = literature_gains(records.mechanism, other)
+            expected = simulated_alone(other, gains, constants, period, readings)
+            check_agreement(other, gains, constants, period, readings, expected)
+
+
+def test_pose_commands_are_led():
+    records = of_ledger(NOISY)
+    record = records.lanes[0]
+    leads = np.array([records.gains[f"lag_lead_{axis}"] for axis in ("x", "y", "z", "rx", "ry", "rz")])
+    assert np.max(leads) > 1e-3
+    rates = np.array(
+        [
+            coordinate_rates(*row)
+            for row in zip(record.pose_desired.tolist(), record.twist_desired.tolist(), strict=True)
+        ]
+    )
+    expected = record.pose_desired[1:] + leads * rates[1:]
+    np.testing.assert_allclose(record.sent[:-1], expected, rtol=0, atol=1e-13)
+
+
+def test_ledger_states_delay_status_and_unpaid_impulse():
+    records = of_ledger(NOISY)
+    law = ON_THE_RIG["impulse_ledger"](records.gains, records.on_the_rig(0), 1e-3)
+    statuses = []
+    for row in zip(*(column.tolist() for column in records.lanes[0][:4]), strict=True):
+        law.step(*row)
+        statuses.append(law.status)
+    acting = [status for status in statuses if status != OUT_OF_CONTACT]
+    assert acting.count(IDENTIFIED) > 0.6 * len(acting) > 20
+    assert statuses[0] == OUT_OF_CONTACT and {*statuses} <= {*STATUS_NAMES}
+    # The lag of the loop is that of the force, the axes' delays and their response in uniform motion.
+    assert 0.02 < law.loop_delay < 0.035
+    assert 0 < law.unpaid_impulse < 0.05
+    law.reset()
+    assert law.loop_delay == 0.0
+
+
+def random_gains(rng, mechanism, name):
+    gains = {}
+    for gain in SIX_AXIS_COMPENSATORS[name].gains:
+        lower, upper, share = gain.lower(mechanism), gain.upper(mechanism), rng.random()
+        inside = lower * (upper / lower) ** share if gain.logarithmic else lower + share * (upper - lower)
+        gains[gain.name] = (lower, upper, gain.nominal(mechanism), inside)[rng.integers(4)]
+    # Otherwise most contacts are over before they may be detected, or below the gate.
+    most = {"settle": 0.05, "force_noise": 1.0, "torque_noise": 0.1, "pose_filter": 0.005}
+    return {gain: min(value, most.get(gain, value)) for gain, value in gains.items()}
+
+
+def random_constants(rng):
+    """Draw a mass matrix whose condition is that of a mechanism's, and a tool."""
+    size = np.diag(np.sqrt([300.0, 300.0, 300.0, 90.0, 90.0, 90.0]))
+    mixed = np.eye(6) + 0.1 * rng.standard_normal((6, 6))
+    mass = size @ mixed @ mixed.T @ size
+    tool = np.diag([12.0, 12.0, 12.0, 0.3, 0.3, 0.3]) * rng.uniform(0, 1)
+    correction = np.linalg.inv(np.eye(6) - tool @ np.linalg.inv(mass))
+    matrices = (mass.tolist(), np.linalg.inv(mass).tolist(), correction.tolist())
+    return ModelConstants(*matrices, (RING - 2) * 1e-3)
+
+
+@pytest.mark.parametrize("runs", [12, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", built_in_compensators(6))
+def test_commands_agree_on_random_contacts(name, runs):
+    """Compare readings that no contact produces; with wide priors, few of them magnify rounding."""
+    ticks, period = 1000, 1e-3
+    mechanism = load_any("probe-drogue").mechanism
+    magnified, acting = 0, 0
+    for run in range(runs):
+        rng = np.random.default_rng([run, runs])
+        readings, constants = random_readings(rng, ticks, period), random_constants(rng)
+        gains = random_gains(rng, mechanism, name)
+        expected = simulated_alone(name, gains, constants, period, readings)
+        acting += bool(np.any(expected != 0))
+        magnified += check_agreement(name, gains, constants, period, readings, expected)
+    assert acting > 0.9 * runs
+    assert magnified <= (0.25 * runs if name == "impulse_ledger" else 0)

@@ -1,0 +1,198 @@
+"""Verification that the rig's controller in six axes behaves like the simulation.
+
+Two comparisons use the gains of a gain file. *Replay*: recorded runs are replayed through the rig's
+compensator without limits; its commands must be the recorded ones. *Closed loop*: JAX simulates sensors,
+motion simulator, contact and numerical model of the nominal run, and the controller with the file's limits
+computes the commands; the final twist must be the simulated one.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+
+from jaxhil.rig.six_axes import Controller6
+from jaxhil.rig.six_axes.gain_file import SixAxisGainFile, check_six_axis_document
+from jaxhil.rig.six_axes.limits import NO_SIX_AXIS_LIMITS
+from jaxhil.simulation.gain_file import LoadedGains
+from jaxhil.sixdof.loop import (
+    Loop,
+    Rig,
+    RunState,
+    Sensed,
+    actuated,
+    begin,
+    build_rig,
+    integrate,
+    model_motion,
+    run,
+    sense,
+)
+from jaxhil.sixdof.relative import Wrench
+from jaxhil.sixdof.scenario import Scenario
+from jaxhil.sixdof.vectors import vector
+from tuning.verification.six_axis_replay import (
+    SIX_AXIS_REPLAY_LIMIT,
+    SixAxisReplay,
+    compare_record,
+    draw_scenarios,
+    record_runs,
+    six_axis_loop,
+)
+
+SIX_AXIS_CLOSED_LOOP_LIMIT = 1e-8  # largest difference of the final twist, over its largest entry [1]
+
+
+class FinalTwist(msgspec.Struct, frozen=True):
+    """Twist of the numerical model at the end of the nominal run."""
+
+    found: list[float]  # with the rig's controller in the loop [m/s, rad/s]
+    simulated: list[float]  # with the JAX compensator [m/s, rad/s]
+    difference: float  # largest difference, over the largest translation or rotation [1]
+    ticks: int  # number of ticks
+    status: str  # status of the controller at the end
+
+
+class SixAxisVerification(msgspec.Struct, frozen=True):
+    """Verdict of a verification in six axes, with all comparisons."""
+
+    verdict: bool  # whether controller and simulation agree in all comparisons
+    reasons: tuple[str, ...]  # reasons for a negative verdict; empty if it is positive
+    compensator: str  # name of the compensator
+    replay_limit: float  # largest accepted difference of commands, divided by their range [1]
+    closed_loop_limit: float  # largest accepted difference of the final twist [1]
+    replay: tuple[SixAxisReplay, ...]  # one comparison for each replayed run
+    closed_loop: FinalTwist
+    axes: int = 6
+
+
+def verify_six_axes(
+    loaded: LoadedGains,
+    scenarios: int,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda message: None,
+) -> SixAxisVerification:
+    """Verify that the rig's controller behaves like the simulation with the gains of a gain file.
+
+    Args:
+        loaded: gain file in six axes.
+        scenarios: number of replayed runs: the nominal run and random draws.
+        seed: seed of the draws.
+        progress: callback, called with a description of each stage.
+    """
+    gain_file = check_six_axis_document(loaded.document)
+    subject = loaded.mechanism, loaded.compensator, loaded.gains
+    progress(f"recording {scenarios} runs")
+    records = record_runs(*subject, 0, seed)[1]
+    if scenarios > 1:
+        records += record_runs(*subject, scenarios - 1, seed)[1]
+    progress(f"replaying {sum(len(record.command) for record in records)} ticks through the runtime")
+    # The replay compares the compensators alone: the limits may rightly stop some draws.
+    free = gain_file._replace(limits=NO_SIX_AXIS_LIMITS)
+    replays = tuple(compare_record(Controller6(free), record) for record in records)
+    progress("running the nominal contacts with the runtime in the loop")
+    closed = run_six_axis_loop(loaded, gain_file, len(records[0].command), seed)
+    reasons = (*_replay_reasons(replays), *_closed_loop_reasons(closed))
+    return SixAxisVerification(
+        verdict=not reasons,
+        reasons=reasons,
+        compensator=loaded.compensator,
+        replay_limit=SIX_AXIS_REPLAY_LIMIT,
+        closed_loop_limit=SIX_AXIS_CLOSED_LOOP_LIMIT,
+        replay=replays,
+        closed_loop=closed,
+    )
+
+
+def run_six_axis_loop(
+    loaded: LoadedGains, gain_file: SixAxisGainFile, ticks: int, seed: int = 0
+) -> FinalTwist:
+    """Run the nominal scenario for some ticks with the rig's controller, and with the JAX compensator."""
+    scenario = draw_scenarios(loaded.mechanism, 0, seed)
+    loop = six_axis_loop(loaded.mechanism, loaded.compensator, scenario)
+    gains = {name: jnp.asarray(value) for name, value in loaded.gains.items()}
+    simulated = np.asarray(_simulated_twist(loop, ticks, gains, scenario))[:, 0]
+    rig, state = _start(loop, gains, scenario)
+    controller = Controller6(gain_file)
+    for _ in range(ticks):
+        sensed = _sense(loop, rig, state)
+        signals = jax.device_get(sensed.signals)
+        command = controller.step(
+            [float(channel[0]) for channel in signals.wrench],
+            np.asarray(signals.pose_desired)[:, 0].tolist(),
+            np.asarray(signals.twist_desired)[:, 0].tolist(),
+            np.asarray(signals.pose_measured)[:, 0].tolist(),
+        )
+        model = _integrate(loop, rig, state, np.array(command)[:, None])
+        position, twist = (np.asarray(part)[:, 0].tolist() for part in (model[1], model[3]))
+        sent = controller.pose_command(position, twist)
+        state = _advance(loop, rig, state, sensed, (model[0], model[1], model[3]), np.array(sent)[:, None])
+    controller.next_contact()
+    found = np.asarray(state.twist)[:, 0]
+    worst = 0.0
+    for part in (slice(0, 3), slice(3, 6)):
+        size = float(np.max(np.abs(simulated[part])))
+        error = float(np.max(np.abs(found[part] - simulated[part])))
+        worst = max(worst, error / size if size > 0 else error)
+    return FinalTwist(found.tolist(), simulated.tolist(), worst, ticks, controller.status)
+
+
+@partial(jax.jit, static_argnums=0)
+def _start(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Rig, RunState]:
+    """Return constants and initial state of the loop."""
+    rig = build_rig(loop, gains, scenario)
+    return rig, begin(loop, rig, scenario.start)
+
+
+@partial(jax.jit, static_argnums=0)
+def _sense(loop: Loop, rig: Rig, state: RunState) -> Sensed:
+    """Return contact and readings of a tick."""
+    return sense(loop, rig, state)
+
+
+@partial(jax.jit, static_argnums=0)
+def _integrate(loop: Loop, rig: Rig, state: RunState, command: Any) -> tuple[Any, ...]:
+    """Return the numerical model after a tick under a wrench, (6, lanes)."""
+    return integrate(loop, rig, state, Wrench(vector(command[:3]), vector(command[3:])))
+
+
+@partial(jax.jit, static_argnums=0)
+def _advance(loop: Loop, rig: Rig, state: RunState, sensed: Sensed, model: Any, sent: Any) -> RunState:
+    """Return the state after a tick with a pose command, (6, lanes)."""
+    return actuated(loop, rig, state, sensed, model, sent)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _simulated_twist(loop: Loop, ticks: int, gains: dict[str, Any], scenario: Scenario) -> Any:
+    """Return the twist after some ticks with the JAX compensator, (6, lanes)."""
+    state, _ = run(loop, gains, scenario, ticks)
+    return model_motion(scenario.bodies, state.states)[2]
+
+
+def _replay_reasons(replays: tuple[SixAxisReplay, ...]) -> Iterator[str]:
+    """Yield the reasons for which the replays do not agree with the records."""
+    for number, lane in enumerate(replays):
+        run = "the nominal run" if number == 0 else f"draw {number}"
+        if lane.status != "ok":
+            yield f"replay, {run}: the controller {lane.status}"
+        for what, difference in (("wrench", lane.difference), ("pose", lane.pose_difference)):
+            if not difference <= SIX_AXIS_REPLAY_LIMIT:
+                yield (
+                    f"replay, {run}: {what} commands differ by {difference:.1e} of their range, expected "
+                    f"{SIX_AXIS_REPLAY_LIMIT:.0e} or less"
+                )
+
+
+def _closed_loop_reasons(closed: FinalTwist) -> Iterator[str]:
+    """Yield the reasons for which the run with the controller in the loop is not the simulated one."""
+    if closed.status != "ok":
+        yield f"closed loop: the controller {closed.status}"
+    elif not closed.difference <= SIX_AXIS_CLOSED_LOOP_LIMIT:
+        yield (
+            f"closed loop: final twist: found {closed.found!r}, expected {closed.simulated!r} (simulation): "
+            f"they differ by {closed.difference:.1e}, expected {SIX_AXIS_CLOSED_LOOP_LIMIT:.0e} or less"
+        )

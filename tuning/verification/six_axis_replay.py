@@ -1,0 +1,95 @@
+"""Recorded runs of a rig in six axes, and their replay through the rig's controller."""
+
+import dataclasses
+from collections.abc import Mapping
+from math import inf
+
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+
+from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.rig.six_axes import Controller6
+from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.controller_record import ControllerRecord, record_controller
+from jaxhil.sixdof.loop import Loop
+from jaxhil.sixdof.metrics import Metrics
+from jaxhil.sixdof.scenario import Scenario
+
+SIX_AXIS_REPLAY_LIMIT = 1e-9  # largest difference of commands, divided by their range [1]
+
+
+class SixAxisReplay(msgspec.Struct, frozen=True):
+    """Comparison of one recorded run with its replay in the controller."""
+
+    ticks: int  # number of recorded ticks
+    difference: float  # largest difference of wrench commands, divided by their range [1]
+    worst_tick: int  # tick with this difference
+    pose_difference: float  # largest difference of pose commands, divided by their range [1]
+    status: str  # status of the controller at the end of the run
+
+
+def six_axis_loop(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -> Loop:
+    """Return the loop of scenarios, which measures the pose whatever the compensator reads."""
+    return dataclasses.replace(loop_of(mechanism, compensator, scenario), measures_pose=True)
+
+
+def draw_scenarios(mechanism: SixAxisMechanism, number: int, seed: int) -> Scenario:
+    """Return the nominal scenario if `number` is 0, else so many draws with the nominal control period."""
+    if not number:
+        return build_scenarios(mechanism, seed=seed)
+    # The gain file fixes the control period.
+    drawn = {k: v for k, v in draw(mechanism, number, seed).items() if k != "rig.control_period"}
+    return build_scenarios(mechanism, drawn, seed=seed)
+
+
+def record_runs(
+    mechanism: SixAxisMechanism, compensator: str, gains: Mapping[str, float], number: int, seed: int
+) -> tuple[Metrics, list[ControllerRecord]]:
+    """Return metrics and records of the nominal run if `number` is 0, else of so many draws."""
+    scenario = draw_scenarios(mechanism, number, seed)
+    loop = six_axis_loop(mechanism, compensator, scenario)
+    return record_controller(loop, {name: jnp.asarray(value) for name, value in gains.items()}, scenario)
+
+
+def replay_record(controller: Controller6, record: ControllerRecord) -> tuple[np.ndarray, np.ndarray]:
+    """Return wrench and pose commands, (ticks, 6), of a controller for the readings of a run.
+
+    There is one pose command less than ticks, because the record ends before the model's next motion.
+    """
+    columns = [column.tolist() for column in record[:4]]
+    commands, sent = [], []
+    for tick, readings in enumerate(zip(*columns, strict=True)):
+        commands.append(controller.step(*readings))
+        if tick + 1 < len(columns[0]):
+            sent.append(controller.pose_command(columns[1][tick + 1], columns[2][tick + 1]))
+    return np.reshape(commands, (-1, 6)), np.reshape(sent, (-1, 6))
+
+
+def compare_record(controller: Controller6, record: ControllerRecord) -> SixAxisReplay:
+    """Replay a recorded run; compare the controller's commands with the recorded ones."""
+    commands, sent = replay_record(controller, record)
+    error = command_difference(commands, record.command)
+    worst = int(np.argmax(error))
+    return SixAxisReplay(
+        ticks=len(error),
+        difference=float(error[worst]),
+        worst_tick=worst,
+        pose_difference=float(np.max(command_difference(sent, record.sent[:-1]), initial=0.0)),
+        status=controller.status,
+    )
+
+
+def command_difference(commands: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Return the largest difference of a tick's channels, over the range of their part, (ticks,).
+
+    The parts are force and moment, or translation and rotation.
+    """
+    worst = np.zeros(len(commands))
+    for part in (slice(0, 3), slice(3, 6)):
+        values = expected[:, part]
+        span = np.max(values, initial=0.0) - np.min(values, initial=0.0)
+        error = np.max(np.abs(commands[:, part] - values), axis=1)
+        worst = np.maximum(worst, error / span if span > 0 else np.where(error == 0, 0.0, inf))
+    return worst

@@ -1,0 +1,243 @@
+"""Calibration of the limits of a gain file in six axes, and the watchdog's rates of wrong alarms.
+
+Scenarios are drawn and recorded. A run is good if its contacts end well and its twist error is at most half
+of `ERROR_LIMIT`. A part of the good runs determines the limits: the extreme signals times a margin. The other
+good runs are replayed through the rig's controller with these limits, as they are (false alarms), and with a
+fault (missed alarms).
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxhil.rig.six_axes import Controller6
+from jaxhil.rig.six_axes.gain_file import SixAxisGainFile, check_six_axis_document
+from jaxhil.rig.six_axes.limits import NO_SIX_AXIS_LIMITS, SIX_AXIS_LIMITS, complete_six_axis_limits
+from jaxhil.rig.six_axes.vectors import COORDINATES
+from jaxhil.simulation.gain_file import LoadedGains
+from jaxhil.sixdof.controller_record import ControllerRecord
+from jaxhil.sixdof.rollout import CAPTURED, REBOUNDED
+from tuning.statistics.intervals import binomial_interval
+from tuning.verification.six_axis_replay import record_runs, replay_record
+from tuning.watchdog.calibration import Calibration
+from tuning.watchdog.verdict import DEFAULT_ALLOWED_RATES, AllowedAlarmRates, add_verdict
+
+SIX_AXIS_DRAWS = 512  # enough for a rate of false alarms of 1 % if three quarters of the runs are good
+LANES = 128  # scenarios that are recorded together
+FITTED_SHARE = 4  # one of so many runs determines the limits
+ERROR_LIMIT = 0.1  # twist error of a run that the watchdog should stop [1]
+MARGIN = 1.5  # limit divided by the extreme signal of good runs [1]
+TICKS_IN_A_ROW = 3.0  # largest number of successive ticks with a bad reading, a miss or a limited rate
+TARE_TIME = 0.1  # duration of the tare [s]
+SETTLING = 0.03  # time after the last reading in contact before the audit [s]
+SIGMAS = 12.0  # spread of the readings of a tare, over the noise's standard deviation
+LEAST_RETREAT = 0.005  # length of the way back after a trip, beyond the contact's depth [m]
+LEAST_DISTANCE = 1e-4  # smallest limit of a distance or an angle [m, rad]
+WATCHDOG_LIMITS = {"momentum_error": 0.05, "energy_gain": 0.1, "unpaid_impulse": 0.1}  # least limits [1]
+LAG_RANGE = 0.5, 2.0  # limits of the lag, over the least and the largest of good runs
+WRONG_MASS = 1.2  # mass matrix of the injected fault, over the model's
+
+
+class DrawnRun(NamedTuple):
+    """Recorded run."""
+
+    record: ControllerRecord
+    error: float  # twist error [1]; NaN if the contact has not ended
+    good: bool  # whether the contacts end well, with a small error
+
+
+def calibrate_six_axes(
+    loaded: LoadedGains,
+    replaced: Mapping[str, float | None] | None = None,
+    allowed: AllowedAlarmRates = DEFAULT_ALLOWED_RATES,
+    progress: Callable[[int], None] = lambda runs: None,
+    scenarios: int = SIX_AXIS_DRAWS,
+    seed: int = 1,
+) -> Calibration:
+    """Calibrate the limits of a gain file in six axes, and estimate the rates of wrong alarms.
+
+    Args:
+        loaded: gain file.
+        replaced: limits that replace the calibrated limits, also in the estimation of the rates.
+        allowed: largest acceptable alarm rates.
+        progress: callback, called with the number of runs that have been completed since the last call.
+        scenarios: number of draws.
+        seed: seed of the draws.
+    """
+    gain_file = check_six_axis_document(loaded.document)
+    runs = list(_recorded(loaded, scenarios, seed, progress))
+    fitted = [run for index, run in enumerate(runs) if index % FITTED_SHARE == 0]
+    used = [run for run in fitted if run.good] or [run for run in fitted if np.isfinite(run.error)] or fitted
+    limits = signal_limits([run.record for run in used], gain_file.control_period, loaded.mechanism)
+    limits |= _audit_limits(gain_file, [run.record for run in used])
+    plain = {name: float(value) for name, value in limits.items()}
+    final = {name: plain.get(name) for name in SIX_AXIS_LIMITS} | dict(replaced or {})
+    held_out = [run for index, run in enumerate(runs) if index % FITTED_SHARE]
+    rates = alarm_rates(gain_file, final, held_out)
+    rates = add_verdict(rates, allowed, scenarios)
+    rates["calibrated_on"] = {"runs": "good" if used[0].good else "ended", "number": len(used), "seed": seed}
+    return Calibration(final, rates)
+
+
+def _recorded(
+    loaded: LoadedGains, scenarios: int, seed: int, progress: Callable[[int], None]
+) -> list[DrawnRun]:
+    """Record draws of a mechanism's uncertain values."""
+    runs = []
+    for first in range(0, scenarios, LANES):
+        number = min(LANES, scenarios - first)
+        subject = loaded.mechanism, loaded.compensator, loaded.gains
+        metrics, records = record_runs(*subject, number, seed + first)
+        ended = np.isin(np.asarray(metrics.status)[0], (REBOUNDED, CAPTURED))
+        errors = np.where(ended, np.asarray(metrics.twist_error)[0], np.nan)
+        runs += [
+            DrawnRun(record, float(error), bool(error <= 0.5 * ERROR_LIMIT))
+            for record, error in zip(records, errors, strict=True)
+        ]
+        progress(number)
+    return runs
+
+
+def signal_limits(records: list[ControllerRecord], period: float, mechanism: Any) -> dict[str, float]:
+    """Return the limits of signals, from the extreme signals of good runs."""
+    sensor = mechanism.rig.force_sensor
+    force, torque = slice(0, 3), slice(3, 6)
+    limits = {
+        "held_readings": TICKS_IN_A_ROW,
+        "limited_in_a_row": TICKS_IN_A_ROW,
+        "missed_in_a_row": TICKS_IN_A_ROW,
+        "settling": SETTLING,
+        "tare_ticks": float(np.ceil(TARE_TIME / period)),
+    }
+    for kind, part in (("force", force), ("torque", torque)):
+        reading = _largest(np.max(np.abs(record.wrench[:, part])) for record in records)
+        command = _largest(np.max(np.abs(record.command[:, part])) for record in records)
+        slew = _largest(np.max(np.abs(np.diff(record.command[:, part], axis=0))) for record in records)
+        noise = max(np.hypot(sensor.noise_std[part], sensor.quantum[part]))
+        limits[f"{kind}_range"] = MARGIN * reading + SIGMAS * noise
+        limits[f"{kind}_limit"] = MARGIN * max(command, reading)
+        limits[f"{kind}_slew"] = MARGIN * max(slew, 0.1 * command) / period
+        limits[f"tare_{kind}_spread"] = SIGMAS * noise + 0.01 * reading
+        limits[f"{kind}_bias_limit"] = SIGMAS * noise + 0.05 * reading
+    limits["fading"] = max(5.0 * max(sensor.noise_std[force]), 0.01 * limits["force_range"])
+    return limits | _motion_limits(records, period)
+
+
+def _motion_limits(records: list[ControllerRecord], period: float) -> dict[str, float]:
+    """Return the limits of measured and commanded poses, and of the way back after a trip."""
+    limits = {}
+    for name, column in (("measured", 3), ("command", 5)):
+        lowest = np.min([np.min(record[column], axis=0) for record in records], axis=0)
+        highest = np.max([np.max(record[column], axis=0) for record in records], axis=0)
+        room = (MARGIN - 1) * (highest - lowest) + 0.001
+        for axis, low, high in zip(COORDINATES, lowest - room, highest + room, strict=True):
+            limits[f"{name}_lowest_{axis}"], limits[f"{name}_highest_{axis}"] = float(low), float(high)
+    for prefix, part, angular in (("", slice(0, 3), ""), ("angular_", slice(3, 6), "angular_")):
+        steps = [np.diff(record.sent[:, part], axis=0) for record in records]
+        speed = _largest(np.max(np.linalg.norm(step, axis=1)) for step in steps) / period
+        bends = (np.diff(step, axis=0) for step in steps)
+        slowing = _largest(np.max(np.linalg.norm(bend, axis=1), initial=0.0) for bend in bends) / period**2
+        limits[f"{prefix}velocity_limit"] = MARGIN * max(speed, 1e-3)
+        limits[f"{prefix}deceleration"] = MARGIN * max(slowing, 1e-2)
+        limits[f"retreat_{angular}velocity"] = max(speed, 1e-3)
+    starts = [record.sent[0] - record.pose_measured[0] for record in records]
+    for name, part in (("start_distance", slice(0, 3)), ("start_angle", slice(3, 6))):
+        limits[name] = MARGIN * _largest(np.linalg.norm(start[part]) for start in starts) + LEAST_DISTANCE
+    depth = _largest(np.max(np.linalg.norm((r.sent - r.sent[0])[:, :3], axis=1)) for r in records)
+    limits["retreat_distance"] = LEAST_RETREAT + depth
+    limits |= _stuck_limits(records)
+    longest = _largest(np.count_nonzero(np.any(r.command != 0, axis=1)) for r in records)
+    limits["longest_contact"] = MARGIN * longest * period + SETTLING
+    return limits
+
+
+def _stuck_limits(records: list[ControllerRecord]) -> dict[str, float]:
+    """Return the limits of the motion under an unchanged reading."""
+    travels, turns, under_force = [0.0], [0.0], [0.0]
+    for record in records:
+        moved = np.linalg.norm(np.diff(record.pose_measured[:, :3], axis=0), axis=1)
+        desired = np.abs(np.diff(record.pose_desired, axis=0))
+        for channel in range(6):
+            still = (np.diff(record.wrench[:, channel]) == 0) & (record.wrench[1:, channel] != 0)
+            under_force.append(longest_sum(moved, still))
+            still = np.diff(record.pose_measured[:, channel]) == 0
+            (travels if channel < 3 else turns).append(longest_sum(desired[:, channel], still))
+    names = ("force_stuck_travel", "position_stuck_travel", "rotation_stuck_travel")
+    values = (under_force, travels, turns)
+    return {name: MARGIN * max(found) + LEAST_DISTANCE for name, found in zip(names, values, strict=True)}
+
+
+def longest_sum(steps: np.ndarray, still: np.ndarray) -> float:
+    """Return the largest sum of successive steps in which a reading stays `still`."""
+    sums = np.cumsum(np.where(still, steps, 0.0))
+    last_moved = np.maximum.accumulate(np.where(still, 0.0, sums))
+    return float(np.max(sums - last_moved, initial=0.0))
+
+
+def _audit_limits(gain_file: SixAxisGainFile, records: list[ControllerRecord]) -> dict[str, float]:
+    """Return the limits of the audit of contacts, from replays without limits."""
+    wide = {**NO_SIX_AXIS_LIMITS, "settling": SETTLING}
+    audits, lags = [], []
+    for record in records:
+        controller = Controller6(gain_file._replace(limits=wide))
+        replay_record(controller, record)
+        lags.append(controller.loop_delay)
+        audits.append(controller.last_audit)
+    largest = dict(zip(WATCHDOG_LIMITS, np.max(audits, axis=0).tolist(), strict=True))
+    limits = {name: max(least, MARGIN * largest[name]) for name, least in WATCHDOG_LIMITS.items()}
+    lags = [lag for lag in lags if lag > 0]
+    if lags:
+        limits["lag_lowest"], limits["lag_highest"] = LAG_RANGE[0] * min(lags), LAG_RANGE[1] * max(lags)
+    return limits
+
+
+def alarm_rates(
+    gain_file: SixAxisGainFile, limits: Mapping[str, float | None], runs: list[DrawnRun]
+) -> dict[str, Any]:
+    """Return the rates of false and missed alarms in runs with these limits, with 95 % intervals."""
+    values = {name: value for name, value in limits.items() if value is not None}
+    limited = gain_file._replace(limits=complete_six_axis_limits(values))
+    good = [run.record for run in runs if run.good]
+    bad = [run.record for run in runs if not run.error <= ERROR_LIMIT]
+    constants = gain_file.constants
+    wrong = constants._replace(
+        mass_matrix=[[WRONG_MASS * entry for entry in row] for row in constants.mass_matrix],
+        inverse_mass=[[entry / WRONG_MASS for entry in row] for row in constants.inverse_mass],
+    )
+    missed = sum(not is_stopped(limited._replace(constants=wrong), record) for record in good)
+    mass = {
+        "meaning": "a numerical model of another mass",
+        "unit": "1",
+        "size": WRONG_MASS - 1,
+        "largest_size": WRONG_MASS - 1,
+        "error": WRONG_MASS - 1,
+        "scenarios": len(good),
+        "counted": bool(good),
+        **_rate(missed, len(good)),
+    }
+    return {
+        "false_alarms": _rate(sum(is_stopped(limited, record) for record in good), len(good)),
+        "missed_alarms": _rate(sum(not is_stopped(limited, record) for record in bad), len(bad)),
+        "held_out_runs": len(runs),
+        "fault_runs": [mass],
+    }
+
+
+def is_stopped(gain_file: SixAxisGainFile, record: ControllerRecord) -> bool:
+    """Return whether the controller trips in a recorded run, or at the audit after it."""
+    controller = Controller6(gain_file)
+    replay_record(controller, record)
+    controller.next_contact()
+    return controller.tripped
+
+
+def _rate(alarms: int, runs: int) -> dict[str, Any]:
+    """Return a rate with its exact 95 % interval."""
+    interval = binomial_interval(alarms, runs)
+    return {"runs": runs, "alarms": alarms, "low": float(interval.low), "high": float(interval.high)}
+
+
+def _largest(values: Any) -> float:
+    """Return the largest of the values."""
+    return float(max(values))
