@@ -68,10 +68,10 @@ def six_axis_errors_plot(result: TuneResult, limit: float) -> Figure:
     """Plot the distributions of a six-axis mechanism's energy and twist errors, before and after tuning."""
     figure = create_figure((11, 4.6), f"{result.mechanism.name}: errors on fresh scenarios", above=0.6)
     labels = {"energy_error": "magnitude of the energy error [1]", "twist_error": "twist error [1]"}
-    by_error = choose_rig_model(result.mechanism).by_error
+    model = choose_rig_model(result.mechanism)
     for axes, (error, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
-        outcomes = {name: by_error(outcome)[error] for name, outcome in result.outcomes.items()}
-        _draw_shares(axes, outcomes, limit)
+        outcomes = {name: model.by_error(outcome)[error] for name, outcome in result.outcomes.items()}
+        _draw_shares(axes, outcomes, limit if error == model.verdict_error else np.inf)
         axes.set(xlabel=label, ylabel="share of episodes with a larger error [1]")
         finish_axes(axes, "lower left")
     return figure
