@@ -168,7 +168,7 @@ def test_verification_detects_wrong_position_command_of_runtime(monkeypatch):
     assert not bad.verdict and bad.replay[0].difference == 0.0
     assert any(reason.startswith("the nominal run: position commands differ") for reason in bad.reasons)
     [reason] = make_vectors(loaded, seed=1, draws=0).reasons
-    assert "position command found" in reason
+    assert "position command: found" in reason
 
 
 def test_stroke_and_velocity_limits_apply_to_command_with_position_lead():

@@ -120,7 +120,7 @@ def from_plain_data(
     data are invalid or describe a six-axis mechanism.
     """
     if is_six_axes(raw):
-        expected = f"{SCHEMA}: only init, mechanisms, simulate, tune, sweep and report support six axes"
+        expected = f"{SCHEMA}, because this command or function supports one axis only"
         raise InputError(
             f"{to_one_line(label)}: schema: found {SIX_AXIS_SCHEMA} (six axes), expected {expected}"
         )
