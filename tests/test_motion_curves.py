@@ -26,7 +26,7 @@ def segments():
 
 @pytest.mark.slow
 def test_nominal_motion_of_several_compensators_equals_separate_simulations(segments):
-    assert [list(piece.curves) for piece in segments] == [["in space", *LAWS]] * 2
+    assert [list(piece.curves) for piece in segments] == [["ideal", *LAWS]] * 2
     for name in ("before", "literature", "tuned"):
         for piece, alone in zip(segments, compute_nominal_motion(MECHANISM, {name: LAWS[name]}), strict=True):
             np.testing.assert_allclose(
@@ -39,7 +39,7 @@ def test_nominal_motion_of_several_compensators_equals_separate_simulations(segm
 
 def test_nominal_ideal_contact_motion_matches_closed_form(segments):
     stiffness, mass = MECHANISM.contact.stiffness[0], MECHANISM.bodies.mass
-    space, velocity = segments[0].curves["in space"], MECHANISM.approach.velocity
+    space, velocity = segments[0].curves["ideal"], MECHANISM.approach.velocity
     assert np.max(space.force) == pytest.approx(velocity * math.sqrt(stiffness * mass), rel=1e-3)
     assert np.max(space.position) == pytest.approx(velocity * math.sqrt(mass / stiffness), rel=1e-3)
     assert space.velocity == velocity

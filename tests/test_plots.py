@@ -66,7 +66,7 @@ def pieces(contacts=2):
     def curve(scale):
         return Curve(0.005 * scale, time, scale * force, 1e-3 * scale * time, force, time)
 
-    curves = {"in space": curve(1.0), "before": curve(1.4), "tuned": curve(1.001)}
+    curves = {"ideal": curve(1.0), "before": curve(1.4), "tuned": curve(1.001)}
     return [RunMotion(f"contact {n + 1}", (0.0,), curves) for n in range(contacts)]
 
 

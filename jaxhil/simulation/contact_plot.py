@@ -32,14 +32,14 @@ BLACK, ORANGE, SKY_BLUE, GREEN, BLUE, VERMILION = (
     "#D55E00",
 )
 CURVE_STYLES = {
-    "in space": (BLACK, "-", 3.0),
+    "ideal": (BLACK, "-", 3.0),
     "before": (VERMILION, "--", 1.5),
     "literature": (ORANGE, "-.", 1.5),
     "tuned": (BLUE, "-", 1.5),
     "rig": (BLUE, "-", 1.5),
 }
 CURVE_LABELS = {
-    "in space": "in space (reference)",
+    "ideal": "ideal contact",
     "before": "before: no compensation",
     "literature": "literature's rule",
     "tuned": "tuned",
@@ -71,7 +71,7 @@ def plot_contacts(motions: Sequence[RunMotion], title: str, sensors: str | None 
         for name, curve in motion.curves.items():
             colour, line, width = CURVE_STYLES[name]
             style = {"color": colour, "linestyle": line, "linewidth": width, "label": CURVE_LABELS[name]}
-            if name == "in space":
+            if name == "ideal":
                 style.update(color="0.65")
             force.plot(1e3 * curve.time, curve.force, **style)
             position.plot(1e3 * curve.time, 1e3 * curve.position, **style)
@@ -161,7 +161,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
 
 def _panel_title(motion: RunMotion) -> str:
     """Return the title of a contact's panel: name, approach speed, and the speeds of curves that differ."""
-    speed = motion.curves["in space"].velocity
+    speed = motion.curves["ideal"].velocity
     text = f"{motion.name}, entered at {1e3 * speed:.3g} mm/s"
     for name, curve in motion.curves.items():
         if abs(curve.velocity - speed) > 0.005 * speed:

@@ -43,7 +43,7 @@ class RunMotion(NamedTuple):
 
     name: str  # name of the run, for the title of its panel
     surfaces: tuple[float, ...]  # positions of the mechanism's surfaces [m]
-    curves: dict[str, Curve]  # curves by name; "in space" is the ideal contact
+    curves: dict[str, Curve]  # curves by name; "ideal" is the ideal contact
 
 
 def compute_nominal_motion(mechanism: Mechanism, laws: NamedCompensators, seed: int = 0) -> list[RunMotion]:
@@ -106,7 +106,7 @@ def _build_run_motions(
     for number, ideal in enumerate(_ideal_curves(mechanism, scenarios, leading)):
         curves = {name: run[number] for name, run in runs.items() if number < len(run)}
         name = f"{mechanism.approach.contacts} contacts" if two else f"contact {number + 1}"
-        motions.append(RunMotion(name, surfaces, {"in space": ideal, **curves}))
+        motions.append(RunMotion(name, surfaces, {"ideal": ideal, **curves}))
     return motions
 
 

@@ -20,7 +20,7 @@ from tuning.plots.six_axes import AXIS_NAMES, VIEWS, find_shown_ticks, find_time
 
 FRAME_COUNT, FRAME_RATE = 60, 12  # number of frames, and frames per second
 MARGIN_FACTOR = 3.0  # margin around the points of contact, divided by the displacement during the contact
-COLUMN_TITLES = ("in space", "on the rig")
+COLUMN_TITLES = ("ideal contact", "on the rig")
 
 
 @matplotlib.style.context("default")

@@ -154,7 +154,7 @@ def quaternion_of(theta: np.ndarray) -> Any:
 def _plot_forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
     """Plot the normal force between each pair of shapes that touches, and the ideal contact's total force."""
     total = np.linalg.norm(recorded.wrench_in_space[shown, :3], axis=1)
-    axes.plot(time, total, color="0.7", linewidth=3, label="total force in space")
+    axes.plot(time, total, color="0.7", linewidth=3, label="total force of the ideal contact")
     for index, candidate in enumerate(np.flatnonzero(np.any(recorded.force > 0, axis=0))):
         colour, line = (
             CANDIDATE_COLOURS[index % len(CANDIDATE_COLOURS)],
