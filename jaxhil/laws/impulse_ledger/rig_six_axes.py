@@ -1,9 +1,9 @@
-"""Impulse ledger in six axes: impulses are booked at the time of the numerical model.
+"""Six-axis impulse ledger: compensator that accounts for impulses at the numerical model's delayed time.
 
-A wrench that is read now is the wrench that should have acted on the numerical model D ago, where D is the
-delay of the whole loop. The compensator credits the impulse of every reading to the model's time t - D,
-bridges the time since then with a scalar model of the contact, and commands the impulse that the numerical
-model still owes. `six_axes/README.md` states the equations, with the letters in brackets of the comments.
+A wrench reading at time t is the wrench that should have acted on the numerical model at t - D, where D is
+the delay of the whole loop. The compensator credits the impulse of every reading to the model's time t - D,
+predicts the contact force from t - D to t with a scalar contact model, and commands the impulse that the
+model still owes. `six_axes/README.md` states the equations (a) to (e) to which the comments refer.
 """
 
 from collections.abc import Mapping
@@ -20,12 +20,12 @@ from jaxhil.rig.six_axes.registry import ModelConstants, SixAxisCompensator, reg
 from jaxhil.rig.six_axes.vectors import AXES, LAG_LEADS, add_multiple, lead_pose, wrench_at_target
 from jaxhil.rig.types import Gains, Positive
 
-LEAST_SPREAD = 1e-3  # of a prior, so that its variance is not 0
+LEAST_SPREAD = 1e-3  # lower bound of a prior's standard deviation, so that the variance is not 0
 
 
 @register_six_axes("impulse_ledger")
 class ImpulseLedger(SixAxisCompensator):
-    """Compensator that books impulses at the time of the numerical model; see the module's docstring."""
+    """Compensator that commands the impulse that the model still owes; see the module's docstring."""
 
     __slots__ = (
         "_impulse", "_in_contact", "_ledger", "_period", "_pose_leads", "_reader", "_release_time", "_unpaid",
@@ -71,12 +71,12 @@ class ImpulseLedger(SixAxisCompensator):
 
     @property
     def loop_delay(self) -> float:
-        """Return the delay D [s] of the hardware behind the model in the last contact; 0 before the first."""
+        """Return the hardware's delay D [s] relative to the model in the last contact; 0 before the first."""
         return self._ledger.delay * self._period
 
     @property
     def unpaid_impulse(self) -> float:
-        """Return the impulse that the last contact has left unpaid, over its impulse."""
+        """Return the impulse still owed after the last contact, divided by its impulse."""
         return self._unpaid
 
     def step(self, wrench, pose_desired, twist_desired, pose_measured):
@@ -103,7 +103,7 @@ class ImpulseLedger(SixAxisCompensator):
         return wrench_at_target(command, pose_desired)
 
     def pose_command(self, pose, rates):
-        """Return the pose led by `lag_lead_...`, so that all coordinates lag equally [m, rad]."""
+        """Return the pose, extrapolated by `lag_lead_...` so that all coordinates lag equally [m, rad]."""
         return lead_pose(self._pose_leads, pose, rates)
 
     def _evaluate(self) -> int:

@@ -1,4 +1,4 @@
-"""No compensation in six axes: the numerical model feels the measured wrench."""
+"""No compensation in six axes: the measured wrench acts on the numerical model."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -10,7 +10,7 @@ from jaxhil.rig.types import Gains, Positive
 
 @register_six_axes("none")
 class NoCompensation(SixAxisCompensator):
-    """Baseline W_c = W, whose contacts diverge because of the loop's delay."""
+    """Baseline W_c = W without compensation; the loop's delay adds energy in every contact."""
 
     __slots__ = ()
 

@@ -1,4 +1,4 @@
-"""Phase lead of each channel of the wrench, with the same lead time."""
+"""Phase lead of the measured wrench, with the same lead time for all channels."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -13,7 +13,7 @@ from jaxhil.rig.types import Gains, Positive
 
 @register_six_axes("phase_lead")
 class PhaseLead(SixAxisCompensator):
-    """Compensator F_c = (1 + T_1 s)/(1 + T_2 s) F of each channel, as on one axis."""
+    """Compensator F_c = (1 + T_1 s)/(1 + T_2 s) F for each channel F, as on one axis."""
 
     __slots__ = ("_lead", "_pose_leads")
 
@@ -28,11 +28,11 @@ class PhaseLead(SixAxisCompensator):
         self._pose_leads = [gains[name] for name in LAG_LEADS]
 
     def step(self, wrench, pose_desired, twist_desired, pose_measured):
-        """Return the phase lead of the measured wrench [N, N m]."""
+        """Return the measured wrench after the lead filter [N, N m]."""
         return self._lead.step(wrench)
 
     def pose_command(self, pose, rates):
-        """Return the pose led by `lag_lead_...` [m, rad]."""
+        """Return the pose command [m, rad]: the pose extrapolated by the lead times `lag_lead_...`."""
         return lead_pose(self._pose_leads, pose, rates)
 
     def reset(self) -> None:

@@ -1,8 +1,10 @@
-"""Response error along the docking axis of a rig in six axes, and phase lead of every channel.
+"""Phase lead of the measured wrench, and response-error feedback along the docking axis in contact.
 
-    F_c = lead(F),  plus  g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a)  along the docking axis, in contact
+    F_c = lead(F) + g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a)
 
-x is the travel -z along the docking axis; the surface is where the force exceeded `contact_threshold`.
+x = -z is position and v velocity along the docking axis, of the numerical model (d) or measured (a). The
+gains are g and g_b; k_hat and b_hat are the identified stiffness and damping. In contact, the force exceeds
+`contact_threshold`; the surface is at the last position before contact. All other channels are lead(F).
 """
 
 from collections.abc import Mapping
@@ -99,5 +101,5 @@ class ResponseError(SixAxisCompensator):
         return command
 
     def pose_command(self, pose, rates):
-        """Return the pose led by `lag_lead_...` [m, rad]."""
+        """Return the pose command [m, rad]: the pose extrapolated by the lead times `lag_lead_...`."""
         return lead_pose(self._pose_leads, pose, rates)

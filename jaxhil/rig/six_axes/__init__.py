@@ -1,4 +1,4 @@
-"""Controller of a rig in six axes in plain Python: floats, a fixed order of operations, no JAX.
+"""Controller of a six-axis rig in plain Python: floats, a fixed order of operations, no JAX.
 
 `Controller6.from_file(path)` reads a gain file; `step` is then called once per control period. Importing this
 package imports the compensators in the folders of `jaxhil.laws`, which register in `SIX_AXIS_COMPENSATORS`.

@@ -1,9 +1,9 @@
-"""Controller in six axes that the rig calls once per control period.
+"""Controller of a six-axis rig, which the rig calls once per control period.
 
-As on one axis (`jaxhil.rig.controller`) it checks the inputs, audits every contact, computes the wrench with
-the compensator that the gain file names, and limits the outputs. A trip is latched until `reset`: the wrench
-ramps to 0, and the pose command moves back along the way that it came. After construction no method raises,
-and each takes bounded time.
+Like the one-axis controller (`jaxhil.rig.controller`), it checks the inputs, audits every contact, computes
+the wrench with the compensator that the gain file names, and limits the outputs. A trip is latched until
+`reset`: the wrench ramps to 0, and the pose command retraces its path backwards. After construction no method
+raises, and each method takes bounded time. C and T are the frames of the chaser's and the target's interface.
 """
 
 import os
@@ -30,13 +30,13 @@ CHANNEL_NAMES = ("fx", "fy", "fz", "mx", "my", "mz", "x", "y", "z", "rx", "ry", 
 
 
 class Controller6:
-    """Compensator in six axes with its gains, its guards and its state.
+    """Six-axis controller of the rig: a compensator with checks of its inputs, outputs and contacts.
 
     Attributes:
-        faults: bits of the faults of this tick (`faults.SIX_AXIS_FAULTS`).
-        seen: bits of the faults of all ticks since `reset`.
-        cause: bits of the faults that tripped the controller, 0 if none has.
-        channels: bits of the channels of sensors with a fault in this tick: wrench, then pose.
+        faults: bits of the present tick's faults (`faults.SIX_AXIS_FAULTS`).
+        seen: bits of all faults since `reset`.
+        cause: bits of the faults that tripped the controller; 0 if it is not tripped.
+        channels: bits of the sensor channels that have a fault in this tick, first wrench, then pose.
     """
 
     __slots__ = (
@@ -65,7 +65,7 @@ class Controller6:
         self._guard(gain_file.limits, constants, period)
 
     def _guard(self, limits: Limits, constants: ModelConstants, period: Positive) -> None:
-        """Create the guards of inputs, contacts and outputs, and reset the controller."""
+        """Create the checks of tick times, inputs, contacts and outputs, and reset the controller."""
         self._period = period
         self._clock = Clock(limits, period)
         self._tare = WrenchTare(limits)
@@ -81,7 +81,7 @@ class Controller6:
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> "Controller6":
-        """Return the controller of a gain file.
+        """Create a controller from a gain file.
 
         Args:
             path: path of the gain file.
@@ -94,7 +94,7 @@ class Controller6:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "Controller6":
-        """Return the controller of a gain document.
+        """Create a controller from the content of a gain file.
 
         Args:
             document: content of a gain file.
@@ -116,12 +116,12 @@ class Controller6:
 
     @property
     def channels(self) -> int:
-        """Return the bits of the sensors' channels with a fault in this tick: wrench, then pose."""
+        """Return the bits of the sensor channels that have a fault in this tick, first wrench, then pose."""
         return self._inputs.channels
 
     @property
     def status(self) -> str:
-        """Return `ok`, or `tripped: ` and the cause."""
+        """Return "ok", or "tripped: " and the names of the causing faults."""
         if not self.cause:
             return "ok"
         names = ", ".join(fault_names(self.cause, SIX_AXIS_FAULTS))
@@ -134,58 +134,59 @@ class Controller6:
 
     @property
     def bias(self) -> Vector:
-        """Return the force sensor's bias [N, N m] by the last successful tare."""
+        """Return the force sensor's bias [N, N m] from the last successful tare; 0 before a tare."""
         return list(self._tare.bias)
 
     @property
     def missed_ticks(self) -> int:
-        """Return the number of missed ticks since `reset`, by the times passed to `step`."""
+        """Return the number of missed ticks since `reset`, from the times passed to `step`."""
         return self._clock.missed
 
     @property
     def late_ticks(self) -> int:
-        """Return the number of late ticks since `reset`, by the times passed to `step`."""
+        """Return the number of late ticks since `reset`, from the times passed to `step`."""
         return self._clock.late
 
     @property
     def loop_delay(self) -> float:
-        """Return the lag [s] of the hardware behind the model in the last contact; 0 if unknown."""
+        """Return the hardware's delay [s] relative to the model in the last contact; 0 if unknown."""
         return self._law.loop_delay
 
     @property
     def unpaid_impulse(self) -> float:
-        """Return the impulse that the last contact has left unpaid, over its impulse; 0 if unknown."""
+        """Return the impulse still owed after the last contact, divided by its impulse; 0 if unknown."""
         return self._law.unpaid_impulse
 
     @property
     def law_status(self) -> str:
-        """Return the compensator's status of the last command, a name in `law_status.STATUSES`."""
+        """Return the compensator's status at the last command, a name in `law_status.STATUSES`."""
         return STATUS_NAMES[self._status()]
 
     def _status(self) -> SmallInt:
-        """Return the number of the compensator's status of the last command."""
+        """Return the number of the compensator's status at the last command."""
         return self._law.status
 
     @property
     def last_contact(self) -> ContactRecord:
-        """Return the statuses of the last audited contact; its number is 0 before the first one."""
+        """Return the compensator status of the last audited contact; the number is 0 before the first."""
         return contact_record(self._last_count())
 
     def _last_count(self) -> ContactCount:
-        """Return the statuses of the last audited contact, which remain even after `reset`."""
+        """Return the compensator status of the last audited contact; `reset` does not change it."""
         return self._watchdog.record
 
     @property
     def last_audit(self) -> tuple[float, float, float]:
-        """Return error of the momentum, energy gain and unpaid impulse of the last audited contact [1]."""
+        """Return momentum error, energy gain and unpaid impulse of the last audited contact [1]."""
         watchdog = self._watchdog
         return watchdog.momentum_error, watchdog.energy_gain, watchdog.unpaid_impulse
 
     def tare(self, wrench: Sequence[float]) -> bool:
-        """Add one reading of the force sensor out of contact; return True once there are enough.
+        """Add one wrench reading out of contact to the tare; return True when the tare has ended.
 
-        Call it once per tick before a run. The mean of the readings is then subtracted from every reading
-        until the next tare. Unusable readings trip the controller with the fault `tare`.
+        Call this method once per tick before a run, until it returns True. The controller then subtracts the
+        mean of these readings from every reading until the next tare. Unusable readings trip the controller
+        with the fault `tare`.
 
         Args:
             wrench: wrench reading [N, N m].
@@ -193,7 +194,7 @@ class Controller6:
         return self._take(as_vector(wrench))
 
     def _take(self, wrench: Vector) -> bool:
-        """Add one reading of the force sensor out of contact; return true once there are enough."""
+        """Add one wrench reading out of contact to the tare; return true when the tare has ended."""
         if self.cause:
             return True
         over = self._tare.take(wrench)
@@ -215,10 +216,10 @@ class Controller6:
 
         Args:
             wrench: measured wrench on the chaser about T's origin, in T axes [N, N m].
-            pose_desired: coordinates of C against T in the numerical model [m, rad].
-            twist_desired: twist of C against T in the numerical model [m/s, rad/s].
-            pose_measured: coordinates of C against T on the hardware [m, rad].
-            time: time of this tick by the rig's clock [s], to detect missed and late ticks.
+            pose_desired: pose of C relative to T in the numerical model [m, rad].
+            twist_desired: twist of C relative to T in the numerical model [m/s, rad/s].
+            pose_measured: measured pose of C relative to T on the hardware [m, rad].
+            time: time of the tick [s]; if None, the controller does not detect late and missed ticks.
         """
         return self._step(
             as_vector(wrench),
@@ -239,7 +240,7 @@ class Controller6:
         """Return the wrench W_c [N, N m] on the numerical model for this tick, about T's origin.
 
         After a trip the wrench ramps to 0 and stays there until `reset`. The arguments are the measured
-        wrench on the chaser about T's origin [N, N m], pose and twist of the numerical model [m, rad, m/s,
+        wrench on the chaser about T's origin [N, N m], the numerical model's pose [m, rad] and twist [m/s,
         rad/s], the measured pose [m, rad], and the tick's time [s] or NULL.
         """
         forces, inputs = self._forces, self._inputs
@@ -272,7 +273,7 @@ class Controller6:
         if not fatal:
             try:
                 computed = self._compute(pose_desired, twist_desired)
-            except Exception:  # of any compensator: the rig always needs a command
+            except Exception:  # whatever the compensator raises, the rig needs a command
                 computed = False
             if not computed:
                 self._command[0] = nan
@@ -286,7 +287,7 @@ class Controller6:
         return list(forces.output)
 
     def _compute(self, pose_desired: Vector, twist_desired: Vector) -> bool:
-        """Compute the compensator's wrench for the checked readings; return true."""
+        """Compute the compensator's wrench from the checked readings; return true."""
         inputs = self._inputs
         self._command = self._law.step(inputs.wrench, pose_desired, twist_desired, inputs.measured)
         return True
@@ -296,25 +297,25 @@ class Controller6:
     ) -> Vector:
         """Return the pose [m, rad] to command for the numerical model's motion after this tick's step.
 
-        Two commands in a row differ by at most `velocity_limit` and `angular_velocity_limit` times the
-        period. A run's first command differs as little from the measured pose; out of contact, where moving
-        drives lag behind, it may differ by `start_distance` and `start_angle`. Before a run's first `step`,
-        the model's pose stands for the measured one.
+        Two successive commands differ by at most `velocity_limit` and `angular_velocity_limit` times the
+        period. A run's first command may differ from the measured pose by this step, or out of contact by
+        `start_distance` and `start_angle`, because moving drives lag behind. Before a run's first `step`,
+        the model's pose replaces the measured pose.
 
-        After a trip the commands brake and lead back along the way that they came, for
-        `retreat_distance`. They begin at the last command; without one, at the last measured pose.
+        After a trip, the commands brake and then retrace their path for `retreat_distance`. They start from
+        the last command, or if there is none, from the last measured pose.
 
         Args:
-            pose: coordinates of C against T in the numerical model [m, rad].
-            twist: twist of C against T in the numerical model [m/s, rad/s].
-            acceleration: acceleration of the numerical model; no compensator needs it.
+            pose: pose of C relative to T in the numerical model [m, rad].
+            twist: twist of C relative to T in the numerical model [m/s, rad/s].
+            acceleration: acceleration of the numerical model; no compensator uses it.
         """
         return self._pose_command(as_vector(pose), as_vector(twist))
 
     def _pose_command(self, pose: Vector, twist: Vector) -> Vector:
         """Return the pose [m, rad] to command for the numerical model's motion after this tick's step.
 
-        The arguments are coordinates [m, rad] and twist [m/s, rad/s] of C against T in the numerical model.
+        The arguments are pose [m, rad] and twist [m/s, rad/s] of C relative to T in the numerical model.
         """
         poses, inputs = self._poses, self._inputs
         if not self.cause:
@@ -334,10 +335,10 @@ class Controller6:
         return list(poses.output)
 
     def _try_lead(self, pose: Vector, twist: Vector) -> bool:
-        """Compute the compensator's pose command; return whether it could."""
+        """Compute the compensator's pose command; return whether this has succeeded."""
         try:
             computed = self._lead(pose, twist)
-        except Exception:  # of any compensator: the rig always needs a command
+        except Exception:  # whatever the compensator raises, the rig needs a command
             computed = False
         return computed
 
@@ -349,9 +350,9 @@ class Controller6:
     def emergency_stop(self, active: bool) -> None:
         """Set the state of the rig's emergency stop; an active stop trips the controller.
 
-        Call it with True while the stop is active (once is enough). The wrench ramps to 0 and the pose
-        command comes to rest; then `at_rest` is True and the drives may be switched off. Call it with False
-        after the stop is released. The trip stays latched until `reset`, which returns False before.
+        Call this method with True when the stop is pressed. The wrench ramps to 0 and the pose command
+        comes to rest; then `at_rest` is True and the drives may be switched off. Call it with False when the
+        stop is released; before this call, `reset` has no effect. The trip stays latched until `reset`.
 
         Args:
             active: whether the stop is active.
@@ -361,10 +362,10 @@ class Controller6:
             self._fail(EMERGENCY_STOP, "")
 
     def reset(self) -> bool:
-        """Restart everything but the tare; return False, without effect, while the emergency stop is active.
+        """Restart everything except the tare. While the emergency stop is active, only return False.
 
-        Wrench and pose command continue without a jump from their last values, within the limits. If the
-        drives have been moved since by other means, call `next_contact` as well.
+        Wrench and pose command continue from their last values without a jump. If something else has moved
+        the drives since the trip, also call `next_contact`.
         """
         if self._stopped or self.cause & UNUSABLE:
             return False
@@ -372,7 +373,7 @@ class Controller6:
         return True
 
     def _restart(self) -> None:
-        """Restart everything but the tare."""
+        """Restart everything except the tare."""
         self._law.reset()
         self._clock.reset()
         self._tare.restart()
@@ -388,10 +389,10 @@ class Controller6:
     def next_contact(self) -> None:
         """Begin a new run: restart filters, delay lines and estimates.
 
-        Call it when the rig has been moved to the start of the run: the first pose command continues from
-        the measured pose, not from the last command. A trip stays latched, and the time until the next tick
-        does not count as missed. A contact that is not over yet is audited first; its faults are in `faults`
-        until the next `step`.
+        Call this method after the rig has moved to the start of the run: the first pose command continues
+        from the measured pose, not from the last command. A trip stays latched, and the gap before the next
+        tick counts no missed ticks. If a contact has not ended, it is audited first, and `faults` has its
+        faults until the next `step`.
         """
         if self.cause:
             return
@@ -411,7 +412,7 @@ class Controller6:
         self._poses.release()
 
     def _describe(self, fatal: int) -> str:
-        """Return the channels with a fault, or the watchdog's audit, in words."""
+        """Describe a trip by the channels with a fault, or by the watchdog's audit."""
         if fatal & CLOCK:
             return ""
         bad = [name for n, name in enumerate(CHANNEL_NAMES) if self._inputs.channels >> n & 1]
@@ -421,7 +422,7 @@ class Controller6:
 
     def _fail(self, cause: int, detail: str) -> None:
         """Trip the controller."""
-        # The first cause is the one to look at: later faults may be its consequences.
+        # Keep the first cause, because later faults may be its consequences.
         if not self.cause:
             self.cause = cause
             self._detail = detail
@@ -430,7 +431,7 @@ class Controller6:
 
 
 def as_vector(values: Any) -> Vector:
-    """Convert six values to floats; return NaN for what is no number or not six."""
+    """Convert six values to floats: NaN replaces any other object, and all values unless there are six."""
     try:
         vector = [value if type(value) is float else as_float(value) for value in values]
     except TypeError:

@@ -1,7 +1,7 @@
-"""Faults that the controller in six axes detects, and its reactions.
+"""Faults that the six-axis controller detects, and its reactions.
 
-Bits and names are those of one axis (`jaxhil.rig.faults`) where the fault is the same. The table
-`SIX_AXIS_FAULTS` is the source of documentation, exports and error texts.
+A fault that also exists on one axis has the same bit and name as there (`jaxhil.rig.faults`). Documentation,
+exports and error texts are generated from the table `SIX_AXIS_FAULTS`.
 """
 
 from jaxhil.rig.faults import (
@@ -35,7 +35,7 @@ MOMENTUM = 0x1000000
 ENERGY_GAIN = 0x2000000
 LAG = 0x4000000
 
-# Conditions that differ from those of one axis, by bit.
+# Descriptions of the faults whose conditions differ from those on one axis, by bit.
 CONDITIONS = {
     FORCE_NOT_FINITE: "a channel of the measured wrench is not a finite number",
     POSITION_NOT_FINITE: "a coordinate of the measured pose is not a finite number",
@@ -43,17 +43,17 @@ CONDITIONS = {
     FORCE_OUT_OF_RANGE: "a channel of the measured wrench is at or beyond `force_range` or `torque_range`",
     POSITION_OUT_OF_RANGE: "a coordinate of the measured pose is outside `measured_lowest_...` to "
     "`measured_highest_...`",
-    FORCE_STUCK: "a channel's reading, other than that of no force, has stayed the same to the bit while the "
-    "hardware moved by more than `force_stuck_travel`",
-    POSITION_STUCK: "a coordinate's reading has stayed the same to the bit while the numerical model moved "
-    "along it by more than `position_stuck_travel`, or turned by more than `rotation_stuck_travel`",
+    FORCE_STUCK: "a nonzero reading of a force or torque channel has not changed by a bit while the hardware "
+    "moved by more than `force_stuck_travel`",
+    POSITION_STUCK: "a coordinate's reading has not changed by a bit while the numerical model moved along "
+    "it by more than `position_stuck_travel`, or turned by more than `rotation_stuck_travel`",
     FORCE_LIMIT: "a channel of the compensated wrench is beyond `force_limit` or `torque_limit`",
     FORCE_SLEW: "a channel of the compensated wrench changes faster than `force_slew` or `torque_slew`",
     STROKE: "a coordinate of the pose command is outside `command_lowest_...` to `command_highest_...`",
     VELOCITY_LIMIT: "the pose command moves faster than `velocity_limit` or `angular_velocity_limit`",
     COMMAND_NOT_FINITE: "the compensated wrench is not finite",
-    TARE: "the readings to tare are not finite, differ by more than `tare_force_spread` or "
-    "`tare_torque_spread`, or their mean is beyond `force_bias_limit` or `torque_bias_limit`",
+    TARE: "the readings of a tare are not finite, differ by more than `tare_force_spread` or "
+    "`tare_torque_spread`, or have a mean beyond `force_bias_limit` or `torque_bias_limit`",
 }
 SAME_AS_ON_ONE_AXIS = (
     LATE_TICK | MISSED_TICK | CLOCK | CONTACT_TOO_LONG | EMERGENCY_STOP | LAW_IN_DOUBT | EARLY_TICK
@@ -62,20 +62,22 @@ WATCHDOG = (
     Fault(
         UNPAID_IMPULSE,
         "unpaid_impulse",
-        "watchdog: a contact has left more than `unpaid_impulse` of its impulse unpaid",
+        "watchdog: after a contact the compensator still owes more than the fraction `unpaid_impulse` of the "
+        "contact's impulse",
         TRIPS,
     ),
     Fault(
         MOMENTUM,
         "momentum",
-        "watchdog: over a contact the numerical model's momentum has not changed by the impulse of the "
-        "controller's wrench: the model has another mass, frame, sign or reference point",
+        "watchdog: during a contact the change of the numerical model's momentum differs from the impulse of "
+        "the controller's wrench: the model has a different mass, frame, sign or reference point",
         TRIPS,
     ),
     Fault(
         ENERGY_GAIN,
         "energy_gain",
-        "watchdog: a contact has given the numerical model more than `energy_gain` of its kinetic energy",
+        "watchdog: a contact has increased the numerical model's kinetic energy by more than the fraction "
+        "`energy_gain`",
         TRIPS,
     ),
     Fault(

@@ -1,16 +1,16 @@
-"""Lead filter of the six channels of a wrench."""
+"""Lead filters for the six channels of a wrench."""
 
 from jaxhil.rig.six_axes.vectors import AXES, Vector
 
 
 class WrenchLead:
-    """Lead filters (1 + T_1 s)/(1 + T_2 s) by Tustin's rule, T_1 = lead + lag, T_2 = lag, of six channels.
+    """Six lead filters (1 + T_1 s)/(1 + T_2 s), T_1 = lead + lag, T_2 = lag, discretised by Tustin's rule.
 
-    Each is the filter of `jaxhil.rig.filters.LeadFilter`, with a lead time of its own.
+    Each channel has the filter `jaxhil.rig.filters.LeadFilter` with its own lead time.
 
     Args:
         leads: lead time of each channel [s].
-        lag: T_2, common to all channels [s].
+        lag: lag time T_2 of all channels [s].
         period: control period [s].
     """
 

@@ -1,7 +1,7 @@
-"""Reader of gain files in six axes: returns checked numbers or raises a `GainFileError` of one line.
+"""Reader of six-axis gain files: returns checked numbers or raises `GainFileError` with one line.
 
-Beside what a file of one axis has, it contains `constants`: what the controller knows of the numerical model
-and of the rig (`registry.ModelConstants`).
+In addition to the entries of a one-axis file, a file contains `constants`: what the controller knows about
+the numerical model and the rig (`registry.ModelConstants`).
 """
 
 from collections.abc import Mapping
@@ -25,11 +25,11 @@ from jaxhil.rig.six_axes.vectors import AXES, product
 
 MATRICES = ("mass_matrix", "inverse_mass", "tool_correction")
 MATRIX_ENTRIES = -1e9, 1e9  # lowest and highest entry, in SI units
-INVERSE_TOLERANCE = 1e-6  # largest entry of M M^-1 - 1, over the sizes of a row and a column
+INVERSE_TOLERANCE = 1e-6  # maximum entry of M M^-1 - 1, divided by the scale of its row and column
 
 
 class SixAxisGainFile(NamedTuple):
-    """Checked content of a gain file in six axes."""
+    """Checked content of a six-axis gain file."""
 
     compensator: str  # name
     gains: Mapping[str, float]  # by name, in SI units
@@ -39,7 +39,7 @@ class SixAxisGainFile(NamedTuple):
 
 
 def check_six_axis_document(document: Mapping[str, Any], source: str = "gain document") -> SixAxisGainFile:
-    """Check a gain document in six axes and return what the controller needs of it.
+    """Check a six-axis gain document and return what the controller needs from it.
 
     Args:
         document: content of a gain file.
@@ -63,7 +63,7 @@ def check_six_axis_document(document: Mapping[str, Any], source: str = "gain doc
 
 
 def _constants(document: Mapping[str, Any], source: str) -> ModelConstants:
-    """Return the constants of the numerical model and of the rig."""
+    """Check and return the constants of the numerical model and the rig."""
     entries = read_object(document, "constants", source, "")
     for name in entries:
         if name not in ModelConstants._fields:
@@ -80,7 +80,7 @@ def _constants(document: Mapping[str, Any], source: str) -> ModelConstants:
 
 
 def _matrix(entries: Mapping[str, Any], name: str, source: str) -> list[list[float]]:
-    """Return a matrix of the constants as lists of floats."""
+    """Check and return the matrix `name` of the constants as lists of floats."""
     key, rows = f"constants.{name}", read_entry(entries, name, source, "constants.")
     is_square = isinstance(rows, (list, tuple)) and len(rows) == AXES
     if not is_square or not all(isinstance(row, (list, tuple)) and len(row) == AXES for row in rows):
@@ -93,7 +93,7 @@ def _matrix(entries: Mapping[str, Any], name: str, source: str) -> list[list[flo
 
 
 def _check_inverse(constants: ModelConstants, source: str) -> None:
-    """Raise GainFileError unless M has a positive diagonal and its inverse fits."""
+    """Raise GainFileError unless `inverse_mass` is the inverse of M and M has a positive diagonal."""
     mass, inverse = constants.mass_matrix, constants.inverse_mass
     for i in range(AXES):
         if not (mass[i][i] > 0.0 and inverse[i][i] > 0.0):

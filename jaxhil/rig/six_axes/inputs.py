@@ -1,7 +1,8 @@
-"""Checks of the inputs in six axes: sensor readings, channel by channel, and the numerical model's motion.
+"""Checks of the six-axis inputs: sensor readings, channel by channel, and the numerical model's motion.
 
-The last good reading of a channel replaces a bad one. `SixAxisInputGuard.check` returns the faults of a tick
-and stores which of them trip; `wrench` and `measured` are then the inputs of the compensator.
+The last good reading of a channel replaces a bad reading. `SixAxisInputGuard.check` returns the faults of a
+tick, and stores in `fatal` the faults that trip the controller. The compensator then gets `wrench` and
+`measured`.
 """
 
 from math import inf, isfinite, nan
@@ -21,12 +22,12 @@ from jaxhil.rig.six_axes.limits import ROTATIONS
 from jaxhil.rig.six_axes.vectors import AXES, COORDINATES, Vector, is_finite, is_within, length
 from jaxhil.rig.types import Bits, Count, Index, Limits, Positive
 
-WRENCH_BITS = (0x1, 0x2, 0x4, 0x8, 0x10, 0x20)  # bits of the channels of the wrench in `channels`
-POSE_BITS = (0x40, 0x80, 0x100, 0x200, 0x400, 0x800)  # bits of the coordinates of the pose
+WRENCH_BITS = (0x1, 0x2, 0x4, 0x8, 0x10, 0x20)  # bits of the wrench's channels in `channels`
+POSE_BITS = (0x40, 0x80, 0x100, 0x200, 0x400, 0x800)  # bits of the pose's coordinates in `channels`
 
 
 class WrenchTare:
-    """Tare of the six-axis force sensor: the mean of `tare_ticks` readings out of contact.
+    """Tare of the six-axis force sensor: the bias is the mean of `tare_ticks` readings out of contact.
 
     Attributes:
         bias: wrench to subtract from every reading [N, N m].
@@ -50,7 +51,7 @@ class WrenchTare:
         self.restart()
 
     def restart(self) -> None:
-        """Let the next reading begin a new tare; the bias remains until that tare is over."""
+        """Begin a new tare at the next reading; keep the bias until the new tare succeeds."""
         self._count = 0
         self._sum = [0.0] * AXES
         self._lowest = [inf] * AXES
@@ -58,7 +59,7 @@ class WrenchTare:
         self.fatal = False
 
     def take(self, reading: Vector) -> bool:
-        """Add a reading [N, N m]; return whether the tare is over, successful or `fatal`."""
+        """Add a reading [N, N m]; return whether the tare has ended, with success or with `fatal` set."""
         if not self._count < self._ticks:
             return True
         if self._count == 0:
@@ -89,15 +90,15 @@ class WrenchTare:
 
 
 class SixAxisInputGuard:
-    """Guard of the inputs; see `faults.SIX_AXIS_FAULTS` for its checks.
+    """Checks of sensor readings and model motion on each tick; `faults.SIX_AXIS_FAULTS` lists the faults.
 
     Attributes:
-        wrench: wrench of the last tick without bias [N, N m], for the compensator.
-        measured: measured pose of the last tick [m, rad], for the compensator.
-        fatal: bits of the last tick's faults that trip.
-        channels: bits of the channels with a fault: 1 to 0x20 of the wrench, 0x40 to 0x800 of the pose.
-        located: pose where the drives were measured last [m, rad]; NaN before.
-        is_located: whether `located` is a reading of this run in range.
+        wrench: last good wrench reading minus the bias [N, N m], for the compensator.
+        measured: last good pose reading [m, rad], for the compensator.
+        fatal: bits of the last tick's faults that trip the controller.
+        channels: bits of the channels with a fault: 1 to 0x20 for the wrench, 0x40 to 0x800 for the pose.
+        located: last measured pose of the drives [m, rad]; NaN before the first reading.
+        is_located: whether `located` is an in-range reading of this run.
     """
 
     __slots__ = (
@@ -133,7 +134,7 @@ class SixAxisInputGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the readings so far, but not where the drives were measured last."""
+        """Forget past readings and counts of bad readings, but keep `located`."""
         self._known = False
         self._bad_forces = [0.0] * AXES
         self._bad_positions = [0.0] * AXES
@@ -147,9 +148,9 @@ class SixAxisInputGuard:
         self.fatal = 0
 
     def locate(self, pose: Vector) -> None:
-        """Store where the drives are measured [m, rad], also after a trip.
+        """Store the measured pose of the drives [m, rad], also after a trip.
 
-        Before a run's first reading in range, any reading that a rig can have is stored.
+        Until the run's first in-range reading, accept every reading within `POSITIONS` and `ROTATIONS`.
         """
         if is_within(pose, self._lowest, self._highest):
             self.is_located = True
@@ -158,7 +159,7 @@ class SixAxisInputGuard:
             self.located = list(pose)
 
     def check(self, reading: Vector, desired: Vector, twist: Vector, pose: Vector, bias: Vector) -> int:
-        """Return the faults of a tick.
+        """Check the inputs of one tick; return the bits of all faults.
 
         Args:
             reading: wrench reading [N, N m].
@@ -174,7 +175,7 @@ class SixAxisInputGuard:
             return MODEL_NOT_FINITE
         first = not self._known
         if first:
-            # Without a reading before the first tick, assume no wrench and the desired pose.
+            # Before the first tick there is no reading: assume zero wrench and the desired pose.
             self._known = True
             self._desired = list(desired)
             self.measured = list(desired)
@@ -199,7 +200,7 @@ class SixAxisInputGuard:
         return faults
 
     def _check_pose(self, pose: Vector, desired: Vector, first: bool) -> int:
-        """Return the faults of the pose reading."""
+        """Check the pose reading; return the bits of its faults."""
         faults = 0
         for i in range(AXES):
             value = pose[i]
@@ -222,10 +223,10 @@ class SixAxisInputGuard:
                 faults |= fault
         return faults
 
-    # The unusual case is a function of its own, so that a usual tick does not pay for it.
+    # Bad readings are rare: a separate function keeps their cost out of the usual tick.
 
     def _bad_force(self, value: float, channel: Index) -> int:
-        """Count a bad reading of a channel; return the fault."""
+        """Count a bad reading of a wrench channel; return the bit of its fault."""
         fault = FORCE_OUT_OF_RANGE if isfinite(value) else FORCE_NOT_FINITE
         self._bad_forces[channel] += 1.0
         self.channels |= WRENCH_BITS[channel]

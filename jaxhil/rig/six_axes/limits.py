@@ -1,8 +1,8 @@
-"""Limits that a gain file in six axes may set for the rig: names, units, bounds and defaults.
+"""Limits that a six-axis gain file may set for the rig: names, units, bounds and defaults.
 
-As on one axis (`jaxhil.rig.limits`), no file can set them beyond their bounds; where it has none, or null,
-the default holds. Limits of lengths and speeds hold for the length of a vector, limits of forces and torques
-for each channel.
+As on one axis (`jaxhil.rig.limits`), no file can set a limit beyond its bounds, and the default replaces a
+missing limit or null. A limit on a distance or speed applies to the norm of the vector; a limit on a force or
+torque applies to each channel.
 """
 
 from collections.abc import Mapping
@@ -87,7 +87,7 @@ SIX_AXIS_LIMITS: dict[str, Limit] = {
     "lag_highest": Limit("s", TIMES[1], *TIMES, "largest lag of the hardware behind the model"),
 }
 
-# Pairs of limits of which the first is below the second, or not above it.
+# RANGES: pairs of limits of which the first must be below the second; ORDER: must not be above the second.
 SIX_AXIS_RANGES = tuple(
     (f"{name}_lowest_{axis}", f"{name}_highest_{axis}")
     for name in ("measured", "command")
@@ -101,7 +101,7 @@ SIX_AXIS_ORDER = (
 
 
 def complete_six_axis_limits(limits: Mapping[str, float]) -> dict[str, float]:
-    """Return all limits, defaults included. Raise ValueError if two of them contradict each other."""
+    """Return all limits including defaults. Raise ValueError if two limits contradict each other."""
     return complete_limit_table(limits, SIX_AXIS_LIMITS, SIX_AXIS_RANGES, SIX_AXIS_ORDER)
 
 

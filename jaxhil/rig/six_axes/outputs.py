@@ -1,8 +1,8 @@
-"""Limits of the outputs in six axes: the wrench on the numerical model and the pose command to the drives.
+"""Limits of the six-axis outputs: the wrench on the numerical model and the pose command to the drives.
 
-Both guards continue from their last output, so that neither a trip nor a reset makes it jump. At the
-beginning of a run the pose command continues from the measured pose. After a trip the wrench ramps to 0. The
-pose command brakes, moves back along the way that it came, and comes to rest.
+Both guards continue from their last output, so that no output jumps at a trip or a reset. At the beginning of
+a run the pose command continues from the measured pose. After a trip the wrench ramps to 0, and the pose
+command brakes, retraces its path backwards and comes to rest.
 """
 
 from math import sqrt
@@ -19,15 +19,15 @@ from jaxhil.rig.six_axes.path import POINTS, CommandPath
 from jaxhil.rig.six_axes.vectors import AXES, COORDINATES, Vector, angle, is_finite, is_within, length
 from jaxhil.rig.types import Bits, Limits, NonNegative, Positive
 
-HEIGHT = 2  # index of z, along which the chaser leaves the target
+HEIGHT = 2  # index of z; the chaser leaves the target in this direction
 
 
 class WrenchGuard:
-    """Limiter of the wrench on the numerical model and of its change, channel by channel.
+    """Guard of the wrench on the numerical model: magnitude and rate of each channel.
 
     Attributes:
         output: last wrench [N, N m].
-        fatal: bits of the faults that trip.
+        fatal: bits of the last command's faults that trip the controller.
     """
 
     __slots__ = ("_cut", "_cut_tolerated", "_limits", "_most", "fatal", "output")
@@ -49,7 +49,7 @@ class WrenchGuard:
         self.fatal = 0
 
     def limit(self, command: Vector) -> int:
-        """Move the output to the command [N, N m] as far as the limits allow; return the faults."""
+        """Move the output to the command [N, N m] as far as the limits allow; return the fault bits."""
         self.fatal = 0
         if not is_finite(command):
             self.fatal = COMMAND_NOT_FINITE
@@ -73,11 +73,11 @@ class WrenchGuard:
         return FORCE_SLEW
 
     def fade(self) -> None:
-        """Move the output towards 0 as far as the limits allow."""
+        """Move the output towards 0 by the largest step that the rate limits allow in one period."""
         self._move([0.0] * AXES)
 
     def _move(self, target: Vector) -> None:
-        """Move each channel towards the target as far as the limits allow."""
+        """Move each channel towards the target by at most the step that the rate limits allow."""
         for i in range(AXES):
             change = target[i] - self.output[i]
             if abs(change) <= self._most[i]:
@@ -89,15 +89,15 @@ class WrenchGuard:
 
 
 class PoseGuard:
-    """Limiter of the pose command (stroke) and of its change (translation and rotation).
+    """Guard of the pose command: range (stroke), and rate of translation and rotation.
 
-    A command is outside the stroke only on the way back into it.
+    A command is outside the stroke only while it returns into the stroke.
 
     Attributes:
         output: last command [m, rad].
-        known: whether there has been a command.
-        at_rest: whether the last command after a trip did not move.
-        fatal: bits of the faults that trip.
+        known: whether there is a last command.
+        at_rest: whether the pose command has come to rest after a trip.
+        fatal: bits of the last command's faults that trip the controller.
     """
 
     __slots__ = (
@@ -126,7 +126,7 @@ class PoseGuard:
         self._start = limits["start_distance"]
         self._start_angle = limits["start_angle"]
         spacing = max(self._retreat, 2.0 * self._retreat_distance / POINTS)
-        # A rotation counts as the distance that is covered in the same time.
+        # The retreat covers the lever times an angle in the same time as the angle.
         lever = self._retreat / self._retreat_turn if self._retreat_turn > 0.0 else 0.0
         self._path = CommandPath(spacing, self._retreat_turn, lever)
         self.output = [0.0] * AXES
@@ -134,30 +134,30 @@ class PoseGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the faults; changes may be cut without limit until the output reaches the next command."""
+        """Forget the faults; until the output first reaches a command, a limited change does not trip."""
         self._cut = 0.0
         self._engaged = False
         self._rate = [0.0] * AXES
-        self._back = False  # whether the command has braked and moves back
-        self._share = 0.0  # speed on the way back, over the retreat's
-        self._remaining = self._retreat_distance  # of the way back [m]
+        self._back = False  # whether braking has ended and the command moves back
+        self._share = 0.0  # speed on the way back, divided by the retreat speed
+        self._remaining = self._retreat_distance  # remaining length of the way back [m]
         self.at_rest = False
         self.fatal = 0
 
     def release(self) -> None:
-        """Forget the last output and the path, because the drives have been moved by other means."""
+        """Forget the last output and the path, after something else has moved the drives."""
         self.known = False
         self._path.clear()
         self.restart()
 
     def limit(self, command: Vector, pose: Vector, measured: Vector, is_fresh: bool, is_free: bool) -> int:
-        """Move the output to the command as far as the limits allow; return the faults.
+        """Move the output to the command as far as the limits allow; return the fault bits.
 
         Args:
             command: pose to command [m, rad].
             pose: pose of the numerical model [m, rad].
             measured: last measured pose of the drives [m, rad]; NaN if there is none.
-            is_fresh: whether that measurement is of this run.
+            is_fresh: whether `measured` was measured in this run.
             is_free: whether the rig is out of contact.
         """
         self.fatal = 0
@@ -168,7 +168,7 @@ class PoseGuard:
             self.fatal = STROKE
             return STROKE
         if not self.known:
-            # Moving drives lag behind. Without a reading the drives are assumed at the model's pose.
+            # Moving drives lag behind. Without a reading, assume that they are at the model's pose.
             near = self._is_near(command, measured) if is_fresh else self._is_near(command, pose)
             if is_free and near:
                 self.known = True
@@ -192,7 +192,7 @@ class PoseGuard:
         return fault
 
     def retreat(self, measured: Vector, pose: Vector) -> None:
-        """Move the output by one period on the way back to rest; arguments as in `limit`."""
+        """Move the output by one period of the retreat; arguments as in `limit`."""
         if not self.known:
             self._stand(measured, pose)
         if not self._back:
@@ -218,16 +218,16 @@ class PoseGuard:
             path.drop()
 
     def _next_share(self, remaining: float) -> float:
-        """Return the next speed on the way back, over the retreat's; `remaining` is the rest of the way."""
+        """Return the next speed on the way back, divided by the retreat speed; `remaining` is in m."""
         if remaining > 0.0 and self._retreat > 0.0 and self._retreat_turn > 0.0:
             gain = min(self._braking / self._retreat, self._braking_turn / self._retreat_turn)
             slowing = sqrt(2.0 * self._braking * remaining) / self._retreat
-            # The last part is covered at the speed of one period's braking.
+            # The last part has the speed that one period's braking can stop.
             return min(self._share + gain, max(slowing, gain), 1.0)
         return 0.0
 
     def _brake(self) -> None:
-        """Slow down in the direction of the last command."""
+        """Slow down along the last change of the command."""
         rate = self._rate
         zero = [0.0] * AXES
         speed, turning = length(rate, zero), angle(rate, zero)
@@ -253,12 +253,12 @@ class PoseGuard:
         return stays
 
     def _is_near(self, command: Vector, reference: Vector) -> bool:
-        """Return whether a run's first command is near enough to where the drives are."""
+        """Return whether a run's first command is within `start_distance` and `start_angle` of a pose."""
         near = length(command, reference) <= self._start
         return near and angle(command, reference) <= self._start_angle
 
     def _share_of(self, target: Vector, most: float, most_turn: float) -> float:
-        """Return the share of the way to a pose that a step allows, at most 1."""
+        """Return the fraction of the way to a pose, at most 1, that the largest step covers."""
         distance, turn = length(target, self.output), angle(target, self.output)
         share = 1.0
         if distance > 0.0 and distance > most:
@@ -268,7 +268,7 @@ class PoseGuard:
         return share
 
     def _move(self, target: Vector, share: float) -> None:
-        """Move the output by a share of the way to a pose."""
+        """Move the output by the fraction `share` of the way to a pose."""
         before = list(self.output)
         if share < 1.0:
             self.output = [at + share * (to - at) for at, to in zip(before, target, strict=True)]
@@ -277,14 +277,14 @@ class PoseGuard:
         self._rate = [new - old for new, old in zip(self.output, before, strict=True)]
 
     def _stand(self, measured: Vector, pose: Vector) -> None:
-        """Begin at the measured pose; without one, at the model's, moved into the stroke."""
+        """Set the output to `measured`; if it is not finite, to `pose` moved into the stroke."""
         self.known = True
         if is_finite(measured):
             self.output = list(measured)
             return
         for i in range(AXES):
             start = pose[i]
-            # Without any pose, the chaser is assumed far from the target.
+            # Without any pose, assume that the chaser is far from the target.
             if not start - start == 0.0:
                 start = self._highest[i] if i == HEIGHT else 0.0
             self.output[i] = min(max(start, self._lowest[i]), self._highest[i])

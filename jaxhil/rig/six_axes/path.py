@@ -7,15 +7,15 @@ from jaxhil.rig.types import Index
 
 POINTS = 256  # stored points of the path, a power of two
 NEWEST_POINTS = POINTS - 1
-LEAST_TURN = 0.002  # rad; rotation between two stored points
+LEAST_TURN = 0.002  # rad; lower bound of the rotation between two stored points
 
 
 class CommandPath:
-    """Points of the path of the pose commands, from the newest back to the oldest that is stored.
+    """Stored points of the path of the pose commands; a new point overwrites the oldest.
 
     Args:
-        spacing: distance between two points [m].
-        turn: rotation between two points [rad].
+        spacing: minimum distance between two points [m].
+        turn: minimum rotation between two points, if their distance is shorter [rad].
         lever: distance that counts as much as a rotation of 1 rad [m].
 
     Attributes:
@@ -45,7 +45,7 @@ class CommandPath:
         self.newest = [0.0] * AXES
 
     def record(self, pose: Vector) -> None:
-        """Add a command [m, rad] if it is far enough from the newest point."""
+        """Add a command [m, rad] if its distance or rotation from the newest point is large enough."""
         travelled = 0.0
         if self.count > 0:
             if length(pose, self.newest) <= self._spacing and angle(pose, self.newest) <= self._turn:
@@ -70,11 +70,11 @@ class CommandPath:
         self.newest = list(self._points[head])
 
     def distance(self, pose: Vector, other: Vector) -> float:
-        """Return the distance of two poses [m], in which a rotation counts with the lever."""
+        """Return the larger of distance and lever times rotation between two poses [m]."""
         return max(length(pose, other), self._lever * angle(pose, other))
 
     def length_back(self) -> float:
-        """Return the length of the path from the newest point back to the oldest one [m]."""
+        """Return the length of the path from the newest to the oldest point [m]."""
         if self.count == 0:
             return 0.0
         head: Index = self._head

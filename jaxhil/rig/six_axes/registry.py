@@ -1,7 +1,7 @@
-"""Interface of the rig's compensators in six axes, and the table of registered ones.
+"""Interface of the rig's six-axis compensators, and the table of registered compensators.
 
-A compensator is a class with the methods of `SixAxisCompensator`, from which it may inherit the defaults;
-`@register_six_axes(name)` adds it to the table under the name that gain files use.
+A compensator is a class with the methods of `SixAxisCompensator`; it may inherit their defaults.
+`@register_six_axes(name)` adds the class to the table; gain files refer to the compensator by this name.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,45 +14,45 @@ from jaxhil.rig.types import Gains, Positive
 
 
 class ModelConstants(NamedTuple):
-    """Constants of the numerical model and of the rig, which a gain file in six axes contains."""
+    """Constants of the numerical model and the rig, which a six-axis gain file contains."""
 
     mass_matrix: Matrix  # relative mass matrix M at the docked pose, about C's origin [kg, kg m, kg m^2]
     inverse_mass: Matrix  # its inverse
-    # (1 - M_t M^-1)^-1, the contact's wrench per reading, about C's origin; the identity without a tool
+    # (1 - M_t M^-1)^-1, converts a reading to the contact's wrench, about C's origin; identity without a tool
     tool_correction: Matrix
     longest_delay: float  # upper bound of the loop's delay [s]
 
 
 class SixAxisCompensator(Protocol):
-    """Interface of a compensator in six axes, which the controller calls once per tick.
+    """Interface of a six-axis compensator, which the controller calls once per tick.
 
     Args:
         gains: gains by name, in SI units.
-        constants: constants of the numerical model and of the rig.
+        constants: constants of the numerical model and the rig.
         period: control period [s].
     """
 
     __slots__ = ()
 
     gains: ClassVar[Mapping[str, GainSpecification]]
-    # Status of the last command, a number of `law_status`; either always UNSTATED or never.
+    # Status at the last command, a number of `law_status`. A compensator without a status has UNSTATED.
     status: int = UNSTATED
 
     def __init__(self, gains: Gains, constants: ModelConstants, period: Positive) -> None: ...
 
     @property
     def loop_delay(self) -> float:
-        """Return the delay [s] of the hardware behind the model in the last contact; 0 if unknown."""
+        """Return the hardware's delay [s] relative to the model in the last contact; 0 if unknown."""
         return 0.0
 
     @property
     def unpaid_impulse(self) -> float:
-        """Return the impulse that the last contact has left unpaid, over its impulse; 0 if none is known."""
+        """Return the impulse still owed after the last contact, divided by its impulse; 0 if unknown."""
         return 0.0
 
     @property
     def is_acting(self) -> bool:
-        """Return whether the compensator acts in a contact, as far as it has a status."""
+        """Return whether the compensator's status says that it acts on a contact; False without a status."""
         return self.status not in (UNSTATED, OUT_OF_CONTACT)
 
     def step(
@@ -62,21 +62,21 @@ class SixAxisCompensator(Protocol):
 
         Args:
             wrench: measured wrench on the chaser about T's origin [N, N m].
-            pose_desired: coordinates of C against T in the numerical model [m, rad].
-            twist_desired: twist of C against T in the numerical model [m/s, rad/s].
-            pose_measured: coordinates of C against T on the hardware [m, rad].
+            pose_desired: pose of chaser frame C relative to target frame T in the model [m, rad].
+            twist_desired: twist of C relative to T in the numerical model [m/s, rad/s].
+            pose_measured: measured pose of C relative to T on the hardware [m, rad].
         """
         ...
 
     def pose_command(self, pose: Vector, rates: Vector) -> Vector:
-        """Return the pose to command [m, rad] for the model's new coordinates and their rates."""
+        """Return the pose command [m, rad] for the model's new coordinates and their rates."""
         return list(pose)
 
     def reset(self) -> None:
         """Restart everything."""
 
     def next_contact(self) -> None:
-        """Restart filters and delay lines for another run."""
+        """Restart filters and delay lines for the next run."""
         self.reset()
 
 

@@ -1,6 +1,7 @@
-"""Linear algebra in six axes: wrenches, poses and twists are lists of six floats (x, y, z, rx, ry, rz).
+"""Six-axis linear algebra: wrenches, poses and twists are lists of six floats (x, y, z, rx, ry, rz).
 
-All are in T axes (notebooks/guide/six_axes.md, section 1). Sums are added from the first term to the last.
+All are in the axes of target frame T (notebooks/guide/six_axes.md, section 1). Sums are added in the order of
+their terms. C is the frame of the chaser's docking interface.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ COTANGENT = (
     3617 / 10670622842880000, 43867 / 5109094217170944000, 174611 / 802857662698291200000,
 )  # fmt: skip
 LAST_TERM = len(COTANGENT) - 1
-MAX_SQUARED_ANGLE = 10.0  # rad^2; beyond pi^2 there is no rotation vector, and the series is cut off
+MAX_SQUARED_ANGLE = 10.0  # rad^2; larger arguments of the series are clamped; rotation vectors end at pi^2
 
 Vector = Annotated[list[float], AXES]
 Matrix = Annotated[list[list[float]], AXES, AXES]
@@ -56,21 +57,21 @@ def multiply(factor: float, vector: Vector) -> Vector:
 
 
 def wrench_at_chaser(wrench: Vector, pose: Vector) -> Vector:
-    """Return a wrench about C's origin from one about T's; `pose` are coordinates of C against T."""
+    """Move the reference point of a wrench from T's to C's origin; `pose` is that of C relative to T."""
     fx, fy, fz, mx, my, mz = wrench
     x, y, z = pose[:3]
     return [fx, fy, fz, mx - (y * fz - z * fy), my - (z * fx - x * fz), mz - (x * fy - y * fx)]
 
 
 def wrench_at_target(wrench: Vector, pose: Vector) -> Vector:
-    """Return a wrench about T's origin from one about C's; `pose` are coordinates of C against T."""
+    """Move the reference point of a wrench from C's to T's origin; `pose` is that of C relative to T."""
     fx, fy, fz, mx, my, mz = wrench
     x, y, z = pose[:3]
     return [fx, fy, fz, mx + (y * fz - z * fy), my + (z * fx - x * fz), mz + (x * fy - y * fx)]
 
 
 def coordinate_rates(pose: Vector, twist: Vector) -> Vector:
-    """Return the rates of the coordinates (p, theta) of a pose for a twist (v, w).
+    """Return the time derivatives of a pose's coordinates (p, theta) at the twist (v, w).
 
     theta' = Jl(theta)^-1 w = w - theta x w/2 + c theta x (theta x w), with the inverse left Jacobian and
     c = (1 - t/2 cot(t/2))/t^2, t = |theta|.
@@ -95,7 +96,7 @@ def coordinate_rates(pose: Vector, twist: Vector) -> Vector:
 
 
 def lead_pose(leads: Vector, pose: Vector, rates: Vector) -> Vector:
-    """Return the pose led by the times `leads` [s] at these rates of its coordinates."""
+    """Extrapolate each coordinate of the pose by its lead time [s] at its rate."""
     return [at + lead * rate for at, lead, rate in zip(pose, leads, rates, strict=True)]
 
 
@@ -112,7 +113,7 @@ def is_finite(vector: Vector) -> bool:
 
 
 def is_within(vector: Vector, lowest: Vector, highest: Vector) -> bool:
-    """Return whether all entries are within their bounds; NaN is not."""
+    """Return whether all entries are within their bounds; False if an entry is NaN."""
     inside = True
     for low, value, high in zip(lowest, vector, highest, strict=True):
         inside = inside and low <= value <= high

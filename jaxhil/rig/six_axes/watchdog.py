@@ -1,18 +1,17 @@
-"""Watchdog in six axes: an audit of every contact, from the motion of the numerical model.
+"""Six-axis watchdog: an audit of every contact, from the motion of the numerical model.
 
-A contact begins on the tick on which the compensator acts; for one without a status, on which a force beyond
-`fading` is measured. On that tick the lag of the hardware behind the model, as far as the compensator has
-measured it, must be within `lag_lowest` and `lag_highest`. The contact is audited once it has not been so for
-`settling`; at the latest when the next run is announced. With the twist V_in on the tick before the contact,
-V now, the relative mass matrix M, the controller's wrench W_c about C's origin and |W|^2 = W . M^-1 W, the
-audit asks:
+A contact begins on the first tick on which the compensator acts or, if it has no status, on which the
+measured force exceeds `fading`. If the compensator has measured the hardware's lag behind the model, this lag
+must be between `lag_lowest` and `lag_highest`. The contact is audited as soon as the condition of its
+beginning has been false for the time `settling`, at the latest at the call of `next_contact`. V_in is the
+twist on the tick before the contact, V the present twist, M the relative mass matrix, W_c the controller's
+wrench about C's origin, and |W|^2 = W . M^-1 W. The audit checks four conditions:
 
-- Is the momentum consistent? |M (V - V_in) - T sum W_c| must be at most `momentum_error` times the impulse's
-  size and a twentieth of the momentum's. Otherwise the model integrates another wrench, or has another mass.
-- Is the contact passive? T sum W_c . V must be at most `energy_gain` times the kinetic energy before it,
-  V_in . M V_in/2.
-- Is the impulse paid? What the compensator still owes must be at most `unpaid_impulse` times its impulse.
-- Did the compensator identify the contact, by its own status (`law_status`)?
+- Momentum: |M (V - V_in) - T sum W_c| is at most `momentum_error` times the sum of |T sum W_c| and 0.05
+  |M V_in|. Otherwise the model integrates a different wrench, or has a different mass.
+- Passivity: T sum W_c . V is at most `energy_gain` times the kinetic energy before contact, V_in . M V_in/2.
+- Impulse: what the compensator still owes is at most `unpaid_impulse` times the contact's impulse.
+- Status: the compensator reports that it identified the contact (`law_status`).
 """
 
 from math import sqrt
@@ -34,19 +33,21 @@ from jaxhil.rig.six_axes.vectors import (
 )
 from jaxhil.rig.types import Count, Limits, Positive
 
-MOMENTUM_SHARE = 0.05  # of the momentum before a contact that counts as impulse: grazing touches have little
+MOMENTUM_SHARE = (
+    0.05  # fraction of the approach momentum that is added to the small impulse of a grazing touch
+)
 
 
 class SixAxisWatchdog:
-    """Audit of one contact after another.
+    """Audit of successive contacts: momentum, passivity, impulse and compensator status.
 
     Attributes:
-        on: whether there is anything to audit.
+        on: whether contacts are audited.
         contacts: number of audited contacts.
-        record: statuses of the last audited contact.
-        momentum_error: error of the momentum in that contact, over its impulse [1], until `restart`.
-        energy_gain: energy that the contact has released, over that of the approach [1], until `restart`.
-        unpaid_impulse: impulse that the contact has left unpaid, over its impulse [1], until `restart`.
+        record: compensator status of the last audited contact.
+        momentum_error: momentum error of that contact, divided by its impulse [1]; 0 after `restart`.
+        energy_gain: energy that it released, divided by the approach energy [1]; 0 after `restart`.
+        unpaid_impulse: impulse still owed, divided by the contact's impulse [1]; 0 after `restart`.
     """
 
     __slots__ = (
@@ -111,7 +112,7 @@ class SixAxisWatchdog:
         self.record = ContactCount(0, 0, 0, 0, 0, 0, OUT_OF_CONTACT, UNSTATED)
 
     def restart(self) -> None:
-        """Forget the current contact and the motion so far, but not `contacts` and `record`."""
+        """Forget the current contact and the past motion, but keep `contacts` and `record`."""
         self._known = False
         self._open = False
         self._measured = False
@@ -137,13 +138,13 @@ class SixAxisWatchdog:
         pose: Vector,
         twist: Vector,
     ) -> int:
-        """Return the faults that this tick shows, 0 if none.
+        """Process one tick; return the fault bits, 0 if there are none.
 
         Args:
-            previous: wrench W_c of the tick before [N, N m].
-            status: the compensator's status of that wrench.
-            lag: lag of the hardware behind the model, as far as the compensator knows it [s]; else 0.
-            unpaid: impulse that the compensator's last contact has left unpaid, over its impulse [1].
+            previous: wrench W_c of the last tick [N, N m].
+            status: the compensator's status at that wrench.
+            lag: lag of the hardware behind the model [s]; 0 if the compensator does not know it.
+            unpaid: impulse still owed after the compensator's last contact, divided by its impulse [1].
             wrench: measured wrench of this tick [N, N m].
             pose: pose of the numerical model [m, rad].
             twist: twist of the numerical model [m/s, rad/s].
@@ -174,7 +175,7 @@ class SixAxisWatchdog:
         else:
             self._quiet += 1.0
             if self._quiet == 1.0:
-                # The contact may have had several touches, of which the worst counts.
+                # If the contact has had several touches, keep the largest value.
                 self.unpaid_impulse = max(self.unpaid_impulse, unpaid)
             if self._quiet >= self._quiet_ticks:
                 return self._audit()
@@ -183,12 +184,12 @@ class SixAxisWatchdog:
         return fault
 
     def conclude(self, previous: Vector, status: int, unpaid: float) -> int:
-        """Audit the current contact, if there is one, and return the faults.
+        """Audit the current contact, if there is one; return the fault bits.
 
         Args:
             previous: wrench W_c of the last tick [N, N m].
-            status: the compensator's status of that wrench.
-            unpaid: impulse that the compensator's last contact has left unpaid, over its impulse [1].
+            status: the compensator's status at that wrench.
+            unpaid: impulse still owed after the compensator's last contact, divided by its impulse [1].
         """
         if not self._open:
             return 0
@@ -201,9 +202,9 @@ class SixAxisWatchdog:
         return self._audit()
 
     def detail(self, fatal: int) -> str:
-        """Return the numbers of the last audit that belong to these faults, in words."""
+        """Describe these faults by the numbers of the last audit."""
         numbers = {
-            MOMENTUM: f"error of the momentum {self.momentum_error:.4g}",
+            MOMENTUM: f"momentum error {self.momentum_error:.4g}",
             ENERGY_GAIN: f"energy released {self.energy_gain:.4g}",
             UNPAID_IMPULSE: f"unpaid impulse {self.unpaid_impulse:.4g}",
         }
@@ -211,7 +212,7 @@ class SixAxisWatchdog:
         return f"contact {self.contacts}: {text}" if text else ""
 
     def _begin(self) -> None:
-        """Open a contact, which begins with the wrench that follows the last tick's twist."""
+        """Begin a contact after the last tick, whose twist is the approach twist."""
         self._open = True
         self._entry = list(self._twist)
         self._impulse = [0.0] * AXES
@@ -223,13 +224,13 @@ class SixAxisWatchdog:
         self.unpaid_impulse = 0.0
 
     def _account(self, previous: Vector, twist: Vector) -> None:
-        """Add impulse and work of the last tick's wrench, which has led to this twist."""
+        """Add the impulse and work of the last tick's wrench; `twist` is the twist after it."""
         wrench = wrench_at_chaser(previous, self._pose)
         self._impulse = add_multiple(self._impulse, self._period, wrench)
         self._work += self._period * 0.5 * (dot(wrench, self._twist) + dot(wrench, twist))
 
     def _audit(self) -> int:
-        """Close the contact; return its faults."""
+        """End the contact and audit it; return the fault bits."""
         self._open = False
         self.contacts += 1
         fault = 0
@@ -253,12 +254,12 @@ class SixAxisWatchdog:
         return fault
 
     def _size(self, wrench: Vector) -> float:
-        """Return the size of a wrench or an impulse."""
+        """Return the norm |W| = sqrt(W . M^-1 W) of a wrench or an impulse."""
         return _root(dot(wrench, product(self._inverse, wrench)))
 
 
 def _root(square: float) -> float:
-    """Return the square root; 0 of what rounding has made negative."""
+    """Return the square root, or 0 if rounding has made the argument negative."""
     if square < 0.0:
         return 0.0
     return sqrt(square)

@@ -1,4 +1,4 @@
-"""Booking of impulses: onset, reference trajectory at the model's time, bridge, and command."""
+"""Balance of impulses: onset of contact, reference trajectory, prediction to the present, and command."""
 
 from math import sqrt
 
@@ -22,9 +22,9 @@ class Ledger:
     """State of one contact, and the impulse that the numerical model still owes.
 
     Attributes:
-        delay: D [ticks].
-        tangent: model of the contact along its direction.
-        is_limited: whether the last correction was at its limit.
+        delay: delay D of the loop [ticks].
+        tangent: tangent model of the force along the contact's direction.
+        is_limited: whether the last correction was limited.
     """
 
     __slots__ = (
@@ -56,22 +56,22 @@ class Ledger:
         """Forget all contacts."""
         self.delay = 0.0
         self.is_limited = False
-        self._speed = 1.0  # v_0, approach speed along the direction
+        self._speed = 1.0  # v_0, approach speed along the contact's direction
         self._impulse = [0.0] * AXES  # I_r, impulse of the reference up to t - D
-        self._drift = [0.0] * AXES  # eps, pose of the model at t - D minus that of the reference
-        self._mixed = [0.0] * AXES  # filtered wrench, with continuous sign
-        self._direction = [0.0] * AXES  # w
-        self._modelled = [0.0] * AXES  # direction for which the tangent model began
-        self._unpaid = [0.0] * AXES  # L
+        self._drift = [0.0] * AXES  # eps, pose of the model at t - D minus the reference's pose
+        self._mixed = [0.0] * AXES  # filtered wrench, whose sign a pulling force does not reverse
+        self._direction = [0.0] * AXES  # w, unit wrench of the contact's direction
+        self._modelled = [0.0] * AXES  # direction at the last restart of the tangent model
+        self._unpaid = [0.0] * AXES  # L, impulse that the model still owes
         self._command = [0.0] * AXES
         self._corrected = 0.0  # F_r, force on the reference
-        self._deeper = 0.0  # depth of the hardware beyond that of the reference
+        self._deeper = 0.0  # depth of the hardware minus depth of the reference
         self._path = 0.0  # X, depth of the hardware along the direction since the onset
         self._peak = 0.0  # largest force so far, per unit mass
         self.tangent.restart()
 
     def begin(self, reader: SixAxisReader, pose_desired: Vector, twist_desired: Vector) -> None:
-        """Begin a contact with the reader's reading (b); `follow` sets its impulse."""
+        """Begin a contact with the reader's reading (equation b); `follow` sets its impulse."""
         wrench = list(reader.wrench)
         direction = multiply(1.0 / self._size(wrench), wrench)
         if not reader.is_recent:
@@ -88,12 +88,12 @@ class Ledger:
         self._peak = 0.0
 
     def _approach(self, direction: Vector, lag: Vector, twist: Vector) -> None:
-        """Set delay and approach speed from lag and twist of free flight."""
+        """Compute delay and approach speed from the mean lag and twist in free flight."""
         momentum = product(self._mass, twist)
         whole = dot(twist, momentum)
         speed = sqrt(whole) if whole > 0.0 else 0.0
         closing = -dot(direction, twist)
-        # Where the contact is across the motion, the delay is the mean over all directions.
+        # If the contact's direction is perpendicular to the motion, use the mean delay of all directions.
         delay = dot(lag, momentum) / (whole + LEAST_TWIST * LEAST_TWIST)
         if closing > LEAST_SHARE * speed + LEAST_TWIST:
             delay = -dot(direction, lag) / closing
@@ -101,7 +101,7 @@ class Ledger:
         self._speed = max(closing, LEAST_SPEED * speed + LEAST_TWIST)
 
     def follow(self, reader: SixAxisReader, commanded: Vector, begins: bool) -> Vector:
-        """Return the command about C's origin after a reading.
+        """Process one reading of a contact; return the command wrench about the chaser's origin C.
 
         Args:
             reader: reader with the reading of this tick.
@@ -130,12 +130,12 @@ class Ledger:
             self._unpaid = add_multiple(self._unpaid, -ahead, rest)
             self._command = add_multiple(rest, last, direction)
         reader.weigh_tool()
-        # Command (e).
+        # Compute the command wrench (equation e).
         pulled = add_multiple(self._unpaid, gain, product(self._mass, self._drift))
         return add_multiple(self._command, 1.0, self._correction(pulled, stiffness))
 
     def _book(self, reader: SixAxisReader, recalled: ModelRows, force: float) -> None:
-        """Update the tangent model, and book the impulse of the reference at its own time t - D (c)."""
+        """Update the tangent model, and advance the reference, which is at the time t - D (equation c)."""
         period, direction, tangent = self._period, self._direction, self.tangent
         rate = -dot(direction, reader.moved) / period
         if reader.loud:
@@ -154,7 +154,7 @@ class Ledger:
         self._impulse = add_multiple(self._impulse, period * (self._corrected - force), direction)
 
     def _bridge(self, recalled: ModelRows, least: float, stiffness: float, ahead: float) -> float:
-        """Bridge from t - D to the middle of the command's period (d); return the last force."""
+        """Predict from t - D to the middle of the command's period (equation d); return the last force."""
         direction, tangent = self._direction, self.tangent
         missing = product(self._inverse, subtract(recalled[12:18], self._impulse))
         velocity = dot(direction, missing) - dot(direction, recalled[6:12])
@@ -164,13 +164,13 @@ class Ledger:
         return min(tangent.force, HIGHEST * expected)
 
     def unpaid_share(self) -> float:
-        """Return the size of the unpaid impulse over that of the reference's."""
+        """Return the norm of the impulse still owed, divided by the norm of the reference's impulse."""
         return self._size(self._unpaid) / self._size(self._impulse)
 
     def _turn(self, reader: SixAxisReader, begins: bool) -> None:
-        """Update the direction; begin the tangent model anew where it has turned.
+        """Update the contact's direction; restart the tangent model if the direction has turned.
 
-        The sign is continuous: a latch that pulls does not turn the direction.
+        A pulling force, for example of a latch, does not reverse the direction.
         """
         if reader.loud and not begins:
             old, pole = self._mixed, self._pole
@@ -182,7 +182,7 @@ class Ledger:
             ]
             self._direction = multiply(1.0 / self._size(self._mixed), self._mixed)
         direction = self._direction
-        # Another surface, or another part of it, needs another model.
+        # If the direction turns, the contact is at a different surface.
         turns = begins
         if reader.loud and not begins:
             turns = dot(self._modelled, product(self._inverse, direction)) < TURNED
@@ -194,7 +194,7 @@ class Ledger:
             self._path -= dot(direction, reader.moved)
 
     def _correction(self, unpaid: Vector, stiffness: float) -> Vector:
-        """Return the wrench that pays the unpaid impulse, with limited size."""
+        """Return the wrench that corrects the missing impulse `unpaid`, with a limited norm."""
         wrench = multiply(-self._velocity_gain, unpaid)
         limit = self._correction_limit * sqrt(stiffness) * self._speed
         square = dot(wrench, product(self._inverse, wrench))
@@ -205,6 +205,6 @@ class Ledger:
         return wrench
 
     def _size(self, wrench: Vector) -> float:
-        """Return the size of a wrench, never 0."""
+        """Return the norm |W| = sqrt(W . M^-1 W) of a wrench W, with the mass matrix M; 1 if W is 0."""
         square = dot(wrench, product(self._inverse, wrench))
         return sqrt(square) if square > 0.0 else 1.0

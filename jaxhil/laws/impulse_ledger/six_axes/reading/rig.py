@@ -1,4 +1,4 @@
-"""Reading of a tick: delay line, pose filter, tool correction, gate, means over free flight."""
+"""Sensor readings of a tick: corrected wrench, aligned pose, contact detection, means of free flight."""
 
 from math import floor
 from typing import Annotated
@@ -24,28 +24,28 @@ from jaxhil.rig.six_axes.vectors import (
 )
 from jaxhil.rig.types import Count, Gains, Index, Positive
 
-SAMPLES = 512  # ticks of the delay line, a power of two
+SAMPLES = 512  # length of the delay line [ticks], a power of two
 MASK = SAMPLES - 1
-LONGEST_RECALL = SAMPLES - 2.0  # ticks; a recalled sample lies between two stored ones
-ROWS = 4 * AXES  # filtered pose of the hardware, and pose, twist and impulse of the model
+LONGEST_RECALL = SAMPLES - 2.0  # ticks; maximum delay, because interpolation needs one older sample
+ROWS = 4 * AXES  # columns: filtered pose of the hardware; pose, twist and impulse of the model
 MODEL_ROWS = 3 * AXES
 ModelRows = Annotated[list[float], MODEL_ROWS]
 
 
 class SixAxisReader:
-    """Readings of the impulse ledger in six axes; README.md of the parent folder states the equations.
+    """Readings of the six-axis impulse ledger; README.md in the parent folder states the equations.
 
     Attributes:
-        wrench: W, about C's origin, without bias and tool [N, N m].
-        variance: variance of its size by noise.
-        pose: xi_a, measured pose as old as the wrench [m, rad].
-        moved: its change since the last tick.
-        loud: whether the wrench is that of a contact.
-        quiet: ticks since the last reading in contact.
-        tool: largest square of the tool's share of a reading in this contact.
-        has_flown: whether `lag` and `twist` are means over free flight.
-        lag: mean pose of the model minus that of the hardware, as old as the reading [m, rad].
-        twist: mean twist of the model [m/s, rad/s].
+        wrench: W, contact wrench about the chaser's origin C, corrected for bias and tool [N, N m].
+        variance: variance of the norm |W| due to noise [N^2/kg].
+        pose: xi_a, filtered pose of the hardware, delayed like the wrench [m, rad].
+        moved: change of `pose` since the last tick [m, rad].
+        loud: whether the wrench is large enough to count as contact.
+        quiet: number of ticks since the last reading in contact.
+        tool: largest squared norm of the tool's part of a reading in this contact [N^2/kg].
+        has_flown: whether `lag` and `twist` contain a reading of free flight.
+        lag: mean of the model's pose minus `pose` in free flight [m, rad].
+        twist: mean twist of the model in free flight [m/s, rad/s].
     """
 
     __slots__ = (
@@ -54,7 +54,7 @@ class SixAxisReader:
         "_noise_linear", "_period", "_pole", "_readings", "_rows", "_settle", "_tool_correction",
         "_torque_variance", "lag", "loud", "moved", "pose", "quiet", "tool", "twist", "variance", "wrench",
     )  # fmt: skip
-    _age: Count  # ticks since the run began
+    _age: Count  # number of ticks since the beginning of the run
     _period: Positive
     _rows: Annotated[list[list[float]], SAMPLES, ROWS]
     _back_ticks: Count
@@ -89,7 +89,7 @@ class SixAxisReader:
         self.reset()
 
     def reset(self) -> None:
-        """Begin another run."""
+        """Begin a new run."""
         self._age = 0
         self._bias = [0.0] * AXES
         self._readings = 0.0
@@ -108,12 +108,12 @@ class SixAxisReader:
 
     @property
     def has_flown(self) -> bool:
-        """Return whether `lag` and `twist` are means over free flight."""
+        """Return whether `lag` and `twist` contain a reading of free flight."""
         return self._flight_ticks > 0.0
 
     @property
     def is_recent(self) -> bool:
-        """Return whether the hardware has been in contact a short time ago."""
+        """Return whether the last contact was less than the time `RECENT` ago."""
         return self.quiet * self._period < RECENT
 
     def read(
@@ -125,9 +125,9 @@ class SixAxisReader:
         impulse: Vector,
         in_contact: bool,
     ) -> None:
-        """Take the inputs of a tick; arguments as in `SixAxisCompensator.step`.
+        """Process the inputs of a tick; arguments as in `SixAxisCompensator.step`.
 
-        `impulse` is the impulse commanded so far [N s, N m s], `in_contact` holds after the last tick.
+        `impulse` is the impulse commanded so far [N s, N m s]; `in_contact` is the state after the last tick.
         """
         begins = self._age == 0
         period = self._period
@@ -136,7 +136,7 @@ class SixAxisReader:
             self.pose = add_multiple(pose, -period, twist_desired)
         self.moved = subtract(pose, self.pose)
         self.pose = pose
-        # The hardware accelerates by M^-1 W, and the sensor reads (1 - M_t M^-1) W (a).
+        # The hardware accelerates by M^-1 W, and the sensor reads (1 - M_t M^-1) W (equation a).
         corrected = product(self._tool_correction, wrench_at_chaser(wrench, pose))
         unbiased = subtract(corrected, self._bias)
         self.wrench = unbiased
@@ -155,12 +155,12 @@ class SixAxisReader:
         self._age += 1
 
     def weigh_tool(self) -> None:
-        """Update the tool's share of the readings in this contact."""
+        """Update `tool` with the tool's part of this reading."""
         share = subtract(product(self._tool_correction, self.wrench), self.wrench)
         self.tool = max(self.tool, dot(share, product(self._inverse, share)))
 
     def recall_model(self, ticks: float) -> ModelRows:
-        """Return pose, twist and impulse of the model so many ticks ago, linear between samples."""
+        """Return pose, twist and impulse of the model `ticks` ticks ago, interpolated linearly."""
         whole = floor(ticks)
         share = ticks - whole
         newest = self._age - 1 - whole
@@ -169,7 +169,7 @@ class SixAxisReader:
         return [new + share * (old - new) for new, old in zip(newer, older, strict=True)]
 
     def _model_at(self, age: int) -> ModelRows:
-        """Return pose, twist and impulse of the model at a tick; before the first one in uniform motion."""
+        """Return pose, twist and impulse of the model at a tick; before tick 0, assume uniform motion."""
         if age >= 0:
             index: Index = age & MASK
             return self._rows[index][AXES:ROWS]
@@ -181,12 +181,12 @@ class SixAxisReader:
     def _aligned(
         self, pose_desired: Vector, twist_desired: Vector, pose_measured: Vector, impulse: Vector
     ) -> Vector:
-        """Store this tick; return the filtered pose as old as the reading."""
+        """Store this tick; return the filtered pose, delayed like the wrench reading."""
         age: Index = self._age & MASK
         pole, period = self._pole, self._period
         rows = self._rows
         if self._age == 0:
-            # In uniform motion the filter lags by pole/(1 - pole) ticks.
+            # Start in steady state: in uniform motion, the filter lags by pole/(1 - pole) ticks.
             self._filtered = add_multiple(pose_measured, -(period * self._kept), twist_desired)
         self._filtered = [
             at + pole * (old - at) for at, old in zip(pose_measured, self._filtered, strict=True)
@@ -205,7 +205,7 @@ class SixAxisReader:
         ]
 
     def _fly(self, wrench: Vector, lag: Vector, twist: Vector, is_uniform: bool) -> None:
-        """Update the bias by a reading of free flight, and lag and twist if the motion is uniform as well."""
+        """Update the bias with a reading of free flight; if the motion is uniform, also lag and twist."""
         self._readings = min(self._readings + 1.0, LONGEST_MEAN)
         share = 1.0 / max(self._readings, 1.0)
         self._bias = [mean + share * (now - mean) for mean, now in zip(self._bias, wrench, strict=True)]

@@ -1,7 +1,7 @@
-"""Tangent model: recursive least squares, and the bridge from the last reading to the present.
+"""Tangent model: recursive least squares, and prediction from the last reading to the present.
 
-Along the contact's direction the force on a unit mass is F = k x + c x|x| + b x' + F_0, with the depth x
-since the onset. The estimate is of F over the approach speed, so that its prior does not depend on the speed.
+Along the contact's direction, the force per unit mass is F = k x + c x|x| + b x' + F_0, where x is the depth
+since the onset. F and x are divided by the approach speed, so that the prior is independent of the speed.
 """
 
 from typing import Annotated
@@ -18,21 +18,21 @@ from jaxhil.laws.impulse_ledger.six_axes.constants import (
 from jaxhil.rig.types import Gains, Positive
 
 SPREADS = "stiffness_spread", "damping_spread", "force_spread", "curvature_spread"
-GROWING = FEATURES - 1  # features whose variances are compared with the prior's
+GROWING = FEATURES - 1  # number of regressors whose variances stop the forgetting
 Features = Annotated[list[float], FEATURES]
 Covariance = Annotated[list[list[float]], FEATURES, FEATURES]
 
 
 class TangentModel:
-    """Estimate of the tangent model, and the model at the depth of the last reading, per unit mass.
+    """Estimate of the tangent model; forces and impulses are per unit mass.
 
     Attributes:
-        readings: readings since the estimate began.
+        readings: number of readings since the last restart.
         stiffness: k [1/s^2].
-        curvature: c over the approach speed [1/s^3].
+        curvature: c times the approach speed [1/s^3].
         damping: b [1/s].
-        impulse: impulse of the last bridge.
-        force: last force of the last bridge.
+        impulse: impulse of the last prediction [m/s].
+        force: force at the end of the last prediction [m/s^2].
     """
 
     __slots__ = (
@@ -49,7 +49,7 @@ class TangentModel:
         self.restart()
 
     def restart(self) -> None:
-        """Return to the prior."""
+        """Set the estimate to the prior."""
         self._mean = [0.0] * FEATURES
         self._covariance = [[0.0] * FEATURES for _ in range(FEATURES)]
         for j in range(FEATURES):
@@ -67,10 +67,10 @@ class TangentModel:
         """Update the estimate with a reading, by recursive least squares with forgetting.
 
         Args:
-            path: depth [m].
+            path: depth since the onset [m].
             rate: speed into the surface [m/s].
-            force: force on a unit mass [m/s^2].
-            variance: variance of its noise.
+            force: force per unit mass [m/s^2].
+            variance: variance of the noise of `force` [m^2/s^4].
             speed: approach speed [m/s].
         """
         depth = path / speed
@@ -102,7 +102,7 @@ class TangentModel:
         self.readings += 1.0
 
     def settle(self, path: float, speed: float) -> None:
-        """Set the model at a depth [m] from the estimate; `speed` is the approach speed [m/s]."""
+        """Set stiffness, curvature and damping to the estimate at depth `path` [m]; `speed` is v_0 [m/s]."""
         self._path = path / speed
         self._speed = speed
         stiffness, damping, _, curvature = self._mean
@@ -111,23 +111,21 @@ class TangentModel:
         self.damping = min(max(damping, 0.0), self._most_damping)
 
     def restoring(self, change: float) -> float:
-        """Return the change of the elastic force for a change of the depth [m]."""
+        """Return the change of the elastic force [m/s^2] for a change of the depth [m]."""
         path, speed = self._path, self._speed
         later = path + change / speed
         bend = later * abs(later) - path * abs(path)
         return self.stiffness * change + self.curvature * speed * bend
 
     def bridge(self, force: float, least: float, deeper: float, velocity: float, duration: float) -> None:
-        """Compute impulse and last force of the reference from the last reading to the present.
-
-        A unit mass moves against the model.
+        """Predict impulse and final force of the reference: integrate a unit mass against the model.
 
         Args:
-            force: force on the reference at the last reading.
-            least: least force, 0 or negative.
-            deeper: depth of the hardware beyond that of the reference, at the last reading.
-            velocity: speed of the reference into the surface.
-            duration: time to bridge [s].
+            force: force on the reference at the last reading [m/s^2].
+            least: lower bound of the force, 0 or negative [m/s^2].
+            deeper: depth of the hardware minus that of the reference at the last reading [m].
+            velocity: speed of the reference into the surface at the last reading [m/s].
+            duration: time from the last reading to the end of the prediction [s].
         """
         damping = self.damping
         step = duration / BRIDGE_STEPS
