@@ -176,7 +176,7 @@ class Lowering:
         return name.lstrip("_")
 
     def note(self, writes: Locations) -> None:
-        """Record the locations that an assignment or a call changes; drop facts that depend on them."""
+        """Record that a statement changes the variables `writes`; drop the facts that depend on their values."""
         if writes:
             self.effects.append(writes)
             self.function.writes |= writes

@@ -137,7 +137,7 @@ def sign_of(value: Any) -> str:
 
 
 def implies_sign(sign: str, required: str) -> bool:
-    """Return whether every number with `sign` also has the sign `required`."""
+    """Return whether the sign `sign` of a number implies `required`, for example "> 0" implies ">= 0"."""
     return required in ("", sign) or sign == "> 0"
 
 

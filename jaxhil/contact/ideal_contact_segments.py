@@ -79,7 +79,7 @@ def arccosine_over_sine(cosine):
 
 
 class _Segment(NamedTuple):
-    """Segment of the piecewise-linear force, divided by the mass."""
+    """Segment of the piecewise-linear force; force and slope are divided by the equivalent mass."""
 
     number: Int[Array, ""]  # index, from 0
     stiffness: Float[Array, "*batch"]  # slope [1/s^2]

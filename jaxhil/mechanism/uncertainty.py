@@ -6,12 +6,12 @@ The distribution of a number with the nominal value m is:
 - ``normal``: a normal distribution with mean m and standard deviation ``std``, truncated to the values that
   are allowed for the key.
 
-One draw scales a whole list: by the drawn factor or, for a distribution in the unit of the number, by the
-ratio of the draw to the first entry. If all entries are equal, the draw is their common value. With
-``independent = true`` every entry has its own draw. Each contact also begins at a random phase of a control
-period, because the phase changes the restitution and cannot be controlled. Unless the table specifies
-otherwise, the phase is uniform from 0 to 1. With six axes, only the phase of the first touch is drawn, and no
-phase if the file has a ``[start]``.
+If the number is a list, one draw scales all entries: by the drawn factor (``factor``), or by the ratio of the
+drawn value to the first entry. If all entries are equal, all become the drawn value. With ``independent =
+true`` every entry has its own draw. Each contact also begins at a random phase of a control period, because
+the phase changes the restitution and cannot be controlled. Unless the table specifies otherwise, the phase is
+uniform from 0 to 1. With six axes, only the phase of the first touch is drawn, and no phase if the file has a
+``[start]``.
 
 Draw i of a key depends on the seed, on i, on the key's entry in the table, and on the earlier keys in
 ``[correlation]`` (`jaxhil.mechanism.correlation`). The draw does not depend on the number of draws made at

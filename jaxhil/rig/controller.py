@@ -186,7 +186,7 @@ class Controller:
         return contact_record(self._last_count())
 
     def _last_count(self) -> ContactCount:
-        """Return the compensator status of the last audited contact; `reset` does not change it."""
+        """Return the compensator's status in the last audited contact; `reset` keeps this record."""
         return self._watchdog.record
 
     def tare(self, force_measured: float) -> bool:

@@ -1,7 +1,7 @@
-"""Gain documents: reading, check of the form, and the entries that files of one and of six axes share.
+"""Reader and checks of the entries that one-axis and six-axis gain documents share.
 
-The digest is the SHA-256 of the document's canonical JSON without date, timings and digest. A `GainFileError`
-has a message of one line.
+The digest is the SHA-256 of the document's canonical JSON without date, timings and digest. The message of a
+`GainFileError` has one line.
 """
 
 import errno
@@ -31,8 +31,8 @@ def digest(document: Mapping[str, Any]) -> str:
         document: content of a gain file.
 
     Raises:
-        TypeError: if the document has objects that JSON cannot express.
-        ValueError: if the document has numbers that JSON cannot express (NaN, infinity).
+        TypeError: if the document contains objects that JSON cannot express.
+        ValueError: if the document contains numbers that JSON cannot express (NaN, infinity).
 
     Example:
         >>> digest({"schema": "jaxhil/gains/1"}) == digest({"schema": "jaxhil/gains/1", "created": "now"})
@@ -44,7 +44,7 @@ def digest(document: Mapping[str, Any]) -> str:
 
 
 def read_gain_document(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read the JSON object in a gain file. Raise GainFileError if the file has none or is unreadable."""
+    """Return the JSON object in a gain file. Raise GainFileError if the file is unreadable or no object."""
     source = os.fspath(path)
     try:
         mode = os.stat(source).st_mode
@@ -76,7 +76,7 @@ def read_gain_document(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def check_form(document: Mapping[str, Any], source: str) -> None:
-    """Check schema, nesting and digest of a gain document."""
+    """Raise GainFileError if schema, nesting depth or digest of a gain document is wrong."""
     if not isinstance(document, Mapping):
         raise make_gain_file_error(source, "", format_value(document), f"a JSON object, {SCHEMA}")
     schema = read_entry(document, "schema", source, "")
@@ -88,14 +88,16 @@ def check_form(document: Mapping[str, Any], source: str) -> None:
     try:
         actual = digest(document)
     except (TypeError, ValueError, RecursionError) as error:
-        raise make_gain_file_error(source, "", f"a value not of JSON ({error})", "JSON values") from None
+        raise make_gain_file_error(
+            source, "", f"a value that JSON cannot express ({error})", "JSON values"
+        ) from None
     if stated != actual:
         allowed = f"'{actual}', the digest of its content (was it edited?)"
         raise make_gain_file_error(source, "sha256", format_value(stated, 80), allowed)
 
 
 def read_control_period(document: Mapping[str, Any], source: str) -> float:
-    """Return the control period [s], which must be that of the document's mechanism."""
+    """Return the control period [s]. Raise GainFileError if it differs from the period in `mechanism`."""
     period = read_number(read_entry(document, "control_period", source, ""), "control_period", source)
     check_within(period, *CONTROL_PERIODS, "control_period", source)
     mechanism = read_object(document, "mechanism", source, "")
@@ -110,7 +112,7 @@ def read_control_period(document: Mapping[str, Any], source: str) -> float:
 def read_gains(
     document: Mapping[str, Any], law: str, specifications: Mapping[str, GainSpecification], source: str
 ) -> dict[str, float]:
-    """Return the gains of a document by name, within their bounds."""
+    """Return the gains of a document by name. Raise GainFileError if one is missing or out of bounds."""
     entries = read_object(document, "gains", source, "")
     for name in entries:
         if name not in specifications:
@@ -142,13 +144,13 @@ def read_limits(
     table: Mapping[str, Limit],
     complete: Callable[[Mapping[str, float]], dict[str, float]],
 ) -> dict[str, float]:
-    """Return the limits of a gain document, defaults included.
+    """Check and return the limits of a gain document, including defaults.
 
     Args:
         document: content of a gain file.
         source: name of the document in error messages.
         table: all limits by name.
-        complete: function that adds the defaults, and raises ValueError if two limits contradict each other.
+        complete: function that adds the defaults. It raises ValueError if two limits contradict each other.
     """
     limits = {}
     entries = read_object(document, "limits", source, "") if "limits" in document else {}
@@ -176,14 +178,14 @@ def read_limits(
 
 
 def read_entry(mapping: Mapping[str, Any], key: str, source: str, prefix: str) -> Any:
-    """Return an entry of an object. Raise GainFileError if there is none."""
+    """Return the entry `key` of an object. Raise GainFileError if it is missing."""
     if key not in mapping:
         raise make_gain_file_error(source, prefix + key, "nothing", "a value")
     return mapping[key]
 
 
 def read_object(mapping: Mapping[str, Any], key: str, source: str, prefix: str) -> Mapping[str, Any]:
-    """Return an entry that must be an object."""
+    """Return the entry `key`. Raise GainFileError if it is missing or not a JSON object."""
     value = read_entry(mapping, key, source, prefix)
     if not isinstance(value, Mapping):
         raise make_gain_file_error(source, prefix + key, format_value(value), "an object")
@@ -191,8 +193,8 @@ def read_object(mapping: Mapping[str, Any], key: str, source: str, prefix: str) 
 
 
 def read_number(value: object, key: str, source: str) -> float:
-    """Return a value as a finite number."""
-    # bool is an int to Python, and an integer of JSON may be too large for a float.
+    """Convert a value to a float. Raise GainFileError if it is not a finite number."""
+    # In Python, bool is a subclass of int; a JSON integer may be too large for a float.
     if not isinstance(value, bool) and isinstance(value, (int, float)):
         try:
             number = float(value)
@@ -225,7 +227,7 @@ def _is_shallow(document: Mapping[str, Any]) -> bool:
 
 
 def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a number of JSON")
+    raise ValueError(f"{name} is not a JSON number")
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -111,7 +111,7 @@ def jax_context() -> Iterator[None]:
 
 
 def start_jax() -> None:
-    """Start JAX with the environment variables of `build_jax_variables`, unless it runs already.
+    """Start JAX with the environment variables of `build_jax_variables`, unless it is already running.
 
     The caller's environment variables are restored afterwards.
 

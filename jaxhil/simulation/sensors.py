@@ -145,8 +145,9 @@ def _bound_above_zero(time_constant):
 def _lag_response(span):
     """Return three response factors of a first-order lag after `span` time constants.
 
-    Let s be the time in time constants. The first factor multiplies the initial output. The second is 1 minus
-    the output for the input s/span. The third is the output for the input 4 s/span (1 - s/span).
+    The time s from 0 to `span` is in units of the time constant. The first factor is the final output for
+    initial output 1 and input 0. The other factors have initial output 0: the second is 1 minus the final
+    output for the ramp s/span, the third the final output for the parabola 4 s/span (1 - s/span).
     """
     decay = jnp.exp(-span)
     positive = jnp.where(span > 0, span, 1)

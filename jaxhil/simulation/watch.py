@@ -225,7 +225,7 @@ def _peak_force(loop, watch, plant_signals, force):
 
 
 def _largest_shortfall(watch, shortfall, lasts):
-    """Return the largest shortfall of the position command so far [m]; None without limits."""
+    """Update the position command's largest shortfall [m] where the contact `lasts`; None without limits."""
     if watch.shortfall is None or shortfall is None:
         return watch.shortfall
     return jnp.where(lasts, jnp.maximum(watch.shortfall, shortfall), watch.shortfall)

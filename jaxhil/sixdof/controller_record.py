@@ -1,4 +1,4 @@
-"""Record of the readings and commands of a six-axis controller, tick by tick, as NumPy arrays."""
+"""Records of a six-axis compensator's readings and commands on every tick, as NumPy arrays."""
 
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -13,16 +13,16 @@ from jaxhil.sixdof.loop import Loop, controller_constants, run
 from jaxhil.sixdof.metrics import Metrics, evaluate
 from jaxhil.sixdof.scenario import Scenario
 
-LEAST_TICKS = 256  # least length of a program; lengths are powers of two, so that most runs share one
+LEAST_TICKS = 256  # minimum number of ticks of a program, a power of two, so that most runs share a program
 
 
 class ControllerRecord(NamedTuple):
-    """Readings and commands of the compensator in one lane; arrays have the shape (ticks, 6)."""
+    """Readings and commands of the compensator in one run; arrays have the shape (ticks, 6)."""
 
-    wrench: np.ndarray  # measured, about T's origin [N, N m]
-    pose_desired: np.ndarray  # coordinates of the numerical model [m, rad]
+    wrench: np.ndarray  # measured wrench, about T's origin [N, N m]
+    pose_desired: np.ndarray  # pose of the numerical model [m, rad]
     twist_desired: np.ndarray  # twist of the numerical model [m/s, rad/s]
-    pose_measured: np.ndarray  # coordinates of the hardware [m, rad]
+    pose_measured: np.ndarray  # measured pose of the hardware [m, rad]
     command: np.ndarray  # wrench on the numerical model about T's origin [N, N m]
     sent: np.ndarray  # pose command after the tick [m, rad]
 
@@ -30,9 +30,9 @@ class ControllerRecord(NamedTuple):
 def record_controller(
     loop: Loop, gains: dict[str, Any], scenario: Scenario
 ) -> tuple[Metrics, list[ControllerRecord]]:
-    """Return the metrics of all lanes, and the record of each lane until its run ends.
+    """Return the metrics of all lanes (runs), and the record of each lane until its run ends.
 
-    `loop` must measure the pose.
+    `loop.measures_pose` must be true.
     """
     program = _compiled()
     metrics, final = jax.device_get(program.evaluate(loop, gains, scenario))
@@ -47,7 +47,7 @@ def record_controller(
 
 @partial(jax.jit, static_argnums=0)
 def known_constants(loop: Loop, scenario: Scenario) -> SixAxisConstants:
-    """Return what the compensator knows of the rig, (*matrix, lanes)."""
+    """Return the constants of the rig that the compensator knows; the last dimension is the lane."""
     return controller_constants(scenario, loop.side == "moving")
 
 
@@ -68,7 +68,7 @@ def _compiled() -> _Programs:
 
 
 def _evaluate(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Metrics, Any]:
-    """Return metrics, and the durations of the runs [s], (lanes,)."""
+    """Return the metrics and the durations [s] of the runs, (lanes,) each."""
     result = evaluate(loop, gains, scenario)
     return result.metrics, result.final_time
 

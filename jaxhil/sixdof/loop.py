@@ -4,8 +4,8 @@ A tick has four steps. The sensors read the delayed wrench of the real contact a
 The compensator computes the wrench command. The numerical model integrates the motion of both bodies under
 this wrench. The motion simulator receives the relative pose of the bodies as its command.
 
-The contact wrench is computed at the hardware's pose, in target frame T and about the origin of T. It acts on
-the numerical model at the origin of the model's frame T.
+The contact wrench is computed at the hardware's pose, in the axes of target frame T and about T's origin. It
+acts on the numerical model at the origin of the model's frame T.
 """
 
 from typing import Any, NamedTuple
@@ -60,7 +60,7 @@ SETTLING_TICKS = 256
 
 
 class Loop(eqx.Module):
-    """Structure of the loop, which determines the compiled program; all fields are static."""
+    """Structure of the loop: static fields, for each combination of which a program is compiled."""
 
     integrator: str = eqx.field(static=True)  # integrator of the numerical model, a name of `SHARES`
     hold: str = eqx.field(static=True)  # hold of the command within a period, "linear" or "zoh"
@@ -148,7 +148,7 @@ class Sensed(NamedTuple):
 
 
 def build_loop(scenario: Scenario, **static: Any) -> Loop:
-    """Build the loop for a batch of scenarios; `static` contains fields that do not follow from scenarios."""
+    """Build the loop for a batch of scenarios; `static` sets the fields that scenarios do not determine."""
     sensor, period = scenario.sensor, np.asarray(scenario.control_period)
     errors = sensor.errors
     slowest = np.maximum(sensor.delay, sensor.position_delay)[None] + np.asarray(scenario.simulator.delay)
@@ -201,9 +201,9 @@ def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
 
 
 def begin(loop: Loop, rig: Rig, states: States) -> RunState:
-    """Return the state of the loop before tick 0, at which the bodies have the given states.
+    """Return the state of the loop before tick 0, from the states of the bodies at tick 0.
 
-    Before tick 0, the pose command moves uniformly with the relative rates of these states.
+    Before tick 0, the pose command is assumed to move uniformly with the bodies' relative rates.
     """
     law = SIX_AXIS_COMPENSATORS[loop.compensator]
     position, rates, twist = model_motion(rig.bodies, states)
@@ -244,7 +244,7 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
 
 
 def run(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[RunState, Tick]:
-    """Run a batch of scenarios for `ticks` ticks; return the final state and the records, (ticks, ...)."""
+    """Run a batch of scenarios for `ticks` ticks; return final state and records, each (ticks, ...)."""
     rig = build_rig(loop, gains, scenario)
     state = begin(loop, rig, scenario.start)
     return lax.scan(lambda state, _: tick(loop, rig, state), state, None, length=ticks)
@@ -301,7 +301,7 @@ def sense(loop: Loop, rig: Rig, state: RunState) -> Sensed:
 
 
 def integrate(loop: Loop, rig: Rig, state: RunState, command: Wrench) -> tuple[States, Array, Array, Array]:
-    """Return the numerical model's next states, their coordinates with rates, and twist (6, *batch)."""
+    """Return the numerical model's next states, coordinates, coordinate rates and twist, (6, *batch) each."""
     states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
     return states, *model_motion(rig.bodies, states)
 
@@ -314,14 +314,14 @@ def actuated(
     model: tuple[States, Array, Array],
     sent: Float[Array, "6 *batch"],
 ) -> RunState:
-    """Return the state after a tick, with the compensator's old state.
+    """Return the state after a tick; only the compensator's state is still the old one.
 
     Args:
         loop: structure of the loop.
         rig: constants of the run.
         state: state before the tick.
         sensed: real contact and readings of the tick.
-        model: next states of the numerical model, their coordinates and twist.
+        model: next states, coordinates and twist of the numerical model.
         sent: pose command [m, rad].
     """
     states, position, twist = model
@@ -369,7 +369,7 @@ def controller_constants(scenario: Scenario, has_tool: bool) -> SixAxisConstants
 
 
 def _measured_pose(loop: Loop, rig: Rig, state: RunState, measured: Array) -> Array:
-    """Convert the measured axis positions to the measured coordinates, with noise and quantum."""
+    """Convert the measured axis positions to measured coordinates, including noise and rounding."""
     still = Motion(measured, jnp.zeros_like(measured), None)
     position = rig.kinematics.coordinates(still, state.near).position
     if not loop.has_pose_errors:

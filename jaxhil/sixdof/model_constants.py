@@ -1,4 +1,4 @@
-"""Constants of the numerical model and of the rig that a gain file in six axes contains."""
+"""Constants of the numerical model and the rig that a six-axis gain file contains."""
 
 from typing import Any
 
@@ -14,10 +14,10 @@ from jaxhil.sixdof.controller_record import known_constants
 
 
 def model_constants(mechanism: SixAxisMechanism) -> dict[str, Any]:
-    """Return the constants of a nominal mechanism by name, as JSON data: `ModelConstants`."""
+    """Return the `ModelConstants` of a nominal mechanism by name, as JSON data."""
     with jax_context():
         scenario = build_scenarios(mechanism)
-        # The delay line of a compensator that reads the pose bounds the delay.
+        # The delay line of a compensator that reads the pose limits the delay.
         loop = loop_of(mechanism, "impulse_ledger", scenario)
         constants = jax.device_get(known_constants(loop, scenario))
     mass, inverse, correction = (

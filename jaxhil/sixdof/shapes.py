@@ -161,7 +161,7 @@ class Capsule(Shape):
         return self.start + s * (self.end - self.start)
 
     def nearest(self, point: Vector) -> Float[Array, "..."]:
-        """Return the segment's nearest point to `point` [m], as a fraction of the segment's length."""
+        """Return where the segment is nearest to `point` [m], as a fraction of its length from its start."""
         along = self.end - self.start
         square = dot(along, along)
         return jnp.clip(dot(along, point - self.start) / jnp.where(square > 0, square, 1), 0, 1)

@@ -235,7 +235,7 @@ def _calibrate_limits(
 def _calibrate_six_axes(
     loaded, sweep: Any, replaced: dict[str, float | None], allowed: tuple[float, float], progress: bool
 ):
-    """Compute the limits in six axes, as `_calibrate_limits` does on one axis."""
+    """Compute the watchdog's limits and alarm rates on six axes, like `_calibrate_limits` on one axis."""
     from tuning.watchdog.six_axes import SIX_AXIS_DRAWS, calibrate_six_axes
     from tuning.watchdog.verdict import AllowedAlarmRates
 
@@ -247,7 +247,7 @@ def _calibrate_six_axes(
 
 
 def _check_limit_names(limits: Mapping[str, Any], axes: int) -> None:
-    """Raise `InputError` if one of the limits is not a limit for so many axes."""
+    """Raise `InputError` if a limit does not exist for a controller with this number of axes."""
     from tuning.bundle.controller_kind import kind_of
 
     table = kind_of({"axes": axes}).limits

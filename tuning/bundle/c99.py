@@ -235,7 +235,7 @@ def _generate_code(law: str, class_: type[Any], axes: int) -> tuple[str, str]:
 
 
 def _program(class_: type[Any], kind: ControllerKind, functions: Mapping[str, Any]) -> CProgram:
-    """Return the empty C program of a controller with a compensator's class."""
+    """Return a C program, still without functions, for a controller with a compensator's class."""
     enumerators = {fault.name.upper(): fault.bit for fault in kind.faults} | {"UNUSABLE": UNUSABLE}
     enumerators |= {status.name.upper(): status.number for status in STATUSES}
     return CProgram(
@@ -259,7 +259,7 @@ def _initialisation(
     Args:
         kind: kind of controller.
         law_fails: whether the compensator's constructor has an error flag.
-        guard_fails: likewise for the controller's guards.
+        guard_fails: whether the constructor of the controller's guards has an error flag.
         has_status: whether the compensator has a status.
     """
     is_one_axis = kind is ONE_AXIS

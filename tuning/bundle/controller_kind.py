@@ -1,4 +1,4 @@
-"""The rig's controllers of one axis and of six: what exports need to know of each."""
+"""Descriptions of the rig's one-axis and six-axis controllers, which exports use."""
 
 from collections.abc import Callable, Mapping
 from types import ModuleType
@@ -21,22 +21,22 @@ from jaxhil.rig.six_axes.registry import SIX_AXIS_COMPENSATORS, ModelConstants, 
 
 
 class ControllerKind(NamedTuple):
-    """Controller of the rig with its compensators, tables, and the names of its methods in C."""
+    """Kind of controller: its classes, compensators, tables, and the names of its methods in C."""
 
     axes: int  # number of axes of motion
-    package: ModuleType  # package whose public names a bundle's controller has
+    package: ModuleType  # package whose public names the bundle's Python module exports
     controller: type  # class of the controller
     compensators: Mapping[str, type[Any]]  # classes of the compensators by name
-    table: str  # name of this table in the package's module `registry`
+    table: str  # name of `compensators` in the package's module `registry`
     protocol: type  # protocol of the compensators
-    constants: type | None  # class of the constants of the numerical model; None without any
+    constants: type | None  # class of the numerical model's constants; None if there are none
     check_document: Callable[..., Any]  # function that checks a gain document and returns its content
     limits: Mapping[str, Limit]
-    ranges: tuple[tuple[str, str], ...]  # pairs of limits of which the first is below the second
-    order: tuple[tuple[str, str], ...]  # pairs of limits of which the first is not above the second
+    ranges: tuple[tuple[str, str], ...]  # pairs of limits of which the first must be below the second
+    order: tuple[tuple[str, str], ...]  # pairs of limits of which the first must not be above the second
     faults: tuple[Fault, ...]
-    methods: Mapping[str, str]  # names in C of the controller's methods and properties, in order
-    c_names: Mapping[type, str]  # names of classes in C where they differ from Python's
+    methods: Mapping[str, str]  # name in C of each method or property of the controller, in C's order
+    c_names: Mapping[type, str]  # name in C of each class whose name differs in Python
     test_program: str  # file of the test program in C
 
 

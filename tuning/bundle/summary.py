@@ -92,7 +92,7 @@ def describe_mechanism(mechanism: Mapping[str, Any], axes: int = 1) -> str:
 
 
 def _describe_six_axes(mechanism: Mapping[str, Any]) -> str:
-    """Return a sentence that describes a mechanism and its rig in six axes."""
+    """Return a sentence that describes a six-axis mechanism and its rig."""
     rig = mechanism["rig"]
     delays = _format_list((1e3 * delay for delay in _flatten([rig["simulator"].get("delay", 0.0)])), 6)
     approach = mechanism.get("approach")
@@ -111,7 +111,7 @@ def _describe_six_axes(mechanism: Mapping[str, Any]) -> str:
 
 
 def _error_table(document: Mapping[str, Any], key: str, title: str) -> Iterator[str]:
-    """Yield the HTML lines of the table of errors in fresh scenarios with a key of the figures."""
+    """Yield the HTML lines of the table of errors in fresh scenarios, with a legend of its numbers."""
     robust = document["figures"].get(key)
     rows = []
     for name, errors in robust.items() if isinstance(robust, Mapping) else ():
@@ -255,7 +255,7 @@ def _html_table(
 ) -> Iterator[str]:
     """Yield the lines of an HTML table; `numbers` are the indices of the right-aligned columns.
 
-    By default, all columns but the first and the unit are right-aligned.
+    By default, all columns except the first column and the column "unit" are right-aligned.
     """
     right = set(range(1, len(heads)) if numbers is None else numbers)
     if numbers is None and "unit" in heads:

@@ -1,7 +1,7 @@
-"""Test vectors of a bundle in six axes: recorded and damaged ticks, with the controller's commands.
+"""Test vectors of a six-axis bundle: recorded and corrupted inputs, with the controller's commands.
 
-The recorded runs are the nominal run and draws of the uncertain values. The motion of the numerical model
-after a tick is that of the record, whose commands the controller must reproduce.
+The recorded runs are the nominal run, and runs with drawn uncertain values. The motion of the numerical model
+is taken from the record, whose commands the controller must reproduce.
 """
 
 import random
@@ -30,23 +30,23 @@ from tuning.bundle.vectors import (
 )
 from tuning.verification.six_axis_replay import SIX_AXIS_REPLAY_LIMIT, command_difference, record_runs
 
-MAX_SIX_AXIS_TICKS = 800  # largest number of ticks of a recorded run, to limit the size of a bundle
+MAX_SIX_AXIS_TICKS = 800  # maximum number of ticks of a recorded run; limits the size of a bundle
 NAN_VECTOR = [nan] * 6
 
 
 class SixAxisInputs(NamedTuple):
-    """Inputs of the controller in one tick, and the command of the simulation."""
+    """Inputs of the controller in one tick, and the simulated command."""
 
     run: int  # number of the run
     event: int  # `RUN_START`, `NEXT_CONTACT`, or 0
     wrench: list[float]  # measured wrench [N, N m]
     pose_desired: list[float]  # pose of the numerical model [m, rad]
-    twist_desired: list[float]  # its twist [m/s, rad/s]
+    twist_desired: list[float]  # twist of the numerical model [m/s, rad/s]
     pose_measured: list[float]  # measured pose [m, rad]
-    time: float | None  # time of the rig's clock [s]; None without a clock
+    time: float | None  # time of the tick by the rig's clock [s]; None without a clock
     pose: list[float]  # pose of the numerical model after the tick [m, rad]
-    twist: list[float]  # its twist after the tick [m/s, rad/s]
-    simulated: list[float] = NAN_VECTOR  # wrench command in the simulation [N, N m]; NaN if not comparable
+    twist: list[float]  # twist of the numerical model after the tick [m/s, rad/s]
+    simulated: list[float] = NAN_VECTOR  # simulated wrench command [N, N m]; NaN if it cannot be compared
 
 
 class SixAxisRow(NamedTuple):
@@ -56,7 +56,7 @@ class SixAxisRow(NamedTuple):
     wrench_command: list[float]  # [N, N m]
     pose_command: list[float]  # [m, rad]
     faults: int  # bits of the controller's faults
-    acting: int  # bits of the faults that change a command
+    acting: int  # bits of those faults that change a command
 
     @property
     def run(self) -> int:
@@ -64,7 +64,7 @@ class SixAxisRow(NamedTuple):
         return self.inputs.run
 
     def fields(self) -> list[float | None]:
-        """Return the fields of the row in the file."""
+        """Return the row's fields in the order of the file's columns."""
         inputs = self.inputs
         before = [*inputs.wrench, *inputs.pose_desired, *inputs.twist_desired, *inputs.pose_measured]
         after = [*inputs.pose, *inputs.twist, *self.wrench_command, *self.pose_command]
@@ -72,7 +72,7 @@ class SixAxisRow(NamedTuple):
 
 
 def make_six_axis_vectors(loaded: LoadedGains, seed: int, draws: int = DEFAULT_DRAWS) -> RecordedVectors:
-    """Return the test vectors of a bundle: first the recorded runs, then the damaged runs."""
+    """Return the test vectors of a bundle: first the recorded runs, then runs with corrupted inputs."""
     gain_file = check_six_axis_document(loaded.document)
     subject = loaded.mechanism, loaded.compensator, loaded.gains
     records = [*record_runs(*subject, 0, seed)[1], *record_runs(*subject, draws, seed)[1]]
@@ -91,7 +91,7 @@ def make_six_axis_vectors(loaded: LoadedGains, seed: int, draws: int = DEFAULT_D
 
 
 def record_inputs(run: int, record: ControllerRecord, period: float) -> Iterator[SixAxisInputs]:
-    """Yield the controller's inputs in each tick of a recorded run but the last."""
+    """Yield the controller's inputs in each tick of a recorded run except the last tick."""
     columns = [column[: MAX_SIX_AXIS_TICKS + 1].tolist() for column in record[:5]]
     wrench, desired, twist, measured, command = columns
     for tick in range(len(wrench) - 1):
@@ -110,7 +110,7 @@ def record_inputs(run: int, record: ControllerRecord, period: float) -> Iterator
 
 
 def run_controller(gain_file: SixAxisGainFile, inputs: Sequence[SixAxisInputs]) -> list[SixAxisRow]:
-    """Run a new controller over the inputs; return the rows of the test vectors."""
+    """Run a new controller with these inputs; return the rows of the test vectors."""
     controller, rows = Controller6(gain_file), []
     for reading in inputs:
         if reading.event == NEXT_CONTACT:
@@ -125,10 +125,11 @@ def run_controller(gain_file: SixAxisGainFile, inputs: Sequence[SixAxisInputs]) 
 def compare_with_record(
     rows: list[SixAxisRow], record: ControllerRecord
 ) -> tuple[list[SixAxisRow], str | None, str | None]:
-    """Compare the controller's commands with the recorded ones until a fault changes a command.
+    """Compare controller and record, up to the first fault that changes a command.
 
-    Return the rows with the simulated wrenches up to there, the reason for an early end or None, and a
-    description of the first difference or None.
+    Returns:
+        The rows (without simulated wrenches after the first such fault or difference), a description of this
+        fault or None, and a description of the first difference or None.
     """
     acting = [tick for tick, row in enumerate(rows) if row.acting]
     end, end_reason = len(rows), None
@@ -165,7 +166,7 @@ def format_six_axis_csv(rows: Sequence[SixAxisRow]) -> str:
 def _damaged_runs(
     nominal: Sequence[SixAxisInputs], period: float, first: int, seed: int
 ) -> Iterator[list[SixAxisInputs]]:
-    """Yield damaged runs: random segments of the nominal run with random damage of the inputs."""
+    """Yield the inputs of runs that are random segments of the nominal run, randomly corrupted."""
     source = random.Random(seed)
     for run in range(first, first + DAMAGED_RUNS):
         begin = source.randrange(max(1, len(nominal) - DAMAGED_RUN_TICKS))
@@ -176,7 +177,7 @@ def _damaged_runs(
 def _damaged(
     source: random.Random, run: int, segment: Sequence[SixAxisInputs], period: float
 ) -> Iterator[SixAxisInputs]:
-    """Yield the controller's inputs in each tick of a segment, with random damage."""
+    """Yield the controller's inputs in each tick of a segment, randomly corrupted."""
     timed, time = source.random() < 0.8, source.uniform(0.0, 1e3)
     for tick, inputs in enumerate(segment):
         event = RUN_START if tick == 0 else NEXT_CONTACT if source.random() < DAMAGED_TICK_SHARE / 4 else 0

@@ -117,7 +117,7 @@ class Objective:
 
     @property
     def weights(self) -> "ObjectiveWeights":
-        """Return all weights as scalar arrays, with the penalties' weights converted to errors [1]."""
+        """Return all weights as scalar arrays; weighted penalties then have the unit of the error [1]."""
         numbers = [float(getattr(self, name)) * self.unit(name) for name in WEIGHT_FIELDS]
         return ObjectiveWeights(
             *map(jnp.asarray, numbers), tolerance=jnp.asarray(float(self.tolerance or 0.0))

@@ -63,7 +63,7 @@ class ParetoPoint(NamedTuple):
 
     @property
     def place(self) -> tuple[float, float]:
-        """Return error and cost [1], rounded to `TABLE_DIGITS` significant digits."""
+        """Return the error and cost [1] as they appear in tables, with `TABLE_DIGITS` significant digits."""
         return float(f"{self.error:.{TABLE_DIGITS}g}"), float(f"{self.cost:.{TABLE_DIGITS}g}")
 
 

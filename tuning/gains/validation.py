@@ -266,7 +266,7 @@ def build_validation(
 
 
 def count_evaluated_runs(scenarios: int, probed: bool) -> int:
-    """Return the number of runs that evaluate one set of gains: scenarios, probes and the nominal run."""
+    """Return the number of runs for one set of gains: scenarios, their probes if `probed`, nominal run."""
     return scenarios * (LANES_PER_SCENARIO if probed else 1) + 1
 
 

@@ -144,7 +144,7 @@ class ContactProblem:
     def fit_surfaces(
         self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None = None
     ) -> list[CoefficientFit]:
-        """Fit the coefficients at several surface positions [m], without derivatives."""
+        """Fit the coefficients for each surface position `planes` [m]; compute no derivatives of the fits."""
         return self._make_fits(self._fit_until_consistent(delay, planes, pseudo)[2])
 
     def _fit_until_consistent(self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None):

@@ -110,7 +110,7 @@ class SummarisedProblem(ContactProblem):
     def fit_surfaces(
         self, delay: float, planes: np.ndarray, pseudo: PseudoRows | None = None
     ) -> list[CoefficientFit]:
-        """Fit the coefficients at several surface positions [m], without derivatives."""
+        """Fit the coefficients for each surface position `planes` [m]; compute no derivatives of the fits."""
         table = self._find_table(delay, planes)
         if table is not None and pseudo is None:
             fits = self.others.fit_surfaces(delay, planes, table.rows(delay, planes))

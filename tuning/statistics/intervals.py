@@ -159,9 +159,9 @@ def estimate_deciding_scenarios(
 ) -> int | None:
     """Estimate how many scenarios are needed to decide whether the failure probability is at most `allowed`.
 
-    With this number, `binomial_interval` lies entirely below or above `allowed`, if the fraction of failures
-    remains failures / number (0 without scenarios). Return None if a billion scenarios are not enough. Raise
-    ValueError unless 0 <= failures <= number and 0 < level < 1.
+    The fraction of failures is assumed to stay failures / number, or 0 if `number` is 0. With the estimated
+    number of scenarios, `binomial_interval` lies entirely below or entirely above `allowed`. Return None if a
+    billion scenarios are not enough. Raise ValueError unless 0 <= failures <= number and 0 < level < 1.
     """
     _check_counts(failures, number, level)
     share = failures / number if number else 0.0

@@ -240,7 +240,7 @@ def _run_chains(
     """Run the Markov chains of the next level, which stay above the threshold of their replicate.
 
     The step size sigma of a replicate is adapted to the acceptance rate of its chains, as in Papaioannou et
-    al. 2015. The chains of replicates that have ended also run, but have no effect.
+    al. 2015. Replicates that have ended are computed with the others, but their results are not used.
     """
     steps, replicates, _, inputs = state.points.shape
     seeds = np.stack([_choose_chain_starts(state.values[:, r], threshold[r], rng) for r in range(replicates)])

@@ -65,10 +65,10 @@ LOCAL_RUN = PointRunSettings()
 def run_points(
     sweep: SweepProgram, points: np.ndarray, noise: np.ndarray, running: PointRunSettings = LOCAL_RUN
 ) -> Rows:
-    """Run one scenario for each point (number, inputs) of the unit cube; return the columns `POINT_COLUMNS`.
+    """Run one scenario for each point of the unit cube; return the columns `POINT_COLUMNS`.
 
-    `noise` (number,) holds the index of each scenario's noise realisation. The division into batches does not
-    affect the result.
+    `points` has the shape (scenarios, inputs); `noise` has each scenario's index of the noise realisation.
+    The division into batches does not affect the result.
     """
     number, label = len(points), sweep.manifest.sha256
     size = min(sweep.manifest.chunk, max(MIN_POINTS_PER_BATCH, -(-number // running.max_batches)))

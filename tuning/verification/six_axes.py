@@ -1,9 +1,10 @@
-"""Verification that the rig's controller in six axes behaves like the simulation.
+"""Verification that the rig's six-axis controller behaves like the simulation.
 
-Two comparisons use the gains of a gain file. *Replay*: recorded runs are replayed through the rig's
-compensator without limits; its commands must be the recorded ones. *Closed loop*: JAX simulates sensors,
-motion simulator, contact and numerical model of the nominal run, and the controller with the file's limits
-computes the commands; the final twist must be the simulated one.
+There are two comparisons, both with the gains of a gain file. *Replay*: recorded runs are replayed through
+the rig's controller without limits; its commands must equal the recorded commands within a tolerance.
+*Closed loop*: JAX simulates sensors, motion simulator, contact and numerical model of the nominal run, and
+the controller with the file's limits computes the commands; the final twist must equal that of the simulation
+with the JAX compensator within a tolerance.
 """
 
 from collections.abc import Callable, Iterator
@@ -44,21 +45,21 @@ from tuning.verification.six_axis_replay import (
     six_axis_loop,
 )
 
-SIX_AXIS_CLOSED_LOOP_LIMIT = 1e-8  # largest difference of the final twist, over its largest entry [1]
+SIX_AXIS_CLOSED_LOOP_LIMIT = 1e-8  # maximum accepted difference of the final twist, as in `FinalTwist` [1]
 
 
 class FinalTwist(msgspec.Struct, frozen=True):
     """Twist of the numerical model at the end of the nominal run."""
 
-    found: list[float]  # with the rig's controller in the loop [m/s, rad/s]
-    simulated: list[float]  # with the JAX compensator [m/s, rad/s]
-    difference: float  # largest difference, over the largest translation or rotation [1]
+    found: list[float]  # result with the rig's controller in the loop [m/s, rad/s]
+    simulated: list[float]  # result with the JAX compensator [m/s, rad/s]
+    difference: float  # largest difference, divided by the largest (angular) velocity [1]
     ticks: int  # number of ticks
-    status: str  # status of the controller at the end
+    status: str  # status of the controller at the end of the run
 
 
 class SixAxisVerification(msgspec.Struct, frozen=True):
-    """Verdict of a verification in six axes, with all comparisons."""
+    """Verdict and comparisons of a six-axis verification."""
 
     verdict: bool  # whether controller and simulation agree in all comparisons
     reasons: tuple[str, ...]  # reasons for a negative verdict; empty if it is positive
@@ -91,7 +92,7 @@ def verify_six_axes(
     if scenarios > 1:
         records += record_runs(*subject, scenarios - 1, seed)[1]
     progress(f"replaying {sum(len(record.command) for record in records)} ticks through the runtime")
-    # The replay compares the compensators alone: the limits may rightly stop some draws.
+    # The replay compares only the compensators, because the limits may stop some draws for good reasons.
     free = gain_file._replace(limits=NO_SIX_AXIS_LIMITS)
     replays = tuple(compare_record(Controller6(free), record) for record in records)
     progress("running the nominal contacts with the runtime in the loop")
@@ -111,7 +112,7 @@ def verify_six_axes(
 def run_six_axis_loop(
     loaded: LoadedGains, gain_file: SixAxisGainFile, ticks: int, seed: int = 0
 ) -> FinalTwist:
-    """Run the nominal scenario for some ticks with the rig's controller, and with the JAX compensator."""
+    """Run `ticks` ticks of the nominal scenario with the rig's controller and with the JAX compensator."""
     scenario = draw_scenarios(loaded.mechanism, 0, seed)
     loop = six_axis_loop(loaded.mechanism, loaded.compensator, scenario)
     gains = {name: jnp.asarray(value) for name, value in loaded.gains.items()}
@@ -150,31 +151,31 @@ def _start(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Rig, 
 
 @partial(jax.jit, static_argnums=0)
 def _sense(loop: Loop, rig: Rig, state: RunState) -> Sensed:
-    """Return contact and readings of a tick."""
+    """Return the real contact and the sensor readings of a tick."""
     return sense(loop, rig, state)
 
 
 @partial(jax.jit, static_argnums=0)
 def _integrate(loop: Loop, rig: Rig, state: RunState, command: Any) -> tuple[Any, ...]:
-    """Return the numerical model after a tick under a wrench, (6, lanes)."""
+    """Return the numerical model after a tick with the wrench `command` (6, lanes)."""
     return integrate(loop, rig, state, Wrench(vector(command[:3]), vector(command[3:])))
 
 
 @partial(jax.jit, static_argnums=0)
 def _advance(loop: Loop, rig: Rig, state: RunState, sensed: Sensed, model: Any, sent: Any) -> RunState:
-    """Return the state after a tick with a pose command, (6, lanes)."""
+    """Return the state of the loop after a tick with the pose command `sent` (6, lanes)."""
     return actuated(loop, rig, state, sensed, model, sent)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _simulated_twist(loop: Loop, ticks: int, gains: dict[str, Any], scenario: Scenario) -> Any:
-    """Return the twist after some ticks with the JAX compensator, (6, lanes)."""
+    """Return the twist (6, lanes) after `ticks` ticks with the JAX compensator."""
     state, _ = run(loop, gains, scenario, ticks)
     return model_motion(scenario.bodies, state.states)[2]
 
 
 def _replay_reasons(replays: tuple[SixAxisReplay, ...]) -> Iterator[str]:
-    """Yield the reasons for which the replays do not agree with the records."""
+    """Yield a text for each disagreement between replayed and recorded commands."""
     for number, lane in enumerate(replays):
         run = "the nominal run" if number == 0 else f"draw {number}"
         if lane.status != "ok":
@@ -188,7 +189,7 @@ def _replay_reasons(replays: tuple[SixAxisReplay, ...]) -> Iterator[str]:
 
 
 def _closed_loop_reasons(closed: FinalTwist) -> Iterator[str]:
-    """Yield the reasons for which the run with the controller in the loop is not the simulated one."""
+    """Yield a text if the closed-loop run disagrees with the simulation."""
     if closed.status != "ok":
         yield f"closed loop: the controller {closed.status}"
     elif not closed.difference <= SIX_AXIS_CLOSED_LOOP_LIMIT:

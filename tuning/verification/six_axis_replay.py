@@ -1,4 +1,4 @@
-"""Recorded runs of a rig in six axes, and their replay through the rig's controller."""
+"""Recorded runs of a simulated six-axis rig, and their replay through the rig's controller."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -17,11 +17,11 @@ from jaxhil.sixdof.loop import Loop
 from jaxhil.sixdof.metrics import Metrics
 from jaxhil.sixdof.scenario import Scenario
 
-SIX_AXIS_REPLAY_LIMIT = 1e-9  # largest difference of commands, divided by their range [1]
+SIX_AXIS_REPLAY_LIMIT = 1e-9  # maximum accepted difference of commands, divided by their range [1]
 
 
 class SixAxisReplay(msgspec.Struct, frozen=True):
-    """Comparison of one recorded run with its replay in the controller."""
+    """Comparison of one recorded run with its replay through the controller."""
 
     ticks: int  # number of recorded ticks
     difference: float  # largest difference of wrench commands, divided by their range [1]
@@ -31,12 +31,12 @@ class SixAxisReplay(msgspec.Struct, frozen=True):
 
 
 def six_axis_loop(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -> Loop:
-    """Return the loop of scenarios, which measures the pose whatever the compensator reads."""
+    """Return the loop of a batch of scenarios, in which the pose is always measured."""
     return dataclasses.replace(loop_of(mechanism, compensator, scenario), measures_pose=True)
 
 
 def draw_scenarios(mechanism: SixAxisMechanism, number: int, seed: int) -> Scenario:
-    """Return the nominal scenario if `number` is 0, else so many draws with the nominal control period."""
+    """Draw `number` scenarios with the nominal control period; return the nominal scenario for 0."""
     if not number:
         return build_scenarios(mechanism, seed=seed)
     # The gain file fixes the control period.
@@ -47,16 +47,16 @@ def draw_scenarios(mechanism: SixAxisMechanism, number: int, seed: int) -> Scena
 def record_runs(
     mechanism: SixAxisMechanism, compensator: str, gains: Mapping[str, float], number: int, seed: int
 ) -> tuple[Metrics, list[ControllerRecord]]:
-    """Return metrics and records of the nominal run if `number` is 0, else of so many draws."""
+    """Return metrics and records of `number` drawn runs; those of the nominal run for 0."""
     scenario = draw_scenarios(mechanism, number, seed)
     loop = six_axis_loop(mechanism, compensator, scenario)
     return record_controller(loop, {name: jnp.asarray(value) for name, value in gains.items()}, scenario)
 
 
 def replay_record(controller: Controller6, record: ControllerRecord) -> tuple[np.ndarray, np.ndarray]:
-    """Return wrench and pose commands, (ticks, 6), of a controller for the readings of a run.
+    """Return a controller's wrench commands (ticks, 6) and pose commands (ticks - 1, 6) for a recorded run.
 
-    There is one pose command less than ticks, because the record ends before the model's next motion.
+    The last tick has no pose command, because the record lacks the numerical model's motion after it.
     """
     columns = [column.tolist() for column in record[:4]]
     commands, sent = [], []
@@ -68,7 +68,7 @@ def replay_record(controller: Controller6, record: ControllerRecord) -> tuple[np
 
 
 def compare_record(controller: Controller6, record: ControllerRecord) -> SixAxisReplay:
-    """Replay a recorded run; compare the controller's commands with the recorded ones."""
+    """Replay a recorded run; compare the controller's commands with the recorded commands."""
     commands, sent = replay_record(controller, record)
     error = command_difference(commands, record.command)
     worst = int(np.argmax(error))
@@ -82,9 +82,9 @@ def compare_record(controller: Controller6, record: ControllerRecord) -> SixAxis
 
 
 def command_difference(commands: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Return the largest difference of a tick's channels, over the range of their part, (ticks,).
+    """Return the largest difference in each tick, divided by the range of the expected values, (ticks,).
 
-    The parts are force and moment, or translation and rotation.
+    Force and torque (or translation and rotation) have separate ranges.
     """
     worst = np.zeros(len(commands))
     for part in (slice(0, 3), slice(3, 6)):

@@ -36,9 +36,9 @@ class EvaluatedRuns(NamedTuple):
 
 
 def evaluate_runs(chunk: RecordedRuns, rules: AuditRules, free_distance: float) -> EvaluatedRuns:
-    """Compute errors, audits and extreme signals of recorded runs.
+    """Compute the restitution errors, contact audits and extreme signal values of recorded runs.
 
-    `free_distance` [m] is the distance from the surfaces beyond which the mechanism counts as in free flight.
+    Farther than `free_distance` [m] from all surfaces, the mechanism counts as in free flight.
     """
     contacts, slots = chunk.contacts, len(chunk.contacts.status)
     return EvaluatedRuns(

@@ -1,9 +1,9 @@
 """Vectorised audit of recorded contacts, which computes the same values as the watchdog on the rig.
 
-The audit equals `jaxhil.rig.watchdog`, but processes many lanes (recorded runs) at once. An audit consists of
-onset and end of the contact as the rig detects them, approach and rebound speed, the energy-consistency test,
-and estimates of stiffness and damping. The estimates come from least squares of the measured force on the
-delay-aligned measured position and its rate.
+The module computes the audit of `jaxhil.rig.watchdog` for many lanes (recorded runs) at once. An audit
+consists of onset and end of the contact as the rig detects them, approach and rebound speed, the
+energy-consistency test, and estimates of stiffness and damping. The estimates are the least-squares fit of
+the measured force to the delay-aligned measured position and its rate.
 """
 
 from typing import NamedTuple

@@ -1,9 +1,9 @@
-"""Calibration of the limits of a gain file in six axes, and the watchdog's rates of wrong alarms.
+"""Calibration of the limits of a six-axis gain file, and the watchdog's rates of false and missed alarms.
 
-Scenarios are drawn and recorded. A run is good if its contacts end well and its twist error is at most half
-of `ERROR_LIMIT`. A part of the good runs determines the limits: the extreme signals times a margin. The other
-good runs are replayed through the rig's controller with these limits, as they are (false alarms), and with a
-fault (missed alarms).
+Runs of drawn scenarios are recorded. A run is good if its contacts end well and its twist error is at most
+half of `ERROR_LIMIT`. One part of the runs determines the limits: the extreme signals of its good runs times
+a margin. The good runs of the other part are replayed through the rig's controller with these limits: without
+a fault to count false alarms, and with an injected fault to count missed alarms.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,28 +23,32 @@ from tuning.verification.six_axis_replay import record_runs, replay_record
 from tuning.watchdog.calibration import Calibration
 from tuning.watchdog.verdict import DEFAULT_ALLOWED_RATES, AllowedAlarmRates, add_verdict
 
-SIX_AXIS_DRAWS = 512  # enough for a rate of false alarms of 1 % if three quarters of the runs are good
-LANES = 128  # scenarios that are recorded together
-FITTED_SHARE = 4  # one of so many runs determines the limits
-ERROR_LIMIT = 0.1  # twist error of a run that the watchdog should stop [1]
+SIX_AXIS_DRAWS = 512  # number of draws; enough for a false-alarm rate of 1 % if 75 % of the runs are good
+LANES = 128  # number of scenarios that are recorded together
+FITTED_SHARE = 4  # every fourth run determines the limits
+ERROR_LIMIT = 0.1  # maximum twist error [1]; the watchdog should stop a run with a larger error
 MARGIN = 1.5  # limit divided by the extreme signal of good runs [1]
-TICKS_IN_A_ROW = 3.0  # largest number of successive ticks with a bad reading, a miss or a limited rate
+TICKS_IN_A_ROW = 3.0  # maximum number of successive ticks with a bad reading, a missed tick or a limited rate
 TARE_TIME = 0.1  # duration of the tare [s]
-SETTLING = 0.03  # time after the last reading in contact before the audit [s]
-SIGMAS = 12.0  # spread of the readings of a tare, over the noise's standard deviation
-LEAST_RETREAT = 0.005  # length of the way back after a trip, beyond the contact's depth [m]
-LEAST_DISTANCE = 1e-4  # smallest limit of a distance or an angle [m, rad]
-WATCHDOG_LIMITS = {"momentum_error": 0.05, "energy_gain": 0.1, "unpaid_impulse": 0.1}  # least limits [1]
-LAG_RANGE = 0.5, 2.0  # limits of the lag, over the least and the largest of good runs
-WRONG_MASS = 1.2  # mass matrix of the injected fault, over the model's
+SETTLING = 0.03  # time from the last reading in contact to the audit [s]
+SIGMAS = 12.0  # allowed spread of a tare's readings, divided by the noise's standard deviation
+LEAST_RETREAT = 0.005  # retreat's length after a trip, minus the largest distance from the start [m]
+LEAST_DISTANCE = 1e-4  # lower bound of the limits of distances and angles [m, rad]
+WATCHDOG_LIMITS = {
+    "momentum_error": 0.05,
+    "energy_gain": 0.1,
+    "unpaid_impulse": 0.1,
+}  # lower bounds of these limits [1]
+LAG_RANGE = 0.5, 2.0  # lag limits, divided by the smallest and the largest lag in good runs
+WRONG_MASS = 1.2  # mass matrix of the injected fault, divided by the model's mass matrix
 
 
 class DrawnRun(NamedTuple):
-    """Recorded run."""
+    """Recorded run of a drawn scenario."""
 
     record: ControllerRecord
-    error: float  # twist error [1]; NaN if the contact has not ended
-    good: bool  # whether the contacts end well, with a small error
+    error: float  # twist error [1]; NaN if the contacts have not ended
+    good: bool  # whether the contacts end well, with at most half of `ERROR_LIMIT`
 
 
 def calibrate_six_axes(
@@ -55,12 +59,12 @@ def calibrate_six_axes(
     scenarios: int = SIX_AXIS_DRAWS,
     seed: int = 1,
 ) -> Calibration:
-    """Calibrate the limits of a gain file in six axes, and estimate the rates of wrong alarms.
+    """Calibrate the limits of a six-axis gain file, and estimate the rates of false and missed alarms.
 
     Args:
         loaded: gain file.
-        replaced: limits that replace the calibrated limits, also in the estimation of the rates.
-        allowed: largest acceptable alarm rates.
+        replaced: limits that replace calibrated limits, also for the alarm rates; None removes a limit.
+        allowed: maximum acceptable alarm rates.
         progress: callback, called with the number of runs that have been completed since the last call.
         scenarios: number of draws.
         seed: seed of the draws.
@@ -83,7 +87,7 @@ def calibrate_six_axes(
 def _recorded(
     loaded: LoadedGains, scenarios: int, seed: int, progress: Callable[[int], None]
 ) -> list[DrawnRun]:
-    """Record draws of a mechanism's uncertain values."""
+    """Record runs with drawn values of the mechanism's uncertain quantities."""
     runs = []
     for first in range(0, scenarios, LANES):
         number = min(LANES, scenarios - first)
@@ -100,7 +104,7 @@ def _recorded(
 
 
 def signal_limits(records: list[ControllerRecord], period: float, mechanism: Any) -> dict[str, float]:
-    """Return the limits of signals, from the extreme signals of good runs."""
+    """Return the limits of readings, wrench, poses and durations, from the extreme signals of runs."""
     sensor = mechanism.rig.force_sensor
     force, torque = slice(0, 3), slice(3, 6)
     limits = {
@@ -125,7 +129,7 @@ def signal_limits(records: list[ControllerRecord], period: float, mechanism: Any
 
 
 def _motion_limits(records: list[ControllerRecord], period: float) -> dict[str, float]:
-    """Return the limits of measured and commanded poses, and of the way back after a trip."""
+    """Return the limits of measured and commanded poses, and of the retreat after a trip."""
     limits = {}
     for name, column in (("measured", 3), ("command", 5)):
         lowest = np.min([np.min(record[column], axis=0) for record in records], axis=0)
@@ -153,7 +157,7 @@ def _motion_limits(records: list[ControllerRecord], period: float) -> dict[str, 
 
 
 def _stuck_limits(records: list[ControllerRecord]) -> dict[str, float]:
-    """Return the limits of the motion under an unchanged reading."""
+    """Return the limits of the motion during which a reading may stay unchanged."""
     travels, turns, under_force = [0.0], [0.0], [0.0]
     for record in records:
         moved = np.linalg.norm(np.diff(record.pose_measured[:, :3], axis=0), axis=1)
@@ -169,14 +173,14 @@ def _stuck_limits(records: list[ControllerRecord]) -> dict[str, float]:
 
 
 def longest_sum(steps: np.ndarray, still: np.ndarray) -> float:
-    """Return the largest sum of successive steps in which a reading stays `still`."""
+    """Return the largest sum of successive steps during which the reading is `still` (unchanged)."""
     sums = np.cumsum(np.where(still, steps, 0.0))
     last_moved = np.maximum.accumulate(np.where(still, 0.0, sums))
     return float(np.max(sums - last_moved, initial=0.0))
 
 
 def _audit_limits(gain_file: SixAxisGainFile, records: list[ControllerRecord]) -> dict[str, float]:
-    """Return the limits of the audit of contacts, from replays without limits."""
+    """Return the limits of the contact audit, from replays without limits."""
     wide = {**NO_SIX_AXIS_LIMITS, "settling": SETTLING}
     audits, lags = [], []
     for record in records:
@@ -195,7 +199,7 @@ def _audit_limits(gain_file: SixAxisGainFile, records: list[ControllerRecord]) -
 def alarm_rates(
     gain_file: SixAxisGainFile, limits: Mapping[str, float | None], runs: list[DrawnRun]
 ) -> dict[str, Any]:
-    """Return the rates of false and missed alarms in runs with these limits, with 95 % intervals."""
+    """Return the rates of false and missed alarms with these limits, with 95 % confidence intervals."""
     values = {name: value for name, value in limits.items() if value is not None}
     limited = gain_file._replace(limits=complete_six_axis_limits(values))
     good = [run.record for run in runs if run.good]
@@ -207,7 +211,7 @@ def alarm_rates(
     )
     missed = sum(not is_stopped(limited._replace(constants=wrong), record) for record in good)
     mass = {
-        "meaning": "a numerical model of another mass",
+        "meaning": "a numerical model with a wrong mass",
         "unit": "1",
         "size": WRONG_MASS - 1,
         "largest_size": WRONG_MASS - 1,
@@ -225,7 +229,7 @@ def alarm_rates(
 
 
 def is_stopped(gain_file: SixAxisGainFile, record: ControllerRecord) -> bool:
-    """Return whether the controller trips in a recorded run, or at the audit after it."""
+    """Return whether the controller trips in a recorded run, or at the audit after the run."""
     controller = Controller6(gain_file)
     replay_record(controller, record)
     controller.next_contact()
@@ -233,11 +237,11 @@ def is_stopped(gain_file: SixAxisGainFile, record: ControllerRecord) -> bool:
 
 
 def _rate(alarms: int, runs: int) -> dict[str, Any]:
-    """Return a rate with its exact 95 % interval."""
+    """Return the counts and the exact 95 % confidence interval of a rate."""
     interval = binomial_interval(alarms, runs)
     return {"runs": runs, "alarms": alarms, "low": float(interval.low), "high": float(interval.high)}
 
 
 def _largest(values: Any) -> float:
-    """Return the largest of the values."""
+    """Return the largest value as a float."""
     return float(max(values))

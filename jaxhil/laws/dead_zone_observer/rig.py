@@ -1,9 +1,10 @@
 """Phase lead with an observer of the force that the force sensor's dead zone removes.
 
-A dead zone of half-width dz subtracts clip(F, -dz, dz) from the force F. The observer estimates this
-difference as clip(k_n d, -dz, dz), where d is the measured penetration, delayed like the force. A first-order
-low-pass filter smooths the estimate, and the phase lead acts on the sum of measured force and estimate. After
-Li et al. 2026 (phase lead, and a disturbance observer with a gain near 1 below 15 Hz).
+A dead zone of half-width dz [N] subtracts clip(F, -dz, dz) from the force F. The observer estimates this
+difference as clip(k_n d, -dz, dz), where k_n is the nominal stiffness and d the measured penetration, delayed
+like the force. A first-order low-pass filter smooths the estimate, and the phase lead acts on the sum of
+measured force and estimate. The method follows Li et al. 2026, whose disturbance observer has a gain near 1
+below 15 Hz.
 """
 
 from collections.abc import Mapping

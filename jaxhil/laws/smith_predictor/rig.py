@@ -6,7 +6,7 @@ from jaxhil.rig.registry import register
 
 @register("smith_predictor")
 class SmithPredictor(Smith):
-    """Compensator F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F."""
+    """Compensator F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F; T_s: drive lag, T_l: force delay."""
 
     __slots__ = ()
 

@@ -13,7 +13,7 @@ from jaxhil.laws.shared.smith.simulation import Smith
 
 
 class SmithPredictor(Smith):
-    """Compensator F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F; see the module's docstring."""
+    """Compensator F_c = (1 + T_s s/(1 + T_s s/2)) (1 + T_l s) F; T_s: drive lag, T_l: force delay."""
 
     name: ClassVar[str] = "smith_predictor"
     waits_for_contact: ClassVar[bool] = True

@@ -30,7 +30,7 @@ def _format_exponential(value: float | None) -> str:
 
 
 def _six_axis_tables(document: dict[str, Any]) -> list[Any]:
-    """Return the tables of replayed runs and of the closed loop in six axes."""
+    """Return the tables of the replayed runs and the closed loop of a six-axis verification."""
     closed = document["closed_loop"]
     twists = zip(("vx", "vy", "vz", "wx", "wy", "wz"), closed["found"], closed["simulated"], strict=True)
     return [

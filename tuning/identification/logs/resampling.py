@@ -167,7 +167,7 @@ class _RowsAmongReadings:
         return not self._exact and abs(self._rate / self._period - 1.0) < EQUAL_RATE_TOLERANCE
 
     def nearest(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return, for each row, the nearest reading and the time from the row to this reading [s]."""
+        """Return the nearest reading of each row, and its time minus the row's time [s]."""
         return values[self._nearest], self._late
 
     def of(self, values: np.ndarray, steps: bool) -> np.ndarray:

@@ -109,7 +109,7 @@ class ContactModel:
     theta: Vector
 
     def restart(self, stiffness: float, spreads: Spreads, delay_variance: float) -> None:
-        """Set the estimate to the prior, with all forces divided by mass and approach speed.
+        """Set the estimate to the prior. All forces are divided by the mass and the approach speed.
 
         Args:
             stiffness: prior mean of the slope at depth 0 [1/s^2].
