@@ -1,4 +1,4 @@
-"""Floats that round at random: Monte Carlo arithmetic (Parker, Pierce and Eggert 2000)."""
+"""Floats with randomly rounded results: Monte Carlo arithmetic (Parker, Pierce and Eggert 2000)."""
 
 import math
 import random
@@ -7,7 +7,7 @@ import numpy as np
 
 
 class Jittered(float):
-    """Float whose results are moved at random to a neighbouring value or not."""
+    """Float whose arithmetic randomly keeps each result or moves it to a neighbouring float."""
 
     generator = random.Random(0)
 
@@ -18,7 +18,7 @@ def _jittered(operation):
             return NotImplemented
         towards = Jittered.generator.choice((-math.inf, None, math.inf))
         result = operation(float(self), float(other))
-        # A result of 0 is exact.
+        # A result of 0 is exact and stays unchanged.
         return Jittered(result if towards is None or result == 0 else math.nextafter(result, towards))
 
     return operate

@@ -1,6 +1,6 @@
-"""The controller of six axes in C beside the one in Python: compiled, loaded, and both run on the same rows.
+"""Helpers that run the six-axis controllers in C and in Python with the same inputs.
 
-A row is what happens in one tick (see `c99_driver_six_axes.c`), a result what either side makes of it.
+A row holds the inputs of one tick (see `c99_driver_six_axes.c`), a result the outputs of either controller.
 """
 
 import ctypes
@@ -45,7 +45,7 @@ _BUILT = tempfile.TemporaryDirectory(prefix="jaxhil-c99-six-axes-")
 
 
 class SixAxisBatch:
-    """The compiled controller of one document, which runs rows."""
+    """Compiled controller of one gain document."""
 
     def __init__(self, library):
         self.library = ctypes.CDLL(str(library))
@@ -55,7 +55,7 @@ class SixAxisBatch:
         self.state = (ctypes.c_double * (self.library.driver_size() // 8 + 1))()
 
     def run(self, rows):
-        """Begin anew and run the rows."""
+        """Restart the controller and return its results for the rows."""
         assert self.library.driver_init(self.state)
         results = np.empty((len(rows), len(RESULT)))
         self.library.driver_run(self.state, ctypes.c_size_t(len(rows)), pointer(rows), pointer(results))
@@ -77,7 +77,7 @@ def write_sources(folder, document):
 
 @functools.cache
 def built(name, wide=False):
-    """Return a compensator's document and its compiled controller; `wide` limits leave it alone."""
+    """Return a compensator's document and compiled controller; if `wide`, with default limits."""
     document = six_axis_document(name, limits={} if wide else LIMITS)
     folder = write_sources(Path(_BUILT.name) / f"{name}{wide}", document)
     library = compiled(folder, DRIVER.name, "driver.so", "-O2", "-shared", "-fPIC")
@@ -85,7 +85,7 @@ def built(name, wide=False):
 
 
 def rows_of(readings, period):
-    """Return rows for readings, four arrays (ticks, 6)."""
+    """Convert four arrays of readings (ticks, 6) to rows."""
     wrench, desired, twist, measured = readings
     count = len(wrench) - 1
     time = period * np.arange(count)[:, None]
@@ -105,10 +105,10 @@ def rows_of(readings, period):
 
 
 def drawn_rows(kind, count, rng, period=1e-3):
-    """Draw a `contact`, rows of `random` size, or `hostile` ones, with events now and then."""
+    """Draw rows of a kind: `contact`, `random` or `hostile` values, with occasional events."""
     readings = random_readings(rng, count + 1, period)
     if rng.random() < 0.5:
-        # Within the limits of `LIMITS`, so that not every run ends with its first tick.
+        # The rows stay within `LIMITS`, so that some runs do not trip on their first tick.
         readings = (0.1 * readings[0], *(0.3 * part for part in readings[1:]))
     rows = rows_of(readings, period)
     if kind != "contact":
@@ -119,7 +119,7 @@ def drawn_rows(kind, count, rng, period=1e-3):
         jitter = rng.choice([0.0, 0.3, -0.3, 2.0], count, p=[0.97, 0.01, 0.01, 0.01])
         rows[:, 25] += period * jitter
         begin, columns = int(rng.integers(count)), slice(*(((1, 7), (19, 25))[rng.integers(2)]))
-        rows[begin : begin + 300, columns] = rows[begin, columns]  # a sensor that hangs
+        rows[begin : begin + 300, columns] = rows[begin, columns]  # a stuck sensor
         if rng.random() < 0.3:
             rows[:4, 0] = TARE
             rows[:4, 1:7] = rng.choice([0.1, 10.0]) * rng.standard_normal((4, 6))
@@ -136,7 +136,7 @@ def drawn_rows(kind, count, rng, period=1e-3):
 
 
 def in_python(document, rows):
-    """Return what the Python controller makes of the rows."""
+    """Return the Python controller's results for the rows."""
     rig = Controller6.from_dict(document)
     watchdog = rig._watchdog
     results = np.zeros((len(rows), len(RESULT)))
@@ -172,7 +172,7 @@ def _event(rig, row):
 
 
 def assert_same(found, expected, rows):
-    """Raise AssertionError with the first tick and column in which C and Python differ."""
+    """Raise AssertionError if C and Python differ; name the first such tick and column."""
     same = same_bits(np.ascontiguousarray(found), np.ascontiguousarray(expected))
     if not same.all():
         tick, column = (int(index) for index in np.argwhere(~same)[0])

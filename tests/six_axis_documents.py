@@ -1,4 +1,4 @@
-"""Valid gain documents in six axes, and limits under which a usual run passes."""
+"""Valid six-axis gain documents, and limits within which a usual run does not trip."""
 
 import copy
 import functools
@@ -61,7 +61,7 @@ def _document(compensator, mechanism):
 
 
 def six_axis_document(compensator="impulse_ledger", mechanism="probe-drogue", limits=None, **gains):
-    """Return a valid gain document; `gains` replace values of gains."""
+    """Return a valid gain document with the nominal gains, except those in `gains`."""
     document = copy.deepcopy(_document(compensator, mechanism))
     for name, value in gains.items():
         document["gains"][name]["value"] = value

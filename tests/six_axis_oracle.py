@@ -1,4 +1,4 @@
-"""Independent six-axis rig and contact in plain NumPy, one case at a time.
+"""Independent simulation of a six-axis rig and its contact in plain NumPy, one case at a time.
 
 It uses rotation matrices, the matrix exponential and a Runge-Kutta method of order 8. A case is a dict:
 `masses`, `inertias` and `interfaces` of target and chaser; `start`: position, velocity, rotation matrix and
@@ -45,7 +45,7 @@ def plane(x):
 
 
 def wrench(case, p, rotation, v, w):
-    """Return force on the chaser and moment about T's origin."""
+    """Return the force on the chaser and the torque about T's origin."""
     force, moment = np.zeros(3), np.zeros(3)
     for centre, radius in case["spheres"]:
         x = p + rotation @ np.asarray(centre)
@@ -81,7 +81,7 @@ def loads(case, bodies, force, moment):
 
 
 def in_space(case, time):
-    """Return the ideal motion of the bodies after a time."""
+    """Return the bodies' states after a time, with the undelayed ideal contact."""
     inertias = [np.asarray(j) for j in case["inertias"]]
 
     def unpacked(y):
@@ -126,7 +126,7 @@ def command(case, bodies):
 
 
 class Axis:
-    """Motion simulator axis y'' + 2 zeta w y' + w^2 y = w^2 u with linear hold, first in uniform motion."""
+    """Motion simulator axis y'' + 2 zeta w y' + w^2 y = w^2 u with linear hold, first in steady motion."""
 
     def __init__(self, frequency, ratio, period, at, rate):
         w = 2 * np.pi * frequency
@@ -145,7 +145,7 @@ class Axis:
         self.state, self.sent = (expm(self.flow * self.period) @ start)[:2], value
 
     def response(self, time):
-        """Return y, y', y'' at a time since the first tick."""
+        """Return y, y', y'' at a time after the first tick."""
         if time <= 1e-9 * self.period:
             return np.array([self.at - self.late + self.rate * time, self.rate, 0.0])
         index = min(int(np.ceil(time / self.period - 1e-9)) - 1, len(self.starts) - 1)
@@ -154,7 +154,7 @@ class Axis:
 
 
 def on_the_rig(case, ticks, controller=None):
-    """Return the bodies of the numerical model after the given number of ticks.
+    """Return the states of the numerical model's bodies after the given number of ticks.
 
     A controller's `step(wrench, pose, twist, measured)` changes the wrench, and its
     `pose_command(pose, twist)` the command; `leads` are the times by which it leads the coordinates before

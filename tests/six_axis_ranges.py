@@ -4,16 +4,16 @@ from pathlib import Path
 
 from jaxhil.mechanism.file import load_any
 
-WIDE = Path(__file__).parent / "data" / "wide_ranges"  # files of the built-ins with wide ranges and noise
+WIDE = Path(__file__).parent / "data" / "wide_ranges"  # built-in mechanisms with wide ranges and noise
 
-OFFSETS = {"ring-capture": 0.01, "probe-drogue": 0.05}  # m; for larger offsets the ring misses the hooks
+OFFSETS = {"ring-capture": 0.01, "probe-drogue": 0.05}  # m; with larger offsets the ring misses the hooks
 ATTITUDES = {"ring-capture": 0.005, "hydraulic-hexapod": 0.015}  # rad
 NOISE = {"force": 0.5, "torque": 0.05}  # N, N m
 POSE_NOISE = {"translation": 5e-6, "rotation": 1e-5}  # m, rad
 
 
 def load_wide(name):
-    """Return a built-in with the ranges and the noise of its file in `WIDE`."""
+    """Return a built-in mechanism with the ranges and noise of its file in `WIDE`."""
     return load_any(WIDE / f"{name}.toml").mechanism
 
 
@@ -22,7 +22,7 @@ def uniform(size, middle=0.0, **more):
 
 
 def with_ranges(name, pose_noise=None, **overrides):
-    """Return a built-in with stiffness x 0.3 to 3, friction 0 to 0.2, force delay +- 0.3 ms, and noise."""
+    """Return a built-in mechanism: stiffness x 0.3 to 3, friction 0 to 0.2, force delay +- 0.3 ms, noise."""
     mechanism = load_any(name).mechanism
     delay = mechanism.rig.force_sensor.delay
     uncertain = {

@@ -1,4 +1,4 @@
-"""Recorded readings of six-axis rigs, and both sides of a compensator on them."""
+"""Recorded readings of six-axis rigs, and the commands of JAX and rig compensators for them."""
 
 import dataclasses
 import functools
@@ -20,11 +20,11 @@ from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.sixdof.building import build_scenarios, loop_of
 from jaxhil.sixdof.controller_record import ControllerRecord, known_constants, record_controller
 
-RING = 128  # samples of the simulated compensators' delay line
+RING = 128  # length of the JAX compensators' delay line [samples]
 
 
 class Records(NamedTuple):
-    """Records of a mechanism's lanes, and what the compensator knows."""
+    """Recorded runs of a mechanism, and the constants that the compensator knows."""
 
     mechanism: object
     gains: dict[str, float]
@@ -39,7 +39,7 @@ class Records(NamedTuple):
 
 
 def recorded(mechanism, compensator, lanes, seed=1):
-    """Return the records of draws of a mechanism with the literature's gains."""
+    """Record drawn runs of a mechanism with the gains from the literature."""
     with jax_context():
         scenario = build_scenarios(mechanism, draw(mechanism, lanes, seed), seed=seed)
         loop = dataclasses.replace(loop_of(mechanism, compensator, scenario), measures_pose=True)
@@ -53,7 +53,7 @@ def recorded(mechanism, compensator, lanes, seed=1):
 
 @functools.partial(jax.jit, static_argnums=0)
 def _simulate(name, gains, constants, readings):
-    """Return the wrenches (ticks, 6) of the simulated compensator for the readings (ticks, 6) of a lane."""
+    """Return the JAX compensator's wrenches (ticks, 6) for the readings (ticks, 6) of one run."""
     law = SIX_AXIS_COMPENSATORS[name]
     wrench, desired, twist = readings[:3]
     prepared = law.prepare(gains, constants)
@@ -72,7 +72,7 @@ def _simulate(name, gains, constants, readings):
 
 
 def simulated_alone(name, gains, constants, period, readings):
-    """Return the commands of the JAX compensator alone on readings, four arrays (ticks, 6)."""
+    """Return the JAX compensator's commands for four arrays of readings (ticks, 6), without a rig."""
     with jax_context():
         arrays = {gain: jnp.asarray(value) for gain, value in gains.items()}
         matrices = (jnp.asarray(matrix) for matrix in constants[:3])
@@ -81,7 +81,7 @@ def simulated_alone(name, gains, constants, period, readings):
 
 
 def rig_commands(name, gains, constants, period, readings):
-    """Return the commands of the rig's compensator on readings, and its pose commands, (ticks, 6)."""
+    """Return the rig compensator's wrench and pose commands (ticks, 6) for the readings."""
     law = ON_THE_RIG[name](gains, constants, period)
     commands, sent = [], []
     for wrench, desired, twist, measured in zip(*(column.tolist() for column in readings), strict=True):
@@ -91,7 +91,7 @@ def rig_commands(name, gains, constants, period, readings):
 
 
 def random_readings(rng, ticks, period):
-    """Draw contacts of any direction with a stiffness, noise and a hardware that lags behind."""
+    """Draw readings of contacts in random directions, with random stiffness, noise and hardware lag."""
     time = period * np.arange(-60, ticks)[:, None]
     middle, phase = rng.uniform(-0.3, 0.3, 6), rng.uniform(0, 2 * np.pi, 6)
     size, rate = 10 ** rng.uniform(-4, -2, 6), rng.uniform(5, 40, 6)
@@ -107,7 +107,7 @@ def random_readings(rng, ticks, period):
 
 
 def rounding_spread(name, gains, constants, period, readings):
-    """Return the spread of the rig's commands under random rounding, over their range."""
+    """Return the spread of the rig's commands with random rounding, divided by their range."""
     noisy = {gain: Jittered(value) for gain, value in gains.items()}
     rows = [
         [[*map(Jittered, vector)] for vector in row]
@@ -123,7 +123,7 @@ def rounding_spread(name, gains, constants, period, readings):
 
 
 def relative_difference(found, expected):
-    """Return the largest difference of a channel, over the range of force or moment, 0 included."""
+    """Return the largest difference, divided by the range (including 0) of force or torque."""
     worst = 0.0
     for part in (slice(0, 3), slice(3, 6)):
         span = np.max(expected[:, part], initial=0.0) - np.min(expected[:, part], initial=0.0)

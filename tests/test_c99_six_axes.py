@@ -1,4 +1,4 @@
-"""The C99 controller of six axes agrees with the Python controller bit for bit."""
+"""The six-axis C99 controller and the Python controller give identical results."""
 
 import shutil
 import subprocess
@@ -48,7 +48,7 @@ def test_sources_compile_without_a_warning(name, compiler, tmp_path):
         assert (ran.returncode, ran.stderr) == (0, "")
 
 
-def test_exported_numbers_are_compiled_to_the_same_bits():
+def test_compiled_gains_limits_and_constants_equal_the_document():
     document, made = built("impulse_ledger")
     parameters = np.zeros(400)
     count = made.library.driver_exported(pointer(parameters))
@@ -59,7 +59,7 @@ def test_exported_numbers_are_compiled_to_the_same_bits():
     assert count == len(expected) and parameters[:count].tobytes() == expected.tobytes()
 
 
-def test_faults_of_the_header_are_those_of_python():
+def test_c_header_has_the_fault_bits_of_python():
     header = generate_c99(six_axis_document("none"))["jaxhil_controller.h"]
     for fault in SIX_AXIS_FAULTS:
         assert f"    JAXHIL_{fault.name.upper()} = 0x{fault.bit:X},\n" in header
@@ -92,7 +92,7 @@ def test_unusable_constants_are_rejected():
 @pytest.mark.parametrize("wide", [False, True], ids=["limited", "wide"])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", LAWS)
-def test_commands_equal_python_to_the_bit(name, kind, wide):
+def test_c_commands_equal_python_commands_exactly(name, kind, wide):
     document, made = built(name, wide)
     for n in range(3):
         rng = np.random.default_rng([LAWS.index(name), KINDS.index(kind), wide, n])
@@ -107,7 +107,7 @@ def of_records():
     return recorded(load_any("probe-drogue", changes).mechanism, "impulse_ledger", 3)
 
 
-def test_recorded_contacts_equal_python_to_the_bit():
+def test_c_commands_equal_python_commands_on_recorded_contacts():
     document, made = built("impulse_ledger")
     for record in of_records().lanes:
         rows = rows_of(record[:4], 1e-3)
@@ -116,8 +116,8 @@ def test_recorded_contacts_equal_python_to_the_bit():
         assert np.any(results[:, :6] != 0)
 
 
-def test_rows_reach_every_fault():
-    """Reach every fault but some of a contact's end, which the tests of the watchdog reach."""
+def test_drawn_rows_cause_all_faults_except_three():
+    """Check that the rows cause all faults except three that the watchdog's tests cause."""
     seen, made = 0, built("impulse_ledger")[1]
     for n in range(150):
         rows = drawn_rows(KINDS[n % 3], 600, np.random.default_rng([5, n]))
@@ -126,7 +126,7 @@ def test_rows_reach_every_fault():
     assert missing <= {"contact_too_long", "energy_gain", "unpaid_impulse"}
 
 
-def test_document_of_a_longer_delay_is_rejected():
+def test_c_export_rejects_delay_longer_than_delay_line():
     document = six_axis_document(identification_delay=0.52)
     document["gains"]["identification_delay"]["upper"] = 1.0
     with pytest.raises(ValueError, match="periods"):
@@ -156,8 +156,8 @@ def test_no_undefined_behaviour_under_sanitizers(name, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
-def test_million_ticks_equal_python_to_the_bit(name):
-    """Run 1e6 ticks of the ledger, and 1e5 of each other compensator."""
+def test_c_equals_python_exactly_for_a_million_ticks(name):
+    """Run 1e6 ticks with the impulse ledger, and 1e5 with each other compensator."""
     total, chunk = (1_000_000 if name == "impulse_ledger" else 100_000), 5_000
     for n in range(total // chunk):
         document, made = built(name, wide=n % 4 == 3)

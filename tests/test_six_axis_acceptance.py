@@ -1,7 +1,7 @@
-"""The exported controller of six axes in the loop of an independent rig (`six_axis_oracle`), in Python and C.
+"""The exported six-axis controller, in Python and C, in a loop with an independent rig (`six_axis_oracle`).
 
 The rig is plain NumPy: its numerical model, motion simulator, contact and force sensor share no code with the
-package. The final twist of a contact must be that of `simulate`.
+package. The final twist of a contact must equal that of `simulate`.
 """
 
 import ctypes
@@ -26,13 +26,13 @@ from jaxhil.sixdof.loop import model_motion, run
 from tuning.bundle.single_file import build_runtime_source
 from tuning.verification.six_axis_replay import six_axis_loop
 
-TICKS = 240  # of a contact of probe-drogue and of the time until it is over
+TICKS = 240  # duration of a run of probe-drogue until its contact is over
 LEADS = tuple(f"lag_lead_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 OFFSETS = ((0.03, -0.025), (-0.01, 0.045))  # m
 
 
 def body(body, state):
-    """Position, velocity, attitude and angular velocity (body axes) of a body, as the oracle has them."""
+    """Return position, velocity, rotation matrix and angular velocity (body axes) of a body."""
     quaternion = np.array(jax.tree.leaves(state.attitude))[:, 0]
     attitude = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
     position, velocity = (np.array(jax.tree.leaves(part))[:, 0] for part in (state.position, state.velocity))
@@ -41,7 +41,7 @@ def body(body, state):
 
 
 def case_of(mechanism, scenario):
-    """Return the oracle's case for probe-drogue."""
+    """Return the oracle's case (see `six_axis_oracle`) for probe-drogue."""
     sensor, simulator = mechanism.rig.force_sensor, mechanism.rig.simulator
     tip, tool = mechanism.contact["tip"], mechanism.rig.force_sensor.tool
     inertias = [np.asarray(part.inertia, float) for part in (mechanism.target, mechanism.chaser)]
@@ -74,7 +74,7 @@ def case_of(mechanism, scenario):
 
 
 class InPython:
-    """The controller of the single file."""
+    """Controller in the bundle's single Python file."""
 
     def __init__(self, document, leads):
         namespace = {"__name__": "jaxhil_runtime"}
@@ -85,7 +85,7 @@ class InPython:
 
 
 class InC:
-    """The controller in C."""
+    """Controller in C."""
 
     def __init__(self, document, leads, folder):
         library = compiled(
@@ -109,7 +109,7 @@ class InC:
 
 @pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 @pytest.mark.parametrize("name", ["impulse_ledger", pytest.param("phase_lead", marks=pytest.mark.slow)])
-def test_final_twist_is_that_of_simulate(name, tmp_path):
+def test_exported_controller_on_independent_rig_gives_simulated_final_twist(name, tmp_path):
     for offset in OFFSETS:
         mechanism = load_any("probe-drogue", {"approach.offset": list(offset)}).mechanism
         gains = literature_gains(mechanism, name)

@@ -1,4 +1,4 @@
-"""Bundle of a rig in six axes: its files, its self-test in Python and C, and its verification."""
+"""Bundle of a six-axis rig: its files, its self-test in Python and C, and its verification."""
 
 import json
 import shutil
@@ -29,7 +29,7 @@ from tuning.watchdog.six_axes import DrawnRun, alarm_rates, calibrate_six_axes, 
 
 
 class Result:
-    """What `tuning.export` takes beside the path of a gain file."""
+    """Replacement for the result of `tuning.tune`, as an argument of `tuning.export`."""
 
     def __init__(self, document):
         self.document = document
@@ -47,7 +47,7 @@ def folder(built, tmp_path):
     return tmp_path / "bundle"
 
 
-def test_bundle_has_every_file_and_its_vectors_agree_with_the_simulation(built):
+def test_bundle_is_complete_and_its_vectors_agree_with_simulation(built):
     assert built.reasons == [] and built.ended == [None] * 4 and built.runs == 52
     assert {name.partition("/")[0] for name in built.files} == {
         *("gains.json", "vectors.csv", "summary.html", "jaxhil_runtime.py", "selftest.py", "ros2.yaml"),
@@ -59,7 +59,7 @@ def test_bundle_has_every_file_and_its_vectors_agree_with_the_simulation(built):
     assert len(built.files["vectors.csv"]) < 8e6
 
 
-def test_selftest_passes_in_isolation_and_in_c(folder):
+def test_selftest_passes_in_isolated_python_and_in_c(folder):
     ran = subprocess.run(
         [sys.executable, "-I", "-S", str(folder / "selftest.py")], capture_output=True, text=True, check=False
     )
@@ -70,7 +70,7 @@ def test_selftest_passes_in_isolation_and_in_c(folder):
 
 
 @pytest.mark.parametrize("name", ["gains.json", "vectors.csv", "jaxhil_runtime.py", "c99/jaxhil_gains.h"])
-def test_selftest_notices_a_changed_digit(folder, name):
+def test_six_axis_selftest_detects_a_changed_digit(folder, name):
     path = folder / name
     content = bytearray(path.read_bytes())
     digits = [index for index, byte in enumerate(content) if 0x30 <= byte <= 0x38]
@@ -80,7 +80,7 @@ def test_selftest_notices_a_changed_digit(folder, name):
     assert not good and f"FAIL  {name}" in text
 
 
-def test_test_program_in_c_notices_a_changed_bit(folder, tmp_path):
+def test_c_test_program_detects_a_changed_bit(folder, tmp_path):
     if c99_cases.COMPILER is None:
         pytest.skip("no C compiler (cc) on this machine")
     shutil.copytree(folder / "c99", tmp_path / "c99")
@@ -99,7 +99,7 @@ def test_test_program_in_c_notices_a_changed_bit(folder, tmp_path):
     assert ran.returncode == 0
 
 
-def test_comparison_with_the_record_ends_at_a_fault_and_names_a_difference(built):
+def test_compare_with_record_ends_at_first_fault_and_reports_difference(built):
     document = six_axis_document(limits={**LIMITS, "force_limit": 20.0})
     with jax_context():
         loaded = check_document(document, any_axes=True)
@@ -117,7 +117,7 @@ def test_comparison_with_the_record_ends_at_a_fault_and_names_a_difference(built
         assert (compare_with_record(rows, record)[2] is None) is agrees
 
 
-def test_gain_file_of_six_axes_is_checked_with_its_own_limits():
+def test_six_axis_gain_file_is_checked_against_six_axis_limits():
     with jax_context():
         loaded = check_document(six_axis_document(limits=LIMITS), any_axes=True)
         assert loaded.compensator == "impulse_ledger"
@@ -130,14 +130,14 @@ def test_gain_file_of_six_axes_is_checked_with_its_own_limits():
             check_document(wrong, any_axes=True)
 
 
-def test_export_rejects_limits_of_another_controller(tmp_path):
+def test_six_axis_export_rejects_one_axis_limit_names(tmp_path):
     with pytest.raises(InputError, match="free_force"):
         tuning.export(Result(six_axis_document()), tmp_path / "b", limits={"free_force": 1.0})
     with pytest.raises(InputError, match="torque_limit"):
         tuning.export(Result(six_axis_document()), tmp_path / "b", limits={"torque_limit": -1.0})
 
 
-def test_command_difference_is_over_the_range_of_force_or_moment():
+def test_command_difference_is_divided_by_range_of_force_or_torque():
     expected = np.zeros((3, 6))
     expected[1, 0], expected[2, 4] = 100.0, 2.0
     found = expected.copy()
@@ -147,24 +147,24 @@ def test_command_difference_is_over_the_range_of_force_or_moment():
     assert command_difference(np.full((1, 6), 1.0), np.zeros((1, 6)))[0] == np.inf
 
 
-def test_longest_sum_is_that_of_successive_steps():
+def test_longest_sum_adds_successive_steps_only():
     still = np.array([True, True, False, True, False, True, True, True])
     assert longest_sum(np.arange(1.0, 9.0), still) == 6 + 7 + 8
     assert longest_sum(np.ones(3), np.zeros(3, bool)) == 0.0
 
 
-def test_calibrated_limits_let_good_runs_pass_and_stop_a_wrong_mass():
+def test_calibrated_limits_accept_good_runs_and_stop_a_wrong_mass():
     with jax_context():
         loaded = check_document(six_axis_document(), any_axes=True)
         calibration = calibrate_six_axes(loaded, scenarios=64, seed=3)
         assert {*calibration.limits} == {*SIX_AXIS_LIMITS}
         complete_six_axis_limits({k: v for k, v in calibration.limits.items() if v is not None})
         rates = calibration.rates
-        # Sixteen runs determine the limits, so that a few of the other runs exceed them.
+        # Only sixteen runs determine the limits, so a few of the other runs exceed them.
         assert rates["false_alarms"]["alarms"] <= 8 and rates["false_alarms"]["runs"] >= 40
         (mass,) = rates["fault_runs"]
         assert mass["alarms"] == 0 and mass["runs"] == rates["false_alarms"]["runs"]
-        assert rates["verdict"] in ("unknown", "bad")  # so few runs decide nothing
+        assert rates["verdict"] in ("unknown", "bad")  # there are too few runs for "good"
         tight = {**calibration.limits, "force_limit": 1.0}
         _, records = record_runs(loaded.mechanism, loaded.compensator, loaded.gains, 64, 3)
     gain_file = check_six_axis_document(loaded.document)
@@ -175,7 +175,7 @@ def test_calibrated_limits_let_good_runs_pass_and_stop_a_wrong_mass():
 
 
 @pytest.mark.slow
-def test_verify_agrees_in_closed_loop_and_notices_a_changed_digit(folder):
+def test_verify_passes_in_closed_loop_and_detects_a_changed_digit(folder):
     good = tuning.verify(folder, scenarios=3)
     assert good.good and good.document["axes"] == 6
     assert good.document["closed_loop"]["difference"] < 1e-10
@@ -188,7 +188,7 @@ def test_verify_agrees_in_closed_loop_and_notices_a_changed_digit(folder):
 
 
 @pytest.mark.slow
-def test_closed_loop_notices_another_controller():
+def test_closed_loop_detects_a_controller_with_changed_gains():
     document = six_axis_document()
     with jax_context():
         loaded = check_document(document, any_axes=True)
@@ -202,7 +202,7 @@ def test_closed_loop_notices_another_controller():
 
 
 @pytest.mark.slow
-def test_export_states_alarm_rates(tmp_path):
+def test_six_axis_export_reports_good_alarm_rates(tmp_path):
     exported = tuning.export(Result(six_axis_document()), tmp_path / "bundle")
     assert exported.verdict == "good", exported.reasons
     rates = exported.document["rates"]

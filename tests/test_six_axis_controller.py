@@ -1,4 +1,4 @@
-"""Controller of a rig in six axes: guards, limits, watchdog, retreat, and hostile inputs."""
+"""Controller of a six-axis rig: guards, limits, watchdog, retreat, and hostile inputs."""
 
 import math
 
@@ -28,12 +28,12 @@ def controller(compensator="impulse_ledger", **limits):
 
 
 def along(tick, pose=START, twist=TWIST):
-    """Return the pose in uniform motion."""
+    """Return the pose at a tick of uniform motion."""
     return [at + tick * PERIOD * rate for at, rate in zip(pose, twist, strict=True)]
 
 
 def fly(rig, ticks, first=0, wrench=ZERO, timed=False):
-    """Run free flight; return the pose commands."""
+    """Run ticks of free flight; return the pose commands."""
     sent = []
     for tick in range(first, first + ticks):
         now = along(tick)
@@ -53,7 +53,7 @@ def records():
 
 
 def replay(rig, record, change=lambda tick, inputs: inputs):
-    """Run a controller over a record; return its commands and pose commands."""
+    """Run a controller with a record's inputs; return its wrench and pose commands."""
     commands, sent = [], []
     rows = list(zip(*(column.tolist() for column in record[:4]), strict=True))
     for tick, row in enumerate(rows):
@@ -68,11 +68,11 @@ def replay(rig, record, change=lambda tick, inputs: inputs):
 
 def of_records(records, **limits):
     document = six_axis_document(limits={**LIMITS, **limits}, **records.gains)
-    # The gains' bounds are those of the mechanism without noise.
+    # The document's gain bounds are those of the mechanism without noise.
     return Controller6.from_dict(document)
 
 
-def test_controller_commands_are_those_of_the_record(records):
+def test_controller_reproduces_recorded_commands(records):
     for record in records.lanes:
         rig = of_records(records)
         commands, sent = replay(rig, record)
@@ -87,7 +87,7 @@ def test_controller_commands_are_those_of_the_record(records):
         assert rig.unpaid_impulse == rig.loop_delay == 0.0
 
 
-def test_every_output_is_a_new_list():
+def test_changing_an_output_list_does_not_change_the_controller():
     rig = controller("none")
     first = rig.step([1.0, 0, 0, 0, 0, 0], START, TWIST, START)
     first[0] = 1e9
@@ -118,7 +118,7 @@ def test_every_output_is_a_new_list():
         (lambda d: d.update(compensator="smith_predictor"), "compensator"),
     ],
 )
-def test_gain_file_in_six_axes_rejects(change, message):
+def test_invalid_six_axis_gain_file_is_rejected(change, message):
     document = six_axis_document(limits=LIMITS)
     change(document)
     try:
@@ -130,14 +130,14 @@ def test_gain_file_in_six_axes_rejects(change, message):
     assert "\n" not in str(error.value)
 
 
-def test_changed_digit_is_noticed():
+def test_changed_digit_in_constants_is_rejected():
     document = six_axis_document()
     document["constants"]["mass_matrix"][0][0] *= 1 + 1e-15
     with pytest.raises(GainFileError, match="sha256"):
         Controller6.from_dict(document)
 
 
-def test_delay_longer_than_the_delay_line_is_rejected():
+def test_delay_longer_than_delay_line_is_rejected():
     document = six_axis_document(identification_delay=0.52)
     document["gains"]["identification_delay"]["upper"] = 1.0
     with pytest.raises(GainFileError, match="periods"):
@@ -152,7 +152,7 @@ def test_delay_longer_than_the_delay_line_is_rejected():
     "value, fault",
     [(math.nan, "force_not_finite"), (math.inf, "force_not_finite"), (2e4, "force_out_of_range")],
 )
-def test_bad_wrench_channel_is_bridged_and_then_trips(channel, value, fault):
+def test_bad_wrench_reading_is_replaced_and_trips_if_it_persists(channel, value, fault):
     rig = controller()
     fly(rig, 20)
     wrench = list(ZERO)
@@ -167,7 +167,7 @@ def test_bad_wrench_channel_is_bridged_and_then_trips(channel, value, fault):
 
 @pytest.mark.parametrize("channel", range(6))
 @pytest.mark.parametrize("value, fault", [(math.nan, "position_not_finite"), (0.6, "position_out_of_range")])
-def test_bad_pose_is_bridged_and_then_trips(channel, value, fault):
+def test_bad_pose_reading_is_replaced_and_trips_if_it_persists(channel, value, fault):
     rig = controller()
     fly(rig, 20)
     for tick in range(20, 24):
@@ -177,7 +177,7 @@ def test_bad_pose_is_bridged_and_then_trips(channel, value, fault):
         assert not rig.tripped
         rig.step(ZERO, now, TWIST, read)
     assert names(rig) == [fault] and rig.channels == 64 << channel
-    # On a run's first tick there is nothing to bridge with.
+    # On a run's first tick there is no earlier reading that could replace a bad one.
     other = controller()
     other.step(ZERO, START, TWIST, read)
     assert names(other) == [fault]
@@ -192,7 +192,7 @@ def test_stuck_wrench_channel_trips_while_the_hardware_moves(channel):
     assert rig.status == "ok"
     fly(rig, 20, 40, wrench)
     assert names(rig) == ["force_stuck"]
-    # A reading of no force may last.
+    # A reading of 0 may stay unchanged.
     free = controller("none")
     fly(free, 300)
     assert free.status == "ok"
@@ -215,7 +215,7 @@ def test_model_that_is_not_finite_trips():
     assert names(other) == ["model_not_finite"]
 
 
-def test_clock_faults_are_those_of_one_axis():
+def test_missed_ticks_are_counted_and_trip_if_too_many():
     rig = controller()
     fly(rig, 5, timed=True)
     now = along(5)
@@ -225,7 +225,7 @@ def test_clock_faults_are_those_of_one_axis():
     assert names(rig) == ["missed_tick"]
 
 
-def test_wrong_arguments_trip_and_do_not_raise():
+def test_invalid_arguments_trip_but_do_not_raise():
     for wrong in (None, [1.0], ["a"] * 6, 5.0, [None] * 6):
         rig = controller()
         assert rig.step(ZERO, wrong, TWIST, START) == ZERO
@@ -257,7 +257,7 @@ def test_emergency_stop_is_latched_until_reset():
 # Outputs
 
 
-def test_wrench_beyond_its_limit_trips_and_fades():
+def test_wrench_beyond_force_limit_trips_and_ramps_to_zero():
     rig = controller("none", limited_in_a_row=1000.0)
     for tick in range(20):
         rig.step([0, 0, 900.0, 0, 0, 0], along(tick), TWIST, along(tick))
@@ -267,15 +267,15 @@ def test_wrench_beyond_its_limit_trips_and_fades():
     np.testing.assert_allclose(values[:8], [700, 600, 500, 400, 300, 200, 100, 0], atol=1e-9)
 
 
-def test_command_outside_the_stroke_trips():
+def test_pose_command_outside_stroke_trips():
     rig = controller()
     fly(rig, 10)
     rig.pose_command([0.41, *START[1:]], TWIST, ZERO)
     assert names(rig) == ["stroke"]
 
 
-def test_retreat_leads_back_along_the_way_and_is_never_too_fast():
-    """Follow a curved approach, stop, and compare the way back with the way."""
+def test_retreat_retraces_the_approach_within_speed_limits():
+    """Follow a curved approach, stop, and compare the retreat with the approach."""
     rig = controller()
     angle = np.linspace(0, 1.5, 600)
     way = np.zeros((600, 6))
@@ -299,17 +299,17 @@ def test_retreat_leads_back_along_the_way_and_is_never_too_fast():
     assert np.max(moved[braking:]) <= 0.02 * PERIOD * (1 + 1e-9)
     assert np.max(turned[braking:]) <= 0.04 * PERIOD * (1 + 1e-9)
     assert np.sum(moved[braking:]) == pytest.approx(0.01, abs=2e-5)
-    # Each point of the way back is near the way that it came, braking included.
+    # Each point of the retreat is near the path of approach and braking.
     all_points = np.concatenate([way, sent[: braking + 1]])
     distance = [np.min(np.linalg.norm(all_points[:, :3] - point[:3], axis=1)) for point in sent[braking:]]
     assert max(distance) < 5e-5
-    # It starts and stops within the deceleration.
+    # The retreat starts and stops within the limit of the deceleration.
     change = np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1)
     assert np.max(change[: braking - 1]) <= 0.5 * PERIOD**2 * (1 + 1e-6)
 
 
-def test_retreat_leads_back_along_a_rotation():
-    """A rotation of 1 rad counts as 0.02/0.04 m."""
+def test_retreat_retraces_a_rotation():
+    """Check the length of a retreat by rotation, in which 1 rad counts as 0.02/0.04 m."""
     rig = controller()
     twist = [0.0, 0.0, 0.0, 0.0, 0.05, 0.0]
     for tick in range(1000):
@@ -325,7 +325,7 @@ def test_retreat_leads_back_along_a_rotation():
     assert np.max(np.abs(np.diff(angles))) <= 0.05 * PERIOD * (1 + 1e-6)
 
 
-def test_first_command_continues_from_the_measured_pose():
+def test_first_pose_command_starts_from_measured_pose():
     rig = controller("none")
     far = [at + 0.05 for at in START]
     rig.step(ZERO, far, ZERO, START)
@@ -340,7 +340,7 @@ def test_first_command_continues_from_the_measured_pose():
 # Watchdog
 
 
-def test_watchdog_stops_a_model_with_another_mass(records):
+def test_watchdog_trips_on_model_with_wrong_mass(records):
     document = six_axis_document(limits=LIMITS, **records.gains)
     document["constants"]["mass_matrix"] = (1.2 * np.array(document["constants"]["mass_matrix"])).tolist()
     document["constants"]["inverse_mass"] = (np.array(document["constants"]["inverse_mass"]) / 1.2).tolist()
@@ -350,8 +350,8 @@ def test_watchdog_stops_a_model_with_another_mass(records):
     assert "momentum" in names(rig)
 
 
-def test_watchdog_stops_an_integrator_with_the_wrong_sign(records):
-    """The model of the record is not that of these commands."""
+def test_watchdog_trips_on_wrong_sign_of_wrench(records):
+    """Replay wrenches with the wrong sign; the recorded motion then contradicts the commands."""
     rig = of_records(records, unpaid_impulse=1e9)
 
     def turned(tick, inputs):
@@ -363,13 +363,13 @@ def test_watchdog_stops_an_integrator_with_the_wrong_sign(records):
     assert {"momentum", "energy_gain"} & {*names(rig)}
 
 
-def test_watchdog_states_the_lag(records):
+def test_watchdog_trips_on_lag_out_of_range(records):
     rig = of_records(records, lag_highest=0.02)
     replay(rig, records.lanes[0])
     assert names(rig) == ["lag"]
 
 
-def test_watchdog_states_unpaid_impulse(records):
+def test_watchdog_trips_on_unpaid_impulse(records):
     rig = of_records(records, unpaid_impulse=1e-6)
     replay(rig, records.lanes[0])
     rig.next_contact()
@@ -377,7 +377,7 @@ def test_watchdog_states_unpaid_impulse(records):
 
 
 def pushed(rig, force, ticks, factor=1.0):
-    """Push a model at 5 mm/s with a force; `factor` is that of the mass that it has too little."""
+    """Push a model at 5 mm/s with a force; its mass is too small by `factor`."""
     inverse = np.array(six_axis_document()["constants"]["inverse_mass"])
     twist, wrench = np.array([0, 0, -0.005, 0, 0, 0]), np.array([0, 0, force, 0, 0, 0])
     at = np.array([0, 0, 0.05, 0, 0, 0])
@@ -385,27 +385,27 @@ def pushed(rig, force, ticks, factor=1.0):
     for tick in range(ticks + 40):
         felt = wrench if tick < ticks else 0 * wrench
         command = np.array(rig.step(felt.tolist(), at.tolist(), twist.tolist(), at.tolist()))
-        # Along z the lever is 0 at this pose, which hardly changes.
+        # The force along z has no lever arm at this pose, which hardly changes.
         twist = twist + factor * PERIOD * inverse @ command
         at = at + PERIOD * twist
         at[:2] = 0
     return rig
 
 
-def test_watchdog_stops_contact_that_releases_energy():
+def test_watchdog_trips_on_contact_that_releases_energy():
     limits = {"force_stuck_travel": 1.0, "fading": 1.0}
     assert pushed(controller("none", **limits), 30.0, 100).status == "ok"
     rig = pushed(controller("none", **limits), 30.0, 150)
     assert names(rig) == ["energy_gain"] and "energy released" in rig.status
 
 
-def test_watchdog_compares_impulse_and_momentum():
+def test_watchdog_trips_if_momentum_differs_from_impulse():
     limits = {"force_stuck_travel": 1.0, "fading": 1.0, "energy_gain": 1e9}
     assert pushed(controller("none", **limits), 30.0, 100, 1.03).status == "ok"
     assert names(pushed(controller("none", **limits), 30.0, 100, 1.1)) == ["momentum"]
 
 
-def test_contact_may_not_last_too_long():
+def test_watchdog_trips_on_contact_that_lasts_too_long():
     limits = {"force_stuck_travel": 1.0, "fading": 1.0, "longest_contact": 0.1}
     assert names(pushed(controller("none", **limits), 10.0, 120)) == ["contact_too_long"]
 
@@ -429,7 +429,7 @@ calls = st.lists(
 
 @settings(max_examples=200, deadline=None)
 @given(calls=calls, name=st.sampled_from(["none", "phase_lead", "response_error", "impulse_ledger"]))
-def test_outputs_are_finite_and_within_limits_for_any_input(calls, name):
+def test_outputs_are_finite_and_within_limits_for_hostile_inputs(calls, name):
     rig = controller(name)
     wrench, sent, measured = np.zeros(6), None, None
     most = np.array([100.0] * 3 + [30.0] * 3)
@@ -445,7 +445,7 @@ def test_outputs_are_finite_and_within_limits_for_any_input(calls, name):
             new = np.array(rig.pose_command(*values[:3]))
             assert np.all(np.isfinite(new))
             if sent is not None:
-                # Outside the stroke only if the drives were there when the run began, and never further out.
+                # If a run begins outside the stroke, the commands never move farther out.
                 assert np.all((np.minimum(-0.4, sent) <= new) & (new <= np.maximum(0.4, sent)))
                 step = new - sent
                 assert np.linalg.norm(step[:3]) <= 1e-4 * (1 + 1e-9) + 1e-14
@@ -459,7 +459,7 @@ def test_outputs_are_finite_and_within_limits_for_any_input(calls, name):
             rig.tare(values[0])
         elif call == "next":
             if not rig.tripped:
-                # After the audit of an open contact the run may not have begun anew.
+                # If the audit of an open contact trips, no new run begins.
                 rig.next_contact()
                 if not rig.tripped:
                     sent = measured = None
@@ -473,5 +473,5 @@ def test_outputs_are_finite_and_within_limits_for_any_input(calls, name):
         assert "\n" not in rig.status
 
 
-def test_every_limit_is_in_the_documents():
+def test_limits_of_test_documents_cover_every_limit():
     assert {*LIMITS} | {"late_fraction"} == {*SIX_AXIS_LIMITS}

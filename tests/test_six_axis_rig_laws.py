@@ -1,4 +1,4 @@
-"""The rig's compensators in six axes agree with the JAX compensators on recorded and random readings."""
+"""The rig's six-axis compensators agree with the JAX compensators for recorded and random readings."""
 
 import functools
 
@@ -23,27 +23,27 @@ from jaxhil.rig.six_axes import SIX_AXIS_COMPENSATORS as ON_THE_RIG
 from jaxhil.rig.six_axes import ModelConstants
 from jaxhil.rig.six_axes.vectors import coordinate_rates
 
-LIMIT = 1e-9  # of the commands' range
-NOISY = "probe-drogue"  # the mechanism that also has noise of force and pose
+LIMIT = 1e-9  # maximum difference, divided by the commands' range
+NOISY = "probe-drogue"  # mechanism whose force and pose readings have noise
 LANES = 3
 MECHANISMS = six_axis_names()
 
 
 @functools.cache
 def of_ledger(name):
-    """Return the records of draws of a mechanism with the ledger."""
+    """Record drawn runs of a mechanism with the impulse ledger."""
     changes = {}
     if name == NOISY:
         changes = {"rig.force_sensor.noise_std": NOISE, "rig.position_sensor.noise_std": POSE_NOISE}
     return recorded(load_any(name, changes).mechanism, "impulse_ledger", LANES)
 
 
-def test_every_built_in_compensator_has_a_rig_side_with_the_same_gains():
+def test_every_built_in_compensator_has_a_rig_class_with_the_same_gains():
     assert {*ON_THE_RIG} == {*built_in_compensators(6)}
     mechanism = load_any("probe-drogue").mechanism
     for name, law in SIX_AXIS_COMPENSATORS.items():
         if name not in ON_THE_RIG:
-            continue  # registered by another test
+            continue  # a different test has registered it
         specified = ON_THE_RIG[name].gains
         assert {gain.name: gain.unit for gain in law.gains} == {k: gain.unit for k, gain in specified.items()}
         for gain in law.gains:
@@ -52,7 +52,7 @@ def test_every_built_in_compensator_has_a_rig_side_with_the_same_gains():
 
 
 def check_agreement(name, gains, constants, period, readings, expected):
-    """Compare the rig's commands with the expected ones; return whether they magnify rounding."""
+    """Compare the rig's commands with expected commands; return whether only rounding explains them."""
     found, _ = rig_commands(name, gains, constants, period, readings)
     difference = relative_difference(found, expected)
     if difference <= LIMIT:
@@ -65,8 +65,8 @@ def check_agreement(name, gains, constants, period, readings, expected):
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name == NOISY else pytest.mark.slow) for name in MECHANISMS]
 )
-def test_commands_agree_on_recorded_ticks(name):
-    """Compare the ledger with its own record, and every compensator on the same readings."""
+def test_rig_and_jax_commands_agree_on_recorded_readings(name):
+    """Compare the ledger with its record, and each rig compensator with JAX for the same readings."""
     records = of_ledger(name)
     period = records.mechanism.rig.control_period
     for lane, record in enumerate(records.lanes):
@@ -74,7 +74,7 @@ def test_commands_agree_on_recorded_ticks(name):
         assert np.any(record.command != 0)
         commands, sent = rig_commands("impulse_ledger", records.gains, constants, period, readings)
         assert relative_difference(commands, record.command) <= LIMIT
-        # The record's pose commands are for the motion after the tick.
+        # A recorded pose command belongs to the motion after its tick.
         np.testing.assert_allclose(sent[1:], record.sent[:-1], rtol=0, atol=1e-13)
         for other in built_in_compensators(6):
             gains = literature_gains(records.mechanism, other)
@@ -82,7 +82,7 @@ def test_commands_agree_on_recorded_ticks(name):
             check_agreement(other, gains, constants, period, readings, expected)
 
 
-def test_pose_commands_are_led():
+def test_pose_commands_are_extrapolated_by_lag_leads():
     records = of_ledger(NOISY)
     record = records.lanes[0]
     leads = np.array([records.gains[f"lag_lead_{axis}"] for axis in ("x", "y", "z", "rx", "ry", "rz")])
@@ -97,7 +97,7 @@ def test_pose_commands_are_led():
     np.testing.assert_allclose(record.sent[:-1], expected, rtol=0, atol=1e-13)
 
 
-def test_ledger_states_delay_status_and_unpaid_impulse():
+def test_ledger_reports_delay_status_and_unpaid_impulse():
     records = of_ledger(NOISY)
     law = ON_THE_RIG["impulse_ledger"](records.gains, records.on_the_rig(0), 1e-3)
     statuses = []
@@ -107,7 +107,7 @@ def test_ledger_states_delay_status_and_unpaid_impulse():
     acting = [status for status in statuses if status != OUT_OF_CONTACT]
     assert acting.count(IDENTIFIED) > 0.6 * len(acting) > 20
     assert statuses[0] == OUT_OF_CONTACT and {*statuses} <= {*STATUS_NAMES}
-    # The lag of the loop is that of the force, the axes' delays and their response in uniform motion.
+    # The loop's delay is the sum of force delay, axes' delays, and axes' lag in uniform motion.
     assert 0.02 < law.loop_delay < 0.035
     assert 0 < law.unpaid_impulse < 0.05
     law.reset()
@@ -120,13 +120,13 @@ def random_gains(rng, mechanism, name):
         lower, upper, share = gain.lower(mechanism), gain.upper(mechanism), rng.random()
         inside = lower * (upper / lower) ** share if gain.logarithmic else lower + share * (upper - lower)
         gains[gain.name] = (lower, upper, gain.nominal(mechanism), inside)[rng.integers(4)]
-    # Otherwise most contacts are over before they may be detected, or below the gate.
+    # With larger gains most contacts end before detection is allowed, or are too weak to be detected.
     most = {"settle": 0.05, "force_noise": 1.0, "torque_noise": 0.1, "pose_filter": 0.005}
     return {gain: min(value, most.get(gain, value)) for gain, value in gains.items()}
 
 
 def random_constants(rng):
-    """Draw a mass matrix whose condition is that of a mechanism's, and a tool."""
+    """Draw a tool, and a mass matrix as well conditioned as those of mechanisms."""
     size = np.diag(np.sqrt([300.0, 300.0, 300.0, 90.0, 90.0, 90.0]))
     mixed = np.eye(6) + 0.1 * rng.standard_normal((6, 6))
     mass = size @ mixed @ mixed.T @ size
@@ -138,8 +138,8 @@ def random_constants(rng):
 
 @pytest.mark.parametrize("runs", [12, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", built_in_compensators(6))
-def test_commands_agree_on_random_contacts(name, runs):
-    """Compare readings that no contact produces; with wide priors, few of them magnify rounding."""
+def test_rig_and_jax_commands_agree_on_random_readings(name, runs):
+    """Compare commands for random readings, few of which magnify rounding errors."""
     ticks, period = 1000, 1e-3
     mechanism = load_any("probe-drogue").mechanism
     magnified, acting = 0, 0

@@ -1,4 +1,4 @@
-"""Six axes: the twist error decides verdicts; ideal contacts computed beforehand change no metric."""
+"""Six-axis verdicts depend on the twist error; precomputed ideal contacts change no metric."""
 
 import jax
 import jax.numpy as jnp
@@ -24,13 +24,13 @@ from tuning.sweeps.columns import list_contact_columns, list_verdict_columns
 
 
 def outcome(errors):
-    """Return an outcome whose rows are told apart by their errors, (rows, lanes)."""
+    """Return an outcome whose rows differ in their errors (rows, lanes)."""
     rows = np.asarray(errors, float)
     metrics = Metrics(*[rows] * len(Metrics._fields))
     return Outcome(metrics, *[rows] * (len(Outcome._fields) - 1))
 
 
-def test_twist_error_decides_in_six_axes():
+def test_twist_error_is_the_verdict_error_on_six_axes():
     energy, twist = [[0.3, -0.4], [0.1, 0.0]], [[0.01, 0.02], [0.03, 0.04]]
     rows = outcome(energy + twist)
     np.testing.assert_array_equal(SIX_AXES.select_verdict_error(rows).error, twist)
@@ -44,7 +44,7 @@ def test_twist_error_decides_in_six_axes():
     assert [slot.error for slot in list_verdict_columns(load_any("rig-300kg").mechanism)] == ["error_1"]
 
 
-def test_default_limit_is_that_of_the_number_of_axes():
+def test_default_error_limit_depends_on_number_of_axes():
     one, six = (load_any(name).mechanism for name in ("rig-300kg", "petals"))
     assert (choose_limit(None, one), choose_limit(None, six)) == (0.01, 0.05)
     assert choose_limit(0.3, six) == choose_limit(0.3, one) == 0.3
@@ -56,7 +56,7 @@ def test_default_limit_is_that_of_the_number_of_axes():
     assert SweepOptions(scenarios=64, rare=0.02).with_limit(one).rare == 0.02
 
 
-def test_only_the_command_peak_is_a_cost_in_six_axes():
+def test_six_axis_pareto_accepts_only_the_command_peak_as_cost():
     mechanism = load_any("petals").mechanism
     TuneOptions(compensator="phase_lead", pareto=3).check_mechanism(mechanism)
     for against in ("noise", "honesty"):
@@ -65,7 +65,7 @@ def test_only_the_command_peak_is_a_cost_in_six_axes():
             options.check_mechanism(mechanism)
 
 
-def test_files_of_wide_ranges_are_the_built_ins_with_noise():
+def test_wide_range_files_are_built_in_mechanisms_with_noise():
     assert sorted(path.stem for path in WIDE.glob("*.toml")) == sorted(six_axis_names())
     for name in six_axis_names():
         wide, own = load_wide(name), load_any(name).mechanism
@@ -82,7 +82,7 @@ def test_files_of_wide_ranges_are_the_built_ins_with_noise():
 
 
 @pytest.mark.slow
-def test_ideal_contacts_computed_beforehand_change_no_metric():
+def test_precomputed_ideal_contacts_change_no_metric():
     mechanism = load_any("probe-drogue").mechanism
     with jax_context():
         scenarios = SIX_AXES.scenarios(mechanism, draw(mechanism, 5, 1), 1)

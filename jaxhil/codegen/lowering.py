@@ -176,7 +176,7 @@ class Lowering:
         return name.lstrip("_")
 
     def note(self, writes: Locations) -> None:
-        """Record that a statement changes the variables `writes`; drop the facts that depend on their values."""
+        """Record that a statement changes the variables `writes`; drop facts that depend on them."""
         if writes:
             self.effects.append(writes)
             self.function.writes |= writes

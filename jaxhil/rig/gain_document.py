@@ -88,9 +88,7 @@ def check_form(document: Mapping[str, Any], source: str) -> None:
     try:
         actual = digest(document)
     except (TypeError, ValueError, RecursionError) as error:
-        raise make_gain_file_error(
-            source, "", f"a value that JSON cannot express ({error})", "JSON values"
-        ) from None
+        raise make_gain_file_error(source, "", f"an invalid value ({error})", "JSON values") from None
     if stated != actual:
         allowed = f"'{actual}', the digest of its content (was it edited?)"
         raise make_gain_file_error(source, "sha256", format_value(stated, 80), allowed)

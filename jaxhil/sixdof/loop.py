@@ -244,7 +244,7 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
 
 
 def run(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[RunState, Tick]:
-    """Run a batch of scenarios for `ticks` ticks; return final state and records, each (ticks, ...)."""
+    """Run a batch of scenarios for `ticks` ticks; return the final state and one record per tick."""
     rig = build_rig(loop, gains, scenario)
     state = begin(loop, rig, scenario.start)
     return lax.scan(lambda state, _: tick(loop, rig, state), state, None, length=ticks)

@@ -34,11 +34,7 @@ SETTLING = 0.03  # time from the last reading in contact to the audit [s]
 SIGMAS = 12.0  # allowed spread of a tare's readings, divided by the noise's standard deviation
 LEAST_RETREAT = 0.005  # retreat's length after a trip, minus the largest distance from the start [m]
 LEAST_DISTANCE = 1e-4  # lower bound of the limits of distances and angles [m, rad]
-WATCHDOG_LIMITS = {
-    "momentum_error": 0.05,
-    "energy_gain": 0.1,
-    "unpaid_impulse": 0.1,
-}  # lower bounds of these limits [1]
+WATCHDOG_LIMITS = {"momentum_error": 0.05, "energy_gain": 0.1, "unpaid_impulse": 0.1}  # lower bounds [1]
 LAG_RANGE = 0.5, 2.0  # lag limits, divided by the smallest and the largest lag in good runs
 WRONG_MASS = 1.2  # mass matrix of the injected fault, divided by the model's mass matrix
 

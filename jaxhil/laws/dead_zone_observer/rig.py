@@ -1,10 +1,10 @@
 """Phase lead with an observer of the force that the force sensor's dead zone removes.
 
 A dead zone of half-width dz [N] subtracts clip(F, -dz, dz) from the force F. The observer estimates this
-difference as clip(k_n d, -dz, dz), where k_n is the nominal stiffness and d the measured penetration, delayed
-like the force. A first-order low-pass filter smooths the estimate, and the phase lead acts on the sum of
-measured force and estimate. The method follows Li et al. 2026, whose disturbance observer has a gain near 1
-below 15 Hz.
+difference as clip(k_n d, -dz, dz), where k_n is the gain `observer_stiffness` and d the measured penetration,
+delayed like the force. A first-order low-pass filter smooths the estimate, and the phase lead acts on the sum
+of measured force and estimate. The method follows Li et al. 2026, whose disturbance observer has a gain near
+1 below 15 Hz.
 """
 
 from collections.abc import Mapping
