@@ -301,7 +301,7 @@ def sense(loop: Loop, rig: Rig, state: RunState) -> Sensed:
 
 
 def integrate(loop: Loop, rig: Rig, state: RunState, command: Wrench) -> tuple[States, Array, Array, Array]:
-    """Return the numerical model's next states, coordinates, coordinate rates and twist, (6, *batch) each."""
+    """Return the numerical model's next states, and its next coordinates, rates and twist (6, *batch)."""
     states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
     return states, *model_motion(rig.bodies, states)
 

@@ -1,7 +1,7 @@
 /* Replays recorded ticks (vectors.csv, argv[1]) through the controller and compares bit for bit.
  *
- * Exit code 0: all the same. 1: a line differs; its number, the column, what was found and what was expected
- * are printed. 2: the vectors cannot be read.
+ * Exit code 0: all values are equal. 1: a line differs; the program prints its number, the column, and the
+ * found and expected values. 2: the vectors cannot be read.
  */
 #include <errno.h>
 #include <math.h>
@@ -12,7 +12,7 @@
 #include "jaxhil_controller.h"
 #include "jaxhil_gains.h"
 
-/* Columns; those of a vector have six. */
+/* Index of each quantity's first column; a vector has six columns. */
 enum {
     RUN = 0,
     EVENT = 1,

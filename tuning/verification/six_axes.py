@@ -80,7 +80,7 @@ def verify_six_axes(
     """Verify that the rig's controller behaves like the simulation with the gains of a gain file.
 
     Args:
-        loaded: gain file in six axes.
+        loaded: six-axis gain file.
         scenarios: number of replayed runs: the nominal run and random draws.
         seed: seed of the draws.
         progress: callback, called with a description of each stage.

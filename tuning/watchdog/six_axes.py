@@ -2,8 +2,9 @@
 
 Runs of drawn scenarios are recorded. A run is good if its contacts end well and its twist error is at most
 half of `ERROR_LIMIT`. One part of the runs determines the limits: the extreme signals of its good runs times
-a margin. The good runs of the other part are replayed through the rig's controller with these limits: without
-a fault to count false alarms, and with an injected fault to count missed alarms.
+a margin. The other part is replayed through the rig's controller with these limits. An alarm in a good run is
+false. An alarm is missed if a run with a larger error than `ERROR_LIMIT`, or a good run with a wrong mass of
+the numerical model, causes none.
 """
 
 from collections.abc import Callable, Mapping

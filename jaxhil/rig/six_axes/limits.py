@@ -30,15 +30,21 @@ def _pose_limits(name: str, side: str, meaning: str) -> dict[str, Limit]:
 SIX_AXIS_LIMITS: dict[str, Limit] = {
     "force_range": Limit("N", FORCES[1], *FORCES, "a force reading of this size is out of range"),
     "torque_range": Limit("N m", FORCES[1], *FORCES, "a torque reading of this size is out of range"),
-    **_pose_limits("measured", "lowest", "least reading"),
-    **_pose_limits("measured", "highest", "largest reading"),
+    **_pose_limits("measured", "lowest", "lowest reading"),
+    **_pose_limits("measured", "highest", "highest reading"),
     "held_readings": Limit("1", 0.0, *HELD_READINGS, "largest number of bad readings in a row"),
-    "force_stuck_travel": Limit("m", DISTANCES[1], *DISTANCES, "travel under the same reading of a channel"),
+    "force_stuck_travel": Limit("m", DISTANCES[1], *DISTANCES, "hardware travel with an unchanged reading"),
     "position_stuck_travel": Limit(
-        "m", DISTANCES[1], *DISTANCES, "the model's travel along an axis under the same reading"
+        "m",
+        DISTANCES[1],
+        *DISTANCES,
+        "model's travel along an axis with an unchanged reading",
     ),
     "rotation_stuck_travel": Limit(
-        "rad", ANGLES[1], *ANGLES, "the model's turn about an axis under the same reading"
+        "rad",
+        ANGLES[1],
+        *ANGLES,
+        "model's rotation about an axis with an unchanged reading",
     ),
     "settling": Limit("s", 0.0, 0.0, 100.0, "time in which wrench and command decay after contact"),
     "late_fraction": LIMITS["late_fraction"],
@@ -53,37 +59,42 @@ SIX_AXIS_LIMITS: dict[str, Limit] = {
     "force_slew": Limit("N/s", FORCE_SLEWS[1], *FORCE_SLEWS, "fastest change of a force on the model"),
     "torque_slew": Limit("N m/s", FORCE_SLEWS[1], *FORCE_SLEWS, "fastest change of a torque on the model"),
     "limited_in_a_row": LIMITS["limited_in_a_row"],
-    **_pose_limits("command", "lowest", "least command"),
-    **_pose_limits("command", "highest", "largest command"),
+    **_pose_limits("command", "lowest", "lowest command"),
+    **_pose_limits("command", "highest", "highest command"),
     "velocity_limit": Limit("m/s", SPEEDS[1], *SPEEDS, "fastest translation of the pose command"),
     "angular_velocity_limit": Limit("rad/s", SPEEDS[1], *SPEEDS, "fastest rotation of the pose command"),
     "start_distance": Limit(
-        "m", 0.0, *DISTANCES, "distance of a run's first command from the measured pose, out of contact"
+        "m",
+        0.0,
+        *DISTANCES,
+        "distance of a run's first command from the measured pose, out of contact",
     ),
     "start_angle": Limit(
         "rad", 0.0, *ANGLES, "angle of a run's first command from the measured pose, out of contact"
     ),
-    "deceleration": Limit("m/s^2", DECELERATIONS[1], *DECELERATIONS, "braking and starting after a trip"),
+    "deceleration": Limit(
+        "m/s^2", DECELERATIONS[1], *DECELERATIONS, "acceleration and deceleration after a trip"
+    ),
     "angular_deceleration": Limit(
-        "rad/s^2", DECELERATIONS[1], *DECELERATIONS, "braking and starting of the rotation after a trip"
+        "rad/s^2", DECELERATIONS[1], *DECELERATIONS, "angular acceleration and deceleration after a trip"
     ),
-    "retreat_velocity": Limit("m/s", 0.0, *SPEEDS, "speed back along the way after a trip"),
-    "retreat_angular_velocity": Limit("rad/s", 0.0, *SPEEDS, "speed of rotation on that way"),
+    "retreat_velocity": Limit("m/s", 0.0, *SPEEDS, "speed of the retreat after a trip"),
+    "retreat_angular_velocity": Limit("rad/s", 0.0, *SPEEDS, "angular speed of the retreat"),
     "retreat_distance": Limit(
-        "m", 0.0, *DISTANCES, "length of that way; a rotation counts as the distance covered in its time"
+        "m", 0.0, *DISTANCES, "length of the retreat; a rotation counts as the distance covered in its time"
     ),
-    "fading": Limit("N", 0.0, *FORCES, "measured force that counts as no contact"),
-    "longest_contact": Limit("s", DURATIONS[1], *DURATIONS, "longest contact"),
+    "fading": Limit("N", 0.0, *FORCES, "largest measured force that counts as no contact"),
+    "longest_contact": Limit("s", DURATIONS[1], *DURATIONS, "longest duration of a contact"),
     "unpaid_impulse": Limit(
-        "1", RATIOS[1], *RATIOS, "largest impulse that a contact leaves unpaid, over its impulse"
+        "1", RATIOS[1], *RATIOS, "largest impulse still owed after a contact, divided by its impulse"
     ),
     "momentum_error": Limit(
-        "1", RATIOS[1], *RATIOS, "largest error of the model's momentum over a contact, over its impulse"
+        "1", RATIOS[1], *RATIOS, "largest momentum error of the model in a contact, divided by its impulse"
     ),
     "energy_gain": Limit(
-        "1", RATIOS[1], *RATIOS, "largest energy that a contact releases, over that of the approach"
+        "1", RATIOS[1], *RATIOS, "largest energy that a contact releases, divided by the approach energy"
     ),
-    "lag_lowest": Limit("s", 0.0, *TIMES, "least lag of the hardware behind the model"),
+    "lag_lowest": Limit("s", 0.0, *TIMES, "smallest lag of the hardware behind the model"),
     "lag_highest": Limit("s", TIMES[1], *TIMES, "largest lag of the hardware behind the model"),
 }
 
