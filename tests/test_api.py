@@ -116,7 +116,7 @@ def test_load_applies_any_override_or_raises_one_line_error(path, value):
 
 @hypothesis.settings(max_examples=60)
 @hypothesis.given(value=ANYTHING)
-def test_simulate_rejects_any_invalid_argument_in_one_line(value):
+def test_simulate_rejects_any_invalid_argument_with_one_line_message(value):
     refusal(jaxhil.simulate, value)
     refusal(jaxhil.simulate, "varying", value)
     if not isinstance(value, float) or not -1e-9 <= value <= 0.03:

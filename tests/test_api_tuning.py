@@ -169,7 +169,7 @@ def test_tune_rejects_unusable_objective(objective, words):
         (lambda: tuning.verify("nowhere", scenarios=0), "scenarios: found 0"),
     ],
 )
-def test_tuning_functions_reject_unusable_arguments_in_one_line(call, words):
+def test_tuning_functions_reject_unusable_arguments_with_one_line_message(call, words):
     with pytest.raises(jaxhil.InputError) as refused:
         call()
     assert words in str(refused.value) and "\n" not in str(refused.value)

@@ -90,7 +90,7 @@ def test_c99_export_rejects_the_same_delays_as_python_runtime(delay):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_c99_source_reproduces_gain_values_to_the_bit(law, tmp_path):
+def test_c99_source_reproduces_gain_values_bit_for_bit(law, tmp_path):
     rng = np.random.default_rng(1)
     document = gain_document(law)
     wide = drawn_gains(law, rng, hostile=True)
@@ -103,7 +103,7 @@ def test_c99_source_reproduces_gain_values_to_the_bit(law, tmp_path):
     assert made.exported().tobytes() == packed(law, gain_file).tobytes()
 
 
-def test_c99_source_reproduces_decimal_constants_to_the_bit(tmp_path):
+def test_c99_source_reproduces_decimal_constants_bit_for_bit(tmp_path):
     rng = np.random.default_rng(2)
     values = rng.integers(0, 2**64, 5000, dtype=np.uint64).view(np.float64)
     values = np.concatenate([values[np.isfinite(values)], c99_cases.HOSTILE[:-1], np.arange(5.0)])
@@ -229,14 +229,14 @@ def test_c99_retreat_command_is_finite_for_infinite_limits(batch):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("law", LAWS)
-def test_c99_commands_equal_python_to_the_bit(law, kind, batch):
+def test_c99_commands_equal_python_bit_for_bit(law, kind, batch):
     rng = np.random.default_rng([LAWS.index(law), KINDS.index(kind)])
     for n in range(12):
         gain_file = drawn_gains(law, rng, hostile=n % 2 == 1)
         compare(batch(law), gain_file, drawn_rows(kind, 1000, rng, gain_file.control_period))
 
 
-def test_c99_impulse_ledger_contacts_equal_python_to_the_bit(batch):
+def test_c99_impulse_ledger_contacts_equal_python_bit_for_bit(batch):
     law, statuses = "impulse_ledger", set()
     for n in range(12):
         rng = np.random.default_rng([11, n])

@@ -202,7 +202,7 @@ def toy_document(monkeypatch, law):
     return sign(gain_document("none") | {"compensator": "toy", "gains": gains})
 
 
-def test_c99_user_registered_compensator_equals_python_to_the_bit(monkeypatch, tmp_path):
+def test_c99_user_registered_compensator_equals_python_bit_for_bit(monkeypatch, tmp_path):
     document = toy_document(monkeypatch, ToyLaw)
     folder = c99_cases.write_sources(tmp_path, document)
     made = c99_cases.Batch(compiled(folder, "c99_driver.c", "driver.so", "-O2", "-shared", "-fPIC"), "toy")

@@ -22,7 +22,7 @@ NUMBERS = [0.1, -0.0, 5e-324, math.inf, -math.inf, math.nan, 1.7976931348623157e
 POINT = Point("a", {"z": 1.5, "a": math.nan}, np.array([[1.0, np.nan], [-0.0, 3.0]]), None)
 
 
-def test_checkpoint_values_are_read_back_to_the_bit():
+def test_checkpoint_values_are_read_back_bit_for_bit():
     result = decode_value(encode_value(NUMBERS), list[float])
     assert [struct.pack("d", one) for one in result] == [struct.pack("d", one) for one in NUMBERS]
     point = decode_value(encode_value(POINT), Point)

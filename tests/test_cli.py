@@ -63,7 +63,7 @@ def test_simulate_exit_code_depends_on_error_limit(jaxhil, tmp_path):
     assert "divergence" in ran.out and "0.1" in ran.out
 
 
-def test_set_option_of_simulate_command_changes_the_mechanism(jaxhil):
+def test_simulate_applies_set_overrides_to_mechanism(jaxhil):
     ran = jaxhil("simulate", "rig-300kg", "--json", "--set", "approach.velocity=0.01", "--set", "name=other")
     document = ran.document
     assert document["mechanism"] == "other"

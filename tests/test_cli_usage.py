@@ -68,7 +68,7 @@ def test_cli_exits_with_code_130_on_interrupt(jaxhil, monkeypatch):
         (["init", "a.toml", "-o", "b.toml"], ["--output", "'b.toml' and a.toml", "only one file"]),
     ],
 )
-def test_cli_reports_unusable_input_in_one_line(jaxhil, arguments, words):
+def test_cli_reports_unusable_input_with_one_line_message(jaxhil, arguments, words):
     refused(jaxhil(*arguments), *words)
 
 
@@ -83,7 +83,7 @@ def test_tune_reports_output_folder_that_cannot_be_created(jaxhil, tmp_path):
     refused(jaxhil("tune", "rig-300kg", "-o", tmp_path / "taken"), "taken")
 
 
-def test_cli_reports_internal_error_in_one_line(jaxhil, monkeypatch):
+def test_cli_reports_internal_error_with_one_line_message(jaxhil, monkeypatch):
     def broken(*arguments):
         raise ZeroDivisionError("inside")
 

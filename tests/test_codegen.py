@@ -230,7 +230,7 @@ double step(double a, double b) {{
 
 
 @needs_compiler
-def test_c99_classes_records_and_lists_equal_python_to_the_bit(tmp_path):
+def test_c99_classes_records_and_lists_equal_python_bit_for_bit(tmp_path):
     program = CProgram("t_")
     program.add(Outer.__init__, Outer)
     program.add(Outer.step, Outer)

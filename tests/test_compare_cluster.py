@@ -21,7 +21,7 @@ def figures(board):
     }
 
 
-def test_compare_reports_missing_scheduler_in_one_line():
+def test_compare_reports_missing_scheduler_with_one_line_message():
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
         tuning.compare("varying", LAWS, scheduler="nowhere://x", **FEW)

@@ -147,7 +147,7 @@ def test_jax_and_runtime_compensators_agree_for_contacts_and_for_noise(name):
 
 
 @pytest.mark.parametrize("name", WITH_GAINS)
-def test_runtime_rejects_bad_gains_in_one_line(name):
+def test_runtime_rejects_bad_gains_with_one_line_message(name):
     for gain, specification in ON_THE_RIG[name].gains.items():
         below = math.nextafter(specification.lowest, -math.inf)
         above = math.nextafter(specification.highest, math.inf)

@@ -49,7 +49,7 @@ def undelayed(members, damped: bool) -> Any:
     return SimpleNamespace(**references)
 
 
-def test_generated_family_of_mechanism_files_loads_unchanged(tmp_path, members):
+def test_files_of_generated_mechanism_family_load_unchanged(tmp_path, members):
     paths = write(tmp_path)
     assert [load(path).mechanism for path in paths] == members
     assert len({path.name for path in paths}) == len({m.name for m in members}) == NUMBER
@@ -65,7 +65,7 @@ def test_generated_mechanism_files_are_reproducible_in_another_process(tmp_path)
     assert texts(seed=1) != texts(seed=0)
 
 
-def test_smaller_generated_family_is_prefix_of_larger_family(members):
+def test_smaller_generated_mechanism_family_is_prefix_of_larger_one(members):
     for number in (1, 3, 20):
         assert family(number) == members[:number]
 
@@ -92,7 +92,7 @@ def test_values_of_generated_mechanisms_fill_their_ranges(members):
     assert all(m.rig.control_period == 1e-3 for m in members)
 
 
-def test_generated_family_has_every_contact_law_and_undamped_members(members):
+def test_generated_mechanism_family_has_every_contact_law_and_undamped_mechanisms(members):
     assert {m.contact.law for m in members} == set(LAWS)
     number = [sum(g.tuned(m) for g in COMPENSATORS["response_error"].gains) for m in members]
     damped = [m.contact.damping[0] > 0 for m in members]

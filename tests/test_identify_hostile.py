@@ -98,7 +98,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_identify_command_rejects_corrupted_logs_in_one_line(jaxhil, day, tmp_path, case):
+def test_identify_command_rejects_corrupted_logs_with_one_line_message(jaxhil, day, tmp_path, case):
     spoil, words = REFUSED[case]
     ran = identified(jaxhil, tmp_path, spoil(day))
     assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1 and "internal" not in ran.err

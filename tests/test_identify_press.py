@@ -39,7 +39,7 @@ def test_measured_press_data_are_explained_by_first_order_lag_with_delay(press):
     assert error(press, press.model.response) < 0.012
 
 
-def test_published_model_without_delay_has_four_times_the_error_on_press_data(press):
+def test_omitting_delay_from_model_quadruples_fit_error_on_press_data(press):
     fast, slow = PUBLISHED
     assert error(press, lambda s: 1.0 / ((1.0 + s / fast) * (1.0 + s / slow))) > 0.044
 

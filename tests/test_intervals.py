@@ -247,7 +247,7 @@ def test_replicate_interval_has_stated_coverage_for_independent_points(probabili
 
 
 @pytest.mark.parametrize("part", (0.0, 0.1, 0.3, 0.5, 0.8))
-def test_replicate_interval_has_stated_coverage_for_perfectly_even_points(part):
+def test_replicate_interval_has_stated_coverage_for_evenly_spaced_points(part):
     failures = 300 + (np.random.default_rng(5).random((2000, 8)) < part)
     assert covered(replicate_interval(failures, 1024), (300 + part) / 1024) >= BAR
 

@@ -111,7 +111,7 @@ def test_closed_standard_output_is_refused_before_any_work():
     refused(run("simulate", shell=">&-"), "standard output: found a closed stream")
 
 
-def test_full_standard_output_is_reported_in_one_line():
+def test_write_failure_of_standard_output_on_full_device_is_reported_in_one_line():
     refused(run("mechanisms", "--json", shell="> /dev/full"), "standard output: cannot be written: No space")
 
 

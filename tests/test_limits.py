@@ -131,7 +131,7 @@ def test_command_limit_that_is_just_reached_does_not_change_the_command(origin, 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.floats(1e-9, 1e-3), st.floats(-VELOCITY_LIMIT / 4, VELOCITY_LIMIT / 4), st.floats(-0.05, 0.05))
-def test_limited_command_equals_target_to_the_bit_after_reaching_the_target(distance, speed, origin):
+def test_limited_command_equals_target_bit_for_bit_after_reaching_the_target(distance, speed, origin):
     targets = origin + moves(np.full(800, speed))
     targets[2:] += distance
     commands = limited_motion(targets, VELOCITY_LIMIT, ACCELERATION_LIMIT)

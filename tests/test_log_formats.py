@@ -123,7 +123,7 @@ def test_all_log_formats_give_the_same_campaign(tmp_path, name, write):
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("suffix", [".mat", ".h5", ".mcap", ".mf4", ".tdms"])
-def test_truncated_log_or_missing_library_is_refused_in_one_line(tmp_path, suffix):
+def test_truncated_log_or_missing_library_is_refused_with_one_line_message(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"torn" * 100)
     with pytest.raises(InputError) as caught:

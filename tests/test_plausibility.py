@@ -317,7 +317,7 @@ def test_velocity_limit_check_applies_to_uncertain_values():
     check_run(rig({"uncertainty": normal}, rig__simulator__velocity_limit=2 * SPEED), drawn=True)
 
 
-def test_every_public_function_refuses_mechanism_with_endless_run():
+def test_every_public_function_refuses_endless_run():
     endless = rig(rig__control_period=1e-9)
     for function in (jaxhil.simulate, tuning.tune, tuning.compare):
         with pytest.raises(jaxhil.InputError, match="at most 1e\\+07 ticks per contact"):
@@ -360,7 +360,7 @@ def test_simulate_output_begins_with_mechanism_summary_line(jaxhil):
 
 
 @pytest.mark.parametrize("command", ["simulate", "tune", "compare"])
-def test_every_command_refuses_mechanism_with_endless_run_in_one_line(jaxhil, command, tmp_path, monkeypatch):
+def test_every_command_refuses_endless_run_with_one_line_message(jaxhil, command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ran = jaxhil(command, "rig-300kg", "--set", "rig.control_period=1e-9")
     assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1

@@ -124,7 +124,7 @@ def test_report_verdict_follows_from_all_requirements(put):
         ({"schema": "jaxhil/gains/1"}, "sha256: found nothing"),
     ],
 )
-def test_report_refuses_third_party_results_in_one_line(jaxhil, put, tmp_path, document, said):
+def test_report_refuses_third_party_results_with_one_line_message(jaxhil, put, tmp_path, document, said):
     ended = jaxhil("report", put(document), "-o", tmp_path / "page.html")
     assert ended.code == 2 and said in ended.err and ended.err.count("\n") == 1
     assert not (tmp_path / "page.html").exists()

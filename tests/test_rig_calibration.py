@@ -88,7 +88,7 @@ def watch(limits, signals, rules, lane):
 
 
 @pytest.mark.parametrize("sided", [pytest.param(1, marks=pytest.mark.slow), 2])
-def test_calibration_audit_equals_watchdog_audit_to_the_bit(sided):
+def test_calibration_audit_equals_watchdog_audit_bit_for_bit(sided):
     rules, _ = build_audit_rules({1: ONE_SIDED, 2: NOISY_GAP}[sided])
     chunk, slots = recorded(sided), 8
     audited = audit_contacts(chunk.signals, rules, slots)

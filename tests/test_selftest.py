@@ -208,7 +208,7 @@ def test_self_test_tolerance_of_simulated_forces_is_a_fraction_of_force_range(fi
     assert good or f"FAIL  vectors.csv: line {tick + 2}: run 0: force" in out
 
 
-def test_self_test_compares_controller_commands_to_the_bit():
+def test_self_test_compares_controller_commands_bit_for_bit():
     assert selftest.are_same_bits(float("nan"), -float("nan"))
     assert not selftest.are_same_bits(0.0, -0.0)
     assert not selftest.are_same_bits(0.1 + 0.2, 0.3)
@@ -221,7 +221,7 @@ def test_self_test_compares_controller_commands_to_the_bit():
 @pytest.mark.parametrize(
     "garbage", [b"", b"\x00\xff\xfe" * 999, b"[" * 100_000, b"{}", b"raise SystemExit(0)\n", None, "folder"]
 )
-def test_self_test_reports_unreadable_files_in_one_line_per_check(folder, name, garbage):
+def test_self_test_reports_unreadable_files_with_one_line_per_check(folder, name, garbage):
     (folder / name).unlink()
     if garbage == "folder":
         (folder / name).mkdir()

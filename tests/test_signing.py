@@ -126,7 +126,7 @@ def test_openssl_creates_keys_and_verifies_bundle_signature(tmp_path):
     assert subprocess.run(proof.split(), cwd=tmp_path, capture_output=True).returncode != 0
 
 
-def test_unusable_signing_keys_are_refused_in_one_line(key, folder, tmp_path, jaxhil):
+def test_unusable_signing_keys_are_refused_with_one_line_message(key, folder, tmp_path, jaxhil):
     pair = Ed25519PrivateKey.generate()
     other = generate_private_key(65537, 2048)
     copy = tmp_path / "kept.pem"

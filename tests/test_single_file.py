@@ -53,7 +53,7 @@ def test_single_file_runtime_has_no_unused_or_missing_name(exported):
     assert ran.returncode == 0, ran.stdout
 
 
-def test_single_file_runtime_commands_equal_commands_of_package_to_the_bit(exported):
+def test_single_file_runtime_commands_equal_commands_of_package_bit_for_bit(exported):
     compensator, folder = exported
     document = gain_document(compensator)
     ours, other = Controller.from_dict(document), loaded(folder)["Controller"].from_dict(document)

@@ -304,7 +304,7 @@ def test_six_axis_bodies_at_rest_with_noise_are_not_reported_as_divergent():
     assert run.status == "miss" and run.final.time == pytest.approx(0.2)
 
 
-def test_unsupported_six_axis_options_are_refused_in_one_line(jaxhil, tmp_path):
+def test_unsupported_six_axis_options_are_refused_with_one_line_message(jaxhil, tmp_path):
     for arguments, reason in (
         (["simulate", "petals", "--setting", "x"], "--setting: found 'x', expected none: compensators"),
         (

@@ -51,7 +51,7 @@ def test_public_functions_accept_six_axis_mechanisms():
         assert reason in str(caught.value) and str(caught.value).isprintable()
 
 
-def test_unsupported_six_axis_features_are_refused_in_one_line(jaxhil, tmp_path):
+def test_unsupported_six_axis_features_are_refused_with_one_line_message(jaxhil, tmp_path):
     path = tmp_path / "gains.json"
     for given, reason in (
         (

@@ -43,7 +43,7 @@ def local_sweep(tmp_path_factory):
     return rows_of(tmp_path_factory.mktemp("whole") / "store")
 
 
-def test_sweep_without_scheduler_fails_in_one_line_and_writes_no_files(tmp_path):
+def test_sweep_without_scheduler_fails_with_one_line_message_and_writes_no_files(tmp_path):
     pytest.importorskip("distributed")
     write_gain_file(tmp_path / "gains.json", case())
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
@@ -55,7 +55,7 @@ def test_sweep_without_scheduler_fails_in_one_line_and_writes_no_files(tmp_path)
     ("says", "reason"),
     ((b"", "nothing answers within"), (b"HTTP/1.1 400 Bad", "another program answers")),
 )
-def test_sweep_with_unresponsive_scheduler_fails_in_one_line(monkeypatch, says, reason):
+def test_sweep_with_unresponsive_scheduler_fails_with_one_line_message(monkeypatch, says, reason):
     pytest.importorskip("distributed")
     monkeypatch.setattr("tuning.caches.cluster.SCHEDULER_TIMEOUT", 0.5)
     waited = Event()

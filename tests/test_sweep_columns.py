@@ -138,7 +138,7 @@ def test_outcome_unlike_ideal_contact_ranks_between_error_and_saturation():
     assert outcomes(unended) == ["timeout"]
 
 
-def test_outcomes_without_ideal_contact_columns_depend_only_on_errors():
+def test_failures_depend_only_on_errors_if_ideal_contact_columns_are_missing():
     result = rows([[0.0], [0.0]], [[OK], [OK]], ideal=(1.0, 1.0))
     old = {name: values for name, values in result.items() if not name.startswith("reference_")}
     classified = classify_outcomes(

@@ -269,7 +269,7 @@ def test_sweep_verdict_is_printed_if_disk_is_full(jaxhil, own_store, quick):
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-def test_replay_command_reproduces_row_to_the_bit(jaxhil, store, tmp_path):
+def test_replay_command_reproduces_row_bit_for_bit(jaxhil, store, tmp_path):
     ran = jaxhil("replay", store, 77, "--json", "--plot", tmp_path / "plots" / "77.png")
     result = document(ran)
     assert ran[0] == 0 and result["verdict"] == "good" and result["different"] == []

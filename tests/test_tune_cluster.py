@@ -14,14 +14,14 @@ pytestmark = pytest.mark.users_options
 FEW: dict[str, Any] = {"scenarios": 4, "starts": 1, "steps": 2, "validation": 15}
 
 
-def test_tuning_without_scheduler_fails_in_one_line():
+def test_tuning_without_scheduler_fails_with_one_line_message():
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="--scheduler: found 'nowhere"):
         tuning.tune("varying", scheduler="nowhere://x", **FEW)
 
 
 @pytest.mark.slow
-def test_tuning_on_a_cluster_gives_gains_and_pareto_fronts_of_local_tuning(tmp_path, monkeypatch):
+def test_cluster_tuning_gives_same_gains_and_pareto_fronts_as_local_tuning(tmp_path, monkeypatch):
     for name in ("tune_all", "pareto"):
         monkeypatch.setattr(f"tuning.gains.{name}.BLOCK", 2)
     changes = [{"bodies.equivalent_mass": mass} for mass in (3e2, 4e2, 5e2)]

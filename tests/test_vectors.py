@@ -106,7 +106,7 @@ def test_hostile_vectors_contain_every_kind_of_bad_reading(vectors):
     assert all(math.isnan(row.force_simulated) for row in rows)
 
 
-def test_new_controller_reproduces_every_test_vector_to_the_bit(loaded, vectors):
+def test_new_controller_reproduces_every_test_vector_bit_for_bit(loaded, vectors):
     gain_file = check_gain_document(loaded.document)
     controller = None
     for row in vectors.rows:
@@ -119,7 +119,7 @@ def test_new_controller_reproduces_every_test_vector_to_the_bit(loaded, vectors)
         assert (force, position, controller.faults) == (row.force_command, row.position_command, row.faults)
 
 
-def test_vector_values_survive_conversion_to_text_to_the_bit(vectors):
+def test_vector_values_survive_conversion_to_text_bit_for_bit(vectors):
     rows = list(csv.reader(io.StringIO(format_csv(vectors.rows))))[1:]
     for row, fields in zip(vectors.rows, rows, strict=True):
         for value, field in zip(row, fields, strict=True):

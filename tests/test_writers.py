@@ -49,7 +49,7 @@ writer_test = settings(max_examples=25)
 
 @writer_test
 @given(documents)
-def test_ros2_parameter_file_is_read_back_to_the_bit(made):
+def test_ros2_parameter_file_is_read_back_bit_for_bit(made):
     text = ros2_files(made)["ros2.yaml"].decode("ascii")
     tree = YAML(typ="safe", pure=True).load(text)
     assert list(tree) == ["/jaxhil_controller"] and list(tree["/jaxhil_controller"]) == ["ros__parameters"]
@@ -92,7 +92,7 @@ def test_ros2_texts_that_look_like_numbers_stay_strings():
 
 @writer_test
 @given(documents)
-def test_matlab_struct_is_read_back_to_the_bit(made):
+def test_matlab_struct_is_read_back_bit_for_bit(made):
     files = matlab_files(made)
     assert files == matlab_files(made)
     result = loadmat(io.BytesIO(files["gains.mat"]), simplify_cells=True)["jaxhil"]
@@ -153,7 +153,7 @@ def test_matlab_file_follows_published_description_of_the_format():
 
 @writer_test
 @given(documents)
-def test_csv_gain_table_is_read_back_to_the_bit(made):
+def test_csv_gain_table_is_read_back_bit_for_bit(made):
     rows = list(csv.DictReader(io.StringIO(csv_files(made)["gains.csv"].decode("ascii"))))
     result = {row["name"]: row for row in rows}
     assert len(result) == len(rows)
