@@ -108,7 +108,7 @@ def test_identify_command_writes_nothing_without_contact_and_prior(jaxhil, day, 
     [
         ([], ["logs: found none"]),
         (["--guess"], ["logs: found none"]),
-        (["LOGS"], ["': found no column with this name", "--guess drafts such a file"]),
+        (["LOGS"], ["': found no column with this name", "--guess writes a draft of it"]),
         (["LOGS", "--map", "none.toml"], ["none.toml: found no such file"]),
         (["LOGS", "--prior", "rig-300"], ["did you mean rig-300kg"]),
         (["LOGS", "--hold-out", "1"], ["--hold-out: found 1.0"]),
@@ -127,7 +127,7 @@ def test_identify_command_writes_nothing_without_contact_and_prior(jaxhil, day, 
         (["LOGS", "--map", "MAP", "--stage", "press"], ["--stage: found 'press'", "contact, free"]),
     ],
 )  # fmt: skip
-def test_identify_command_rejects_wrong_arguments_with_one_line_message(
+def test_identify_command_rejects_bad_arguments_with_one_line_message(
     jaxhil, day, tmp_path, arguments, words
 ):
     words_for = {

@@ -61,7 +61,7 @@ def test_surface_is_estimated_from_bias_at_rest_and_press_run_always_in_contact(
 def test_press_run_always_in_contact_is_rejected_without_bias_at_rest():
     for run in (multisine(), ramp(2e-4), multisine(noise=10.0)):
         with pytest.raises(
-            InputError, match=r"^press.csv: force_measured: found a press run that never leaves"
+            InputError, match=r"^press.csv: force_measured: found only a press run that stays"
         ):
             fit(run, None)
 

@@ -193,7 +193,7 @@ class Progress:
         self._begun_stage = True
 
     def _show(self, due: float) -> None:
-        """Update the bar; if there is none, print a line unless the last line is newer than `due` [s]."""
+        """Update the bar. Without a bar, print a line if the last one is at least `due` seconds old."""
         if self._bar is not None:
             rate = self._format_rate()
             self._bar.update(self._task, completed=self._done, description=self._text, pace=rate)
@@ -265,7 +265,7 @@ class _ActivityColumn(TextColumn):
 
 @contextmanager
 def _show_bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress | None]:
-    """Provide a progress bar, or None unless it is `shown` and standard error is a terminal."""
+    """Provide a progress bar if `shown` is true and standard error is a terminal, else None."""
     console = _make_console(sys.stderr)
     if not shown or not console.is_terminal:
         yield None

@@ -55,8 +55,8 @@ class CExpression(NamedTuple):
     text: str  # C code
     type: ValueType  # type of the value
     rank: int = ATOM  # precedence of the expression's outermost operator in C
-    reads: Locations = frozenset()  # locations that the evaluation reads
-    writes: Locations = frozenset()  # locations that the evaluation changes
+    reads: Locations = frozenset()  # variables and attributes that are read when the expression is evaluated
+    writes: Locations = frozenset()  # variables and attributes that the evaluation changes
     fails: bool = False  # whether the error flag must be tested after the evaluation
     sign: str = ""  # sign of the value, as in `ValueType`
     span: tuple[Any, Any] | None = None  # least and largest value, if known at export

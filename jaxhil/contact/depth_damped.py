@@ -1,4 +1,7 @@
-"""Hertz contact with damping proportional to depth: F = k d^n + b d' d/d_0, clamped at 0."""
+"""Hertz contact with damping proportional to depth: F = k d^n + b d' d/d_0, clamped at 0.
+
+d_0 is the reference depth.
+"""
 
 from typing import ClassVar
 
@@ -10,7 +13,7 @@ from jaxhil.contact.keys import EXPONENT, REFERENCE_DEPTH
 from jaxhil.contact.power_law import COMMON_EXPONENTS, PowerLaw
 from jaxhil.contact.regression import Regression, RegressionFamily
 
-DEFAULT_REFERENCE_DEPTH = 1e-3  # m, d_0 for which identification fits b
+DEFAULT_REFERENCE_DEPTH = 1e-3  # m; reference depth d_0 for which identification fits b
 
 
 class DepthDamped(PowerLaw):

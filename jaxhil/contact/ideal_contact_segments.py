@@ -112,7 +112,10 @@ class _SegmentPassage(NamedTuple):
 
 
 def _traverse(decay, segment: _Segment, inward, state: _State) -> _State:
-    """Advance the state through one segment: to the far depth, the turning point or the separation."""
+    """Advance the state through one segment: to its other end, the turning point or the separation.
+
+    The other end is the deeper one for the inward motion, and the shallower one for the outward motion.
+    """
     active = jnp.where(inward, ~state.ended, ~state.ended & (state.segment >= segment.number))
     passage = _compute_passage(decay, segment, inward, state, active)
     stiffness = segment.stiffness
@@ -159,14 +162,14 @@ def _traverse(decay, segment: _Segment, inward, state: _State) -> _State:
 def _compute_passage(decay, segment: _Segment, inward, state: _State, active) -> _SegmentPassage:
     """Compute the motion of the `active` batch elements through a segment; its times have no derivative."""
     stiffness, turns_here = segment.stiffness, state.segment == segment.number
-    # The outward motion enters a segment at its upper depth, but the turning segment at the turning point.
+    # The outward motion enters a segment at its deeper end, but the turning segment at the turning point.
     depth = jnp.where(inward, 0.0, jnp.where(turns_here, state.depth, segment.thickness))
     depth = jnp.where(active, depth, 0.0)
     velocity = jnp.where(active, state.velocity, 0.0)
     spring = segment.acceleration + stiffness * depth
     force = jnp.maximum(spring + 2 * decay * velocity, 0.0)
 
-    # If the motion does not cross the far depth, it ends at d' = 0 (inward) or F = 0 (outward). In the
+    # If the motion does not cross the other end, it ends at d' = 0 (inward) or F = 0 (outward). In the
     # inward motion, F is largest at the start, at the end, or (if F increases at the start) where F' = 0.
     fixed = lax.stop_gradient((decay, stiffness, spring, velocity))
     growth = stiffness * velocity - 2 * decay * force

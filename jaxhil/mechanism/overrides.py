@@ -112,7 +112,10 @@ def _numeric_keys(raw: Mapping[str, Any]) -> dict[str, Range]:
 
 
 def _parse_path(text: str, key: str | None = None) -> tuple[KeyPath, int]:
-    """Return the path before ``=`` and the position after ``=``; messages show `key` or, if None, `text`."""
+    """Return the path before ``=`` and the index of the character after ``=``.
+
+    Error messages show `key`, or `text` if `key` is None.
+    """
     source, example = (text, _EXAMPLE) if key is None else (key, _EXAMPLE_KEY)
     path: list[str | int] = []
     position = 0

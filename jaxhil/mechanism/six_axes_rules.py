@@ -120,7 +120,7 @@ def _check_inertia(path: KeyPath, inertia: Inertia, *, massless: bool = False) -
         raise KeyProblem(path, f"a principal moment of {first:g} kg m^2", "positive principal moments")
     if first < MIN_INERTIA_RATIO * third:
         found = f"principal moments from {first:g} to {third:g} kg m^2"
-        raise KeyProblem(path, found, f"moments of at least {MIN_INERTIA_RATIO:g} of the largest")
+        raise KeyProblem(path, found, f"moments of at least {MIN_INERTIA_RATIO:g} times the largest moment")
     if third > (first + second) * (1 + INERTIA_TOLERANCE):
         found = f"principal moments {first:.6g}, {second:.6g} and {third:.6g} kg m^2"
         expected = "moments of a rigid body: none larger than the sum of the other two"

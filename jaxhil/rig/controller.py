@@ -269,9 +269,9 @@ class Controller:
         """Return the position [m] to command for the numerical model's motion after this tick's step.
 
         Two successive commands differ by at most `velocity_limit` times the period. A run's first command
-        may differ from the measured position by this step, or out of contact by `start_distance`, because
-        moving drives lag behind. Before a run's first `step`, the model's position replaces the measured
-        position if the model is out of contact.
+        may differ from the measured position by at most this amount or, if the model is out of contact, by
+        at most `start_distance`, because moving drives lag behind. Before a run's first `step`, the model's
+        position replaces the measured position if the model is out of contact.
 
         After a trip, the commands move to rest out of contact. They start from the last command, or if there
         is none, from the last measured position. If there is neither, they start from a position out of

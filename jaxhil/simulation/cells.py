@@ -51,7 +51,7 @@ NO_CELLS = CellCounts(0, 0, 0)
 class Cells(NamedTuple):
     """Positions of the cells in a sampling interval, and matrices that give the motion in each cell.
 
-    Cells are in the order of time.
+    Cells are in chronological order.
     """
 
     begin: Float[Array, "cells *batch"]  # start of a cell in the sampling interval [periods]

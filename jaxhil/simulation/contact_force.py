@@ -79,7 +79,7 @@ class Surfaces(NamedTuple):
     clearance: Array | None  # distance between two surfaces [m]; None for one surface
 
     def force(self, motion: MotionSample) -> tuple[Array, tuple[Any, ...]]:
-        """Return the signed contact force [N] at this motion, and the contact law's next state."""
+        """Return the signed contact force [N] for this position and velocity, and the law's next state."""
         return compute_two_sided_force(
             self.law, self.parameters, self.state, motion.position, motion.velocity, self.clearance
         )
@@ -115,7 +115,7 @@ class Surfaces(NamedTuple):
         )
 
     def sample(self, motion: MotionSample, force: Array) -> "ContactSample":
-        """Return the contact at this motion, given the contact force [N]."""
+        """Return the contact for this position and velocity, given the contact force [N]."""
         if self.clearance is None:
             edge = self.law.edge(self.parameters, motion.velocity)
             return ContactSample(motion.position, force, edge, jnp.ones_like(edge))

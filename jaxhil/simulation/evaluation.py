@@ -112,9 +112,9 @@ class RigModel(abc.ABC):
         """Return the name of a loop's compensator."""
 
     def with_ideal_contacts(self, batches: Sequence[Any]) -> list[Any]:
-        """Return batches of scenarios with their ideal contacts, which runs with any gains then use.
+        """Add the ideal contacts to batches of scenarios, so that they are computed once for all gains.
 
-        Use it for scenarios that run with several gains. Batches whose ideal contacts are cheap are returned
+        Batches whose ideal contacts are cheap are returned
         unchanged.
         """
         return list(batches)
@@ -140,7 +140,10 @@ class RigModel(abc.ABC):
         }
 
     def select_verdict_error(self, outcome: Outcome) -> Outcome:
-        """Return the rows of an outcome with the error that tuning minimises and to which limits apply."""
+        """Return only those rows of an outcome that contain the verdict's error.
+
+        Tuning minimises this error, and compares it with the limits.
+        """
         return self.by_error(outcome)[self.verdict_error]
 
     def evaluate(self, loop: Any, gains: Mapping[str, Any], scenarios: Any, at_least: int = 1) -> Outcome:

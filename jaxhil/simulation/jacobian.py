@@ -34,7 +34,7 @@ from jaxhil.simulation.run import ContactResult, check_seed
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 GAIN_PREFIX = "gains."
-# Results without a derivative: durations are whole numbers of ticks, and the status is a text.
+# Results without a derivative: durations are whole numbers of ticks, and the status is a string.
 NOT_DIFFERENTIABLE = ("duration", "duration_ratio", "status")
 DIFFERENTIABLE_RESULTS = tuple(name for name in ContactResult._fields if name not in NOT_DIFFERENTIABLE)
 _QUANTUM_KEYS = ("rig.force_sensor.quantum", "rig.position_sensor.quantum")

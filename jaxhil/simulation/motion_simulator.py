@@ -277,7 +277,7 @@ def _last_row(denominator, control_period):
 
 
 def _steady_velocity(system, transition, steady_command, hold):
-    """Return the steady state per unit of the command's increase in a control period."""
+    """Return the steady state under a ramp command that increases by 1 in each control period."""
     order = steady_command.shape[0]
     if hold == "linear":
         # The steady response to a ramp u is w = u/a_n - a_{n-1} u'/a_n^2 and w' = u'/a_n.

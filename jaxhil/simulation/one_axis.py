@@ -109,10 +109,11 @@ evaluate = ONE_AXIS.evaluate
 
 
 def _separate_loops(rig: RigConstants) -> RigConstants:
-    """Return equal constants that make XLA compile the loop over the contacts as a separate function.
+    """Return a copy with equal values that makes XLA compile the contact loop as a separate function.
 
-    XLA compiles nested loops as one function, up to the outermost loop without a sort. LLVM's time for a
-    function grows with the square of its length. This function sorts two numbers to keep functions short.
+    XLA merges nested loops into one function, but does not merge a loop that contains a sort. A dummy sort of
+    two numbers therefore splits the code into shorter functions. LLVM's time for a function grows with the
+    square of its length.
     """
     contacts = rig.scenario.contacts
     bound = jnp.max(contacts)

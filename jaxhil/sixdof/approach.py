@@ -26,7 +26,7 @@ def touching_height(
 
     The chaser moves along -z of T. If it passes without a touch, the result is NaN. Each search step is as
     long as the gap between the shapes, so that no step can pass a surface. Newton's method then refines the
-    result to rounding.
+    result to within rounding error.
     """
 
     def depth(height: Array) -> Array:

@@ -106,7 +106,10 @@ def _latch(latch: six_axes.Latch, numbers: Values, path: str) -> Latch:
 
 
 def _candidate(contact: six_axes.Contact, numbers: Values, name: str, copy: int, count: int) -> Candidate:
-    """Build the candidate for the copy with index `copy`, of `count` copies, of a [contact] table."""
+    """Build the candidate contact (pair of shapes that may touch) for one copy of a `[contact]` table.
+
+    `count` is the number of copies, and `copy` is the index of this copy.
+    """
     path = f"contact.{name}"
     turn = numbers(f"{path}.pattern.phase", 0.0) + 2 * np.pi * copy / count
     turns = {"chaser": turn, "target": turn + numbers(f"{path}.target_pattern.phase", 0.0)}

@@ -29,7 +29,7 @@ class Latch(NamedTuple):
     point: Vector  # point of the chaser that the latch catches, in chaser frame C [m]
     depth: Float[Array, "latches *batch"]  # minimum depth of the point below T's plane z = 0 [m]
     angle: Float[Array, "latches *batch"]  # maximum angle between frames of chaser and target [rad]
-    speed: Float[Array, "latches *batch"]  # maximum speed at which the point recedes [m/s]; may be infinite
+    speed: Float[Array, "latches *batch"]  # maximum velocity of the point along T's z [m/s]; may be infinite
     # stiffness matrix in target frame T: from displacement and rotation to force and moment about the point
     stiffness: Float[Array, "6 6 latches *batch"]  # [N/m, N, N m]
     # damping matrix in target frame T: from velocity and angular velocity to force and moment about the point

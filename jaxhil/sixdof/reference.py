@@ -38,7 +38,7 @@ class Past(NamedTuple):
     """Past of the ideal contact: its metrics up to a time, and the states at this time."""
 
     time: Float[Array, "*batch"]  # time since the start [s]
-    states: States  # states of the bodies at the field `time`
+    states: States  # states of the bodies at the instants in `time`
     touches: Int[Array, "*batch"]  # number of touches of all pairs of shapes
     touched: Float[Array, "*batch"]  # time during which shapes touched [s]
     peak_force: Float[Array, "*batch"]  # peak force [N]
@@ -83,12 +83,12 @@ class Passage(NamedTuple):
 
 
 class Approach(NamedTuple):
-    """Constants of the integration: motion at the start of the ideal contact, and minimum recorded gap."""
+    """Quantities that stay constant during the integration of the ideal contact."""
 
-    twist: Twist  # twist of chaser frame C relative to target frame T
+    twist: Twist  # twist of chaser frame C relative to target frame T at the start
     mass: Float[Array, "6 6 *batch"]  # relative mass matrix
     speed: Float[Array, "*batch"]  # speed that scales the integration error, see `space.scale` [m/s]
-    quiet: Float[Array, "*batch"]  # minimum duration of a recorded gap [s]
+    quiet: Float[Array, "*batch"]  # minimum duration of a recorded gap between touches [s]
 
 
 def follow_contact(space: Space, states: States, quiet: Array, until: Array, period: Array) -> Reference:

@@ -2,8 +2,8 @@
 
 A sensor on the fixed side, under the target's mechanism, reads the reaction force; the constant weight on it
 is tared. A sensor on the moving side is between the robot's flange and the chaser's mechanism (the tool). It
-also reads the tool's weight and inertia, which change with the pose. Delay and lag of
-the sensor are part of `jaxhil.sixdof.loop`.
+also reads the tool's weight and inertial force, which depend on the tool's orientation and motion. Delay and
+lag of the sensor are part of `jaxhil.sixdof.loop`.
 """
 
 from typing import NamedTuple

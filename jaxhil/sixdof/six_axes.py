@@ -75,7 +75,7 @@ class SixAxes(RigModel):
         return mechanism.approach.episodes if mechanism.approach else 1
 
     def with_ideal_contacts(self, batches: Sequence[Scenario]) -> list[Scenario]:
-        """Return batches of scenarios with their ideal contacts, integrated together on all devices."""
+        """Add the ideal contacts to batches of scenarios; integrate them together on all devices."""
         together = self.place_batch(jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *batches))
         results = cached_programs.run_cached(
             _compute_ideal_contacts, self, together.scenarios, options=self.compiler_options

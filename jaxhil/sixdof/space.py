@@ -38,7 +38,7 @@ EVENT_ACCURACY = 1e-6  # s; accuracy of the time at which a touch begins or ends
 MAX_STEP_WITH_MEMORY = 1e-4  # s; maximum length of a step for laws with memory
 MAX_STEPS = 200_000  # maximum number of steps if the mean step is short
 MIN_STEP_RATIO, MAX_STEP_RATIO = 0.1, 4.0  # limits of the ratio of two successive step lengths
-NEAREST_POINT_MARGIN = 1.0  # m; distance by which the nearest points may move along two shapes
+NEAREST_POINT_MARGIN = 1.0  # m; margin added to the lever arm, because contact points move along the shapes
 MIN_SPEED = 1e-30  # m/s; avoids a division by zero
 
 

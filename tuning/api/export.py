@@ -275,7 +275,7 @@ def _parse_limits(limits: Any) -> dict[str, float | None]:
     Raise `InputError` if a name or a value is not allowed.
     """
     if not isinstance(limits, Mapping):
-        raise ArgumentError("limits", format_value(limits), "limits by name")
+        raise ArgumentError("limits", format_value(limits), "a dict from names of limits to values")
     for name, value in limits.items():
         if name not in ALL_LIMITS:
             raise ArgumentError("limits", format_value(name), f"one of {', '.join(LIMITS)}")

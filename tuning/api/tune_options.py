@@ -176,10 +176,11 @@ class TuneOptions:
 
     @property
     def wants_quiet(self) -> bool:
-        """Return whether the options ask for the quietest gains whose error is within the limit.
+        """Return whether the options ask for quiet gains.
 
-        This is the case if the limit is positive and finite, and all options of the objective have their
-        default values.
+        Among the gains whose error is within the limit, these amplify sensor noise least and cause the
+        smallest peaks of the force command. The options ask for them if the limit is positive and finite, and
+        all options of the objective have their default values.
         """
         weights = self.command_weight, self.noise_weight, self.chatter_weight, self.transparency_weight
         is_default = self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4

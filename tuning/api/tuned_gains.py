@@ -234,7 +234,7 @@ class TradedGains:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the gain file of this point.
+        """Write the gain file of this point of the Pareto front.
 
         Raises:
             InputError: If the file cannot be written.

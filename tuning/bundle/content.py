@@ -17,7 +17,7 @@ from tuning.bundle.manifest import manifest_text
 TUNING_FOLDER = Path(__file__).parents[1]
 # Files that are copied unchanged into a bundle.
 SELFTEST = "bundle/selftest.py"
-UDP_FILES = ("rig/udp_controller.py", "rig/udp_protocol.py")  # of one axis
+UDP_FILES = ("rig/udp_controller.py", "rig/udp_protocol.py")  # only in bundles of one axis
 
 
 def code_files(compensator: str, axes: int = 1) -> dict[str, bytes]:

@@ -165,10 +165,10 @@ def list_objectives(objective: Objective | Sequence[Objective], number: int) -> 
 
 
 def join_terms(objectives: Sequence[Objective], probed: bool = False, contacts: int = 0) -> ObjectiveTerms:
-    """Return the terms that at least one of several objectives has, so that all can share a program.
+    """Return the union of the terms of several objectives, so that they can share a compiled program.
 
-    An objective without one of these terms gives the term a weight of 0. `probed` is whether the scenarios
-    include probes; `contacts` is the number of contacts that a user's function gets. Raise ValueError if the
+    An objective without one of these terms gives the term a weight of 0. `probed`: whether the scenarios
+    include probes; `contacts`: number of contacts that a user's function gets. Raise ValueError if the
     objectives differ in metric or function.
     """
     [(name, function)] = {(objective.name, objective.function) for objective in objectives}

@@ -67,7 +67,10 @@ def build_least_error_objective(objective: Objective) -> Objective:
 
 
 def build_quiet_objective(objective: Objective, scenarios: int, accurate: CommandExcess) -> Objective:
-    """Return the objective of quiet gains, whose penalties are scaled by those of the most accurate gains."""
+    """Return the objective for tuning quiet gains.
+
+    It divides each penalty by that penalty's value at the most accurate gains, or by a minimum value.
+    """
     return replace(
         objective,
         tolerance=compute_training_tolerance(objective.limit, scenarios),

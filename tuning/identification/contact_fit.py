@@ -46,7 +46,7 @@ COARSE_GRID_SIZE = 21, 5  # numbers of delays and of surface positions in the gr
 ASSUMED_NOISE_SHARE = 0.01  # standard deviation of unknown noise, relative to the largest force
 MIN_NOISE_SHARE = 1e-6  # minimum noise as a share of the largest force; simulated logs may be noise-free
 MIN_DEAD_ZONE_SIGMAS = 3.0  # minimum size of a significant dead zone, in standard deviations
-MAX_REDUCED_CHI_SQUARE = 1.3  # maximum chi-squared per degree of freedom without wider intervals
+MAX_REDUCED_CHI_SQUARE = 1.3  # chi-squared per degree of freedom above which the intervals are widened
 
 
 def split_long_run(run: LoggedRun, period: float) -> list[LoggedRun]:
@@ -330,8 +330,8 @@ def _has_dead_zone(posterior: Posterior) -> bool:
 def _is_silent_outside(runs: Sequence[LoggedRun], problem: ContactProblem, posterior: Posterior) -> bool:
     """Return whether most readings before and after the contacts are exactly 0, as a dead zone makes them.
 
-    A fit alone may not show a dead zone: if the surface is nearer than assumed, the greater penetration
-    replaces the force that the dead zone removes.
+    A fit alone may not reveal a dead zone: a nearer surface gives more penetration, and so more model force,
+    which hides the force that the dead zone removes.
     """
     delay, plane, _ = posterior.best
     position, _ = problem.motion.at(delay)

@@ -6,5 +6,5 @@ __all__ = ["Law", "kelvin_voigt"]
 
 
 def kelvin_voigt() -> Law:
-    """Return the Kelvin-Voigt law F = k d + b d' >= 0."""
+    """Return the Kelvin-Voigt law F = max(0, k d + b d')."""
     return Law("kelvin_voigt", lambda d, v: [d], ("stiffness", "damping"), lambda d, v: [v])

@@ -38,7 +38,7 @@ from tuning.identification.sensor_filter import (
 MAX_FORCE_DELAY = 0.02  # s, longest force delay in the search range of a fit
 COARSE_DELAY_STEP = 0.0005  # s, step between the delays of a first search
 MAX_NEWTON_STEPS = 6  # maximum number of Newton steps in the search for a surface position
-MIN_LIKELIHOOD_GAIN = 2.0  # a Newton step that increases the log likelihood by less is the last one
+MIN_LIKELIHOOD_GAIN = 2.0  # Newton's method stops when a step increases the log likelihood by less
 STEP = 1e-7  # m, step of finite differences with respect to the surface position
 FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants after which a filter's response is below rounding errors
 
@@ -95,7 +95,8 @@ class ContactProblem:
         self.damping_indices = [i for i, name in enumerate(self.names) if name.startswith("damping")]
         # A dead zone changes only the readings in contact; a bias changes all readings.
         self.has_dead_zone = bool(readings.threshold)
-        # Reading out of contact for a bias of 1 N, whitened and divided by the noise.
+        # Value of a reading out of contact for a bias of 1 N, whitened and divided by the noise's standard
+        # deviation.
         self.bias_alone = 0.0 if self.has_dead_zone else float(np.sum(readings.whitening)) / readings.std
         self.sums = sum_and_squares(self.target)
         self.memory = len(readings.whitening) + int(

@@ -1,4 +1,4 @@
-"""Linear least squares for the coefficients of a contact law, at several surface positions ("planes")."""
+"""Linear least squares for the coefficients of a contact law, at several surface positions."""
 
 from __future__ import annotations
 
@@ -24,40 +24,47 @@ class CoefficientFit:
 
 
 class PseudoRows(NamedTuple):
-    """Rows that replace many readings (`tuning.identification.deep_contact`), divided by the noise."""
+    """Rows that replace many readings of deep lanes (`tuning.identification.deep_contact`).
 
-    design: np.ndarray  # (planes, coefficients, rows), design matrix
+    Rows are divided by the standard deviation of the noise; the axis `positions` has one entry per surface
+    position.
+    """
+
+    design: np.ndarray  # (positions, coefficients, rows), design matrix
     target: np.ndarray  # (rows,), readings
     by_plane: np.ndarray  # 1/m, derivative of `design` with respect to the surface position
 
 
 class LeastSquaresFit(NamedTuple):
-    """Least-squares fits at several surface positions to readings that are divided by the noise."""
+    """Least-squares fits at several surface positions.
 
-    coefficients: np.ndarray  # (planes, coefficients)
-    covariance: np.ndarray  # (planes, coefficients, coefficients), covariance of the coefficients
-    misfit: np.ndarray  # (planes,), chi-squared
-    residual: np.ndarray  # (planes, rows), prediction minus reading
-    design: np.ndarray  # (planes, coefficients, rows), design matrix
+    Readings are divided by the standard deviation of the noise.
+    """
+
+    coefficients: np.ndarray  # (positions, coefficients)
+    covariance: np.ndarray  # (positions, coefficients, coefficients), covariance of the coefficients
+    misfit: np.ndarray  # (positions,), chi-squared
+    residual: np.ndarray  # (positions, rows), prediction minus reading
+    design: np.ndarray  # (positions, coefficients, rows), design matrix
 
 
 def fit_coefficients(
     design: np.ndarray,
     target: np.ndarray,
-    rest: tuple[float, float, float],
+    bias_readings: tuple[float, float, float],
     bias_alone: float,
     bias_prior: tuple[float, float] | None,
 ) -> LeastSquaresFit:
     """Fit the coefficients of a contact law by least squares at each surface position.
 
     Args:
-        design: Design matrix, shape (planes, coefficients, rows): regressors of the law, then the bias.
+        design: Design matrix, shape (positions, coefficients, rows): regressors of the law, then the bias.
         target: Readings, shape (rows,).
-        rest: Number, sum and sum of squares of the other readings, which depend on the bias alone.
-        bias_alone: Value of these other readings for a bias of 1 N.
-        bias_prior: Mean and standard deviation of the bias [N] from runs at rest, or None.
+        bias_readings: Number, sum and sum of squares of further readings, which depend on the bias alone.
+        bias_alone: Value of these further readings for a bias of 1 N.
+        bias_prior: Mean and standard deviation of the bias [N] from standstill runs, or None.
     """
-    count, total, square = rest
+    count, total, square = bias_readings
     normal, right = design @ design.swapaxes(1, 2), sum_products(design, target)
     normal[:, -1, -1] += count * bias_alone**2
     right[:, -1] += total * bias_alone
@@ -80,7 +87,7 @@ def fit_coefficients(
 
 
 def compute_force(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the force [N] of the contact law without the bias, shape (planes, rows)."""
+    """Return the force [N] of the contact law without the bias, shape (positions, rows)."""
     return (coefficients[..., None, :-1] @ columns)[:, 0]
 
 

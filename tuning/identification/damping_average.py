@@ -33,7 +33,10 @@ FitLaw = Callable[[Law], tuple[Posterior, float]]
 
 
 def drop_damping_term(law: Law) -> Law:
-    """Return the law without its damping term, which all entries of the contact lists have in common."""
+    """Return the law without its damping term.
+
+    The damping term is the same for all entries of the lists in `[contact]`.
+    """
     names = tuple(name for name in law.names if name != DAMPING_NAME)
     return replace(law, names=names, shared=lambda depth, rate: [], pulls=False)
 

@@ -81,7 +81,10 @@ class SummarisedProblem(ContactProblem):
     """Contact problem that uses pseudo-rows instead of its deep lanes wherever they are accurate enough."""
 
     def __init__(self, problem: ContactProblem, deep: np.ndarray, delay: float):
-        """Split the lanes of a problem; `deep` marks deep lanes, `delay` [s] is the approximate delay."""
+        """Split the lanes of a problem into deep lanes, which pseudo-rows replace, and other lanes.
+
+        `deep` marks the lanes that always stay well below the surface; `delay` [s] is the approximate delay.
+        """
         motion, readings, law = problem.motion, problem.readings, problem.law
         super().__init__(motion, readings, law, problem.plane, problem.time_constant)
         self.deep, self.delay = deep, delay

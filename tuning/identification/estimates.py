@@ -69,7 +69,7 @@ def accumulates_at_zero(values: np.ndarray) -> bool:
 
 
 def select_dampings_at_zero(draws_by_key: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the draws of the damping coefficients [N s/m] that accumulate at 0, by key."""
+    """Select the damping coefficients [N s/m] whose draws accumulate at 0; return their draws by key."""
     return {
         key: values
         for key, values in draws_by_key.items()

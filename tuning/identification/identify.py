@@ -180,7 +180,7 @@ def _drop_undetermined_entries(
             for key, draws in draws_by_key.items()
             if vague == [] or key.startswith(SIMULATOR_PREFIX)
         }, vague
-    # If all entries have one common damping, the remaining entries determine it.
+    # If one damping is common to all entries, the entries that were not excluded are enough to determine it.
     shared = sum(key.startswith("contact.damping.") for key in draws_by_key) == 1
     lists = (STIFFNESS_PREFIX,) if shared else (STIFFNESS_PREFIX, "contact.damping.")
     dropped = tuple(f"{name}{entry}" for name in lists for entry in entries)

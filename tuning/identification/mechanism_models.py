@@ -49,7 +49,7 @@ def _get_transfer_function(simulator: Simulator) -> tuple[list[float], list[floa
 def make_regression_law(contact: Contact) -> Law:
     """Return the contact law as a linear combination of regressors (functions of depth and rate).
 
-    Each entry of the contact lists has separate coefficients.
+    If contact parameters are lists, each list entry has its own coefficients.
 
     Raises:
         InputError: If the law's force is not a linear combination of functions of depth and rate.

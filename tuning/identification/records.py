@@ -70,9 +70,10 @@ class CampaignTiming:
 
     @property
     def shift(self) -> int:
-        """Return by how many periods the readings of a row are older than its command.
+        """Return the age of a row's readings relative to its command [periods].
 
-        The computing delay is subtracted, because it has the same effect on the loop as a later motion.
+        The computing delay is subtracted, because in the loop it cannot be distinguished from a delay of the
+        motion simulator.
         """
         return ROW_SHIFT[self.row] - self.computing_delay
 

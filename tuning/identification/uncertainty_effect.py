@@ -122,12 +122,12 @@ def _list_identified_keys(mechanism: Mechanism) -> list[str]:
 def _compute_change(
     mechanism: Mechanism, contact: _IdealContact, entry: int, frequency: float, key: str, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the changes of e* and of e - e* for each draw of one parameter.
+    """Return the changes of e* (ideal restitution) and e - e* (restitution error) per draw of a parameter.
 
     Args:
         mechanism: Mechanism with the nominal parameters.
         contact: Ideal contact and its sensitivities.
-        entry: Index into the contact lists.
+        entry: Index into the list-valued keys of `[contact]`.
         frequency: Contact frequency [Hz].
         key: Key of the parameter.
         values: Draws of the parameter.

@@ -67,7 +67,10 @@ def set_plain_ticks(axis: Axis, low: float, high: float) -> None:
 
 @matplotlib.style.context("default")
 def as_svg(figure: Figure, points: Mapping[int, str] | None = None) -> str:
-    """Return a figure as an SVG element; `points` are the texts of its links, by index of the scenario."""
+    """Return a figure as an SVG element.
+
+    `points` maps the index of a scenario to the text of the link at that scenario's point.
+    """
     content = io.StringIO()
     FigureCanvasSVG(figure)
     # With a fixed salt, the names of the elements depend only on the content of the figure.

@@ -105,7 +105,10 @@ def write_plots(store: SweepStore, acceptable: float | None = None) -> list[str]
 
 @matplotlib.style.context("default")
 def plot_error_map(plan: PlotPlan, regions: PlotStatistics, manifest: Manifest, name: str) -> Figure:
-    """Plot quantiles of |e - e*| against the plan's first input, and a map of one quantile for two inputs."""
+    """Plot quantiles of |e - e*| against the first input of the sampling plan.
+
+    If the plan has two inputs, add a map of one quantile over both inputs.
+    """
     figure = create_figure(
         (8.6, 7.4), f"{name}: restitution error of {regions.scenarios} scenarios", below=0.85
     )

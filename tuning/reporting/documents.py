@@ -257,7 +257,7 @@ class MarginsOfMap(Struct):
 
 
 class NominalOfMap(Struct):
-    """Results at the nominal point of a stability map, which the mechanism file describes."""
+    """Results at the nominal point of a stability map; the mechanism file defines this point."""
 
     margins: MarginsOfMap
     restitution: float | None = None  # e of the contact with the largest error [1]

@@ -169,7 +169,7 @@ def _run_controller_loop(
     scratch: Path,
     progress: Callable[[int, int], None],
 ) -> tuple[LoopReport, bool]:
-    """Execute one loop with a new controller's process.
+    """Run one closed loop, with the controller in a new process.
 
     Return the report of the loop, and whether the user interrupted it.
     """

@@ -61,11 +61,11 @@ class NominalPoint(NamedTuple):
     peak_force_ratio: float | None
     duration_ratio: float | None  # duration ratio that is farthest from 1 [1]; None if a contact did not end
     growth: Growth | None  # growth of the oscillation in contact; None if the loop is not linear
-    # ranges of x and y with an error within the limit; None if the nominal error exceeds the limit
+    # ranges of x and y with an error within the limit; None if the error at the nominal point exceeds it
     error_margins: tuple[NominalMargin, NominalMargin] | None
-    # ranges of x and y with peak force and duration within their bounds; None if the nominal ones are not
+    # ranges of x and y with peak force and duration within their bounds; None if the nominal point's are not
     contact_margins: tuple[NominalMargin, NominalMargin] | None
-    # ranges of x and y with a spectral radius of at most 1; None if the nominal one exceeds 1
+    # ranges of x and y with a spectral radius of at most 1; None if the radius at the nominal point exceeds 1
     radius_margins: tuple[NominalMargin, NominalMargin] | None
 
 

@@ -110,9 +110,10 @@ def binned_quantile(
 
 
 def binned_estimate(counted: np.ndarray, order: float) -> np.ndarray:
-    """Return the estimate of `binned_quantile` without its interval, (...); NaN without values.
+    """Return only the estimate of `binned_quantile`, not its interval; NaN if there are no values.
 
-    `counted` contains counts of `count_in_bins`, (..., `BIN_COUNT`).
+    The last axis of `counted` contains counts of `count_in_bins`; the result has one estimate for each index
+    of the other axes.
     """
     below = np.cumsum(counted, axis=-1)
     number = below[..., -1]

@@ -184,7 +184,9 @@ def _build_result(
 def _choose_level(
     state: _SubsetState, failing: float, independent: bool, last: bool
 ) -> tuple[np.ndarray, _SubsetState]:
-    """Choose the next threshold of each replicate, (replicates,), and update the state with its probability.
+    """Return the next threshold of each replicate, (replicates,), and the updated state.
+
+    The state's probability is multiplied by the conditional probability of exceeding the threshold.
 
     The threshold is the performance that a tenth of the scenarios reach. If more than a tenth fail, the
     threshold is `failing`. If fewer than a tenth exceed the smallest performance (a plateau), the threshold

@@ -116,7 +116,10 @@ def _run_until_narrow(
         return is_narrow_enough(tally.looks, width) or following == manifest.parts
 
     def look_at_stored() -> bool:
-        """Add stored chunks up to the first missing one; return whether the sweep ends with one of them."""
+        """Add the stored chunks before the first missing chunk to the tally.
+
+        Return whether the sweep ends with one of these chunks.
+        """
         while (rows := read_chunk(store, following)) is not None:
             if look(rows):
                 return True

@@ -119,8 +119,8 @@ def fit_transmission(
 ) -> Float[np.ndarray, "*resamples"]:
     """Return the slope of a least-squares line through the origin, of `change` against `true`.
 
-    A push causes the change `change` of e on the rig, and the change `true` of e* in the ideal contact. NaN
-    are ignored.
+    A push changes the restitution e on the rig by `change`, and the restitution e* of the ideal contact by
+    `true`. NaN values are ignored.
     """
     return np.nansum(change * true, axis=-1) / np.nansum(true**2, axis=-1)
 
@@ -129,7 +129,7 @@ def fit_slope(
     restitution: Float[np.ndarray, "*resamples contacts"],
     reference: Float[np.ndarray, "*resamples contacts"],
 ) -> Float[np.ndarray, "*resamples"]:
-    """Return the slope of a least-squares line with intercept, of e against e*; NaN are ignored."""
+    """Return the slope of a least-squares line with intercept, of e against e*; NaN values are ignored."""
     centred = reference - np.nanmean(reference, axis=-1, keepdims=True)
     return np.nansum(centred * restitution, axis=-1) / np.nansum(centred**2, axis=-1)
 

@@ -163,7 +163,7 @@ def _compute_ideal_duration(loaded: LoadedGains) -> float:
 def _inject_fault(
     loaded: LoadedGains, case: _FaultCase, sizes: FaultSizes
 ) -> tuple[Mapping[str, Any], Scenario]:
-    """Return gains and scenarios with the injected fault, which has one size for each scenario."""
+    """Return gains and scenarios with the injected fault; `sizes` contains its size in each scenario."""
     scenarios, fault = case.scenarios, case.fault
     gains = {name: np.full(len(sizes), value) for name, value in loaded.gains.items()}
     if fault == GAIN_FAULT:

@@ -260,7 +260,8 @@ class ImpulseLedger(Compensator):
             return UNSURE
         if self._lag * peak > LATE * pi:
             return TOO_SHORT
-        # Before the detection, an impulse of (DRIFT sigma)^2/(2 k) is lost in the noise; peak^2 is about k.
+        # Before the detection, an impulse of (DRIFT sigma)^2/(2 k) is lost in the noise. k, the stiffness
+        # divided by the mass, is about peak^2.
         lost_impulse = 0.5 * (DRIFT * DRIFT) * noise / (peak * peak)
         if reference.spread(model.covariance, 0.0) + lost_impulse > UNCERTAIN:
             return NOISY

@@ -11,9 +11,9 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 class Passivity(Compensator):
     """Compensator F_c = F, or F_c = -E_before/(T v_d) if E = E_before + T F v_d would be negative.
 
-    E is the energy that the numerical model has given to the contact, v_d its velocity, and T the control
-    period. The second force makes E = 0; it corresponds to a virtual damping alpha = -E/(T v_d^2). Because
-    E_before >= 0, the divisor T v_d is then not 0, and F_c is between 0 and F.
+    E is the energy that the numerical model has given to the contact, v_d the velocity of the numerical
+    model, and T the control period. The second force makes E = 0; it corresponds to a virtual damping
+    alpha = -E/(T v_d^2). Because E_before >= 0, the divisor T v_d is then not 0, and F_c is between 0 and F.
     """
 
     __slots__ = ("_energy", "_period")

@@ -124,8 +124,8 @@ def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) 
     log, others = next(iter(sources)), f" and {len(sources) - 1} more" if len(sources) > 1 else ""
     raise InputError(
         f"{to_one_line(str(path))}: found results of other logs ({format_value(log)}{others}), expected "
-        "results of the same logs or none: choose another folder with --output, or name the mechanism with "
-        "--prior"
+        "an empty folder or results of the same logs: choose another folder with --output, or name the "
+        "mechanism with --prior"
     )
 
 
@@ -214,7 +214,8 @@ def read_logs(logs: list[Path], mapping: str | None, prior: Mechanism | None) ->
         return read_campaign(logs, None, prior)
     except InputError as error:
         raise InputError(
-            f"{error} (state the meaning of the columns with --map; --guess drafts such a file)"
+            f"{error} (describe the columns in a mapping file and pass it with --map; --guess writes a draft "
+            "of it)"
         ) from None
 
 

@@ -241,7 +241,7 @@ class _MultisinePlan:
         if rig.simulator.model not in SIMULATOR_KEYS:
             raise InputError(
                 f"rig.simulator.model: found {format_value(rig.simulator.model)}, expected "
-                f"{', '.join(SIMULATOR_KEYS)}"
+                f"one of {', '.join(SIMULATOR_KEYS)}"
             )
         self.period, self.rows = rig.control_period, round(MULTISINE_PERIOD / rig.control_period)
         model = mechanism_models.make_motion_model(mechanism)

@@ -22,11 +22,11 @@ UNIT_FACTOR_TOLERANCE = 0.25  # relative tolerance of a unit's factor, because c
 WIDE_IMPULSE_RATIO_RANGE = 0.2, 5.0
 TOLERANCE_SIGMAS = 5.0  # this number of standard errors is added to a tolerance
 VELOCITY_TOLERANCE = 0.02  # maximum relative deviation of the velocity from the differences of positions
-MAX_RELATIVE_RESIDUAL = 0.3  # maximum relative residual of a fit that is evaluated
+MAX_RELATIVE_RESIDUAL = 0.3  # relative residual above which a fit is ignored
 POSITION_GAIN_RANGE = 0.5, 2.0  # allowed ratio of measured to desired position in slow motion
 MAX_EVALUATED_ROWS, MAX_GAIN_ROWS = 50_000, 10_000  # maximum numbers of evaluated rows; more are not needed
 MAX_EVALUATED_CONTACTS = 500  # maximum number of evaluated contacts; more are not needed
-MAX_SLOW_MOTION_LAG = 100  # rows, longest delay of a slow motion in the search
+MAX_SLOW_MOTION_LAG = 100  # longest delay that the search tries for a slow motion [rows]
 ROWS_BESIDE_CONTACT = 60  # number of rows before and after a contact that determine the force without contact
 
 # Factors by which a wrong unit multiplies the force.

@@ -14,7 +14,7 @@ from scipy import stats
 
 from tuning.identification.monitor.metrics import BIAS_INDEX, METRIC_NAMES, NOISE_INDEX
 
-NOISE_LEVEL_STD = 0.1  # relative standard deviation of the force noise from day to day
+NOISE_LEVEL_STD = 0.1  # day-to-day variation of the force noise's level (relative standard deviation)
 COVERAGE_PROBABILITY = 0.99  # probability that metrics which agree with the file's uncertainty are covered
 
 

@@ -15,10 +15,10 @@ readings, where k is the slope. Because damping has a similar effect with the op
 only after the contact (`estimate_delay`). Then the posterior is a mixture of two models, with and without
 dissipation, weighted by prior odds and evidence. Large squared innovations reduce the weight of the readings.
 
-Sources: recursive least squares, Ljung, "System Identification" (1999), section 11.2; prior with a positive
-probability of zero, Mitchell and Beauchamp, "Bayesian variable selection in linear regression" (1988);
-moments of a non-normal factor, Minka, "Expectation propagation" (2001); Bayes factor from the density at
-zero, Dickey, "The weighted likelihood ratio" (1971).
+Sources: recursive least squares, Ljung, "System Identification" (1999), section 11.2; prior with a point
+mass at zero (spike and slab), Mitchell and Beauchamp, "Bayesian variable selection in linear regression"
+(1988); moments of a non-normal factor, Minka, "Expectation propagation" (2001); Bayes factor from the density
+at zero, Dickey, "The weighted likelihood ratio" (1971).
 """
 
 from collections.abc import Sequence
