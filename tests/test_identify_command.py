@@ -127,9 +127,7 @@ def test_identify_command_writes_nothing_without_contact_and_prior(jaxhil, day, 
         (["LOGS", "--map", "MAP", "--stage", "press"], ["--stage: found 'press'", "contact, free"]),
     ],
 )  # fmt: skip
-def test_identify_command_rejects_bad_arguments_with_one_line_message(
-    jaxhil, day, tmp_path, arguments, words
-):
+def test_identify_rejects_bad_arguments_with_one_line_message(jaxhil, day, tmp_path, arguments, words):
     words_for = {
         "LOGS": logs(day),
         "LOG": logs(day)[:1],

@@ -118,7 +118,8 @@ class Progress:
     """Progress display on standard error for a known amount of work.
 
     The display shows the work done, the rate, the time left and the current activity. On a terminal, it is a
-    bar. Otherwise, a line is printed at regular intervals and when the activity changes, unless `quiet`.
+    bar. Otherwise, a line is printed at regular intervals and when the activity changes; if
+    `quiet` is true, nothing is printed.
     """
 
     def __init__(self, total: float, unit: str, bar: rich.progress.Progress | None, quiet: bool):
@@ -223,7 +224,7 @@ class Progress:
 
 @contextmanager
 def show_progress(total: float, unit: str, shown: bool = True) -> Iterator[Progress]:
-    """Provide a progress display: a bar on a terminal, lines otherwise, and nothing unless `shown`."""
+    """Provide a progress display: a bar on a terminal, lines otherwise, nothing if `shown` is false."""
     with _show_bar(
         shown, SpinnerColumn(), BarColumn(bar_width=10), TaskProgressColumn(), _ActivityColumn()
     ) as bar:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-_NEWTON_STEPS = 80  # enough even if the motion turns at a depth: each step then only halves the error
+_NEWTON_STEPS = 80  # enough even if the motion turns at a segment's end: each step then only halves the error
 
 
 def solve_chained_oscillators(
@@ -226,7 +226,7 @@ def _first_zero(decay, stiffness, value, slope_share):
     """
     over, rate = _characteristic_root(decay, stiffness)
     circular = jnp.arctan2(rate * value, decay * value + slope_share) / rate
-    # The form a - h = k / (a + h) is accurate also for a large damping ratio.
+    # The form a - h = k / (a + h) is accurate even for a large damping ratio.
     gap = stiffness / (decay + rate) * value + slope_share
     is_used = over & (value > 0)
     hyperbolic = jnp.log1p(jnp.where(is_used, 2 * rate * value, 0.0) / jnp.where(is_used, gap, 1.0))

@@ -115,7 +115,7 @@ class Surfaces(NamedTuple):
         )
 
     def sample(self, motion: MotionSample, force: Array) -> "ContactSample":
-        """Return the contact for this position and velocity, given the contact force [N]."""
+        """Return the `ContactSample` for this position and velocity, given the contact force [N]."""
         if self.clearance is None:
             edge = self.law.edge(self.parameters, motion.velocity)
             return ContactSample(motion.position, force, edge, jnp.ones_like(edge))

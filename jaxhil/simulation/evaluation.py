@@ -114,8 +114,7 @@ class RigModel(abc.ABC):
     def with_ideal_contacts(self, batches: Sequence[Any]) -> list[Any]:
         """Add the ideal contacts to batches of scenarios, so that they are computed once for all gains.
 
-        Batches whose ideal contacts are cheap are returned
-        unchanged.
+        Batches whose ideal contacts are cheap are returned unchanged.
         """
         return list(batches)
 
@@ -142,7 +141,7 @@ class RigModel(abc.ABC):
     def select_verdict_error(self, outcome: Outcome) -> Outcome:
         """Return only those rows of an outcome that contain the verdict's error.
 
-        Tuning minimises this error, and compares it with the limits.
+        It is the error that tuning minimises and that is compared with the limits.
         """
         return self.by_error(outcome)[self.verdict_error]
 

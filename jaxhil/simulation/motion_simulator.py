@@ -53,7 +53,7 @@ class Propagation(NamedTuple):
     # rows that give position and velocity at the interval's end (left limit); None unless requested
     end: tuple[Array, Array] | None
     steady_command: Float[Array, "order *batch"]  # steady state per unit of the command
-    # steady state per unit of the command's increase in a control period
+    # steady state under a ramp command that increases by 1 in each control period
     steady_velocity: Float[Array, "order *batch"]
 
 

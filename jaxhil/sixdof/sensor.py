@@ -56,7 +56,7 @@ class Sensor(NamedTuple):
 
 
 def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity: Vector) -> Wrench:
-    """Return the wrench of the tool's weight and inertia about the origin of chaser frame C [N, N m].
+    """Return the wrench of the tool's weight and inertial force about the origin of chaser frame C [N, N m].
 
     The wrench is in target frame T, which is at rest. `acceleration` contains the acceleration of C's origin
     and the tool's angular acceleration.
@@ -134,7 +134,7 @@ def sample(
 ) -> Wrench:
     """Add cross-talk, bias and `noise` [N, N m] to a reading.
 
-    With `has_effects`, apply quantum, dead zone and range too.
+    If `has_effects` is true, apply quantum, dead zone and range too.
     """
     # Each component is a separate array: from a stack, the compiler would compute the components repeatedly.
     components, structure = jax.tree.flatten(reading)

@@ -126,10 +126,10 @@ SIX_AXES = SixAxes()
 
 
 def _separate_loops(scenario: Scenario) -> Scenario:
-    """Return an equal scenario for which XLA compiles the loop of the ticks as a separate function.
+    """Return a copy with equal values that makes XLA compile the tick loop as a separate function.
 
-    Otherwise it is one function with the loop over tiles (`jaxhil.simulation.one_axis`); this function sorts
-    two numbers, which separates them.
+    Otherwise XLA merges it with the loop over tiles. A dummy sort of two numbers prevents this; see the
+    function of the same name in `jaxhil.simulation.one_axis`.
     """
     most = jnp.max(scenario.duration)
     most = jnp.sort(jnp.stack([most, most + 1]))[1]
@@ -137,7 +137,7 @@ def _separate_loops(scenario: Scenario) -> Scenario:
 
 
 def _compute_ideal_contacts(_: SixAxes, scenarios: Any) -> tuple[Array, ...]:
-    """Return the leaves of the ideal contacts of scenarios in tiles, in tiles as well."""
+    """Return the leaves of the scenarios' ideal contacts; `scenarios` and leaves are arranged in tiles."""
     return tuple(map_tiles(lambda _, tile: jax.tree.leaves(compute_ideal_contact(tile)), (), scenarios))
 
 

@@ -191,7 +191,7 @@ class TuneOptions:
         return self.limit is None or 0 < self.limit < math.inf
 
     def _objective(self, axes: int) -> "Objective":
-        """Return the objective; a weight that is not given has the compensator's default value."""
+        """Return the objective; an unspecified weight has the compensator's default value."""
         from tuning.gains.objective import WEIGHT_FIELDS, Objective
         from tuning.transparency.probes import choose_default_weights
 

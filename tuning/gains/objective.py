@@ -143,7 +143,7 @@ class ObjectiveTerms(NamedTuple):
 class ObjectiveWeights(NamedTuple):
     """Weights of the terms C, N, S and H of `Objective` for each problem: arguments of the program."""
 
-    divergence: Float[Array, "*problems"]  # weight of squared positive errors / that of negative ones [1]
+    divergence: Float[Array, "*problems"]  # weight of squared positive errors relative to negative ones [1]
     command: Float[Array, "*problems"]  # weight of the excess peak command C [1]
     noise: Float[Array, "*problems"]  # weight of the excess noise amplification N [1]
     chatter: Float[Array, "*problems"]  # weight of the chatter S [1]

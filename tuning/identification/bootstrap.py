@@ -2,7 +2,7 @@
 
 The likelihood of a single fit accounts only for the noise of the readings. If the contacts differ by more
 than this noise, the intervals of such a fit are too narrow. The scatter of the bootstrap fits includes all
-differences between contacts. Contacts are drawn separately for each entry of the mechanism's contact lists.
+differences between contacts. Contacts are drawn separately for each entry of the lists in `[contact]`.
 The fits are independent, so that the workers of a cluster can compute them. Finished chunks are checkpointed.
 """
 
@@ -150,7 +150,7 @@ def fit_resampled_contacts(
 
 
 def _find_contact_entries(fit: ContactFit) -> np.ndarray:
-    """Return the index of each contact into the mechanism's contact lists."""
+    """Return the index of each contact into the lists in the mechanism's `[contact]`."""
     return np.max(fit.readings.entry, axis=0)
 
 

@@ -44,12 +44,12 @@ FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants after which a filter's res
 
 
 class _NearbyRows(NamedTuple):
-    """Rows that are in contact for at least one of several surface positions ("planes")."""
+    """Rows that are in contact for at least one of several surface positions."""
 
     rows: np.ndarray  # (rows,), indices of the rows
-    depth: np.ndarray  # m, (planes, rows), penetration; 0 out of contact
+    depth: np.ndarray  # m, (surface positions, rows), penetration; 0 out of contact
     rate: np.ndarray  # m/s, (rows,), rate of the penetration
-    columns: np.ndarray  # (planes, coefficients, rows), regressors of the law, without the bias
+    columns: np.ndarray  # (surface positions, coefficients, rows), regressors of the law, without the bias
 
 
 class _Onsets(NamedTuple):
@@ -202,7 +202,7 @@ class ContactProblem:
         return _NearbyRows(rows, depth, rate, self._tabulate(depth, rate, where[rows]))
 
     def _tabulate(self, depth: np.ndarray, rate: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Evaluate the regressors of the law in the given rows, shape (planes, coefficients, rows)."""
+        """Return the law's regressors in the given rows, shape (surface positions, coefficients, rows)."""
         own_columns, entries = self.law.entry_functions(depth, rate), self.readings.entries
         if len(entries) > 1:
             entry = self.readings.entry.ravel()[rows]
@@ -273,7 +273,10 @@ class ContactProblem:
         return lagged
 
     def inside(self, delay: float, planes: np.ndarray) -> np.ndarray:
-        """Return the design matrix (planes, coefficients, used rows) of lanes that are always in contact."""
+        """Return the design matrix of lanes that are always in contact.
+
+        Its shape is (surface positions, coefficients, used rows).
+        """
         tables, shape = [], self.readings.force.shape
         rows = np.arange(self.readings.force.size).reshape(shape).T.ravel()
         for position, rate in self.motion_at(delay):
@@ -297,7 +300,10 @@ class ContactProblem:
     def _build_design(
         self, near: list[_NearbyRows], flags: list[np.ndarray], onsets: _Onsets | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return design (planes, coefficients, rows) and readings near contact, both divided by the noise."""
+        """Return design (surface positions, coefficients, rows) and readings near contact.
+
+        Both are divided by the standard deviation of the noise.
+        """
         std, tables, first = self.readings.std, [], None
         for rows_near, flag in zip(near, flags, strict=True):
             # The last column belongs to the bias. It is 1 in all rows or, if there is a dead zone, only in
@@ -333,7 +339,10 @@ class ContactProblem:
     def _differentiate_by_plane(
         self, delay: float, plane: float, coefficients, near: list[_NearbyRows], flag: np.ndarray
     ) -> np.ndarray:
-        """Differentiate the predicted readings with respect to the surface position; divide by the noise."""
+        """Differentiate the predicted readings with respect to the surface position.
+
+        The result is divided by the standard deviation of the noise.
+        """
         scale = 2.0 * STEP * self.readings.std
         if self.time_constant:
             shifted = self._all_rows_near_contact(
@@ -366,7 +375,7 @@ class ContactProblem:
         return force if self.has_dead_zone else force + coefficients[-1]
 
     def _predict(self, near, flags, onsets, coefficients, where: PackedRows, whitening) -> np.ndarray:
-        """Return the whitened predicted force readings [N] without a constant bias, shape (planes, rows)."""
+        """Return the whitened predicted readings [N] without a constant bias, (surface positions, rows)."""
         offset, first = self.has_dead_zone * coefficients[-1], None
         tables = [
             ((compute_force(coefficients, part.columns) + offset) * flag)[:, None]

@@ -26,11 +26,10 @@ class CoefficientFit:
 class PseudoRows(NamedTuple):
     """Rows that replace many readings of deep lanes (`tuning.identification.deep_contact`).
 
-    Rows are divided by the standard deviation of the noise; the axis `positions` has one entry per surface
-    position.
+    Rows are divided by the standard deviation of the noise.
     """
 
-    design: np.ndarray  # (positions, coefficients, rows), design matrix
+    design: np.ndarray  # (surface positions, coefficients, rows), design matrix
     target: np.ndarray  # (rows,), readings
     by_plane: np.ndarray  # 1/m, derivative of `design` with respect to the surface position
 
@@ -41,11 +40,11 @@ class LeastSquaresFit(NamedTuple):
     Readings are divided by the standard deviation of the noise.
     """
 
-    coefficients: np.ndarray  # (positions, coefficients)
-    covariance: np.ndarray  # (positions, coefficients, coefficients), covariance of the coefficients
-    misfit: np.ndarray  # (positions,), chi-squared
-    residual: np.ndarray  # (positions, rows), prediction minus reading
-    design: np.ndarray  # (positions, coefficients, rows), design matrix
+    coefficients: np.ndarray  # (surface positions, coefficients)
+    covariance: np.ndarray  # (surface positions, coefficients, coefficients), covariance of the coefficients
+    misfit: np.ndarray  # (surface positions,), chi-squared
+    residual: np.ndarray  # (surface positions, rows), prediction minus reading
+    design: np.ndarray  # (surface positions, coefficients, rows), design matrix
 
 
 def fit_coefficients(
@@ -58,7 +57,7 @@ def fit_coefficients(
     """Fit the coefficients of a contact law by least squares at each surface position.
 
     Args:
-        design: Design matrix, shape (positions, coefficients, rows): regressors of the law, then the bias.
+        design: Design matrix, shape (surface positions, coefficients, rows); the last regressor is the bias.
         target: Readings, shape (rows,).
         bias_readings: Number, sum and sum of squares of further readings, which depend on the bias alone.
         bias_alone: Value of these further readings for a bias of 1 N.
@@ -87,7 +86,7 @@ def fit_coefficients(
 
 
 def compute_force(coefficients: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the force [N] of the contact law without the bias, shape (positions, rows)."""
+    """Return the force [N] of the contact law without the bias, shape (surface positions, rows)."""
     return (coefficients[..., None, :-1] @ columns)[:, 0]
 
 

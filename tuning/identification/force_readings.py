@@ -21,7 +21,7 @@ class ForceReadings:
 
     force: np.ndarray  # N; 0 if the reading is missing
     counts: np.ndarray  # bool, whether fits use the reading
-    entry: np.ndarray  # int, index into the mechanism's contact lists
+    entry: np.ndarray  # int, index into the lists in `[contact]`
     entries: tuple[int, ...]  # indices that occur in `entry`
     std: float  # N, standard deviation of the noise after whitening
     whitening: tuple[float, ...] = (1.0,)  # coefficients of the filter that whitens the noise
@@ -68,7 +68,7 @@ class ForceReadings:
 
 
 def _assign_contact_entries(run: LoggedRun) -> np.ndarray:
-    """Return the index of each row into the mechanism's contact lists.
+    """Return the index of each row into the lists in the mechanism's `[contact]`.
 
     Rows out of contact get the index of the previous contact. Rows before the first contact get its index.
     """

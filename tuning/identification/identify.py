@@ -163,7 +163,7 @@ def _condition_draws(
 def _drop_undetermined_entries(
     draws_by_key: dict[str, np.ndarray],
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Drop the entries of the contact lists whose stiffness the logs hardly determine.
+    """Drop the entries of the lists in `[contact]` whose stiffness the logs hardly determine.
 
     Returns:
         The remaining draws, and the keys of the dropped stiffnesses. If the logs determine no entry, all
@@ -214,7 +214,7 @@ def _make_prior_model(prior: Mechanism | None) -> MotionModel | None:
 def _estimate_sensor_noise(
     runs: Mapping[str, Sequence[LoggedRun]],
 ) -> tuple[NoiseEstimate | None, NoiseEstimate | None]:
-    """Return the noise of the force sensor and that of the position sensor at rest; each may be None.
+    """Return the noise of force sensor and position sensor at rest; each may be None.
 
     Without a run at rest, the noise of the force sensor is estimated from free motion.
     """

@@ -131,7 +131,7 @@ def list_law_families(
 
     Args:
         deepest: Largest depth of all contacts [m].
-        entries: Number of entries in the mechanism's contact lists.
+        entries: Number of entries in the lists in `[contact]`.
         names: Names of the laws, or None for all laws that can be fitted to logs.
     """
     laws = [CONTACT_LAWS[name] for name in FITTABLE_LAW_NAMES if names is None or name in names]
@@ -230,6 +230,6 @@ def _cross_validate(motion, readings, tested: ForceReadings, law, plane, start: 
 def compute_contact_misfits(
     problem: ContactProblem, readings: ForceReadings, delay, plane, coefficients
 ) -> np.ndarray:
-    """Return chi-squared of each contact: the sum of its squared whitened residuals, divided by the noise."""
+    """Return chi-squared of each contact: squared whitened residuals divided by the noise's variance."""
     left = problem.whiten(readings.force - problem.force(delay, plane, coefficients)) / readings.std
     return np.sum(np.where(readings.counts, left, 0.0) ** 2, axis=0)

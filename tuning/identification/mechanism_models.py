@@ -70,7 +70,7 @@ def make_regression_law(contact: Contact) -> Law:
 
 
 def get_regression_coefficients(contact: Contact, entry: int) -> list[float]:
-    """Return the coefficients of the law from `make_regression_law` for one entry of the contact lists."""
+    """Return the coefficients of `make_regression_law` for one entry of the lists in `[contact]`."""
     stiffness = contact.stiffness[min(entry, len(contact.stiffness) - 1)]
     damping = contact.damping[min(entry, len(contact.damping) - 1)]
     return laws.find_contact_law(contact.law).coefficients(contact, stiffness, damping)

@@ -1,8 +1,8 @@
 """Surface position from the bias of the force sensor, for press runs that never leave the contact.
 
 In such a run (slow motion while pressed against the surface), a bias b has the same effect on the readings as
-a surface that is closer by b / K, with the stiffness K. The surface position is therefore observable only if
-a run at rest or in free motion determines the bias.
+a surface that is closer by b / K, where K is the stiffness. The surface position is therefore observable only
+if a run at rest or in free motion determines the bias.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class LoggedRun:
     velocity_desired: np.ndarray | None  # m/s
     force_command: np.ndarray | None  # N
     valid: np.ndarray  # bool; False if the row was lost, or if fits must not use its readings
-    contact_index: np.ndarray | None  # int64, index into the mechanism's contact lists; -1: no contact
+    contact_index: np.ndarray | None  # int64, index into the lists in `[contact]`; -1: no contact
     speed: float | None  # m/s, approach speed; None if unknown
     begin: float = 0.0  # s, time stamp of tick 0
     force_late: np.ndarray | None = None  # s, time from each row to its force reading

@@ -70,7 +70,7 @@ def compute_uncertainty_effect(mechanism: Mechanism) -> UncertaintyEffect:
     normal distribution in `[uncertainty]`. Others in `[uncertainty]` vary, but were not identified.
 
     Returns:
-        The 99 % quantiles of the effects, for the entry of the mechanism's contact lists with the largest
+        The 99 % quantiles of the effects, for the entry of the lists in `[contact]` with the largest
         effects; or 0 if the file does not come from an identification.
     """
     keys = _list_identified_keys(mechanism)
@@ -186,7 +186,7 @@ def _compute_effect_quantile(values: np.ndarray) -> float:
 
 
 def _simulate_ideal_contact(mechanism: Mechanism, law: Law, entry: int) -> tuple[_IdealContact | None, float]:
-    """Simulate the ideal contact of one entry of the contact lists.
+    """Simulate the ideal contact of one entry of the lists in `[contact]`.
 
     Returns:
         The contact, or None if there is no rebound; and the contact frequency [Hz].

@@ -128,7 +128,7 @@ class SessionSettings(NamedTuple):
 def run_session(
     setup: SessionSettings, scratch: Path, say: Callable[[str], None], progress: Callable[[int, int], None]
 ) -> SessionReport:
-    """Execute an empty loop for comparison, then the loop with the simulated rig.
+    """Run an empty loop for comparison, then the loop with the simulated rig.
 
     Args:
         setup: settings of the session.
@@ -212,7 +212,7 @@ def _run_controller_loop(
 
 @contextmanager
 def real_time_priority(wanted: bool) -> Iterator[None]:
-    """Run this thread with a real-time priority within the context, if `wanted`.
+    """Context manager: run this thread with real-time priority if `wanted` is true.
 
     Raise OSError if the operating system refuses the priority.
     """

@@ -53,7 +53,7 @@ class SpectralRadii(NamedTuple):
 
 
 class NominalPoint(NamedTuple):
-    """Results at the nominal point of a stability map, which the mechanism file describes."""
+    """Results at the nominal point of a stability map; the mechanism file defines this point."""
 
     restitution: float | None  # e of the contact with the largest error [1]
     error: float | None  # largest error e - e* [1]; None if a contact did not end

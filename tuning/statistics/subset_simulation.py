@@ -186,7 +186,7 @@ def _choose_level(
 ) -> tuple[np.ndarray, _SubsetState]:
     """Return the next threshold of each replicate, (replicates,), and the updated state.
 
-    The state's probability is multiplied by the conditional probability of exceeding the threshold.
+    The probability in the state is multiplied by the conditional probability of exceeding the threshold.
 
     The threshold is the performance that a tenth of the scenarios reach. If more than a tenth fail, the
     threshold is `failing`. If fewer than a tenth exceed the smallest performance (a plateau), the threshold

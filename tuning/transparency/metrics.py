@@ -57,7 +57,7 @@ def compute_metrics(
         outcomes: outcomes of the scenarios, with and without perturbations.
         pushed: restitution e* of the first ideal contacts with the early push, and with the late push.
         unpushed: restitution e* of the first ideal contacts without a push, from the same numerical
-        integration.
+            integration.
         depth: largest penetration of each ideal contact [m].
         amplification: amplification of white force noise by the compensator [1].
         limit: limit of the restitution error [1].

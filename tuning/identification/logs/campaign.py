@@ -2,7 +2,7 @@
 
 A run has at most one contact. A log with several contacts is therefore divided in the middle between
 successive contacts. If the log has no channel `contact_index`, the contacts of a file are numbered in their
-order. The number of a contact is its index into the contact lists of a mechanism file.
+order. The number of a contact is its index into the lists in `[contact]`.
 """
 
 from __future__ import annotations
