@@ -48,9 +48,9 @@ def find_bias_prior(
     if noise is None:
         names = ", ".join(dict.fromkeys(to_one_line(run.source) for run in runs))
         raise InputError(
-            f"{names}: force_measured: found only a press run that stays in contact throughout, expected one "
-            "of: logs with further contacts; a rest or free run with force_measured; --fix "
-            "rig.contact_plane=.... The press run cannot separate the sensor's bias from the surface position"
+            f"{names}: force_measured: found only a press run that stays in contact throughout, which cannot "
+            "separate the sensor's bias from the surface position; expected one of: logs with further contacts; "
+            "a rest or free run with force_measured; or --fix rig.contact_plane=..."
         )
     return noise.mean, float(np.hypot(np.hypot(noise.mean_std, noise.drift), MIN_BIAS_STD_RATIO * noise.std))
 
