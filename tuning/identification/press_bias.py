@@ -49,8 +49,8 @@ def find_bias_prior(
         names = ", ".join(dict.fromkeys(to_one_line(run.source) for run in runs))
         raise InputError(
             f"{names}: force_measured: found only a press run that stays in contact throughout, which cannot "
-            "separate the sensor's bias from the surface position; expected one of: logs with further contacts; "
-            "a rest or free run with force_measured; or --fix rig.contact_plane=..."
+            "separate the sensor's bias from the surface position; expected one of: logs with further "
+            "contacts; a rest or free run with force_measured; or --fix rig.contact_plane=..."
         )
     return noise.mean, float(np.hypot(np.hypot(noise.mean_std, noise.drift), MIN_BIAS_STD_RATIO * noise.std))
 
