@@ -192,7 +192,7 @@ def read_object(mapping: Mapping[str, Any], key: str, source: str, prefix: str) 
 
 def read_number(value: object, key: str, source: str) -> float:
     """Convert a value to a float. Raise GainFileError if it is not a finite number."""
-    # In Python, bool is a subclass of int; a JSON integer may be too large for a float.
+    # In Python, bool is a subclass of int. A JSON integer may be too large for a float.
     if not isinstance(value, bool) and isinstance(value, (int, float)):
         try:
             number = float(value)
