@@ -1,11 +1,11 @@
 """Six-axis watchdog: an audit of every contact, from the motion of the numerical model.
 
 A contact begins on the first tick on which the compensator acts or, if it has no status, on which the
-measured force exceeds `fading`. If the compensator has measured the hardware's lag behind the model, this lag
-must be between `lag_lowest` and `lag_highest`. The contact is audited as soon as the condition of its
+measured force exceeds `fading`. If the compensator then knows the hardware's lag behind the model, the
+lag must be between `lag_lowest` and `lag_highest`. The contact is audited as soon as the condition of its
 beginning has been false for the time `settling`, at the latest at the call of `next_contact`. V_in is the
 twist on the tick before the contact, V the present twist, M the relative mass matrix, W_c the controller's
-wrench about C's origin, and |W|^2 = W . M^-1 W. The audit checks four conditions:
+wrench about the chaser's origin, and |W|^2 = W . M^-1 W. The audit checks four conditions:
 
 - Momentum: |M (V - V_in) - T sum W_c| is at most `momentum_error` times the sum of |T sum W_c| and 0.05
   |M V_in|. Otherwise the model integrates a different wrench, or has a different mass.
@@ -33,9 +33,8 @@ from jaxhil.rig.six_axes.vectors import (
 )
 from jaxhil.rig.types import Count, Limits, Positive
 
-MOMENTUM_SHARE = (
-    0.05  # fraction of the approach momentum that is added to the small impulse of a grazing touch
-)
+# Fraction of the approach momentum that is added to the impulse, because a grazing touch has a small impulse.
+MOMENTUM_SHARE = 0.05
 
 
 class SixAxisWatchdog:
