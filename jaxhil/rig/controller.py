@@ -12,11 +12,12 @@ from math import isfinite, nan
 from typing import Any
 
 from jaxhil.rig.clock import Clock
+from jaxhil.rig.controller_base import ControllerBase
 from jaxhil.rig.conversion import as_float
 from jaxhil.rig.errors import format_value, make_gain_file_error
 from jaxhil.rig.faults import (
     CLOCK,
-    EMERGENCY_STOP,
+    FAULTS,
     FORCE_NOT_FINITE,
     LAW_IN_DOUBT,
     MODEL_NOT_FINITE,
@@ -24,18 +25,17 @@ from jaxhil.rig.faults import (
     RESTITUTION,
     TARE,
     UNUSABLE,
-    fault_names,
 )
 from jaxhil.rig.gain_file import GainFile, check_gain_document, read_gain_document
 from jaxhil.rig.inputs import InputGuard, Tare
-from jaxhil.rig.law_status import STATUS_NAMES, UNSTATED, ContactCount, ContactRecord, contact_record
+from jaxhil.rig.law_status import UNSTATED
 from jaxhil.rig.outputs import ForceGuard, PositionGuard
 from jaxhil.rig.registry import COMPENSATORS, Compensator
-from jaxhil.rig.types import Bits, Limits, Positive, SmallInt
+from jaxhil.rig.types import Limits, Positive
 from jaxhil.rig.watchdog import Watchdog
 
 
-class Controller:
+class Controller(ControllerBase):
     """Controller of the rig: a compensator with checks of its inputs, outputs and contacts.
 
     Attributes:
@@ -48,11 +48,9 @@ class Controller:
         "_clock", "_detail", "_forces", "_inputs", "_law", "_period", "_positions", "_stopped", "_tare",
         "_watchdog", "cause", "faults", "seen",
     )  # fmt: skip
-    cause: Bits
-    faults: Bits
-    seen: Bits
-    _detail: str
+    fault_table = FAULTS
     _law: Compensator
+    _watchdog: Watchdog
 
     def __init__(self, gain_file: GainFile, source: str = "gain document") -> None:
         law = COMPENSATORS[gain_file.compensator]
@@ -120,25 +118,6 @@ class Controller:
         return cls(check_gain_document(document))
 
     @property
-    def control_period(self) -> float:
-        """Return the control period [s] for which the gains are valid."""
-        return self._period
-
-    @property
-    def tripped(self) -> bool:
-        """Return whether a fault has tripped the controller since the last `reset`."""
-        return self.cause != 0
-
-    @property
-    def status(self) -> str:
-        """Return "ok", or "tripped: " and the names of the causing faults."""
-        if not self.cause:
-            return "ok"
-        return f"tripped: {', '.join(fault_names(self.cause))}" + (
-            f" ({self._detail})" if self._detail else ""
-        )
-
-    @property
     def at_rest(self) -> bool:
         """Return whether the position command has come to rest after a trip."""
         return self.tripped and self._positions.at_rest
@@ -149,16 +128,6 @@ class Controller:
         return self._tare.bias
 
     @property
-    def missed_ticks(self) -> int:
-        """Return the number of missed ticks since `reset`, from the times passed to `step`."""
-        return self._clock.missed
-
-    @property
-    def late_ticks(self) -> int:
-        """Return the number of late ticks since `reset`, from the times passed to `step`."""
-        return self._clock.late
-
-    @property
     def identified(self) -> tuple[float, float]:
         """Return the identified stiffness [N/m] and damping [N s/m]; (0, 0) if nothing is identified."""
         return self._law.identified
@@ -167,27 +136,6 @@ class Controller:
     def force_delay(self) -> float:
         """Return the estimated delay [s] of the force measurement; 0 if none is estimated."""
         return self._law.force_delay
-
-    @property
-    def law_status(self) -> str:
-        """Return the compensator's status at the last command, a name in `law_status.STATUSES`."""
-        return STATUS_NAMES[self._status()]
-
-    def _status(self) -> SmallInt:
-        """Return the number of the compensator's status at the last command."""
-        return self._law.status
-
-    @property
-    def last_contact(self) -> ContactRecord:
-        """Return the compensator status of the last audited contact; the number is 0 before the first.
-
-        The record remains until the next audit, even after `reset`.
-        """
-        return contact_record(self._last_count())
-
-    def _last_count(self) -> ContactCount:
-        """Return the compensator's status in the last audited contact; `reset` keeps this record."""
-        return self._watchdog.record
 
     def tare(self, force_measured: float) -> bool:
         """Add one force reading out of contact to the tare; return True when the tare has ended.
@@ -307,20 +255,6 @@ class Controller:
         except Exception:  # whatever a compensator raises, the rig needs a command
             return nan
 
-    def emergency_stop(self, active: bool) -> None:
-        """Set the state of the rig's emergency stop; an active stop trips the controller.
-
-        Call this method with True when the stop is pressed. The force ramps to 0 and the position command
-        comes to rest; then `at_rest` is True and the drives may be switched off. Call it with False when the
-        stop is released; before this call, `reset` has no effect. The trip stays latched until `reset`.
-
-        Args:
-            active: whether the stop is active.
-        """
-        self._stopped = bool(active)
-        if active:
-            self._fail(EMERGENCY_STOP, "")
-
     def reset(self) -> bool:
         """Restart everything except the tare. While the emergency stop is active, only return False.
 
@@ -366,14 +300,6 @@ class Controller:
         self._inputs.is_located = False
         self._watchdog.restart()
         self._positions.release()
-
-    def _fail(self, cause: int, detail: str) -> None:
-        # Keep the first cause: later faults may be its consequences.
-        if not self.cause:
-            self.cause = cause
-            self._detail = detail
-        self.faults |= cause
-        self.seen |= self.faults
 
 
 READING_NAMES = "time", "force_measured", "position_desired", "velocity_desired", "position_measured"

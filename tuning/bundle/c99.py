@@ -8,6 +8,7 @@ limit NAME.
 """
 
 import functools
+import inspect
 import math
 import re
 from collections.abc import Mapping
@@ -205,7 +206,7 @@ def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> 
 def _generate_code(law: str, class_: type[Any], axes: int) -> tuple[str, str]:
     """Return the C declarations and definitions of the controller with the compensator `law`."""
     kind = kind_of({"axes": axes})
-    members = {name: vars(kind.controller)[name] for name in kind.methods}
+    members = {name: inspect.getattr_static(kind.controller, name) for name in kind.methods}
     functions: dict[str, Any] = {
         name: member.fget if isinstance(member, property) else member for name, member in members.items()
     }

@@ -12,11 +12,12 @@ from math import nan
 from typing import Any
 
 from jaxhil.rig.clock import Clock
+from jaxhil.rig.controller_base import ControllerBase
 from jaxhil.rig.conversion import as_float
 from jaxhil.rig.errors import make_gain_file_error
-from jaxhil.rig.faults import CLOCK, EMERGENCY_STOP, LAW_IN_DOUBT, TARE, UNUSABLE, fault_names
+from jaxhil.rig.faults import CLOCK, LAW_IN_DOUBT, TARE, UNUSABLE
 from jaxhil.rig.gain_document import read_gain_document
-from jaxhil.rig.law_status import STATUS_NAMES, UNSTATED, ContactCount, ContactRecord, contact_record
+from jaxhil.rig.law_status import UNSTATED
 from jaxhil.rig.six_axes.faults import SIX_AXIS_FAULTS
 from jaxhil.rig.six_axes.gain_file import SixAxisGainFile, check_six_axis_document
 from jaxhil.rig.six_axes.inputs import SixAxisInputGuard, WrenchTare
@@ -24,12 +25,12 @@ from jaxhil.rig.six_axes.outputs import PoseGuard, WrenchGuard
 from jaxhil.rig.six_axes.registry import SIX_AXIS_COMPENSATORS, ModelConstants, SixAxisCompensator
 from jaxhil.rig.six_axes.vectors import AXES, Vector, coordinate_rates, is_finite
 from jaxhil.rig.six_axes.watchdog import SixAxisWatchdog
-from jaxhil.rig.types import Bits, Limits, Positive, SmallInt
+from jaxhil.rig.types import Limits, Positive
 
 CHANNEL_NAMES = ("fx", "fy", "fz", "mx", "my", "mz", "x", "y", "z", "rx", "ry", "rz")
 
 
-class Controller6:
+class Controller6(ControllerBase):
     """Six-axis controller of the rig: a compensator with checks of its inputs, outputs and contacts.
 
     Attributes:
@@ -43,14 +44,11 @@ class Controller6:
         "_clock", "_command", "_detail", "_forces", "_inputs", "_law", "_period", "_poses", "_sent",
         "_stopped", "_tare", "_watchdog", "cause", "faults", "seen",
     )  # fmt: skip
-    cause: Bits
-    faults: Bits
-    seen: Bits
+    fault_table = SIX_AXIS_FAULTS
     _command: Vector
     _sent: Vector
-    _detail: str
     _law: SixAxisCompensator
-    _period: Positive
+    _watchdog: SixAxisWatchdog
 
     def __init__(self, gain_file: SixAxisGainFile, source: str = "gain document") -> None:
         law = SIX_AXIS_COMPENSATORS[gain_file.compensator]
@@ -60,7 +58,7 @@ class Controller6:
             self._law = law(gain_file.gains, constants, period)
         except ValueError as error:
             raise make_gain_file_error(
-                source, "gains", str(error), "gains that fit the control period"
+                source, "gains", str(error), "gains suitable for the control period"
             ) from None
         self._guard(gain_file.limits, constants, period)
 
@@ -105,27 +103,9 @@ class Controller6:
         return cls(check_six_axis_document(document))
 
     @property
-    def control_period(self) -> float:
-        """Return the control period [s] for which the gains are valid."""
-        return self._period
-
-    @property
-    def tripped(self) -> bool:
-        """Return whether a fault has tripped the controller since the last `reset`."""
-        return self.cause != 0
-
-    @property
     def channels(self) -> int:
         """Return the bits of the sensor channels that have a fault in this tick, first wrench, then pose."""
         return self._inputs.channels
-
-    @property
-    def status(self) -> str:
-        """Return "ok", or "tripped: " and the names of the causing faults."""
-        if not self.cause:
-            return "ok"
-        names = ", ".join(fault_names(self.cause, SIX_AXIS_FAULTS))
-        return f"tripped: {names}" + (f" ({self._detail})" if self._detail else "")
 
     @property
     def at_rest(self) -> bool:
@@ -138,16 +118,6 @@ class Controller6:
         return list(self._tare.bias)
 
     @property
-    def missed_ticks(self) -> int:
-        """Return the number of missed ticks since `reset`, from the times passed to `step`."""
-        return self._clock.missed
-
-    @property
-    def late_ticks(self) -> int:
-        """Return the number of late ticks since `reset`, from the times passed to `step`."""
-        return self._clock.late
-
-    @property
     def loop_delay(self) -> float:
         """Return the hardware's delay [s] relative to the model in the last contact; 0 if unknown."""
         return self._law.loop_delay
@@ -156,24 +126,6 @@ class Controller6:
     def unpaid_impulse(self) -> float:
         """Return the impulse still owed after the last contact, divided by its impulse; 0 if unknown."""
         return self._law.unpaid_impulse
-
-    @property
-    def law_status(self) -> str:
-        """Return the compensator's status at the last command, a name in `law_status.STATUSES`."""
-        return STATUS_NAMES[self._status()]
-
-    def _status(self) -> SmallInt:
-        """Return the number of the compensator's status at the last command."""
-        return self._law.status
-
-    @property
-    def last_contact(self) -> ContactRecord:
-        """Return the compensator status of the last audited contact; the number is 0 before the first."""
-        return contact_record(self._last_count())
-
-    def _last_count(self) -> ContactCount:
-        """Return the compensator's status in the last audited contact; `reset` keeps this record."""
-        return self._watchdog.record
 
     @property
     def last_audit(self) -> tuple[float, float, float]:
@@ -347,20 +299,6 @@ class Controller6:
         self._sent = self._law.pose_command(pose, coordinate_rates(pose, twist))
         return True
 
-    def emergency_stop(self, active: bool) -> None:
-        """Set the state of the rig's emergency stop; an active stop trips the controller.
-
-        Call this method with True when the stop is pressed. The wrench ramps to 0 and the pose command
-        comes to rest; then `at_rest` is True and the drives may be switched off. Call it with False when the
-        stop is released; before this call, `reset` has no effect. The trip stays latched until `reset`.
-
-        Args:
-            active: whether the stop is active.
-        """
-        self._stopped = bool(active)
-        if active:
-            self._fail(EMERGENCY_STOP, "")
-
     def reset(self) -> bool:
         """Restart everything except the tare. While the emergency stop is active, only return False.
 
@@ -419,15 +357,6 @@ class Controller6:
         if bad:
             return ", ".join(bad)
         return self._watchdog.detail(fatal)
-
-    def _fail(self, cause: int, detail: str) -> None:
-        """Trip the controller."""
-        # Keep the first cause, because later faults may be its consequences.
-        if not self.cause:
-            self.cause = cause
-            self._detail = detail
-        self.faults |= cause
-        self.seen |= self.faults
 
 
 def as_vector(values: Any) -> Vector:
