@@ -261,6 +261,15 @@ def test_reset_after_trip_causes_no_jump_of_position_command():
     assert controller.cause == VELOCITY_LIMIT
 
 
+def test_trip_keeps_its_first_cause():
+    controller = limited()
+    simulate_flight(controller, 20)
+    for _ in range(5):
+        controller.position_command(-0.01, 0.0, 0.0)
+    controller.emergency_stop(True)
+    assert controller.cause == VELOCITY_LIMIT and controller.seen & EMERGENCY_STOP
+
+
 def test_next_contact_starts_at_model_position_except_after_trip():
     controller = limited()
     simulate_flight(controller, 20)

@@ -254,6 +254,15 @@ def test_emergency_stop_is_latched_until_reset():
     assert rig.tripped and rig.reset() is True and rig.status == "ok"
 
 
+def test_six_axis_trip_keeps_its_first_cause():
+    rig = controller()
+    fly(rig, 10)
+    rig.pose_command([float("nan")] * 6, TWIST)
+    first = names(rig)
+    rig.emergency_stop(True)
+    assert rig.tripped and names(rig) == first != ["emergency_stop"]
+
+
 # Outputs
 
 
