@@ -32,7 +32,7 @@ CONTACTS = 4
 
 
 # Limits: rms, 99th percentile and maximum of a contact's error [%], and smallest transparency.
-RMS, PERCENTILE, LARGEST, TRANSPARENCY = 0.5, 1.5, 3.0, 0.75
+RMS, PERCENTILE, LARGEST, TRANSPARENCY = 0.5, 1.5, 3.0, 0.8
 
 
 def uniform_override(path: str, low: float, high: float) -> str:
