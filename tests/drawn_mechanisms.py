@@ -19,7 +19,7 @@ LAGS = ((), (0.3, 20.0), (1e-7, 0.3))  # control periods, range of the force sen
 INTEGRATORS = ("semi_implicit_euler", "zoh", "explicit_euler")
 PERIODS, MASSES, STIFFNESSES = (1e-4, 2e-2), (0.1, 1e6), (1.0, 1e9)
 FREQUENCIES = 5e-3, 2.0  # rad per control period, range of the contact frequency
-LONGEST_DELAY = 0.1  # s
+MAX_DELAY = 0.1  # s
 NUDGE = 1e-12  # relative change of an input, to exclude ill-conditioned cases
 BAR = 1e-6
 
@@ -137,12 +137,12 @@ class Form:
     @staticmethod
     def _delay(rng, spread, period, frequency) -> float:
         """Draw a delay: none, whole periods, arbitrary or tiny; usually short compared with the contact."""
-        longest = min(LONGEST_DELAY, 0.5 / frequency)
+        longest = min(MAX_DELAY, 0.5 / frequency)
         choice = rng.integers(5)
         if choice == 0:
             return 0.0
         if choice == 1:
-            return min(period * int(rng.integers(1, 4)), LONGEST_DELAY)
+            return min(period * int(rng.integers(1, 4)), MAX_DELAY)
         return spread(1e-9, 1e-6) if choice == 2 else spread(0.01 * longest, longest)
 
 

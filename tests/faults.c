@@ -18,15 +18,15 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-enum { MOST_FOLDERS = 4, MOST_FILES = 4096 };
+enum { MAX_FOLDERS = 4, MAX_FILES = 4096 };
 
-static char folders[MOST_FOLDERS][4096];
+static char folders[MAX_FOLDERS][4096];
 static int folder_count = 0;
 static long chosen = -1;
 static int kills = 0;
 static int journal = -1;
 static atomic_long calls;
-static char watched[MOST_FILES];
+static char watched[MAX_FILES];
 
 #define REAL(name) ((__typeof__(&name))dlsym(RTLD_NEXT, #name))
 
@@ -36,7 +36,7 @@ void faults_arm(const char *below, long at, int to_kill, const char *log)
 {
     journal = (int)syscall(SYS_openat, AT_FDCWD, log, O_WRONLY | O_CREAT | O_TRUNC | O_APPEND | O_CLOEXEC, 0600);
     folder_count = 0;
-    for (const char *start = below; *start && folder_count < MOST_FOLDERS;) {
+    for (const char *start = below; *start && folder_count < MAX_FOLDERS;) {
         size_t length = strcspn(start, "\n");
         snprintf(folders[folder_count++], sizeof folders[0], "%.*s", (int)length, start);
         start += length + (start[length] == '\n');
@@ -93,12 +93,12 @@ static int fails(const char *call, int at, const char *path, int reason)
 
 static int is_watched(int file)
 {
-    return folder_count && file >= 0 && file < MOST_FILES && watched[file];
+    return folder_count && file >= 0 && file < MAX_FILES && watched[file];
 }
 
 static int opened(int file, int at, const char *path)
 {
-    if (file >= 0 && file < MOST_FILES)
+    if (file >= 0 && file < MAX_FILES)
         watched[file] = (char)(folder_count && is_below(at, path));
     return file;
 }
@@ -124,7 +124,7 @@ int openat64(int at, const char *path, int flags, ...) OPEN(openat64, at, at, pa
 
 int close(int file)
 {
-    if (file >= 0 && file < MOST_FILES)
+    if (file >= 0 && file < MAX_FILES)
         watched[file] = 0;
     return REAL(close)(file);
 }

@@ -10,7 +10,7 @@ from jaxhil.mechanism.file import to_plain_data
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.rig import Controller
 from jaxhil.rig.gain_file import GainFile
-from tuning.rig.contact_watch import ContactWatch, RigContact
+from tuning.rig.contact_detector import ContactDetector, RigContact
 from tuning.rig.plant import RigHardware
 from tuning.rig.rig_task import RigTask
 from tuning.rig.udp_protocol import (
@@ -42,10 +42,10 @@ def closed_loop(
     Each contact starts at the rebound speed of the previous contact. Shortfalls are the largest of each
     contact [m].
     """
-    law, plant, watch = (
+    law, plant, detector = (
         controller(mechanism, compensator, gains),
         RigHardware(mechanism, seed),
-        ContactWatch(mechanism),
+        ContactDetector(mechanism),
     )
     raw = to_plain_data(mechanism)
     model, sensor = NumericalModel(raw), mechanism.rig.force_sensor
@@ -55,18 +55,18 @@ def closed_loop(
         number, tick, shortfall = len(results), 0, []
         model.place(position, velocity)
         plant.begin(position, velocity, law.position_command(position, velocity, 0.0), number)
-        watch.begin(number)
+        detector.begin(number)
         while len(results) < mechanism.approach.contacts:
             reading, measured = plant.read()[0], plant.read()[1]
             force = law.step(reading, model.position, model.velocity, measured)
             force = 0.0 if zeroed and tick == 0 else force
-            over = watch.observe(model.position, model.velocity, force, plant.force, reading)
+            over = detector.observe(model.position, model.velocity, force, plant.force, reading)
             shortfall.append(plant.shortfall)
             model.integrate(force)
             plant.move(law.position_command(model.position, model.velocity, model.acceleration))
             tick += 1
             if over is not None:
-                shortfalls[len(results)] = max(shortfall[over.begun :])
+                shortfalls[len(results)] = max(shortfall[over.onset_tick :])
                 results.append(over)
                 if over.status != "ok" or math.isinf(mechanism.contact.clearance):
                     break

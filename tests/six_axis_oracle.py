@@ -80,7 +80,7 @@ def loads(case, bodies, force, moment):
     return [(-f, -m - np.cross(place - r1, f)), (f, m + np.cross(place - r2, f))]
 
 
-def in_space(case, time):
+def ideal_motion(case, time):
     """Return the bodies' states after a time, with the undelayed ideal contact."""
     inertias = [np.asarray(j) for j in case["inertias"]]
 

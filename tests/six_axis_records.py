@@ -17,7 +17,7 @@ from jaxhil.rig.six_axes import SIX_AXIS_COMPENSATORS as ON_THE_RIG
 from jaxhil.rig.six_axes import ModelConstants
 from jaxhil.rig.six_axes.vectors import coordinate_rates
 from jaxhil.simulation.jax_environment import jax_context
-from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.building import build_scenarios, make_loop
 from jaxhil.sixdof.controller_record import ControllerRecord, known_constants, record_controller
 
 RING = 128  # length of the JAX compensators' delay line [samples]
@@ -42,7 +42,7 @@ def recorded(mechanism, compensator, lanes, seed=1):
     """Record drawn runs of a mechanism with the gains from the literature."""
     with jax_context():
         scenario = build_scenarios(mechanism, draw(mechanism, lanes, seed), seed=seed)
-        loop = dataclasses.replace(loop_of(mechanism, compensator, scenario), measures_pose=True)
+        loop = dataclasses.replace(make_loop(mechanism, compensator, scenario), measures_pose=True)
         gains = literature_gains(mechanism, compensator)
         arrays = {name: jnp.asarray(value) for name, value in gains.items()}
         _, records = record_controller(loop, arrays, scenario)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
-from laws_from_elsewhere import ScaledLead, ScaledLeadOnTheRig, SquaredSpring
+from user_registered_laws import ScaledLead, ScaledLeadOnTheRig, SquaredSpring
 
 import jaxhil
 import tuning
@@ -124,8 +124,8 @@ def test_user_objective_receives_contacts_and_scenarios():
 
     result = tuning.tune("varying", "phase_lead", objective=largest, **SMALL)
     assert all(shape == {(3, 4)} for shape in shapes)
-    worst = result.found.starts[0].history[0]
-    assert min(start.rms for start in result.found.starts) <= worst
+    worst = result.tune_result.starts[0].history[0]
+    assert min(start.rms for start in result.tune_result.starts) <= worst
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 
 from jaxhil.simulation.contact_plot import save_figure
 from tuning import terminal
-from tuning.benchmark.comparison import LawMetrics
+from tuning.benchmark.comparison import CompensatorMetrics
 from tuning.benchmark.computing_time import measure_tick_time
 from tuning.benchmark.tables import (
     METRIC_HEADINGS,
@@ -51,7 +51,7 @@ def test_compare_command_is_reproducible_from_seed(tmp_path):
         costs = document.pop("timings")["microseconds_per_tick"]
         assert set(costs) == {"none", "passivity"} and all(cost > 0 for cost in costs.values())
     assert documents[0] == documents[1]
-    assert documents[0]["transparency"].endswith("at 25 and 75 % of the contact's duration in space")
+    assert documents[0]["transparency"].endswith("at 25 and 75 % of the ideal contact's duration")
     [mechanism] = documents[0]["mechanisms"]
     none, passivity = mechanism["laws"]
     assert none["knows"] == [] and set(none["figures"]) == {"literature"}
@@ -71,8 +71,8 @@ def figures(rms, **others):
 
 
 FOUND = [
-    LawMetrics("none", "m", {"literature": {}}, {"literature": figures(0.5)}),
-    LawMetrics(
+    CompensatorMetrics("none", "m", {"literature": {}}, {"literature": figures(0.5)}),
+    CompensatorMetrics(
         "phase_lead",
         "m",
         {"literature": {"phase_lead": 0.1}, "tuned": {"phase_lead": 0.2}},
@@ -95,9 +95,15 @@ def test_compare_tables_mark_the_best_compensator(capsys):
 
 
 def test_compare_leaderboard_lists_all_compensators_and_settings(capsys):
-    ours = LawMetrics("impulse_ledger", "m", {}, {"literature": figures(0.05), "gentle": figures(0.06)})
-    many = [*FOUND, ours, *(LawMetrics(f"law_{n}", "m", {}, {"literature": figures(0.5)}) for n in range(12))]
-    better = [*FOUND, LawMetrics("impulse_ledger", "n", {}, {"literature": figures(0.2)})]
+    ours = CompensatorMetrics(
+        "impulse_ledger", "m", {}, {"literature": figures(0.05), "gentle": figures(0.06)}
+    )
+    many = [
+        *FOUND,
+        ours,
+        *(CompensatorMetrics(f"law_{n}", "m", {}, {"literature": figures(0.5)}) for n in range(12)),
+    ]
+    better = [*FOUND, CompensatorMetrics("impulse_ledger", "n", {}, {"literature": figures(0.2)})]
     board = {"m": many, "n": better}
     terminal.emit(build_leaderboard(["m", "n"], board), wrap=False)
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
@@ -109,7 +115,7 @@ def test_compare_leaderboard_lists_all_compensators_and_settings(capsys):
 
 def test_compare_tables_have_no_rows_for_tuned_gains_without_tuning(capsys):
     both = {"literature": figures(0.4), "gentle": figures(0.3)}
-    result = [FOUND[0], LawMetrics("impulse_ledger", "m", {}, both)]
+    result = [FOUND[0], CompensatorMetrics("impulse_ledger", "m", {}, both)]
     terminal.emit(build_mechanism_table("m", result), build_leaderboard(["m"], {"m": result}))
     out = capsys.readouterr().out
     assert "tuned" not in out and "  gentle  " in out

@@ -24,17 +24,17 @@ from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.simulation_base import KnownConstants
 from jaxhil.mechanism.file import builtin_names, to_plain_data
 from jaxhil.mechanism.structs import Mechanism
+from jaxhil.simulation.contact_tracking import MAX_DECAY_WAIT, build_end_conditions
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import OK
 from jaxhil.simulation.rollout import rollout
 from jaxhil.simulation.scenario import build_scenarios
 from jaxhil.simulation.sensors import white_noise
-from jaxhil.simulation.watch import MAX_DECAY_WAIT, build_end_conditions
 from tuning.bundle.bundle import build_limits_section
 from tuning.gain_file import build_document
 from tuning.gains.tasks import build_task
-from tuning.rig.contact_watch import ContactWatch
+from tuning.rig.contact_detector import ContactDetector
 from tuning.rig.plant import RigHardware
 from tuning.rig.udp_protocol import NumericalModel
 from tuning.statistics.intervals import binomial_interval
@@ -131,7 +131,7 @@ def check_means(parsed: Mechanism, name: str, shares: tuple[float, ...], seeds: 
         if abs(np.mean(over) - free) <= BIAS + 3 * np.std(over) / math.sqrt(seeds):
             continue
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("jaxhil.simulation.watch.MAX_DECAY_WAIT", 10 * MAX_DECAY_WAIT)
+            patch.setattr("jaxhil.simulation.contact_tracking.MAX_DECAY_WAIT", 10 * MAX_DECAY_WAIT)
             (later,) = restitutions(noisy, name, gains, seeds, jax.jit(rollout, static_argnums=0))[:1]
         assert abs(np.mean(later - over)) <= BIAS + 3 * np.std(later - over) / math.sqrt(seeds), (name, share)
 
@@ -162,7 +162,7 @@ def continue_contact(
     parsed: Mechanism, name: str, gains: dict[str, float], factor: float
 ) -> tuple[float, float]:
     """Return the first contact's restitution, and the value after `factor` times the longest wait."""
-    law, plant, watch = controller(parsed, name, gains), RigHardware(parsed), ContactWatch(parsed)
+    law, plant, detector = controller(parsed, name, gains), RigHardware(parsed), ContactDetector(parsed)
     model = NumericalModel(to_plain_data(parsed))
     position, velocity = model.start
     model.place(position, velocity)
@@ -172,7 +172,7 @@ def continue_contact(
         reading, measured = plant.read()
         force = law.step(reading, model.position, model.velocity, measured)
         if result is None:
-            result = watch.observe(model.position, model.velocity, force, plant.force, reading)
+            result = detector.observe(model.position, model.velocity, force, plant.force, reading)
         else:
             ticks_to_wait -= 1
         model.integrate(force)

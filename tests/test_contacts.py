@@ -29,7 +29,7 @@ def contact(**values):
 
 def reference(name, **values):
     mass, velocity = (np.full(LANES, value) for value in (MASS, VELOCITY))
-    run = jax.jit(CONTACT_LAWS[name].reference, compiler_options=QUICK)
+    run = jax.jit(CONTACT_LAWS[name].ideal_contact, compiler_options=QUICK)
     return run(contact(**values), mass, velocity)
 
 
@@ -131,7 +131,7 @@ def test_integrated_ideal_contact_derivatives_match_finite_differences():
                 stiffness=parameters.stiffness * (1 + scales[0]), damping=parameters.damping * (1 + scales[1])
             )
             velocity = jnp.full((LANES,), VELOCITY) * (1 + scales[2])
-            result = law.reference(changed, jnp.full((LANES,), MASS), velocity)
+            result = law.ideal_contact(changed, jnp.full((LANES,), MASS), velocity)
             return jnp.stack(result)
 
         both = jax.jit(

@@ -90,7 +90,7 @@ def test_evaluation_compares_every_contact_with_its_own_ideal_contact():
     )
     root = np.sqrt(1 - damping_ratio**2)
     expected = np.exp(-damping_ratio / root * np.arctan2(2 * damping_ratio * root, 2 * damping_ratio**2 - 1))
-    wanted = outcome.wanted
+    wanted = outcome.is_scheduled
     np.testing.assert_allclose(outcome.reference_restitution[wanted], expected[wanted], rtol=1e-12)
     np.testing.assert_array_equal(wanted.sum(axis=0), scenarios.contacts)
     assert outcome.good[wanted].all()

@@ -43,7 +43,7 @@ def undelayed(members, damped: bool) -> Any:
         }
         mass = np.array([members[i].bodies.mass for i in indices])
         velocity = np.array([members[i].approach.velocity for i in indices])
-        reference = jax.jit(CONTACT_LAWS[name].reference, compiler_options=QUICK)
+        reference = jax.jit(CONTACT_LAWS[name].ideal_contact, compiler_options=QUICK)
         for field, values in reference(ContactParameters(**parameters), mass, velocity)._asdict().items():
             references[field][indices] = values
     return SimpleNamespace(**references)

@@ -12,8 +12,8 @@ import pytest
 from conftest import Ran
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from laws_from_elsewhere import SquaredSpring
 from scipy import optimize
+from user_registered_laws import SquaredSpring
 
 import jaxhil
 from jaxhil.errors import InputError

@@ -57,9 +57,9 @@ def within(law, parameters, mass, velocity, tolerance):
 
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
-def closed_form(law, parameters, mass, velocity):
+def has_closed_form(law, parameters, mass, velocity):
     """Return the contact by the closed form of the law."""
-    return law.reference(parameters, mass, velocity)
+    return law.ideal_contact(parameters, mass, velocity)
 
 
 def integrated(name, values, tolerance=STEP_TOLERANCE, **options):
@@ -71,7 +71,7 @@ def integrated(name, values, tolerance=STEP_TOLERANCE, **options):
         result = run(parameters, mass, velocity)
     else:
         result = within(law, parameters, mass, velocity, np.asarray(tolerance, float))
-    return result, closed_form(law, parameters, mass, velocity)
+    return result, has_closed_form(law, parameters, mass, velocity)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -194,8 +194,8 @@ def test_integrated_contact_derivatives_match_derivatives_of_closed_forms(case, 
         return jax.jit(jax.jacfwd(function), compiler_options=QUICK)(np.zeros(4), parameters)
 
     result = derivatives(lambda c, m, v: integrate_contact(law, c, m, v))
-    expected = derivatives(law.reference)
-    size = closed_form(law, parameters._replace(damping=parameters.damping + 10), mass, velocity)
+    expected = derivatives(law.ideal_contact)
+    size = has_closed_form(law, parameters._replace(damping=parameters.damping + 10), mass, velocity)
     np.testing.assert_array_less(np.abs(result - expected) / np.stack(size)[..., None], tolerance)
 
 
@@ -209,5 +209,5 @@ def test_integrated_contact_works_in_single_precision_and_under_vmap():
 
     result = jax.jit(jax.vmap(run), compiler_options=QUICK)(parameters.damping, mass, velocity)
     assert result.restitution.dtype == np.float32
-    expected = closed_form(law, parameters, mass, velocity)
+    expected = has_closed_form(law, parameters, mass, velocity)
     np.testing.assert_allclose(result.restitution, expected.restitution, atol=1e-4)

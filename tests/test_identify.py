@@ -88,13 +88,13 @@ def test_identify_reports_defect_of_rig_and_verdict_is_bad(wrong, worst):
         runs = [replace(run, position_measured=1.02 * run.position_measured) for run in runs]
     result = identify(replace(campaign, runs=tuple(runs)), options=options)
     assert not result.good and result.verdict.startswith("Bad")
-    assert any(line.name.startswith(worst) and line.there for line in result.lines)
+    assert any(line.name.startswith(worst) and line.is_significant for line in result.lines)
 
 
 def test_identify_reports_stiffening_contact_as_drift():
     result = identify_kind("drifting", speeds=FEW)
     assert not result.good
-    assert next(line for line in result.lines if line.name.startswith("drift")).there
+    assert next(line for line in result.lines if line.name.startswith("drift")).is_significant
 
 
 def test_identify_separates_dead_zone_from_bias_and_reports_confounded_pair():

@@ -43,7 +43,7 @@ def test_mechanism_check_accepts_logs_of_the_same_mechanism(clean):
 def test_mechanism_check_rejects_logs_of_another_mechanism(clean, changed, name):
     result = check_against_mechanism(clean, campaign_rigs.mechanism("clean", **changed))
     assert result.good == (name is None)
-    assert name in [None, *(line.name for line in result.lines if line.there)]
+    assert name in [None, *(line.name for line in result.lines if line.is_significant)]
 
 
 def test_mechanism_check_reports_file_and_time_of_deviating_contact(clean):
@@ -52,7 +52,7 @@ def test_mechanism_check_reports_file_and_time_of_deviating_contact(clean):
     runs[index] = replace(runs[index], force_measured=1.1 * runs[index].force_measured, begin=7.0)
     result = check_against_mechanism(replace(clean, runs=tuple(runs)), campaign_rigs.mechanism("clean"))
     (line,) = (line for line in result.lines if line.name == "contact law")
-    assert line.there and line.where.startswith(f"run_{index}.csv from 7.")
+    assert line.is_significant and line.where.startswith(f"run_{index}.csv from 7.")
 
 
 def test_mechanism_check_detects_wrong_command_hold(clean):
@@ -60,7 +60,7 @@ def test_mechanism_check_detects_wrong_command_hold(clean):
     assert "command hold" in [
         line.name
         for line in check_against_mechanism(wrong, campaign_rigs.mechanism("clean")).lines
-        if line.there
+        if line.is_significant
     ]
 
 
@@ -79,7 +79,9 @@ def test_mechanism_check_accepts_logs_of_every_kind_of_rig(name):
 @pytest.mark.slow
 def test_mechanism_check_detects_drift():
     result = check_against_mechanism(campaigns.campaign("drifting", 1), campaign_rigs.mechanism("drifting"))
-    assert not result.good and any(line.name.startswith("drift") and line.there for line in result.lines)
+    assert not result.good and any(
+        line.name.startswith("drift") and line.is_significant for line in result.lines
+    )
 
 
 def test_mechanism_check_rejects_logs_without_motion_and_unsupported_contact_law(clean):

@@ -65,7 +65,7 @@ def test_identify_verdict_is_bad_for_undeclared_second_clock():
         options=IdentificationOptions(law="kelvin_voigt", hold_out=0.0),
     )
     line = next(item for item in result.lines if item.name == "drift of the force delay")
-    assert line.there and not result.good
+    assert line.is_significant and not result.good
     assert float(line.finding.split()[0]) == pytest.approx(0.96, abs=0.15)
 
 

@@ -31,8 +31,8 @@ def checked(monkeypatch, lag):
 @pytest.mark.parametrize(("lag", "there"), [(0.0016, False), (0.0, True)])
 def test_force_lag_missing_from_model_is_detected_at_onset_and_end_of_contact(monkeypatch, lag, there):
     line = checked(monkeypatch, lag)
-    assert line.there == there
-    assert not there or line.counted_error > 0.01
+    assert line.is_significant == there
+    assert not there or line.error_in_verdict > 0.01
 
 
 def test_dead_zone_is_estimated_from_noise_at_rest():

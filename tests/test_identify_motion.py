@@ -85,7 +85,7 @@ def test_motion_model_selection_takes_lowest_order_that_explains_the_data(name):
     )
     chosen, candidates = choose_structure(noisy)
     assert chosen.fit.model.structure.name == name
-    assert chosen.fit.chi2 / chosen.fit.freedom == pytest.approx(1.0, abs=0.35)
+    assert chosen.fit.chi2 / chosen.fit.degrees_of_freedom == pytest.approx(1.0, abs=0.35)
     for larger in candidates:
         assert larger.fault or larger.criterion > chosen.criterion - 2.0
 

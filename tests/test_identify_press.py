@@ -46,4 +46,4 @@ def test_omitting_delay_from_model_quadruples_fit_error_on_press_data(press):
 
 def test_friction_in_measured_press_data_is_detected(press):
     misfit = validation.check_motion_model(press, 3.0)[0]
-    assert misfit.name == "motion model" and misfit.there and misfit.effect > 0.01
+    assert misfit.name == "motion model" and misfit.is_significant and misfit.effect > 0.01

@@ -20,15 +20,15 @@ from tuning.identification.identify import IdentificationOptions, identify
 
 pytestmark = [pytest.mark.slow, pytest.mark.users_options]
 PHASES = 511
-LEAST_DEVIATION = 1.02e-4  # s, standard deviation of the force delay on the lagging rig without press run
+MIN_DEVIATION = 1.02e-4  # s, standard deviation of the force delay on the lagging rig without press run
 
 
 def error(mechanism, compensator, gains):
     """Return the rms of e - e* on the true rig over phases of its contacts."""
     scenarios = build_scenarios(mechanism, {"approach.phase": np.arange(PHASES) / PHASES}, 0)
     result = evaluate(build_loop(mechanism, compensator, scenarios), gains, scenarios)
-    assert np.array_equal(result.good, result.wanted)
-    return float(np.sqrt(np.mean(result.error[result.wanted] ** 2)))
+    assert np.array_equal(result.good, result.is_scheduled)
+    return float(np.sqrt(np.mean(result.error[result.is_scheduled] ** 2)))
 
 
 def truth_within_bound(truth, identified):
@@ -39,7 +39,7 @@ def truth_within_bound(truth, identified):
     the delay error.
     """
     off = force_age(identified) - force_age(truth)
-    shift = math.copysign(1.2 * LEAST_DEVIATION, off)
+    shift = math.copysign(1.2 * MIN_DEVIATION, off)
     raw = to_plain_data(truth)
     raw["rig"]["force_sensor"]["delay"] += shift
     raw["contact"]["damping"] = [

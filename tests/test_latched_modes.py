@@ -12,9 +12,9 @@ from scipy.special import lambertw
 from six_axes import FULL, ideal_sensor, lanes, meeting, place, plain_body, second_order
 
 from jaxhil.simulation.scenario import MotionSimulatorBatch
-from jaxhil.sixdof.axes import actuate, build_axes, enter, sampled
+from jaxhil.sixdof.axes import actuate, build_axes, read_samples, start_uniform_motion
 from jaxhil.sixdof.bodies import SHARES
-from jaxhil.sixdof.kinematics import TaskSpace, moving
+from jaxhil.sixdof.kinematics import TaskSpace, to_rigid_motion
 from jaxhil.sixdof.latch import Latch, init_latch, latch_wrench
 from jaxhil.sixdof.loop import build_loop, model_motion, run
 from jaxhil.sixdof.relative import Pair, Pose, Wrench, advance, mass_matrix
@@ -89,7 +89,7 @@ def test_response_error_with_true_stiffness_cancels_rig_dynamics_of_latched_bodi
     simulator = second_order(lanes([14.0, 13.0, 12.0, 11.0, 10.0, 9.0], BATCH), 0.8, lanes(UNEQUAL, BATCH))
     axes = build_axes(simulator, 0 * period, 0 * period, period, "linear")
     at, rates, _ = model_motion(bodies, start)
-    hardware = enter(axes, at, rates * PERIOD, period, "linear", 0, 64)
+    hardware = start_uniform_motion(axes, at, rates * PERIOD, period, "linear", 0, 64)
     still = init_latch(one, pose)
 
     def pulled(share):
@@ -97,8 +97,8 @@ def test_response_error_with_true_stiffness_cancels_rig_dynamics_of_latched_bodi
 
         def tick(carry, now):
             states, hardware = carry
-            motion = sampled(axes, hardware, now).motion
-            here = moving(motion)
+            motion = read_samples(axes, hardware, now).motion
+            here = to_rigid_motion(motion)
             real, _ = latch_wrench(one, still, here.pose, here.twist)
             wanted, *_ = model_motion(bodies, states)
             missing = jnp.einsum("ij,jb->ib", jnp.asarray(STIFFNESS), wanted - motion.position)

@@ -45,7 +45,7 @@ BIAS = "rig.force_sensor.bias=0.0", uniform_override("rig.force_sensor.bias", -5
 FRICTION = "contact.friction=3.0", uniform_override("contact.friction", 0.0, 6.0)
 
 
-def outcome_of(mechanism: Mechanism, gains: Mapping[str, Any], scenarios: Scenario) -> Outcome:
+def to_outcome(mechanism: Mechanism, gains: Mapping[str, Any], scenarios: Scenario) -> Outcome:
     loop = build_loop(mechanism, LAW, scenarios)
     # Run the lanes one after the other, so that one program serves every set of gains.
     lanes = scenarios.velocity.shape
@@ -76,10 +76,10 @@ def test_impulse_ledger_is_accurate_with_surface_within_1_mm(suite, noise):
     probed = build_probed_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)
     in_place = probed.scenarios._replace(contact_plane=0 * probed.scenarios.contact_plane)
     gains = literature_gains(mechanism, LAW)
-    copies = copies_of(probed, outcome_of(mechanism, gains, probed.scenarios))
+    copies = copies_of(probed, to_outcome(mechanism, gains, probed.scenarios))
     assert np.all(copies.good[..., 0])
     first, fourth = error_statistics(copies.error[0, :, 0]), error_statistics(copies.error[3, :, 0])
-    specified = error_statistics(copies_of(probed, outcome_of(mechanism, gains, in_place)).error[3, :, 0])
+    specified = error_statistics(copies_of(probed, to_outcome(mechanism, gains, in_place)).error[3, :, 0])
     figures = {name: estimate.value for name, estimate in compute_probe_metrics(probed, copies).items()}
     printed(suite, "noise", noise, *first, "fourth", *fourth, "as specified", *specified, figures)
     assert first[0] < RMS and first[1] < PERCENTILE and first[2] < LARGEST
@@ -99,7 +99,7 @@ def test_impulse_ledger_is_accurate_for_contacts_of_1_to_8_s(period, noise):
         std = {"none": 0 * peak, "0.15 N": 0 * peak + 0.15}.get(noise, 0.005 * peak)
         scenarios = scenarios._replace(force_sensor=scenarios.force_sensor._replace(noise_std=std))
         gains = literature_gains(mechanism, LAW)
-        outcome = outcome_of(mechanism, {**gains, "force_noise": std}, scenarios)
+        outcome = to_outcome(mechanism, {**gains, "force_noise": std}, scenarios)
         assert np.all(outcome.good[0])
         errors = error_statistics(outcome.error[0])
         excess = (outcome.peak_ratio[0] - 3) * outcome.reference_peak_force[0]
@@ -123,7 +123,7 @@ def test_impulse_ledger_is_accurate_with_preload_friction_and_bias(case):
     suite, changes = OFFSETS[case]
     mechanism = load(f"suite-{suite}", changes).mechanism
     scenarios = build_scenarios(mechanism, draw(mechanism, 200, SEED), SEED)
-    outcome = outcome_of(mechanism, literature_gains(mechanism, LAW), scenarios)
+    outcome = to_outcome(mechanism, literature_gains(mechanism, LAW), scenarios)
     assert np.all(outcome.good[0])
     errors = error_statistics(outcome.error[0])
     printed(case, *errors)

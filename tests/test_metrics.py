@@ -14,10 +14,10 @@ from lanes import QUICK, first_contact, join, mechanism, nominal_gains, spread, 
 
 from jaxhil.laws.simulation_base import Signals
 from jaxhil.simulation.contact_force import PlantSignals
+from jaxhil.simulation.contact_tracking import build_end_conditions, record_contact, start_tracking
 from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.metrics import empty_metrics, store_metrics
 from jaxhil.simulation.scenario import build_scenarios
-from jaxhil.simulation.watch import build_end_conditions, fresh_watch, record_contact
 
 PARSED = validated(mechanism({}))
 SCENARIO = join([build_scenarios(PARSED)])
@@ -31,16 +31,18 @@ def excess(commands, touching):
     rules = build_end_conditions(SCENARIO)
     zeros = jnp.zeros(1)
 
-    def tick(watch, now):
+    def tick(tracker, now):
         command, touches = now
         # The model reverses immediately, so that the contact ends during the ticks without force.
         signals = Signals(zeros, zeros, zeros - 1, zeros, jnp.zeros(1, jnp.int32))
         plant_signals = PlantSignals(jnp.where(touches, 10.0, 0.0)[None], None, None, None)
-        return record_contact(LOOP, rules, watch, signals, plant_signals, command[None], None), None
+        return record_contact(LOOP, rules, tracker, signals, plant_signals, command[None], None), None
 
-    watch, _ = jax.lax.scan(tick, fresh_watch(LOOP, zeros), (commands, touching))
+    tracker, _ = jax.lax.scan(tick, start_tracking(LOOP, zeros), (commands, touching))
     index = jnp.zeros(1, jnp.int32)
-    metrics = store_metrics(SCENARIO, empty_metrics(LOOP, 4, zeros), watch, index, watch.over, index, index)
+    metrics = store_metrics(
+        SCENARIO, empty_metrics(LOOP, 4, zeros), tracker, index, tracker.has_ended, index, index
+    )
     return metrics.excess_variation[0, 0]
 
 

@@ -113,8 +113,8 @@ def test_global_search_evaluates_every_task_with_its_own_objective(tasks, valida
 
 def restitution_errors_of(task, gains):
     outcome = evaluate(task.loop, gains, task.scenarios)
-    assert outcome.good[outcome.wanted].all()
-    return outcome.error[outcome.wanted]
+    assert outcome.good[outcome.is_scheduled].all()
+    return outcome.error[outcome.is_scheduled]
 
 
 def test_tasks_with_long_simulations_are_spread_evenly_over_devices():

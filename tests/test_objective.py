@@ -104,7 +104,7 @@ def outcomes(batch):
 
 def test_tuning_residuals_equal_errors_of_an_evaluation(outcomes, known_residuals):
     for gains, outcome, row in zip(GAINS, outcomes, known_residuals[0], strict=True):
-        good, wanted = outcome.good, outcome.wanted
+        good, wanted = outcome.good, outcome.is_scheduled
         assert (wanted & ~good).sum() == 3 and not good[:, SHORT].any()
         count = wanted.sum()
         error = np.where(good, outcome.error, 3.0)
@@ -131,7 +131,7 @@ def test_residual_sum_of_squares_is_never_below_but_close_to_objective(outcomes,
         jax.tree.map(
             np.testing.assert_array_equal, terms, compute_contact_terms(jax.tree.map(jnp.asarray, outcome))
         )
-        error, excess, swings = (np.asarray(term)[outcome.wanted] for term in terms)
+        error, excess, swings = (np.asarray(term)[outcome.is_scheduled] for term in terms)
         noise = amplification(gains)
         value = evaluate_objective(objective, error, excess, noise, swings)
         ours = np.sqrt(sum_of_squares(objective, error, excess, noise, swings))

@@ -64,8 +64,8 @@ def made(results):
 
 def errors_of(loop, scenarios, gains):
     outcome = evaluate(loop, gains, scenarios)
-    assert outcome.good[outcome.wanted].all()
-    return outcome.error[outcome.wanted]
+    assert outcome.good[outcome.is_scheduled].all()
+    return outcome.error[outcome.is_scheduled]
 
 
 def test_pareto_weights_are_in_units_of_the_objective():

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhil.sixdof.peaks import higher, no_peak
+from jaxhil.sixdof.peaks import update_peak, zero_peak
 
 # Times with unequal steps [s]; every lane begins at a different index.
 TIMES = np.cumsum(np.tile([0.02, 0.03, 0.05], 22))[:, None] + np.linspace(0, 0.02, 5)
@@ -17,9 +17,11 @@ def largest(curve, times, anew):
     def take(carry, given):
         peak, before = carry
         value, time, new = given
-        return (higher(peak, value, time - before, new), time), None
+        return (update_peak(peak, value, time - before, new), time), None
 
-    (peak, _), _ = jax.lax.scan(take, (no_peak(jnp.zeros_like(times[0])), 0 * times[0]), (curve, times, anew))
+    (peak, _), _ = jax.lax.scan(
+        take, (zero_peak(jnp.zeros_like(times[0])), 0 * times[0]), (curve, times, anew)
+    )
     return peak.largest
 
 

@@ -5,9 +5,9 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from laws_from_elsewhere import SquaredSpring
 from scipy.linalg import expm
 from scipy.special import beta
+from user_registered_laws import SquaredSpring
 
 import jaxhil
 import tuning
@@ -116,8 +116,8 @@ def test_summary_frequency_of_damped_spring_equals_undamped_frequency():
 
 def test_estimated_number_of_ticks_of_a_run_is_close_to_simulation():
     run = jaxhil.simulate("varying", "phase_lead")
-    assert run.meaning == summarise_mechanism(run.mechanism)
-    assert run.meaning.duration == pytest.approx(run.time[-1], rel=0.25)
+    assert run.summary == summarise_mechanism(run.mechanism)
+    assert run.summary.duration == pytest.approx(run.time[-1], rel=0.25)
 
 
 SIMULATORS = [

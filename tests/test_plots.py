@@ -203,7 +203,7 @@ def test_plotted_reference_motion_equals_ideal_contact(name):
     (curve,) = _ideal_curves(mechanism, scenarios, [until])
     contact = parameters_by_slot(jax.tree.map(jax.numpy.asarray, scenarios.contact))
     like = jax.numpy.full(scenarios.phase.shape, velocity)
-    of_law = jax.jit(CONTACT_LAWS[mechanism.contact.law].reference, compiler_options=QUICK)
+    of_law = jax.jit(CONTACT_LAWS[mechanism.contact.law].ideal_contact, compiler_options=QUICK)
     reference = of_law(contact, 0 * like + mechanism.bodies.mass, like)
     assert np.max(curve.force) == pytest.approx(float(reference.peak_force[0, 0]), rel=2e-3)
     rebound = -np.diff(curve.position)[-1] / np.diff(curve.time)[-1]

@@ -6,8 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from laws_from_elsewhere import ScaledLead, ScaledLeadOnTheRig, SquaredSpring
 from test_api import KEYS, TWO, refusal
+from user_registered_laws import ScaledLead, ScaledLeadOnTheRig, SquaredSpring
 
 import jaxhil
 from jaxhil.contact import laws
@@ -68,7 +68,7 @@ def test_incomplete_contact_law_is_refused(registered):
     mechanism = jaxhil.load("rig-300kg", {"contact": {"law": "squared_spring", "stiffness": [1e8]}})
     for needs, method in (
         (lambda: perturb_damping(mechanism, draw(mechanism, 4, 0)), "perturb_damping"),
-        (lambda: RigHardware(mechanism), "in_floats"),
+        (lambda: RigHardware(mechanism), "as_float_law"),
         (lambda: mechanism_models.make_regression_law(mechanism.contact), "regression"),
     ):
         message = refusal(needs)

@@ -1,4 +1,4 @@
-"""`jaxhil tune` and `compare_laws` interrupted at any time: resumed runs give the uninterrupted result."""
+"""Interrupted and resumed `jaxhil tune` and `compare_compensators` give the uninterrupted result."""
 
 import json
 import math
@@ -17,7 +17,7 @@ import pytest
 from jaxhil.mechanism.file import builtin_path, load
 from jaxhil.mechanism.structs import Mechanism
 from tuning.benchmark import comparison
-from tuning.benchmark.comparison import CompareSettings, LawMetrics, compare_laws
+from tuning.benchmark.comparison import CompareSettings, CompensatorMetrics, compare_compensators
 from tuning.caches import checkpoints
 from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
 from tuning.gains.common_program import group_by_common_program
@@ -138,8 +138,8 @@ def test_checkpoints_of_other_files_and_options_are_not_used(jaxhil, files, tmp_
 @pytest.mark.parametrize("number", [1, pytest.param(FILES, marks=pytest.mark.slow)])
 def test_result_read_from_checkpoint_is_bit_identical(tmp_path, number):
     mechanisms = [load("rig-300kg", [f"name=m{i}"]).mechanism for i in range(number)]
-    made = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Checkpoints(tmp_path)))
-    read = dict(tune_all(mechanisms, "phase_lead", SETTINGS, pieces=Checkpoints(tmp_path, resume=True)))
+    made = dict(tune_all(mechanisms, "phase_lead", SETTINGS, checkpoints=Checkpoints(tmp_path)))
+    read = dict(tune_all(mechanisms, "phase_lead", SETTINGS, checkpoints=Checkpoints(tmp_path, resume=True)))
     assert made.keys() == read.keys()
     for index, one in made.items():
         assert_same(vars(one), vars(read[index]))
@@ -195,19 +195,22 @@ def test_resumed_comparison_computes_only_missing_results(tmp_path, monkeypatch)
             raise KeyboardInterrupt
         figures = {"literature": {"rms": IntervalEstimate(0.1, math.nan, 1 / 3)}}
         return [
-            LawMetrics(law, scene.mechanism.name, {"literature": {"g": 0.1}}, figures) for scene in scenes
+            CompensatorMetrics(law, scene.mechanism.name, {"literature": {"g": 0.1}}, figures)
+            for scene in scenes
         ]
 
     def build(mechanisms, settings):
         return [[Scene(one) for one in group] for group in groups if group[0] in mechanisms]
 
-    monkeypatch.setattr(comparison, "evaluate_law", evaluate)
+    monkeypatch.setattr(comparison, "evaluate_compensator", evaluate)
     monkeypatch.setattr(comparison, "build_scenario_sets", build)
 
     def run(*laws, resume=True, **settings):
         evaluated.clear()
         checkpoints = Checkpoints(tmp_path, resume)
-        result = list(compare_laws(mechanisms, laws, CompareSettings(**settings), 0, pieces=checkpoints))
+        result = list(
+            compare_compensators(mechanisms, laws, CompareSettings(**settings), 0, checkpoints=checkpoints)
+        )
         return sorted(map(repr, result)), [law for law, _ in evaluated]
 
     with pytest.raises(KeyboardInterrupt):

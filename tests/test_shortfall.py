@@ -141,5 +141,5 @@ def test_loop_without_motion_limits_has_no_shortfall_state(batch):
     for one in (batch, free):
         rig = jax.eval_shape(functools.partial(build_rig_constants, one.loop), one.scenario)
         run = jax.eval_shape(functools.partial(start_rollout, one.loop), rig, one.gains)
-        state = run.watch.shortfall, run.state.plant.wanted
+        state = run.tracker.shortfall, run.state.plant.unlimited_command
         assert [leaf is not None for leaf in state] == [one.loop.has_limits] * 2

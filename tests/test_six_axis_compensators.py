@@ -10,8 +10,8 @@ from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS, literature_gains
 from jaxhil.laws.six_axis_base import LAG_LEADS, SixAxisCompensator
 from jaxhil.mechanism.file import load_any
 from jaxhil.simulation.jax_environment import jax_context
-from jaxhil.sixdof.building import build_scenarios, loop_of
-from jaxhil.sixdof.loop import build_rig, controller_constants, run
+from jaxhil.sixdof.building import build_scenarios, make_loop
+from jaxhil.sixdof.loop import build_rig_constants, controller_constants, run
 from jaxhil.sixdof.relative import coordinates
 
 pytestmark = pytest.mark.slow
@@ -43,7 +43,7 @@ def recorded(changes, gains=None, compensator="recorder"):
     mechanism = load_any("petals", {**FREE, **changes}).mechanism
     with jax_context():
         scenario = build_scenarios(mechanism)
-        loop = loop_of(mechanism, compensator, scenario)
+        loop = make_loop(mechanism, compensator, scenario)
         program = jax.jit(run, static_argnums=(0, 3), compiler_options=QUICK)
         arrays = {name: jnp.asarray(value) for name, value in (gains or {}).items()}
         state, ticks = program(loop, arrays, scenario, TICKS)
@@ -127,5 +127,5 @@ def test_six_axis_tool_correction_is_identity_without_tool():
     mechanism = load_any("petals").mechanism
     with jax_context():
         scenario = build_scenarios(mechanism)
-        rig = build_rig(loop_of(mechanism, "none", scenario), {}, scenario)
+        rig = build_rig_constants(make_loop(mechanism, "none", scenario), {}, scenario)
     np.testing.assert_array_equal(rig.constants.tool_correction[..., 0], np.eye(6))

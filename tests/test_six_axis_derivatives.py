@@ -11,8 +11,9 @@ import pytest
 from compiling import QUICK
 from six_axes import ideal_sensor, lanes, meeting, place, plain_body, second_order, spheres, springs
 
-from jaxhil.sixdof.approach import touching_height
+from jaxhil.sixdof.approach import find_touching_height
 from jaxhil.sixdof.friction import Regularised
+from jaxhil.sixdof.ideal_contact_integration import IdealContactModel, sample_ideal_contact
 from jaxhil.sixdof.kinematics import TaskSpace
 from jaxhil.sixdof.loop import build_loop
 from jaxhil.sixdof.metrics import evaluate
@@ -20,7 +21,6 @@ from jaxhil.sixdof.relative import Pair
 from jaxhil.sixdof.rotations import exponential
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.shapes import Drogue, Plane
-from jaxhil.sixdof.space import Space, follow
 from jaxhil.sixdof.vectors import vector
 
 pytestmark = pytest.mark.slow
@@ -75,7 +75,7 @@ def draw_touches():
 @jax.jit
 def start_states(offset, theta, twist):
     """Return states shortly before the first touch."""
-    height = touching_height(contact(np.ones(3)), *offset, exponential(vector(theta)))
+    height = find_touching_height(contact(np.ones(3)), *offset, exponential(vector(theta)))
     pose = jnp.concatenate([offset, height[None], theta])
     return meeting(bodies(), pose, twist, (0.02 + PERIOD / 3) * jnp.ones(LANES))
 
@@ -99,8 +99,10 @@ def passes_over(start):
     The surface's curvature jumps there, and the integration conserves energy only to 1e-8, a hundred times
     worse than elsewhere.
     """
-    space = Space(bodies(), contact(np.ones(3)), ())
-    _, seen = follow(space, start, jnp.full(LANES, PERIOD), 300, jnp.full(LANES, 2 * PERIOD))
+    contact_model = IdealContactModel(bodies(), contact(np.ones(3)), ())
+    _, seen = sample_ideal_contact(
+        contact_model, start, jnp.full(LANES, PERIOD), 300, jnp.full(LANES, 2 * PERIOD)
+    )
     at, (probe, _) = seen.pose.position, seen.forces
     on_wall = jnp.hypot(at.x, at.y) * np.sin(HALF_ANGLE) + at.z * np.cos(HALF_ANGLE) > 0
     touches = probe.touch.depth[:, 0] > 0

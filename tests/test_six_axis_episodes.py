@@ -14,9 +14,10 @@ import pytest
 from six_axes import ideal_sensor, lanes, meeting, place, plain_body, second_order, spheres, springs
 
 import jaxhil as package
-from jaxhil.sixdof.approach import touching_height
+from jaxhil.sixdof.approach import find_touching_height
 from jaxhil.sixdof.bodies import kinetic_energy
 from jaxhil.sixdof.friction import Regularised
+from jaxhil.sixdof.ideal_contact_integration import EVENT_ACCURACY, IdealContactModel, sample_ideal_contact
 from jaxhil.sixdof.kinematics import TaskSpace
 from jaxhil.sixdof.loop import build_loop, run
 from jaxhil.sixdof.metrics import evaluate
@@ -25,7 +26,6 @@ from jaxhil.sixdof.rollout import STATUS_NAMES
 from jaxhil.sixdof.rotations import identity
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.shapes import Plane
-from jaxhil.sixdof.space import EVENT_ACCURACY, Space, follow
 
 pytestmark = pytest.mark.slow
 CENTRAL, ASIDE, EARLIER, BIASED, AWAY, AGAIN, GRAZING = range(7)
@@ -54,7 +54,7 @@ def scenario():
     spring = springs(124355.0 * one, 395.8 * one, one)
     contact = spheres(jnp.asarray(centres), 0 * one, flat, "kelvin_voigt", spring, friction)
     zero = jnp.zeros(LANES)
-    height = touching_height((contact,), zero, zero, identity(zero))
+    height = find_touching_height((contact,), zero, zero, identity(zero))
     twist = lanes([0, 0, -0.005, 0, 0, 0], BATCH).at[2, AWAY].set(0.005).at[0].add(0.002 * aside)
     twist = twist.at[0, GRAZING].set(SIDEWAYS)
     pose = jnp.zeros((6, LANES)).at[2].set(height)
@@ -126,8 +126,10 @@ def record_touches(loop, given):
     For the rig these are touches of the hardware, and the energy of the numerical model before the tick.
     """
     _, seen = run(loop, {}, given, TICKS)
-    space = Space(given.bodies, given.groups, ())
-    _, ideal = follow(space, given.start, given.control_period, TICKS, given.control_period)
+    contact_model = IdealContactModel(given.bodies, given.groups, ())
+    _, ideal = sample_ideal_contact(
+        contact_model, given.start, given.control_period, TICKS, given.control_period
+    )
 
     def energy(states):
         return sum(kinetic_energy(*one) for one in zip(given.bodies, states, strict=True))

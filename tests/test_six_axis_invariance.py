@@ -16,10 +16,15 @@ from jaxhil.sixdof.bodies import build_body, build_state, kinetic_energy
 from jaxhil.sixdof.candidates import TargetSpheres
 from jaxhil.sixdof.forces import ContactGroup
 from jaxhil.sixdof.friction import Regularised
+from jaxhil.sixdof.ideal_contact_integration import (
+    IdealContactModel,
+    error_speed,
+    integrate_until,
+    start_integration,
+)
 from jaxhil.sixdof.relative import Pair, States
 from jaxhil.sixdof.rotations import exponential, identity, rotate, rotate_back
 from jaxhil.sixdof.shapes import Drogue, Plane
-from jaxhil.sixdof.space import Space, fly, scale, start_flight
 from jaxhil.sixdof.vectors import components
 
 pytestmark = pytest.mark.slow
@@ -51,13 +56,23 @@ def start(pair):
 
 def collide(pair, states, group):
     """Return the states of the bodies after the contact, and the lost energy."""
-    space, time, longest = Space(pair, (group,), ()), lanes(DURATION, BATCH), lanes(1e-3, BATCH)
+    contact_model, time, longest = (
+        IdealContactModel(pair, (group,), ()),
+        lanes(DURATION, BATCH),
+        lanes(1e-3, BATCH),
+    )
 
     @jax.jit
-    def flown(space, states):
-        return fly(space, start_flight(space, states, longest), time, longest, scale(space, states)).states
+    def flown(contact_model, states):
+        return integrate_until(
+            contact_model,
+            start_integration(contact_model, states, longest),
+            time,
+            longest,
+            error_speed(contact_model, states),
+        ).states
 
-    end = flown(space, states)
+    end = flown(contact_model, states)
     energies = [sum(kinetic_energy(*one) for one in zip(pair, now, strict=True)) for now in (states, end)]
     return end, energies[0] - energies[1]
 

@@ -11,7 +11,7 @@ from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import load_any
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.jax_environment import jax_context
-from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.building import build_scenarios, make_loop
 from jaxhil.sixdof.loop import run
 from jaxhil.sixdof.metrics import evaluate
 from jaxhil.sixdof.rollout import STATUS_NAMES
@@ -32,7 +32,7 @@ def evaluated(mechanism, compensator, *changes, lanes=LANES, scenario=None):
         scenarios = build_scenarios(mechanism, draw(mechanism, lanes, 1), seed=1)
         if scenario is not None:
             scenarios = scenario(scenarios)
-        loop = loop_of(mechanism, compensator, scenarios)
+        loop = make_loop(mechanism, compensator, scenarios)
         gains = literature_gains(mechanism, compensator)
         program = jax.jit(evaluate, static_argnums=0, compiler_options=QUICK)
 
@@ -110,7 +110,7 @@ def test_six_axis_impulse_ledger_commands_zero_wrench_without_contact():
         )
         start = scenarios.start._replace(chaser=scenarios.start.chaser._replace(position=away))
         scenarios = scenarios._replace(start=start)
-        loop = loop_of(mechanism, LAW, scenarios)
+        loop = make_loop(mechanism, LAW, scenarios)
         gains = {name: jnp.asarray(value) for name, value in literature_gains(mechanism, LAW).items()}
         _, ticks = jax.jit(run, static_argnums=(0, 3), compiler_options=QUICK)(loop, gains, scenarios, 800)
     assert all(np.all(np.asarray(part) == 0) for part in jax.tree.leaves(ticks.command))

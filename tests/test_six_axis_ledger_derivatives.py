@@ -12,7 +12,7 @@ from six_axis_ranges import load_wide
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.jax_environment import jax_context
-from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.building import build_scenarios, make_loop
 from jaxhil.sixdof.metrics import evaluate
 
 pytestmark = pytest.mark.slow
@@ -58,7 +58,7 @@ def test_ledger_derivatives_are_finite_and_agree_with_central_differences():
     mechanism = load_wide("probe-drogue")
     with jax_context():
         scenarios = build_scenarios(mechanism, draw(mechanism, LANES, 3), seed=3)
-        loop, gains = loop_of(mechanism, LAW, scenarios), literature_gains(mechanism, LAW)
+        loop, gains = make_loop(mechanism, LAW, scenarios), literature_gains(mechanism, LAW)
 
         def errors(scales):
             changed = {name: scales[i] * gains[name] for i, name in enumerate(GAINS)}

@@ -12,10 +12,15 @@ import pytest
 from six_axes import FULL, lanes, place, plain_body, spheres, springs
 
 from jaxhil.sixdof.bodies import angular_velocity, build_state
+from jaxhil.sixdof.ideal_contact_integration import (
+    IdealContactModel,
+    error_speed,
+    integrate_until,
+    start_integration,
+)
 from jaxhil.sixdof.relative import Pair, States
 from jaxhil.sixdof.rotations import identity
 from jaxhil.sixdof.shapes import Cavity
-from jaxhil.sixdof.space import Space, fly, scale, start_flight
 from jaxhil.sixdof.vectors import components, vector
 
 mujoco = pytest.importorskip("mujoco")
@@ -58,12 +63,18 @@ def simulate_tethers(tethers, duration):
         target, chaser = (lanes(np.array(ends).T, BATCH) for ends in zip(*ENDS[:tethers], strict=True))
         shape = Cavity(vector(target), LENGTH * one)
         groups = (spheres(chaser, 0 * one, shape, "hunt_crossley", springs(STIFFNESS * one, 0 * one, one)),)
-    space = Space(bodies, groups, ())
+    contact_model = IdealContactModel(bodies, groups, ())
     time, longest = lanes(duration, BATCH), lanes(1e-3, BATCH)
 
     @jax.jit
     def flown():
-        return fly(space, start_flight(space, start, longest), time, longest, scale(space, start)).states
+        return integrate_until(
+            contact_model,
+            start_integration(contact_model, start, longest),
+            time,
+            longest,
+            error_speed(contact_model, start),
+        ).states
 
     end = flown()
     turning = [angular_velocity(*one) for one in zip(bodies, end, strict=True)]

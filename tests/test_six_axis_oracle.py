@@ -19,13 +19,13 @@ from six_axes import (
     spheres,
     springs,
 )
-from six_axis_oracle import command, in_space, on_the_rig, relative
+from six_axis_oracle import command, ideal_motion, on_the_rig, relative
 
 from jaxhil.sixdof.bodies import build_state
 from jaxhil.sixdof.friction import Regularised
 from jaxhil.sixdof.kinematics import TaskSpace
 from jaxhil.sixdof.loop import build_loop, run
-from jaxhil.sixdof.metrics import reference_final
+from jaxhil.sixdof.metrics import compute_ideal_states
 from jaxhil.sixdof.relative import Pair, States
 from jaxhil.sixdof.rotations import Quaternion
 from jaxhil.sixdof.scenario import Scenario
@@ -139,9 +139,9 @@ def test_six_axis_ideal_contact_agrees_with_independent_implementation(name):
     case = initial_bodies(CASES[name])
     case_scenario = as_scenario(case)
     time = lanes(TICKS * PERIOD, BATCH)
-    result = jax.jit(reference_final)(case_scenario, time)
+    result = jax.jit(compute_ideal_states)(case_scenario, time)
     before = case["start"][1][1]
-    expected = in_space(case, TICKS * PERIOD)
+    expected = ideal_motion(case, TICKS * PERIOD)
     assert np.linalg.norm(expected[1][1] - before) > 0.01
     close(result, expected, 1e-9)
     assert np.all(np.isfinite(command(case, expected)[0])) and relative(case, expected)[0][2] > 0

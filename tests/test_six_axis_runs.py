@@ -14,7 +14,7 @@ from jaxhil.mechanism.file import any_from_plain_data, builtin_names, load_any, 
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.sixdof.building import build_scenarios
 from jaxhil.sixdof.building_contacts import candidate_names
-from jaxhil.sixdof.meaning import meaning
+from jaxhil.sixdof.mechanism_summary import summarise_six_axes
 from jaxhil.sixdof.run import simulate_six_axes
 
 STILL = {"velocity": [0, 0, 0], "angular_velocity": [0, 0, 0], "attitude": [1, 0, 0, 0]}
@@ -75,9 +75,9 @@ def test_six_axis_latches_and_robots_are_built_as_specified():
     # The delay of each robot counts by its share.
     lag = 0.9 / (np.pi * np.array([14.0, 12.0]))
     delay = 0.004 + 0.7 * (lag[0] + 0.008) + 0.3 * (lag[1] + 0.016)
-    late = meaning(mechanism, 1.0, 1.0, 1.0, 1.0, 1.0).delay
+    late = summarise_six_axes(mechanism, 1.0, 1.0, 1.0, 1.0, 1.0).delay
     np.testing.assert_allclose(late, max(delay, 0.004 + lag[1] + 0.008))
-    held = meaning(mechanism, 1.0, 1.0, np.nan, 1.0, np.nan)
+    held = summarise_six_axes(mechanism, 1.0, 1.0, np.nan, 1.0, np.nan)
     assert "; ideal contact: held by a latch, peak force 1 N; rig: delay" in held.line("claw")
 
 
@@ -274,9 +274,9 @@ def test_too_stiff_six_axis_friction_is_named_in_error():
 def test_simulate_reports_shapes_that_pass_through_each_other():
     soft = {"contact.tip.stiffness": 3e4, "approach.velocity": [0, 0, -0.5], "uncertainty": {}}
     run = package.simulate(package.load("probe-drogue", soft))
-    assert run.episodes[0].penetration > 0.9 and "times the size of the shapes" in run.meaning.warnings[-1]
+    assert run.episodes[0].penetration > 0.9 and "times the size of the shapes" in run.summary.warnings[-1]
     gentle = package.simulate(package.load("probe-drogue"))
-    assert gentle.episodes[0].penetration < 0.1 and not gentle.meaning.warnings
+    assert gentle.episodes[0].penetration < 0.1 and not gentle.summary.warnings
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 from six_axes import lanes, place, second_order
 
-from jaxhil.sixdof.axes import Motion, actuate, build_axes, enter, sampled
+from jaxhil.sixdof.axes import AxisMotion, actuate, build_axes, read_samples, start_uniform_motion
 from jaxhil.sixdof.kinematics import TaskSpace, TwoRobots
 from jaxhil.sixdof.stewart import Stewart, condition
 from jaxhil.sixdof.vectors import vector
@@ -43,7 +43,7 @@ def test_hexapod_pose_survives_inverse_and_forward_kinematics():
         return lambda time: jax.jvp(function, (time,), (jnp.ones_like(time),))[1]
 
     now = jnp.asarray(0.0)
-    legs = Motion(along(now), slope(along)(now), slope(slope(along))(now))
+    legs = AxisMotion(along(now), slope(along)(now), slope(slope(along))(now))
     result = jax.jit(lambda *given: rig.coordinates(*given))(legs, at + 2e-3)
     for part, expected in zip(result, (at, rate, bend), strict=True):
         np.testing.assert_allclose(part, expected, atol=1e-10)
@@ -57,7 +57,7 @@ def test_hexapod_pose_derivatives_agree_with_differences():
     @jax.jit
     def pose(scale):
         changed = Stewart(scale * rig.base, rig.platform, rig.height)
-        return changed.coordinates(Motion(legs, 0 * legs, None), at).position
+        return changed.coordinates(AxisMotion(legs, 0 * legs, None), at).position
 
     one = jnp.asarray(1.0)
     _, result = jax.jvp(pose, (one,), (one,))
@@ -74,10 +74,10 @@ def oscillate(kinematics, axes, amplitude):
     zero, period = jnp.zeros(BATCH), PERIOD + jnp.zeros(BATCH)
     plant = build_axes(second_order(axes + 0 * late, 0.8 + 0 * late, late), zero, zero, period, "linear")
     start = kinematics.command(0 * shape)
-    hardware = enter(plant, start, 0 * start, period, "linear", 0, RING)
+    hardware = start_uniform_motion(plant, start, 0 * start, period, "linear", 0, RING)
 
     def body(hardware, tick):
-        seen = kinematics.coordinates(sampled(plant, hardware, tick).motion, 0 * shape)
+        seen = kinematics.coordinates(read_samples(plant, hardware, tick).motion, 0 * shape)
         way = jnp.sin(2 * np.pi * 3.0 * PERIOD * (tick + 1).astype(float)) ** 2
         hardware = actuate(plant, hardware, tick, kinematics.command(amplitude * way * shape), "linear", 0)
         return hardware, jnp.concatenate([seen.position, seen.rate])

@@ -16,10 +16,12 @@ def test_terminal_table_shows_every_digit(monkeypatch, capsys, width):
     monkeypatch.setattr(terminal, "DEFAULT_WIDTH", width)
     heads = ["law", *(f"figure {number} %" for number in range(len(FIGURES)))]
     terminal.emit(
-        terminal.build_table("suite-damped: each law, and a title that is long", heads, [[LAW, *FIGURES]])
+        terminal.build_table(
+            "suite-damped: each compensator, and a title that is long", heads, [[LAW, *FIGURES]]
+        )
     )
     title, *_, line, _ = capsys.readouterr().out.splitlines()
-    assert title == "suite-damped: each law, and a title that is long"
+    assert title == "suite-damped: each compensator, and a title that is long"
     assert line.split() == [LAW, *(f"{figure:.4g}" for figure in FIGURES)]
 
 

@@ -33,18 +33,18 @@ class Toy(ContactLaw):
     )
 
     @property
-    def arcs(self):
+    def is_locally_parabolic(self):
         return True
 
     def step(self, parameters, state, penetration, rate):
-        force = self.hold(parameters, state, penetration, rate)
+        force = self.separation_function(parameters, state, penetration, rate)
         return jnp.where((penetration > 0) & (force > 0), force, 0), state
 
-    def edge(self, parameters, rate):
+    def onset_force(self, parameters, rate):
         force = parameters.damping * rate
         return jnp.where(force > 0, force, 0)
 
-    def hold(self, parameters, state, penetration, rate):
+    def separation_function(self, parameters, state, penetration, rate):
         stiffening = 1 + penetration / parameters.doubling_depth
         return parameters.stiffness * penetration * stiffening + parameters.damping * rate
 
@@ -54,7 +54,7 @@ class Toy(ContactLaw):
     def perturb_damping(self, drawn, ratio, mass, velocity):
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
-    def in_floats(self, contact, stiffness, damping):
+    def as_float_law(self, contact, stiffness, damping):
         def spring(depth, rate):
             return stiffness * depth * (1.0 + depth / contact.doubling_depth) + damping * rate
 

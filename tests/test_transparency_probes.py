@@ -107,7 +107,7 @@ def task():
 def of_training(task, gains):
     """Return restitution errors of scenarios and copies, and all peak excesses, in training."""
     outcome = evaluate(task.loop, gains, task.scenarios)
-    assert outcome.good[outcome.wanted].all()
+    assert outcome.good[outcome.is_scheduled].all()
     error, excess, _ = (np.asarray(term)[0] for term in compute_contact_terms(outcome))
     copies = mask_probes(len(error))
     return error[~copies], error[copies], excess

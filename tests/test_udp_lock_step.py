@@ -42,7 +42,7 @@ def test_udp_lock_step_contacts_equal_contacts_of_closed_loop(name):
     rig, _, _ = packets(mechanism, controller(mechanism, "response_error", gains), 2500)
     result = rig.contacts[: len(wanted)]
     assert [one.restitution for one in result] == [one.restitution for one in wanted]
-    assert [one.begun for one in result] == [one.begun for one in wanted]
+    assert [one.onset_tick for one in result] == [one.onset_tick for one in wanted]
     # Each run uses the next entries of the mechanism's lists at the nominal speed.
     numbers = [contact.number for contact in rig.contacts]
     assert len(numbers) > len(wanted)

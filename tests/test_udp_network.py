@@ -10,7 +10,7 @@ from rig_lock_step import a_reading, prepared
 
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load
-from tuning.rig.contact_watch import RigContact
+from tuning.rig.contact_detector import RigContact
 from tuning.rig.loop import EmptyTask, PacketTimes, answered_packet_number, run_loop
 from tuning.rig.network import Injection, Network
 from tuning.rig.rig_task import MAX_COMMAND_AGE

@@ -99,3 +99,28 @@ def test_guide_and_readme_use_no_retired_words():
         if RETIRED.search(line)
     ]
     assert not wrong, "\n".join(wrong)
+
+
+# Names that no code may bring back: of modules, classes, functions, methods and fields.
+RETIRED_NAMES = re.compile(
+    r"\b(EpisodeInSpace|SpaceRun|simulate_in_space|final_in_space|follow_contact|start_flight|advance_flight|"
+    r"fresh_watch|ContactWatch|watch_tick|check_followed|meeting_mass|touching_height|outcome_of|loop_of|"
+    r"MonotonePieces|monotone_pieces|wrench_in_space|twist_in_space|LawMetrics|LawFailure|compare_laws|"
+    r"evaluate_law|sixdof\.(alone|space|reference|values|watch|meaning)|simulation\.watch|contact_watch|"
+    r"in_floats|dissipates_by|damped_as|_cut_tolerated|_most_turn|laws_from_elsewhere|"
+    r"law\.(edge|hold|remembers|jumps|arcs|specialised)|def (edge|remembers|jumps|arcs|specialised)|"
+    r"[Ee]ach law (tuned|with the literature))\b"
+)
+
+
+def test_retired_names_do_not_come_back():
+    folders = ("jaxhil", "tuning", "tests", "notebooks")
+    paths = [path for folder in folders for path in sorted((ROOT / folder).rglob("*"))]
+    wrong = [
+        f"{path.relative_to(ROOT)}:{number}: {line.strip()[:100]}"
+        for path in paths
+        if path.suffix in {".py", ".md", ".ipynb"} and path != Path(__file__)
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
+        if RETIRED_NAMES.search(line)
+    ]
+    assert not wrong, "\n".join(wrong)

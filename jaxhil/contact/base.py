@@ -44,11 +44,11 @@ class ContactLaw(abc.ABC):
     keys: ClassVar[tuple[ContactKey, ...] | None] = None
     stiffness_unit: ClassVar[str] = "N/m"
     damping_unit: ClassVar[str] = "N s/m"
-    damped: ClassVar[bool] = True  # whether the force depends on the key `damping`
-    dissipates_by: ClassVar[str] = ""  # process that dissipates energy in a law that rejects `damping`
-    segmented: ClassVar[bool] = False  # whether each entry of `stiffness` is a list of slopes
+    is_damped: ClassVar[bool] = True  # whether the force depends on the key `damping`
+    dissipation_process: ClassVar[str] = ""  # process that dissipates energy in a law that rejects `damping`
+    is_segmented: ClassVar[bool] = False  # whether each entry of `stiffness` is a list of slopes
     is_linear: ClassVar[bool] = False  # whether the force in contact is k d + b d'
-    damped_as: ClassVar[str] = ""  # name of the same law with damping; empty: this law itself
+    damped_law: ClassVar[str] = ""  # name of the same law with damping; empty: this law itself
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Make the subclass a frozen dataclass, so that a law can be a key of compiled programs."""
@@ -58,7 +58,7 @@ class ContactLaw(abc.ABC):
     # Simulation
 
     @property
-    def remembers(self) -> bool:
+    def has_memory(self) -> bool:
         """Return whether the force depends on the deepest penetration so far.
 
         If so, the simulation also updates the state of the law between samples. `step` must reset the
@@ -67,12 +67,12 @@ class ContactLaw(abc.ABC):
         return False
 
     @property
-    def jumps(self) -> bool:
+    def has_reversal_jump(self) -> bool:
         """Return whether the force jumps when the motion reverses; its peak may lie between two samples."""
         return False
 
     @property
-    def arcs(self) -> bool:
+    def is_locally_parabolic(self) -> bool:
         """Return whether a slow contact has a nearly parabolic force in each quarter of a control period.
 
         This is false if the slope changes at a given depth, if the force jumps when the motion reverses, or
@@ -81,23 +81,23 @@ class ContactLaw(abc.ABC):
         return False
 
     @property
-    def closed_form(self) -> bool:
+    def has_closed_form(self) -> bool:
         """Return whether the ideal contact has a closed form; if not, it is integrated numerically."""
-        return type(self).reference is not ContactLaw.reference
+        return type(self).ideal_contact is not ContactLaw.ideal_contact
 
     @property
-    def simulated(self) -> ContactLaw:
+    def simulation_law(self) -> ContactLaw:
         """Return the law to simulate instead of this law, so that laws with equal forces share a program."""
         return self
 
-    def specialised(self, contact: Any, drawn: Callable[[str], bool]) -> ContactLaw:
+    def specialise(self, contact: Any, drawn: Callable[[str], bool]) -> ContactLaw:
         """Return a faster law with the same force for a batch in which certain keys have only one value.
 
         Args:
             contact: the file's table `[contact]`.
             drawn: function that returns whether the value of a key differs between batch elements.
         """
-        return self.simulated
+        return self.simulation_law
 
     def init(self, penetration: Any) -> tuple[Any, ...]:
         """Return the state of the law before the first touch, in the batch shape of `penetration`."""
@@ -110,21 +110,23 @@ class ContactLaw(abc.ABC):
         """Return the force [N] at a `penetration` [m] and its `rate` [m/s], and the next state of the law."""
 
     @abc.abstractmethod
-    def edge(self, parameters: Any, rate: Any) -> Any:
+    def onset_force(self, parameters: Any, rate: Any) -> Any:
         """Return the force [N] just inside the surface: its limit as d goes to 0 from above."""
 
     @abc.abstractmethod
-    def hold(self, parameters: Any, state: tuple[Any, ...], penetration: Any, rate: Any) -> Any:
+    def separation_function(
+        self, parameters: Any, state: tuple[Any, ...], penetration: Any, rate: Any
+    ) -> Any:
         """Return a smooth value that is positive during the contact and crosses 0 at the separation.
 
         The value is the force before clamping at 0, or has the same sign as this force.
         """
 
-    def corners(self, parameters: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
+    def breakpoints(self, parameters: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Return the penetrations [m] at which the slope of the force changes; none by default."""
         return ()
 
-    def reference(self, parameters: Any, mass: Any, velocity: Any) -> IdealContact:
+    def ideal_contact(self, parameters: Any, mass: Any, velocity: Any) -> IdealContact:
         """Return the ideal contact for an equivalent `mass` [kg] and an approach `velocity` [m/s].
 
         By default the motion is integrated numerically (`jaxhil.contact.ideal_contact_motion`).
@@ -195,12 +197,12 @@ class ContactLaw(abc.ABC):
         """
         raise self._missing_method_error("perturb_damping")
 
-    def in_floats(self, contact: Any, stiffness: Any, damping: float) -> FloatLaw:
+    def as_float_law(self, contact: Any, stiffness: Any, damping: float) -> FloatLaw:
         """Return the law as functions of Python floats, for one entry of `stiffness` and one of `damping`.
 
         Raise `InputError` if the law does not define this method.
         """
-        raise self._missing_method_error("in_floats")
+        raise self._missing_method_error("as_float_law")
 
     def regression(self, contact: Any) -> Regression:
         """Return the law as a linear regression. Raise `InputError` if the law does not define it."""

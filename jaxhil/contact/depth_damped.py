@@ -38,10 +38,10 @@ class DepthDamped(PowerLaw):
         force = force + parameters.damping * rate * (depth / parameters.reference_depth)
         return jnp.where(touching & (force > 0), force, 0), state
 
-    def edge(self, parameters, rate):
+    def onset_force(self, parameters, rate):
         return jnp.zeros_like(rate)
 
-    def hold(self, parameters, state, penetration, rate):
+    def separation_function(self, parameters, state, penetration, rate):
         """Return the unclamped F/d for d > 0, and its limit at d = 0 for d <= 0."""
         touching = penetration > 0
         power = jnp.where(touching, penetration, 1) ** (parameters.exponent - 1)
@@ -59,7 +59,7 @@ class DepthDamped(PowerLaw):
         added = 1.5 * np.pi * ratio / velocity * stiffness * depth ** (order - 2) * reference_depth
         return "damping", drawn("damping") + added
 
-    def in_floats(self, contact, stiffness, damping):
+    def as_float_law(self, contact, stiffness, damping):
         exponent, reference_depth = contact.exponent, contact.reference_depth
 
         def hold(depth: float, rate: float) -> float:

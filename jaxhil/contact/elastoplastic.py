@@ -32,40 +32,40 @@ class Elastoplastic(ContactLaw):
             neutral=1.0,
         ),
     )
-    damped: ClassVar[bool] = False
-    dissipates_by: ClassVar[str] = "yielding"
+    is_damped: ClassVar[bool] = False
+    dissipation_process: ClassVar[str] = "yielding"
 
     @property
-    def remembers(self):
+    def has_memory(self):
         return True
 
     def init(self, penetration):
         return (jnp.zeros_like(penetration),)
 
     @property
-    def arcs(self):
+    def is_locally_parabolic(self):
         return True
 
     def step(self, parameters, state, penetration, rate):
         (deepest,) = state
-        force = self.hold(parameters, state, penetration, rate)
+        force = self.separation_function(parameters, state, penetration, rate)
         deepest = jnp.where(penetration > deepest, penetration, deepest)
         deepest = jnp.where(penetration > 0, deepest, 0)
         return jnp.where((penetration > 0) & (force > 0), force, 0), (deepest,)
 
-    def corners(self, parameters, state):
+    def breakpoints(self, parameters, state):
         return state
 
-    def edge(self, parameters, rate):
+    def onset_force(self, parameters, rate):
         return jnp.zeros_like(rate)
 
-    def hold(self, parameters, state, penetration, rate):
+    def separation_function(self, parameters, state, penetration, rate):
         (deepest,) = state
         above = deepest - penetration
         slope = parameters.stiffness * parameters.unloading_ratio
         return parameters.stiffness * deepest - jnp.where(above > 0, slope, parameters.stiffness) * above
 
-    def reference(self, parameters, mass, velocity):
+    def ideal_contact(self, parameters, mass, velocity):
         """Return the ideal contact: a quarter period at sqrt(k/M) inward, then one at sqrt(k_u/M) outward."""
         from jaxhil.contact.ideal_contact import IdealContact
 
@@ -87,11 +87,11 @@ class Elastoplastic(ContactLaw):
         """Multiply r by exp(2 pi zeta) with zeta = `ratio`, because the restitution is 1/sqrt(r)."""
         return "unloading_ratio", drawn("unloading_ratio") * np.exp(2 * np.pi * ratio[:, 0])
 
-    def in_floats(self, contact, stiffness, damping):
-        return _in_floats(stiffness, contact.unloading_ratio, 0.0)
+    def as_float_law(self, contact, stiffness, damping):
+        return _as_float_law(stiffness, contact.unloading_ratio, 0.0)
 
 
-def _in_floats(stiffness: float, unloading_ratio: float, deepest: float) -> FloatLaw:
+def _as_float_law(stiffness: float, unloading_ratio: float, deepest: float) -> FloatLaw:
     """Return the law in Python floats for a contact whose largest penetration so far is `deepest` [m]."""
 
     def spring(depth: float, rate: float) -> float:
@@ -99,7 +99,7 @@ def _in_floats(stiffness: float, unloading_ratio: float, deepest: float) -> Floa
             return stiffness * depth
         return stiffness * deepest - stiffness * unloading_ratio * (deepest - depth)
 
-    def loaded(depth: float) -> FloatLaw:
-        return _in_floats(stiffness, unloading_ratio, depth)
+    def loaded_law(depth: float) -> FloatLaw:
+        return _as_float_law(stiffness, unloading_ratio, depth)
 
-    return clamp_force(spring, lambda rate: 0.0)._replace(loaded=loaded)
+    return clamp_force(spring, lambda rate: 0.0)._replace(loaded_law=loaded_law)

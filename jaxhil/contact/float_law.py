@@ -12,21 +12,23 @@ class FloatLaw(NamedTuple):
     """Contact law of one contact, as functions of the penetration d [m] and its rate d' [m/s]."""
 
     force: ForceFunction  # force [N] at d > 0; 0 where the surfaces separate
-    hold: ForceFunction  # positive until the surfaces separate (`ContactLaw.hold`)
-    edge: Callable[[float], float]  # limit of the force [N] as d goes to 0 from above, a function of d' only
+    # positive until the surfaces separate (`ContactLaw.separation_function`)
+    separation_function: ForceFunction
+    # limit of the force [N] as d goes to 0 from above, a function of d' only
+    onset_force: Callable[[float], float]
     # only for a law with memory: returns the law after a deepest penetration [m]; 0: undeformed
-    loaded: "Callable[[float], FloatLaw] | None" = None
+    loaded_law: "Callable[[float], FloatLaw] | None" = None
 
 
-def clamp_force(spring: ForceFunction, edge: Callable[[float], float]) -> FloatLaw:
-    """Return the law with the force max(0, `spring`); `edge` is the limit of `spring` at d = 0."""
+def clamp_force(spring: ForceFunction, onset_force: Callable[[float], float]) -> FloatLaw:
+    """Return the law with the force max(0, `spring`); `onset_force` is the limit of `spring` at d = 0."""
 
     def force(depth: float, rate: float) -> float:
         value = spring(depth, rate)
         return value if value > 0.0 else 0.0
 
     def limit(rate: float) -> float:
-        value = edge(rate)
+        value = onset_force(rate)
         return value if value > 0.0 else 0.0
 
     return FloatLaw(force, spring, limit)

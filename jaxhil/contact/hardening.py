@@ -26,18 +26,18 @@ class Hardening(ContactLaw):
     keys: ClassVar = (REFERENCE_DEPTH,)
 
     @property
-    def arcs(self):
+    def is_locally_parabolic(self):
         return True
 
     def step(self, parameters, state, penetration, rate):
-        force = self.hold(parameters, state, penetration, rate)
+        force = self.separation_function(parameters, state, penetration, rate)
         return jnp.where((penetration > 0) & (force > 0), force, 0), state
 
-    def edge(self, parameters, rate):
+    def onset_force(self, parameters, rate):
         force = parameters.damping * rate
         return jnp.where(force > 0, force, 0)
 
-    def hold(self, parameters, state, penetration, rate):
+    def separation_function(self, parameters, state, penetration, rate):
         stiffening = 1 + (penetration / parameters.reference_depth) ** 2
         return parameters.stiffness * penetration * stiffening + parameters.damping * rate
 
@@ -61,7 +61,7 @@ class Hardening(ContactLaw):
         """Add 2 zeta sqrt(k M) to `damping`, where zeta is the damping ratio `ratio`."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
-    def in_floats(self, contact, stiffness, damping):
+    def as_float_law(self, contact, stiffness, damping):
         reference_depth = contact.reference_depth
 
         def spring(depth: float, rate: float) -> float:

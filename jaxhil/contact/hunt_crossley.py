@@ -24,10 +24,10 @@ class HuntCrossley(PowerLaw):
     exponent: float | None = None
 
     @property
-    def arcs(self):
+    def is_locally_parabolic(self):
         return True
 
-    def specialised(self, contact, drawn):
+    def specialise(self, contact, drawn):
         is_fast = not drawn("exponent") and contact.exponent in self.FAST_EXPONENTS
         return HuntCrossley(contact.exponent) if is_fast else self
 
@@ -39,13 +39,13 @@ class HuntCrossley(PowerLaw):
         force = force * (1 + 1.5 * parameters.damping * rate)
         return jnp.where(touching & (force > 0), force, 0), state
 
-    def edge(self, parameters, rate):
+    def onset_force(self, parameters, rate):
         return jnp.zeros_like(rate)
 
-    def hold(self, parameters, state, penetration, rate):
+    def separation_function(self, parameters, state, penetration, rate):
         return 1 + 1.5 * parameters.damping * rate
 
-    def reference(self, parameters, mass, velocity):
+    def ideal_contact(self, parameters, mass, velocity):
         from jaxhil.contact.ideal_contact import ideal_hunt_crossley
 
         return ideal_hunt_crossley(
@@ -60,7 +60,7 @@ class HuntCrossley(PowerLaw):
         """Add pi zeta/v to chi with zeta = `ratio`, because the restitution is about 1 - chi v."""
         return "damping", drawn("damping") + np.pi * ratio / velocity * np.ones_like(drawn("stiffness"))
 
-    def in_floats(self, contact, stiffness, damping):
+    def as_float_law(self, contact, stiffness, damping):
         exponent = contact.exponent
 
         def hold(depth: float, rate: float) -> float:

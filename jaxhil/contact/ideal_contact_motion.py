@@ -40,9 +40,9 @@ class ForceLaw(Protocol):
 
     def step(self, parameters: Any, state: Any, penetration: Any, rate: Any) -> tuple[Any, Any]: ...
 
-    def edge(self, parameters: Any, rate: Any) -> Any: ...
+    def onset_force(self, parameters: Any, rate: Any) -> Any: ...
 
-    def hold(self, parameters: Any, state: Any, penetration: Any, rate: Any) -> Any: ...
+    def separation_function(self, parameters: Any, state: Any, penetration: Any, rate: Any) -> Any: ...
 
 
 class IdealContactMotion(NamedTuple):
@@ -69,9 +69,9 @@ def integrate_contact(
 ) -> IdealContactMotion:
     """Integrate the motion of one ideal contact.
 
-    The bodies separate when the penetration, or `ContactLaw.hold`, crosses 0 during the outward motion. Since
-    p >= 0 drives the bodies apart, they never touch again. If the push lasts longer than the contact, the
-    restitution is computed from the speed at the end of the push and may exceed 1.
+    The bodies separate when the penetration, or `ContactLaw.separation_function`, crosses 0 during the
+    outward motion. Since p >= 0 drives the bodies apart, they never touch again. If the push lasts longer
+    than the contact, the restitution is computed from the speed at the end of the push and may exceed 1.
 
     The function can be jitted, vmapped and differentiated in forward mode, also with respect to `times` and
     to the variables that `push` encloses. All arrays have one batch shape and one dtype; slopes and depths
@@ -127,7 +127,7 @@ class _IntegrationState(NamedTuple):
     phase: Array  # INWARD, OUTWARD, FREE or ENDED
     deepest: Array  # largest |penetration| so far [m]
     peak: Array  # largest contact force so far [N]
-    hold_scale: Array  # `ContactLaw.hold` at the turning point
+    separation_scale: Array  # `ContactLaw.separation_function` at the turning point
     separation_time: Array  # time of separation [s]
 
 
@@ -158,11 +158,11 @@ def _event_value(problem, state, time, depth, rate):
 
     A phase ends at the turning point, at the separation, or at the end of the push.
     """
-    hold = problem.law.hold(problem.parameters, state.memory, depth, rate)
+    law_value = problem.law.separation_function(problem.parameters, state.memory, depth, rate)
     # Force and depth are scaled to order 1; otherwise the root of their minimum would be hard to find.
-    hold = hold / jnp.where(state.hold_scale > 0, state.hold_scale, 1)
+    law_value = law_value / jnp.where(state.separation_scale > 0, state.separation_scale, 1)
     scaled_depth = depth / jnp.where(state.deepest > 0, state.deepest, 1)
-    separation = jnp.where(hold < scaled_depth, hold, scaled_depth)
+    separation = jnp.where(law_value < scaled_depth, law_value, scaled_depth)
     event = jnp.where(state.phase == INWARD, rate, separation)
     return jnp.where(state.phase == FREE, problem.push_end - time, event)
 
@@ -170,7 +170,7 @@ def _event_value(problem, state, time, depth, rate):
 def _contact_force(problem, state, depth, rate):
     """Return the contact force [N]; at d <= 0, which a step may reach, its limit for d -> 0 from above."""
     force, _ = problem.law.step(problem.parameters, state.memory, depth, rate)
-    force = jnp.where(depth > 0, force, problem.law.edge(problem.parameters, rate))
+    force = jnp.where(depth > 0, force, problem.law.onset_force(problem.parameters, rate))
     return jnp.where(state.phase < FREE, force, 0)
 
 
@@ -199,7 +199,7 @@ def _initial_state(problem):
         phase=jnp.zeros(zeros.shape, jnp.int32),
         deepest=zeros,
         peak=zeros,
-        hold_scale=zeros,
+        separation_scale=zeros,
         separation_time=zeros,
     )
 
@@ -322,7 +322,10 @@ def _update_state(problem, state, step, trial, correction, is_located):
     depth = trial.depth + correction * trial.velocity
     velocity = trial.velocity + correction * trial.end_acceleration
     _, memory = problem.law.step(problem.parameters, state.memory, depth, velocity)
-    magnitude, hold = jnp.abs(depth), problem.law.hold(problem.parameters, memory, depth, velocity)
+    magnitude, law_value = (
+        jnp.abs(depth),
+        problem.law.separation_function(problem.parameters, memory, depth, velocity),
+    )
     phase = state.phase + is_located.astype(state.phase.dtype)
     phase = jnp.where((phase == FREE) & (time >= problem.push_end), ENDED, phase)
     return _IntegrationState(
@@ -333,7 +336,9 @@ def _update_state(problem, state, step, trial, correction, is_located):
         phase=phase,
         deepest=lax.stop_gradient(jnp.where(magnitude > state.deepest, magnitude, state.deepest)),
         peak=peak,
-        hold_scale=lax.stop_gradient(jnp.where(state.phase == INWARD, hold, state.hold_scale)),
+        separation_scale=lax.stop_gradient(
+            jnp.where(state.phase == INWARD, law_value, state.separation_scale)
+        ),
         separation_time=jnp.where(state.phase < FREE, time, state.separation_time),
     )
 

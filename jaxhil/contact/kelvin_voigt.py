@@ -19,7 +19,7 @@ class KelvinVoigt(ContactLaw):
     is_linear: ClassVar[bool] = True
 
     @property
-    def arcs(self):
+    def is_locally_parabolic(self):
         return True
 
     def step(self, parameters, state, penetration, rate):
@@ -27,15 +27,15 @@ class KelvinVoigt(ContactLaw):
         force = jnp.where(parameters.tension | (force > 0), force, 0)
         return jnp.where(penetration > 0, force, 0), state
 
-    def edge(self, parameters, rate):
+    def onset_force(self, parameters, rate):
         force = parameters.damping * rate
         return jnp.where(parameters.tension | (force > 0), force, 0)
 
-    def hold(self, parameters, state, penetration, rate):
+    def separation_function(self, parameters, state, penetration, rate):
         force = parameters.stiffness * penetration + parameters.damping * rate
         return jnp.where(parameters.tension, 1, force)
 
-    def reference(self, parameters, mass, velocity):
+    def ideal_contact(self, parameters, mass, velocity):
         from jaxhil.contact.ideal_contact import ideal_kelvin_voigt
 
         return ideal_kelvin_voigt(
@@ -49,7 +49,7 @@ class KelvinVoigt(ContactLaw):
         """Add 2 zeta sqrt(k M) to `damping`, where zeta is the damping ratio `ratio`."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
-    def in_floats(self, contact, stiffness, damping):
+    def as_float_law(self, contact, stiffness, damping):
         def spring(depth: float, rate: float) -> float:
             return stiffness * depth + damping * rate
 
@@ -69,15 +69,15 @@ class Linear(KelvinVoigt):
 
     name: ClassVar[str] = "linear"
     keys: ClassVar = ()
-    damped: ClassVar[bool] = False
-    damped_as: ClassVar[str] = "kelvin_voigt"
+    is_damped: ClassVar[bool] = False
+    damped_law: ClassVar[str] = "kelvin_voigt"
 
     @property
-    def simulated(self):
+    def simulation_law(self):
         return KelvinVoigt()
 
-    def in_floats(self, contact, stiffness, damping):
-        return super().in_floats(contact, stiffness, 0.0)
+    def as_float_law(self, contact, stiffness, damping):
+        return super().as_float_law(contact, stiffness, 0.0)
 
     def regression(self, contact):
         return Regression("linear", lambda d, v: [d], ("stiffness",))

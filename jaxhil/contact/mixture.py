@@ -20,24 +20,24 @@ class LawMixture(ContactLaw):
     Stiffness and depths have a leading axis of segments; laws without segments use the first segment. A batch
     element has the parameters of its own law; the other laws are evaluated with damping 0.
 
-    If `beforehand` is true, the scenarios contain the ideal contacts of laws without a closed form
-    (`Scenario.reference`), and the method `reference` returns NaN for these laws.
+    If `precomputed` is true, the scenarios contain the ideal contacts of laws without a closed form
+    (`Scenario.reference`), and the method `ideal_contact` returns NaN for these laws.
     """
 
     laws: tuple[ContactLaw, ...]
-    beforehand: bool = False
+    precomputed: bool = False
 
     @property
-    def closed_form(self):
-        return self.beforehand or all(law.closed_form for law in self.laws)
+    def has_closed_form(self):
+        return self.precomputed or all(law.has_closed_form for law in self.laws)
 
     @property
-    def remembers(self):
-        return any(law.remembers for law in self.laws)
+    def has_memory(self):
+        return any(law.has_memory for law in self.laws)
 
     @property
-    def jumps(self):
-        return any(law.jumps for law in self.laws)
+    def has_reversal_jump(self):
+        return any(law.has_reversal_jump for law in self.laws)
 
     def init(self, penetration):
         return tuple(law.init(penetration) for law in self.laws)
@@ -50,23 +50,29 @@ class LawMixture(ContactLaw):
         forces, states = zip(*results, strict=True)
         return self._choose(parameters, forces), states
 
-    def edge(self, parameters, rate):
+    def onset_force(self, parameters, rate):
         laws = zip(self.laws, self._per_law(parameters), strict=True)
-        return self._choose(parameters, [law.edge(numbers, rate) for law, numbers in laws])
+        return self._choose(parameters, [law.onset_force(numbers, rate) for law, numbers in laws])
 
-    def corners(self, parameters, state: Any):
+    def breakpoints(self, parameters, state: Any):
         laws = zip(self.laws, self._per_law(parameters), state, strict=True)
-        return tuple(corner for law, numbers, memory in laws for corner in law.corners(numbers, memory))
+        return tuple(
+            breakpoint for law, numbers, memory in laws for breakpoint in law.breakpoints(numbers, memory)
+        )
 
-    def hold(self, parameters, state: Any, penetration, rate):
+    def separation_function(self, parameters, state: Any, penetration, rate):
         laws = zip(self.laws, self._per_law(parameters), state, strict=True)
-        values = [law.hold(numbers, memory, penetration, rate) for law, numbers, memory in laws]
+        values = [
+            law.separation_function(numbers, memory, penetration, rate) for law, numbers, memory in laws
+        ]
         return self._choose(parameters, values)
 
-    def reference(self, parameters, mass, velocity):
+    def ideal_contact(self, parameters, mass, velocity):
         unknown = IdealContact(*[jnp.full_like(velocity, jnp.nan)] * 3)
         references = [
-            law.reference(numbers, mass, velocity) if law.closed_form or not self.beforehand else unknown
+            law.ideal_contact(numbers, mass, velocity)
+            if law.has_closed_form or not self.precomputed
+            else unknown
             for law, numbers in zip(self.laws, self._per_law(parameters), strict=True)
         ]
         return IdealContact(*(self._choose(parameters, leaves) for leaves in zip(*references, strict=True)))
@@ -76,7 +82,7 @@ class LawMixture(ContactLaw):
         per_law = []
         for kind, law in enumerate(self.laws):
             damping = jnp.where(parameters.kind == kind, parameters.damping, 0)
-            stiffness = parameters.stiffness if law.segmented else parameters.stiffness[0]
+            stiffness = parameters.stiffness if law.is_segmented else parameters.stiffness[0]
             per_law.append(parameters._replace(stiffness=stiffness, damping=damping, kind=None))
         return per_law
 

@@ -21,13 +21,13 @@ class PiecewiseLinear(ContactLaw):
 
     name: ClassVar[str] = "piecewise_linear"
     keys: ClassVar = (DEPTHS,)
-    segmented: ClassVar[bool] = True
+    is_segmented: ClassVar[bool] = True
 
     def step(self, parameters, state, penetration, rate):
-        force = self.hold(parameters, state, penetration, rate)
+        force = self.separation_function(parameters, state, penetration, rate)
         return jnp.where((penetration > 0) & (force > 0), force, 0), state
 
-    def hold(self, parameters, state, penetration, rate):
+    def separation_function(self, parameters, state, penetration, rate):
         segments = parameters.stiffness.shape[0]
         force = parameters.damping * rate
         for i in range(segments):
@@ -39,14 +39,14 @@ class PiecewiseLinear(ContactLaw):
             force = force + parameters.stiffness[i] * overlap
         return force
 
-    def corners(self, parameters, state):
+    def breakpoints(self, parameters, state):
         return tuple(parameters.depths)
 
-    def edge(self, parameters, rate):
+    def onset_force(self, parameters, rate):
         force = parameters.damping * rate
         return jnp.where(force > 0, force, 0)
 
-    def reference(self, parameters, mass, velocity):
+    def ideal_contact(self, parameters, mass, velocity):
         from jaxhil.contact.ideal_contact import ideal_piecewise_linear
 
         return ideal_piecewise_linear(
@@ -72,7 +72,7 @@ class PiecewiseLinear(ContactLaw):
         """Add 2 zeta sqrt(k M) to `damping`, with the damping ratio zeta = `ratio` and the first slope k."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
-    def in_floats(self, contact, stiffness, damping):
+    def as_float_law(self, contact, stiffness, damping):
         segments, start, level = [], 0.0, 0.0
         for slope, end in zip(stiffness, [*contact.depths, float("inf")], strict=True):
             segments.append((end, start, level, slope))

@@ -35,25 +35,25 @@ class Preloaded(ContactLaw):
             meaning_in_six_axes="force against the change of the depth, for {laws}",
         ),
     )
-    damped: ClassVar[bool] = False
-    dissipates_by: ClassVar[str] = "friction"
+    is_damped: ClassVar[bool] = False
+    dissipation_process: ClassVar[str] = "friction"
 
     @property
-    def jumps(self):
+    def has_reversal_jump(self):
         return True
 
     def step(self, parameters, state, penetration, rate):
-        force = self.hold(parameters, state, penetration, rate)
+        force = self.separation_function(parameters, state, penetration, rate)
         return jnp.where((penetration > 0) & (force > 0), force, 0), state
 
-    def edge(self, parameters, rate):
+    def onset_force(self, parameters, rate):
         force = self._constant(parameters, rate)
         return jnp.where(force > 0, force, 0)
 
-    def hold(self, parameters, state, penetration, rate):
+    def separation_function(self, parameters, state, penetration, rate):
         return self._constant(parameters, rate) + parameters.stiffness * penetration
 
-    def reference(self, parameters, mass, velocity):
+    def ideal_contact(self, parameters, mass, velocity):
         from jaxhil.contact.ideal_contact import IdealContact
 
         frequency = jnp.sqrt(parameters.stiffness / mass)
@@ -86,7 +86,7 @@ class Preloaded(ContactLaw):
         loss = energy * -np.expm1(-2 * np.pi * ratio[:, 0])
         return "friction", friction + loss / (2 * deepest)
 
-    def in_floats(self, contact, stiffness, damping):
+    def as_float_law(self, contact, stiffness, damping):
         def constant(rate: float) -> float:
             return contact.preload + contact.friction * ((rate > 0.0) - (rate < 0.0))
 

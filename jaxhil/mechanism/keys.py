@@ -139,7 +139,7 @@ def _find_users(path: str) -> tuple[str, ...]:
     table, _, name = path.rpartition(".")
     if table == "contact":
         if name == "damping":
-            return tuple(law.name for law in CONTACT_LAWS.values() if not law.dissipates_by)
+            return tuple(law.name for law in CONTACT_LAWS.values() if not law.dissipation_process)
         return laws_with_key(CONTACT_KEYS[name]) if name in CONTACT_KEYS else ()
     if table == "rig.simulator":
         return tuple(model for model, keys in KEYS_OF_MODELS.items() if name in keys)

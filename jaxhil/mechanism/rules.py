@@ -124,20 +124,22 @@ def check_contact_law(
     is_list = isinstance(contact, Contact)  # A one-axis file has one entry for each successive contact.
     for i, entry in enumerate(contact.stiffness if is_list else [contact.stiffness]):
         where = (*path, "stiffness", *[i] * is_list)
-        if law.segmented and not (isinstance(entry, list) and len(entry) == len(contact.depths) + 1):
+        if law.is_segmented and not (isinstance(entry, list) and len(entry) == len(contact.depths) + 1):
             expected = f"a list of {len(contact.depths) + 1} slopes, one more than depths (law {law.name})"
             raise KeyProblem(where, format_value(entry), expected)
-        if isinstance(entry, list) and not law.segmented:
+        if isinstance(entry, list) and not law.is_segmented:
             raise KeyProblem(where, format_value(entry), f"a number > 0 N/m (law {law.name})")
     _check_keys(path, law, contact, uncertainties, keys)
-    if law.dissipates_by and is_damped(path, contact, uncertainties):
+    if law.dissipation_process and is_damped(path, contact, uncertainties):
         damping = format_value(contact.damping) if np.any(contact.damping) else "an uncertain damping"
-        raise KeyProblem((*path, "damping"), damping, f"0 (law {law.name} dissipates by {law.dissipates_by})")
+        raise KeyProblem(
+            (*path, "damping"), damping, f"0 (law {law.name} dissipates by {law.dissipation_process})"
+        )
 
 
 def _check_depths(path: KeyPath, law: ContactLaw, depths: Sequence[float]) -> None:
     """Raise `KeyProblem` unless a segmented law has depths, in increasing order."""
-    if law.segmented and not depths:
+    if law.is_segmented and not depths:
         expected = f"a list of at least one depth (law {law.name} needs it)"
         raise KeyProblem((*path, "depths"), "no entries", expected)
     for i, (depth, deeper) in enumerate(pairwise(depths)):
@@ -218,7 +220,7 @@ def _check_hold(mechanism: Mechanism) -> None:
     # Such a simulator jumps at the ticks and has no velocity between the ticks.
     rig, contact = mechanism.rig, mechanism.contact
     law, arguments = find_contact_law(contact.law), (("contact",), contact, mechanism.uncertainty)
-    dissipates = (law.damped and is_damped(*arguments)) or is_damped(*arguments, "friction")
+    dissipates = (law.is_damped and is_damped(*arguments)) or is_damped(*arguments, "friction")
     if rig.simulator.model == "ideal" and rig.command_hold == "zoh" and dissipates:
         expected = '"linear", because the model ideal with "zoh" does not support contact damping'
         raise KeyProblem(("rig", "command_hold"), format_value(rig.command_hold), expected)

@@ -47,8 +47,8 @@ def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> N
         raise KeyProblem((*path, "target_pattern"), "a table", "nothing, or pattern = { count = N } as well")
     check_contact_law(path, contact, mechanism.uncertainty, KEYS_IN_SIX_AXES.values())
     law = find_contact_law(contact.law)
-    if not (law.damped or law.dissipates_by) and contact.damping:
-        expected = f'0 (law {law.name} has no damping), or law = "{law.damped_as}"'
+    if not (law.is_damped or law.dissipation_process) and contact.damping:
+        expected = f'0 (law {law.name} has no damping), or law = "{law.damped_law}"'
         raise KeyProblem((*path, "damping"), format_value(contact.damping), expected)
     if contact.friction is not None:
         _check_friction((*path, "friction"), contact.friction)

@@ -67,7 +67,7 @@ STIFFNESS_UNITS = "in N/m^exponent for " + " and ".join(
 )
 DAMPING_UNITS = "in s/m for {}, none for {}".format(
     " and ".join(law.name for law in CONTACT_LAWS.values() if law.damping_unit == "s/m"),
-    " and ".join(law.name for law in CONTACT_LAWS.values() if law.dissipates_by),
+    " and ".join(law.name for law in CONTACT_LAWS.values() if law.dissipation_process),
 )
 Factor = Annotated[float, key_metadata("factor on the nominal value", "1", gt=0.0)]
 Coefficient = Annotated[float, key_metadata("coefficient of the n-th power of s", "s^n", gt=0.0)]

@@ -77,14 +77,14 @@ class PositionGuard:
 
     Attributes:
         output: last command [m].
-        known: whether there is a last command.
+        has_output: whether there is a last command.
         at_rest: whether the position command has come to rest after a trip.
         fatal: bits of the last command's faults that trip the controller.
     """
 
     __slots__ = (
         "_braking", "_clearance", "_distance", "_engaged", "_highest", "_limited_ticks", "_lowest",
-        "_max_change", "_max_limited_ticks", "_rate", "_retreat", "_start", "at_rest", "fatal", "known",
+        "_max_change", "_max_limited_ticks", "_rate", "_retreat", "_start", "at_rest", "fatal", "has_output",
         "output",
     )  # fmt: skip
 
@@ -101,7 +101,7 @@ class PositionGuard:
         self._max_limited_ticks = limits["limited_in_a_row"]
         self._start = limits["start_distance"]
         self.output = 0.0
-        self.known = False
+        self.has_output = False
         self.restart()
 
     def restart(self) -> None:
@@ -114,7 +114,7 @@ class PositionGuard:
 
     def release(self) -> None:
         """Forget the last output, after something else has moved the drives."""
-        self.known = False
+        self.has_output = False
         self.restart()
 
     def limit(self, command: float, position: float, measured: float, is_fresh: bool) -> int:
@@ -133,11 +133,11 @@ class PositionGuard:
         if command < self._lowest or command > self._highest:
             self.fatal = STROKE
             return STROKE
-        if not self.known:
+        if not self.has_output:
             # Moving drives lag behind. Without a reading, assume that they are at the model's position.
             is_near = abs(command - (measured if is_fresh else position)) <= self._start
             if is_near and deflection(position, self._clearance) == 0.0:
-                self.known = True
+                self.has_output = True
                 self.output = command
             else:
                 self._stand(measured, position)
@@ -164,7 +164,7 @@ class PositionGuard:
             measured: last measured position of the drives [m]; NaN if there is none.
             position: position of the numerical model [m].
         """
-        if not self.known:
+        if not self.has_output:
             self._stand(measured, position)
         output = self.output
         target_rate = 0.0
@@ -194,7 +194,7 @@ class PositionGuard:
 
     def _stand(self, measured: float, position: float) -> None:
         """Set the output to `measured`; if it is NaN, to `position` moved into the stroke, out of contact."""
-        self.known = True
+        self.has_output = True
         self.output = measured
         if isfinite(measured):
             return

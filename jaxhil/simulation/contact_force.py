@@ -93,7 +93,7 @@ class Surfaces(NamedTuple):
             duration: Duration of the section [s].
             s: Fraction of the section, from 0 to 1.
         """
-        if not self.law.remembers:
+        if not self.law.has_memory:
             return self
         side, surface = self.side(start, end)
         turn = jnp.minimum(_find_turning_point(start, end, duration, side), s)
@@ -117,13 +117,13 @@ class Surfaces(NamedTuple):
     def sample(self, motion: MotionSample, force: Array) -> "ContactSample":
         """Return the `ContactSample` for this position and velocity, given the contact force [N]."""
         if self.clearance is None:
-            edge = self.law.edge(self.parameters, motion.velocity)
-            return ContactSample(motion.position, force, edge, jnp.ones_like(edge))
+            onset_force = self.law.onset_force(self.parameters, motion.velocity)
+            return ContactSample(motion.position, force, onset_force, jnp.ones_like(onset_force))
         far = -self.clearance - motion.position
         beyond = jnp.where(far > motion.position, far, motion.position)
         side = jnp.where(far > motion.position, -1, 1).astype(far.dtype)
-        edge = side * self.law.edge(self.parameters, side * motion.velocity)
-        return ContactSample(beyond, force, edge, side)
+        onset_force = side * self.law.onset_force(self.parameters, side * motion.velocity)
+        return ContactSample(beyond, force, onset_force, side)
 
 
 class ContactSample(NamedTuple):
@@ -131,7 +131,7 @@ class ContactSample(NamedTuple):
 
     distance: Float[Array, "*batch"]  # penetration into the nearer surface [m]; negative without contact
     force: Float[Array, "*batch"]  # contact force [N]
-    edge: Float[Array, "*batch"]  # limit of the force as the penetration goes to 0 [N]
+    onset_force: Float[Array, "*batch"]  # limit of the force as the penetration goes to 0 [N]
     side: Float[Array, "*batch"]  # side of the nearer surface, 1 or -1
 
     def position(self, clearance: Array | None) -> Array:
@@ -156,8 +156,8 @@ def compute_work_between(before: ContactSample, now: ContactSample) -> tuple[Arr
     """
     depth_0 = jnp.where(before.distance > 0, before.distance, 0)
     depth_1 = jnp.where(now.distance > 0, now.distance, 0)
-    force_0 = jnp.where(before.distance > 0, before.force, now.edge)
-    force_1 = jnp.where(now.distance > 0, now.force, before.edge)
+    force_0 = jnp.where(before.distance > 0, before.force, now.onset_force)
+    force_1 = jnp.where(now.distance > 0, now.force, before.onset_force)
     side = jnp.where(now.distance > 0, now.side, before.side)
     work = side * (force_0 + force_1) / 2 * (depth_1 - depth_0)
     return jnp.where(work > 0, work, 0), jnp.where(work > 0, 0, -work)
@@ -292,26 +292,26 @@ class _SectionContact(NamedTuple):
 def _find_section_contact(surfaces, start, end, duration):
     """Find the beginning and the end of the contact in a section of motion.
 
-    The contact lasts while both the penetration and the contact law's function `hold` are positive. `hold`
-    becomes negative if the force vanishes while there is still a penetration.
+    The contact lasts while both the penetration and the contact law's `separation_function` are positive.
+    This function becomes negative if the force vanishes while there is still a penetration.
     """
     side, surface = surfaces.side(start, end)
 
     def depth(s):
         return side * (interpolate_motion(start, end, duration, s).position - surface)
 
-    def hold(s):
+    def separation(s):
         motion = interpolate_motion(start, end, duration, s)
         state = surfaces.advance(start, end, duration, s).state
-        return surfaces.law.hold(surfaces.parameters, state, depth(s), side * motion.velocity)
+        return surfaces.law.separation_function(surfaces.parameters, state, depth(s), side * motion.velocity)
 
     depth_begin, depth_end = _find_positive_interval(depth, duration)
-    hold_begin, hold_end = _find_positive_interval(hold, duration)
-    contact_begin = jnp.where(depth_begin >= hold_begin, depth_begin, hold_begin)
-    contact_end = jnp.where(depth_end <= hold_end, depth_end, hold_end)
+    separation_begin, separation_end = _find_positive_interval(separation, duration)
+    contact_begin = jnp.where(depth_begin >= separation_begin, depth_begin, separation_begin)
+    contact_end = jnp.where(depth_end <= separation_end, depth_end, separation_end)
     touches = (side != 0) & (contact_begin < contact_end)
-    begins_at_surface = (depth_begin > 0) & (depth_begin >= hold_begin)
-    ends_at_surface = (depth_end < 1) & (depth_end <= hold_end)
+    begins_at_surface = (depth_begin > 0) & (depth_begin >= separation_begin)
+    ends_at_surface = (depth_end < 1) & (depth_end <= separation_end)
     return _SectionContact(
         touches,
         side,
@@ -350,8 +350,8 @@ def _apply_lag_along(surfaces, reading, start, end, duration, time_constant):
         motion, force = _force_along(surfaces, start, end, duration, s)
         if i in (0, 2 * PARABOLAS_PER_SECTION):
             # At zero penetration, use the limit of the force as the penetration goes to 0 from above.
-            edge = surfaces.law.edge(surfaces.parameters, contact.side * motion.velocity)
-            force = jnp.where(contact.at_surface[i > 0], contact.side * edge, force)
+            onset_force = surfaces.law.onset_force(surfaces.parameters, contact.side * motion.velocity)
+            force = jnp.where(contact.at_surface[i > 0], contact.side * onset_force, force)
         forces.append(jnp.where(contact.touches, force, 0))
     idle, touching, free = (part * duration for part in (contact.begin, span, 1 - contact.end))
     return apply_lag(reading, idle, touching, free, forces, time_constant)

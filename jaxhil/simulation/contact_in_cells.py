@@ -1,8 +1,8 @@
 """Real contact in one sampling interval, from the exact motion: sensor lag, work, peak force, duration.
 
-Each cell (`jaxhil.simulation.cells`) is divided into pieces of monotone motion, at the instants at which the
-motion reverses. Each piece is divided into spans at the surface, at the points at which the slope of the
-contact law changes, and at the points at which the force vanishes. In each span the force is a smooth
+Each cell (`jaxhil.simulation.cells`) is divided into sections of monotone motion, at the instants at which
+the motion reverses. Each section is divided into spans at the surface, at the points at which the slope of
+the contact law changes, and at the points at which the force vanishes. In each span the force is a smooth
 function, which Gauss-Legendre quadrature integrates. All cells are computed in parallel. Only the state of a
 contact law with memory is passed from cell to cell.
 """
@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxhil.contact.laws import ContactLaw, ContactParameters, compute_two_sided_force
 from jaxhil.simulation.cells import Cells, bound_time_constant
-from jaxhil.simulation.monotone_pieces import (
+from jaxhil.simulation.monotone_sections import (
     SHORT_CELL_DEGREE,
     build_cell_motion,
     horner,
@@ -57,7 +57,7 @@ def _build_quadrature(number: int) -> QuadratureRule:
 # Key: whether the cells are short, with a series of low degree.
 QUADRATURE_RULES = {True: _build_quadrature(12), False: _build_quadrature(16)}
 _RESULT_COUNT = 7  # number of results that `_sum_surfaces` returns
-_SUMMED_AXES = (0, 1, 2, 3)  # array axes: nodes of a span, spans of a piece, pieces of a cell, cells
+_SUMMED_AXES = (0, 1, 2, 3)  # array axes: nodes of a span, spans of a section, sections of a cell, cells
 
 
 class CellContact(NamedTuple):
@@ -107,9 +107,11 @@ def contact_in_cells(
     # Each branch returns distinct arrays: without optimisation, XLA confuses results that share an array.
     def touches(state):
         """Return contact results and law states (at sample and end) if a lane may be in contact."""
-        pieces = split_at_reversals(build_cell_motion(series, cells.length))
-        states, at_sample, at_end = _compute_law_states(touch, state, pieces, period)
-        parts = [_compute_side_contact(touch, states, pieces, side, period, rates) for side in _sides(touch)]
+        sections = split_at_reversals(build_cell_motion(series, cells.length))
+        states, at_sample, at_end = _compute_law_states(touch, state, sections, period)
+        parts = [
+            _compute_side_contact(touch, states, sections, side, period, rates) for side in _sides(touch)
+        ]
         return _sum_surfaces(parts), jax.tree.map(lambda *leaves: jnp.stack(leaves), at_sample, at_end)
 
     def free(state):
@@ -136,10 +138,10 @@ def compute_jump_work(
     """Return the work [J] done on the mechanism and the work returned by it if the position jumps."""
     ones = jnp.ones_like(before)
     path = build_cell_motion(jnp.stack([before, now - before])[:, None], ones[None])
-    pieces = split_at(path, jnp.stack([0 * ones, ones])[:, None])
+    sections = split_at(path, jnp.stack([0 * ones, ones])[:, None])
     states = jax.tree.map(lambda leaf: leaf[None, None], state)
     parts = [
-        _compute_side_contact(touch, states, pieces, side, ones, None, still=True) for side in _sides(touch)
+        _compute_side_contact(touch, states, sections, side, ones, None, still=True) for side in _sides(touch)
     ]
     done, returned = (sum((part.work[i] for part in parts), 0 * ones) for i in (0, 1))
     return done, returned
@@ -166,16 +168,16 @@ def _sides(touch):
     return (1,) if touch.clearance is None else (1, -1)
 
 
-def _compute_law_states(touch, state, pieces, period):
-    """Return the contact law's states at the start of each piece, at the sample and at the interval's end.
+def _compute_law_states(touch, state, sections, period):
+    """Return the contact law's states at the start of each section, at the sample and at the interval's end.
 
-    The states at the starts of the pieces have the shape (pieces of a cell, cells, *batch).
+    The states at the starts of the sections have the shape (sections of a cell, cells, *batch).
     """
-    cells = pieces.path.length.shape[0]
-    if not touch.law.remembers:
+    cells = sections.path.length.shape[0]
+    if not touch.law.has_memory:
         return state, state, state
-    position = position_at(pieces.path, pieces.high)
-    speed = velocity_at(pieces.path, pieces.high) / period
+    position = position_at(sections.path, sections.high)
+    speed = velocity_at(sections.path, sections.high) / period
 
     def through(state, motion):
         before = []
@@ -228,10 +230,10 @@ def _may_touch(touch, cells, series):
     return jnp.any(may | ~jnp.isfinite(reach))
 
 
-def _compute_side_contact(touch, states, pieces, side, period, rates, still=False) -> _SurfaceContribution:
+def _compute_side_contact(touch, states, sections, side, period, rates, still=False) -> _SurfaceContribution:
     """Compute the contact at the surface on one side; with `still`, the contact law gets zero velocity."""
-    law, parameters, path = touch.law, touch.parameters, pieces.path
-    inward = side * pieces.way
+    law, parameters, path = touch.law, touch.parameters, sections.path
+    inward = side * sections.direction
     surface = 0.0 if side > 0 else touch.clearance
 
     def depth(path, s):
@@ -241,30 +243,32 @@ def _compute_side_contact(touch, states, pieces, side, period, rates, still=Fals
         if still:
             return jnp.zeros_like(s)
         speed = side * velocity_at(path, s) / period
-        if not law.jumps:
+        if not law.has_reversal_jump:
             return speed
         # The force jumps with the sign of the velocity. Near a reversal, rounding can change this sign, so
-        # the sign of the piece is used.
+        # the sign of the section is used.
         return jnp.where(speed * inward > 0, speed, inward * jnp.finfo(speed.dtype).tiny)
 
     def height(data, s):
         return depth(data[0], s) - data[1]
 
-    def hold(data, s):
+    def separation(data, s):
         path, parameters, states = data
-        return law.hold(parameters, states, depth(path, s), rate(path, s))
+        return law.separation_function(parameters, states, depth(path, s), rate(path, s))
 
     def force(s):
         return law.step(parameters, states, depth(path, s), rate(path, s))[0]
 
-    corners = [jnp.broadcast_to(corner, pieces.low.shape) for corner in law.corners(parameters, states)]
-    levels = jnp.sort(jnp.stack([jnp.zeros_like(pieces.low), *corners]), axis=0)
-    low, high = (jnp.broadcast_to(edge, levels.shape) for edge in (pieces.low, pieces.high))
+    breakpoints = [
+        jnp.broadcast_to(breakpoint, sections.low.shape) for breakpoint in law.breakpoints(parameters, states)
+    ]
+    levels = jnp.sort(jnp.stack([jnp.zeros_like(sections.low), *breakpoints]), axis=0)
+    low, high = (jnp.broadcast_to(onset_force, levels.shape) for onset_force in (sections.low, sections.high))
     inner, outer = jnp.where(inward > 0, low, high), jnp.where(inward > 0, high, low)
     at_level = find_sign_change(height, (path, levels), low, high, inner, outer)
     beyond = jnp.concatenate([at_level[1:], outer[:1]])
     spans = jnp.minimum(at_level, beyond), jnp.maximum(at_level, beyond)
-    begin, end = find_positive_part(hold, (path, parameters, states), *spans)
+    begin, end = find_positive_part(separation, (path, parameters, states), *spans)
     width = end - begin
 
     shape = (-1, *[1] * width.ndim)

@@ -10,10 +10,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.laws.simulation_base import Gains
+from jaxhil.simulation.contact_tracking import ContactTracker
 from jaxhil.simulation.loop import Loop, RigConstants, start_uniform_motion
 from jaxhil.simulation.loop_state import LoopState
 from jaxhil.simulation.motion_simulator import apply_row, steady_state
-from jaxhil.simulation.watch import Watch
 
 APPROACH_TIME = 0.02  # s; duration of the approach before a contact, to which a part of a period is added
 # [1]; maximum deviation of a settled motion simulator from its steady state, divided by the distance that it
@@ -55,7 +55,13 @@ def begin_approach(
 
 
 def advance_to_surface(
-    loop: Loop, rig: RigConstants, gains: Gains, state: LoopState, watch: Watch, command: Array, tick: Array
+    loop: Loop,
+    rig: RigConstants,
+    gains: Gains,
+    state: LoopState,
+    tracker: ContactTracker,
+    command: Array,
+    tick: Array,
 ) -> tuple[LoopState, Bool[Array, "*batch"]]:
     """Return the state shortly before the next touch of a surface, and whether each lane may skip to it.
 
@@ -71,7 +77,7 @@ def advance_to_surface(
     periods = lax.stop_gradient(jnp.floor(jnp.where(stride != 0, strides, 0)))
     arrived = start_uniform_motion(loop, rig, gains, state, position + periods * stride, velocity, tick)
     uniform = start_uniform_motion(loop, rig, gains, state, position, velocity, tick)
-    follows = (watch.elapsed == 0) & (watch.force_free_ticks > loop.first_tick)
+    follows = (tracker.elapsed == 0) & (tracker.force_free_ticks > loop.first_tick)
     for component, steady in zip(state.plant.state, uniform.plant.state, strict=True):
         # Time is in control periods, so that all components of the state have similar magnitudes.
         scale = jnp.abs(rig.propagation.steady_command[0] * stride)

@@ -82,12 +82,14 @@ class Loop(eqx.Module):
     @property
     def has_corners(self) -> bool:
         """Return whether the peak of the real force may lie at a kink or jump of the force."""
-        return self.discontinuity_order in (1, 2) or (self.discontinuity_order > 0 and self.law.jumps)
+        return self.discontinuity_order in (1, 2) or (
+            self.discontinuity_order > 0 and self.law.has_reversal_jump
+        )
 
     @property
     def follows_intervals(self) -> bool:
         """Return whether results depend on the motion between the samples."""
-        return self.has_lag or self.has_corners or self.energies or self.law.remembers
+        return self.has_lag or self.has_corners or self.energies or self.law.has_memory
 
     @property
     def has_cells(self) -> bool:

@@ -59,7 +59,7 @@ def build_loop(
 
     is_two_sided = bool(np.any(np.isfinite(scenarios.clearance)))
     return Loop(
-        law=find_contact_law(mechanism.contact.law).simulated,
+        law=find_contact_law(mechanism.contact.law).simulation_law,
         compensator=law,
         integrator=rig.integrator,
         hold=rig.command_hold,
@@ -97,9 +97,9 @@ def _choose_cell_counts(mechanism: Mechanism, scenarios: Scenario, exact: bool) 
     fastest = float(np.max(fastest_pole(scenarios.simulator.denominator))) * period
     lags = np.asarray(scenarios.force_sensor.time_constant) / period
     law, lagging = find_contact_law(mechanism.contact.law), bool(np.any(lags > 0))
-    pole, contact = MAX_SAMPLED_RATES_WITH_MEMORY if law.remembers or lagging else MAX_SAMPLED_RATES
+    pole, contact = MAX_SAMPLED_RATES_WITH_MEMORY if law.has_memory or lagging else MAX_SAMPLED_RATES
     slow = fastest <= pole and _max_contact_frequency(mechanism, scenarios) * period <= contact
-    if slow and (law.arcs or not lagging) and not exact:
+    if slow and (law.is_locally_parabolic or not lagging) and not exact:
         return NO_CELLS
     return count_cells(min(fastest, MAX_POLE), lags)
 

@@ -15,17 +15,18 @@ class PlantState(NamedTuple):
     commands: tuple[Array, ...]  # limited position commands c(n), c(n-1), ... that the drives received [m]
     step: Array  # last step of the limited position command, c(n) - c(n-1) [m]
     state: tuple[Array, ...]  # state of the motion simulator
-    wanted: Float[Array, "*batch"] | None  # unlimited position command for tick n [m]; None without limits
+    # unlimited position command for tick n [m]; None without limits
+    unlimited_command: Float[Array, "*batch"] | None
 
     @property
     def sent(self) -> Float[Array, "*batch"]:
         """Unlimited position command of the compensator for tick n [m]."""
-        return self.commands[0] if self.wanted is None else self.wanted
+        return self.commands[0] if self.unlimited_command is None else self.unlimited_command
 
     @property
     def shortfall(self) -> Float[Array, "*batch"] | None:
         """Distance [m] between the limited and the unlimited position command; None without limits."""
-        return None if self.wanted is None else abs(self.wanted - self.commands[0])
+        return None if self.unlimited_command is None else abs(self.unlimited_command - self.commands[0])
 
 
 class Rings(NamedTuple):

@@ -5,10 +5,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxhil.simulation.contact_tracking import DIVERGENCE_SPEED_RATIO, ContactTracker
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.probe import root_mean_square
 from jaxhil.simulation.scenario import MAX_CONTACT_DURATION, Scenario
-from jaxhil.simulation.watch import DIVERGENCE_SPEED_RATIO, Watch
 
 NOT_REACHED, OK, TIMEOUT, DIVERGED, NON_FINITE = -1, 0, 1, 2, 3
 CONTACT_STATUS_NAMES = {
@@ -87,7 +87,7 @@ def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
     )
 
 
-def determine_status(scenario: Scenario, watch: Watch, age: Array) -> Array:
+def determine_status(scenario: Scenario, tracker: ContactTracker, age: Array) -> Array:
     """Return the status of the current contact, which is `OK` while the contact continues.
 
     `age` is the number of ticks since the run began.
@@ -98,23 +98,23 @@ def determine_status(scenario: Scenario, watch: Watch, age: Array) -> Array:
     )
     limit = scenario.time_limit / period
     max_flight = limit + 10 * distance / scenario.velocity / period
-    is_missing = (watch.elapsed == 0) & (age.astype(period.dtype) > max_flight)
-    late = (watch.elapsed > limit) | is_missing
+    is_missing = (tracker.elapsed == 0) & (age.astype(period.dtype) > max_flight)
+    late = (tracker.elapsed > limit) | is_missing
     # If the numerical model turned back without a measured force, there was no contact.
-    ended = jnp.where(watch.measured, OK, NOT_REACHED)
-    timed_out = jnp.where(watch.in_contact > 0, TIMEOUT, NOT_REACHED)
-    status = jnp.where(watch.over, ended, jnp.where(late, timed_out, OK))
-    status = jnp.where(watch.rebound > DIVERGENCE_SPEED_RATIO * scenario.velocity, DIVERGED, status)
-    finite = jnp.isfinite(watch.rebound) & jnp.isfinite(watch.peak_command)
+    ended = jnp.where(tracker.has_reading, OK, NOT_REACHED)
+    timed_out = jnp.where(tracker.in_contact > 0, TIMEOUT, NOT_REACHED)
+    status = jnp.where(tracker.has_ended, ended, jnp.where(late, timed_out, OK))
+    status = jnp.where(tracker.rebound > DIVERGENCE_SPEED_RATIO * scenario.velocity, DIVERGED, status)
+    finite = jnp.isfinite(tracker.rebound) & jnp.isfinite(tracker.peak_command)
     return jnp.where(finite, status, NON_FINITE).astype(jnp.int32)
 
 
 def store_metrics(
     scenario: Scenario,
     metrics: Metrics,
-    watch: Watch,
+    tracker: ContactTracker,
     index: Array,
-    over: Array,
+    has_ended: Array,
     status: Array,
     ticks: Array,
     force_delay: Array | None = None,
@@ -126,9 +126,9 @@ def store_metrics(
     Args:
         scenario: Scenarios.
         metrics: Metrics of earlier contacts.
-        watch: Record of the current contact of each lane.
+        tracker: Record of the current contact of each lane.
         index: Index of the current contact of each lane.
-        over: Whether the current contact of each lane has ended.
+        has_ended: Whether the current contact of each lane has ended.
         status: Status of the current contact.
         ticks: Number of ticks since the first run began.
         force_delay: Delay of the force measurement as estimated by the compensator [s]; None if it estimates
@@ -136,23 +136,23 @@ def store_metrics(
     """
     period = scenario.control_period
     zeros = jnp.zeros_like(period)
-    work_in, work_out = watch.work or (zeros, zeros)
+    work_in, work_out = tracker.work or (zeros, zeros)
     excess = zeros
-    if watch.command_variation is not None:
-        command = watch.command_variation
+    if tracker.command_variation is not None:
+        command = tracker.command_variation
         excess = command.variation / 2 - (command.highest - command.lowest)
     optional = {
-        "position_shortfall": watch.shortfall,
-        "trajectory_error": None if watch.deviation is None else root_mean_square(watch.deviation),
+        "position_shortfall": tracker.shortfall,
+        "trajectory_error": None if tracker.deviation is None else root_mean_square(tracker.deviation),
         "force_delay": force_delay,
     }
     values = Metrics(
-        restitution=watch.rebound / jnp.where(watch.approach > 0, watch.approach, jnp.nan),
-        approach_velocity=watch.approach,
-        peak_force=watch.peak_force,
-        peak_command=watch.peak_command,
+        restitution=tracker.rebound / jnp.where(tracker.approach > 0, tracker.approach, jnp.nan),
+        approach_velocity=tracker.approach,
+        peak_force=tracker.peak_force,
+        peak_command=tracker.peak_command,
         excess_variation=excess,
-        duration=watch.in_contact * period,
+        duration=tracker.in_contact * period,
         work_in=work_in,
         work_out=work_out,
         status=status,
@@ -161,7 +161,7 @@ def store_metrics(
     )
     slots = metrics.restitution.shape[0]
     slot = jnp.arange(slots, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
-    mask = (slot == index[None]) & (over & (status != NOT_REACHED))[None]
+    mask = (slot == index[None]) & (has_ended & (status != NOT_REACHED))[None]
     updated = Metrics(*(jnp.where(mask, v[None], m) for v, m in zip(values, metrics, strict=True)))
     # Metrics that are not recorded keep their initial arrays, which saves time.
     return updated._replace(

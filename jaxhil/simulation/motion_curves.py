@@ -138,7 +138,7 @@ def _ideal_curves(mechanism: Mechanism, scenarios: Scenario, curves: list[Curve]
     step = (np.array([curve.time[-1] for curve in curves]) + APPROACH_TIME) / INTEGRATION_STEPS
     forces, positions = cached_programs.run_cached(
         _integrate_ideal_contacts,
-        find_contact_law(mechanism.contact.law).simulated,
+        find_contact_law(mechanism.contact.law).simulation_law,
         jax.tree.map(lambda leaf: leaf[..., 0], scenarios.contact),
         scenarios.clearance[0],
         scenarios.equivalent_mass[0],

@@ -28,10 +28,10 @@ class Outcome(NamedTuple):
     peak_ratio: Float[Array, "slots *batch"]  # largest |force command|, divided by the ideal peak force [1]
     # chatter of the force command (see `Metrics`), divided by the ideal contact's peak force [1]
     chatter: Float[Array, "slots *batch"]
-    wanted: Bool[Array, "slots *batch"]  # whether the scenario has this contact
+    is_scheduled: Bool[Array, "slots *batch"]  # whether the scenario has this contact
     good: Bool[Array, "slots *batch"]  # whether the contact was reached and ended with the status `OK`
     # whether peak force or duration of the real contact violates the bounds in `contact_bounds`
-    unlike: Bool[Array, "slots *batch"]
+    is_unlike_ideal: Bool[Array, "slots *batch"]
 
     @property
     def peak_force_ratio(self) -> Any:
@@ -50,12 +50,12 @@ def compare_with_ideal(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outc
     number = jnp.arange(slots, dtype=scenario.contacts.dtype).reshape(
         slots, *[1] * (metrics.restitution.ndim - 1)
     )
-    wanted = number < scenario.contacts[None]
-    good = wanted & (metrics.status == OK)
+    is_scheduled = number < scenario.contacts[None]
+    good = is_scheduled & (metrics.status == OK)
     velocity = jnp.where(good, metrics.approach_velocity, scenario.velocity[None])
     contact = parameters_by_slot(scenario.contact)
     mass = jnp.broadcast_to(scenario.equivalent_mass, velocity.shape)
-    reference = loop.law.reference(contact, mass, velocity)
+    reference = loop.law.ideal_contact(contact, mass, velocity)
     known_reference = scenario.reference
     if known_reference is not None:
         is_known = ~jnp.isnan(known_reference.restitution)
@@ -70,9 +70,9 @@ def compare_with_ideal(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outc
         error=metrics.restitution - reference.restitution,
         peak_ratio=metrics.peak_command / reference.peak_force,
         chatter=metrics.excess_variation / reference.peak_force,
-        wanted=wanted,
+        is_scheduled=is_scheduled,
         good=good,
-        unlike=good
+        is_unlike_ideal=good
         & is_contact_out_of_bounds(
             metrics.peak_force,
             reference.peak_force,

@@ -1,7 +1,7 @@
 """Plausibility of a mechanism file: its ideal contacts compared with the capabilities of the rig.
 
-No run is simulated. The ideal contacts are computed by `ContactLaw.reference`, in closed form if the contact
-law has one. They show which numbers of the file are implausible, and how many ticks a run will take.
+No run is simulated. The ideal contacts are computed by `ContactLaw.ideal_contact`, in closed form if the
+contact law has one. They show which numbers of the file are implausible, and how many ticks a run will take.
 """
 
 import itertools
@@ -228,7 +228,7 @@ def _compute_ideal_contacts(mechanism: Mechanism, scenarios: Scenario) -> IdealC
     """Return the ideal contacts, (contacts, lanes), all with the velocity of the first approach."""
     shape = scenarios.phase.shape
     mass, velocity = (np.broadcast_to(x, shape) for x in (scenarios.equivalent_mass, scenarios.velocity))
-    law = find_contact_law(mechanism.contact.law).simulated
+    law = find_contact_law(mechanism.contact.law).simulation_law
     reference = cached_programs.run_cached(_compute_reference, law, scenarios.contact, mass, velocity)
     numbers: Any = [np.asarray(leaf)[: mechanism.approach.contacts] for leaf in reference]
     return IdealContact(*numbers)
@@ -238,7 +238,7 @@ def _compute_reference(
     law: ContactLaw, parameters: ContactParameters, mass: Any, velocity: Any
 ) -> IdealContact:
     """Return the ideal contacts of a contact law, (contacts, lanes); compiled by `run_cached`."""
-    return law.reference(parameters_by_slot(parameters), mass, velocity)
+    return law.ideal_contact(parameters_by_slot(parameters), mass, velocity)
 
 
 def _find_distinct_contacts(mechanism: Mechanism, reference: IdealContact) -> tuple[ContactSummary, ...]:
@@ -334,7 +334,7 @@ def _find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) -
         warnings.append(
             f"rig.force_sensor.range: found {rig.force_sensor.range:.4g} N, expected more than {peak}"
         )
-    if not find_contact_law(contact.law).damped and any(contact.damping):
+    if not find_contact_law(contact.law).is_damped and any(contact.damping):
         largest = max(contact.damping)
         warnings.append(
             f"contact.damping: found {largest:.4g} N s/m, expected 0: law {contact.law} has no damping"

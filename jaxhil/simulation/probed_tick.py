@@ -6,37 +6,37 @@ from jaxtyping import Array
 from jaxhil.contact.laws import deflection
 from jaxhil.laws.simulation_base import KnownConstants, Signals
 from jaxhil.simulation.contact_force import IntervalContact, MotionSample
+from jaxhil.simulation.contact_tracking import ContactTracker
 from jaxhil.simulation.loop import RigConstants
 from jaxhil.simulation.loop_state import LoopState
 from jaxhil.simulation.probe import FirstContact, Probe, update_deviation, update_first_contact
-from jaxhil.simulation.watch import Watch
 
 
 def apply_probe(
     rig: RigConstants,
     probe: Probe,
     state: LoopState,
-    over: Array,
+    has_ended: Array,
     signals: Signals,
     sample: MotionSample,
     contact: IntervalContact,
-    watch: Watch,
-) -> tuple[LoopState, IntervalContact, Watch]:
+    tracker: ContactTracker,
+) -> tuple[LoopState, IntervalContact, ContactTracker]:
     """Add the effects of the probe to the state, the contact and the watch of a tick.
 
     Args:
         rig: Constants of the run.
         probe: Probe of the current contact.
         state: State of the loop.
-        over: Whether the contact ended before this tick.
+        has_ended: Whether the contact ended before this tick.
         signals: Inputs of the compensator at this tick.
         sample: Motion of the hardware at the instant at which the force is sampled.
         contact: Real contact in the sampling interval.
-        watch: Record of the current contact.
+        tracker: Record of the current contact.
     """
     first_contact, contact = apply_push(rig, probe, state.first_contact, signals.age, sample, contact)
-    watch = update_model_deviation(rig.constants, probe, over, signals, watch)
-    return state._replace(first_contact=first_contact), contact, watch
+    tracker = update_model_deviation(rig.constants, probe, has_ended, signals, tracker)
+    return state._replace(first_contact=first_contact), contact, tracker
 
 
 def apply_push(
@@ -63,16 +63,16 @@ def apply_push(
 
 
 def update_model_deviation(
-    constants: KnownConstants, probe: Probe, over: Array, signals: Signals, watch: Watch
-) -> Watch:
-    """Add the numerical model's deviation from the ideal contact, unless the contact is `over`."""
-    assert watch.deviation is not None
+    constants: KnownConstants, probe: Probe, has_ended: Array, signals: Signals, tracker: ContactTracker
+) -> ContactTracker:
+    """Add the numerical model's deviation from the ideal contact, unless the contact has ended."""
+    assert tracker.deviation is not None
     depth, rate = signals.position_desired, signals.velocity_desired
-    if watch.side is not None:
-        depth = jnp.where(watch.side > 0, depth, -constants.clearance - depth)
-        rate = watch.side * rate
+    if tracker.side is not None:
+        depth = jnp.where(tracker.side > 0, depth, -constants.clearance - depth)
+        rate = tracker.side * rate
     now = signals.age.astype(rate.dtype)
     deviation = update_deviation(
-        watch.deviation, probe.depth, probe.span, depth, rate, now, constants.control_period, ~over
+        tracker.deviation, probe.depth, probe.span, depth, rate, now, constants.control_period, ~has_ended
     )
-    return watch._replace(deviation=deviation)
+    return tracker._replace(deviation=deviation)

@@ -5,8 +5,8 @@ from jaxtyping import Array
 
 
 def limit_command(
-    wanted: Array,
-    wanted_before: Array,
+    unlimited_command: Array,
+    unlimited_before: Array,
     previous: Array,
     previous_step: Array,
     control_period: Array,
@@ -25,8 +25,8 @@ def limit_command(
     If no limit is active, apart from rounding, c(n+1) equals the unlimited command exactly.
 
     Args:
-        wanted: Unlimited command for tick n + 1 [m].
-        wanted_before: Unlimited command for tick n [m].
+        unlimited_command: Unlimited command for tick n + 1 [m].
+        unlimited_before: Unlimited command for tick n [m].
         previous: Limited command c(n) [m].
         previous_step: Last step of the limited command, c(n) - c(n-1) [m].
         control_period: Control period T [s].
@@ -37,13 +37,17 @@ def limit_command(
     change = acceleration_limit * control_period**2
     limited = jnp.isfinite(change)
     change = jnp.where(limited, change, 1)
-    unlimited = wanted - previous
-    behind, wanted_step = wanted_before - previous, wanted - wanted_before
+    unlimited = unlimited_command - previous
+    behind, unlimited_step = unlimited_before - previous, unlimited_command - unlimited_before
     more = jnp.floor((jnp.sqrt(1 + 8 * jnp.abs(behind) / change) - 1) / 2)
     closing = behind / (more + 1) + jnp.sign(behind) * change * more / 2
-    step = jnp.where(limited, wanted_step + closing, unlimited)
+    step = jnp.where(limited, unlimited_step + closing, unlimited)
     step = jnp.where(limited, jnp.clip(step, previous_step - change, previous_step + change), step)
     step = jnp.where(step > largest, largest, jnp.where(step < -largest, -largest, step))
-    rounding = 2 * jnp.finfo(wanted.dtype).eps * (jnp.abs(wanted) + jnp.abs(previous) + jnp.abs(wanted_step))
+    rounding = (
+        2
+        * jnp.finfo(unlimited_command.dtype).eps
+        * (jnp.abs(unlimited_command) + jnp.abs(previous) + jnp.abs(unlimited_step))
+    )
     follows = jnp.abs(step - unlimited) <= rounding
-    return jnp.where(follows, wanted, previous + step), jnp.where(follows, unlimited, step)
+    return jnp.where(follows, unlimited_command, previous + step), jnp.where(follows, unlimited, step)

@@ -14,6 +14,7 @@ from jaxhil.lanes import select_lanes
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.simulation.cells import IntervalInputs
 from jaxhil.simulation.contact_force import MotionSample, PlantSignals, SamplingInterval, no_contact
+from jaxhil.simulation.contact_tracking import COMMAND_DECAY_RATIO, build_end_conditions, start_tracking
 from jaxhil.simulation.free_flight import advance_to_surface, begin_approach
 from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
 from jaxhil.simulation.loop_state import LoopState, PlantState, Rings, SensorState
@@ -22,7 +23,6 @@ from jaxhil.simulation.probe import initial_first_contact
 from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.sensors import SensorNoise, draw_noise
 from jaxhil.simulation.tick import RunState, SegmentConstants, Tick, tick
-from jaxhil.simulation.watch import COMMAND_DECAY_RATIO, build_end_conditions, fresh_watch
 
 
 def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
@@ -119,7 +119,7 @@ def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool
     slots = scenario.phase.shape[0]
     return RunState(
         state=state,
-        watch=fresh_watch(loop, like),
+        tracker=start_tracking(loop, like),
         metrics=empty_metrics(loop, slots, like),
         index=index,
         active=scenario.contacts > 0,
@@ -166,64 +166,68 @@ def begin_next_contacts(
     loop: Loop, rig: RigConstants, gains: Gains, run: RunState, skip_flight: bool = True
 ) -> RunState:
     """Store the metrics of finished contacts, begin the next contacts, and skip free flight."""
-    watch, state, scenario = run.watch, run.state, rig.scenario
-    status = determine_status(scenario, watch, run.tick - state.onset_tick)
-    over = _finished_lanes(rig, run)
+    tracker, state, scenario = run.tracker, run.state, rig.scenario
+    status = determine_status(scenario, tracker, run.tick - state.onset_tick)
+    has_ended = _finished_lanes(rig, run)
     ticks = run.tick - loop.first_tick + run.skipped
     law = loop.compensator
     delay = law.force_delay(gains, state.controller) if law.estimates_delay else None
-    metrics = store_metrics(scenario, run.metrics, watch, run.index, over, status, ticks, delay)
-    index = run.index + over.astype(jnp.int32)
+    metrics = store_metrics(scenario, run.metrics, tracker, run.index, has_ended, status, ticks, delay)
+    index = run.index + has_ended.astype(jnp.int32)
     ends = (status != OK) | (index >= scenario.contacts)
     if loop.has_limits and not loop.is_two_sided:
         # End a scenario whose drives cannot follow the rebound speed, with which the next run would begin.
-        ends = ends | (watch.rebound > scenario.simulator.velocity_limit)
-    active = run.active & ~(over & ends)
-    blank = fresh_watch(loop, watch.approach)
+        ends = ends | (tracker.rebound > scenario.simulator.velocity_limit)
+    active = run.active & ~(has_ended & ends)
+    blank = start_tracking(loop, tracker.approach)
     entry = _select_entry(scenario.contact, _select_slot(rig, index))
-    if watch.command is not None:
-        remaining_command = jnp.maximum(COMMAND_DECAY_RATIO * watch.peak_command, watch.command)
+    if tracker.command is not None:
+        remaining_command = jnp.maximum(COMMAND_DECAY_RATIO * tracker.peak_command, tracker.command)
         # If a force still acts, the next contact begins at once. Its approach speed is the rebound speed of
         # the contact that has just ended.
         unchanged = {
-            "approach": watch.rebound,
-            "force_free_ticks": watch.force_free_ticks,
-            "recent_forces": watch.recent_forces,
-            "command": watch.command,
+            "approach": tracker.rebound,
+            "force_free_ticks": tracker.force_free_ticks,
+            "recent_forces": tracker.recent_forces,
+            "command": tracker.command,
         }
-        watch = select_lanes(over, blank._replace(remaining_command=remaining_command, **unchanged), watch)
+        tracker = select_lanes(
+            has_ended, blank._replace(remaining_command=remaining_command, **unchanged), tracker
+        )
         # A damped contact may end before the penetration does. The parameters of this contact apply until the
         # mechanism has left the surface.
         free = state.sensed.last.distance <= 0
         state = state._replace(parameters=select_lanes(free, entry, state.parameters))
         if state.first_contact is not None:
             state = state._replace(
-                first_contact=select_lanes(over, initial_first_contact(watch.approach), state.first_contact)
+                first_contact=select_lanes(
+                    has_ended, initial_first_contact(tracker.approach), state.first_contact
+                )
             )
         if skip_flight:
-            arrived, skipped = advance_to_surface(loop, rig, gains, state, watch, watch.command, run.tick)
+            arrived, skipped = advance_to_surface(loop, rig, gains, state, tracker, tracker.command, run.tick)
             state = _restart(loop, gains, state, arrived, skipped, jnp.zeros_like(skipped))
     else:
-        state = state._replace(parameters=select_lanes(over, entry, state.parameters))
+        state = state._replace(parameters=select_lanes(has_ended, entry, state.parameters))
         phase = _select_entry(scenario.phase, _select_slot(rig, index))
         entered, skipped = begin_approach(
-            loop, rig, gains, state, phase, watch.rebound, run.tick, skip_flight
+            loop, rig, gains, state, phase, tracker.rebound, run.tick, skip_flight
         )
-        run = run._replace(skipped=run.skipped + jnp.where(over, skipped, 0))
-        state = _restart(loop, gains, state, entered, over, over)
-        watch = select_lanes(over, blank, watch)
-    return run._replace(state=state, watch=watch, metrics=metrics, index=index, active=active)
+        run = run._replace(skipped=run.skipped + jnp.where(has_ended, skipped, 0))
+        state = _restart(loop, gains, state, entered, has_ended, has_ended)
+        tracker = select_lanes(has_ended, blank, tracker)
+    return run._replace(state=state, tracker=tracker, metrics=metrics, index=index, active=active)
 
 
 def _changing_parts(run):
     """Return the parts of the state that change within a segment."""
-    return run.state, run.watch, run.tick
+    return run.state, run.tracker, run.tick
 
 
 def _replace_changing_parts(run, parts):
     """Return the state with the parts of `_changing_parts` replaced."""
-    state, watch, now = parts
-    return run._replace(state=state, watch=watch, tick=now)
+    state, tracker, now = parts
+    return run._replace(state=state, tracker=tracker, tick=now)
 
 
 def _build_rings(loop, ring, measured, order):
@@ -246,8 +250,8 @@ def _build_rings(loop, ring, measured, order):
 
 def _finished_lanes(rig, run):
     """Return whether the current contact of each lane has ended, normally or with an error status."""
-    status = determine_status(rig.scenario, run.watch, run.tick - run.state.onset_tick)
-    return (run.watch.over | (status != OK)) & run.active
+    status = determine_status(rig.scenario, run.tracker, run.tick - run.state.onset_tick)
+    return (run.tracker.has_ended | (status != OK)) & run.active
 
 
 def _restart(loop, gains, state, entered, begins, fresh):

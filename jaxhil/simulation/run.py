@@ -121,7 +121,7 @@ class Run:
     status: str
 
     @cached_property
-    def meaning(self) -> MechanismSummary:
+    def summary(self) -> MechanismSummary:
         """Summary of the mechanism: mass, ideal contacts, rates, and warnings about implausible numbers."""
         return summarise_mechanism(self.mechanism)
 

@@ -113,7 +113,7 @@ def build_scenarios(
         clearance=table.scalar("contact.clearance"),
         contact=ContactParameters(
             stiffness=table.successive("contact.stiffness"),
-            damping=table.successive("contact.damping") * float(find_contact_law(contact.law).damped),
+            damping=table.successive("contact.damping") * float(find_contact_law(contact.law).is_damped),
             **{key.name: table.repeated(table.of_law(key)) for key in CONTACT_KEYS.values()},
         ),
         control_period=table.scalar("rig.control_period"),

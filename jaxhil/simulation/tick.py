@@ -31,6 +31,7 @@ from jaxhil.simulation.contact_force import (
     largest_force,
 )
 from jaxhil.simulation.contact_in_cells import ContactSurfaces, compute_jump_work, contact_in_cells
+from jaxhil.simulation.contact_tracking import ContactEndConditions, ContactTracker, record_contact
 from jaxhil.simulation.integrators import INTEGRATORS
 from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.loop_state import LoopState, PlantState, Rings
@@ -40,14 +41,13 @@ from jaxhil.simulation.probe import Probe
 from jaxhil.simulation.probed_tick import apply_probe
 from jaxhil.simulation.rate_limits import limit_command
 from jaxhil.simulation.sensors import SensorNoise, quantise, sample_force
-from jaxhil.simulation.watch import ContactEndConditions, Watch, record_contact
 
 
 class RunState(NamedTuple):
     """State of the simulation, which changes from tick to tick."""
 
     state: LoopState  # state of the loop
-    watch: Watch  # record of the current contact
+    tracker: ContactTracker  # record of the current contact
     metrics: Metrics  # metrics of finished contacts
     index: Int[Array, "*batch"]  # index of the current contact, from 0
     active: Bool[Array, "*batch"]  # whether the last contact of the lane has not yet ended
@@ -107,24 +107,31 @@ def tick(
     model = integrate(loop, rig, state, force)
     actuated = actuate(loop, rig, prepared.gains, state, now, model, controller)
     contact = compute_contact(loop, rig, state, actuated.interval)
-    watch = record_contact(
-        loop, prepared.rules, run.watch, signals, plant_signals, force, state.plant.shortfall
+    tracker = record_contact(
+        loop, prepared.rules, run.tracker, signals, plant_signals, force, state.plant.shortfall
     )
     if prepared.probe is not None:
-        state, contact, watch = apply_probe(
-            rig, prepared.probe, state, run.watch.over, signals, actuated.interval.sample, contact, watch
+        state, contact, tracker = apply_probe(
+            rig,
+            prepared.probe,
+            state,
+            run.tracker.has_ended,
+            signals,
+            actuated.interval.sample,
+            contact,
+            tracker,
         )
     state = update_state(state, now, plant_signals, model, actuated, contact)
     record = Tick(
         signals,
         force,
         plant_signals,
-        active=run.active & ~watch.over,
+        active=run.active & ~tracker.has_ended,
         contact=run.index,
         identified=loop.compensator.identified(controller),
         sent=state.plant.sent,
     )
-    return run._replace(state=state, watch=watch, tick=now + 1), record
+    return run._replace(state=state, tracker=tracker, tick=now + 1), record
 
 
 def sense(
@@ -184,7 +191,7 @@ def actuate(
 ) -> ActuationResult:
     """Stage 4: apply limits, latency, hold and motion simulator to the position command."""
     command, controller = loop.compensator.position_command(gains, controller, *model)
-    command, step, wanted = _apply_limits(rig, state.plant, command)
+    command, step, unlimited_command = _apply_limits(rig, state.plant, command)
     commands = (command, *state.plant.commands)
     end = commands[loop.latency]
     start = commands[loop.latency + 1] if loop.hold == "linear" else end
@@ -199,7 +206,7 @@ def actuate(
         interval = _current_interval(rig, pending, now, now - state.onset_tick)
     simulator = advance_state(rows.transition, simulator, start, end)
     return ActuationResult(
-        plant=PlantState(commands[: loop.latency + 1], step, simulator, wanted),
+        plant=PlantState(commands[: loop.latency + 1], step, simulator, unlimited_command),
         controller=controller,
         position=read_measured_position(rows, state.plant.state, start, end),
         interval=interval,
@@ -217,7 +224,7 @@ def compute_contact(
     clearance = scenario.clearance if loop.is_two_sided else None
     surfaces = Surfaces(loop.law, state.parameters, state.law, clearance)
     sample_time = rig.delays.force.fraction * period
-    if loop.law.remembers:
+    if loop.law.has_memory:
         at_sample = surfaces.advance(interval.start, interval.sample, sample_time)
         force, _ = at_sample.force(interval.sample)
         law = at_sample.advance(interval.sample, interval.end, period - sample_time).state
@@ -326,11 +333,11 @@ def _delayed_position(rig, state, now, age):
 
 def _apply_limits(rig, plant, command):
     """Return limited command [m], its step [m], and unlimited command [m], which is None without limits."""
-    if plant.wanted is None:
+    if plant.unlimited_command is None:
         return command, plant.step, None
     simulator = rig.scenario.simulator
     limited, step = limit_command(
-        command, plant.wanted, plant.commands[0], plant.step, rig.constants.control_period,
+        command, plant.unlimited_command, plant.commands[0], plant.step, rig.constants.control_period,
         simulator.velocity_limit, simulator.acceleration_limit,
     )  # fmt: skip
     return limited, step, command

@@ -16,7 +16,7 @@ NEWTON_STEPS = 3  # number of Newton steps after the search; enough for rounding
 FLIGHT_STEPS = 8  # number of integration steps of the free flight before the first touch
 
 
-def touching_height(
+def find_touching_height(
     groups: tuple[ContactGroup, ...],
     offset_x: Float[Array, "*batch"],
     offset_y: Float[Array, "*batch"],

@@ -39,7 +39,7 @@ class Axes(NamedTuple):
     position: SplitDelay  # sum of the delays of each axis and of the position sensor, (axes, *batch)
 
 
-class Motion(NamedTuple):
+class AxisMotion(NamedTuple):
     """Positions, rates and accelerations of the axes or of the coordinates, (axes, *batch)."""
 
     position: Float[Array, "..."]  # [m or rad]
@@ -50,7 +50,7 @@ class Motion(NamedTuple):
 class Samples(NamedTuple):
     """Motion of the axes at the sensors' sampling instants."""
 
-    motion: Motion  # motion at the force sensor's sampling instant
+    motion: AxisMotion  # motion at the force sensor's sampling instant
     measured: Float[Array, "..."] | None  # positions at the position sensor's instant; None if not needed
 
 
@@ -86,7 +86,7 @@ def build_axes(
     return Axes(exact, acceleration, force, position)
 
 
-def lags(simulator: MotionSimulatorBatch) -> np.ndarray:
+def static_lags(simulator: MotionSimulatorBatch) -> np.ndarray:
     """Return the low-frequency lag -G'(0) [s] of each axis, (axes, *batch), without the transport delay."""
     numerator, denominator = (np.asarray(part) for part in (simulator.numerator, simulator.denominator))
     if len(denominator) == 1:
@@ -95,7 +95,7 @@ def lags(simulator: MotionSimulatorBatch) -> np.ndarray:
     return denominator[-2] / denominator[-1] - lead
 
 
-def enter(
+def start_uniform_motion(
     axes: Axes, at: Array, stride: Array, period: Array, hold: str, latency: int, ring: int
 ) -> Hardware:
     """Return the hardware state in steady uniform motion.
@@ -129,7 +129,7 @@ def enter(
     )
 
 
-def sampled(axes: Axes, hardware: Hardware, tick: Int[Array, ""]) -> Samples:
+def read_samples(axes: Axes, hardware: Hardware, tick: Int[Array, ""]) -> Samples:
     """Return the samples that the sensors read at a tick; ticks are counted from the start of the run."""
     force = axes.force.intervals
     delays, structure = jax.tree.flatten(_samples(axes, force, force, force, axes.position.intervals))
@@ -165,6 +165,6 @@ def actuate(
 def _samples(axes: Axes, position: Any, rate: Any, acceleration: Any, measured: Any) -> Samples:
     """Return the arguments as `Samples`, with None for quantities that the loop does not need."""
     return Samples(
-        Motion(position, rate, acceleration if axes.acceleration is not None else None),
+        AxisMotion(position, rate, acceleration if axes.acceleration is not None else None),
         measured if axes.propagation.measured_position is not None else None,
     )

@@ -14,9 +14,10 @@ from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.six_axes_rig import Tool
 from jaxhil.simulation.scenario import MotionSimulatorBatch
 from jaxhil.sixdof import sensor
-from jaxhil.sixdof.approach import begin, touching_height
+from jaxhil.sixdof.approach import begin, find_touching_height
 from jaxhil.sixdof.bodies import Body, build_body, build_state
 from jaxhil.sixdof.building_contacts import build_groups, build_latches
+from jaxhil.sixdof.drawn_values import DrawnValues
 from jaxhil.sixdof.forces import ContactGroup
 from jaxhil.sixdof.kinematics import Kinematics, TaskSpace, TwoRobots
 from jaxhil.sixdof.loop import Loop, build_loop
@@ -24,7 +25,6 @@ from jaxhil.sixdof.relative import Pair, Pose, States, Twist
 from jaxhil.sixdof.rotations import Quaternion, exponential
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.stewart import Stewart
-from jaxhil.sixdof.values import Values
 from jaxhil.sixdof.vectors import Vector, vector
 
 APPROACH_DURATION = 0.02  # s; duration of the flight before the first touch, without the phase
@@ -43,7 +43,7 @@ def build_scenarios(
         seed: Seed of the sensors' noise.
         first: Index of the first scenario. The noise of a scenario depends only on seed and index.
     """
-    numbers = Values(mechanism, dict(draws or {}))
+    numbers = DrawnValues(mechanism, dict(draws or {}))
     bodies = Pair(*(_body(numbers, name) for name in ("target", "chaser")))
     groups = build_groups(mechanism, numbers)
     indices = np.arange(first, first + numbers.number, dtype=np.uint32)
@@ -73,7 +73,7 @@ def build_scenarios(
     ))  # fmt: skip
 
 
-def loop_of(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -> Loop:
+def make_loop(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -> Loop:
     """Return the loop that runs a mechanism's scenarios with a compensator."""
     rig, sensor = mechanism.rig, scenario.sensor
     return build_loop(
@@ -93,7 +93,7 @@ def loop_of(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -
     )
 
 
-def _body(numbers: Values, name: str) -> Body:
+def _body(numbers: DrawnValues, name: str) -> Body:
     rotation_path = f"{name}.interface_rotation"
     return build_body(
         jnp.asarray(numbers(f"{name}.mass")),
@@ -103,7 +103,7 @@ def _body(numbers: Values, name: str) -> Body:
     )
 
 
-def _specified(numbers: Values, bodies: Pair) -> States:
+def _specified(numbers: DrawnValues, bodies: Pair) -> States:
     """Return the states of the bodies that the table [start] specifies."""
 
     def state(name: str, body: Body):
@@ -120,7 +120,9 @@ def _specified(numbers: Values, bodies: Pair) -> States:
     return States(state("target", bodies.target), state("chaser", bodies.chaser))
 
 
-def _before_touch(numbers: Values, bodies: Pair, groups: tuple[ContactGroup, ...], before: Any) -> States:
+def _before_touch(
+    numbers: DrawnValues, bodies: Pair, groups: tuple[ContactGroup, ...], before: Any
+) -> States:
     """Return the states at `before` seconds before the first touch that the table [approach] specifies."""
     keys = ("offset", "attitude", "velocity", "angular_velocity")
     return _lowered(bodies, groups, *(numbers(f"approach.{key}") for key in keys), before)
@@ -130,12 +132,12 @@ def _before_touch(numbers: Values, bodies: Pair, groups: tuple[ContactGroup, ...
 def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, before) -> States:
     """Return the states at `before` seconds before a first touch with this offset and velocity."""
     rotation = exponential(vector(attitude))
-    height = touching_height(groups, offset[0], offset[1], rotation)
+    height = find_touching_height(groups, offset[0], offset[1], rotation)
     pose = Pose(Vector(offset[0], offset[1], height), rotation)
     return begin(bodies, pose, Twist(vector(velocity), vector(angular_velocity)), before)
 
 
-def _kinematics(mechanism: SixAxisMechanism, numbers: Values) -> Kinematics:
+def _kinematics(mechanism: SixAxisMechanism, numbers: DrawnValues) -> Kinematics:
     path, simulator = "rig.simulator.", mechanism.rig.simulator
     if simulator.space == "task":
         return TaskSpace()
@@ -148,7 +150,7 @@ def _kinematics(mechanism: SixAxisMechanism, numbers: Values) -> Kinematics:
     return Stewart(base, platform, height, jnp.asarray(stroke))
 
 
-def _simulator(mechanism: SixAxisMechanism, numbers: Values) -> MotionSimulatorBatch:
+def _simulator(mechanism: SixAxisMechanism, numbers: DrawnValues) -> MotionSimulatorBatch:
     """Return the transfer function, delay and limits of every axis; the model "ideal" has order 0."""
     path, model = "rig.simulator.", mechanism.rig.simulator.model
 
@@ -190,7 +192,7 @@ def _simulator(mechanism: SixAxisMechanism, numbers: Values) -> MotionSimulatorB
     return MotionSimulatorBatch(numerator, denominator, delay, limit, limit)
 
 
-def _sensor(mechanism: SixAxisMechanism, numbers: Values) -> sensor.Sensor:
+def _sensor(mechanism: SixAxisMechanism, numbers: DrawnValues) -> sensor.Sensor:
     """Build the force sensor and the controller's assumptions about the sensor."""
     path = "rig.force_sensor."
     nothing: Any = np.zeros((6, numbers.number))
@@ -217,7 +219,7 @@ def _sensor(mechanism: SixAxisMechanism, numbers: Values) -> sensor.Sensor:
     )
 
 
-def _tool(mechanism: SixAxisMechanism, numbers: Values, assumed: str = "") -> sensor.Tool:
+def _tool(mechanism: SixAxisMechanism, numbers: DrawnValues, assumed: str = "") -> sensor.Tool:
     """Build the real tool or, with the suffix "_assumed", the tool that the controller assumes.
 
     Without assumed values in the file, the controller assumes the nominal tool.

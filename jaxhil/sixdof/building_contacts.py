@@ -16,12 +16,12 @@ from jaxhil.contact.laws import ContactLaw, ContactParameters, find_contact_law
 from jaxhil.mechanism import six_axes
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.sixdof.candidates import Candidates, Capsules, ChaserSpheres, TargetSpheres
+from jaxhil.sixdof.drawn_values import DrawnValues
 from jaxhil.sixdof.forces import ContactGroup
 from jaxhil.sixdof.friction import Bristle, Friction, Frictionless, Regularised
 from jaxhil.sixdof.latch import Latch
 from jaxhil.sixdof.rotations import compose
 from jaxhil.sixdof.shapes import Ball, Box, Capsule, Cavity, Drogue, Plane, Shape, Shell
-from jaxhil.sixdof.values import Values
 from jaxhil.sixdof.vectors import Vector
 
 
@@ -35,7 +35,7 @@ class Candidate(NamedTuple):
     friction: Friction
 
 
-def candidates(mechanism: SixAxisMechanism, numbers: Values) -> list[list[Candidate]]:
+def candidates(mechanism: SixAxisMechanism, numbers: DrawnValues) -> list[list[Candidate]]:
     """Return the pairs of shapes that may touch (candidates), grouped by the kinds of shapes and laws."""
     groups: dict[Any, list[Candidate]] = {}
     for name, contact in mechanism.contact.items():
@@ -49,11 +49,11 @@ def candidates(mechanism: SixAxisMechanism, numbers: Values) -> list[list[Candid
 
 def candidate_names(mechanism: SixAxisMechanism) -> tuple[str, ...]:
     """Return the names of all contact candidates, in the order in which `build_groups` returns them."""
-    groups = candidates(mechanism, Values(mechanism, {}))
+    groups = candidates(mechanism, DrawnValues(mechanism, {}))
     return tuple(candidate.name for group in groups for candidate in group)
 
 
-def build_groups(mechanism: SixAxisMechanism, numbers: Values) -> tuple[ContactGroup, ...]:
+def build_groups(mechanism: SixAxisMechanism, numbers: DrawnValues) -> tuple[ContactGroup, ...]:
     """Build the groups of contact candidates (shape pairs), with arrays (..., candidates, lanes)."""
 
     def stacked(*leaves: Any) -> Any:
@@ -71,12 +71,12 @@ def build_groups(mechanism: SixAxisMechanism, numbers: Values) -> tuple[ContactG
     )
 
 
-def build_latches(mechanism: SixAxisMechanism, numbers: Values) -> tuple[Latch, ...]:
+def build_latches(mechanism: SixAxisMechanism, numbers: DrawnValues) -> tuple[Latch, ...]:
     """Build the latches of each [latch] table, with arrays (..., latches, lanes)."""
     return tuple(_latch(latch, numbers, f"latch.{name}") for name, latch in mechanism.latch.items())
 
 
-def _latch(latch: six_axes.Latch, numbers: Values, path: str) -> Latch:
+def _latch(latch: six_axes.Latch, numbers: DrawnValues, path: str) -> Latch:
     """Build the latches of one table: one for each copy of the table's pattern (points around the z axis)."""
     count = latch.pattern.count if latch.pattern else 1
 
@@ -105,7 +105,9 @@ def _latch(latch: six_axes.Latch, numbers: Values, path: str) -> Latch:
     )
 
 
-def _candidate(contact: six_axes.Contact, numbers: Values, name: str, copy: int, count: int) -> Candidate:
+def _candidate(
+    contact: six_axes.Contact, numbers: DrawnValues, name: str, copy: int, count: int
+) -> Candidate:
     """Build the candidate contact (pair of shapes that may touch) for one copy of a `[contact]` table.
 
     `count` is the number of copies, and `copy` is the index of this copy.
@@ -134,7 +136,7 @@ def _pair(chaser: Shape, target: Shape) -> Candidates:
     return Capsules(chaser, target)
 
 
-def _shape(shape: six_axes.Shape, numbers: Values, path: str, turn: Any) -> Shape:
+def _shape(shape: six_axes.Shape, numbers: DrawnValues, path: str, turn: Any) -> Shape:
     """Build a shape and rotate it about z by `turn` [rad]."""
 
     def of(key: str) -> Any:
@@ -160,12 +162,12 @@ def _shape(shape: six_axes.Shape, numbers: Values, path: str, turn: Any) -> Shap
     return (Cavity if shape.inside else Ball)(point("centre"), of("radius"))
 
 
-def _law(contact: six_axes.Contact, numbers: Values, path: str) -> ContactLaw:
+def _law(contact: six_axes.Contact, numbers: DrawnValues, path: str) -> ContactLaw:
     """Return the contact law, specialised for the values in the file."""
-    return find_contact_law(contact.law).specialised(contact, lambda key: numbers.is_drawn(f"{path}.{key}"))
+    return find_contact_law(contact.law).specialise(contact, lambda key: numbers.is_drawn(f"{path}.{key}"))
 
 
-def _parameters(contact: six_axes.Contact, numbers: Values, path: str) -> ContactParameters:
+def _parameters(contact: six_axes.Contact, numbers: DrawnValues, path: str) -> ContactParameters:
     """Return a candidate's contact-law parameters, (lanes,); slopes and depths are (segments, lanes)."""
 
     def of_law(key: ContactKey) -> Any:
@@ -180,7 +182,7 @@ def _parameters(contact: six_axes.Contact, numbers: Values, path: str) -> Contac
     )
 
 
-def _friction(friction: six_axes.Friction | None, numbers: Values, path: str) -> Friction:
+def _friction(friction: six_axes.Friction | None, numbers: DrawnValues, path: str) -> Friction:
     if friction is None:
         return Frictionless()
     keys = ("slip",) if friction.law == "regularised" else ("stiffness", "damping")

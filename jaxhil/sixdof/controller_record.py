@@ -13,7 +13,7 @@ from jaxhil.sixdof.loop import Loop, controller_constants, run
 from jaxhil.sixdof.metrics import Metrics, evaluate
 from jaxhil.sixdof.scenario import Scenario
 
-LEAST_TICKS = 256  # minimum number of ticks of a program, a power of two, so that most runs share a program
+MIN_TICKS = 256  # minimum number of ticks of a program, a power of two, so that most runs share a program
 
 
 class ControllerRecord(NamedTuple):
@@ -37,7 +37,7 @@ def record_controller(
     program = _compiled()
     metrics, final = jax.device_get(program.evaluate(loop, gains, scenario))
     ends = np.maximum(np.round(final / np.asarray(scenario.control_period)).astype(int), 2)
-    length = max(LEAST_TICKS, 1 << (int(np.max(ends)) - 1).bit_length())
+    length = max(MIN_TICKS, 1 << (int(np.max(ends)) - 1).bit_length())
     columns = jax.device_get(program.record(loop, length, gains, scenario))
     return metrics, [
         ControllerRecord(*(np.asarray(column, float)[:end, :, lane] for column in columns))

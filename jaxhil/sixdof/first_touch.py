@@ -10,14 +10,14 @@ from jaxtyping import Array, Float
 from jaxhil.lanes import select_lanes
 from jaxhil.sixdof.bodies import Load, kick_drift
 from jaxhil.sixdof.candidates import Touch, motion_at
+from jaxhil.sixdof.ideal_contact_integration import IdealContactModel
 from jaxhil.sixdof.relative import Pair, States, effective_mass, relative
-from jaxhil.sixdof.space import Space
 from jaxhil.sixdof.vectors import Vector
 
 TOUCH_STEPS = 4  # number of Newton steps for the time of the first touch
 
 
-class Meeting(NamedTuple):
+class FirstTouch(NamedTuple):
     """Bodies and contact geometry at the first touch of an episode."""
 
     states: States  # states of the bodies
@@ -25,47 +25,49 @@ class Meeting(NamedTuple):
     normal: Vector  # normal of the target's surface, in target frame T
 
 
-def meet(space: Space, before: States, depths: tuple[Float[Array, "candidates *batch"], ...]) -> Meeting:
+def find_first_touch(
+    contact_model: IdealContactModel, before: States, depths: tuple[Float[Array, "candidates *batch"], ...]
+) -> FirstTouch:
     """Compute the first touch by Newton's method for the time of the free flight that leads to it.
 
     Args:
-        space: Constants of the ideal contact.
+        contact_model: Constants of the ideal contact.
         before: States at the start of the integration step in which the first touch begins.
         depths: Penetration of each pair of shapes at the end of this step [m]; 0 if nothing ever touches.
     """
     zero = jnp.zeros_like(before.target.position.x)
-    if not space.groups:
+    if not contact_model.groups:
         apart = zero + jnp.nan
         nowhere = Vector(apart, apart, apart)
-        return Meeting(before, nowhere, nowhere)
+        return FirstTouch(before, nowhere, nowhere)
 
     def touch_of(states: States) -> tuple[Touch, Array]:
         """Return geometry and penetration rate of the shape pair that is deepest at the end of the step."""
-        pose, twist = jax.tree.map(lambda leaf: leaf[None], relative(space.bodies, states))
-        touches = [group.candidates.touch(pose) for group in space.groups]
+        pose, twist = jax.tree.map(lambda leaf: leaf[None], relative(contact_model.bodies, states))
+        touches = [group.candidates.touch(pose) for group in contact_model.groups]
         rates = [motion_at(touch, pose, twist)[0] for touch in touches]
         return _deepest(list(zip(touches, rates, strict=True)), depths)
 
     # The compiler would unroll a Python loop, fuse its computations and repeat them.
-    def newton(_, carry: tuple[Array, States, Meeting]) -> tuple[Array, States, Meeting]:
+    def newton(_, carry: tuple[Array, States, FirstTouch]) -> tuple[Array, States, FirstTouch]:
         time, states, _ = carry
         touch, rate = touch_of(states)
         time = time - touch.depth / jnp.where(rate > 0, rate, jnp.inf)
-        ahead = glide(space.bodies, before, time)
-        return time, ahead, Meeting(states, touch.point, touch.normal)
+        ahead = advance_free_flight(contact_model.bodies, before, time)
+        return time, ahead, FirstTouch(states, touch.point, touch.normal)
 
     nothing = Vector(zero, zero, zero)
-    start = zero, before, Meeting(before, nothing, nothing)
-    *_, meeting = lax.fori_loop(0, TOUCH_STEPS, newton, start)
-    return meeting
+    start = zero, before, FirstTouch(before, nothing, nothing)
+    *_, first_touch = lax.fori_loop(0, TOUCH_STEPS, newton, start)
+    return first_touch
 
 
-def meeting_mass(bodies: Pair, meeting: Meeting) -> Float[Array, "*batch"]:
+def first_touch_mass(bodies: Pair, first_touch: FirstTouch) -> Float[Array, "*batch"]:
     """Return the effective mass [kg] of the bodies at the first touch, along the normal of the touch."""
-    return effective_mass(bodies, meeting.states, meeting.point, meeting.normal)
+    return effective_mass(bodies, first_touch.states, first_touch.point, first_touch.normal)
 
 
-def glide(bodies: Pair, states: States, time: Float[Array, "*batch"]) -> States:
+def advance_free_flight(bodies: Pair, states: States, time: Float[Array, "*batch"]) -> States:
     """Return the states after a free flight that lasts `time` [s], integrated in a single step."""
     zero = jnp.zeros_like(time)
     nothing = Vector(zero, zero, zero)

@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxhil.sixdof.axes import Motion
+from jaxhil.sixdof.axes import AxisMotion
 from jaxhil.sixdof.relative import Coordinates, Pose, Twist, motion_of
 from jaxhil.sixdof.vectors import vector
 
 
-class Moving(NamedTuple):
+class RigidMotion(NamedTuple):
     """Motion of the hardware: pose, twist and acceleration of chaser frame C relative to target frame T."""
 
     pose: Pose
@@ -41,7 +41,7 @@ class Kinematics(eqx.Module):
         """Return the axis positions for the pose with these coordinates."""
 
     @abc.abstractmethod
-    def coordinates(self, motion: Motion, near: Float[Array, "6 *batch"]) -> Motion:
+    def coordinates(self, motion: AxisMotion, near: Float[Array, "6 *batch"]) -> AxisMotion:
         """Convert the motion of the axes to the motion of the coordinates.
 
         `near` contains coordinates near the result, from which an iteration can start.
@@ -71,19 +71,19 @@ class TwoRobots(Kinematics):
         return jnp.concatenate([(1 - self.share) * coordinates, -self.share * coordinates])
 
     def coordinates(self, motion, near):
-        difference: Motion = jax.tree.map(lambda leaf: leaf[:6] - leaf[6:], motion)
+        difference: AxisMotion = jax.tree.map(lambda leaf: leaf[:6] - leaf[6:], motion)
         return difference
 
 
-def moving(motion: Motion) -> Moving:
+def to_rigid_motion(motion: AxisMotion) -> RigidMotion:
     """Convert the motion of the coordinates to pose, twist and acceleration."""
 
     def pose_and_twist(at, rates):
         return motion_of(*(Coordinates(vector(part[:3]), vector(part[3:])) for part in (at, rates)))
 
     if motion.acceleration is None:
-        return Moving(*pose_and_twist(motion.position, motion.rate), None)
+        return RigidMotion(*pose_and_twist(motion.position, motion.rate), None)
     (pose, twist), (_, acceleration) = jax.jvp(
         pose_and_twist, (motion.position, motion.rate), (motion.rate, motion.acceleration)
     )
-    return Moving(pose, twist, Twist(*acceleration))
+    return RigidMotion(pose, twist, Twist(*acceleration))

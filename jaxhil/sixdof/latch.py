@@ -37,7 +37,7 @@ class Latch(NamedTuple):
     from_start: Bool[Array, "latches *batch"]  # whether the latch holds the chaser at the start of the run
 
 
-class Held(NamedTuple):
+class LatchState(NamedTuple):
     """State of the latches: whether they have caught, and the pose at which they caught."""
 
     caught: Bool[Array, "latches *batch"]
@@ -45,14 +45,14 @@ class Held(NamedTuple):
     attitude: Quaternion  # rotation from chaser frame C to target frame T at the catch
 
 
-def init_latch(latch: Latch, pose: Pose) -> Held:
+def init_latch(latch: Latch, pose: Pose) -> LatchState:
     """Return the latches' state at the start of a run, at which the chaser has the given pose."""
     zero = jnp.zeros_like(latch.depth)
     attitude: Quaternion = jax.tree.map(lambda part: part[None] + zero, pose.attitude)
-    return Held(latch.from_start, latch_points(latch, pose), attitude)
+    return LatchState(latch.from_start, latch_points(latch, pose), attitude)
 
 
-def latch_wrench(latch: Latch, memory: Held, pose: Pose, twist: Twist) -> tuple[Wrench, Held]:
+def latch_wrench(latch: Latch, memory: LatchState, pose: Pose, twist: Twist) -> tuple[Wrench, LatchState]:
     """Return the wrench of all latches on the chaser [N, N m], and the next state of the latches.
 
     The wrench is about the origin of target frame T.
@@ -63,8 +63,8 @@ def latch_wrench(latch: Latch, memory: Held, pose: Pose, twist: Twist) -> tuple[
     tilt = 2 * jnp.arctan2(_sine(attitude), jnp.abs(attitude.w))
     fires = (-point.z > latch.depth) & (tilt < latch.angle) & (velocity.z <= latch.speed)
     first = fires & ~memory.caught
-    now = Held(memory.caught | fires, point, attitude)
-    memory = Held(
+    now = LatchState(memory.caught | fires, point, attitude)
+    memory = LatchState(
         now.caught, *(select_lanes(first, new, old) for new, old in zip(now[1:], memory[1:], strict=True))
     )
 

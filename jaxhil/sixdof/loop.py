@@ -22,12 +22,21 @@ from jaxhil.laws.simulation_base import Gains
 from jaxhil.laws.six_axis_base import SixAxisConstants, SixAxisSignals
 from jaxhil.simulation.sensors import apply_lag, quantise, white_noise
 from jaxhil.sixdof.approach import begin as place
-from jaxhil.sixdof.axes import Axes, Hardware, Motion, actuate, build_axes, enter, lags, sampled
+from jaxhil.sixdof.axes import (
+    Axes,
+    AxisMotion,
+    Hardware,
+    actuate,
+    build_axes,
+    read_samples,
+    start_uniform_motion,
+    static_lags,
+)
 from jaxhil.sixdof.bodies import SHARES
 from jaxhil.sixdof.equations import product, solve
 from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
-from jaxhil.sixdof.kinematics import Kinematics, Moving, moving
-from jaxhil.sixdof.latch import Held, Latch, init_latch, latch_wrench
+from jaxhil.sixdof.kinematics import Kinematics, RigidMotion, to_rigid_motion
+from jaxhil.sixdof.latch import Latch, LatchState, init_latch, latch_wrench
 from jaxhil.sixdof.relative import (
     Pair,
     Pose,
@@ -84,7 +93,7 @@ class Loop(eqx.Module):
     whole: bool = eqx.field(static=True, default=False)
 
 
-class Rig(NamedTuple):
+class RigConstants(NamedTuple):
     """Constants of a batch of runs: bodies, hardware, sensors and compensator."""
 
     bodies: Pair  # bodies of the numerical model
@@ -116,7 +125,7 @@ class RunState(NamedTuple):
     twist: Float[Array, "6 *batch"]  # twist of the numerical model
     hardware: Hardware
     memories: tuple[Memory, ...]  # states of the contact and friction laws
-    held: tuple[Held, ...]  # states of the latches
+    latch_states: tuple[LatchState, ...]  # states of the latches
     controller: NumericalController
     tick: Int[Array, ""]  # index of the next tick
 
@@ -129,7 +138,7 @@ class Tick(NamedTuple):
     twist: Twist  # twist of the hardware at the force sensor's sampling instant
     contact: Wrench  # wrench of contacts and latches at the sampling instant
     forces: tuple[Forces, ...]  # contact forces of each group at the sampling instant
-    held: tuple[Held, ...]  # states of the latches
+    latch_states: tuple[LatchState, ...]  # states of the latches
     signals: SixAxisSignals  # inputs of the compensator
     command: Wrench  # wrench command, which acts on the numerical model
     sent: Float[Array, "6 *batch"]  # pose command after the tick [m, rad]
@@ -138,11 +147,11 @@ class Tick(NamedTuple):
 class Sensed(NamedTuple):
     """Real contact and sensor readings of a tick."""
 
-    motion: Moving  # motion of the hardware at the force sensor's sampling instant
+    motion: RigidMotion  # motion of the hardware at the force sensor's sampling instant
     contact: Wrench  # wrench of contacts and latches at the sampling instant
     forces: tuple[Forces, ...]  # contact forces of each group at the sampling instant
     memories: tuple[Memory, ...]  # next states of the contact laws
-    held: tuple[Held, ...]  # next states of the latches
+    latch_states: tuple[LatchState, ...]  # next states of the latches
     lag: tuple[Wrench, Wrench] | None  # next state of the force sensor's lag
     signals: SixAxisSignals  # inputs of the compensator
 
@@ -155,7 +164,7 @@ def build_loop(scenario: Scenario, **static: Any) -> Loop:
     intervals = int(np.max(slowest / period[None])) + 2
     law = SIX_AXIS_COMPENSATORS[static.get("compensator", "none")]
     # A compensator may estimate the delay of the whole loop, with an error of up to 100 %.
-    whole = int(np.max((slowest + lags(scenario.simulator)) / period[None]))
+    whole = int(np.max((slowest + static_lags(scenario.simulator)) / period[None]))
     loop = Loop(
         ring=1 << intervals.bit_length(),
         controller_ring=1 << (2 * whole + 4).bit_length() if law.reads_pose else 1,
@@ -170,7 +179,7 @@ def build_loop(scenario: Scenario, **static: Any) -> Loop:
     return loop
 
 
-def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
+def build_rig_constants(loop: Loop, gains: Gains, scenario: Scenario) -> RigConstants:
     """Discretise the axes and prepare the compensator; each gain is a scalar or has the batch shape."""
     sensor, period, law = scenario.sensor, scenario.control_period, SIX_AXIS_COMPENSATORS[loop.compensator]
     has_tool = loop.side == "moving"
@@ -185,7 +194,7 @@ def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
     )
     full = {name: jnp.zeros_like(period) + value for name, value in gains.items()}
     constants = controller_constants(scenario, has_tool)
-    return Rig(
+    return RigConstants(
         bodies=scenario.bodies,
         axes=axes,
         kinematics=scenario.kinematics,
@@ -200,7 +209,7 @@ def build_rig(loop: Loop, gains: Gains, scenario: Scenario) -> Rig:
     )
 
 
-def begin(loop: Loop, rig: Rig, states: States) -> RunState:
+def begin(loop: Loop, rig: RigConstants, states: States) -> RunState:
     """Return the state of the loop before tick 0, from the states of the bodies at tick 0.
 
     Before tick 0, the pose command is assumed to move uniformly with the bodies' relative rates.
@@ -211,7 +220,7 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
     history = 0 if rig.kinematics.is_linear else SETTLING_TICKS
     first = law.pose_command(rig.gains, position, rates) - history * stride
     legs, leg_rates = jax.jvp(rig.kinematics.command, (first,), (stride,))
-    hardware = enter(rig.axes, legs, leg_rates, rig.period, loop.hold, loop.latency, loop.ring)
+    hardware = start_uniform_motion(rig.axes, legs, leg_rates, rig.period, loop.hold, loop.latency, loop.ring)
 
     def before(hardware, tick):
         command = rig.kinematics.command(first + (tick + 1).astype(position.dtype) * stride)
@@ -234,7 +243,7 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
         twist=twist,
         hardware=hardware,
         memories=tuple(group.init() for group in rig.groups),
-        held=tuple(init_latch(latch, pose) for latch in rig.latches),
+        latch_states=tuple(init_latch(latch, pose) for latch in rig.latches),
         controller=NumericalController(
             (nothing, nothing) if loop.has_lag else None,
             law.init(rig.prepared, rig.constants, start, loop.controller_ring),
@@ -245,12 +254,12 @@ def begin(loop: Loop, rig: Rig, states: States) -> RunState:
 
 def run(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[RunState, Tick]:
     """Run a batch of scenarios for `ticks` ticks; return the final state and one record per tick."""
-    rig = build_rig(loop, gains, scenario)
+    rig = build_rig_constants(loop, gains, scenario)
     state = begin(loop, rig, scenario.start)
     return lax.scan(lambda state, _: tick(loop, rig, state), state, None, length=ticks)
 
 
-def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
+def tick(loop: Loop, rig: RigConstants, state: RunState) -> tuple[RunState, Tick]:
     """Simulate one control period; return the next state and the record of the tick."""
     sensed, law = sense(loop, rig, state), SIX_AXIS_COMPENSATORS[loop.compensator]
     # The compensator of a sensor without a tool is given the measured pose only if it reads it.
@@ -267,7 +276,7 @@ def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
         twist=sensed.motion.twist,
         contact=sensed.contact,
         forces=sensed.forces,
-        held=sensed.held,
+        latch_states=sensed.latch_states,
         signals=sensed.signals,
         command=command,
         sent=sent,
@@ -276,14 +285,14 @@ def tick(loop: Loop, rig: Rig, state: RunState) -> tuple[RunState, Tick]:
     return after._replace(controller=controller), seen
 
 
-def sense(loop: Loop, rig: Rig, state: RunState) -> Sensed:
+def sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
     """Return the real contact at a tick, and the readings of force sensor and position sensor."""
-    samples = sampled(rig.axes, state.hardware, state.tick)
-    motion = moving(rig.kinematics.coordinates(samples.motion, state.near))
+    samples = read_samples(rig.axes, state.hardware, state.tick)
+    motion = to_rigid_motion(rig.kinematics.coordinates(samples.motion, state.near))
     pose, twist, _ = motion
     contact, forces, memories = contact_wrench(rig.groups, state.memories, pose, twist, rig.period)
     latched = []
-    for latch, before in zip(rig.latches, state.held, strict=True):
+    for latch, before in zip(rig.latches, state.latch_states, strict=True):
         latch_force, latch_state = latch_wrench(latch, before, pose, twist)
         contact = jax.tree.map(jnp.add, contact, latch_force)
         latched.append(latch_state)
@@ -300,7 +309,9 @@ def sense(loop: Loop, rig: Rig, state: RunState) -> Sensed:
     return Sensed(motion, contact, forces, memories, tuple(latched), lag, signals)
 
 
-def integrate(loop: Loop, rig: Rig, state: RunState, command: Wrench) -> tuple[States, Array, Array, Array]:
+def integrate(
+    loop: Loop, rig: RigConstants, state: RunState, command: Wrench
+) -> tuple[States, Array, Array, Array]:
     """Return the numerical model's next states, and its next coordinates, rates and twist (6, *batch)."""
     states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
     return states, *model_motion(rig.bodies, states)
@@ -308,7 +319,7 @@ def integrate(loop: Loop, rig: Rig, state: RunState, command: Wrench) -> tuple[S
 
 def actuated(
     loop: Loop,
-    rig: Rig,
+    rig: RigConstants,
     state: RunState,
     sensed: Sensed,
     model: tuple[States, Array, Array],
@@ -334,7 +345,7 @@ def actuated(
         twist=twist,
         hardware=hardware,
         memories=sensed.memories,
-        held=sensed.held,
+        latch_states=sensed.latch_states,
         controller=state.controller._replace(lag=sensed.lag),
         tick=state.tick + 1,
     )
@@ -368,9 +379,9 @@ def controller_constants(scenario: Scenario, has_tool: bool) -> SixAxisConstants
     return SixAxisConstants(period, mass, inverse, correction)
 
 
-def _measured_pose(loop: Loop, rig: Rig, state: RunState, measured: Array) -> Array:
+def _measured_pose(loop: Loop, rig: RigConstants, state: RunState, measured: Array) -> Array:
     """Convert the measured axis positions to measured coordinates, including noise and rounding."""
-    still = Motion(measured, jnp.zeros_like(measured), None)
+    still = AxisMotion(measured, jnp.zeros_like(measured), None)
     position = rig.kinematics.coordinates(still, state.near).position
     if not loop.has_pose_errors:
         return position
@@ -379,7 +390,12 @@ def _measured_pose(loop: Loop, rig: Rig, state: RunState, measured: Array) -> Ar
 
 
 def _measured_wrench(
-    loop: Loop, rig: Rig, state: RunState, contact: Wrench, motion: Moving, measured: Array | None
+    loop: Loop,
+    rig: RigConstants,
+    state: RunState,
+    contact: Wrench,
+    motion: RigidMotion,
+    measured: Array | None,
 ) -> tuple[Wrench, tuple[Wrench, Wrench] | None]:
     """Return the measured wrench about T's origin, and the next state of the sensor's lag."""
     sensor, last = rig.sensor, state.controller
@@ -402,7 +418,7 @@ def _measured_wrench(
     return wrench, None if last.lag is None else (raw, lagged)
 
 
-def _lagged_reading(rig: Rig, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:
+def _lagged_reading(rig: RigConstants, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:
     """Return the output of the force sensor's lag; its input is interpolated linearly between ticks."""
     first, zero = now == (0 if rig.kinematics.is_linear else SETTLING_TICKS), jnp.zeros_like(rig.period)
 
@@ -420,7 +436,7 @@ def _wrench(channels: Array) -> Wrench:
     return Wrench(vector(channels[:3]), vector(channels[3:]))
 
 
-def _noise(rig: Rig, now: Array, sensor: int) -> Array:
+def _noise(rig: RigConstants, now: Array, sensor: int) -> Array:
     """Return standard normal noise for the six channels of a sensor: 0 for the force, 1 for the pose."""
     channel = jnp.arange(6, dtype=jnp.int32).reshape(6, *[1] * rig.period.ndim)
     count = jnp.broadcast_to(6 * now + channel, (6, *rig.period.shape))

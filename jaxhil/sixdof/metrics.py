@@ -15,18 +15,23 @@ from jaxhil.lanes import safe_sqrt
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.sixdof.bodies import kinetic_energy
 from jaxhil.sixdof.equations import square_root
-from jaxhil.sixdof.first_touch import Meeting, meeting_mass
+from jaxhil.sixdof.first_touch import FirstTouch, first_touch_mass
+from jaxhil.sixdof.ideal_contact import MAX_STEP_PERIODS, states_at
+from jaxhil.sixdof.ideal_contact_integration import (
+    IdealContactModel,
+    error_speed,
+    integrate_until,
+    start_integration,
+)
 from jaxhil.sixdof.loop import Loop
-from jaxhil.sixdof.reference import LONGEST, states_at
 from jaxhil.sixdof.relative import Pair, Pose, States, Twist, mass_matrix, relative
-from jaxhil.sixdof.rollout import CAPTURED, MISS, Episode, rollout
+from jaxhil.sixdof.rollout import CAPTURED, MISS, EpisodeBatch, rollout
 from jaxhil.sixdof.scenario import Scenario
-from jaxhil.sixdof.space import Space, fly, scale, start_flight
 from jaxhil.sixdof.vectors import components, cross, dot
 
 # Minimum energy by which errors are divided, relative to the energy of the approach [1]. Without it, a first
 # touch that only grazes the surface would enlarge all errors.
-LEAST_SHARE = 0.05
+MIN_ENERGY_SHARE = 0.05
 
 
 class Metrics(NamedTuple):
@@ -65,7 +70,7 @@ class Metrics(NamedTuple):
     status: Int[Array, "..."]  # index of `rollout.STATUS_NAMES`
 
 
-class Moment(NamedTuple):
+class Snapshot(NamedTuple):
     """Twist, kinetic energy and mass matrix of the two bodies at one instant."""
 
     twist: Twist  # twist of chaser frame C relative to target frame T
@@ -73,7 +78,7 @@ class Moment(NamedTuple):
     mass: Float[Array, "..."]  # relative mass matrix, (6, 6, episodes, *batch)
 
 
-class Result(NamedTuple):
+class EvaluationResult(NamedTuple):
     """Metrics and final states of a batch of runs on the rig."""
 
     metrics: Metrics
@@ -81,39 +86,43 @@ class Result(NamedTuple):
     final_time: Float[Array, "*batch"]  # duration of each run [s]
 
 
-def evaluate(loop: Loop, gains: Gains, scenario: Scenario) -> Result:
+def evaluate(loop: Loop, gains: Gains, scenario: Scenario) -> EvaluationResult:
     """Simulate a batch of scenarios on the rig, and compare their episodes with the ideal contacts.
 
     Each of the compensator's `gains` is a scalar or has the batch shape.
     """
     outcome = rollout(loop, gains, scenario)
-    return Result(judge(scenario.bodies, outcome.episodes), outcome.final, outcome.final_time)
+    return EvaluationResult(
+        compare_with_ideal(scenario.bodies, outcome.episodes), outcome.final, outcome.final_time
+    )
 
 
-def reference_final(scenario: Scenario, time: Float[Array, "*batch"]) -> States:
+def compute_ideal_states(scenario: Scenario, time: Float[Array, "*batch"]) -> States:
     """Return the bodies' states in the ideal contact at a `time` [s] after the start of the scenario."""
-    space = Space(scenario.bodies, scenario.groups, scenario.latches)
-    longest = LONGEST * scenario.control_period
-    flight = start_flight(space, scenario.start, jnp.minimum(longest, time))
-    return fly(space, flight, time, longest, scale(space, scenario.start)).states
+    contact_model = IdealContactModel(scenario.bodies, scenario.groups, scenario.latches)
+    longest = MAX_STEP_PERIODS * scenario.control_period
+    integration = start_integration(contact_model, scenario.start, jnp.minimum(longest, time))
+    return integrate_until(
+        contact_model, integration, time, longest, error_speed(contact_model, scenario.start)
+    ).states
 
 
-def judge(bodies: Pair, episodes: Episode) -> Metrics:
+def compare_with_ideal(bodies: Pair, episodes: EpisodeBatch) -> Metrics:
     """Return the metrics of all episodes, (episodes, *batch); each run has its own `bodies`, (*batch)."""
     bodies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, episodes.status.shape), bodies)
-    past, meeting = episodes.past, episodes.meeting
-    expected_states = states_at(bodies, past, episodes.lasted)
-    start, end, expected, before = _moments(
-        bodies, [episodes.start, episodes.end, expected_states, meeting.states]
+    summary, first_touch = episodes.summary, episodes.first_touch
+    expected_states = states_at(bodies, summary, episodes.elapsed)
+    start, end, expected, before = _take_snapshots(
+        bodies, [episodes.start, episodes.end, expected_states, first_touch.states]
     )
-    mass, (pose, _) = meeting_mass(bodies, meeting), relative(bodies, meeting.states)
-    speed = _closing(pose, meeting, before.twist)
-    least = LEAST_SHARE * _square(before.mass, _stacked(before.twist)) / 2
+    mass, (pose, _) = first_touch_mass(bodies, first_touch), relative(bodies, first_touch.states)
+    speed = _approach_speed(pose, first_touch, before.twist)
+    least = MIN_ENERGY_SHARE * _square(before.mass, _stacked(before.twist)) / 2
     approach = jnp.maximum(mass * speed**2 / 2, least)
     change, changed = end.energy - start.energy, expected.energy - start.energy
     parts = _twist_parts(expected.mass, end.twist, expected.twist, before.twist)
-    touched = (episodes.status != MISS) & (past.touches > 0)
-    once, only = touched & (episodes.touches == 1), touched & (past.touches == 1)
+    touched = (episodes.status != MISS) & (summary.touches > 0)
+    touched_once, is_single = touched & (episodes.touches == 1), touched & (summary.touches == 1)
 
     def of(is_valid: Array, value: Array) -> Array:
         return jnp.where(is_valid, value, jnp.nan)
@@ -121,47 +130,47 @@ def judge(bodies: Pair, episodes: Episode) -> Metrics:
     return Metrics(
         of(touched, (change - changed) / approach),
         *(of(touched, part) for part in parts),
-        restitution=of(once & only, -_closing(pose, meeting, end.twist) / speed),
-        reference_restitution=of(only, -_closing(pose, meeting, expected.twist) / speed),
+        restitution=of(touched_once & is_single, -_approach_speed(pose, first_touch, end.twist) / speed),
+        reference_restitution=of(is_single, -_approach_speed(pose, first_touch, expected.twist) / speed),
         effective_mass=of(touched, mass),
         approach_velocity=of(touched, speed),
-        point=of(touched[None], components(meeting.point)),
-        normal=of(touched[None], components(meeting.normal)),
+        point=of(touched[None], components(first_touch.point)),
+        normal=of(touched[None], components(first_touch.normal)),
         energy_change=change,
         reference_energy_change=changed,
         peak_force=episodes.peak_force,
         peak_command=episodes.peak_command,
-        reference_peak_force=past.peak_force,
+        reference_peak_force=summary.peak_force,
         peak_moment=episodes.peak_moment,
-        reference_peak_moment=past.peak_moment,
+        reference_peak_moment=summary.peak_moment,
         duration=episodes.duration,
-        reference_duration=of(jnp.isfinite(past.time), past.touched),
+        reference_duration=of(jnp.isfinite(summary.time), summary.touch_duration),
         touches=episodes.touches,
-        reference_touches=past.touches,
+        reference_touches=summary.touches,
         penetration=episodes.penetration,
         captured=episodes.status == CAPTURED,
-        reference_captured=past.captured,
+        reference_captured=summary.captured,
         status=episodes.status,
     )
 
 
-def _closing(pose: Pose, meeting: Meeting, twist: Twist) -> Array:
+def _approach_speed(pose: Pose, first_touch: FirstTouch, twist: Twist) -> Array:
     """Return the approach speed [m/s] at the first touch's point, along its normal, for a pose and twist."""
-    velocity = twist.linear + cross(twist.angular, meeting.point - pose.position)
-    return -dot(meeting.normal, velocity)
+    velocity = twist.linear + cross(twist.angular, first_touch.point - pose.position)
+    return -dot(first_touch.normal, velocity)
 
 
-def _moments(bodies: Pair, states: list[States]) -> list[Moment]:
+def _take_snapshots(bodies: Pair, states: list[States]) -> list[Snapshot]:
     """Return the twist, energy and mass matrix that belong to each of the states."""
 
     # The compiler would unroll a Python loop, fuse its computations and repeat them.
-    def moment(_, states: States) -> tuple[None, Moment]:
+    def snapshot(_, states: States) -> tuple[None, Snapshot]:
         _, twist = relative(bodies, states)
         energies = [kinetic_energy(*item) for item in zip(bodies, states, strict=True)]
-        return None, Moment(twist, energies[0] + energies[1], mass_matrix(bodies, states))
+        return None, Snapshot(twist, energies[0] + energies[1], mass_matrix(bodies, states))
 
-    _, moments = lax.scan(moment, None, jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
-    return [jax.tree.map(lambda leaf, at=at: leaf[at], moments) for at in range(len(states))]
+    _, snapshots = lax.scan(snapshot, None, jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
+    return [jax.tree.map(lambda leaf, at=at: leaf[at], snapshots) for at in range(len(states))]
 
 
 def _twist_parts(matrix: Array, after: Twist, expected: Twist, before: Twist) -> tuple[Array, ...]:

@@ -5,11 +5,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxhil.laws.impulse_ledger.six_axes.reading.rig import LONGEST_RECALL
+from jaxhil.laws.impulse_ledger.six_axes.reading.rig import MAX_RECALL
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.rig.six_axes.registry import ModelConstants
 from jaxhil.simulation.jax_environment import jax_context
-from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.building import build_scenarios, make_loop
 from jaxhil.sixdof.controller_record import known_constants
 
 
@@ -18,11 +18,11 @@ def model_constants(mechanism: SixAxisMechanism) -> dict[str, Any]:
     with jax_context():
         scenario = build_scenarios(mechanism)
         # The delay line of a compensator that reads the pose limits the delay.
-        loop = loop_of(mechanism, "impulse_ledger", scenario)
+        loop = make_loop(mechanism, "impulse_ledger", scenario)
         constants = jax.device_get(known_constants(loop, scenario))
     mass, inverse, correction = (
         np.asarray(matrix)[..., 0].tolist()
         for matrix in (constants.mass_matrix, constants.inverse_mass, constants.tool_correction)
     )
-    delay = min(loop.controller_ring - 2.0, LONGEST_RECALL) * mechanism.rig.control_period
+    delay = min(loop.controller_ring - 2.0, MAX_RECALL) * mechanism.rig.control_period
     return ModelConstants(mass, inverse, correction, delay)._asdict()

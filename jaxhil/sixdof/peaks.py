@@ -14,12 +14,12 @@ class Peak(NamedTuple):
     step: Float[Array, "*batch"]  # time between the last two samples [s]
 
 
-def no_peak(zero: Float[Array, "*batch"]) -> Peak:
+def zero_peak(zero: Float[Array, "*batch"]) -> Peak:
     """Return the initial `Peak`, whose value and samples are 0 in every lane."""
     return Peak(zero, (zero, zero), zero)
 
 
-def higher(peak: Peak, now: Array, step: Array, anew: Bool[Array, "*batch"] | bool = False) -> Peak:
+def update_peak(peak: Peak, now: Array, step: Array, anew: Bool[Array, "*batch"] | bool = False) -> Peak:
     """Update the peak with the sample `now`, which follows a time `step` [s] after the last sample.
 
     A peak between samples is the vertex of a parabola through three samples, all greater than 0. `anew`

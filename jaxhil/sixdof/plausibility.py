@@ -20,7 +20,7 @@ from jaxhil.sixdof.forces import deepest
 from jaxhil.sixdof.latch import init_latch, latch_wrench
 from jaxhil.sixdof.loop import model_motion
 from jaxhil.sixdof.relative import relative
-from jaxhil.sixdof.rollout import STRETCH
+from jaxhil.sixdof.rollout import SEGMENT_TICKS
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.stewart import Stewart, condition
 from jaxhil.sixdof.vectors import dot
@@ -29,7 +29,7 @@ MAX_TICKS = 1e7  # maximum number of ticks of a run
 MAX_ATTITUDE = 1.0  # rad; maximum angle between the frames of chaser and target at the start
 MAX_CONDITION_NUMBER = 100.0  # maximum condition number of a hexapod's Jacobian, with lengths in m
 # Number of control periods between checks of a run. In this time, shapes must not pass through each other.
-CHECK_PERIODS = STRETCH
+CHECK_PERIODS = SEGMENT_TICKS
 
 
 class StartValues(NamedTuple):

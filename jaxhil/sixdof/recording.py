@@ -11,21 +11,21 @@ import numpy as np
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, supported_options
 from jaxhil.sixdof.bodies import angular_velocity
-from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.building import build_scenarios, make_loop
 from jaxhil.sixdof.building_contacts import candidate_names
 from jaxhil.sixdof.forces import ContactGroup, Forces
+from jaxhil.sixdof.ideal_contact_integration import IdealContactModel, sample_ideal_contact
 from jaxhil.sixdof.loop import Loop, run
 from jaxhil.sixdof.relative import Pair, States, coordinates, relative
 from jaxhil.sixdof.rollout import rollout
 from jaxhil.sixdof.scenario import Scenario
-from jaxhil.sixdof.space import Space, follow
 from jaxhil.sixdof.vectors import Vector
 
 # Minimum number of ticks of a compiled program. Numbers are powers of two, so that runs can share programs.
 MIN_TICKS = 256
 
 
-class Recorded(NamedTuple):
+class RunRecord(NamedTuple):
     """Signals of the rig and of the ideal contact at all ticks of a run, in SI units.
 
     Coordinates (p, theta), twists (v, w) and wrenches (force, moment about the origin) are in target frame T.
@@ -36,13 +36,13 @@ class Recorded(NamedTuple):
         time: Time since the start of the run [s], (ticks,).
         desired: Coordinates of the numerical model, (ticks, 6).
         actual: Coordinates of the hardware, (ticks, 6).
-        in_space: Coordinates in the ideal contact, (ticks, 6).
+        ideal: Coordinates in the ideal contact, (ticks, 6).
         twist_desired: Twist of the numerical model, (ticks, 6).
         twist_actual: Twist of the hardware, (ticks, 6).
-        twist_in_space: Twist in the ideal contact, (ticks, 6).
+        twist_ideal: Twist in the ideal contact, (ticks, 6).
         wrench: Wrench of the real contact, (ticks, 6).
         command: Wrench command, which acts on the numerical model, (ticks, 6).
-        wrench_in_space: Wrench of the ideal contact, (ticks, 6).
+        wrench_ideal: Wrench of the ideal contact, (ticks, 6).
         target: Motion of the numerical model's target, (ticks, 13).
         chaser: Motion of the numerical model's chaser, (ticks, 13).
         names: Names of the contact candidates (pairs of shapes that may touch).
@@ -57,13 +57,13 @@ class Recorded(NamedTuple):
     time: np.ndarray
     desired: np.ndarray
     actual: np.ndarray
-    in_space: np.ndarray
+    ideal: np.ndarray
     twist_desired: np.ndarray
     twist_actual: np.ndarray
-    twist_in_space: np.ndarray
+    twist_ideal: np.ndarray
     wrench: np.ndarray
     command: np.ndarray
-    wrench_in_space: np.ndarray
+    wrench_ideal: np.ndarray
     target: np.ndarray
     chaser: np.ndarray
     names: tuple[str, ...]
@@ -78,20 +78,21 @@ COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
 WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 MOTION = ("x", "y", "z", "qw", "qx", "qy", "qz", *TWIST)
-# For each field of `Recorded`, the suffixes of its columns in the CSV file.
+# For each field of `RunRecord`, the suffixes of its columns in the CSV file.
 COLUMNS: Mapping[str, tuple[str, ...]] = {
-    **dict.fromkeys(("desired", "actual", "in_space"), COORDINATES),
-    **dict.fromkeys(("twist_desired", "twist_actual", "twist_in_space"), TWIST),
-    **dict.fromkeys(("wrench", "command", "wrench_in_space"), WRENCH),
+    **dict.fromkeys(("desired", "actual", "ideal"), COORDINATES),
+    **dict.fromkeys(("twist_desired", "twist_actual", "twist_ideal"), TWIST),
+    **dict.fromkeys(("wrench", "command", "wrench_ideal"), WRENCH),
     **dict.fromkeys(("target", "chaser"), MOTION),
 }
 
 
-def table(recorded: Recorded) -> dict[str, np.ndarray]:
+def to_columns(recorded: RunRecord) -> dict[str, np.ndarray]:
     """Split the record into columns (ticks,) by name, such as `desired_x`, `wrench_fz` and `depth_tip`."""
     columns = {"time": recorded.time}
     for name, suffixes in COLUMNS.items():
-        columns |= {f"{name}_{suffix}": getattr(recorded, name)[:, i] for i, suffix in enumerate(suffixes)}
+        column = name.replace("ideal", "in_space")  # name in CSV files
+        columns |= {f"{column}_{suffix}": getattr(recorded, name)[:, i] for i, suffix in enumerate(suffixes)}
     for key in ("force", "depth"):
         columns |= {f"{key}_{name}": getattr(recorded, key)[:, i] for i, name in enumerate(recorded.names)}
     return columns
@@ -99,15 +100,15 @@ def table(recorded: Recorded) -> dict[str, np.ndarray]:
 
 def record(
     mechanism: SixAxisMechanism, compensator: str, gains: dict[str, Any], seed: int, duration: float
-) -> Recorded:
+) -> RunRecord:
     """Simulate the nominal run of a mechanism for a `duration` [s], and record all ticks."""
     scenario = build_scenarios(mechanism, seed=seed)
-    return _recorded(mechanism, loop_of(mechanism, compensator, scenario), gains, scenario, duration)
+    return _recorded(mechanism, make_loop(mechanism, compensator, scenario), gains, scenario, duration)
 
 
 def record_scenario(
     mechanism: SixAxisMechanism, loop: Loop, gains: dict[str, Any], scenario: Scenario
-) -> Recorded:
+) -> RunRecord:
     """Simulate the whole run of a mechanism's scenario (a batch with one lane), and record all ticks."""
     (duration,) = np.asarray(_duration()(loop, gains, scenario))
     return _recorded(mechanism, loop, gains, scenario, float(duration))
@@ -115,13 +116,13 @@ def record_scenario(
 
 def _recorded(
     mechanism: SixAxisMechanism, loop: Loop, gains: dict[str, Any], scenario: Scenario, duration: float
-) -> Recorded:
+) -> RunRecord:
     """Simulate a scenario with one lane for a `duration` [s], and record all ticks."""
     period = float(scenario.control_period[0])
     ticks = max(round(duration / period), 2)
     length = max(MIN_TICKS, 1 << (ticks - 1).bit_length())
     arrays = _run(loop, length, gains, scenario)
-    return Recorded(
+    return RunRecord(
         time=np.arange(ticks) * period,
         names=candidate_names(mechanism),
         groups=scenario.groups,
@@ -154,23 +155,26 @@ def motion(bodies: Pair, states: States) -> tuple[Any, ...]:
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _run(loop: Loop, ticks: int, gains: dict[str, Any], scenario: Scenario) -> dict[str, Any]:
-    """Simulate a run and the ideal contact; return the arrays of `Recorded`, (ticks, ..., lanes)."""
+    """Simulate a run and the ideal contact; return the arrays of `RunRecord`, (ticks, ..., lanes)."""
     _, seen = run(loop, gains, scenario, ticks)
-    space, period = Space(scenario.bodies, scenario.groups, scenario.latches), scenario.control_period
-    _, free = follow(space, scenario.start, period, ticks, period)
+    contact_model, period = (
+        IdealContactModel(scenario.bodies, scenario.groups, scenario.latches),
+        scenario.control_period,
+    )
+    _, free = sample_ideal_contact(contact_model, scenario.start, period, ticks, period)
     desired, twist, target, chaser = jax.vmap(lambda states: motion(scenario.bodies, states))(seen.states)
     arrays = {
         "desired": desired,
         "actual": _stacked(coordinates(seen.pose, seen.twist)[0], 1),
-        "in_space": _stacked(coordinates(free.pose, free.twist)[0], 1),
+        "ideal": _stacked(coordinates(free.pose, free.twist)[0], 1),
         "twist_desired": twist,
         "twist_actual": _stacked(seen.twist, 1),
-        "twist_in_space": _stacked(free.twist, 1),
+        "twist_ideal": _stacked(free.twist, 1),
         "target": target,
         "chaser": chaser,
         "wrench": _stacked(seen.contact, 1),
         "command": _stacked(seen.command, 1),
-        "wrench_in_space": _stacked(free.wrench, 1),
+        "wrench_ideal": _stacked(free.wrench, 1),
     }
     nothing = {name: jnp.zeros((ticks, 0, *more, *period.shape)) for name, more in _OF_CANDIDATES.items()}
     candidates = [nothing, *map(_of_candidates, seen.forces)]

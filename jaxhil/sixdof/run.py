@@ -18,12 +18,12 @@ from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, jax_context, supported_options
 from jaxhil.simulation.run import check_seed
-from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.building import build_scenarios, make_loop
 from jaxhil.sixdof.loop import Loop
-from jaxhil.sixdof.meaning import Meaning, meaning
-from jaxhil.sixdof.metrics import Metrics, evaluate, reference_final
+from jaxhil.sixdof.mechanism_summary import SixAxisSummary, summarise_six_axes
+from jaxhil.sixdof.metrics import Metrics, compute_ideal_states, evaluate
 from jaxhil.sixdof.plausibility import check_scenario
-from jaxhil.sixdof.recording import Recorded, motion, record, table
+from jaxhil.sixdof.recording import RunRecord, motion, record, to_columns
 from jaxhil.sixdof.relative import Pair, States, effective_mass
 from jaxhil.sixdof.rollout import STATUS_NAMES
 from jaxhil.sixdof.scenario import Scenario
@@ -122,7 +122,7 @@ class SixAxisRun:
         status: Status of the first episode that did not end with "rebounded" or "captured"; if there is no
             such episode, status of the last episode.
         final: Motion of the numerical model at the end of the run.
-        meaning: Summary of the mechanism.
+        summary: Summary of the mechanism.
     """
 
     mechanism: SixAxisMechanism = field(repr=False)
@@ -132,15 +132,15 @@ class SixAxisRun:
     episodes: tuple[Episode, ...]
     status: str
     final: Final
-    meaning: Meaning
+    summary: SixAxisSummary
 
     @cached_property
     def reference_final(self) -> Final:
         """Motion of the bodies in the ideal contact from the same start, at the time of `final`."""
-        return final_in_space(self.mechanism, self.final.time)
+        return compute_ideal_final(self.mechanism, self.final.time)
 
     @cached_property
-    def ticks(self) -> Recorded:
+    def ticks(self) -> RunRecord:
         """Signals at all ticks of the run, computed when this attribute is first used."""
         with jax_context():
             return record(self.mechanism, self.compensator, self.gains, self.seed, self.final.time)
@@ -156,7 +156,7 @@ class SixAxisRun:
         Raises:
             InputError: The file cannot be written.
         """
-        write_csv(path, {name: column.tolist() for name, column in table(self.ticks).items()})
+        write_csv(path, {name: column.tolist() for name, column in to_columns(self.ticks).items()})
 
 
 def simulate_six_axes(
@@ -175,7 +175,7 @@ def simulate_six_axes(
     with jax_context():
         scenario = build_scenarios(mechanism, seed=number)
         check_scenario(mechanism, scenario)
-        loop = loop_of(mechanism, name, scenario)
+        loop = make_loop(mechanism, name, scenario)
         arrays = {key: jnp.asarray(value) for key, value in values.items()}
         outcome = jax.device_get(_compiled()(loop, arrays, scenario))
     return _result(mechanism, name, values, number, outcome)
@@ -186,7 +186,7 @@ def _result(
 ) -> SixAxisRun:
     """Build the `SixAxisRun` from the arrays that the compiled simulation returns (`outcome`)."""
     metrics, time, final, tangential = outcome
-    check_followed(mechanism, metrics)
+    check_integrated(mechanism, metrics)
     episodes = tuple(
         _episode(metrics, slot)
         for slot in range(metrics.status.shape[0])
@@ -195,7 +195,7 @@ def _result(
     bad = [episode.status for episode in episodes if episode.status not in GOOD_STATUSES]
     first = episodes[0]
     duration = math.nan if metrics.reference_captured[0, 0] else first.reference_duration
-    summary = meaning(
+    summary = summarise_six_axes(
         mechanism, first.effective_mass, float(tangential[0]), duration,
         first.reference_peak_force, first.reference_restitution,
     )  # fmt: skip
@@ -213,18 +213,18 @@ def _result(
         episodes=episodes,
         status=status,
         final=_final(float(time[0]), final),
-        meaning=summary,
+        summary=summary,
     )
 
 
-def final_in_space(mechanism: SixAxisMechanism, time: float) -> Final:
+def compute_ideal_final(mechanism: SixAxisMechanism, time: float) -> Final:
     """Return the motion of the bodies in the ideal contact, at a `time` [s] after the start."""
     with jax_context():
         scenario = build_scenarios(mechanism)
         return _final(time, jax.device_get(_ideal_motion(scenario, np.array([time]))))
 
 
-def check_followed(mechanism: SixAxisMechanism, metrics: Metrics) -> None:
+def check_integrated(mechanism: SixAxisMechanism, metrics: Metrics) -> None:
     """Raise `InputError`, with advice, if the ideal contact could not be integrated to its end."""
     if not np.all(np.isfinite(metrics.reference_duration)):
         raise InputError(f"{mechanism.name}: {_stiffest(mechanism)}")
@@ -274,7 +274,7 @@ def _run(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Any, ..
 @jax.jit
 def _ideal_motion(scenario: Scenario, time: Any) -> tuple[Any, ...]:
     """Return the arrays of `_motion` for the ideal contact at a `time` [s]."""
-    return _motion(scenario.bodies, reference_final(scenario, time))
+    return _motion(scenario.bodies, compute_ideal_states(scenario, time))
 
 
 def _tangential_mass(scenario: Scenario, metrics: Metrics) -> Any:

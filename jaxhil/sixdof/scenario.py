@@ -10,9 +10,9 @@ from jaxtyping import Array, Float, UInt32
 
 from jaxhil.simulation.scenario import MotionSimulatorBatch
 from jaxhil.sixdof.forces import ContactGroup
+from jaxhil.sixdof.ideal_contact import IdealContactRecord
 from jaxhil.sixdof.kinematics import Kinematics
 from jaxhil.sixdof.latch import Latch
-from jaxhil.sixdof.reference import Reference
 from jaxhil.sixdof.relative import Pair, States
 from jaxhil.sixdof.sensor import Sensor
 
@@ -31,4 +31,4 @@ class Scenario(NamedTuple):
     duration: Float[Array, "*batch"]  # maximum duration of the run [s], which is rounded to ticks
     key: UInt32[Array, "2 *batch"]  # key of the sensors' noise
     # ideal contact from `start`; None: every run computes it
-    ideal_contact: Reference | None = None
+    ideal_contact: IdealContactRecord | None = None

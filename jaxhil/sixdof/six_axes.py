@@ -68,7 +68,7 @@ class SixAxes(RigModel):
 
     def loop(self, mechanism: SixAxisMechanism, compensator: str, scenarios: Scenario, **parts: bool) -> Loop:
         """Build the loop that runs all the scenarios; `parts`, the options of one-axis loops, are ignored."""
-        return building.loop_of(mechanism, compensator, scenarios)
+        return building.make_loop(mechanism, compensator, scenarios)
 
     def runs(self, mechanism: SixAxisMechanism) -> int:
         """Return the number of evaluated episodes (contacts with all their touches) in a scenario."""
@@ -92,7 +92,7 @@ class SixAxes(RigModel):
 
     def run(self, loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
         """Simulate a batch of scenarios, and compare the episodes with the ideal contacts."""
-        return outcome_of(evaluate(loop, gains, _separate_loops(scenario)).metrics, scenario)
+        return to_outcome(evaluate(loop, gains, _separate_loops(scenario)).metrics, scenario)
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
         """Return the scenarios with a duration of 0 in the `idle` lanes."""
@@ -141,20 +141,23 @@ def _compute_ideal_contacts(_: SixAxes, scenarios: Any) -> tuple[Array, ...]:
     return tuple(map_tiles(lambda _, tile: jax.tree.leaves(compute_ideal_contact(tile)), (), scenarios))
 
 
-def outcome_of(episodes: Metrics, scenario: Scenario) -> Outcome:
+def to_outcome(episodes: Metrics, scenario: Scenario) -> Outcome:
     """Convert the metrics of episodes to an outcome, whose arrays contain every episode twice.
 
     The first half has the energy errors, the second half the twist errors. The chatter is 0.
     """
     # A draw that misses the target has no contact to evaluate.
     begins = jnp.isfinite(scenario.start.chaser.position.z)
-    wanted = (episodes.status != MISS) & begins[None]
+    is_scheduled = (episodes.status != MISS) & begins[None]
     is_finite = jnp.isfinite(episodes.energy_error) & jnp.isfinite(episodes.twist_error)
     status = jnp.full_like(episodes.status, one_axis.DIVERGED)
     for code, one_axis_code in STATUSES.items():
         status = jnp.where(episodes.status == code, one_axis_code, status)
-    status = jnp.where(wanted, jnp.where((status == one_axis.OK) & ~is_finite, one_axis.NON_FINITE, status),
-                       one_axis.NOT_REACHED)  # fmt: skip
+    status = jnp.where(
+        is_scheduled,
+        jnp.where((status == one_axis.OK) & ~is_finite, one_axis.NON_FINITE, status),
+        one_axis.NOT_REACHED,
+    )
     zero = jnp.zeros_like(episodes.energy_error)
     metrics = one_axis.Metrics(
         restitution=episodes.restitution,
@@ -182,9 +185,9 @@ def outcome_of(episodes: Metrics, scenario: Scenario) -> Outcome:
         error=episodes.energy_error,
         peak_ratio=ratio,
         chatter=zero,
-        wanted=wanted,
+        is_scheduled=is_scheduled,
         good=status == one_axis.OK,
-        unlike=(status == one_axis.OK)
+        is_unlike_ideal=(status == one_axis.OK)
         & is_contact_out_of_bounds(
             episodes.peak_force,
             episodes.reference_peak_force,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxhil.sixdof.axes import Motion
+from jaxhil.sixdof.axes import AxisMotion
 from jaxhil.sixdof.equations import solve
 from jaxhil.sixdof.kinematics import Kinematics
 from jaxhil.sixdof.rotations import exponential, left_jacobian, rotate
@@ -51,13 +51,13 @@ class Stewart(Kinematics):
         slopes = jacobian(self, at)
         rate = solve(slopes, motion.rate[:, None])[:, 0]
         if motion.acceleration is None:
-            return Motion(at, rate, None)
+            return AxisMotion(at, rate, None)
 
         def leg_rates(at: Array) -> Array:
             return jax.jvp(self.command, (at,), (rate,))[1]
 
         curvature = jax.jvp(leg_rates, (at,), (rate,))[1]
-        return Motion(at, rate, solve(slopes, (motion.acceleration - curvature)[:, None])[:, 0])
+        return AxisMotion(at, rate, solve(slopes, (motion.acceleration - curvature)[:, None])[:, 0])
 
 
 def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 6 *batch"]:

@@ -30,7 +30,7 @@ namespace {
 constexpr int W = LANES;
 constexpr int JUDGED_EVERY = 16;         // ticks between looks for time-outs and divergence
 constexpr double APPROACH = 0.02;        // s of free approach before a contact
-constexpr double LONGEST_CONTACT = 10;   // s
+constexpr double MAX_CONTACT = 10;   // s
 constexpr double RUNAWAY = 1e3;          // of the first approach speed
 constexpr double FADED = 1e-6;           // of the command's peak
 constexpr double LONG_QUIET = 1e6;       // ticks without a touch, before the first one
@@ -385,7 +385,7 @@ private:
     void judge(int64_t tick) {
         for (int l = 0; l < W; ++l) {
             if (!b.active[l]) continue;
-            const double limit = LONGEST_CONTACT / b.period[l], speed = std::fabs(b.velocity[l]);
+            const double limit = MAX_CONTACT / b.period[l], speed = std::fabs(b.velocity[l]);
             const bool waiting = b.elapsed[l] == 0 && double(tick + 1 - b.begun_at[l]) > limit;
             const int status = !std::isfinite(speed) ? NON_FINITE
                 : speed > RUNAWAY * p.velocity[number(l)] ? DIVERGED

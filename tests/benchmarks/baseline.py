@@ -15,10 +15,10 @@ import numpy as np
 
 from jaxhil.contact.laws import KelvinVoigt
 from jaxhil.laws.response_error.simulation import ResponseError
+from jaxhil.simulation.contact_tracking import build_end_conditions
 from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.metrics import NOT_REACHED
 from jaxhil.simulation.scenario import Scenario
-from jaxhil.simulation.watch import build_end_conditions
 
 SOURCE = Path(__file__).with_name("baseline.cpp")
 FLAGS = ("-O3", "-march=native", "-std=c++17", "-pthread")

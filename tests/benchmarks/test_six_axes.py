@@ -21,8 +21,8 @@ from jaxhil.mechanism.file import load_any
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.evaluation import TILE_SIZE
 from jaxhil.simulation.jax_environment import SIX_AXIS_OPTIONS, supported_options
-from jaxhil.sixdof.building import build_scenarios, loop_of
-from jaxhil.sixdof.loop import begin, build_rig, tick
+from jaxhil.sixdof.building import build_scenarios, make_loop
+from jaxhil.sixdof.loop import begin, build_rig_constants, tick
 from jaxhil.sixdof.shapes import Drogue
 
 pytestmark = pytest.mark.benchmark
@@ -52,7 +52,7 @@ def build_loop_and_scenarios():
     drogue = Drogue(shape.half_angle, shape.bottom_radius, shape.bottom)
     spheres = type(group.candidates)(group.candidates.centre, group.candidates.radius, drogue)
     group = type(group)(spheres, group.law, group.parameters, group.friction)
-    loop = loop_of(mechanism, "none", scenario)
+    loop = make_loop(mechanism, "none", scenario)
     fixed = type(loop)(
         **{name: getattr(loop, name) for name in loop.__dataclass_fields__} | {"side": "fixed"}
     )
@@ -136,7 +136,7 @@ def test_six_axis_simulation_speed_is_compared_with_cpp_and_mujoco(tmp_path, cap
     subprocess.run(["g++", *FLAGS, source, "-o", str(tmp_path / "six_axes.so")], check=True)
     library = compiled(tmp_path)
     loop, scenario = build_loop_and_scenarios()
-    rig = jax.jit(build_rig, static_argnums=0)(loop, {}, scenario)
+    rig = jax.jit(build_rig_constants, static_argnums=0)(loop, {}, scenario)
     run = jax.jit(begin, static_argnums=0)(loop, rig, scenario.start)
     arrays = inputs(loop, rig, run)
     first = arrays["states"].copy()

@@ -16,7 +16,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from jaxhil.mechanism.file import load_any
 from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, supported_options
-from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.building import build_scenarios, make_loop
 from jaxhil.sixdof.metrics import evaluate
 
 pytestmark = pytest.mark.benchmark
@@ -60,7 +60,7 @@ def test_six_axis_program_of_twelve_shape_pairs_compiles_within_time_limit(capsy
     mechanism = load_any("petals", []).mechanism
     scenario = build_scenarios(mechanism)
     assert sum(group.parameters.damping.shape[0] for group in scenario.groups) == 12
-    loop = loop_of(mechanism, "phase_lead", scenario)
+    loop = make_loop(mechanism, "phase_lead", scenario)
 
     def errors(leads):
         gains = {"phase_lead": leads[:, None], "lead_filter": jnp.array(1e-3)}

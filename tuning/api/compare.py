@@ -25,7 +25,7 @@ from tuning.api.options import (
 )
 
 if TYPE_CHECKING:
-    from tuning.benchmark.comparison import LawMetrics
+    from tuning.benchmark.comparison import CompensatorMetrics
     from tuning.caches.checkpoints import Checkpoints
 
 
@@ -140,10 +140,10 @@ def compare(
     settings.check()
     arguments.check_booleans(progress=progress)
     check_distinct_names(loaded)
-    results: dict[str, dict[str, LawMetrics]] = {entry.mechanism.name: {} for entry in loaded}
+    results: dict[str, dict[str, CompensatorMetrics]] = {entry.mechanism.name: {} for entry in loaded}
     with jax_context(), terminal.show_progress(len(loaded) * len(settings.laws), "results", progress) as bar:
         for result in compare_each(loaded, settings, 0, bar):
-            results[result.mechanism][result.law] = result
+            results[result.mechanism][result.compensator] = result
         boards = [build_board(entry, settings, results[entry.mechanism.name]) for entry in loaded]
     return boards if is_list else boards[0]
 
@@ -165,9 +165,9 @@ def compare_each(
         checkpoints: results of finished work, which is not repeated; new results are added.
 
     Yields:
-        Results of `tuning.benchmark.comparison.compare_laws`.
+        Results of `tuning.benchmark.comparison.compare_compensators`.
     """
-    from tuning.benchmark.comparison import CompareSettings, compare_laws
+    from tuning.benchmark.comparison import CompareSettings, compare_compensators
     from tuning.caches.checkpoints import NO_CHECKPOINTS
 
     settings = CompareSettings(
@@ -180,7 +180,7 @@ def compare_each(
     for entry in loaded:
         mechanism_summary.check_can_be_simulated(entry.mechanism, entry.label)
     mechanisms = [entry.mechanism for entry in loaded]
-    yield from compare_laws(
+    yield from compare_compensators(
         mechanisms,
         options.laws,
         settings,
@@ -204,7 +204,7 @@ def check_distinct_names(loaded: Sequence[LoadedMechanism]) -> None:
 
 
 def build_board(
-    entry: LoadedMechanism, options: CompareOptions, results: "Mapping[str, LawMetrics]"
+    entry: LoadedMechanism, options: CompareOptions, results: "Mapping[str, CompensatorMetrics]"
 ) -> Board:
     """Return the comparison for one mechanism, from the results of the finished compensators."""
     from jaxhil.laws.compensators import COMPENSATORS
@@ -217,8 +217,8 @@ def build_board(
         "file": entry.label,
         "laws": [
             {
-                "law": result.law,
-                "knows": list(COMPENSATORS[result.law].knows),
+                "law": result.compensator,
+                "knows": list(COMPENSATORS[result.compensator].knows),
                 "gains": result.gains,
                 "figures": result.figures,
             }
@@ -227,7 +227,7 @@ def build_board(
         "winners": best,
     }
     figures = {
-        result.law: {
+        result.compensator: {
             gains_name: SimpleNamespace(
                 **{name: ComparedMetric(*estimate[:3]) for name, estimate in metrics.items()}
             )
@@ -235,7 +235,7 @@ def build_board(
         }
         for result in laws
     }
-    return Board(document, figures, {result.law: result.gains for result in laws}, best)
+    return Board(document, figures, {result.compensator: result.gains for result in laws}, best)
 
 
 def _as_compensator_list(value: Any) -> list[Any]:

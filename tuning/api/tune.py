@@ -109,7 +109,7 @@ def tune_each(
         settings,
         work,
         earlier,
-        pieces=checkpoints or NO_CHECKPOINTS,
+        checkpoints=checkpoints or NO_CHECKPOINTS,
         scheduler=options.scheduler,
     )
     for index, result in results:

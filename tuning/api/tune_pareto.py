@@ -83,7 +83,7 @@ def compute_fronts(
     from tuning.gains.pareto import compute_fronts
     from tuning.gains.search_progress import SearchProgress
 
-    results = [gains.found for gains in tuned]
+    results = [gains.tune_result for gains in tuned]
     axis: Any = None
     if tuned:
         axis = select_cost_axis(against, tuned[0].compensator, axes_of(tuned[0].mechanism))

@@ -24,13 +24,13 @@ class TunedGains:
     """Result of `tune` for one mechanism.
 
     Attributes:
-        found: all results of the tuning (`tuning.gains.tune.TuneResult`).
+        tune_result: all results of the tuning (`tuning.gains.tune.TuneResult`).
         mechanism_sha256: SHA-256 digest of the mechanism file.
         limit: largest rms error for which the verdict is good [1].
         pareto: points of the Pareto front; empty if no front was requested.
     """
 
-    found: "TuneResult"
+    tune_result: "TuneResult"
     mechanism_sha256: str
     limit: float
     pareto: "tuple[TradedGains, ...]" = ()
@@ -38,22 +38,22 @@ class TunedGains:
     @property
     def mechanism(self) -> AnyMechanism:
         """Return the mechanism for which the gains were tuned."""
-        return self.found.mechanism
+        return self.tune_result.mechanism
 
     @property
     def compensator(self) -> str:
         """Return the name of the compensator whose gains were tuned."""
-        return self.found.compensator
+        return self.tune_result.compensator
 
     @property
     def gains(self) -> dict[str, float]:
         """Return all gains of the compensator by name [SI units], including gains that were not tuned."""
-        return self.found.gains
+        return self.tune_result.gains
 
     @property
     def literature(self) -> dict[str, float]:
         """Return the gains by the literature's rule, or those of the chosen setting, by name [SI units]."""
-        return self.found.literature
+        return self.tune_result.literature
 
     @property
     def figures(self) -> "dict[str, ErrorMetrics]":
@@ -62,7 +62,7 @@ class TunedGains:
         The keys are "before" (no compensation), "literature" and "tuned". Each value has the attributes rms,
         p99, max [1] and more.
         """
-        return self.found.figures
+        return self.tune_result.figures
 
     @property
     def parts(self) -> "dict[str, dict[str, ErrorMetrics]]":
@@ -73,7 +73,7 @@ class TunedGains:
         """
         from tuning.gains.tune import compute_metrics_by_error
 
-        return compute_metrics_by_error(self.found)
+        return compute_metrics_by_error(self.tune_result)
 
     @property
     def verdict(self) -> str:
@@ -83,7 +83,7 @@ class TunedGains:
         rms error is within the limit; at most 1 % of the real contacts have a peak force above 2 times, or a
         duration outside 0.5 to 2 times, that of the ideal contact.
         """
-        return "good" if tune_verdict.is_good(self.found, self.limit) else "bad"
+        return "good" if tune_verdict.is_good(self.tune_result, self.limit) else "bad"
 
     @property
     def without_noise(self) -> "ErrorMetrics | None":
@@ -91,7 +91,7 @@ class TunedGains:
 
         The result is None if the mechanism has no sensor noise.
         """
-        return self.found.without_noise
+        return self.tune_result.without_noise
 
     @functools.cached_property
     def command(self) -> CommandMetrics:
@@ -100,15 +100,15 @@ class TunedGains:
         `peak_p99` is the 99th percentile of the command's peak divided by the ideal contact's peak force [1].
         `noise_amplification` is the amplification of the sensor noise [1].
         """
-        return tune_verdict.command_metrics(self.found)
+        return tune_verdict.command_metrics(self.tune_result)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return a sentence for each metric in `command` that exceeds its bound."""
-        return tune_verdict.command_warnings(self.found, self.command)
+        return tune_verdict.command_warnings(self.tune_result, self.command)
 
     @functools.cached_property
-    def meaning(self) -> "MechanismSummary | None":
+    def summary(self) -> "MechanismSummary | None":
         """Return a summary of the mechanism: mass, ideal contacts, rates, and warnings of implausible values.
 
         The summary is None for six axes, where only a result of `jaxhil.simulate` has a summary.
@@ -125,7 +125,7 @@ class TunedGains:
         from tuning.gain_file import build_document
         from tuning.transparency.pushes import PUSH_DEFINITION
 
-        result = self.found
+        result = self.tune_result
         return build_document(
             result.compensator,
             result.gains,
@@ -214,7 +214,7 @@ class TradedGains:
         """Return the content of the gain file."""
         from tuning.gain_file import build_document
 
-        result, point = self.tuned.found, self.point
+        result, point = self.tuned.tune_result, self.point
         figures: dict[str, Any] = {
             "nominal": {**result.nominal, "tuned": point.nominal},
             "robust": {**result.figures, "tuned": point.figures},

@@ -47,14 +47,14 @@ class CompareSettings:
     tuned: bool = True  # whether to tune the gains
 
 
-class LawMetrics(NamedTuple):
+class CompensatorMetrics(NamedTuple):
     """Metrics of one compensator on one mechanism, for each set of gains.
 
     The sets of gains are "literature", the named settings of the compensator, and "tuned". A compensator
     without gains, or with settings that hold for all mechanisms, is not tuned.
     """
 
-    law: str  # name of the compensator
+    compensator: str  # name of the compensator
     mechanism: str  # name of the mechanism
     gains: dict[str, dict[str, float]]  # gains by name, for each set
     figures: dict[
@@ -67,44 +67,50 @@ class LawMetrics(NamedTuple):
         return tuple(which for which in self.figures if which not in (LITERATURE_GAINS, TUNED_GAINS))
 
 
-class LawFailure(NamedTuple):
+class CompensatorFailure(NamedTuple):
     """Error that prevented the evaluation of a compensator on a group of mechanisms."""
 
-    law: str  # name of the compensator
+    compensator: str  # name of the compensator
     reason: str  # description of the error
 
 
 # Scenario sets of a group of mechanisms, name of the compensator, and result.
-GroupResult = tuple[list[Any], str, list[LawMetrics] | LawFailure]
+GroupResult = tuple[list[Any], str, list[CompensatorMetrics] | CompensatorFailure]
 
 
-def compare_laws(
+def compare_compensators(
     mechanisms: Sequence[Mechanism],
-    laws: Sequence[str],
+    compensators: Sequence[str],
     settings: CompareSettings,
     processes: int,
     tell: Callable[[str, float, float], None] = lambda text, done, done_before: None,
-    pieces: Checkpoints = NO_CHECKPOINTS,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
     scheduler: str | None = None,
-) -> Iterator[LawMetrics | LawFailure]:
+) -> Iterator[CompensatorMetrics | CompensatorFailure]:
     """Evaluate every compensator on every mechanism; yield each result when it is complete.
 
     Args:
         mechanisms: mechanisms to simulate.
-        laws: names of the compensators.
+        compensators: names of the compensators.
         settings: settings of the comparison.
         processes: number of processes. With 0, this process computes all results, and an error ends the
             comparison.
         tell: callback, called with a description of the current work, the number of results (including
             fractions of unfinished results), and the number of cached results.
-        pieces: cache of results.
+        checkpoints: cache of results.
         scheduler: address of a cluster's scheduler, whose workers compute the results; None for no cluster.
     """
-    cached = _read_cached_results(mechanisms, laws, settings, pieces) if pieces.is_resuming else []
+    cached = (
+        _read_cached_results(mechanisms, compensators, settings, checkpoints)
+        if checkpoints.is_resuming
+        else []
+    )
     yield from cached
-    complete = {(result.mechanism, result.law) for result in cached}
+    complete = {(result.mechanism, result.compensator) for result in cached}
     # The results of a compensator and a group are cached together, for all mechanisms of the group.
-    left = [m for m in mechanisms if any((m.name, law) not in complete for law in laws)]
+    left = [
+        m for m in mechanisms if any((m.name, compensator) not in complete for compensator in compensators)
+    ]
     if not left:
         return
 
@@ -118,8 +124,15 @@ def compare_laws(
 
         This order balances the load of the processes.
         """
-        order = sorted(laws, key=_count_gains, reverse=True) if processes or scheduler else laws
-        return [(g, law) for g in scenes for law in order if (g[0].mechanism.name, law) not in complete]
+        order = (
+            sorted(compensators, key=_count_gains, reverse=True) if processes or scheduler else compensators
+        )
+        return [
+            (g, compensator)
+            for g in scenes
+            for compensator in order
+            if (g[0].mechanism.name, compensator) not in complete
+        ]
 
     if scheduler is not None:
         computed = _evaluate_on_cluster(
@@ -129,75 +142,90 @@ def compare_laws(
         computed = _evaluate_in_order(missing(build_scenario_sets(left, settings)), settings, report)
     else:
         computed = _evaluate_in_processes(processes, left, settings, missing, report)
-    for group, law, result in computed:
-        if isinstance(result, LawFailure):
+    for group, compensator, result in computed:
+        if isinstance(result, CompensatorFailure):
             yield result
             continue
-        pieces.write(*_describe_checkpoint([scene.mechanism for scene in group], law, settings), result)
+        checkpoints.write(
+            *_describe_checkpoint([scene.mechanism for scene in group], compensator, settings), result
+        )
         yield from result
 
 
 def _read_cached_results(
-    mechanisms: Sequence[Mechanism], laws: Sequence[str], settings: CompareSettings, pieces: Checkpoints
-) -> list[LawMetrics]:
+    mechanisms: Sequence[Mechanism],
+    compensators: Sequence[str],
+    settings: CompareSettings,
+    checkpoints: Checkpoints,
+) -> list[CompensatorMetrics]:
     """Return the results that an earlier comparison with the same inputs has cached."""
     from tuning.gains.common_program import group_by_common_program
 
     groups = [[mechanisms[i] for i in group] for group, _ in group_by_common_program(mechanisms)]
     read = (
-        pieces.read(*_describe_checkpoint(group, law, settings), list[LawMetrics])
+        checkpoints.read(*_describe_checkpoint(group, compensator, settings), list[CompensatorMetrics])
         for group in groups
-        for law in laws
+        for compensator in compensators
     )
     return [result for results in read for result in results or ()]
 
 
-def _describe_checkpoint(group: list[Mechanism], law: str, settings: CompareSettings) -> tuple[str, Any]:
+def _describe_checkpoint(
+    group: list[Mechanism], compensator: str, settings: CompareSettings
+) -> tuple[str, Any]:
     """Return the name and the inputs under which the result of one task is cached."""
-    return f"compare {law} {group[0].name}", ("compare", law, [to_plain_data(m) for m in group], settings)
+    return f"compare {compensator} {group[0].name}", (
+        "compare",
+        compensator,
+        [to_plain_data(m) for m in group],
+        settings,
+    )
 
 
 def _evaluate_in_order(
     tasks: list[tuple[list[Any], str]], settings: CompareSettings, tell: ComparisonProgress
 ) -> Iterator[GroupResult]:
     done = 0
-    for group, law in tasks:
+    for group, compensator in tasks:
 
         def report(text: str, share: float, group=group, done=done) -> None:
             tell(text, done + share * len(group))
 
-        yield group, law, evaluate_law(group, law, settings, report)
+        yield group, compensator, evaluate_compensator(group, compensator, settings, report)
         done += len(group)
 
 
 def _evaluate_on_cluster(
     scheduler: str, tasks: list[tuple[list[Any], str]], settings: CompareSettings, tell: ComparisonProgress
 ) -> Iterator[GroupResult]:
-    pieces = [WorkUnit(i, (group, law, settings)) for i, (group, law) in enumerate(tasks)]
+    units = [WorkUnit(i, (group, compensator, settings)) for i, (group, compensator) in enumerate(tasks)]
     inputs = [
-        _describe_checkpoint([scene.mechanism for scene in group], law, settings) for group, law in tasks
+        _describe_checkpoint([scene.mechanism for scene in group], compensator, settings)
+        for group, compensator in tasks
     ]
     done, what = 0, f"compare-{compute_digest(inputs)[:16]}"
     tell(f"{len(tasks)} tasks on the cluster", done)
-    for i, result in run_on_workers(scheduler, evaluate_law_or_failure, pieces, get_process_setting(), what):
-        group, law = tasks[i]
+    for i, result in run_on_workers(
+        scheduler, evaluate_compensator_or_failure, units, get_process_setting(), what
+    ):
+        group, compensator = tasks[i]
         done += len(group)
-        tell(law, done)
-        yield group, law, result
+        tell(compensator, done)
+        yield group, compensator, result
 
 
-def evaluate_law_or_failure(
-    group: list[Any], law: str, settings: CompareSettings
-) -> list[LawMetrics] | LawFailure:
-    """Call `evaluate_law`; if it raises an error, return the error as `LawFailure`."""
+def evaluate_compensator_or_failure(
+    group: list[Any], compensator: str, settings: CompareSettings
+) -> list[CompensatorMetrics] | CompensatorFailure:
+    """Call `evaluate_compensator`; if it raises an error, return the error as `CompensatorFailure`."""
     try:
-        return evaluate_law(group, law, settings)
+        return evaluate_compensator(group, compensator, settings)
     except Exception as error:
-        return _describe_failure(law, error)
+        return _describe_failure(compensator, error)
 
 
-def _describe_failure(law: str, error: BaseException) -> LawFailure:
-    return LawFailure(law, to_one_line(f"{type(error).__name__}: {error}", 200))
+def _describe_failure(compensator: str, error: BaseException) -> CompensatorFailure:
+    return CompensatorFailure(compensator, to_one_line(f"{type(error).__name__}: {error}", 200))
 
 
 def _evaluate_in_processes(
@@ -235,11 +263,11 @@ def _evaluate_in_processes(
             raise
 
 
-def _count_gains(law: str) -> int:
+def _count_gains(compensator: str) -> int:
     """Return the number of a compensator's gains, which determines the compilation time."""
     from jaxhil.rig import COMPENSATORS
 
-    return len(COMPENSATORS[law].gains)
+    return len(COMPENSATORS[compensator].gains)
 
 
 def build_scenario_sets(mechanisms: list[Mechanism], settings: CompareSettings) -> list[list[Any]]:
@@ -257,12 +285,12 @@ def build_scenario_sets(mechanisms: list[Mechanism], settings: CompareSettings) 
     ]
 
 
-def evaluate_law(
+def evaluate_compensator(
     scenes: list[Any],
-    law: str,
+    compensator: str,
     settings: CompareSettings,
     tell: ComparisonProgress = lambda text, share: None,
-) -> list[LawMetrics]:
+) -> list[CompensatorMetrics]:
     """Tune one compensator for mechanisms that share a program, and compute its metrics on each mechanism.
 
     `tell` is a callback, called with a description of the current work and the completed fraction.
@@ -276,19 +304,22 @@ def evaluate_law(
     mechanisms = [scene.mechanism for scene in scenes]
     further = [
         name
-        for name in COMPENSATORS[law].settings
-        if any(literature_gains(m, law, name) != literature_gains(m, law) for m in mechanisms)
+        for name in COMPENSATORS[compensator].settings
+        if any(literature_gains(m, compensator, name) != literature_gains(m, compensator) for m in mechanisms)
     ]
     gains = [
-        {which or LITERATURE_GAINS: literature_gains(mechanism, law, which) for which in (None, *further)}
+        {
+            which or LITERATURE_GAINS: literature_gains(mechanism, compensator, which)
+            for which in (None, *further)
+        }
         for mechanism in mechanisms
     ]
     # A compensator whose settings hold for all mechanisms is not tuned.
-    tuned = settings.tuned and not COMPENSATORS[law].settings
+    tuned = settings.tuned and not COMPENSATORS[compensator].settings
     tuned = tuned and any(
-        gain.tuned(mechanism) for gain in COMPENSATORS[law].gains for mechanism in mechanisms
+        gain.tuned(mechanism) for gain in COMPENSATORS[compensator].gains for mechanism in mechanisms
     )
-    work = SearchProgress(lambda text, share, _: tell(f"{law}, {text}", share))
+    work = SearchProgress(lambda text, share, _: tell(f"{compensator}, {text}", share))
     lanes = {scene.mechanism.name: count_evaluated_lanes(scene) for scene in scenes}
     work.runs_after_group = (1 + len(further) + tuned) * sum(lanes.values())
     if tuned:
@@ -301,23 +332,23 @@ def evaluate_law(
             polish=settings.polish,
             scanned=settings.scanned,
         )
-        for index, result in tune_all(mechanisms, law, tuning, work, common=scenes[0].common):
+        for index, result in tune_all(mechanisms, compensator, tuning, work, common=scenes[0].common):
             gains[index][TUNED_GAINS] = result.gains
     results = []
     for scene, by_name in zip(scenes, gains, strict=True):
         metrics = {}
         for which, values in by_name.items():
             work.say(f"{scene.mechanism.name}: evaluating {which} gains")
-            metrics[which] = evaluate_gains(scene, law, values, settings.limit, settings.seed)
+            metrics[which] = evaluate_gains(scene, compensator, values, settings.limit, settings.seed)
             work.report_runs(lanes[scene.mechanism.name])
-        results.append(LawMetrics(law, scene.mechanism.name, by_name, metrics))
+        results.append(CompensatorMetrics(compensator, scene.mechanism.name, by_name, metrics))
     return results
 
 
 def _evaluate_in_worker(
-    number: int, scenes: list[Any], law: str, settings: CompareSettings
-) -> list[LawMetrics]:
-    """Call `evaluate_law` in a worker process, and send its progress to the parent process."""
+    number: int, scenes: list[Any], compensator: str, settings: CompareSettings
+) -> list[CompensatorMetrics]:
+    """Call `evaluate_compensator` in a worker process, and send its progress to the parent process."""
     last = 0.0
 
     def tell(text: str, share: float) -> None:
@@ -326,7 +357,7 @@ def _evaluate_in_worker(
             last = now
             _messages.put((number, text, share))
 
-    return evaluate_law(scenes, law, settings, tell)
+    return evaluate_compensator(scenes, compensator, settings, tell)
 
 
 _messages: Any = None  # in a worker process, queue for progress messages to the parent process

@@ -52,7 +52,7 @@ def build_scenario_set(mechanism: Mechanism, common: CommonProgram, scenarios: i
         common,
         plain,
         damped,
-        compute_ideal_contacts(common.law(beforehand=False), plain, _broadcast_velocity(plain), 1),
+        compute_ideal_contacts(common.law(precomputed=False), plain, _broadcast_velocity(plain), 1),
     )
 
 
@@ -69,7 +69,7 @@ def evaluate_gains(
         # The approach speeds of later contacts depend on the compensator, and so do their ideal contacts.
         plain: Any = runs.plain
         velocity = np.where(plain.good, plain.metrics.approach_velocity, _broadcast_velocity(scene.plain))
-        contact_law = scene.common.law(beforehand=False)
+        contact_law = scene.common.law(precomputed=False)
         ideal_contacts = compute_ideal_contacts(contact_law, scene.plain, velocity, contacts)
         runs = _run_scenarios(scene, law, gains, ideal_contacts)
     return compute_metrics(

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tuning import terminal
-from tuning.benchmark.comparison import LITERATURE_GAINS, TUNED_GAINS, LawMetrics
+from tuning.benchmark.comparison import LITERATURE_GAINS, TUNED_GAINS, CompensatorMetrics
 from tuning.statistics.intervals import IntervalEstimate
 from tuning.transparency.metrics import find_winner
 
@@ -28,21 +28,21 @@ UNLIMITED_WIDTH = 10_000  # console width [characters] that does not limit a tab
 WINNER_MARK = "*"  # marks the metric of a compensator that is significantly better than all others
 
 
-def find_winners(results: Sequence[LawMetrics], which: str = TUNED_GAINS) -> dict[str, str | None]:
+def find_winners(results: Sequence[CompensatorMetrics], which: str = TUNED_GAINS) -> dict[str, str | None]:
     """Return for each metric the compensator that is significantly the best on one mechanism, or None.
 
     A compensator without the gains `which` is compared with its gains from the literature.
     """
-    by_law = {result.law: choose_best_metrics(result, which) for result in results}
+    by_law = {result.compensator: choose_best_metrics(result, which) for result in results}
     return {name: find_winner(name, {law: m[name] for law, m in by_law.items()}) for name in METRIC_HEADINGS}
 
 
-def choose_best_metrics(result: LawMetrics, which: str = TUNED_GAINS) -> dict[str, IntervalEstimate]:
+def choose_best_metrics(result: CompensatorMetrics, which: str = TUNED_GAINS) -> dict[str, IntervalEstimate]:
     """Return the metrics with the gains `which` or, if there are none, with the literature's gains."""
     return result.figures.get(which) or result.figures[LITERATURE_GAINS]
 
 
-def build_mechanism_table(name: str, results: Sequence[LawMetrics]) -> Table:
+def build_mechanism_table(name: str, results: Sequence[CompensatorMetrics]) -> Table:
     """Build the table of one mechanism: one row for each compensator and set of gains."""
     winners = find_winners(results)
     rows = []
@@ -51,32 +51,34 @@ def build_mechanism_table(name: str, results: Sequence[LawMetrics]) -> Table:
             is_best = metrics is choose_best_metrics(result)
             rows.append(
                 [
-                    result.law if which == LITERATURE_GAINS else f"  {which}",
+                    result.compensator if which == LITERATURE_GAINS else f"  {which}",
                     *(
-                        format_metric(key, metrics[key], is_best and winners[key] == result.law)
+                        format_metric(key, metrics[key], is_best and winners[key] == result.compensator)
                         for key in METRIC_HEADINGS
                     ),
                 ]
             )
     tuned = ", then tuned, but for those with settings" * _has_tuned_gains(results)
-    title = f"{name}: each law with the literature's gains{tuned}"
+    title = f"{name}: each compensator with the literature's gains{tuned}"
     return _set_compact_style(terminal.build_table(title, ["law", *METRIC_HEADINGS.values()], rows))
 
 
-def build_leaderboard(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]]) -> Table:
+def build_leaderboard(names: Sequence[str], results: Mapping[str, Sequence[CompensatorMetrics]]) -> Table:
     """Build the table of rms restitution errors [%], with a row for each mechanism.
 
     The columns are the compensators, and their named settings.
     """
     flat = [result for name in names for result in results[name]]
-    laws = list(dict.fromkeys(result.law for result in flat))
-    columns = dict.fromkeys((result.law, which) for result in flat for which in ("", *result.settings))
+    laws = list(dict.fromkeys(result.compensator for result in flat))
+    columns = dict.fromkeys(
+        (result.compensator, which) for result in flat for which in ("", *result.settings)
+    )
     columns = sorted(columns, key=lambda column: laws.index(column[0]))
     winners = {name: find_winners(results[name])["rms"] for name in names}
     rows = []
     for name in names:
         cells = []
-        by_law = {result.law: result for result in results[name]}
+        by_law = {result.compensator: result for result in results[name]}
         for law, which in columns:
             result = by_law.get(law)
             metrics = result and (result.figures.get(which) if which else choose_best_metrics(result))
@@ -86,7 +88,11 @@ def build_leaderboard(names: Sequence[str], results: Mapping[str, Sequence[LawMe
         rows.append([name.removeprefix("suite-"), *cells])
     headings = ["", *("\n".join(filter(None, [*law.split("_"), which])) for law, which in columns)]
     tuned = any(map(_has_tuned_gains, results.values()))
-    how = "each law tuned, but for those with settings" if tuned else "each law with the literature's gains"
+    how = (
+        "each compensator tuned, but for those with settings"
+        if tuned
+        else "each compensator with the literature's gains"
+    )
     table = _set_compact_style(
         terminal.build_table(f"Leaderboard: restitution error, rms [%], {how}", headings, rows)
     )
@@ -95,14 +101,14 @@ def build_leaderboard(names: Sequence[str], results: Mapping[str, Sequence[LawMe
     return table
 
 
-def describe_least_errors(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]]) -> str:
+def describe_least_errors(names: Sequence[str], results: Mapping[str, Sequence[CompensatorMetrics]]) -> str:
     """Return a sentence that names the compensator with the smallest rms error on each mechanism.
 
     The sentence ignores the intervals, so that a difference may not be significant.
     """
     leading: dict[str, list[str]] = {}
     for name in names:
-        errors = {result.law: choose_best_metrics(result)["rms"].value for result in results[name]}
+        errors = {result.compensator: choose_best_metrics(result)["rms"].value for result in results[name]}
         finite = {law: value for law, value in errors.items() if np.isfinite(value)}
         if len(finite) > 1:
             best = min(finite, key=lambda law: finite[law])
@@ -112,7 +118,7 @@ def describe_least_errors(names: Sequence[str], results: Mapping[str, Sequence[L
     return f"Least rms error: {'; '.join(texts)}." if leading else ""
 
 
-def _has_tuned_gains(results: Sequence[LawMetrics]) -> bool:
+def _has_tuned_gains(results: Sequence[CompensatorMetrics]) -> bool:
     return any(TUNED_GAINS in result.figures for result in results)
 
 

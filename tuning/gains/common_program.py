@@ -47,16 +47,16 @@ class CommonProgram:
     discontinuity_order: int  # order of the lowest derivative of the motion that is discontinuous at a tick
     ring: int  # length of the delay lines [samples]
     cells: CellCounts  # numbers of integration cells in a control period
-    beforehand: bool  # whether ideal contacts without a closed form are integrated before the simulation
+    precomputed: bool  # whether ideal contacts without a closed form are integrated before the simulation
 
-    def law(self, beforehand: bool | None = None) -> LawMixture:
-        """Return a law that selects a law per lane; unless `beforehand`, it also computes ideal contacts."""
-        return LawMixture(self._kinds, self.beforehand if beforehand is None else beforehand)
+    def law(self, precomputed: bool | None = None) -> LawMixture:
+        """Return a law that selects a law per lane; unless `precomputed`, it also computes ideal contacts."""
+        return LawMixture(self._kinds, self.precomputed if precomputed is None else precomputed)
 
     @property
     def _kinds(self) -> tuple[ContactLaw, ...]:
         """Return the contact laws that the simulation uses, each once even if several names mean it."""
-        return tuple(dict.fromkeys(find_contact_law(name).simulated for name in self.laws))
+        return tuple(dict.fromkeys(find_contact_law(name).simulation_law for name in self.laws))
 
     def loop(self, loop: Loop) -> Loop:
         """Adapt the loop of one mechanism to the static properties of this program."""
@@ -88,13 +88,13 @@ class CommonProgram:
         deepest = depths[:, -1:] if depths.shape[1] else np.full((self.slots, 1, number), UNREACHED_DEPTH)
         further = deepest * (1 + np.arange(1, self.segments))[None, :, None]
         depths = np.concatenate([depths, further], axis=1)[:, : self.segments - 1]
-        law = find_contact_law(mechanism.contact.law).simulated
+        law = find_contact_law(mechanism.contact.law).simulation_law
         kind: Any = np.full((self.slots, number), self._kinds.index(law), np.int32)
         contact = contact._replace(stiffness=stiffness, depths=depths, kind=kind)
         reference: Any = None
-        if self.beforehand:
+        if self.precomputed:
             unknown: Any = np.full((self.slots, number), np.nan)
-            reference = IdealContact(*[unknown] * 3) if law.closed_form else self._first(law, batch)
+            reference = IdealContact(*[unknown] * 3) if law.has_closed_form else self._first(law, batch)
         return batch._replace(contact=contact, phase=by_slot(batch.phase), reference=reference)
 
     def _first(self, law: ContactLaw, batch: Scenario) -> Any:
@@ -113,7 +113,7 @@ UNREACHED_DEPTH = 1.0  # m; no mechanism penetrates so deeply
 def _compute_ideal_contact(
     law: ContactLaw, contact: ContactParameters, mass: Array, velocity: Array
 ) -> IdealContact:
-    return law.reference(contact, mass, velocity)
+    return law.ideal_contact(contact, mass, velocity)
 
 
 def group_by_common_program(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], CommonProgram]]:
@@ -137,7 +137,7 @@ def group_by_common_program(mechanisms: Sequence[Mechanism]) -> list[tuple[list[
 
 def _needs_simulated_speeds(mechanism: Mechanism) -> bool:
     """Return whether ideal contacts are integrated numerically from speeds known only during simulation."""
-    return mechanism.approach.contacts > 1 and not find_contact_law(mechanism.contact.law).closed_form
+    return mechanism.approach.contacts > 1 and not find_contact_law(mechanism.contact.law).has_closed_form
 
 
 def _build_common_program(mechanisms, group, loops, batches) -> CommonProgram:
@@ -150,8 +150,8 @@ def _build_common_program(mechanisms, group, loops, batches) -> CommonProgram:
         discontinuity_order=min(loops[i].discontinuity_order for i in group),
         ring=max(loops[i].ring for i in group),
         cells=_join_cell_counts(mechanisms, [loops[i] for i in group], [batches[i] for i in group]),
-        beforehand=not _needs_simulated_speeds(mechanisms[0])
-        and not all(loops[i].law.closed_form for i in group),
+        precomputed=not _needs_simulated_speeds(mechanisms[0])
+        and not all(loops[i].law.has_closed_form for i in group),
     )
 
 

@@ -221,15 +221,15 @@ def compute_residuals(
 
     error, excess, chatter = map(by_problem, compute_contact_terms(outcome))
     amplification = jnp.mean(by_problem(model.noise_amplification(loop, values, rig)), axis=1)
-    probes = by_problem(jnp.broadcast_to(mask_probes(number * lanes), outcome.wanted.shape))
-    wanted = by_problem(outcome.wanted)
+    probes = by_problem(jnp.broadcast_to(mask_probes(number * lanes), outcome.is_scheduled.shape))
+    is_scheduled = by_problem(outcome.is_scheduled)
     metric = None
     if terms.function is not None:
         metric = terms.function.values(
             extract_scenario_metrics(outcome, number, terms.contacts, terms.transparency)
         )
     return weight_residuals(
-        terms, problems.weights, error, excess, chatter, wanted, amplification, probes, metric
+        terms, problems.weights, error, excess, chatter, is_scheduled, amplification, probes, metric
     )
 
 
@@ -239,7 +239,7 @@ def weight_residuals(
     error: Float[Array, "problems contacts"],
     excess: Float[Array, "problems contacts"],
     chatter: Float[Array, "problems contacts"],
-    wanted: Bool[Array, "problems contacts"],
+    is_scheduled: Bool[Array, "problems contacts"],
     amplification: Float[Array, "problems"],
     probes: Bool[Array, "problems contacts"] | None = None,
     metric: Float[Array, "problems"] | None = None,
@@ -255,12 +255,12 @@ def weight_residuals(
     def counted(mask):
         return jnp.maximum(jnp.sum(mask, axis=1, dtype=jnp.int32), 1)[:, None]
 
-    count = plain = counted(wanted)
+    count = plain = counted(is_scheduled)
     transparency = []
     if terms.transparency and probes is not None:
-        probe_errors = _compute_norm_residuals(jnp.where(probes, error, 0), counted(wanted & probes), 2)
+        probe_errors = _compute_norm_residuals(jnp.where(probes, error, 0), counted(is_scheduled & probes), 2)
         transparency = [weights.transparency[:, None] * probe_errors]
-        error, plain = jnp.where(probes, 0, error), counted(wanted & ~probes)
+        error, plain = jnp.where(probes, 0, error), counted(is_scheduled & ~probes)
     diverging = jnp.sqrt(weights.divergence)[:, None] * error
     number = {"rms": plain, "cvar": _count_tail_contacts(plain), "worst": jnp.ones_like(plain)}[terms.name]
     if metric is None:
@@ -297,8 +297,9 @@ def compute_contact_terms(
     """Return the restitution error, the excess of the peak command and the chatter of every contact, all [1].
 
     The excess is max(0, peak command / peak force of the ideal contact - 1). All three are
-    `FAILED_CONTACT_ERROR` for failed contacts, and 0 for rows that are no contact of the scenario (`wanted`
-    is false). The results are NumPy arrays if the outcome holds NumPy arrays, otherwise JAX arrays.
+    `FAILED_CONTACT_ERROR` for failed contacts, and 0 for rows that are no contact of the scenario
+    (`is_scheduled` is false). The results are NumPy arrays if the outcome holds NumPy arrays, otherwise JAX
+    arrays.
     """
     xp = jnp if isinstance(outcome.error, jax.Array) else np
     # Without the inner `where`, non-finite numbers of failed contacts would make the derivative NaN.
@@ -308,8 +309,12 @@ def compute_contact_terms(
     beyond = xp.where(usable, outcome.peak_ratio, 1 + FAILED_CONTACT_ERROR) - 1
     excess = xp.where(beyond > 0, beyond, 0)
     chatter = xp.where(usable, outcome.chatter, FAILED_CONTACT_ERROR)
-    wanted = outcome.wanted
-    return xp.where(wanted, error, 0), xp.where(wanted, excess, 0), xp.where(wanted, chatter, 0)
+    is_scheduled = outcome.is_scheduled
+    return (
+        xp.where(is_scheduled, error, 0),
+        xp.where(is_scheduled, excess, 0),
+        xp.where(is_scheduled, chatter, 0),
+    )
 
 
 def extract_scenario_metrics(outcome: Outcome, number: int, contacts: int, probed: bool) -> ScenarioMetrics:

@@ -120,13 +120,13 @@ def compute_fronts(
     number: int,
     work: SearchProgress | None = None,
     axis: ParetoCriterion = NOISE_CRITERION,
-    pieces: Checkpoints = NO_CHECKPOINTS,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, ParetoFront]]:
     """Compute the Pareto fronts of tuned mechanisms; yield (index, front) as soon as a front is complete.
 
     All `results` have the same compensator and settings. If the second criterion `axis` is transparency, the
-    settings must evaluate transparency. Each front has `number` points and is cached in `pieces`. If
+    settings must evaluate transparency. Each front has `number` points and is cached in `checkpoints`. If
     `scheduler` is given, the workers of a cluster compute the fronts.
     """
     work = work or SearchProgress()
@@ -142,9 +142,9 @@ def compute_fronts(
     ]
     work.runs_after_group = sum(group.runs for group in groups)
     if scheduler is None:
-        computed = _compute_locally(groups, work, pieces)
+        computed = _compute_locally(groups, work, checkpoints)
     else:
-        computed = _compute_on_cluster(scheduler, groups, work, pieces)
+        computed = _compute_on_cluster(scheduler, groups, work, checkpoints)
     for index, group_fronts in computed:
         yield from zip(members[index], group_fronts, strict=True)
 
@@ -159,31 +159,31 @@ def _build_tasks(results: Sequence[TuneResult]) -> list[TuneTask]:
 
 
 def _compute_locally(
-    groups: list[_FrontGroup], work: SearchProgress, pieces: Checkpoints
+    groups: list[_FrontGroup], work: SearchProgress, checkpoints: Checkpoints
 ) -> Iterator[tuple[int, list[ParetoFront]]]:
     """Compute the Pareto fronts of each group of mechanisms; yield (index of the group, fronts)."""
     for index, group in enumerate(groups):
         work.runs_after_group -= group.runs
         work.name = describe_group(group.tasks)
-        group_fronts = _read_fronts(group, pieces)
+        group_fronts = _read_fronts(group, checkpoints)
         if group_fronts is not None:
             work.keep("front from the cache", group.runs)
         else:
-            if pieces.is_enabled:
-                work.journal = pieces.journal(group.names[0], group.inputs)
+            if checkpoints.is_enabled:
+                work.journal = checkpoints.journal(group.names[0], group.inputs)
             group_fronts = _compute_group_fronts(group, work)
-            _write_fronts(group, pieces, group_fronts)
+            _write_fronts(group, checkpoints, group_fronts)
             work.journal.finish()
         yield index, group_fronts
 
 
 def _compute_on_cluster(
-    scheduler: str, groups: list[_FrontGroup], work: SearchProgress, pieces: Checkpoints
+    scheduler: str, groups: list[_FrontGroup], work: SearchProgress, checkpoints: Checkpoints
 ) -> Iterator[tuple[int, list[ParetoFront]]]:
     """Compute Pareto fronts on a cluster; yield (index of the group, fronts) of each finished group."""
     missing = []
     for index, group in enumerate(groups):
-        group_fronts = _read_fronts(group, pieces)
+        group_fronts = _read_fronts(group, checkpoints)
         if group_fronts is None:
             # Outcomes and scenarios are needed for plots only, and are too large to send to a worker.
             light = [replace(result, outcomes={}, scenarios=None) for result in group.tuned]
@@ -202,7 +202,7 @@ def _compute_on_cluster(
         work.name = describe_group(group.tasks)
         work.begin("front from the cluster", group.runs)
         work.report_runs(group.runs)
-        _write_fronts(group, pieces, group_fronts)
+        _write_fronts(group, checkpoints, group_fronts)
         yield index, group_fronts
 
 
@@ -213,17 +213,19 @@ def compute_and_encode_fronts(tuned: list[TuneResult], number: int, axis: Pareto
     )
 
 
-def _read_fronts(group: _FrontGroup, pieces: Checkpoints) -> list[ParetoFront] | None:
-    if not pieces.is_enabled:
+def _read_fronts(group: _FrontGroup, checkpoints: Checkpoints) -> list[ParetoFront] | None:
+    if not checkpoints.is_enabled:
         return None
-    group_fronts = [pieces.read(name, (group.inputs, i), ParetoFront) for i, name in enumerate(group.names)]
+    group_fronts = [
+        checkpoints.read(name, (group.inputs, i), ParetoFront) for i, name in enumerate(group.names)
+    ]
     return group_fronts if all(group_fronts) else None
 
 
-def _write_fronts(group: _FrontGroup, pieces: Checkpoints, group_fronts: list[ParetoFront]) -> None:
-    if pieces.is_enabled:
+def _write_fronts(group: _FrontGroup, checkpoints: Checkpoints, group_fronts: list[ParetoFront]) -> None:
+    if checkpoints.is_enabled:
         for i, (name, front) in enumerate(zip(group.names, group_fronts, strict=True)):
-            pieces.write(name, (group.inputs, i), front)
+            checkpoints.write(name, (group.inputs, i), front)
 
 
 def _compute_group_fronts(group: _FrontGroup, work: SearchProgress) -> list[ParetoFront]:
@@ -253,7 +255,7 @@ def _evaluate_fronts(
         for task, result, ladder in zip(validation.tasks, tuned, points, strict=True)
     ]
     # Each call evaluates one set of gains of every task, and so uses the same compiled program as tuning.
-    outcomes = [validation.judge([gains for _, gains in row]) for row in zip(*plans, strict=True)]
+    outcomes = [validation.evaluate([gains for _, gains in row]) for row in zip(*plans, strict=True)]
     fronts = []
     for index, (plan, pairs) in enumerate(zip(plans, zip(*outcomes, strict=True), strict=True)):
         *evaluated, literature, before = [
@@ -281,13 +283,15 @@ def _evaluate_point(
     task, probed = validation.tasks[index], validation.probed[index]
     fresh, nominal = split_nominal(task.model.select_verdict_error(outcome))
     noise = compute_noise_amplification(task.mechanism, task.compensator, gains)
-    errors = np.asarray(compute_contact_terms(fresh)[0])[fresh.wanted]
+    errors = np.asarray(compute_contact_terms(fresh)[0])[fresh.is_scheduled]
     scenarios, probe_errors = fresh, None
     if with_probes is not None:
         scenarios = with_probes
         probes = jax.tree.map(lambda leaf: leaf[..., 1:], with_probes)
-        probe_errors = np.asarray(compute_contact_terms(probes)[0])[probes.wanted]
-    excesses, chatter = (np.asarray(term)[scenarios.wanted] for term in compute_contact_terms(scenarios)[1:])
+        probe_errors = np.asarray(compute_contact_terms(probes)[0])[probes.is_scheduled]
+    excesses, chatter = (
+        np.asarray(term)[scenarios.is_scheduled] for term in compute_contact_terms(scenarios)[1:]
+    )
     cost = noise
     if axis == PEAK_CRITERION:
         cost = float(np.percentile(fresh.peak_ratio[fresh.good], 99)) if fresh.good.any() else math.nan

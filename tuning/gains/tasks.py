@@ -22,10 +22,10 @@ from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw_quasi_random
 from jaxhil.rig_models import choose_rig_model
+from jaxhil.simulation.contact_tracking import MAX_DECAY_WAIT
 from jaxhil.simulation.evaluation import RigModel, count_lanes
 from jaxhil.simulation.outcome import parameters_by_slot
 from jaxhil.simulation.scenario import Scenario
-from jaxhil.simulation.watch import MAX_DECAY_WAIT
 from tuning.gains.common_program import CommonProgram
 from tuning.optimisation.unit_box import GainBounds, to_gains
 from tuning.transparency.probes import LANES_PER_SCENARIO, build_probed_scenarios
@@ -214,7 +214,7 @@ def _compute_time_limit(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*
     shape = scenarios.phase.shape
     mass = jnp.broadcast_to(scenarios.equivalent_mass, shape)
     velocity = jnp.broadcast_to(scenarios.velocity, shape)
-    reference = law.reference(parameters_by_slot(scenarios.contact), mass, velocity)
+    reference = law.ideal_contact(parameters_by_slot(scenarios.contact), mass, velocity)
     longest = TIME_LIMIT_FACTOR * jnp.max(reference.duration, axis=0) + TIME_LIMIT_OFFSET
     # With noise, the command does not decay: a contact ends only after the longest wait for its decay.
     sensor = scenarios.force_sensor

@@ -80,7 +80,7 @@ class TuneResult:
     timings: dict[str, float] = field(default_factory=dict)  # duration of each stage [s]
     intervals: ErrorIntervals | None = None  # 95 % confidence intervals of the "tuned" metrics
     first: tuple[EarlierGains, ...] = ()  # earlier gains that replaced the last starts of the first batch
-    freedom: dict[str, GainTolerance] = field(default_factory=dict)  # tolerance of each tuned gain
+    tolerances: dict[str, GainTolerance] = field(default_factory=dict)  # tolerance of each tuned gain
     global_comparison: GlobalComparison | None = None  # None if no global search was requested
     # transparency, its slope and its peak; empty if the scenarios have no probes
     transparency: dict[str, dict[str, IntervalEstimate]] = field(default_factory=dict)
@@ -102,8 +102,8 @@ def tune_group(
     `near` holds, for each mechanism, earlier gains of similar mechanisms, which serve as additional starts.
     """
     clock, validation = _StageClock(), build_validation(tasks, settings.validation, settings.seed, work)
-    evaluating, beforehand = _count_evaluation_runs(tasks, settings), _count_baseline_runs(tasks, settings)
-    work.runs_after_group += evaluating - beforehand
+    evaluating, precomputed = _count_evaluation_runs(tasks, settings), _count_baseline_runs(tasks, settings)
+    work.runs_after_group += evaluating - precomputed
     baselines: dict[str, list] = {}
     searched = work.step(
         "search",
@@ -112,18 +112,18 @@ def tune_group(
             validation, settings, near, lambda: baselines.update(_evaluate_baselines(validation))
         ),
     )
-    work.runs_after_group -= evaluating - beforehand
+    work.runs_after_group -= evaluating - precomputed
     clock.lap("tune")
     work.begin(
-        f"evaluating on {settings.validation} fresh scenarios", evaluating - (beforehand if baselines else 0)
+        f"evaluating on {settings.validation} fresh scenarios", evaluating - (precomputed if baselines else 0)
     )
     best = [
         result.best.gains if result.best else task.literature
         for result, task in zip(searched, tasks, strict=True)
     ]
-    evaluated = {**(baselines or _evaluate_baselines(validation)), "tuned": validation.judge(best)}
+    evaluated = {**(baselines or _evaluate_baselines(validation)), "tuned": validation.evaluate(best)}
     noisy = [has_sensor_noise(task.mechanism) for task in tasks]
-    noiseless = validation.judge(best, noise=False) if any(noisy) else []
+    noiseless = validation.evaluate(best, noise=False) if any(noisy) else []
     clock.lap("judge")
     comparisons: list[GlobalComparison | None] = [None for _ in tasks]
     if settings.global_search and settings.setting is None:
@@ -149,7 +149,7 @@ def tune_group(
             timings=clock.laps,
             intervals=compute_error_intervals(decisive["tuned"].error, decisive["tuned"].good),
             first=tuple(near[i]),
-            freedom=_compute_tolerances(task, validation.names, searched[i].best),
+            tolerances=_compute_tolerances(task, validation.names, searched[i].best),
             global_comparison=comparisons[i],
             transparency=_compute_transparency(
                 validation, i, {key: pairs[i][1] for key, pairs in evaluated.items()}
@@ -237,8 +237,8 @@ def _evaluate_baselines(validation: Validation) -> dict[str, list]:
     task = validation.tasks[0]
     plain = [remove_compensation(task.compensator, gains, task.model.axes) for gains in literature]
     return {
-        "before": validation.judge([gains for _, gains in plain], plain[0][0]),
-        "literature": validation.judge(literature),
+        "before": validation.evaluate([gains for _, gains in plain], plain[0][0]),
+        "literature": validation.evaluate(literature),
     }
 
 
@@ -272,7 +272,7 @@ def _compute_tolerances(
 def compute_error_metrics(outcome: Outcome) -> ErrorMetrics:
     """Compute the error metrics of a batch of scenarios; they are NaN if no contact ended."""
     errors = outcome.error[outcome.good]
-    failed = int(np.sum(outcome.wanted & ~outcome.good))
+    failed = int(np.sum(outcome.is_scheduled & ~outcome.good))
     if not len(errors):
         nan = float("nan")
         return ErrorMetrics(
@@ -299,7 +299,7 @@ def _compare_real_contacts(outcome: Outcome) -> dict[str, Any]:
     return {
         "peak_force_ratio": float(np.nanpercentile(outcome.peak_force_ratio[good], 99)),
         "duration_ratio": (float(lowest), float(highest)),
-        "unlike": float(np.mean(outcome.unlike[good])),
+        "unlike": float(np.mean(outcome.is_unlike_ideal[good])),
     }
 
 

@@ -55,7 +55,7 @@ class _CachedResult(NamedTuple):
     outcomes: dict[str, list[np.ndarray]]
     timings: dict[str, float]
     intervals: ErrorIntervals | None
-    freedom: dict[str, GainTolerance]
+    tolerances: dict[str, GainTolerance]
     global_comparison: GlobalComparison | None
     transparency: dict[str, dict[str, IntervalEstimate]]
     without_noise: ErrorMetrics | None
@@ -76,7 +76,7 @@ def tune_all(
     work: SearchProgress | None = None,
     tuned: Sequence[EarlierGains] = (),
     common: CommonProgram | None = None,
-    pieces: Checkpoints = NO_CHECKPOINTS,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, TuneResult]]:
     """Tune the gains of `compensator` for many mechanisms; yield (index, result) of each finished mechanism.
@@ -86,8 +86,8 @@ def tune_all(
     groups but the first, the gains of the most similar mechanism of the first group are a start too. These
     starts never replace the literature's gains.
 
-    `pieces` caches each result under the mechanism's name and its group, because the other mechanisms of the
-    group affect the last bits. If `scheduler` is given, the workers of a cluster tune the groups.
+    `checkpoints` caches each result under the mechanism's name and its group, because the other mechanisms of
+    the group affect the last bits. If `scheduler` is given, the workers of a cluster tune the groups.
     """
     work, first_group = work or SearchProgress(), []
     tasks = _build_tasks(mechanisms, compensator, settings, common)
@@ -109,9 +109,9 @@ def tune_all(
         ]
         work.runs_after_group = afterwards + left
         if scheduler is None:
-            computed = _tune_locally(groups, settings, work, pieces)
+            computed = _tune_locally(groups, settings, work, checkpoints)
         else:
-            computed = _tune_on_cluster(scheduler, groups, settings, work, pieces)
+            computed = _tune_on_cluster(scheduler, groups, settings, work, checkpoints)
         for index, results in computed:
             if not first_group:
                 first_group = [
@@ -141,21 +141,21 @@ def _group_tasks(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int
 
 
 def _tune_locally(
-    groups: list[_TuneGroup], settings: TuneSettings, work: SearchProgress, pieces: Checkpoints
+    groups: list[_TuneGroup], settings: TuneSettings, work: SearchProgress, checkpoints: Checkpoints
 ) -> Iterator[tuple[int, list[TuneResult]]]:
     """Tune each group of mechanisms in order; yield (index of the group, results)."""
     for index, group in enumerate(groups):
         runs = estimate_group_runs(group.tasks, settings)
         work.runs_after_group -= runs
         work.name = describe_group(group.tasks)
-        results = _read_results(group, settings, pieces)
+        results = _read_results(group, settings, checkpoints)
         if results is not None:
             work.keep("from the cache", runs)
         else:
-            if pieces.is_enabled:
-                work.journal = pieces.journal(_list_names(group)[0], _list_inputs(group, settings))
+            if checkpoints.is_enabled:
+                work.journal = checkpoints.journal(_list_names(group)[0], _list_inputs(group, settings))
             results = tune_group(group.tasks, settings, work, group.near)
-            _write_results(group, settings, pieces, map(_select_cached_fields, results))
+            _write_results(group, settings, checkpoints, map(_select_cached_fields, results))
             work.journal.finish()
         yield index, results
 
@@ -165,13 +165,13 @@ def _tune_on_cluster(
     groups: list[_TuneGroup],
     settings: TuneSettings,
     work: SearchProgress,
-    pieces: Checkpoints,
+    checkpoints: Checkpoints,
 ) -> Iterator[tuple[int, list[TuneResult]]]:
     """Tune groups of mechanisms on a cluster; yield (index of the group, results) of each finished group."""
     missing = []
     for index, group in enumerate(groups):
         runs = estimate_group_runs(group.tasks, settings)
-        results = _read_results(group, settings, pieces)
+        results = _read_results(group, settings, checkpoints)
         if results is not None:
             work.runs_after_group -= runs
             work.keep("from the cache", runs)
@@ -189,7 +189,7 @@ def _tune_on_cluster(
         work.name = describe_group(group.tasks)
         work.begin("tuned on the cluster", runs)
         work.report_runs(runs)
-        _write_results(group, settings, pieces, cached)
+        _write_results(group, settings, checkpoints, cached)
         yield index, _restore_results(group, cached, settings)
 
 
@@ -221,21 +221,23 @@ def _list_names(group: _TuneGroup) -> list[str]:
     return [f"tune {task.mechanism.name}" for task in group.tasks]
 
 
-def _read_results(group: _TuneGroup, settings: TuneSettings, pieces: Checkpoints) -> list[TuneResult] | None:
-    if not pieces.is_enabled:
+def _read_results(
+    group: _TuneGroup, settings: TuneSettings, checkpoints: Checkpoints
+) -> list[TuneResult] | None:
+    if not checkpoints.is_enabled:
         return None
     inputs = _list_inputs(group, settings)
-    cached = [pieces.read(name, (inputs, i), _CachedResult) for i, name in enumerate(_list_names(group))]
+    cached = [checkpoints.read(name, (inputs, i), _CachedResult) for i, name in enumerate(_list_names(group))]
     return _restore_results(group, cached, settings) if all(cached) else None
 
 
 def _write_results(
-    group: _TuneGroup, settings: TuneSettings, pieces: Checkpoints, results: Iterable[_CachedResult]
+    group: _TuneGroup, settings: TuneSettings, checkpoints: Checkpoints, results: Iterable[_CachedResult]
 ) -> None:
-    if pieces.is_enabled:
+    if checkpoints.is_enabled:
         inputs = _list_inputs(group, settings)
         for i, (name, result) in enumerate(zip(_list_names(group), results, strict=True)):
-            pieces.write(name, (inputs, i), result)
+            checkpoints.write(name, (inputs, i), result)
 
 
 def _select_cached_fields(result: TuneResult) -> _CachedResult:

@@ -51,12 +51,12 @@ class Validation:
     names: tuple[str, ...]  # names of the gains that are tuned in at least one task
     bounds: list[GainBounds]  # bounds of the gains `names`, for each task
     # scenarios to evaluate: for each task the fresh scenarios, with probes if any, then the nominal run
-    judged: Any
+    evaluated: Any
     training: Any  # training scenarios, (tasks, ..., scenarios)
-    lanes: int  # number of lanes per task in `judged`
+    lanes: int  # number of lanes per task in `evaluated`
     work: SearchProgress  # progress counter
 
-    def judge(
+    def evaluate(
         self, gains: list[dict[str, float]], compensator: str | None = None, noise: bool = True
     ) -> list[tuple[Outcome, Outcome | None]]:
         """Evaluate one set of gains for each task on the task's fresh scenarios.
@@ -130,11 +130,11 @@ class Validation:
             self.work.report_runs(pairs * number)
             # arrays (contacts, tasks, points, scenarios)
             terms = [term.reshape(-1, *shape, number) for term in compute_contact_terms(outcome)]
-            wanted = outcome.wanted.reshape(terms[0].shape)
+            is_scheduled = outcome.is_scheduled.reshape(terms[0].shape)
             probes = mask_probes(number) & self.tasks[0].probed
             values = self._evaluate_function(objectives[which[0]], outcome, pairs)
             for index, task in enumerate(which[rows]):
-                mask = wanted[:, index, 0]  # the wanted contacts are the same at every point
+                mask = is_scheduled[:, index, 0]  # the wanted contacts are the same at every point
                 error, excess, chatter = (np.moveaxis(term[:, index], 1, 0) for term in terms)
                 losses[rows.start + index, columns] = evaluate_objective(
                     objectives[task],
@@ -184,13 +184,13 @@ class Validation:
     @cached_property
     def _evaluated_batch(self) -> Batch:
         # A small batch is padded to the number of training lanes, so that both batches share a program.
-        return self.tasks[0].model.place_batch(self.judged, at_least=count_lanes(self.training))
+        return self.tasks[0].model.place_batch(self.evaluated, at_least=count_lanes(self.training))
 
     @cached_property
     def _noiseless_batch(self) -> Batch:
         # The noise is multiplied by 0, so that runs with and without noise share a program.
         model = self.tasks[0].model
-        return model.place_batch(model.without_noise(self.judged), at_least=count_lanes(self.training))
+        return model.place_batch(model.without_noise(self.evaluated), at_least=count_lanes(self.training))
 
     @cached_property
     def _placed(self) -> Callable[[tuple[int, ...], int, int, int], tuple[Any, Batch]]:
@@ -243,9 +243,9 @@ def build_validation(
     Ideal contacts, which no gain changes, are computed here, once for all gains.
     """
     drawn = [_draw_evaluation_lanes(task, scenarios, seed + VALIDATION_SEED_OFFSET) for task in tasks]
-    fresh, probed, judged, loops = (list(column) for column in zip(*drawn, strict=True))
-    batches = tasks[0].model.with_ideal_contacts([*judged, *[task.scenarios for task in tasks]])
-    judged, training = batches[: len(tasks)], batches[len(tasks) :]
+    fresh, probed, evaluated, loops = (list(column) for column in zip(*drawn, strict=True))
+    batches = tasks[0].model.with_ideal_contacts([*evaluated, *[task.scenarios for task in tasks]])
+    evaluated, training = batches[: len(tasks)], batches[len(tasks) :]
     tasks = [replace(task, scenarios=batch) for task, batch in zip(tasks, training, strict=True)]
     names = list_tuned_gains(tasks)
     return Validation(
@@ -255,7 +255,7 @@ def build_validation(
         loop=join_loops(loops),
         names=names,
         bounds=[build_gain_bounds(task, names) for task in tasks],
-        judged=join_batches(judged),
+        evaluated=join_batches(evaluated),
         training=jax.tree.map(
             lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]),
             *training,
@@ -294,12 +294,12 @@ def _draw_evaluation_lanes(
     if task.probed and isinstance(task.mechanism, Mechanism):
         probed = build_probed_scenarios(task.mechanism, drawn, seed)
         nominal = build_probed_scenarios(task.mechanism).scenarios
-        judged = join_batches([probed.scenarios, jax.tree.map(lambda leaf: leaf[..., :1], nominal)])
+        evaluated = join_batches([probed.scenarios, jax.tree.map(lambda leaf: leaf[..., :1], nominal)])
     else:
-        judged = join_batches([fresh, task.model.scenarios(task.mechanism)])
+        evaluated = join_batches([fresh, task.model.scenarios(task.mechanism)])
     if task.common is None:
-        both = join_batches([judged, task.scenarios])
-        return fresh, probed, judged, task.model.loop(task.mechanism, task.compensator, both, chatter=True)
+        both = join_batches([evaluated, task.scenarios])
+        return fresh, probed, evaluated, task.model.loop(task.mechanism, task.compensator, both, chatter=True)
     assert isinstance(task.mechanism, Mechanism)
-    loop = task.common.loop(task.model.loop(task.mechanism, task.compensator, judged, chatter=True))
-    return fresh, probed, task.common.scenarios(task.mechanism, judged), loop
+    loop = task.common.loop(task.model.loop(task.mechanism, task.compensator, evaluated, chatter=True))
+    return fresh, probed, task.common.scenarios(task.mechanism, evaluated), loop

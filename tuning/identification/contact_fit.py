@@ -105,7 +105,7 @@ class ContactFit:
     evaluated: tuple[EvaluatedLaw, ...]
     problem: ContactProblem
     posterior: Posterior
-    freedom: int  # degrees of freedom: number of readings minus number of parameters
+    degrees_of_freedom: int  # degrees of freedom: number of readings minus number of parameters
     noise_error: float  # relative standard error of the noise level that weights the residuals
     dead_zone: bool  # whether the sensor has a dead zone; the parameter "bias" is then minus the dead zone
     drift: ClockDrift | None = None  # drift of a separate force clock, whose offset is part of the delay
@@ -119,7 +119,7 @@ class ContactFit:
     @property
     def left(self) -> float:
         """Return chi-squared per degree of freedom."""
-        return self.posterior.best[2].misfit / self.freedom
+        return self.posterior.best[2].misfit / self.degrees_of_freedom
 
     def draws(self) -> np.ndarray:
         """Return posterior draws, shape (draws, parameters), widened if the residuals exceed the noise."""
@@ -175,11 +175,19 @@ def fit_contact(
         readings = _drop_readings_near_edges(problem, posterior)
         problem, posterior = _fit_laws(motion, readings, (law,), plane, None, noise_is_hidden, seed)
         posterior = _add_surface_uncertainty(posterior, seed)
-    freedom = len(problem.used_rows) - len(posterior.names)
+    degrees_of_freedom = len(problem.used_rows) - len(posterior.names)
     error = 0.0 if noise is None or noise_is_hidden else noise.std_std / max(noise.std, 1e-300)
     is_specified = plane_option is not None
     return ContactFit(
-        law, evaluated, problem, posterior, freedom, error, bool(noise_is_hidden), drift, is_specified
+        law,
+        evaluated,
+        problem,
+        posterior,
+        degrees_of_freedom,
+        error,
+        bool(noise_is_hidden),
+        drift,
+        is_specified,
     )
 
 
@@ -411,7 +419,7 @@ def refit_without(fit: ContactFit, held_out: np.ndarray, seed: int = 0) -> Conta
     readings, problem = fit.readings, fit.problem
     rest = replace(readings, counts=readings.counts & ~held_out)
     rest = ContactProblem(problem.motion, rest, fit.law, problem.plane, problem.time_constant)
-    freedom = len(rest.used_rows) - len(fit.posterior.names)
+    degrees_of_freedom = len(rest.used_rows) - len(fit.posterior.names)
     delay, plane, inner = fit.posterior.best
     rest = summarise_deep_lanes(rest, (delay, plane))
     if rest.time_constant:
@@ -419,4 +427,4 @@ def refit_without(fit: ContactFit, held_out: np.ndarray, seed: int = 0) -> Conta
         posterior = compute_posterior_at_lag(rest, best, fit.posterior, seed)
     else:
         posterior = compute_posterior(rest, seed, (delay, plane), COARSE_GRID_SIZE)
-    return replace(fit, posterior=posterior, freedom=freedom)
+    return replace(fit, posterior=posterior, degrees_of_freedom=degrees_of_freedom)

@@ -37,7 +37,9 @@ def make_estimates(draws_by_key, motion, contact, force, position, fixed) -> tup
     elif contact is not None:
         std = contact.readings.std
         direct.append(
-            _make_normal_estimate("rig.force_sensor.noise_std", std, std / np.sqrt(2.0 * contact.freedom))
+            _make_normal_estimate(
+                "rig.force_sensor.noise_std", std, std / np.sqrt(2.0 * contact.degrees_of_freedom)
+            )
         )
         if force is None:
             bias = contact.posterior.draws[:, contact.posterior.names.index("bias")]

@@ -58,12 +58,12 @@ class FreeMotion:
     def left(self) -> float:
         """Return chi-squared per degree of freedom: the ratio of residual power to noise power."""
         error, noise = self.misfit()
-        return float(2.0 * np.sum(np.abs(error / noise) ** 2)) / max(self.fit.freedom, 1)
+        return float(2.0 * np.sum(np.abs(error / noise) ** 2)) / max(self.fit.degrees_of_freedom, 1)
 
     @property
     def covariance(self) -> np.ndarray:
         """Return the covariance of the model's parameters, increased if the residual exceeds the noise."""
-        unexplained = self.fit.chi2 / max(self.fit.freedom, 1)
+        unexplained = self.fit.chi2 / max(self.fit.degrees_of_freedom, 1)
         return self.fit.covariance * (unexplained if unexplained > MAX_REDUCED_CHI_SQUARE else 1.0)
 
     @property
@@ -139,12 +139,15 @@ def estimate_model_error(model: MotionModel, lines: SpectralLines) -> float:
         variances.append(1.0 / weight.sum())
         counts.append(len(band))
     power, variance = np.square(errors), np.array(variances)
-    freedom = 2 * len(power) - model.structure.size
-    if freedom < 1 or stats.chi2.sf(np.sum(2.0 * power / variance), freedom) > MODEL_ERROR_P_VALUE:
+    degrees_of_freedom = 2 * len(power) - model.structure.size
+    if (
+        degrees_of_freedom < 1
+        or stats.chi2.sf(np.sum(2.0 * power / variance), degrees_of_freedom) > MODEL_ERROR_P_VALUE
+    ):
         return 0.0
 
     def excess(logarithm: float) -> float:
-        return float(np.sum(2.0 * power / (variance + np.exp(2.0 * logarithm)))) - freedom
+        return float(np.sum(2.0 * power / (variance + np.exp(2.0 * logarithm)))) - degrees_of_freedom
 
     least, most = np.log(1e-9), np.log(MAX_MODEL_ERROR)
     root: Any = optimize.brentq(excess, least, most) if excess(most) < 0.0 else most
@@ -165,7 +168,7 @@ def compare_free_motion(
 
     lines = concatenate_lines(spectra, timing)
     lines_with_other_hold = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
-    fit, inflation = held(lines), max(1.0, held(lines).chi2 / max(held(lines).freedom, 1))
+    fit, inflation = held(lines), max(1.0, held(lines).chi2 / max(held(lines).degrees_of_freedom, 1))
     candidate = StructureCandidate(fit, compute_criterion(fit, inflation), "")
     gain = candidate.criterion - compute_criterion(held(lines_with_other_hold), inflation)
     return FreeMotion(lines, tuple(spectra), candidate, (candidate,), estimate_static_gain(fit, lines), gain)

@@ -135,12 +135,12 @@ def average_periods(command: np.ndarray, output: np.ndarray, valid: np.ndarray, 
     mean = np.where(valid, output, 0.0).sum(axis=0) / counted
     input_mean = np.where(valid, command, 0.0).sum(axis=0) / counted
     rest = np.where(valid, output - mean, 0.0)
-    freedom = float(valid.sum() - np.sum(valid_count > 0))
-    noise = float(np.sqrt(np.sum(rest**2) / max(freedom, 1.0)))
+    degrees_of_freedom = float(valid.sum() - np.sum(valid_count > 0))
+    noise = float(np.sqrt(np.sum(rest**2) / max(degrees_of_freedom, 1.0)))
     U, Y = np.fft.rfft(input_mean) / size, np.fft.rfft(mean) / size
     spread = np.sum(np.abs(np.fft.rfft(rest, axis=1) / size) ** 2, axis=0)
     # The variance of a mean over n periods is 1/n of the variance of a reading.
-    variance = spread / max(freedom / size, 1e-9) * np.mean(1.0 / counted)
+    variance = spread / max(degrees_of_freedom / size, 1e-9) * np.mean(1.0 / counted)
     variance = _smooth(variance)
     number = np.arange(len(U))
     excited = (np.abs(U) > MIN_AMPLITUDE_SHARE * np.abs(U[1:]).max()) & (number > 0)

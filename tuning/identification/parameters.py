@@ -107,8 +107,8 @@ def make_contact_section(law: Law, values: dict[str, float]) -> dict[str, Any]:
     """Return the section `contact` of a mechanism file for a law with the given values by key."""
     section: dict[str, Any] = {"law": law.name, **law.shape}
     stiffness = _collect_entries(values, "contact.stiffness.")
-    segmented = find_contact_law(law.name).segmented
-    section["stiffness"] = stiffness if segmented else [value for (value,) in stiffness]
+    is_segmented = find_contact_law(law.name).is_segmented
+    section["stiffness"] = stiffness if is_segmented else [value for (value,) in stiffness]
     if damping := _collect_entries(values, "contact.damping."):
         section["damping"] = [max(value, 0.0) for (value,) in damping]
     return section | {key: values[f"contact.{key}"] for key in CONTACT_KEYS if f"contact.{key}" in values}

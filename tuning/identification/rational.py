@@ -174,7 +174,7 @@ class SpectrumFit:
         return float(2.0 * np.sum(np.abs(self.residual) ** 2))
 
     @property
-    def freedom(self) -> int:
+    def degrees_of_freedom(self) -> int:
         return 2 * len(self.residual) - self.model.structure.size
 
     @property

@@ -95,12 +95,12 @@ class Identification:
     @property
     def effect(self) -> float:
         """Return the effect of all detected defects and of the parameters' uncertainty on e."""
-        return float(sum(line.counted for line in self.lines))
+        return float(sum(line.effect_in_verdict for line in self.lines))
 
     @property
     def effect_on_error(self) -> float:
         """Return the effect of all detected defects and of the parameters' uncertainty on e - e*."""
-        return float(sum(line.counted_error for line in self.lines))
+        return float(sum(line.error_in_verdict for line in self.lines))
 
     @property
     def good(self) -> bool:
@@ -116,8 +116,8 @@ class Identification:
     @property
     def worst(self) -> CheckResult | None:
         """Return the check whose defect has the largest effect, or None if there is no defect."""
-        defects = [line for line in self.lines if line.there and line.counts]
-        return max(defects, key=lambda line: max(line.counted, line.counted_error), default=None)
+        defects = [line for line in self.lines if line.is_significant and line.is_in_verdict]
+        return max(defects, key=lambda line: max(line.effect_in_verdict, line.error_in_verdict), default=None)
 
     @property
     def verdict(self) -> str:

@@ -49,9 +49,12 @@ def choose_structure(
     for structure in STRUCTURES:
         if structure.order == order or (order is None and (highest is None or structure.order <= highest)):
             fits.append(fit_structure(structure, lines))
-            if not find_fault(fits[-1]) and stats.chi2.sf(fits[-1].chi2, fits[-1].freedom) > NOISE_P_VALUE:
+            if (
+                not find_fault(fits[-1])
+                and stats.chi2.sf(fits[-1].chi2, fits[-1].degrees_of_freedom) > NOISE_P_VALUE
+            ):
                 break
-    inflation = max(1.0, min(result.chi2 / max(result.freedom, 1) for result in fits))
+    inflation = max(1.0, min(result.chi2 / max(result.degrees_of_freedom, 1) for result in fits))
     candidates = [
         StructureCandidate(result, compute_criterion(result, inflation), find_fault(result, inflation))
         for result in fits
@@ -65,7 +68,9 @@ def choose_structure(
 
 def compute_residual_ratio(candidates: list[StructureCandidate]) -> float:
     """Return the smallest chi-squared per degree of freedom of all candidates, but at least 1."""
-    return max(1.0, min(candidate.fit.chi2 / max(candidate.fit.freedom, 1) for candidate in candidates))
+    return max(
+        1.0, min(candidate.fit.chi2 / max(candidate.fit.degrees_of_freedom, 1) for candidate in candidates)
+    )
 
 
 def compute_criterion(fit: SpectrumFit, inflation: float) -> float:

@@ -41,31 +41,31 @@ class CheckResult:
     Attributes:
         name: Name of the check.
         finding: Result in words and numbers.
-        there: Whether the defect is statistically significant.
+        is_significant: Whether the defect is statistically significant.
         effect: Effect of the defect on the restitution e.
         where: Where the error is largest: the frequency, or the log file and the time of the contact.
         on_error: Effect of the defect on the error e - e* (e*: ideal contact), or None if it equals `effect`.
-        counts: Whether the verdict includes this check.
+        is_in_verdict: Whether the verdict includes this check.
     """
 
     name: str
     finding: str
-    there: bool
+    is_significant: bool
     effect: float
     where: str = ""
     on_error: float | None = None
-    counts: bool = True
+    is_in_verdict: bool = True
 
     @property
-    def counted(self) -> float:
+    def effect_in_verdict(self) -> float:
         """Return the effect on e for the verdict: 0 if the defect is absent or not in the verdict."""
-        return self.effect if self.there and self.counts else 0.0
+        return self.effect if self.is_significant and self.is_in_verdict else 0.0
 
     @property
-    def counted_error(self) -> float:
+    def error_in_verdict(self) -> float:
         """Return the effect on e - e* for the verdict: 0 if the defect is absent or not in the verdict."""
         effect = self.effect if self.on_error is None else self.on_error
-        return effect if self.there and self.counts else 0.0
+        return effect if self.is_significant and self.is_in_verdict else 0.0
 
 
 def check_motion_model(motion: FreeMotion, frequency: float) -> list[CheckResult]:
@@ -90,8 +90,8 @@ def _check_motion_misfit(motion: FreeMotion, frequency: float) -> CheckResult:
     middle = np.convolve(at, kernel, "valid")
     near = middle <= max(MAX_FREQUENCY_RATIO * frequency, middle[0])
     worst = int(np.argmax(excess * near))
-    freedom = max(motion.fit.freedom, 1)
-    probability = stats.chi2.sf(motion.left * freedom, freedom)
+    degrees_of_freedom = max(motion.fit.degrees_of_freedom, 1)
+    probability = stats.chi2.sf(motion.left * degrees_of_freedom, degrees_of_freedom)
     return CheckResult(
         "motion model",
         f"leaves {motion.left:.3g} times the noise's power, {excess[worst]:.2g} of the motion near contacts",
@@ -185,12 +185,12 @@ def check_held_out_contacts(
     The verdict ignores these checks, because the mechanism file comes from another fit, to all contacts.
     """
     residual_check = _check_law_residual(contact, runs, held_out)
-    lines = [replace(residual_check, name="contact law, touches not fitted", counts=False)]
+    lines = [replace(residual_check, name="contact law, touches not fitted", is_in_verdict=False)]
     errors, stds = estimate_restitution_errors(contact, runs, mass)
     usable = held_out & np.isfinite(errors)
     if contact.drift is None and usable.any():
         line = _check_restitution(contact, runs, errors, stds, usable)
-        lines.append(replace(line, name="restitution of touches not fitted", counts=False))
+        lines.append(replace(line, name="restitution of touches not fitted", is_in_verdict=False))
     return lines
 
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from jaxhil.files import write_atomically
 from jaxhil.simulation.contact_plot import BLUE, create_figure
-from jaxhil.sixdof.recording import Recorded
+from jaxhil.sixdof.recording import RunRecord
 from tuning.plots.outlines import Polyline, outlines, rotation_matrix
 from tuning.plots.six_axes import AXIS_NAMES, VIEWS, find_shown_ticks, find_time_origin, quaternion_of
 
@@ -24,7 +24,7 @@ COLUMN_TITLES = ("ideal contact", "on the rig")
 
 
 @matplotlib.style.context("default")
-def animate(recorded: Recorded, title: str, path: str | Path) -> None:
+def animate(recorded: RunRecord, title: str, path: str | Path) -> None:
     """Write an animation of target and chaser near the contact, for the ideal contact and for the rig.
 
     Raise OSError if the file cannot be written.
@@ -57,7 +57,7 @@ def _select_writer(target: Path) -> AbstractMovieWriter:
 
 
 def _draw_scene(
-    figure: Figure, recorded: Recorded
+    figure: Figure, recorded: RunRecord
 ) -> list[tuple[LineCollection, list[Polyline], np.ndarray, Any]]:
     """Draw the target in four subplots: two views of the ideal contact, and two of the contact on the rig.
 
@@ -68,7 +68,7 @@ def _draw_scene(
     middle, half = _shown_region(recorded)
     moving = []
     for row, view in enumerate(VIEWS):
-        for column, poses in enumerate((recorded.in_space, recorded.actual)):
+        for column, poses in enumerate((recorded.ideal, recorded.actual)):
             axes = figure.add_subplot(2, 2, 2 * row + column + 1)
             fixed: Any = [1e3 * line[:, list(view)] for line in target]
             axes.add_collection(LineCollection(fixed, colors="0.55", linewidths=1.2))
@@ -80,7 +80,7 @@ def _draw_scene(
     return moving
 
 
-def _shown_region(recorded: Recorded) -> tuple[np.ndarray, float]:
+def _shown_region(recorded: RunRecord) -> tuple[np.ndarray, float]:
     """Return centre (3,) and half width [m] of the shown region: all contact points, and a margin."""
     touching = recorded.depth > 0
     points = recorded.point[touching] if np.any(touching) else recorded.actual[:1, :3]

@@ -16,7 +16,7 @@ from jaxhil.simulation.contact_plot import (
     finish_axes,
     legend_below,
 )
-from tuning.benchmark.comparison import LITERATURE_GAINS, TUNED_GAINS, LawMetrics
+from tuning.benchmark.comparison import LITERATURE_GAINS, TUNED_GAINS, CompensatorMetrics
 from tuning.benchmark.tables import choose_best_metrics
 from tuning.plots.parts import MARKERS, name_rows
 
@@ -30,13 +30,15 @@ TRANSPARENCY_TITLES = {
 
 
 @matplotlib.style.context("default")
-def plot_errors(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]], limit: float) -> Figure:
+def plot_errors(
+    names: Sequence[str], results: Mapping[str, Sequence[CompensatorMetrics]], limit: float
+) -> Figure:
     """Plot the rms error of each compensator with its 95 % interval, in one panel per mechanism.
 
     `names` are the mechanisms, and `results` the metrics of all compensators by mechanism.
     """
     keys = _list_gain_names(names, results)
-    laws = list(dict.fromkeys(result.law for name in names for result in results[name]))
+    laws = list(dict.fromkeys(result.compensator for name in names for result in results[name]))
     columns = min(MAX_PANEL_COLUMNS, len(names))
     rows = -(-len(names) // columns)
     height = 0.9 + (0.14 + 0.06 * len(keys)) * len(laws)
@@ -44,7 +46,7 @@ def plot_errors(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]
     figure = create_figure(size, "Restitution error on fresh scenarios", above=0.9, below=0.75)
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for panel, name in zip(panels.flat, names, strict=False):
-        by_law = {result.law: result for result in results[name]}
+        by_law = {result.compensator: result for result in results[name]}
         for key, offset in zip(keys, _compute_offsets(len(keys)), strict=True):
             indices = [i for i, law in enumerate(laws) if law in by_law and key in by_law[law].figures]
             errors = [by_law[laws[i]].figures[key]["rms"] for i in indices]
@@ -78,12 +80,12 @@ def plot_errors(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]
 
 
 @matplotlib.style.context("default")
-def plot_transparency(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]]) -> Figure:
+def plot_transparency(names: Sequence[str], results: Mapping[str, Sequence[CompensatorMetrics]]) -> Figure:
     """Plot transparency, slope of e against e*, and peak command of each compensator with its best gains.
 
     Each mechanism in `names` is a point; `results` are the metrics of all compensators by mechanism.
     """
-    laws = list(dict.fromkeys(result.law for name in names for result in results[name]))
+    laws = list(dict.fromkeys(result.compensator for name in names for result in results[name]))
     size = (12.0, 1.75 + 0.34 * len(laws))
     gains = "Tuned gains" if TUNED_GAINS in _list_gain_names(names, results) else "The literature's gains"
     figure = create_figure(size, f"Does the run still test the hardware? {gains}", above=0.6, below=0.95)
@@ -96,7 +98,7 @@ def plot_transparency(names: Sequence[str], results: Mapping[str, Sequence[LawMe
                 choose_best_metrics(result)[key].value
                 for name in names
                 for result in results[name]
-                if result.law == law
+                if result.compensator == law
             ]
             heights = row + np.linspace(-0.25, 0.25, max(len(values), 2))[: len(values)]
             # A value beyond the range of the axis is drawn at the end of the axis.
@@ -115,7 +117,7 @@ def plot_transparency(names: Sequence[str], results: Mapping[str, Sequence[LawMe
     return figure
 
 
-def _list_gain_names(names: Sequence[str], results: Mapping[str, Sequence[LawMetrics]]) -> list[str]:
+def _list_gain_names(names: Sequence[str], results: Mapping[str, Sequence[CompensatorMetrics]]) -> list[str]:
     """Return the names of all evaluated sets of gains: "literature", then named settings, then "tuned"."""
     keys = {key: None for name in names for result in results[name] for key in result.figures}
     rank = {LITERATURE_GAINS: 0, TUNED_GAINS: 2}

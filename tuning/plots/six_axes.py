@@ -18,7 +18,7 @@ from jaxhil.simulation.contact_plot import (
     create_figure,
     finish_axes,
 )
-from jaxhil.sixdof.recording import Recorded
+from jaxhil.sixdof.recording import RunRecord
 from tuning.plots.outlines import Polyline, outlines, rotation_matrix
 
 AXIS_NAMES = ("x", "y", "z")
@@ -32,7 +32,7 @@ VIEWS = ((0, 2), (1, 2))  # indices of the horizontal and the vertical axis of e
 
 
 @matplotlib.style.context("default")
-def six_axes_plot(recorded: Recorded, title: str) -> Figure:
+def six_axes_plot(recorded: RunRecord, title: str) -> Figure:
     """Plot a six-axis run: pose, normal forces and moments over time, and views of the mechanism in contact.
 
     The views show the mechanism at the first touch and at the largest penetration. Grey lines show the ideal
@@ -46,9 +46,9 @@ def six_axes_plot(recorded: Recorded, title: str) -> Figure:
         axes = figure.add_subplot(cell)
         for axis, colour in enumerate(AXIS_COLOURS):
             entry = part + axis
-            curves = (curve[shown, entry] - recorded.in_space[origin, entry] for curve in recorded[1:4])
-            desired, actual, in_space = (1e3 * curve for curve in curves)
-            axes.plot(time, in_space, color="0.7", linewidth=3)
+            curves = (curve[shown, entry] - recorded.ideal[origin, entry] for curve in recorded[1:4])
+            desired, actual, ideal = (1e3 * curve for curve in curves)
+            axes.plot(time, ideal, color="0.7", linewidth=3)
             axes.plot(time, desired, color=colour, label=AXIS_NAMES[axis])
             axes.plot(time, actual, color=colour, linestyle=":")
         axes.set(ylabel=f"{name}, minus that\n{since.replace('since', 'at')}")
@@ -71,20 +71,20 @@ def six_axes_plot(recorded: Recorded, title: str) -> Figure:
     return figure
 
 
-def find_time_origin(recorded: Recorded) -> tuple[int, str]:
+def find_time_origin(recorded: RunRecord) -> tuple[int, str]:
     """Return the tick at which the plots' time is 0, and a text that describes this tick.
 
     This is the tick of the first touch in the ideal contact. If there is none, it is the first touch on the
     rig, or without any contact the start of the run.
     """
-    in_space = np.flatnonzero(np.any(recorded.wrench_in_space != 0, axis=1))
-    if len(in_space):
-        return int(in_space[0]), "since first touch in space"
+    ideal = np.flatnonzero(np.any(recorded.wrench_ideal != 0, axis=1))
+    if len(ideal):
+        return int(ideal[0]), "since first touch of the ideal contact"
     on_the_rig = np.flatnonzero(np.any(recorded.depth > 0, axis=1))
     return (int(on_the_rig[0]), "since first touch") if len(on_the_rig) else (0, "since the start")
 
 
-def _find_shown_instants(recorded: Recorded) -> tuple[tuple[str, int], ...]:
+def _find_shown_instants(recorded: RunRecord) -> tuple[tuple[str, int], ...]:
     """Return description and tick of the two instants at which the mechanism is drawn."""
     touching = np.flatnonzero(np.any(recorded.depth > 0, axis=1))
     if not len(touching):
@@ -92,12 +92,12 @@ def _find_shown_instants(recorded: Recorded) -> tuple[tuple[str, int], ...]:
     return ("first touch", int(touching[0])), ("deepest", int(np.argmax(recorded.depth.max(axis=1))))
 
 
-def find_shown_ticks(recorded: Recorded) -> slice:
+def find_shown_ticks(recorded: RunRecord) -> slice:
     """Return the ticks to be shown: from the first to the last (ideal or real) contact, with a margin.
 
     Without contact, return all ticks.
     """
-    touching = np.any(recorded.depth > 0, axis=1) | np.any(recorded.wrench_in_space != 0, axis=1)
+    touching = np.any(recorded.depth > 0, axis=1) | np.any(recorded.wrench_ideal != 0, axis=1)
     ticks = np.flatnonzero(touching)
     if not len(ticks):
         return slice(0, len(recorded.time))
@@ -107,7 +107,7 @@ def find_shown_ticks(recorded: Recorded) -> slice:
 
 def draw_view(
     axes: Axes,
-    recorded: Recorded,
+    recorded: RunRecord,
     tick: int,
     target: list[Polyline],
     chaser: list[Polyline],
@@ -151,9 +151,9 @@ def quaternion_of(theta: np.ndarray) -> Any:
     return exponential(vector(jnp.asarray(theta)))
 
 
-def _plot_forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
+def _plot_forces(axes: Axes, recorded: RunRecord, shown: slice, time: np.ndarray) -> None:
     """Plot the normal force between each pair of shapes that touches, and the ideal contact's total force."""
-    total = np.linalg.norm(recorded.wrench_in_space[shown, :3], axis=1)
+    total = np.linalg.norm(recorded.wrench_ideal[shown, :3], axis=1)
     axes.plot(time, total, color="0.7", linewidth=3, label="total force of the ideal contact")
     for index, candidate in enumerate(np.flatnonzero(np.any(recorded.force > 0, axis=0))):
         colour, line = (
@@ -166,10 +166,10 @@ def _plot_forces(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray)
     finish_axes(axes, "best")
 
 
-def _plot_moments(axes: Axes, recorded: Recorded, shown: slice, time: np.ndarray) -> None:
+def _plot_moments(axes: Axes, recorded: RunRecord, shown: slice, time: np.ndarray) -> None:
     """Plot the moments about the origin of the target's frame T: real contact, command, and ideal contact."""
     for axis, colour in enumerate(AXIS_COLOURS):
-        axes.plot(time, recorded.wrench_in_space[shown, 3 + axis], color="0.7", linewidth=3)
+        axes.plot(time, recorded.wrench_ideal[shown, 3 + axis], color="0.7", linewidth=3)
         axes.plot(time, recorded.command[shown, 3 + axis], color=colour, label=AXIS_NAMES[axis])
         axes.plot(time, recorded.wrench[shown, 3 + axis], color=colour, linestyle=":")
     axes.set(ylabel="moment about T [N m]")

@@ -91,7 +91,7 @@ def _draw_shares(axes: Axes, outcomes: Mapping[str, Any], limit: float) -> None:
         if not len(errors):
             continue
         colour, line, width = CURVE_STYLES[name]
-        total = int(np.sum(outcome.wanted))
+        total = int(np.sum(outcome.is_scheduled))
         # A contact that did not end counts as an infinite error, which raises the whole curve.
         share = (np.arange(1, len(errors) + 1) + total - len(errors)) / total
         style: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": width}

@@ -124,7 +124,7 @@ class RigHardware:
             position = evaluate_row(motion_rows.position, state, start, end) - self._plane
             return MotionState(position, evaluate_row(motion_rows.velocity, state, start, end))
 
-        if self._force_sensor.time_constant > 0.0 or self._law.loaded is not None:
+        if self._force_sensor.time_constant > 0.0 or self._law.loaded_law is not None:
             interval = motion(rows.sample), motion(rows.start), motion(rows.end)
         else:
             interval = motion(rows.sample), None, None
@@ -149,9 +149,9 @@ class RigHardware:
         sample, start, end = interval
         clearance, rest = self._clearance, self._period - self._sample_time
         law, deepest = self._law, self._deepest
-        if law.loaded is not None and start is not None and end is not None:
+        if law.loaded_law is not None and start is not None and end is not None:
             at_sample = self._deepest_until(deepest, start, sample, self._sample_time)
-            law = law.loaded(at_sample)
+            law = law.loaded_law(at_sample)
             self._deepest = self._deepest_until(at_sample, sample, end, rest)
         else:
             at_sample = 0.0
@@ -207,7 +207,7 @@ def _contact_law_of(contact: Contact, number: int) -> FloatLaw:
     """Return the law of contact `number`; contacts beyond the end of a list use its last entry."""
     stiffness = contact.stiffness[min(number, len(contact.stiffness) - 1)]
     damping = contact.damping[min(number, len(contact.damping) - 1)]
-    return find_contact_law(contact.law).in_floats(contact, stiffness, damping)
+    return find_contact_law(contact.law).as_float_law(contact, stiffness, damping)
 
 
 def _quantise(value: float, quantum: float) -> float:

@@ -11,7 +11,7 @@ from random import Random
 from typing import NamedTuple
 
 from jaxhil.mechanism.structs import Mechanism
-from tuning.rig.contact_watch import ContactWatch, RigContact
+from tuning.rig.contact_detector import ContactDetector, RigContact
 from tuning.rig.plant import RigHardware
 from tuning.rig.udp_protocol import (
     APPROACH_TIME,
@@ -69,7 +69,7 @@ class RigTask:
     ) -> None:
         self._mechanism, self._period = mechanism, mechanism.rig.control_period
         self._two_sided = math.isfinite(mechanism.contact.clearance)
-        self._plant, self._watch = RigHardware(mechanism, seed), ContactWatch(mechanism)
+        self._plant, self._detector = RigHardware(mechanism, seed), ContactDetector(mechanism)
         self._phases = Random(seed + 1)
         self._sequence, self._run = -1, 0
         self._contacts: list[RigContact] = []
@@ -146,12 +146,12 @@ class RigTask:
         if age > 0:
             command += min(age, MAX_EXTRAPOLATED_PERIODS) * self._period * newest.command_rate
         command = min(max(command, self._stroke[0]), self._stroke[1])
-        plant, watch = self._plant, self._watch
+        plant, detector = self._plant, self._detector
         if newest.tick >= 0:
             model = newest.position, newest.velocity, newest.force_command
         else:
             model = *self._start, 0.0
-        contact = watch.observe(*model, plant.force, self._force)
+        contact = detector.observe(*model, plant.force, self._force)
         plant.move(command)
         self._tick += 1
         if contact is not None:
@@ -160,7 +160,7 @@ class RigTask:
     def finish(self) -> None:
         """End the session; if the controller has tripped, store the current contact as "tripped"."""
         if self._tick >= 0 and self.tripped and all(c.status != "tripped" for c in self._contacts):
-            aborted_contact = self._watch.cut("tripped")
+            aborted_contact = self._detector.cut("tripped")
             if aborted_contact is not None:
                 self._contacts.append(aborted_contact)
 
@@ -176,7 +176,7 @@ class RigTask:
         self.tripped = ""
         number = self._number
         if self._tick >= 0:
-            aborted_contact = self._watch.cut(STALLED)
+            aborted_contact = self._detector.cut(STALLED)
             if aborted_contact is not None:
                 self._store(aborted_contact)
                 following = (aborted_contact.number + 1) % self._mechanism.approach.contacts
@@ -191,7 +191,7 @@ class RigTask:
         if newest is None or self._pause > 0 or self.tripped:
             return
         self._plant.begin(*self._start, newest.position_command, self._number)
-        self._watch.begin(self._number)
+        self._detector.begin(self._number)
         self._tick = 0
 
     def _finish_contact(self, contact: RigContact) -> None:

@@ -90,7 +90,7 @@ class _ContactInterval:
         self, path: "_CubicPath", side: float, surface: float, law: FloatLaw, deepest: float
     ) -> None:
         self._path, self._side, self._surface, self._law = path, side, surface, law
-        self._turn, bottom = _turning_point(path, self._depth, side) if law.loaded else (1.0, 0.0)
+        self._turn, bottom = _turning_point(path, self._depth, side) if law.loaded_law else (1.0, 0.0)
         self._before = max(deepest, self._depth(0.0))
         self._bottom = max(self._before, bottom)
 
@@ -119,18 +119,18 @@ class _ContactInterval:
         return self._side * (self._path.position(s) - self._surface)
 
     def _law_at(self, s: float) -> FloatLaw:
-        if self._law.loaded is None:
+        if self._law.loaded_law is None:
             return self._law
-        return self._law.loaded(self._bottom if s > self._turn else max(self._before, self._depth(s)))
+        return self._law.loaded_law(self._bottom if s > self._turn else max(self._before, self._depth(s)))
 
     def _hold(self, s: float) -> float:
-        return self._law_at(s).hold(self._depth(s), self._side * self._path.velocity(s))
+        return self._law_at(s).separation_function(self._depth(s), self._side * self._path.velocity(s))
 
     def _force(self, s: float, at_surface: bool) -> float:
         rate = self._side * self._path.velocity(s)
         if at_surface:
             # At the surface, use the limit of the force from inside the contact.
-            return self._law.edge(rate)
+            return self._law.onset_force(rate)
         penetration = self._depth(s)
         return self._law_at(s).force(penetration, rate) if penetration > 0.0 else 0.0
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from jaxhil.errors import InputError, to_one_line
 from jaxhil.mechanism.structs import Mechanism
-from tuning.rig.contact_watch import RigContact
+from tuning.rig.contact_detector import RigContact
 from tuning.rig.loop import ANSWER_SHARE, EmptyTask, PacketTimes, answered_packet_number, run_loop
 from tuning.rig.network import Injection, Network
 from tuning.rig.rig_task import CommandRange, RigTask

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxhil.mechanism.structs import Mechanism
-from tuning.rig.contact_watch import MAX_CONTACT_DURATION, RigContact
+from tuning.rig.contact_detector import MAX_CONTACT_DURATION, RigContact
 from tuning.rig.rig_task import MAX_COMMAND_AGE, STALLED
 from tuning.rig.session import CAUSE_CONTROLLER, LoopReport, SessionReport, SessionSettings
 
@@ -31,8 +31,8 @@ def ideal_restitutions(mechanism: Mechanism, contacts: Sequence[RigContact]) -> 
     speeds = [contact.approach_velocity for contact in contacts]
     velocity = np.array([speed if speed > 0.0 else 1.0 for speed in speeds])[:, None]
     mass = np.broadcast_to(scenario.equivalent_mass, velocity.shape)
-    law = find_contact_law(mechanism.contact.law).simulated
-    ideal = jax.jit(lambda contact, *motion: law.reference(parameters_by_slot(contact), *motion))
+    law = find_contact_law(mechanism.contact.law).simulation_law
+    ideal = jax.jit(lambda contact, *motion: law.ideal_contact(parameters_by_slot(contact), *motion))
     return [float(value) for value in np.asarray(ideal(parameters, mass, velocity).restitution)[:, 0]]
 
 

@@ -311,8 +311,8 @@ def _worst_contact(outcome: Outcome) -> tuple[np.ndarray, ...]:
     duration ratio farthest from 1, and 1 if the peak force or duration of a real contact is out of bounds,
     else 0. All values are NaN if a contact did not end.
     """
-    used = outcome.wanted & outcome.good
-    ended = ~np.any(outcome.wanted & ~outcome.good, axis=0)
+    used = outcome.is_scheduled & outcome.good
+    ended = ~np.any(outcome.is_scheduled & ~outcome.good, axis=0)
 
     def at_largest(size: Any, *values: Any) -> Iterator[np.ndarray]:
         index = np.argmax(np.where(used, np.nan_to_num(size), -1.0), axis=0)[None]
@@ -326,7 +326,7 @@ def _worst_contact(outcome: Outcome) -> tuple[np.ndarray, ...]:
         *at_largest(np.abs(outcome.error), outcome.metrics.restitution, outcome.error),
         *at_largest(force, force),
         *at_largest(deviation, duration),
-        *at_largest(outcome.unlike.astype(float), outcome.unlike),
+        *at_largest(outcome.is_unlike_ideal.astype(float), outcome.is_unlike_ideal),
     )
 
 

@@ -15,7 +15,7 @@ from tuning.sweeps.manifest import load_gains
 from tuning.sweeps.store import SweepStore, read_row
 
 if TYPE_CHECKING:
-    from jaxhil.sixdof.recording import Recorded
+    from jaxhil.sixdof.recording import RunRecord
 
 
 class ScenarioReplay(NamedTuple):
@@ -46,7 +46,7 @@ def compute_motion(sweep: SweepProgram, index: int) -> list[RunMotion]:
     return compute_scenario_motion(loaded._replace(gains=gains), lane)
 
 
-def record_six_axes(sweep: SweepProgram, index: int) -> "Recorded":
+def record_six_axes(sweep: SweepProgram, index: int) -> "RunRecord":
     """Compute the motion of a six-axis scenario at every tick."""
     from jaxhil.sixdof.recording import record_scenario
 

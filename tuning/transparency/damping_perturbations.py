@@ -44,12 +44,12 @@ def perturb_damping(
             return _repeat_last_entry(
                 np.asarray(values).reshape(number, len(contact.stiffness), -1)[:, :, 0], entries
             )
-        return _repeat_last_entry(values, entries) * law.damped if key == "damping" else np.asarray(values)
+        return _repeat_last_entry(values, entries) * law.is_damped if key == "damping" else np.asarray(values)
 
     key, values = law.perturb_damping(drawn, ratio, mass, velocity)
     # The draws have one value per entry, so that the nominal list needs the same number of entries.
     damping_list = list(contact.damping) + [contact.damping[-1]] * (entries - len(contact.damping))
-    changed = {"law": law.damped_as or law.name, "damping": damping_list} if key == "damping" else {}
+    changed = {"law": law.damped_law or law.name, "damping": damping_list} if key == "damping" else {}
     perturbed = msgspec.structs.replace(mechanism, contact=msgspec.structs.replace(contact, **changed))
     return perturbed, {**draws, f"contact.{key}": values}
 

@@ -67,12 +67,12 @@ def compute_metrics(
     good = plain.good
     magnitudes = np.abs(plain.error[good])
     ends = compute_error_intervals(plain.error, good, seed=seed)
-    if np.any(plain.wanted & ~good):
+    if np.any(plain.is_scheduled & ~good):
         # Some contacts did not end. The errors of the others cannot be compared with the errors of a
         # compensator with which all contacts end.
         ends = ErrorIntervals(UNDEFINED_INTERVAL, UNDEFINED_INTERVAL)
-    beyond = good & ((np.abs(plain.error) > limit) | plain.unlike)
-    has_failed = np.any((plain.wanted & ~good) | beyond, axis=0)
+    beyond = good & ((np.abs(plain.error) > limit) | plain.is_unlike_ideal)
+    has_failed = np.any((plain.is_scheduled & ~good) | beyond, axis=0)
     metrics = {
         "rms": IntervalEstimate(_compute_rms(magnitudes), *ends.rms),
         "p99": IntervalEstimate(_compute_percentile(magnitudes, 99), *ends.p99),

@@ -70,7 +70,7 @@ def build_probed_scenarios(
     perturbed, damped = perturb_damping(mechanism, draws or {"approach.phase": np.asarray(plain.phase).T})
     slots = plain.phase.shape[0]
     velocity: Any = np.broadcast_to(plain.velocity, (slots, number))
-    law = find_contact_law(mechanism.contact.law).simulated
+    law = find_contact_law(mechanism.contact.law).simulation_law
     ideal_contacts = compute_ideal_contacts(law, plain, velocity, 1)
     damped_scenarios = build_scenarios(perturbed, damped, seed)
     pushes = [

@@ -30,7 +30,7 @@ EARLY_PUSH_CENTRE, LATE_PUSH_CENTRE = 0.25, 0.75  # time of the centre / duratio
 # Files contain this definition of `early` and `late`, so that other definitions can be recognised.
 PUSH_DEFINITION = (
     f"a push on the hardware at {100 * EARLY_PUSH_CENTRE:g} and {100 * LATE_PUSH_CENTRE:g} % "
-    "of the contact's duration in space"
+    "of the ideal contact's duration"
 )
 MOTION_SAMPLES = 129  # number of samples of the motion of an ideal contact
 LANES_PER_CALL = 256  # number of contacts that are integrated in one call, to limit the memory
@@ -130,7 +130,7 @@ def _integrate_motion(
     law: ContactLaw, parameters: ContactParameters, mass: Array, velocity: Array, size: Array, centre: Array
 ) -> _IdealMotion:
     push = Push(size, centre, jnp.full_like(size, PUSH_DURATION))
-    reference = law.reference(parameters, mass, velocity)
+    reference = law.ideal_contact(parameters, mass, velocity)
     share = jnp.linspace(0, 1, MOTION_SAMPLES, dtype=velocity.dtype)[:, None]
     until = jnp.where(size > 0, centre + PUSH_DURATION / 2, 0)
     motion = integrate_contact(

@@ -16,6 +16,7 @@ from jaxtyping import Array
 from jaxhil.laws.simulation_base import Compensator, Gain, Gains, Signals
 from jaxhil.rig.gain_file import GainFile
 from jaxhil.simulation.contact_force import PlantSignals
+from jaxhil.simulation.contact_tracking import build_end_conditions, record_contact
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.loop_construction import build_loop
@@ -32,7 +33,6 @@ from jaxhil.simulation.tick import (
     sense,
     update_state,
 )
-from jaxhil.simulation.watch import build_end_conditions, record_contact
 from tuning.verification.stops import ControllerStop, RecordingController
 
 
@@ -157,9 +157,9 @@ def _advance(
     actuated = actuate(loop, rig, gains, state, now, model, SentCommand(sent, state.controller))
     contact = compute_contact(loop, rig, state, actuated.interval)
     rules, shortfall = build_end_conditions(rig.scenario), state.plant.shortfall
-    watch = record_contact(loop, rules, run.watch, signals, plant_signals, command, shortfall)
+    tracker = record_contact(loop, rules, run.tracker, signals, plant_signals, command, shortfall)
     state = update_state(state, now, plant_signals, model, actuated, contact)
-    return run._replace(state=state, watch=watch, tick=now + 1)
+    return run._replace(state=state, tracker=tracker, tick=now + 1)
 
 
 def _turn_over(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> RunState:

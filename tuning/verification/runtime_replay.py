@@ -130,7 +130,7 @@ def verify(
         f"{contact.duration_ratio:.3g} times the duration of the ideal contact, expected "
         f"{CONTACT_BOUNDS_SHORT_TEXT}"
         for number, contact in enumerate(comparisons, start=1)
-        if outcome.unlike[number - 1, 0]
+        if outcome.is_unlike_ideal[number - 1, 0]
     ]
     reasons = (
         *_list_replay_reasons(replays),

@@ -22,12 +22,12 @@ from jaxhil.rig.six_axes.limits import NO_SIX_AXIS_LIMITS
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.sixdof.loop import (
     Loop,
-    Rig,
+    RigConstants,
     RunState,
     Sensed,
     actuated,
     begin,
-    build_rig,
+    build_rig_constants,
     integrate,
     model_motion,
     run,
@@ -143,26 +143,28 @@ def run_six_axis_loop(
 
 
 @partial(jax.jit, static_argnums=0)
-def _start(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Rig, RunState]:
+def _start(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[RigConstants, RunState]:
     """Return constants and initial state of the loop."""
-    rig = build_rig(loop, gains, scenario)
+    rig = build_rig_constants(loop, gains, scenario)
     return rig, begin(loop, rig, scenario.start)
 
 
 @partial(jax.jit, static_argnums=0)
-def _sense(loop: Loop, rig: Rig, state: RunState) -> Sensed:
+def _sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
     """Return the real contact and the sensor readings of a tick."""
     return sense(loop, rig, state)
 
 
 @partial(jax.jit, static_argnums=0)
-def _integrate(loop: Loop, rig: Rig, state: RunState, command: Any) -> tuple[Any, ...]:
+def _integrate(loop: Loop, rig: RigConstants, state: RunState, command: Any) -> tuple[Any, ...]:
     """Return the numerical model after a tick with the wrench `command` (6, lanes)."""
     return integrate(loop, rig, state, Wrench(vector(command[:3]), vector(command[3:])))
 
 
 @partial(jax.jit, static_argnums=0)
-def _advance(loop: Loop, rig: Rig, state: RunState, sensed: Sensed, model: Any, sent: Any) -> RunState:
+def _advance(
+    loop: Loop, rig: RigConstants, state: RunState, sensed: Sensed, model: Any, sent: Any
+) -> RunState:
     """Return the state of the loop after a tick with the pose command `sent` (6, lanes)."""
     return actuated(loop, rig, state, sensed, model, sent)
 

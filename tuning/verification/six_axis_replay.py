@@ -11,7 +11,7 @@ import numpy as np
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.rig.six_axes import Controller6
-from jaxhil.sixdof.building import build_scenarios, loop_of
+from jaxhil.sixdof.building import build_scenarios, make_loop
 from jaxhil.sixdof.controller_record import ControllerRecord, record_controller
 from jaxhil.sixdof.loop import Loop
 from jaxhil.sixdof.metrics import Metrics
@@ -32,7 +32,7 @@ class SixAxisReplay(msgspec.Struct, frozen=True):
 
 def six_axis_loop(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -> Loop:
     """Return the loop of a batch of scenarios, in which the pose is always measured."""
-    return dataclasses.replace(loop_of(mechanism, compensator, scenario), measures_pose=True)
+    return dataclasses.replace(make_loop(mechanism, compensator, scenario), measures_pose=True)
 
 
 def draw_scenarios(mechanism: SixAxisMechanism, number: int, seed: int) -> Scenario:

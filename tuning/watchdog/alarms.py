@@ -60,7 +60,7 @@ def find_reached_contacts(runs: EvaluatedRuns, limit: float) -> Bool[np.ndarray,
     """Return for each contact whether it occurs on the rig, where a run ends after its first bad contact."""
     bad = (runs.status != OK) | ~(np.abs(runs.error) <= limit)
     first = find_first_true(bad)
-    return (np.arange(len(bad))[:, None] <= first) & runs.audited.begun
+    return (np.arange(len(bad))[:, None] <= first) & runs.audited.occurred
 
 
 def extract_features(audited: AuditedContacts) -> ContactFeatures:
@@ -133,7 +133,7 @@ def find_alarms(
             & (audited.imbalance <= balance)
             & (audited.duration <= longest)
         )
-    return audited.begun & ~passes & ~(audited.approach == 0)
+    return audited.occurred & ~passes & ~(audited.approach == 0)
 
 
 def find_guard_trips(extent: SignalExtremes, limits: Mapping[str, float | None]) -> Bool[np.ndarray, "lanes"]:

@@ -39,7 +39,7 @@ class AuditedContacts(NamedTuple):
     imbalance: Float[np.ndarray, "slots lanes"]
     duration: Float[np.ndarray, "slots lanes"]  # time from the onset to the audit [s]
     tick: Float[np.ndarray, "slots lanes"]  # tick of the onset
-    begun: Bool[np.ndarray, "slots lanes"]  # whether the contact occurred
+    occurred: Bool[np.ndarray, "slots lanes"]  # whether the contact occurred
 
     @property
     def restitution(self) -> Float[np.ndarray, "slots lanes"]:
@@ -64,7 +64,7 @@ class _AuditState:
         self.ticks_without_contact, self.ticks = zeros.copy(), zeros.copy()
         self.sums = {name: zeros.copy() for name in LEAST_SQUARES_SUMS}
         self.results = {name: np.full((slots, lanes), np.nan) for name in AuditedContacts._fields[:-1]}
-        self.begun = np.zeros((slots, lanes), bool)
+        self.occurred = np.zeros((slots, lanes), bool)
 
     def begin(self, where: Bool[np.ndarray, "lanes"], tick: int, entry: np.ndarray, side: np.ndarray) -> None:
         """Begin a contact in the lanes `where`, with velocity `entry` [m/s] at surface `side` (1 or -1)."""
@@ -76,7 +76,7 @@ class _AuditState:
             accumulator[where] = 0.0
         stored = where & (self.count < self.slots)
         index = self.count[stored], np.nonzero(stored)[0]
-        self.begun[index] = True
+        self.occurred[index] = True
         self.results["tick"][index] = tick
 
     def audit(self, where: Bool[np.ndarray, "lanes"], velocity: np.ndarray, extra: np.ndarray) -> None:
@@ -172,7 +172,7 @@ def audit_contacts(signals: RecordedSignals, rules: AuditRules, slots: int) -> A
             velocity_before = np.where(live, velocity, velocity_before)
             command_before = np.where(live, command, command_before)
             force_before, aligned_before = force, deflection
-    return AuditedContacts(**state.results, begun=state.begun)
+    return AuditedContacts(**state.results, occurred=state.occurred)
 
 
 class _LaneDelayLine:

@@ -209,7 +209,7 @@ def _find_critical_sizes(
     def errors(multiples: Any) -> FaultSizes:
         gains, scenarios = _inject_fault(loaded, case, _limit_sizes(case, multiples))
         outcome = evaluate(loop, gains, scenarios)
-        size = np.where(outcome.good, np.abs(outcome.error), np.where(outcome.wanted, np.inf, 0.0))
+        size = np.where(outcome.good, np.abs(outcome.error), np.where(outcome.is_scheduled, np.inf, 0.0))
         return np.max(size, axis=0)
 
     # The searched size lies between the multiples `below` (error within the limit) and `above` (beyond it).

@@ -72,7 +72,7 @@ def choose_restitution_margin(
         )
     )
     good = find_good_runs(runs, GOOD_ERROR_FACTOR * limit)
-    audited = runs.audited.begun & (runs.audited.approach > 0)
+    audited = runs.audited.occurred & (runs.audited.approach > 0)
     furthest = np.max(np.where(audited, np.abs(difference), 0.0), axis=0)
     if _find_passing_margin(furthest[good & fitted], false_alarms) <= narrow:
         return RestitutionMargin(narrow, None, fitted)

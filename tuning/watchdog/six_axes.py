@@ -33,8 +33,8 @@ TICKS_IN_A_ROW = 3.0  # maximum number of successive ticks with a bad reading, a
 TARE_TIME = 0.1  # duration of the tare [s]
 SETTLING = 0.03  # time from the last reading in contact to the audit [s]
 SIGMAS = 12.0  # allowed spread of a tare's readings, divided by the noise's standard deviation
-LEAST_RETREAT = 0.005  # retreat's length after a trip, minus the largest distance from the start [m]
-LEAST_DISTANCE = 1e-4  # lower bound of the limits of distances and angles [m, rad]
+MIN_RETREAT = 0.005  # retreat's length after a trip, minus the largest distance from the start [m]
+MIN_DISTANCE = 1e-4  # lower bound of the limits of distances and angles [m, rad]
 WATCHDOG_LIMITS = {"momentum_error": 0.05, "energy_gain": 0.1, "unpaid_impulse": 0.1}  # lower bounds [1]
 LAG_RANGE = 0.5, 2.0  # lag limits, divided by the smallest and the largest lag in good runs
 WRONG_MASS = 1.2  # mass matrix of the injected fault, divided by the model's mass matrix
@@ -144,9 +144,9 @@ def _motion_limits(records: list[ControllerRecord], period: float) -> dict[str, 
         limits[f"retreat_{angular}velocity"] = max(speed, 1e-3)
     starts = [record.sent[0] - record.pose_measured[0] for record in records]
     for name, part in (("start_distance", slice(0, 3)), ("start_angle", slice(3, 6))):
-        limits[name] = MARGIN * _largest(np.linalg.norm(start[part]) for start in starts) + LEAST_DISTANCE
+        limits[name] = MARGIN * _largest(np.linalg.norm(start[part]) for start in starts) + MIN_DISTANCE
     depth = _largest(np.max(np.linalg.norm((r.sent - r.sent[0])[:, :3], axis=1)) for r in records)
-    limits["retreat_distance"] = LEAST_RETREAT + depth
+    limits["retreat_distance"] = MIN_RETREAT + depth
     limits |= _stuck_limits(records)
     longest = _largest(np.count_nonzero(np.any(r.command != 0, axis=1)) for r in records)
     limits["longest_contact"] = MARGIN * longest * period + SETTLING
@@ -166,7 +166,7 @@ def _stuck_limits(records: list[ControllerRecord]) -> dict[str, float]:
             (travels if channel < 3 else turns).append(longest_sum(desired[:, channel], still))
     names = ("force_stuck_travel", "position_stuck_travel", "rotation_stuck_travel")
     values = (under_force, travels, turns)
-    return {name: MARGIN * max(found) + LEAST_DISTANCE for name, found in zip(names, values, strict=True)}
+    return {name: MARGIN * max(found) + MIN_DISTANCE for name, found in zip(names, values, strict=True)}
 
 
 def longest_sum(steps: np.ndarray, still: np.ndarray) -> float:

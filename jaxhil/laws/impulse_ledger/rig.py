@@ -36,22 +36,22 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 from jaxhil.rig.surfaces import deflection
 
 RELEASE_TIME = 0.03  # s; the compensator continues to act for this time after the hardware leaves the surface
-LEAST_MOMENTUM = 1e-9  # kg m/s; with less momentum, forces cannot be scaled
-LONGEST_LAG = 0.2  # s; upper bound of the lag D
+MIN_MOMENTUM = 1e-9  # kg m/s; with less momentum, forces cannot be scaled
+MAX_LAG = 0.2  # s; upper bound of the lag D
 ONSET_PLACE = -0.5  # periods of travel; assumed depth of the hardware at the last reading of free flight
 MISFIT = 0.00315  # [1]; standard deviation of the contact model's relative error, averaged for `MISFIT_TIME`
 MISFIT_TIME = 0.001  # s
 SLOWEST = 1e-9  # [1]; minimum speed, divided by the approach speed; a lower speed is a rounding error
 SHALLOW = 0.001  # s; lower bound of the depth by which the secant stiffness is divided
-LEAST_PEAK = 0.3  # 1/s; minimum of peak force / (mass x approach speed), for a contact at 0.05 Hz
+MIN_PEAK = 0.3  # 1/s; minimum of peak force / (mass x approach speed), for a contact at 0.05 Hz
 FEW_READINGS = 5  # readings in contact; with fewer readings the status is `unsure`
 LATE = 0.8  # [1]; if the lag D is a larger share of the contact's duration, the status is `too_short`
 UNCERTAIN = 0.006  # [1]; if the reference speed has a larger standard deviation, the status is `noisy`
-MOST_GAIN = 0.01  # [1]; limit on the energy gain beyond the contact model, divided by M v^2
-MOST_LOSS = 0.014  # [1]; limit on the energy loss beyond the contact model, divided by M v^2
+MAX_GAIN = 0.01  # [1]; limit on the energy gain beyond the contact model, divided by M v^2
+MAX_LOSS = 0.014  # [1]; limit on the energy loss beyond the contact model, divided by M v^2
 USUAL_PRELOAD = 1.0  # 1/s; standard deviation of preload/(mass x approach speed), added to the specified one
-LARGEST_DELAY_SPREAD = 0.004  # s; limit, because a first-order correction of more is not accurate
-MOST_SPREADS = 3.0  # standard deviations; limit on the difference of estimated and specified delay
+MAX_DELAY_SPREAD = 0.004  # s; limit, because a first-order correction of more is not accurate
+MAX_SPREADS = 3.0  # standard deviations; limit on the difference of estimated and specified delay
 ONSET_TICKS = 0.3  # periods; standard deviation of the time of the onset, 1/sqrt(12)
 ONSET_MEAN = 0.25  # [1]; mean force at the onset, divided by the force at which the onset is detected
 ONSET_SPREAD = 0.4  # [1]; standard deviation of the force at the onset, divided by the same force
@@ -72,17 +72,17 @@ class ImpulseLedger(Compensator):
     """Compensator that follows a predicted reference trajectory; see the module's docstring."""
 
     __slots__ = (
-        "_alignment", "_clearance", "_correction_limit", "_deepest", "_delay", "_delay_spread",
-        "_detector", "_estimate", "_floor", "_gain", "_identification_delay", "_in_contact", "_lag", "_mass",
-        "_model", "_origin", "_outside", "_peak", "_period", "_preload", "_reference", "_side",
-        "_since_start", "_speed", "_spreads", "_stiffness", "_variance", "status",
+        "_alignment", "_clearance", "_correction_limit", "_deepest", "_delay", "_delay_spread", "_detector",
+        "_estimate", "_floor", "_gain", "_identification_delay", "_in_contact", "_lag", "_mass", "_model",
+        "_origin", "_outside", "_peak", "_period", "_preload", "_reference", "_side", "_since_start",
+        "_speed", "_spreads", "_stiffness", "_variance", "status",
     )  # fmt: skip
     _estimate: tuple[float, float]  # mean and variance of the delay after this contact
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         "equivalent_mass": GainSpecification("kg", *MASSES),
         "identification_delay": GainSpecification("s", *TIMES),
-        "delay_spread": GainSpecification("s", 0.0, LARGEST_DELAY_SPREAD),
+        "delay_spread": GainSpecification("s", 0.0, MAX_DELAY_SPREAD),
         "force_noise": GainSpecification("N", *FORCES),
         "force_noise_floor": GainSpecification("1/s", 2e-3, 10.0),
         "prior_stiffness": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
@@ -171,11 +171,11 @@ class ImpulseLedger(Compensator):
         """Test a force reading for contact; if it shows free flight, prepare for contact on the next tick."""
         side = 1.0 if velocity_desired > 0.0 or self._clearance == inf else -1.0
         speed = side * velocity_desired
-        approaches = self._mass * speed > LEAST_MOMENTUM
+        approaches = self._mass * speed > MIN_MOMENTUM
         detector = self._detector
         # The bias is known only after a reading of free flight during an approach in this direction.
         settled = settled and approaches and self._speed > 0.0 and side == self._side
-        detector.watch(force, side, self._floor * (self._mass * speed), settled)
+        detector.update(force, side, self._floor * (self._mass * speed), settled)
         if detector.total > 0.0:
             return
         self._side = side
@@ -183,9 +183,9 @@ class ImpulseLedger(Compensator):
         if not approaches:
             return
         self._origin = side * position - ONSET_PLACE * (self._period * speed)
-        self._lag = min(max(side * (position_desired - position) / speed, 0.0), LONGEST_LAG)
+        self._lag = min(max(side * (position_desired - position) / speed, 0.0), MAX_LAG)
         self._deepest = 0.0
-        self._peak = LEAST_PEAK
+        self._peak = MIN_PEAK
         self._outside = 0.0
         self._estimate = 0.0, self._variance
         self._model.restart(self._stiffness, self._spreads, self._variance)
@@ -269,13 +269,13 @@ class ImpulseLedger(Compensator):
             # If the force has a larger delay or lag than specified, the contact seems to add energy.
             spread = reference.spread(model.covariance, self._estimate[1])
             lost = reference.imbalance()
-            if spread > UNCERTAIN or lost < -MOST_GAIN or lost > MOST_LOSS + 3.0 * spread:
+            if spread > UNCERTAIN or lost < -MAX_GAIN or lost > MAX_LOSS + 3.0 * spread:
                 return UNEXPLAINED
         return IDENTIFIED if free else SATURATED
 
     def _end(self) -> None:
         """End the contact; store the estimated delay for the following contacts."""
-        limit = MOST_SPREADS * self._delay_spread
+        limit = MAX_SPREADS * self._delay_spread
         shift, self._variance = self._estimate
         self._delay = min(max(self._delay + shift, -limit), limit)
         self._speed = 0.0

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from math import pi, sqrt
 from typing import ClassVar
 
-from jaxhil.laws.impulse_ledger.six_axes.booking.rig import Ledger
 from jaxhil.laws.impulse_ledger.six_axes.constants import FEW_READINGS, LATE
+from jaxhil.laws.impulse_ledger.six_axes.impulse_accounting.rig import Ledger
 from jaxhil.laws.impulse_ledger.six_axes.reading.rig import SixAxisReader
 from jaxhil.rig.bounds import DAMPINGS_BY_MASS, FORCES, STIFFNESSES_BY_MASS, TIMES
 from jaxhil.rig.law_status import IDENTIFIED, OUT_OF_CONTACT, SATURATED, TOO_SHORT, UNSURE
@@ -20,7 +20,7 @@ from jaxhil.rig.six_axes.registry import ModelConstants, SixAxisCompensator, reg
 from jaxhil.rig.six_axes.vectors import AXES, LAG_LEADS, add_multiple, lead_pose, wrench_at_target
 from jaxhil.rig.types import Gains, Positive
 
-LEAST_SPREAD = 1e-3  # lower bound of a prior's standard deviation, so that the variance is not 0
+MIN_SPREAD = 1e-3  # lower bound of a prior's standard deviation, so that the variance is not 0
 
 
 @register_six_axes("impulse_ledger")
@@ -37,9 +37,9 @@ class ImpulseLedger(SixAxisCompensator):
         "velocity_gain": GainSpecification("1/s", 0.0, 1e5),
         "position_gain": GainSpecification("1/s", 0.0, 100.0),
         "direction_pole": GainSpecification("1", 0.0, 0.95),
-        "stiffness_spread": GainSpecification("1/s^2", LEAST_SPREAD, STIFFNESSES_BY_MASS[1]),
-        "damping_spread": GainSpecification("1/s", LEAST_SPREAD, DAMPINGS_BY_MASS[1]),
-        "force_spread": GainSpecification("1/s", LEAST_SPREAD, DAMPINGS_BY_MASS[1]),
+        "stiffness_spread": GainSpecification("1/s^2", MIN_SPREAD, STIFFNESSES_BY_MASS[1]),
+        "damping_spread": GainSpecification("1/s", MIN_SPREAD, DAMPINGS_BY_MASS[1]),
+        "force_spread": GainSpecification("1/s", MIN_SPREAD, DAMPINGS_BY_MASS[1]),
         "curvature_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
         "forgetting": GainSpecification("1", 0.5, 1.0),
         "correction_limit": GainSpecification("1", 0.0, 20.0),

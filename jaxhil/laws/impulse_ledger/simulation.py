@@ -50,7 +50,7 @@ GAINS: tuple[Gain, ...] = (
     _from_file(
         "identification_delay", lambda m: 2 * nominal_values.force_delay(m) + 0.02, nominal_values.force_delay
     ),
-    _from_file("delay_spread", lambda m: rig.LARGEST_DELAY_SPREAD, specified.delay_spread),
+    _from_file("delay_spread", lambda m: rig.MAX_DELAY_SPREAD, specified.delay_spread),
     _from_file(
         "force_noise", lambda m: m.rig.force_sensor.noise_std + nominal_values.peak_force(m),
         lambda m: m.rig.force_sensor.noise_std,
@@ -191,7 +191,7 @@ class ImpulseLedger(Compensator):
             contact,
         )
         over = acts & follows & contact.reference.released & (contact.outside * period > rig.RELEASE_TIME)
-        limit = rig.MOST_SPREADS * gains["delay_spread"]
+        limit = rig.MAX_SPREADS * gains["delay_spread"]
         shifted = jnp.clip(state.delay + contact.delay, -limit, limit)
         command = jnp.where(passes, jnp.where(inside, signals.force_measured, 0), command)
         return jnp.where(acts & ~over, command, 0), LedgerState(
@@ -218,24 +218,24 @@ class ImpulseLedger(Compensator):
         gains, (period, clearance), flight = prepared.gains, prepared.constants, state.flight
         side = jnp.where((signals.velocity_desired > 0) | jnp.isinf(clearance), 1, -1)
         speed = side * signals.velocity_desired
-        approaches = gains["equivalent_mass"] * speed > rig.LEAST_MOMENTUM
+        approaches = gains["equivalent_mass"] * speed > rig.MIN_MOMENTUM
         sigma = safe_sqrt(onset_detection.variance(flight, gains["force_noise"]))
         sigma = sigma + gains["force_noise_floor"] * (gains["equivalent_mass"] * speed)
         # The bias is known only after a reading of free flight during an approach in this direction.
         settled = ~(signals.age.astype(period.dtype) * period < SETTLING)
         settled = settled & approaches & (contact.speed > 0) & (side == contact.side)
         deviation = side * (signals.force_measured - flight.bias) / jnp.where(approaches, sigma, 1)
-        total = onset_detection.watch(flight, deviation, settled)
+        total = onset_detection.update(flight, deviation, settled)
         flight = flight._replace(total=jnp.where(in_contact, flight.total, total))
         free = ~in_contact & ~(total > 0)
         divisor = jnp.where(approaches, speed, 1)
         origin = side * position - rig.ONSET_PLACE * (period * speed)
-        lag = jnp.clip(side * (signals.position_desired - position) / divisor, 0, rig.LONGEST_LAG)
+        lag = jnp.clip(side * (signals.position_desired - position) / divisor, 0, rig.MAX_LAG)
         zeros = jnp.zeros_like(speed)
         prior = self._prior(gains, state.variance)
         reference = reference_trajectory.begin((side * position - origin) / divisor, prior[0])
         fresh = LedgerContact(
-            side, speed, origin, lag, zeros, zeros + rig.LEAST_PEAK, zeros,
+            side, speed, origin, lag, zeros, zeros + rig.MIN_PEAK, zeros,
             contact_model.begin(*prior), reference, zeros, state.variance,
         )  # fmt: skip
         contact = select_lanes(free & approaches, fresh, contact)

@@ -12,12 +12,17 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from jaxhil.lanes import select_lanes
-from jaxhil.laws.impulse_ledger.six_axes.booking.simulation import follow, onset
 from jaxhil.laws.impulse_ledger.six_axes.constants import LONG_AGO
 from jaxhil.laws.impulse_ledger.six_axes.gains import GAINS
+from jaxhil.laws.impulse_ledger.six_axes.impulse_accounting.simulation import follow, onset
 from jaxhil.laws.impulse_ledger.six_axes.reading.simulation import read, record
 from jaxhil.laws.impulse_ledger.six_axes.simulation import wrench_at_target
-from jaxhil.laws.impulse_ledger.six_axes.state import FreeFlightState, LedgerState, Prepared, SixAxisContact
+from jaxhil.laws.impulse_ledger.six_axes.state import (
+    FreeFlightState,
+    LedgerState,
+    PreparedLedger,
+    SixAxisContact,
+)
 from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import begin_estimate
 from jaxhil.laws.shared import nominal_values
 from jaxhil.laws.simulation_base import Gain
@@ -43,7 +48,7 @@ class ImpulseLedger(SixAxisCompensator):
         period = constants.control_period
         delay = gains["identification_delay"]
         filter_lag = jnp.minimum(gains["pose_filter"], delay)
-        return Prepared(
+        return PreparedLedger(
             gains=gains,
             constants=constants,
             pole=filter_lag / (filter_lag + period),

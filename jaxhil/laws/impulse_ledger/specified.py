@@ -2,7 +2,7 @@
 
 import math
 
-from jaxhil.laws.impulse_ledger.rig import LARGEST_DELAY_SPREAD
+from jaxhil.laws.impulse_ledger.rig import MAX_DELAY_SPREAD
 from jaxhil.laws.shared.nominal_values import typical_stiffness
 from jaxhil.mechanism.structs import Mechanism, value_at
 
@@ -14,7 +14,7 @@ def delay_spread(mechanism: Mechanism) -> float:
     uncertainty = mechanism.uncertainty.get(DELAY)
     is_range = uncertainty is not None and uncertainty.std is None
     spread = _spread(mechanism, DELAY)
-    return min(spread / math.sqrt(3) if is_range else spread, LARGEST_DELAY_SPREAD)
+    return min(spread / math.sqrt(3) if is_range else spread, MAX_DELAY_SPREAD)
 
 
 def friction(mechanism: Mechanism) -> float:

@@ -51,7 +51,7 @@ class ResponseErrorState(NamedTuple):
     identified: ContactEstimate  # identified stiffness and damping
 
 
-class Prepared(NamedTuple):
+class PreparedResponseError(NamedTuple):
     """Gains and filter coefficients of the six-axis response-error compensator, computed once per run."""
 
     gains: Gains
@@ -119,7 +119,7 @@ class ResponseError(SixAxisCompensator):
     def prepare(self, gains, constants):
         period, filter_time = constants.control_period, gains["velocity_filter"]
         scale = 1 / (2 * filter_time + period)
-        return Prepared(
+        return PreparedResponseError(
             gains=gains,
             period=period,
             lead=build_lead_filter(gains, constants.of_channel),

@@ -67,7 +67,7 @@ def axis_lags(mechanism: SixAxisMechanism) -> list[float]:
 
 def is_damped(mechanism: Mechanism) -> bool:
     """Return whether the mechanism's contact law dissipates energy."""
-    return find_contact_law(mechanism.contact.law).damped and any(b > 0 for b in mechanism.contact.damping)
+    return find_contact_law(mechanism.contact.law).is_damped and any(b > 0 for b in mechanism.contact.damping)
 
 
 def peak_force(mechanism: Mechanism) -> float:

@@ -102,9 +102,10 @@ class SixAxisInputGuard:
     """
 
     __slots__ = (
-        "_bad_forces", "_bad_positions", "_desired", "_force_stuck", "_force_travel", "_held", "_highest",
-        "_known", "_lowest", "_position_stuck", "_position_travel", "_ranges", "_reading", "_rig_highest",
-        "_rig_lowest", "channels", "fatal", "is_located", "located", "measured", "wrench",
+        "_bad_forces", "_bad_positions", "_desired", "_force_stuck", "_force_travel", "_has_reading",
+        "_highest", "_lowest", "_max_held_readings", "_position_stuck", "_position_travel", "_ranges",
+        "_reading", "_rig_highest", "_rig_lowest", "channels", "fatal", "is_located", "located", "measured",
+        "wrench",
     )  # fmt: skip
     _bad_forces: Vector
     _bad_positions: Vector
@@ -123,7 +124,7 @@ class SixAxisInputGuard:
         self._highest = [limits[f"measured_highest_{axis}"] for axis in COORDINATES]
         self._rig_lowest = [*[POSITIONS[0]] * 3, *[ROTATIONS[0]] * 3]
         self._rig_highest = [*[POSITIONS[1]] * 3, *[ROTATIONS[1]] * 3]
-        self._held = limits["held_readings"]
+        self._max_held_readings = limits["held_readings"]
         self._force_stuck = limits["force_stuck_travel"]
         self._position_stuck = [
             *[limits["position_stuck_travel"]] * 3,
@@ -135,7 +136,7 @@ class SixAxisInputGuard:
 
     def restart(self) -> None:
         """Forget past readings and counts of bad readings, but keep `located`."""
-        self._known = False
+        self._has_reading = False
         self._bad_forces = [0.0] * AXES
         self._bad_positions = [0.0] * AXES
         self._force_travel = [0.0] * AXES
@@ -173,10 +174,10 @@ class SixAxisInputGuard:
         if not (is_finite(desired) and is_finite(twist)):
             self.fatal = MODEL_NOT_FINITE
             return MODEL_NOT_FINITE
-        first = not self._known
+        first = not self._has_reading
         if first:
             # Before the first tick there is no reading: assume zero wrench and the desired pose.
-            self._known = True
+            self._has_reading = True
             self._desired = list(desired)
             self.measured = list(desired)
         before = list(self.measured)
@@ -219,7 +220,7 @@ class SixAxisInputGuard:
                 fault = POSITION_OUT_OF_RANGE if isfinite(value) else POSITION_NOT_FINITE
                 self._bad_positions[i] += 1.0
                 self.channels |= POSE_BITS[i]
-                self.fatal |= fault if first or self._bad_positions[i] > self._held else 0
+                self.fatal |= fault if first or self._bad_positions[i] > self._max_held_readings else 0
                 faults |= fault
         return faults
 
@@ -230,5 +231,5 @@ class SixAxisInputGuard:
         fault = FORCE_OUT_OF_RANGE if isfinite(value) else FORCE_NOT_FINITE
         self._bad_forces[channel] += 1.0
         self.channels |= WRENCH_BITS[channel]
-        self.fatal |= fault if self._bad_forces[channel] > self._held else 0
+        self.fatal |= fault if self._bad_forces[channel] > self._max_held_readings else 0
         return fault

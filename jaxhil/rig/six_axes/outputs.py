@@ -30,22 +30,22 @@ class WrenchGuard:
         fatal: bits of the last command's faults that trip the controller.
     """
 
-    __slots__ = ("_cut", "_cut_tolerated", "_limits", "_most", "fatal", "output")
+    __slots__ = ("_limited_ticks", "_limits", "_max_change", "_max_limited_ticks", "fatal", "output")
     _limits: Vector
-    _most: Vector
+    _max_change: Vector
     fatal: Bits
     output: Vector
 
     def __init__(self, limits: Limits, period: Positive) -> None:
         self._limits = [*[limits["force_limit"]] * 3, *[limits["torque_limit"]] * 3]
-        self._most = [*[limits["force_slew"] * period] * 3, *[limits["torque_slew"] * period] * 3]
-        self._cut_tolerated = limits["limited_in_a_row"]
+        self._max_change = [*[limits["force_slew"] * period] * 3, *[limits["torque_slew"] * period] * 3]
+        self._max_limited_ticks = limits["limited_in_a_row"]
         self.output = [0.0] * AXES
         self.restart()
 
     def restart(self) -> None:
         """Forget the faults; the next command continues from the last output."""
-        self._cut = 0.0
+        self._limited_ticks = 0.0
         self.fatal = 0
 
     def limit(self, command: Vector) -> int:
@@ -55,18 +55,20 @@ class WrenchGuard:
             self.fatal = COMMAND_NOT_FINITE
             return COMMAND_NOT_FINITE
         is_slow = True
-        for limit, most, value, last in zip(self._limits, self._most, command, self.output, strict=True):
+        for limit, max_change, value, last in zip(
+            self._limits, self._max_change, command, self.output, strict=True
+        ):
             if abs(value) > limit:
                 self.fatal = FORCE_LIMIT
-            is_slow = is_slow and abs(value - last) <= most
+            is_slow = is_slow and abs(value - last) <= max_change
         if self.fatal:
             return FORCE_LIMIT
         if is_slow:
-            self._cut = 0.0
+            self._limited_ticks = 0.0
             self.output = list(command)
             return 0
-        self._cut += 1.0
-        if self._cut > self._cut_tolerated:
+        self._limited_ticks += 1.0
+        if self._limited_ticks > self._max_limited_ticks:
             self.fatal = FORCE_SLEW
         else:
             self._move(command)
@@ -80,12 +82,12 @@ class WrenchGuard:
         """Move each channel towards the target by at most the step that the rate limits allow."""
         for i in range(AXES):
             change = target[i] - self.output[i]
-            if abs(change) <= self._most[i]:
+            if abs(change) <= self._max_change[i]:
                 self.output[i] = target[i]
             elif change > 0.0:
-                self.output[i] += self._most[i]
+                self.output[i] += self._max_change[i]
             else:
-                self.output[i] -= self._most[i]
+                self.output[i] -= self._max_change[i]
 
 
 class PoseGuard:
@@ -95,15 +97,16 @@ class PoseGuard:
 
     Attributes:
         output: last command [m, rad].
-        known: whether there is a last command.
+        has_output: whether there is a last command.
         at_rest: whether the pose command has come to rest after a trip.
         fatal: bits of the last command's faults that trip the controller.
     """
 
     __slots__ = (
-        "_back", "_braking", "_braking_turn", "_cut", "_cut_tolerated", "_engaged", "_highest", "_lowest",
-        "_most", "_most_turn", "_path", "_rate", "_remaining", "_retreat", "_retreat_distance",
-        "_retreat_turn", "_share", "_start", "_start_angle", "at_rest", "fatal", "known", "output",
+        "_back", "_braking", "_braking_turn", "_engaged", "_highest", "_limited_ticks", "_lowest",
+        "_max_change", "_max_limited_ticks", "_max_turn", "_path", "_rate", "_remaining", "_retreat",
+        "_retreat_distance", "_retreat_turn", "_share", "_start", "_start_angle", "at_rest", "fatal",
+        "has_output", "output",
     )  # fmt: skip
     _braking: NonNegative
     _rate: Vector
@@ -115,14 +118,14 @@ class PoseGuard:
     def __init__(self, limits: Limits, period: Positive) -> None:
         self._lowest = [limits[f"command_lowest_{axis}"] for axis in COORDINATES]
         self._highest = [limits[f"command_highest_{axis}"] for axis in COORDINATES]
-        self._most = limits["velocity_limit"] * period
-        self._most_turn = limits["angular_velocity_limit"] * period
+        self._max_change = limits["velocity_limit"] * period
+        self._max_turn = limits["angular_velocity_limit"] * period
         self._braking = limits["deceleration"] * period * period
         self._braking_turn = limits["angular_deceleration"] * period * period
         self._retreat = limits["retreat_velocity"] * period
         self._retreat_turn = limits["retreat_angular_velocity"] * period
         self._retreat_distance = limits["retreat_distance"]
-        self._cut_tolerated = limits["limited_in_a_row"]
+        self._max_limited_ticks = limits["limited_in_a_row"]
         self._start = limits["start_distance"]
         self._start_angle = limits["start_angle"]
         spacing = max(self._retreat, 2.0 * self._retreat_distance / POINTS)
@@ -130,12 +133,12 @@ class PoseGuard:
         lever = self._retreat / self._retreat_turn if self._retreat_turn > 0.0 else 0.0
         self._path = CommandPath(spacing, self._retreat_turn, lever)
         self.output = [0.0] * AXES
-        self.known = False
+        self.has_output = False
         self.restart()
 
     def restart(self) -> None:
         """Forget the faults; until the output first reaches a command, a limited change does not trip."""
-        self._cut = 0.0
+        self._limited_ticks = 0.0
         self._engaged = False
         self._rate = [0.0] * AXES
         self._back = False  # whether braking has ended and the command moves back
@@ -146,7 +149,7 @@ class PoseGuard:
 
     def release(self) -> None:
         """Forget the last output and the path, after something else has moved the drives."""
-        self.known = False
+        self.has_output = False
         self._path.clear()
         self.restart()
 
@@ -167,33 +170,33 @@ class PoseGuard:
         if not is_within(command, self._lowest, self._highest):
             self.fatal = STROKE
             return STROKE
-        if not self.known:
+        if not self.has_output:
             # Moving drives lag behind. Without a reading, assume that they are at the model's pose.
             near = self._is_near(command, measured) if is_fresh else self._is_near(command, pose)
             if is_free and near:
-                self.known = True
+                self.has_output = True
                 self.output = list(command)
             else:
                 self._stand(measured, pose)
         fault = 0
-        share = self._share_of(command, self._most, self._most_turn)
+        share = self._share_of(command, self._max_change, self._max_turn)
         if share < 1.0:
             fault = VELOCITY_LIMIT
             if self._engaged:
-                self._cut += 1.0
-                if self._cut > self._cut_tolerated:
+                self._limited_ticks += 1.0
+                if self._limited_ticks > self._max_limited_ticks:
                     self.fatal = VELOCITY_LIMIT
                     return VELOCITY_LIMIT
         else:
             self._engaged = True
-            self._cut = 0.0
+            self._limited_ticks = 0.0
         self._move(command, share)
         self._path.record(self.output)
         return fault
 
     def retreat(self, measured: Vector, pose: Vector) -> None:
         """Move the output by one period of the retreat; arguments as in `limit`."""
-        if not self.known:
+        if not self.has_output:
             self._stand(measured, pose)
         if not self._back:
             self._brake()
@@ -257,14 +260,14 @@ class PoseGuard:
         near = length(command, reference) <= self._start
         return near and angle(command, reference) <= self._start_angle
 
-    def _share_of(self, target: Vector, most: float, most_turn: float) -> float:
+    def _share_of(self, target: Vector, max_change: float, max_turn: float) -> float:
         """Return the fraction of the way to a pose, at most 1, that the largest step covers."""
         distance, turn = length(target, self.output), angle(target, self.output)
         share = 1.0
-        if distance > 0.0 and distance > most:
-            share = most / distance
-        if turn > 0.0 and turn > most_turn:
-            share = min(share, most_turn / turn)
+        if distance > 0.0 and distance > max_change:
+            share = max_change / distance
+        if turn > 0.0 and turn > max_turn:
+            share = min(share, max_turn / turn)
         return share
 
     def _move(self, target: Vector, share: float) -> None:
@@ -278,7 +281,7 @@ class PoseGuard:
 
     def _stand(self, measured: Vector, pose: Vector) -> None:
         """Set the output to `measured`; if it is not finite, to `pose` moved into the stroke."""
-        self.known = True
+        self.has_output = True
         if is_finite(measured):
             self.output = list(measured)
             return

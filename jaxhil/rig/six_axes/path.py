@@ -7,7 +7,7 @@ from jaxhil.rig.types import Index
 
 POINTS = 256  # stored points of the path, a power of two
 NEWEST_POINTS = POINTS - 1
-LEAST_TURN = 0.002  # rad; lower bound of the rotation between two stored points
+MIN_TURN = 0.002  # rad; lower bound of the rotation between two stored points
 
 
 class CommandPath:
@@ -33,7 +33,7 @@ class CommandPath:
     def __init__(self, spacing: float, turn: float, lever: float) -> None:
         self._lever = lever
         self._spacing = spacing
-        self._turn = max(turn, LEAST_TURN)
+        self._turn = max(turn, MIN_TURN)
         self._points = [[0.0] * AXES for _ in range(POINTS)]
         self._lengths = [0.0] * POINTS
         self.clear()

@@ -50,35 +50,10 @@ class SixAxisWatchdog:
     """
 
     __slots__ = (
-        "_energy_limit",
-        "_entry",
-        "_fading",
-        "_impulse",
-        "_inverse",
-        "_known",
-        "_lag_highest",
-        "_lag_lowest",
-        "_longest",
-        "_mass",
-        "_measured",
-        "_momentum_limit",
-        "_open",
-        "_period",
-        "_pose",
-        "_quiet",
-        "_quiet_ticks",
-        "_stated",
-        "_statuses",
-        "_ticks",
-        "_twist",
-        "_unpaid_limit",
-        "_work",
-        "contacts",
-        "energy_gain",
-        "momentum_error",
-        "on",
-        "record",
-        "unpaid_impulse",
+        "_energy_limit", "_entry", "_fading", "_has_motion", "_impulse", "_inverse", "_lag_highest",
+        "_lag_lowest", "_longest", "_mass", "_measured", "_momentum_limit", "_open", "_period", "_pose",
+        "_quiet", "_quiet_ticks", "_stated", "_statuses", "_ticks", "_twist", "_unpaid_limit", "_work",
+        "contacts", "energy_gain", "momentum_error", "on", "record", "unpaid_impulse",
     )  # fmt: skip
     _entry: Vector
     _impulse: Vector
@@ -112,7 +87,7 @@ class SixAxisWatchdog:
 
     def restart(self) -> None:
         """Forget the current contact and the past motion, but keep `contacts` and `record`."""
-        self._known = False
+        self._has_motion = False
         self._open = False
         self._measured = False
         self._entry = [0.0] * AXES
@@ -148,8 +123,8 @@ class SixAxisWatchdog:
             pose: pose of the numerical model [m, rad].
             twist: twist of the numerical model [m/s, rad/s].
         """
-        if not self._known:
-            self._known = True
+        if not self._has_motion:
+            self._has_motion = True
             self._pose = list(pose)
             self._twist = list(twist)
         felt = length(wrench, [0.0] * AXES) > self._fading

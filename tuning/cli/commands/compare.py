@@ -31,7 +31,7 @@ def run(options: Compare) -> int:
     names = [entry.mechanism.name for entry in loaded]
     checks.check_earlier_results(folder / "compare.json", "mechanisms", PLOTS, names)
     prepare_jax()
-    from tuning.benchmark.comparison import LawFailure
+    from tuning.benchmark.comparison import CompensatorFailure
     from tuning.transparency.pushes import PUSH_DEFINITION
 
     laws = options.laws
@@ -41,11 +41,11 @@ def run(options: Compare) -> int:
     with terminal.show_progress(len(names) * len(laws), "results") as bar:
         try:
             for result in compare_each(loaded, options, count_usable_cores(), bar, checkpoints):
-                if isinstance(result, LawFailure):
-                    problems.append(f"{result.law}: {result.reason}")
+                if isinstance(result, CompensatorFailure):
+                    problems.append(f"{result.compensator}: {result.reason}")
                     terminal.note(f"jaxhil: {problems[-1]}")
                 else:
-                    results[result.mechanism][result.law] = result
+                    results[result.mechanism][result.compensator] = result
         except KeyboardInterrupt:
             interrupted = True
     ordered = {name: [results[name][law] for law in laws if law in results[name]] for name in names}
@@ -97,8 +97,8 @@ def _measure_tick_times(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[
     mechanism = loaded.mechanism
     period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
     return {
-        result.law: measure_tick_time(
-            result.law, result.gains[LITERATURE_GAINS], period, clearance, mechanism.approach.velocity
+        result.compensator: measure_tick_time(
+            result.compensator, result.gains[LITERATURE_GAINS], period, clearance, mechanism.approach.velocity
         )
         for result in ordered[mechanism.name]
     }

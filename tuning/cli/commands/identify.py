@@ -281,8 +281,8 @@ def _build_document(
         "checks": [
             {
                 **{name: getattr(line, name) for name in ("name", "finding", "where")},
-                "there": bool(line.there),
-                "counts": line.counts,
+                "there": bool(line.is_significant),
+                "counts": line.is_in_verdict,
                 "effect": float(line.effect),
                 "effect_on_error": float(line.effect if line.on_error is None else line.on_error),
             }

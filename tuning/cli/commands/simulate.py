@@ -71,7 +71,7 @@ def run(options: SimulateOptions) -> int:
                 "contacts": contacts,
                 "status": result.status,
                 "reason": _explain_status(result.status),
-                "meaning": result.meaning,
+                "meaning": result.summary,
                 "limit": limit,
                 "bounds": CONTACT_BOUNDS,
                 "reasons": reasons,

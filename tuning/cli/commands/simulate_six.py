@@ -64,12 +64,12 @@ def run(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
     limit = arguments.choose_limit(options.limit, mechanism)
     good = result.status in GOOD_STATUSES and _worst_twist_error(result) <= limit
     good = good and not any(_is_unlike_ideal(result))
-    terminal.warn(f"{mechanism.name}: {warning}" for warning in result.meaning.warnings)
+    terminal.warn(f"{mechanism.name}: {warning}" for warning in result.summary.warnings)
     _write(options, result)
     if options.json:
         terminal.emit_json(_build_document(limit, result, good))
     else:
-        terminal.emit_line(result.meaning.line(mechanism.name))
+        terminal.emit_line(result.summary.line(mechanism.name))
         _print(options, limit, result, good)
     return 0 if good else 1
 
@@ -79,9 +79,9 @@ def _run_ideal_contact(options: SimulateOptions, mechanism: SixAxisMechanism) ->
 
     Return the exit code: 1 if the bodies do not touch, else 0.
     """
-    from jaxhil.sixdof.alone import simulate_in_space
+    from jaxhil.sixdof.ideal_run import simulate_ideal_contact
 
-    result = simulate_in_space(mechanism)
+    result = simulate_ideal_contact(mechanism)
     episode = result.episode
     if options.json:
         episodes = [episode._asdict()] if episode.reference_touches else []
@@ -163,7 +163,7 @@ def _build_document(limit: float, result: "SixAxisRun", good: bool) -> dict[str,
         "final": result.final._asdict(),
         "reference_final": result.reference_final._asdict(),
         "status": result.status,
-        "meaning": result.meaning._asdict(),
+        "meaning": result.summary._asdict(),
         "limit": limit,
         "verdict": "good" if good else "bad",
     }

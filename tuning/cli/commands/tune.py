@@ -200,7 +200,7 @@ def _tune_all(
                 done[index] = result
                 terminal.warn(f"{result.mechanism.name}: {text}" for text in result.warnings)
                 if not options.json and drawn:
-                    print_result(options, result.found, entries[index])
+                    print_result(options, result.tune_result, entries[index])
         if options.pareto and done:
             with terminal.show_progress(len(done), "fronts") as bar:
                 fronts = tune_pareto.compute_fronts(options, done, entries, problems, bar, checkpoints)
@@ -209,13 +209,13 @@ def _tune_all(
     if len(loaded) > 1 and done:
         _show_overview(
             options,
-            [gains.found for gains in _sort_by_index(done)],
+            [gains.tune_result for gains in _sort_by_index(done)],
             _sort_by_index(entries),
             drawn,
         )
     if not options.json and drawn:
         for index in sorted(fronts):
-            tune_pareto.print_front(options, done[index].found, fronts[index], entries[index])
+            tune_pareto.print_front(options, done[index].tune_result, fronts[index], entries[index])
     elif not options.json and fronts:
         terminal.emit(
             f"wrote {options.output}/NAME/pareto/NN/gains.json and {options.output}/NAME/pareto.png", ""
@@ -249,7 +249,7 @@ def _write_result(
         make_folder(folder)
         remove_stale(folder)
     result.save(folder / "gains.json")
-    tuned, plots = result.found, []
+    tuned, plots = result.tune_result, []
     if drawn:
         say(f"{loaded.mechanism.name}: drawing")
         plots = _draw(tuned, options, result.limit, folder)
@@ -258,7 +258,7 @@ def _write_result(
         "file": loaded.label,
         "compensator": options.compensator,
         "limit": result.limit,
-        "meaning": result.meaning,
+        "meaning": result.summary,
         "gain_file": str(folder / "gains.json"),
         "plots": plots,
         "gains": result.document["gains"],
@@ -274,7 +274,7 @@ def _write_result(
         "honesty": tuned.transparency,
         "starts": [_start_entry(start) for start in tuned.starts],
         "carried_over": _starts_from_earlier_gains(tuned),
-        "freedom": {name: tolerance._asdict() for name, tolerance in tuned.freedom.items()},
+        "freedom": {name: tolerance._asdict() for name, tolerance in tuned.tolerances.items()},
         "certified": tuned.global_comparison._asdict() if tuned.global_comparison else None,
         "timings": tuned.timings,
         "sensor_noise": has_sensor_noise(loaded.mechanism),

@@ -91,7 +91,7 @@ def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[s
     from jaxhil.simulation.contact_plot import save_figure
     from tuning.plots.tuning_results import front_plot
 
-    front, result, entries = points[0].front, points[0].tuned.found, []
+    front, result, entries = points[0].front, points[0].tuned.tune_result, []
     for number, point in enumerate(points, start=1):
         point_folder = folder / FRONT_FOLDER / f"{number:02d}"
         for target in (folder / FRONT_FOLDER, point_folder):

@@ -118,7 +118,7 @@ def _gain_tables(options: Tune, result: Any) -> list[Any]:
             *(gain.name, gain.unit, float(gain.lower(mechanism)), float(gain.upper(mechanism))),
             result.literature[gain.name],
             result.gains[gain.name] if gain.tuned(mechanism) else "(not tuned)",
-            *([f"{100 * share:.1f} %" for share in result.freedom.get(gain.name, ())] or ["", ""]),
+            *([f"{100 * share:.1f} %" for share in result.tolerances.get(gain.name, ())] or ["", ""]),
         )
         for gain in get_compensator(options.compensator, axes_of(mechanism)).gains
     ]
@@ -148,7 +148,7 @@ def _describe_aim(limit: float, result: Any) -> list[str]:
 def _describe_confidence(result: Any) -> list[str]:
     """Return sentences on the tolerances of the gains, the spread of the starts, and the global search."""
     lines = []
-    if result.freedom:
+    if result.tolerances:
         lines.append(
             "Free: the change of a gain, as a share of its range, that raises the loss by 1 %: alone, or "
             "together with the other gains readjusted."

@@ -288,7 +288,7 @@ class _MultisinePlan:
         document, simulator = to_plain_data(mechanism), mechanism.rig.simulator.model
         keys = [*(f"rig.simulator.{name}" for name in SIMULATOR_KEYS[simulator]), "rig.simulator.delay"]
         keys += ["rig.force_sensor.delay", *_find_stiffness_key(mechanism, self.depth)]
-        if find_contact_law(mechanism.contact.law).damped:
+        if find_contact_law(mechanism.contact.law).is_damped:
             keys.append(DAMPING_KEY)
         return {key: _get_value(document, key) for key in keys}
 
@@ -359,7 +359,7 @@ def _get_value(document: dict, key: str) -> float:
 def _find_stiffness_key(mechanism: Mechanism, depth: float) -> list[str]:
     """Return a list of one key: that of the stiffness at a depth [m]."""
     contact = mechanism.contact
-    if not find_contact_law(contact.law).segmented:
+    if not find_contact_law(contact.law).is_segmented:
         return ["contact.stiffness.0"]
     return [f"contact.stiffness.0.{np.searchsorted(contact.depths, depth)}"]
 

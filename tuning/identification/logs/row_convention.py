@@ -122,9 +122,9 @@ def _find_latest_reading(commands: np.ndarray, columns: np.ndarray) -> int | Non
         if rank < columns.shape[1]:
             return None
         error = commands - columns @ solution
-    freedom = np.count_nonzero(used) - columns.shape[1]
+    degrees_of_freedom = np.count_nonzero(used) - columns.shape[1]
     inverse = np.linalg.inv(columns[used].T @ columns[used])
-    variance = float(error[used] @ error[used]) / freedom * np.diag(inverse)
+    variance = float(error[used] @ error[used]) / degrees_of_freedom * np.diag(inverse)
     lags = slice(0, ROWS_AFTER_COMMAND + ROWS_BEFORE_COMMAND + 1)
     size = np.abs(solution[lags])
     is_significant = (size > MIN_COEFFICIENT_SIGMAS * np.sqrt(variance[lags])) & (

@@ -48,7 +48,7 @@ ELASTIC_ODDS = 19.0  # [1]; prior odds of a contact without dissipation
 WIDE_STIFFNESS = (200.0, 300.0)  # 1/s^2; prior mean and standard deviation of hinge 0 in `estimate_delay`
 SURPLUS = 1.4  # [1]; factor on the readings' variance, because the model's errors are correlated
 EXACT = 1e18  # 1/variance of a parameter that is known exactly
-LEAST_VARIANCE = 1e-12  # lower bound of a parameter's variance, avoids division by 0
+MIN_VARIANCE = 1e-12  # lower bound of a parameter's variance, avoids division by 0
 Vector = Annotated[list[float], PARAMETERS]
 Matrix = Annotated[list[list[float]], PARAMETERS, PARAMETERS]
 Spreads = Annotated[list[float], 7]
@@ -175,7 +175,7 @@ class ContactModel:
             j = DELAY_PARAMETERS[index]
             value = WIDE_STIFFNESS[0] if j == 0 else preload
             spread = WIDE_STIFFNESS[1] if j == 0 else preload_spread
-            old, new = 1.0 / max(self._variances[j], LEAST_VARIANCE), 1.0 / (spread * spread)
+            old, new = 1.0 / max(self._variances[j], MIN_VARIANCE), 1.0 / (spread * spread)
             observe(mean, rows, index, index, new * value - old * self._prior_mean[j], new - old)
         excess = SURPLUS * max(self._squares / max(self.count, 1.0), 1.0)
         lossy = list(mean)
@@ -183,8 +183,8 @@ class ContactModel:
         self._dissipate(lossy, lossy_rows, 0, False)
         evidence = 0.0
         for index in range(last):
-            variance = max(rows[index][index], LEAST_VARIANCE)
-            ratio = max(self._variances[DAMPING + index], LEAST_VARIANCE) / variance
+            variance = max(rows[index][index], MIN_VARIANCE)
+            ratio = max(self._variances[DAMPING + index], MIN_VARIANCE) / variance
             evidence += 0.5 * (log(ratio) - mean[index] * mean[index] / (variance * excess))
             observe(mean, rows, index, index, 0.0, EXACT)
         odds = exp(min(max(evidence, -50.0), 50.0))  # odds of an elastic contact, from the readings alone
@@ -211,7 +211,7 @@ class ContactModel:
         """
         for row in range(len(DISSIPATIVE)):
             index = first + row
-            variance = max(rows[row][index], LEAST_VARIANCE)
+            variance = max(rows[row][index], MIN_VARIANCE)
             expected, left = zero_or_positive(mean[index], variance, self._variances[DAMPING + row])
             old, new = 1.0 / variance, EXACT if certain else 1.0 / max(left, 1.0 / EXACT)
             observe(mean, rows, row, index, new * expected - old * mean[index], new - old)

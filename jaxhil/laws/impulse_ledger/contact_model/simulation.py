@@ -104,14 +104,14 @@ def estimate_delay(
         (last + 1, 0, *rig.WIDE_STIFFNESS),
         (last + 2, PRELOAD, preload, preload_spread),
     ):
-        old, new = 1 / _above(variances[j], rig.LEAST_VARIANCE), 1 / spread**2
+        old, new = 1 / _above(variances[j], rig.MIN_VARIANCE), 1 / spread**2
         mean, rows = _observe(mean, rows, index, index, new * value - old * prior_mean[j], new - old)
     excess = rig.SURPLUS * _above(estimate.squares / _above(estimate.count, 1.0), 1.0)
     lossy, lossy_rows = _dissipate(mean, rows, 0, variances, False)
     evidence = 0.0
     for index in range(last):
-        variance = _above(rows[index][index], rig.LEAST_VARIANCE)
-        ratio = _above(variances[DAMPING + index], rig.LEAST_VARIANCE) / variance
+        variance = _above(rows[index][index], rig.MIN_VARIANCE)
+        ratio = _above(variances[DAMPING + index], rig.MIN_VARIANCE) / variance
         evidence += 0.5 * (jnp.log(ratio) - mean[index] ** 2 / (variance * excess))
         mean, rows = _observe(mean, rows, index, index, 0.0, rig.EXACT)
     odds = jnp.exp(jnp.clip(evidence, -50, 50))  # odds of an elastic contact, from the readings alone
@@ -134,7 +134,7 @@ def _dissipate(
     """Return mean and covariance rows with the dissipative parameters constrained to be >= 0."""
     for row in range(len(DISSIPATIVE)):
         index = first + row
-        variance = _above(rows[row][index], rig.LEAST_VARIANCE)
+        variance = _above(rows[row][index], rig.MIN_VARIANCE)
         expected, left = zero_or_positive(mean[index], variance, prior_variances[DAMPING + row])
         old, new = 1 / variance, rig.EXACT if certain else 1 / _above(left, 1 / rig.EXACT)
         mean, rows = _observe(mean, rows, row, index, new * expected - old * mean[index], new - old)

@@ -13,7 +13,7 @@ from math import sqrt
 DRIFT = 2.0  # standard deviations; a reading increases S only if it exceeds the bias by more than this
 LEVEL = 8.0  # standard deviations; contact is detected if S exceeds this level
 SETTLING = 0.004  # s; no detection during this time after the start of a run
-LONGEST_MEAN = 2000.0  # readings; limits the memory of the bias, which may drift slowly
+MAX_MEAN = 2000.0  # readings; limits the memory of the bias, which may drift slowly
 FEW = 9.0  # readings in free flight; with fewer, sigma is the specified noise
 
 
@@ -25,10 +25,10 @@ class OnsetDetector:
         total: cumulative sum S [1]; 0 in free flight.
     """
 
-    __slots__ = ("_before", "_count", "_known", "_square", "bias", "total")
+    __slots__ = ("_before", "_count", "_noise_variance", "_square", "bias", "total")
 
     def __init__(self, noise: float) -> None:
-        self._known = noise * noise
+        self._noise_variance = noise * noise
         self.restart()
 
     def restart(self) -> None:
@@ -42,9 +42,9 @@ class OnsetDetector:
     @property
     def variance(self) -> float:
         """Return the noise variance of a force reading [N^2]: the larger of specified and measured value."""
-        return max(self._known, self._square) if self._count > FEW else self._known
+        return max(self._noise_variance, self._square) if self._count > FEW else self._noise_variance
 
-    def watch(self, force: float, side: float, floor: float, settled: bool) -> None:
+    def update(self, force: float, side: float, floor: float, settled: bool) -> None:
         """Update the cumulative sum with one force reading [N].
 
         Args:
@@ -66,4 +66,4 @@ class OnsetDetector:
             self._square += (0.5 * (step * step) - self._square) / self._count
         self._before = force
         self._count += 1.0
-        self.bias += (force - self.bias) / min(self._count, LONGEST_MEAN)
+        self.bias += (force - self.bias) / min(self._count, MAX_MEAN)

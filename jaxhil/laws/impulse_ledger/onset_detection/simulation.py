@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxhil.laws.impulse_ledger.onset_detection.rig import DRIFT, FEW, LONGEST_MEAN
+from jaxhil.laws.impulse_ledger.onset_detection.rig import DRIFT, FEW, MAX_MEAN
 
 
 class FreeFlight(NamedTuple):
@@ -24,7 +24,7 @@ def variance(flight: FreeFlight, noise: Array) -> Float[Array, "*batch"]:
     return jnp.where((flight.count > FEW) & (flight.square > specified), flight.square, specified)
 
 
-def watch(flight: FreeFlight, deviation: Array, settled: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:
+def update(flight: FreeFlight, deviation: Array, settled: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Return the next cumulative sum; `deviation` is the reading minus the bias, divided by sigma."""
     total = flight.total + deviation - DRIFT
     return jnp.where(settled & (total > 0), total, 0)
@@ -35,5 +35,5 @@ def learn(old: FreeFlight, force: Array) -> FreeFlight:
     step = force - old.before
     change = (0.5 * (step * step) - old.square) / jnp.maximum(old.count, 1)
     square = old.square + jnp.where(old.count > 0, change, 0)
-    bias = old.bias + (force - old.bias) / jnp.minimum(old.count + 1, LONGEST_MEAN)
+    bias = old.bias + (force - old.bias) / jnp.minimum(old.count + 1, MAX_MEAN)
     return FreeFlight(old.count + 1, square, force, bias, old.total)

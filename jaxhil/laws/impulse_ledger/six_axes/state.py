@@ -12,7 +12,7 @@ from jaxhil.laws.six_axis_base import Six, SixAxisConstants
 POSE, MODEL = slice(0, 6), slice(6, 24)
 
 
-class Prepared(NamedTuple):
+class PreparedLedger(NamedTuple):
     """Gains and constants of the six-axis impulse ledger, computed once per run."""
 
     gains: Gains

@@ -4,10 +4,10 @@ from math import floor
 from typing import Annotated
 
 from jaxhil.laws.impulse_ledger.six_axes.constants import (
-    LEAST_RATE,
     LONG_AGO,
-    LONGEST_FLIGHT,
-    LONGEST_MEAN,
+    MAX_FLIGHT,
+    MAX_MEAN,
+    MIN_RATE,
     ONSET_SIGMAS,
     RECENT,
 )
@@ -26,7 +26,7 @@ from jaxhil.rig.types import Count, Gains, Index, Positive
 
 SAMPLES = 512  # length of the delay line [ticks], a power of two
 MASK = SAMPLES - 1
-LONGEST_RECALL = SAMPLES - 2.0  # ticks; maximum delay, because interpolation needs one older sample
+MAX_RECALL = SAMPLES - 2.0  # ticks; maximum delay, because interpolation needs one older sample
 ROWS = 4 * AXES  # columns: filtered pose of the hardware; pose, twist and impulse of the model
 MODEL_ROWS = 3 * AXES
 ModelRows = Annotated[list[float], MODEL_ROWS]
@@ -49,8 +49,8 @@ class SixAxisReader:
     """
 
     __slots__ = (
-        "_age", "_back", "_back_share", "_back_ticks", "_bias", "_filtered", "_first", "_flight_ticks",
-        "_force_variance", "_inverse", "_kept", "_longest_flight", "_mass", "_noise_angular",
+        "_age", "_back", "_back_share", "_back_ticks", "_bias", "_filter_gain", "_filtered", "_first",
+        "_flight_ticks", "_force_variance", "_inverse", "_longest_flight", "_mass", "_noise_angular",
         "_noise_linear", "_period", "_pole", "_readings", "_rows", "_settle", "_tool_correction",
         "_torque_variance", "lag", "loud", "moved", "pose", "quiet", "tool", "twist", "variance", "wrench",
     )  # fmt: skip
@@ -72,10 +72,10 @@ class SixAxisReader:
         delay = gains["identification_delay"]
         filter_lag = min(gains["pose_filter"], delay)
         self._pole = filter_lag / (filter_lag + period)
-        self._kept = 1.0 / (1.0 - self._pole)
+        self._filter_gain = 1.0 / (1.0 - self._pole)
         self._back = (delay - filter_lag) / period
-        if not self._back <= LONGEST_RECALL:
-            raise ValueError(f"a delay of {self._back!r} periods, expected at most {LONGEST_RECALL!r}")
+        if not self._back <= MAX_RECALL:
+            raise ValueError(f"a delay of {self._back!r} periods, expected at most {MAX_RECALL!r}")
         self._back_ticks = floor(self._back)
         self._back_share = self._back - self._back_ticks
         self._force_variance = gains["force_noise"] * gains["force_noise"]
@@ -84,7 +84,7 @@ class SixAxisReader:
         self._noise_linear = inverse[0][0] + inverse[1][1] + inverse[2][2]
         self._noise_angular = inverse[3][3] + inverse[4][4] + inverse[5][5]
         self._settle = gains["settle"]
-        self._longest_flight = LONGEST_FLIGHT / period
+        self._longest_flight = MAX_FLIGHT / period
         self._rows = [[0.0] * ROWS for _ in range(SAMPLES)]
         self.reset()
 
@@ -146,7 +146,7 @@ class SixAxisReader:
         settles = self._age * period < self._settle
         is_recent = self.is_recent
         gate = ONSET_SIGMAS * ONSET_SIGMAS * self.variance
-        gate += LEAST_RATE * LEAST_RATE * dot(twist_desired, product(self._mass, twist_desired))
+        gate += MIN_RATE * MIN_RATE * dot(twist_desired, product(self._mass, twist_desired))
         if in_contact or is_recent:
             gate += self.tool
         self.loud = not settles and dot(unbiased, product(self._inverse, unbiased)) > gate
@@ -187,7 +187,7 @@ class SixAxisReader:
         rows = self._rows
         if self._age == 0:
             # Start in steady state: in uniform motion, the filter lags by pole/(1 - pole) ticks.
-            self._filtered = add_multiple(pose_measured, -(period * self._kept), twist_desired)
+            self._filtered = add_multiple(pose_measured, -(period * self._filter_gain), twist_desired)
         self._filtered = [
             at + pole * (old - at) for at, old in zip(pose_measured, self._filtered, strict=True)
         ]
@@ -206,7 +206,7 @@ class SixAxisReader:
 
     def _fly(self, wrench: Vector, lag: Vector, twist: Vector, is_uniform: bool) -> None:
         """Update the bias with a reading of free flight; if the motion is uniform, also lag and twist."""
-        self._readings = min(self._readings + 1.0, LONGEST_MEAN)
+        self._readings = min(self._readings + 1.0, MAX_MEAN)
         share = 1.0 / max(self._readings, 1.0)
         self._bias = [mean + share * (now - mean) for mean, now in zip(self._bias, wrench, strict=True)]
         if not is_uniform:

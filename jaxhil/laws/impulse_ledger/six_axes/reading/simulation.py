@@ -12,13 +12,19 @@ from jaxhil.laws.impulse_ledger.six_axes.simulation import (
     running_mean,
     wrench_at_chaser,
 )
-from jaxhil.laws.impulse_ledger.six_axes.state import POSE, FreeFlightState, LedgerState, Prepared, Reading
+from jaxhil.laws.impulse_ledger.six_axes.state import (
+    POSE,
+    FreeFlightState,
+    LedgerState,
+    PreparedLedger,
+    Reading,
+)
 from jaxhil.laws.shared.ring_buffer import write_sample
 from jaxhil.laws.six_axis_base import Six, SixAxisSignals
 
 
 def record(
-    prepared: Prepared, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]
+    prepared: PreparedLedger, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]
 ) -> LedgerState:
     """Filter the measured pose and write the signals of this tick to the delay line."""
     assert signals.pose_measured is not None
@@ -37,7 +43,7 @@ def record(
 
 
 def read(
-    prepared: Prepared, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]
+    prepared: PreparedLedger, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]
 ) -> tuple[Reading, LedgerState]:
     """Return the corrected readings of this tick, and the state with updated means of free flight."""
     constants, gains = prepared.constants, prepared.gains
@@ -51,7 +57,7 @@ def read(
     variance = noise_variance(prepared, pose)
     settles = signals.age.astype(period.dtype) * period < gains["settle"]
     is_recent = state.flight.ticks_since_contact * period < fixed.RECENT
-    least = fixed.LEAST_RATE**2 * dot(
+    least = fixed.MIN_RATE**2 * dot(
         signals.twist_desired, product(constants.mass_matrix, signals.twist_desired)
     )
     tool = jnp.where(state.in_contact | is_recent, state.contact.tool, 0)
@@ -79,7 +85,7 @@ def _computed_once(components: tuple[Array, ...], tick: Int[Array, ""]) -> tuple
     return lax.cond(tick >= 0, lambda values: values, lambda values: tuple(-v for v in values), components)
 
 
-def noise_variance(prepared: Prepared, pose: Six) -> Float[Array, "*batch"]:
+def noise_variance(prepared: PreparedLedger, pose: Six) -> Float[Array, "*batch"]:
     """Return the mean |W|^2 of a wrench W that is only noise; `pose` moves its torque to the frame C."""
     gains, inverse_mass = prepared.gains, prepared.constants.inverse_mass
     force, torque = gains["force_noise"] ** 2, gains["torque_noise"] ** 2
@@ -88,7 +94,9 @@ def noise_variance(prepared: Prepared, pose: Six) -> Float[Array, "*batch"]:
     return linear * force + angular * moment
 
 
-def _aligned(prepared: Prepared, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]) -> Six:
+def _aligned(
+    prepared: PreparedLedger, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]
+) -> Six:
     """Return the filtered pose, delayed like the force; assume uniform motion before the first tick."""
     back = prepared.back
     recalled = look_back(state.ring, POSE, tick, back)
@@ -107,8 +115,8 @@ def _update_free_flight(
     period: Float[Array, "*batch"],
 ) -> FreeFlightState:
     """Update the bias on the lanes `free`, and the means of lag and twist on the lanes `uniform`."""
-    readings = jnp.minimum(flight.readings + free.astype(period.dtype), fixed.LONGEST_MEAN)
-    ticks = jnp.minimum(flight.ticks + 1, fixed.LONGEST_FLIGHT / period)
+    readings = jnp.minimum(flight.readings + free.astype(period.dtype), fixed.MAX_MEAN)
+    ticks = jnp.minimum(flight.ticks + 1, fixed.MAX_FLIGHT / period)
     ticks = jnp.where(uniform, ticks, jnp.where(free, 0, flight.ticks))
     lag, twist = (
         running_mean(mean, value, ticks, uniform)

@@ -10,10 +10,10 @@ from jaxhil.laws.impulse_ledger.six_axes.constants import (
     BEND,
     BRIDGE_STEPS,
     FEATURES,
-    LEAST_ERROR,
+    MAX_DAMPING,
+    MAX_GROWTH,
+    MIN_ERROR,
     MISFIT,
-    MOST_DAMPING,
-    MOST_GROWTH,
 )
 from jaxhil.rig.types import Gains, Positive
 
@@ -45,7 +45,7 @@ class TangentModel:
     def __init__(self, gains: Gains, period: Positive) -> None:
         self._prior = [gains[name] * gains[name] for name in SPREADS]
         self._growth = gains["forgetting"] ** (-period / 1e-3)
-        self._most_damping = MOST_DAMPING / period
+        self._most_damping = MAX_DAMPING / period
         self.restart()
 
     def restart(self) -> None:
@@ -82,7 +82,7 @@ class TangentModel:
             for row in covariance
         ]
         misfit = MISFIT * scaled
-        total = variance / (speed * speed) + misfit * misfit + LEAST_ERROR * LEAST_ERROR
+        total = variance / (speed * speed) + misfit * misfit + MIN_ERROR * MIN_ERROR
         innovation = scaled
         for phi, entry, value in zip(features, column, mean, strict=True):
             total += phi * entry
@@ -95,7 +95,7 @@ class TangentModel:
                 covariance[i][j] -= share * column[j]
             if i < GROWING:
                 grown += covariance[i][i] / self._prior[i]
-        if grown < MOST_GROWTH:
+        if grown < MAX_GROWTH:
             for i in range(FEATURES):
                 for j in range(FEATURES):
                     covariance[i][j] *= self._growth

@@ -15,9 +15,9 @@ from jaxhil.laws.impulse_ledger.six_axes.constants import (
     BEND,
     BRIDGE_STEPS,
     FEATURES,
-    LEAST_ERROR,
+    MAX_GROWTH,
+    MIN_ERROR,
     MISFIT,
-    MOST_GROWTH,
 )
 from jaxhil.laws.impulse_ledger.six_axes.simulation import dot
 
@@ -68,12 +68,12 @@ def learn(
     unit = jnp.ones_like(path)
     features = jnp.stack([path, rate, unit, path * jnp.abs(path) / BEND])
     column = jnp.sum(old.covariance * features[None], axis=1)
-    error = variance + (MISFIT * force) ** 2 + LEAST_ERROR**2
+    error = variance + (MISFIT * force) ** 2 + MIN_ERROR**2
     share = column / (error + dot(features, column))[None]
     mean = old.mean + share * (force - dot(old.mean, features))[None]
     covariance = old.covariance - share[:, None] * column[None]
     grown = sum(covariance[j, j] / prior.covariance[j, j] for j in range(3))
-    return Estimate(mean, covariance * jnp.where(grown < MOST_GROWTH, growth, 1)[None, None])
+    return Estimate(mean, covariance * jnp.where(grown < MAX_GROWTH, growth, 1)[None, None])
 
 
 def restoring(tangent: Tangent, change: Array) -> Float[Array, "*batch"]:

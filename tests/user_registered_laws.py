@@ -41,10 +41,10 @@ class SquaredSpring(jaxhil.ContactLaw):
     def step(self, parameters, state, penetration, rate):
         return jnp.where(penetration > 0, parameters.stiffness * penetration**2, 0), state
 
-    def edge(self, parameters, rate):
+    def onset_force(self, parameters, rate):
         return jnp.zeros_like(rate)
 
-    def hold(self, parameters, state, penetration, rate):
+    def separation_function(self, parameters, state, penetration, rate):
         return parameters.stiffness * penetration
 
 

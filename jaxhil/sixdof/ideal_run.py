@@ -11,16 +11,16 @@ import numpy as np
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, jax_context, supported_options
 from jaxhil.sixdof.building import build_scenarios
-from jaxhil.sixdof.metrics import Metrics, judge
+from jaxhil.sixdof.episode_tracking import required_pause
+from jaxhil.sixdof.ideal_contact import summary_at
+from jaxhil.sixdof.metrics import Metrics, compare_with_ideal
 from jaxhil.sixdof.plausibility import check_scenario
-from jaxhil.sixdof.reference import past_at
-from jaxhil.sixdof.rollout import REBOUNDED, Episode, compute_ideal_contact
-from jaxhil.sixdof.run import Final, check_followed, final_in_space
+from jaxhil.sixdof.rollout import REBOUNDED, EpisodeBatch, compute_ideal_contact
+from jaxhil.sixdof.run import Final, check_integrated, compute_ideal_final
 from jaxhil.sixdof.scenario import Scenario
-from jaxhil.sixdof.watch import quiet_time
 
 
-class EpisodeInSpace(NamedTuple):
+class IdealEpisode(NamedTuple):
     """Metrics of the first episode (contact with all its touches) of the ideal contact; NaN if undefined.
 
     Attributes:
@@ -46,7 +46,7 @@ class EpisodeInSpace(NamedTuple):
     reference_touches: int
 
 
-class SpaceRun(NamedTuple):
+class IdealRun(NamedTuple):
     """Result of a simulation of the ideal contact.
 
     Attributes:
@@ -55,12 +55,12 @@ class SpaceRun(NamedTuple):
         final: Motion of the bodies at the end of the duration that the mechanism file specifies.
     """
 
-    episode: EpisodeInSpace
+    episode: IdealEpisode
     status: str
     final: Final
 
 
-def simulate_in_space(mechanism: SixAxisMechanism) -> SpaceRun:
+def simulate_ideal_contact(mechanism: SixAxisMechanism) -> IdealRun:
     """Simulate the ideal contact of a six-axis mechanism for the whole duration of its nominal run.
 
     Raise `InputError` if the start is invalid, or if a contact is too stiff to be integrated.
@@ -69,36 +69,36 @@ def simulate_in_space(mechanism: SixAxisMechanism) -> SpaceRun:
         scenario = build_scenarios(mechanism)
         check_scenario(mechanism, scenario)
         metrics = jax.device_get(_compiled()(scenario))
-    check_followed(mechanism, metrics)
+    check_integrated(mechanism, metrics)
 
     def value(name: str) -> Any:
         entry = np.asarray(getattr(metrics, name))[..., 0, 0]
         return tuple(entry.tolist()) if entry.ndim else entry.item()
 
-    episode = EpisodeInSpace(*map(value, EpisodeInSpace._fields))
+    episode = IdealEpisode(*map(value, IdealEpisode._fields))
     status = (
         "captured" if value("reference_captured") else "rebounded" if episode.reference_touches else "miss"
     )
     period = float(scenario.control_period[0])
     ticks = np.round(float(scenario.duration[0]) / period)
-    return SpaceRun(episode, status, final_in_space(mechanism, float(ticks * period)))
+    return IdealRun(episode, status, compute_ideal_final(mechanism, float(ticks * period)))
 
 
 def _ideal_metrics(scenario: Scenario) -> Metrics:
     """Return metrics whose fields of the ideal contact are valid; the fields of the rig are meaningless."""
     period = scenario.control_period
     until = jnp.round(scenario.duration / period) * period
-    quiet = quiet_time(scenario.sensor, period)
+    pause = required_pause(scenario.sensor, period)
     reference = compute_ideal_contact(scenario)
     first = reference.gaps.begin.time[0]
-    lasted = jnp.minimum(first + quiet, until)
+    elapsed = jnp.minimum(first + pause, until)
     zero, none = jnp.zeros_like(until), jnp.zeros(until.shape, jnp.int32)
-    episode = Episode(
+    episode = EpisodeBatch(
         start=scenario.start,
         end=scenario.start,
-        lasted=lasted,
-        meeting=reference.meeting,
-        past=past_at(reference, lasted, lasted < until),
+        elapsed=elapsed,
+        first_touch=reference.first_touch,
+        summary=summary_at(reference, elapsed, elapsed < until),
         touches=none,
         duration=zero,
         peak_force=zero,
@@ -107,7 +107,7 @@ def _ideal_metrics(scenario: Scenario) -> Metrics:
         penetration=zero,
         status=none + REBOUNDED,
     )
-    return judge(scenario.bodies, jax.tree.map(lambda leaf: leaf[None], episode))
+    return compare_with_ideal(scenario.bodies, jax.tree.map(lambda leaf: leaf[None], episode))
 
 
 @cache

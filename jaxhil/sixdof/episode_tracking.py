@@ -1,8 +1,8 @@
 """Record of the current episode (a contact with all its touches) of a six-axis rig, and its end condition.
 
 An episode ends at the first tick at which three conditions hold: the hardware and the ideal contact have both
-paused (no touch for `quiet_time`), the numerical model is free, and the wrench command has decayed. The wait
-for this decay lasts at most `MAX_DECAY_WAIT`, because a noisy command never decays completely.
+paused (no touch for `required_pause`), the numerical model is free, and the wrench command has decayed. The
+wait for this decay lasts at most `MAX_DECAY_WAIT`, because a noisy command never decays completely.
 """
 
 from typing import NamedTuple
@@ -12,11 +12,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.lanes import select_lanes
-from jaxhil.simulation.watch import COMMAND_DECAY_RATIO, MAX_DECAY_WAIT
+from jaxhil.simulation.contact_tracking import COMMAND_DECAY_RATIO, MAX_DECAY_WAIT
 from jaxhil.sixdof.forces import deepest
-from jaxhil.sixdof.loop import Rig, Tick
-from jaxhil.sixdof.peaks import Peak, higher, no_peak
-from jaxhil.sixdof.reference import Reference, is_quiet
+from jaxhil.sixdof.ideal_contact import IdealContactRecord, is_in_gap
+from jaxhil.sixdof.loop import RigConstants, Tick
+from jaxhil.sixdof.peaks import Peak, update_peak, zero_peak
 from jaxhil.sixdof.relative import States, relative
 from jaxhil.sixdof.sensor import Sensor
 from jaxhil.sixdof.vectors import dot, norm
@@ -24,89 +24,94 @@ from jaxhil.sixdof.vectors import dot, norm
 MIN_PAUSE = 0.06  # s; minimum time without any touch, after which an episode may end
 
 
-class Beginning(NamedTuple):
+class EpisodeStart(NamedTuple):
     """Start of an episode (a contact with all its touches): start of the run, or end of the last episode."""
 
     states: States  # states of the numerical model at the start
     tick: Int[Array, "*batch"]  # index of the tick at the start
     energy: Float[Array, "*batch"]  # energy of the relative motion at the start, see `relative_energy`
-    reference: Reference  # ideal contact that starts from these states
+    reference: IdealContactRecord  # ideal contact that starts from these states
 
 
-class Watch(NamedTuple):
+class EpisodeTracker(NamedTuple):
     """Record of the current episode (a contact with all its touches) on the rig."""
 
-    begun: Bool[Array, "*batch"]  # whether the hardware has touched or a latch has caught
+    has_touched: Bool[Array, "*batch"]  # whether the hardware has touched or a latch has caught
     touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each pair of shapes touches, per group
     touches: Int[Array, "*batch"]  # number of touches of all pairs of shapes
-    touched: Int[Array, "*batch"]  # number of ticks with a touch
-    quiet: Int[Array, "*batch"]  # number of ticks since the last touch
+    touch_ticks: Int[Array, "*batch"]  # number of ticks with a touch
+    ticks_since_touch: Int[Array, "*batch"]  # number of ticks since the last touch
     caught: Bool[Array, "*batch"]  # whether a latch holds
     force: Peak  # peak force of the real contact [N]
     moment: Peak  # peak moment of the real contact, about the origin of target frame T [N m]
     highest: tuple[Array, Array]  # largest force [N] and largest moment [N m] of the wrench command
-    faded: Int[Array, "*batch"]  # number of ticks since the wrench command decayed
-    over: Bool[Array, "*batch"]  # whether the episode has ended
+    ticks_since_decay: Int[Array, "*batch"]  # number of ticks since the wrench command decayed
+    has_ended: Bool[Array, "*batch"]  # whether the episode has ended
     end: States  # states of the numerical model at the end of the episode
     end_tick: Int[Array, "*batch"]  # number of ticks from the start of the run to the end of the episode
     penetration: Float[Array, "*batch"]  # largest penetration, divided by the shapes' size [1]
-    beyond: Bool[Array, "*batch"]  # whether an axis was commanded beyond its workspace
+    is_out_of_reach: Bool[Array, "*batch"]  # whether an axis was commanded beyond its workspace
 
 
-def fresh_watch(rig: Rig, states: States, now: Array) -> Watch:
+def start_tracking(rig: RigConstants, states: States, now: Array) -> EpisodeTracker:
     """Return the record at the start of an episode, for the model's `states` after `now` ticks."""
     zero, none = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32)
-    peak = no_peak(zero)
-    return Watch(
-        begun=none > 0,
+    peak = zero_peak(zero)
+    return EpisodeTracker(
+        has_touched=none > 0,
         touching=tuple(group.parameters.damping > jnp.inf for group in rig.groups),
         touches=none,
-        touched=none,
-        quiet=none,
+        touch_ticks=none,
+        ticks_since_touch=none,
         caught=none > 0,
         force=peak,
         moment=peak,
         highest=(zero, zero),
-        faded=none,
-        over=none > 0,
+        ticks_since_decay=none,
+        has_ended=none > 0,
         end=states,
         end_tick=now,
         penetration=zero,
-        beyond=none > 0,
+        is_out_of_reach=none > 0,
     )
 
 
-def watch_tick(
-    rig: Rig, beginning: Beginning, watch: Watch, seen: Tick, after: States, ticks: Array
-) -> Watch:
+def track_tick(
+    rig: RigConstants,
+    episode_start: EpisodeStart,
+    tracker: EpisodeTracker,
+    seen: Tick,
+    after: States,
+    ticks: Array,
+) -> EpisodeTracker:
     """Update the record of the episode with a tick, and end the episode if the conditions hold.
 
     Args:
         rig: Constants of the run.
-        beginning: Start of the episode.
-        watch: Record of the episode before the tick.
+        episode_start: Start of the episode.
+        tracker: Record of the episode before the tick.
         seen: Record of the tick.
         after: States of the numerical model after the tick.
         ticks: Number of ticks from the start of the run, including this tick.
     """
-    watch = _updated(rig, watch, seen)
-    time = (ticks - beginning.tick).astype(rig.period.dtype) * rig.period
-    quiet = is_quiet(beginning.reference, time, quiet_time(rig.sensor, rig.period))
-    pauses = watch.begun & is_rig_quiet(rig, watch) & quiet & ~watch.over
+    tracker = _updated(rig, tracker, seen)
+    time = (ticks - episode_start.tick).astype(rig.period.dtype) * rig.period
+    is_free = is_in_gap(episode_start.reference, time, required_pause(rig.sensor, rig.period))
+    pauses = tracker.has_touched & has_rig_settled(rig, tracker) & is_free & ~tracker.has_ended
 
     def are_free() -> Array:
         return deepest(rig.groups, relative(rig.bodies, after)[0]) < 0
 
     # Few ticks need the model's penetrations: computing them only there saves time.
     ends = pauses & lax.cond(jnp.any(pauses), are_free, lambda: jnp.ones_like(pauses))
-    return watch._replace(
-        over=watch.over | ends,
-        end=select_lanes(ends, after, watch.end),
-        end_tick=jnp.where(ends, ticks, watch.end_tick),
+    return tracker._replace(
+        has_ended=tracker.has_ended | ends,
+        end=select_lanes(ends, after, tracker.end),
+        end_tick=jnp.where(ends, ticks, tracker.end_tick),
     )
 
 
-def quiet_time(sensor: Sensor, period: Array) -> Array:
+def required_pause(sensor: Sensor, period: Array) -> Array:
     """Return the pause [s] (time without a touch) after which an episode may end.
 
     The pause is `MIN_PAUSE` or, if longer, the time that the force sensor needs to settle: its delay, 20 of
@@ -115,59 +120,61 @@ def quiet_time(sensor: Sensor, period: Array) -> Array:
     return jnp.maximum(MIN_PAUSE, sensor.delay + 20 * sensor.time_constant + 2 * period)
 
 
-def is_rig_quiet(rig: Rig, watch: Watch) -> Array:
+def has_rig_settled(rig: RigConstants, tracker: EpisodeTracker) -> Array:
     """Return whether the hardware has paused and the wrench command has decayed, or the wait is too long."""
-    pause = quiet_ticks(rig)
+    pause = required_pause_ticks(rig)
     max_wait = pause + jnp.ceil(MAX_DECAY_WAIT / rig.period).astype(jnp.int32)
-    return ((watch.quiet >= pause) & (watch.faded > 0)) | (watch.quiet >= max_wait)
+    return ((tracker.ticks_since_touch >= pause) & (tracker.ticks_since_decay > 0)) | (
+        tracker.ticks_since_touch >= max_wait
+    )
 
 
-def quiet_ticks(rig: Rig) -> Array:
-    """Return the pause of `quiet_time` as a number of ticks."""
-    return jnp.floor(quiet_time(rig.sensor, rig.period) / rig.period + 1e-9).astype(jnp.int32) + 1
+def required_pause_ticks(rig: RigConstants) -> Array:
+    """Return the pause of `required_pause` as a number of ticks."""
+    return jnp.floor(required_pause(rig.sensor, rig.period) / rig.period + 1e-9).astype(jnp.int32) + 1
 
 
-def relative_energy(rig: Rig, states: States) -> Array:
+def relative_energy(rig: RigConstants, states: States) -> Array:
     """Return twice the relative motion's energy [J], without the coupling of translation and rotation."""
     _, (linear, angular) = relative(rig.bodies, states)
     return dot(linear, linear) / mass_share(rig) + dot(angular, rig.bodies.chaser.inertia @ angular)
 
 
-def mass_share(rig: Rig) -> Array:
+def mass_share(rig: RigConstants) -> Array:
     """Return the inverse of the reduced mass [1/kg]."""
     return 1 / rig.bodies.target.mass + 1 / rig.bodies.chaser.mass
 
 
-def _updated(rig: Rig, watch: Watch, seen: Tick) -> Watch:
+def _updated(rig: RigConstants, tracker: EpisodeTracker, seen: Tick) -> EpisodeTracker:
     """Update the touches, peaks and decay of the record with those of a tick."""
     touching = tuple(forces.touch.depth > 0 for forces in seen.forces)
-    caught = watch.caught
-    for latch in seen.held:
+    caught = tracker.caught
+    for latch in seen.latch_states:
         caught = caught | jnp.any(latch.caught, axis=0)
-    now, touches = caught, watch.touches
-    for flags, before in zip(touching, watch.touching, strict=True):
+    now, touches = caught, tracker.touches
+    for flags, before in zip(touching, tracker.touching, strict=True):
         now = now | jnp.any(flags, axis=0)
         touches = touches + jnp.sum(flags & ~before, axis=0, dtype=touches.dtype)
-    penetration = watch.penetration
+    penetration = tracker.penetration
     for group, forces in zip(rig.groups, seen.forces, strict=True):
         share = jnp.max(forces.touch.depth / group.candidates.size, axis=0)
         penetration = jnp.maximum(penetration, share)
     command = norm(seen.command.force), norm(seen.command.moment)
-    highest = tuple(jnp.maximum(a, b) for a, b in zip(watch.highest, command, strict=True))
-    # The threshold does not depend on the noise; `jaxhil.simulation.watch` states the reason.
-    faded = (command[0] <= COMMAND_DECAY_RATIO * highest[0]) & (
+    highest = tuple(jnp.maximum(a, b) for a, b in zip(tracker.highest, command, strict=True))
+    # The threshold does not depend on the noise; `jaxhil.simulation.contact_tracking` states the reason.
+    ticks_since_decay = (command[0] <= COMMAND_DECAY_RATIO * highest[0]) & (
         command[1] <= COMMAND_DECAY_RATIO * highest[1]
     )
-    return watch._replace(
-        begun=watch.begun | now,
+    return tracker._replace(
+        has_touched=tracker.has_touched | now,
         touching=touching,
         touches=touches,
-        touched=watch.touched + now.astype(touches.dtype),
-        quiet=jnp.where(now, 0, watch.quiet + 1),
+        touch_ticks=tracker.touch_ticks + now.astype(touches.dtype),
+        ticks_since_touch=jnp.where(now, 0, tracker.ticks_since_touch + 1),
         caught=caught,
-        force=higher(watch.force, norm(seen.contact.force), rig.period),
-        moment=higher(watch.moment, norm(seen.contact.moment), rig.period),
+        force=update_peak(tracker.force, norm(seen.contact.force), rig.period),
+        moment=update_peak(tracker.moment, norm(seen.contact.moment), rig.period),
         highest=(highest[0], highest[1]),
-        faded=jnp.where(faded, watch.faded + 1, 0),
+        ticks_since_decay=jnp.where(ticks_since_decay, tracker.ticks_since_decay + 1, 0),
         penetration=penetration,
     )

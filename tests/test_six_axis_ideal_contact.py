@@ -21,10 +21,10 @@ from jaxhil.sixdof.bodies import (
 from jaxhil.sixdof.candidates import ChaserSpheres
 from jaxhil.sixdof.forces import ContactGroup
 from jaxhil.sixdof.friction import Bristle, Frictionless, Regularised
+from jaxhil.sixdof.ideal_contact_integration import IdealContactModel, sample_ideal_contact
 from jaxhil.sixdof.relative import Pair, States, effective_mass, power, wrench_at_chaser
 from jaxhil.sixdof.rotations import Quaternion
 from jaxhil.sixdof.shapes import Cavity, Plane
-from jaxhil.sixdof.space import Space, follow
 from jaxhil.sixdof.vectors import components, matrix, vector
 
 pytestmark = pytest.mark.slow
@@ -159,7 +159,7 @@ def begin(masses, inertias, offsets, places, speeds, attitude, angular):
 
 @jax.jit
 def simulate(pair, states, contact, step):
-    flight, seen = follow(Space(pair, (contact,), ()), states, step, STEPS, step)
+    flight, seen = sample_ideal_contact(IdealContactModel(pair, (contact,), ()), states, step, STEPS, step)
     final = flight.states
     lifted = jax.tree.map(lambda leaf: leaf[None], pair)
 
@@ -297,8 +297,8 @@ def test_six_axis_contact_combines_elastoplastic_contact_and_tether():
     slack = Cavity(contact.candidates.centre, jnp.full((2, len(LANES)), 5.0))
     tether = ChaserSpheres(contact.candidates.centre, jnp.zeros((2, len(LANES))), slack)
     tethered = ContactGroup(tether, CONTACT_LAWS["hunt_crossley"], contact.parameters, Frictionless())
-    space = Space(pair, (yields, tethered), ())
-    flight, _ = jax.jit(follow, static_argnums=3)(space, states, step, STEPS, step)
+    contact_model = IdealContactModel(pair, (yields, tethered), ())
+    flight, _ = jax.jit(sample_ideal_contact, static_argnums=3)(contact_model, states, step, STEPS, step)
     final = flight.states
     lane = LANES.index("central")
     speed = np.asarray(final.chaser.velocity.z - final.target.velocity.z)[lane]
@@ -317,7 +317,9 @@ def test_six_axis_contact_derivatives_match_finite_differences():
         )
         law = Regularised(friction * contact.friction.coefficient, contact.friction.slip)
         changed_group = ContactGroup(contact.candidates, contact.law, changed, law)
-        flight, _ = follow(Space(pair, (changed_group,), ()), states, step, STEPS, step)
+        flight, _ = sample_ideal_contact(
+            IdealContactModel(pair, (changed_group,), ()), states, step, STEPS, step
+        )
         final = flight.states
         return jnp.stack([*jax.tree.leaves(final.chaser.velocity), *jax.tree.leaves(final.chaser.spin)])
 

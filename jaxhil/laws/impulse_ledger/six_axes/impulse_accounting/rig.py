@@ -5,13 +5,13 @@ from math import sqrt
 from jaxhil.laws.impulse_ledger.six_axes.constants import (
     AHEAD,
     HIGHEST,
-    LEAST_SHARE,
-    LEAST_SPEED,
-    LEAST_STIFFNESS,
-    LEAST_TWIST,
+    MIN_SHARE,
+    MIN_SPEED,
+    MIN_STIFFNESS,
+    MIN_TWIST,
     TURNED,
 )
-from jaxhil.laws.impulse_ledger.six_axes.reading.rig import LONGEST_RECALL, ModelRows, SixAxisReader
+from jaxhil.laws.impulse_ledger.six_axes.reading.rig import MAX_RECALL, ModelRows, SixAxisReader
 from jaxhil.laws.impulse_ledger.six_axes.tangent_model.rig import TangentModel
 from jaxhil.rig.six_axes.registry import ModelConstants
 from jaxhil.rig.six_axes.vectors import AXES, Matrix, Vector, add_multiple, dot, multiply, product, subtract
@@ -29,9 +29,8 @@ class Ledger:
 
     __slots__ = (
         "_command", "_corrected", "_correction_limit", "_deeper", "_direction", "_drift", "_impulse",
-        "_inverse", "_least_delay", "_longest", "_mass", "_mixed", "_modelled", "_path", "_peak",
-        "_period", "_pole", "_position_gain", "_speed", "_unpaid", "_velocity_gain", "delay", "is_limited",
-        "tangent",
+        "_inverse", "_least_delay", "_longest", "_mass", "_mixed", "_modelled", "_path", "_peak", "_period",
+        "_pole", "_position_gain", "_speed", "_unpaid", "_velocity_gain", "delay", "is_limited", "tangent",
     )  # fmt: skip
     _period: Positive
     _inverse: Matrix
@@ -47,8 +46,8 @@ class Ledger:
         self._pole = gains["direction_pole"]
         self._least_delay = gains["identification_delay"] / period
         self._longest = constants.longest_delay / period
-        if not self._longest <= LONGEST_RECALL:
-            raise ValueError(f"a delay of {self._longest!r} periods, expected at most {LONGEST_RECALL!r}")
+        if not self._longest <= MAX_RECALL:
+            raise ValueError(f"a delay of {self._longest!r} periods, expected at most {MAX_RECALL!r}")
         self.tangent = TangentModel(gains, period)
         self.reset()
 
@@ -94,11 +93,11 @@ class Ledger:
         speed = sqrt(whole) if whole > 0.0 else 0.0
         closing = -dot(direction, twist)
         # If the contact's direction is perpendicular to the motion, use the mean delay of all directions.
-        delay = dot(lag, momentum) / (whole + LEAST_TWIST * LEAST_TWIST)
-        if closing > LEAST_SHARE * speed + LEAST_TWIST:
+        delay = dot(lag, momentum) / (whole + MIN_TWIST * MIN_TWIST)
+        if closing > MIN_SHARE * speed + MIN_TWIST:
             delay = -dot(direction, lag) / closing
         self.delay = min(max(delay / self._period, self._least_delay), self._longest)
-        self._speed = max(closing, LEAST_SPEED * speed + LEAST_TWIST)
+        self._speed = max(closing, MIN_SPEED * speed + MIN_TWIST)
 
     def follow(self, reader: SixAxisReader, commanded: Vector, begins: bool) -> Vector:
         """Process one reading of a contact; return the command wrench about the chaser's origin C.
@@ -116,7 +115,7 @@ class Ledger:
         force = dot(wrench, product(self._inverse, direction))
         self._book(reader, recalled, force)
         self._peak = max(self._peak, abs(force))
-        stiffness = max(self.tangent.stiffness, LEAST_STIFFNESS)
+        stiffness = max(self.tangent.stiffness, MIN_STIFFNESS)
         self._unpaid = subtract(commanded, self._impulse)
         self._command = [0.0] * AXES
         gain = 0.0

@@ -9,7 +9,7 @@ from jaxhil.laws.impulse_ledger.six_axes.simulation import dot, look_back, produ
 from jaxhil.laws.impulse_ledger.six_axes.state import (
     MODEL,
     LedgerState,
-    Prepared,
+    PreparedLedger,
     Reading,
     SixAxisContact,
 )
@@ -24,7 +24,7 @@ from jaxhil.laws.six_axis_base import Six, SixAxisSignals
 
 
 def onset(
-    prepared: Prepared, state: LedgerState, reading: Reading, signals: SixAxisSignals
+    prepared: PreparedLedger, state: LedgerState, reading: Reading, signals: SixAxisSignals
 ) -> SixAxisContact:
     """Return the state of a contact that begins with this reading (equation b of README.md).
 
@@ -37,11 +37,11 @@ def onset(
     twist = jnp.where(has_flown[None], flight.twist, signals.twist_desired)
     direction = reading.wrench / _norm(prepared, reading.wrench)[None]
     closing, whole = -dot(direction, twist), dot(twist, product(mass, twist))
-    least = fixed.LEAST_SHARE * safe_sqrt(whole) + fixed.LEAST_TWIST
+    least = fixed.MIN_SHARE * safe_sqrt(whole) + fixed.MIN_TWIST
     is_closing = closing > least
-    slowest = fixed.LEAST_SPEED * safe_sqrt(whole) + fixed.LEAST_TWIST
+    slowest = fixed.MIN_SPEED * safe_sqrt(whole) + fixed.MIN_TWIST
     # If the contact's direction is perpendicular to the motion, use the mean delay of all directions.
-    mean = dot(lag, product(mass, twist)) / (whole + fixed.LEAST_TWIST**2)
+    mean = dot(lag, product(mass, twist)) / (whole + fixed.MIN_TWIST**2)
     delay = jnp.where(is_closing, -dot(direction, lag) / jnp.where(is_closing, closing, 1), mean) / period
     longest = len(state.ring) - 2.0
     delay = jnp.clip(delay, prepared.gains["identification_delay"] / period, longest)
@@ -61,7 +61,7 @@ def onset(
 
 
 def follow(
-    prepared: Prepared,
+    prepared: PreparedLedger,
     state: LedgerState,
     reading: Reading,
     contact: tuple[SixAxisContact, Estimate, Bool[Array, "*batch"]],
@@ -110,7 +110,7 @@ def follow(
     ahead = (old.delay + fixed.AHEAD) * period
     touches = is_contact & (corrected != 0)
     bridged, last_force = bridge(tangent, corrected, least, deeper, velocity, ahead)
-    stiffness = jnp.maximum(tangent.stiffness, fixed.LEAST_STIFFNESS)
+    stiffness = jnp.maximum(tangent.stiffness, fixed.MIN_STIFFNESS)
     peak = jnp.maximum(old.peak, jnp.abs(force))
     expected = jnp.maximum(jnp.sqrt(stiffness) * old.speed, peak)
     last_force = jnp.minimum(last_force, fixed.HIGHEST * expected)
@@ -132,7 +132,7 @@ def follow(
 
 
 def _correction(
-    prepared: Prepared, unpaid: Six, stiffness: Float[Array, "*batch"], speed: Float[Array, "*batch"]
+    prepared: PreparedLedger, unpaid: Six, stiffness: Float[Array, "*batch"], speed: Float[Array, "*batch"]
 ) -> Six:
     """Return the wrench that corrects the missing impulse `unpaid`, with a limited norm."""
     wrench = -prepared.gains["velocity_gain"][None] * unpaid
@@ -141,14 +141,14 @@ def _correction(
     return wrench * jnp.where(large > limit, limit / jnp.where(large > 0, large, 1), 1)[None]
 
 
-def _norm(prepared: Prepared, wrench: Six) -> Float[Array, "*batch"]:
+def _norm(prepared: PreparedLedger, wrench: Six) -> Float[Array, "*batch"]:
     """Return the norm |W| = sqrt(W . M^-1 W) of a wrench W, with the mass matrix M; 1 if W is 0."""
     square = dot(wrench, product(prepared.constants.inverse_mass, wrench))
     return jnp.where(square > 0, safe_sqrt(square), 1)
 
 
 def _direction(
-    prepared: Prepared, contact: SixAxisContact, reading: Reading, begins: Bool[Array, "*batch"]
+    prepared: PreparedLedger, contact: SixAxisContact, reading: Reading, begins: Bool[Array, "*batch"]
 ) -> tuple[Six, Six]:
     """Return the contact's direction, a unit wrench, and the filtered wrench of the same direction.
 
@@ -162,7 +162,7 @@ def _direction(
 
 
 def _update_estimate(
-    prepared: Prepared,
+    prepared: PreparedLedger,
     contact: SixAxisContact,
     reading: Reading,
     estimate: Estimate,
@@ -190,7 +190,7 @@ def _update_estimate(
     tangent = Tangent(
         stiffness=jnp.maximum(mean[0], 0),
         curvature=mean[3] / fixed.BEND,
-        damping=jnp.clip(mean[1], 0, fixed.MOST_DAMPING / period),
+        damping=jnp.clip(mean[1], 0, fixed.MAX_DAMPING / period),
         path=path / speed,
         speed=speed,
     )

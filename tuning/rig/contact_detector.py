@@ -24,14 +24,14 @@ class RigContact(NamedTuple):
     peak_force: float  # largest sample of the real force [N]
     duration: float  # time with a real contact force [s]
     status: str  # a status of `jaxhil.simulation.metrics`, "tripped" or "stalled"
-    begun: int  # tick of the run at which the contact starts
+    onset_tick: int  # tick of the run at which the contact starts
     # sequence numbers of the first and last packet of the contact, set by `RigTask`
     packets: tuple[int, int] = (0, 0)
     # largest age of a position command during the contact [periods], set by `RigTask`
     oldest_command: int = 0
 
 
-class ContactWatch:
+class ContactDetector:
     """Detector of the contacts of one run; a mechanism with two surfaces has several contacts in a run."""
 
     def __init__(self, mechanism: Mechanism) -> None:
@@ -126,7 +126,7 @@ class ContactWatch:
             peak_force=self._peak_force,
             duration=self._contact_ticks * self._period,
             status=status,
-            begun=self._onset_tick,
+            onset_tick=self._onset_tick,
         )
         # A force command that remains from this contact must not count as the onset of the next contact.
         self._number += 1

@@ -30,18 +30,18 @@ class CommandVariation(NamedTuple):
     variation: Float[Array, "*batch"]  # total variation so far [N]
 
 
-class Watch(NamedTuple):
+class ContactTracker(NamedTuple):
     """Record of the current contact, from the end of the previous contact to the current tick."""
 
     elapsed: Float[Array, "*batch"]  # number of ticks since the contact began; 0 before
-    over: Bool[Array, "*batch"]  # whether the contact has ended normally or by divergence
+    has_ended: Bool[Array, "*batch"]  # whether the contact has ended normally or by divergence
     approach: Float[Array, "*batch"]  # speed of the numerical model before the contact [m/s]
     rebound: Float[Array, "*batch"]  # speed of the numerical model at the current tick [m/s]
     peak_force: Float[Array, "*batch"]  # largest real force so far [N]
     peak_command: Float[Array, "*batch"]  # largest |force command| so far [N]
     recent_forces: tuple[Array, Array]  # real force at the last two ticks [N]
     in_contact: Float[Array, "*batch"]  # duration of the real force so far [control periods]
-    measured: Bool[Array, "*batch"]  # whether the force sensor has read a force
+    has_reading: Bool[Array, "*batch"]  # whether the force sensor has read a force
     # number of ticks since the last real force; in a contact without a real force so far, since its beginning
     force_free_ticks: Float[Array, "*batch"]
     work: tuple[Array, ...]  # work done on the mechanism and work returned by it [J]; empty unless recorded
@@ -82,19 +82,19 @@ def build_end_conditions(scenario: Scenario) -> ContactEndConditions:
     )
 
 
-def fresh_watch(loop: Loop, like: Array) -> Watch:
+def start_tracking(loop: Loop, like: Array) -> ContactTracker:
     """Return the record before a contact, for a rig on which no force has acted for a long time."""
     zeros = jnp.zeros_like(like)
-    return Watch(
+    return ContactTracker(
         elapsed=zeros,
-        over=jnp.zeros(like.shape, bool),
+        has_ended=jnp.zeros(like.shape, bool),
         approach=zeros,
         rebound=zeros,
         peak_force=zeros,
         peak_command=zeros,
         recent_forces=(zeros, zeros),
         in_contact=zeros,
-        measured=jnp.zeros(like.shape, bool),
+        has_reading=jnp.zeros(like.shape, bool),
         force_free_ticks=zeros + 1e6,
         work=(zeros, zeros) if loop.energies else (),
         command_variation=CommandVariation(zeros, zeros, zeros, zeros) if loop.chatter else None,
@@ -109,18 +109,18 @@ def fresh_watch(loop: Loop, like: Array) -> Watch:
 def record_contact(
     loop: Loop,
     rules: ContactEndConditions,
-    watch: Watch,
+    tracker: ContactTracker,
     signals: Signals,
     plant_signals: PlantSignals,
     command: Array,
     shortfall: Array | None,
-) -> Watch:
+) -> ContactTracker:
     """Stage 6: return the record of the current contact, updated with the current tick.
 
     Args:
         loop: Loop.
         rules: Conditions for the end of a contact.
-        watch: Record up to the previous tick.
+        tracker: Record up to the previous tick.
         signals: Inputs of the compensator.
         plant_signals: Real forces in the last sampling interval.
         command: Force command F_c [N].
@@ -131,43 +131,43 @@ def record_contact(
     touching = force > 0
     if plant_signals.contact_time is not None:
         # A contact may begin and end between two samples, so that no sample has a force.
-        touching = touching | ((watch.recent_forces[1] == 0) & (plant_signals.contact_time > 0))
-    begun = _has_begun(loop, rules, watch, signals, touching, magnitude)
-    side = _choose_side(rules, watch, signals)
-    peak_command = jnp.maximum(watch.peak_command, magnitude)
+        touching = touching | ((tracker.recent_forces[1] == 0) & (plant_signals.contact_time > 0))
+    begun = _has_begun(loop, rules, tracker, signals, touching, magnitude)
+    side = _choose_side(rules, tracker, signals)
+    peak_command = jnp.maximum(tracker.peak_command, magnitude)
     # A contact may begin at the numerical model, before the delayed hardware touches. The count of ticks
     # without a force then starts when the contact begins.
-    force_free_ticks = jnp.where(touching | (begun & (watch.elapsed == 0)), 0, watch.force_free_ticks + 1)
+    force_free_ticks = jnp.where(touching | (begun & (tracker.elapsed == 0)), 0, tracker.force_free_ticks + 1)
     contact_time = plant_signals.contact_time
-    in_contact = jnp.where(touching, watch.in_contact + 1, watch.in_contact)
-    in_contact = in_contact if contact_time is None else watch.in_contact + contact_time
+    in_contact = jnp.where(touching, tracker.in_contact + 1, tracker.in_contact)
+    in_contact = in_contact if contact_time is None else tracker.in_contact + contact_time
     ends = begun & _has_ended(rules, signals, side, force_free_ticks, magnitude, peak_command)
-    lasts = begun & ~watch.over
-    variation = watch.command_variation
-    return Watch(
-        elapsed=jnp.where(begun, watch.elapsed + 1, watch.elapsed),
+    lasts = begun & ~tracker.has_ended
+    variation = tracker.command_variation
+    return ContactTracker(
+        elapsed=jnp.where(begun, tracker.elapsed + 1, tracker.elapsed),
         # A run that has diverged ends at this tick, even if the speed would decrease again.
-        over=watch.over | ends | (speed > rules.divergence_speed),
+        has_ended=tracker.has_ended | ends | (speed > rules.divergence_speed),
         # The approach speed is taken at the tick before the contact, the rebound speed at the contact's end.
-        approach=jnp.where(begun | watch.over, watch.approach, speed),
-        rebound=jnp.where(watch.over, watch.rebound, speed),
-        peak_force=jnp.maximum(watch.peak_force, _peak_force(loop, watch, plant_signals, force)),
+        approach=jnp.where(begun | tracker.has_ended, tracker.approach, speed),
+        rebound=jnp.where(tracker.has_ended, tracker.rebound, speed),
+        peak_force=jnp.maximum(tracker.peak_force, _peak_force(loop, tracker, plant_signals, force)),
         peak_command=peak_command,
-        recent_forces=(watch.recent_forces[1], force),
+        recent_forces=(tracker.recent_forces[1], force),
         in_contact=in_contact,
-        measured=watch.measured | ((in_contact > 0) & (signals.force_measured != 0)),
+        has_reading=tracker.has_reading | ((in_contact > 0) & (signals.force_measured != 0)),
         force_free_ticks=force_free_ticks,
-        work=tuple(total + work for total, work in zip(watch.work, plant_signals.work or (), strict=True)),
+        work=tuple(total + work for total, work in zip(tracker.work, plant_signals.work or (), strict=True)),
         command_variation=variation and _update_variation(variation, command, lasts, ends),
-        shortfall=_largest_shortfall(watch, shortfall, lasts),
+        shortfall=_largest_shortfall(tracker, shortfall, lasts),
         side=side,
         command=magnitude if loop.is_two_sided else None,
-        remaining_command=watch.remaining_command,
-        deviation=watch.deviation,
+        remaining_command=tracker.remaining_command,
+        deviation=tracker.deviation,
     )
 
 
-def _has_begun(loop, rules, watch, signals, touching, magnitude):
+def _has_begun(loop, rules, tracker, signals, touching, magnitude):
     """Return whether the contact has begun.
 
     A contact begins with a real force or with a force command. If the sensor has noise or bias, there is
@@ -175,22 +175,22 @@ def _has_begun(loop, rules, watch, signals, touching, magnitude):
     """
     if loop.reads_always:
         starts = touching | (deflection(signals.position_desired, rules.clearance) != 0)
-    elif watch.remaining_command is not None:
+    elif tracker.remaining_command is not None:
         # A force command that remains from the previous contact does not begin the next contact.
-        starts = touching | (magnitude > watch.remaining_command)
+        starts = touching | (magnitude > tracker.remaining_command)
     else:
         starts = touching | (magnitude > 0)
-    fresh = watch.elapsed == 0
+    fresh = tracker.elapsed == 0
     begun = ~fresh | starts
-    return begun if watch.side is None else begun & ~watch.over
+    return begun if tracker.side is None else begun & ~tracker.has_ended
 
 
-def _choose_side(rules, watch, signals):
+def _choose_side(rules, tracker, signals):
     """Return the side of the nearer surface, constant during a contact; None with one surface."""
-    if watch.side is None:
+    if tracker.side is None:
         return None
     position = signals.position_desired
-    return jnp.where(watch.elapsed == 0, _nearer_side(rules, position), watch.side)
+    return jnp.where(tracker.elapsed == 0, _nearer_side(rules, position), tracker.side)
 
 
 def _nearer_side(rules, position):
@@ -216,19 +216,19 @@ def _has_ended(rules, signals, side, force_free_ticks, magnitude, peak_command):
     return (side * velocity < 0) & (force_free_ticks >= rules.force_free_ticks) & faded
 
 
-def _peak_force(loop, watch, plant_signals, force):
+def _peak_force(loop, tracker, plant_signals, force):
     """Return the largest real force [N] since the previous tick."""
     if plant_signals.peak is not None:
         return plant_signals.peak
     # If the position jumps at the ticks, the force is constant between two ticks.
-    return force if loop.discontinuity_order == 0 else _parabola_peak(watch.recent_forces, force)
+    return force if loop.discontinuity_order == 0 else _parabola_peak(tracker.recent_forces, force)
 
 
-def _largest_shortfall(watch, shortfall, lasts):
+def _largest_shortfall(tracker, shortfall, lasts):
     """Update the position command's largest shortfall [m] where the contact `lasts`; None without limits."""
-    if watch.shortfall is None or shortfall is None:
-        return watch.shortfall
-    return jnp.where(lasts, jnp.maximum(watch.shortfall, shortfall), watch.shortfall)
+    if tracker.shortfall is None or shortfall is None:
+        return tracker.shortfall
+    return jnp.where(lasts, jnp.maximum(tracker.shortfall, shortfall), tracker.shortfall)
 
 
 def _update_variation(

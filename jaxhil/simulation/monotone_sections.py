@@ -1,7 +1,7 @@
-"""Division of the motion in each cell into pieces of monotone motion.
+"""Division of the motion in each cell into sections of monotone motion.
 
 A cell (`jaxhil.simulation.cells`) is a short part of a sampling interval. The relative time s in a cell runs
-from 0 to 1. Arrays have the axes (pieces of a cell, cells, *batch).
+from 0 to 1. Arrays have the axes (sections of a cell, cells, *batch).
 """
 
 from typing import NamedTuple
@@ -23,13 +23,13 @@ class CellMotion(NamedTuple):
     length: Array  # length of each cell [periods], (cells, *batch)
 
 
-class MonotonePieces(NamedTuple):
-    """Pieces of the cells in which the motion is monotone, (pieces of a cell, cells, *batch)."""
+class MonotoneSections(NamedTuple):
+    """Sections of the cells in which the motion is monotone, (sections of a cell, cells, *batch)."""
 
     path: CellMotion  # motion in the cells
-    low: Array  # relative time at which a piece begins, 0 to 1
-    high: Array  # relative time at which a piece ends, 0 to 1
-    way: Array  # 1 if the position increases in the piece, else -1
+    low: Array  # relative time at which a section begins, 0 to 1
+    high: Array  # relative time at which a section ends, 0 to 1
+    direction: Array  # 1 if the position increases in the section, else -1
 
 
 def build_cell_motion(series: Array, length: Array) -> CellMotion:
@@ -37,7 +37,7 @@ def build_cell_motion(series: Array, length: Array) -> CellMotion:
     return CellMotion(series, _derivative(series), length)
 
 
-def split_at_reversals(path: CellMotion) -> MonotonePieces:
+def split_at_reversals(path: CellMotion) -> MonotoneSections:
     """Divide the cells at the instants at which the motion reverses.
 
     The motion is assumed to reverse at most twice in a cell, and at most once in a short cell.
@@ -50,15 +50,15 @@ def split_at_reversals(path: CellMotion) -> MonotonePieces:
     bend = find_sign_change(velocity_at, path._replace(rate=_derivative(path.rate)), low, high, high)
     begin, end = jnp.stack([low, bend]), jnp.stack([bend, high])
     early, late = find_sign_change(velocity_at, path, begin, end, end)
-    # The cells are divided at `bend` too: the velocity is then monotone in each piece, and the force of a
+    # The cells are divided at `bend` too: the velocity is then monotone in each section, and the force of a
     # damper vanishes at most once.
     return split_at(path, jnp.stack([low, early, bend, late, high]))
 
 
-def split_at(path: CellMotion, edges: Array) -> MonotonePieces:
-    """Divide each cell at the relative times `edges`, (edges, cells, *batch), into monotone pieces."""
+def split_at(path: CellMotion, edges: Array) -> MonotoneSections:
+    """Divide each cell at the relative times `edges`, (edges, cells, *batch), into monotone sections."""
     step = position_at(path, edges[1:]) - position_at(path, edges[:-1])
-    return MonotonePieces(path, edges[:-1], edges[1:], jnp.where(step < 0, -1, 1).astype(step.dtype))
+    return MonotoneSections(path, edges[:-1], edges[1:], jnp.where(step < 0, -1, 1).astype(step.dtype))
 
 
 def position_at(path: CellMotion, s: Array) -> Array:

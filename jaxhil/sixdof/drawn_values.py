@@ -17,7 +17,7 @@ from jaxhil.sixdof.rotations import Quaternion, exponential
 from jaxhil.sixdof.vectors import Matrix, Vector
 
 
-class Values:
+class DrawnValues:
     """Drawn or nominal values of a mechanism, as arrays (*entries, lanes) of NumPy or JAX."""
 
     def __init__(self, mechanism: SixAxisMechanism, draws: Mapping[str, Any]) -> None:

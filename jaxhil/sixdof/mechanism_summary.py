@@ -10,7 +10,7 @@ from jaxhil.sixdof.units import unit_warnings
 MAX_FREQUENCY_RATIO = 0.1  # highest plausible contact frequency, divided by the control rate [1]
 
 
-class Meaning(NamedTuple):
+class SixAxisSummary(NamedTuple):
     """Summary of a nominal six-axis mechanism; metrics of the contact are NaN if nothing touches.
 
     Attributes:
@@ -45,14 +45,14 @@ class Meaning(NamedTuple):
         return text
 
 
-def meaning(
+def summarise_six_axes(
     mechanism: SixAxisMechanism,
     effective_mass: float,
     tangential_mass: float,
     duration: float,
     peak_force: float,
     restitution: float,
-) -> Meaning:
+) -> SixAxisSummary:
     """Summarise a mechanism whose first ideal contact has the given metrics, in SI units.
 
     `tangential_mass` is the effective mass along the surface, `duration` the duration of the contact.
@@ -80,4 +80,4 @@ def meaning(
                 f"contact.{name}.friction.slip: found {friction.slip:.3g} m/s, "
                 f"expected more than {slip:.2g} m/s: below it the delayed friction chatters"
             )
-    return Meaning(effective_mass, frequency, peak_force, restitution, delay, limit, tuple(warnings))
+    return SixAxisSummary(effective_mass, frequency, peak_force, restitution, delay, limit, tuple(warnings))

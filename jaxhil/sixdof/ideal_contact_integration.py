@@ -18,7 +18,7 @@ from jaxhil.contact.dormand_prince import take_looped_step
 from jaxhil.lanes import select_lanes
 from jaxhil.sixdof.bodies import Body, Load, State, angular_velocity
 from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
-from jaxhil.sixdof.latch import Held, Latch, init_latch, latch_points, latch_wrench
+from jaxhil.sixdof.latch import Latch, LatchState, init_latch, latch_points, latch_wrench
 from jaxhil.sixdof.relative import (
     Pair,
     Pose,
@@ -32,7 +32,7 @@ from jaxhil.sixdof.relative import (
 from jaxhil.sixdof.rotations import Quaternion, compose, normalise, rotate
 from jaxhil.sixdof.vectors import norm
 
-TOLERANCE = 1e-10  # maximum error of a step, divided by the relative speed (function `scale`)
+TOLERANCE = 1e-10  # maximum error of a step, divided by the relative speed (function `error_speed`)
 MIN_STEP = 1e-9  # s; steps up to this length are accepted with any error, so that the integration proceeds
 EVENT_ACCURACY = 1e-6  # s; accuracy of the time at which a touch begins or ends, or a latch catches
 MAX_STEP_WITH_MEMORY = 1e-4  # s; maximum length of a step for laws with memory
@@ -42,7 +42,7 @@ NEAREST_POINT_MARGIN = 1.0  # m; margin added to the lever arm, because contact 
 MIN_SPEED = 1e-30  # m/s; avoids a division by zero
 
 
-class Space(NamedTuple):
+class IdealContactModel(NamedTuple):
     """Constants of an ideal contact: bodies, pairs of shapes that may touch, and latches."""
 
     bodies: Pair
@@ -50,11 +50,11 @@ class Space(NamedTuple):
     latches: tuple[Latch, ...]
 
 
-class Memories(NamedTuple):
+class LawStates(NamedTuple):
     """States of the contact laws, friction laws and latches."""
 
     laws: tuple[Memory, ...]  # states of each group's contact law and friction law
-    held: tuple[Held, ...]  # states of the latches
+    latch_states: tuple[LatchState, ...]  # states of the latches
 
 
 class Instant(NamedTuple):
@@ -67,89 +67,96 @@ class Instant(NamedTuple):
     forces: tuple[Forces, ...]  # contact forces of each group of shape pairs
 
 
-class Flight(NamedTuple):
+class IntegrationState(NamedTuple):
     """State of the integration of an ideal contact."""
 
     time: Float[Array, "*batch"]  # time since the start of the integration [s]
     length: Float[Array, "*batch"]  # length of the next step [s]
     touching: tuple[Bool[Array, "candidates *batch"], ...]  # whether each pair of shapes touches, per group
-    memories: Memories
+    memories: LawStates
     states: States  # states of the bodies
-    tries: Int[Array, "*batch"]  # number of steps so far, including rejected steps
-    apart: Float[Array, "*batch"]  # time from now in which nothing can touch [s]; 0 if something touches
+    steps: Int[Array, "*batch"]  # number of steps so far, including rejected steps
+    # time from now in which nothing can touch [s]; 0 if something touches
+    contact_free_time: Float[Array, "*batch"]
 
 
 class Step(NamedTuple):
     """Result of an integration step, accepted or rejected."""
 
     now: Instant  # motion and forces at the end of the step
-    memories: Memories  # states of laws and latches at the end of the step
+    memories: LawStates  # states of laws and latches at the end of the step
     accepted: Bool[Array, "*batch"]  # whether the step was accepted
 
 
-def start_flight(space: Space, states: States, length: Float[Array, "*batch"]) -> Flight:
+def start_integration(
+    contact_model: IdealContactModel, states: States, length: Float[Array, "*batch"]
+) -> IntegrationState:
     """Return the state of an integration that starts with `states` and a first step of `length` [s]."""
-    memories = Memories(tuple(group.init() for group in space.groups), ())
-    if space.latches:
-        pose, _ = relative(space.bodies, states)
-        memories = memories._replace(held=tuple(init_latch(latch, pose) for latch in space.latches))
-    touching = tuple(jnp.zeros_like(group.parameters.damping, bool) for group in space.groups)
-    return Flight(
+    memories = LawStates(tuple(group.init() for group in contact_model.groups), ())
+    if contact_model.latches:
+        pose, _ = relative(contact_model.bodies, states)
+        memories = memories._replace(
+            latch_states=tuple(init_latch(latch, pose) for latch in contact_model.latches)
+        )
+    touching = tuple(jnp.zeros_like(group.parameters.damping, bool) for group in contact_model.groups)
+    return IntegrationState(
         time=0 * length,
         length=length,
         touching=touching,
         memories=memories,
         states=states,
-        tries=jnp.zeros(length.shape, jnp.int32),
-        apart=0 * length,
+        steps=jnp.zeros(length.shape, jnp.int32),
+        contact_free_time=0 * length,
     )
 
 
-def instant(
-    space: Space, states: States, memories: Memories, duration: Float[Array, "*batch"]
-) -> tuple[Instant, Memories]:
+def compute_instant(
+    contact_model: IdealContactModel, states: States, memories: LawStates, duration: Float[Array, "*batch"]
+) -> tuple[Instant, LawStates]:
     """Compute relative motion and contact forces for the bodies' states, and the next states of the laws.
 
     `duration` is the time since the last evaluation of the laws [s].
     """
-    pose, twist = relative(space.bodies, states)
-    wrench, forces, laws = contact_wrench(space.groups, memories.laws, pose, twist, duration)
+    pose, twist = relative(contact_model.bodies, states)
+    wrench, forces, laws = contact_wrench(contact_model.groups, memories.laws, pose, twist, duration)
     latched = []
-    for latch, before in zip(space.latches, memories.held, strict=True):
+    for latch, before in zip(contact_model.latches, memories.latch_states, strict=True):
         pull, now = latch_wrench(latch, before, pose, twist)
         wrench = jax.tree.map(jnp.add, wrench, pull)
         latched.append(now)
-    return Instant(states, pose, twist, wrench, forces), Memories(laws, tuple(latched))
+    return Instant(states, pose, twist, wrench, forces), LawStates(laws, tuple(latched))
 
 
-def advance_flight(
-    space: Space,
-    flight: Flight,
+def advance_integration(
+    contact_model: IdealContactModel,
+    integration: IntegrationState,
     left: Float[Array, "*batch"],
     longest: Float[Array, "*batch"],
     speed: Float[Array, "*batch"],
-) -> tuple[Flight, Step]:
+) -> tuple[IntegrationState, Step]:
     """Integrate one step. Return the state of the integration after the step, and the step itself.
 
     If the step is rejected, the state keeps its motion and has a shorter next step. If a number is not
     finite, or if there are too many steps, the time of the state becomes infinite.
 
     Args:
-        space: Constants of the ideal contact.
-        flight: State of the integration before the step.
+        contact_model: Constants of the ideal contact.
+        integration: State of the integration before the step.
         left: Maximum length of the step [s].
         longest: Maximum length of a step while something touches or may touch soon [s].
         speed: Relative speed by which the error of the step is divided [m/s].
     """
-    if _remembers(space):
+    if _has_memory(contact_model):
         longest = jnp.minimum(longest, MAX_STEP_WITH_MEMORY)
-    length = jnp.minimum(jnp.minimum(flight.length, left), jnp.maximum(longest, flight.apart))
+    length = jnp.minimum(
+        jnp.minimum(integration.length, left), jnp.maximum(longest, integration.contact_free_time)
+    )
     length = lax.stop_gradient(length)
-    now, memories, error = _try(space, flight, length, speed)
+    now, memories, error = _try(contact_model, integration, length, speed)
     touching = tuple(forces.touch.depth > 0 for forces in now.forces)
-    before = (*flight.touching, *(latch.caught for latch in flight.memories.held))
+    before = (*integration.touching, *(latch.caught for latch in integration.memories.latch_states))
     happens = jnp.zeros(length.shape, bool)
-    for old, new in zip(before, (*touching, *(latch.caught for latch in memories.held)), strict=True):
+    for old, new in zip(before, (*touching, *(latch.caught for latch in memories.latch_states)), strict=True):
         happens = happens | jnp.any(old != new, axis=0)
     is_too_long = happens & (length > EVENT_ACCURACY)
     accepted = ((error <= 1) | (length <= MIN_STEP)) & ~is_too_long
@@ -157,55 +164,63 @@ def advance_flight(
     change = jnp.clip(0.9 * safe**-0.2, MIN_STEP_RATIO, jnp.where(accepted, MAX_STEP_RATIO, 0.9))
     proposed = length * change
     # If `left` or `longest` shortened an accepted step, the next step may have the original length.
-    cut = accepted & (length < flight.length)
-    proposed = jnp.where(cut, jnp.maximum(flight.length, proposed), proposed)
+    cut = accepted & (length < integration.length)
+    proposed = jnp.where(cut, jnp.maximum(integration.length, proposed), proposed)
     ahead = lax.stop_gradient(jnp.where(is_too_long, length / 4, proposed))
-    tries = flight.tries + 1
-    time = jnp.where(jnp.isfinite(error), flight.time + length, jnp.inf)
-    apart = lax.stop_gradient(_time_apart(space, now))
-    moved = Flight(time, ahead, touching, memories, now.states, tries, apart)
-    after: Flight = select_lanes(accepted, moved, flight._replace(length=ahead, tries=tries))
+    steps = integration.steps + 1
+    time = jnp.where(jnp.isfinite(error), integration.time + length, jnp.inf)
+    apart = lax.stop_gradient(_contact_free_time(contact_model, now))
+    moved = IntegrationState(time, ahead, touching, memories, now.states, steps, apart)
+    after: IntegrationState = select_lanes(accepted, moved, integration._replace(length=ahead, steps=steps))
     # The integration stops after `MAX_STEPS` steps whose mean length is below a thousandth of `longest`.
-    endless = (tries > MAX_STEPS) & (after.time < 1e-3 * tries.astype(length.dtype) * longest)
+    endless = (steps > MAX_STEPS) & (after.time < 1e-3 * steps.astype(length.dtype) * longest)
     time = jnp.where(endless, jnp.inf, after.time)
     return after._replace(time=time), Step(now, memories, accepted | endless)
 
 
 def _try(
-    space: Space, flight: Flight, length: Float[Array, "*batch"], speed: Array
-) -> tuple[Instant, Memories, Array]:
+    contact_model: IdealContactModel,
+    integration: IntegrationState,
+    length: Float[Array, "*batch"],
+    speed: Array,
+) -> tuple[Instant, LawStates, Array]:
     """Compute a step of `length` [s]: motion and laws at its end, and its error divided by `TOLERANCE`."""
 
     def slope(offset, states):
-        now, memories = instant(space, states, flight.memories, offset)
-        return slope_at(space, now), (now._replace(states=None), memories)
+        now, memories = compute_instant(contact_model, states, integration.memories, offset)
+        return state_derivative(contact_model, now), (now._replace(states=None), memories)
 
-    step = take_looped_step(slope, flight.states, length)
+    step = take_looped_step(slope, integration.states, length)
     now, memories = step.extra
     normalised: Any = States(*(body._replace(attitude=normalise(body.attitude)) for body in step.end))
-    return now._replace(states=normalised), memories, _size(space, step.error, speed) / TOLERANCE
-
-
-def slope_at(space: Space, now: Instant) -> States:
-    """Return the time derivatives of the bodies' states under the contact wrench."""
-    states = now.states
-    target, chaser = loads(now.wrench, interface_frame(space.bodies.target, states.target), states)
-    return States(
-        _slope(space.bodies.target, states.target, target), _slope(space.bodies.chaser, states.chaser, chaser)
+    return (
+        now._replace(states=normalised),
+        memories,
+        _relative_error(contact_model, step.error, speed) / TOLERANCE,
     )
 
 
-def follow(
-    space: Space,
+def state_derivative(contact_model: IdealContactModel, now: Instant) -> States:
+    """Return the time derivatives of the bodies' states under the contact wrench."""
+    states = now.states
+    target, chaser = loads(now.wrench, interface_frame(contact_model.bodies.target, states.target), states)
+    return States(
+        _slope(contact_model.bodies.target, states.target, target),
+        _slope(contact_model.bodies.chaser, states.chaser, chaser),
+    )
+
+
+def sample_ideal_contact(
+    contact_model: IdealContactModel,
     states: States,
     period: Float[Array, "*batch"],
     periods: int,
     longest: Float[Array, "*batch"],
-) -> tuple[Flight, Instant]:
+) -> tuple[IntegrationState, Instant]:
     """Integrate the ideal contact for a number of periods, and record the start of each period.
 
     Args:
-        space: Constants of the ideal contact.
+        contact_model: Constants of the ideal contact.
         states: States of the bodies at the start.
         period: Length of a period [s].
         periods: Number of periods.
@@ -214,35 +229,41 @@ def follow(
     Returns:
         State of the integration at the end, and motion and forces at the starts, (periods, ...).
     """
-    speed = scale(space, states)
+    speed = error_speed(contact_model, states)
 
-    def body(flight, _):
-        flight = flight._replace(time=0 * period, tries=0 * flight.tries)
-        seen, _ = instant(space, flight.states, flight.memories, flight.time)
-        return fly(space, flight, period, longest, speed), seen
+    def body(integration, _):
+        integration = integration._replace(time=0 * period, steps=0 * integration.steps)
+        seen, _ = compute_instant(contact_model, integration.states, integration.memories, integration.time)
+        return integrate_until(contact_model, integration, period, longest, speed), seen
 
-    begin = start_flight(space, states, jnp.minimum(period, longest))
+    begin = start_integration(contact_model, states, jnp.minimum(period, longest))
     return lax.scan(body, begin, None, length=periods)
 
 
-def fly(space: Space, flight: Flight, until: Array, longest: Array, speed: Array) -> Flight:
+def integrate_until(
+    contact_model: IdealContactModel,
+    integration: IntegrationState,
+    until: Array,
+    longest: Array,
+    speed: Array,
+) -> IntegrationState:
     """Continue an integration up to the time `until` [s] since its start.
 
-    `longest` and `speed` are those of `advance_flight`.
+    `longest` and `speed` are those of `advance_integration`.
     """
 
-    def body(flight):
-        left = until - flight.time
-        moved, _ = advance_flight(space, flight, left, longest, speed)
-        return select_lanes(left > _end_tolerance(until), moved, flight)
+    def body(integration):
+        left = until - integration.time
+        moved, _ = advance_integration(contact_model, integration, left, longest, speed)
+        return select_lanes(left > _end_tolerance(until), moved, integration)
 
-    def ahead(flight):
-        return jnp.any(until - flight.time > _end_tolerance(until))
+    def ahead(integration):
+        return jnp.any(until - integration.time > _end_tolerance(until))
 
-    return lax.while_loop(ahead, body, flight)
+    return lax.while_loop(ahead, body, integration)
 
 
-def scale(space: Space, states: States) -> Float[Array, "*batch"]:
+def error_speed(contact_model: IdealContactModel, states: States) -> Float[Array, "*batch"]:
     """Return the relative speed [m/s] by which integration errors are divided.
 
     It is the relative speed of the centres of mass, plus the speed that the relative rotation gives a point
@@ -250,7 +271,7 @@ def scale(space: Space, states: States) -> Float[Array, "*batch"]:
     """
     target, chaser = (
         rotate(state.attitude, angular_velocity(body, state))
-        for body, state in zip(space.bodies, states, strict=True)
+        for body, state in zip(contact_model.bodies, states, strict=True)
     )
     apart = states.chaser.velocity - states.target.velocity
     return lax.stop_gradient(norm(apart) + norm(chaser - target) + 1e-9)
@@ -261,7 +282,7 @@ def _end_tolerance(until: Array) -> Array:
     return 1e-14 + 1e-13 * until
 
 
-def _time_apart(space: Space, now: Instant) -> Float[Array, "*batch"]:
+def _contact_free_time(contact_model: IdealContactModel, now: Instant) -> Float[Array, "*batch"]:
     """Return a step length [s] in which no shapes can touch and no latch can catch.
 
     It is half of the shortest time until one of these events is possible. A latch is assumed to catch at any
@@ -273,26 +294,26 @@ def _time_apart(space: Space, now: Instant) -> Float[Array, "*batch"]:
         arm = jax.tree.map(lambda point, origin: point - origin[None], forces.touch.point, now.pose.position)
         closing = linear[None] + angular[None] * (NEAREST_POINT_MARGIN + norm(arm))
         time = jnp.minimum(time, jnp.min(-forces.touch.depth / (2 * closing + MIN_SPEED), axis=0))
-    for latch in space.latches:
+    for latch in contact_model.latches:
         height = latch_points(latch, now.pose).z + latch.depth
         closing = linear[None] + angular[None] * (NEAREST_POINT_MARGIN + norm(latch.point))
         time = jnp.minimum(time, jnp.min(height / (2 * closing + MIN_SPEED), axis=0))
     return jnp.maximum(time, 0)
 
 
-def _remembers(space: Space) -> bool:
+def _has_memory(contact_model: IdealContactModel) -> bool:
     """Return whether any contact law or friction law has memory."""
-    memories = jax.eval_shape(lambda: [group.init() for group in space.groups])
+    memories = jax.eval_shape(lambda: [group.init() for group in contact_model.groups])
     return bool(jax.tree.leaves(memories))
 
 
-def _size(space: Space, error: States, speed: Array) -> Array:
+def _relative_error(contact_model: IdealContactModel, error: States, speed: Array) -> Array:
     """Return the error of a step, divided by the relative speed [1].
 
     Velocity errors are divided by `speed`, position errors by the distance that `speed` covers in 0.1 s.
     """
     largest = jnp.zeros_like(speed)
-    for body, state in zip(space.bodies, error, strict=True):
+    for body, state in zip(contact_model.bodies, error, strict=True):
         turning = norm(body.inverse_inertia @ state.spin)
         tilt = 2 * norm(state.attitude.v)
         for part in (norm(state.velocity), turning, 10 * norm(state.position), 10 * tilt):
