@@ -10,10 +10,10 @@ from jax import export
 from jaxhil.laws.compensators import COMPENSATORS, SIX_AXIS_COMPENSATORS, literature_gains
 from jaxhil.mechanism.file import load_any
 from jaxhil.rig_models import choose_rig_model
-from jaxhil.simulation import cached_programs, jax_environment
+from jaxhil.simulation import cached_programs, jax_environment, tile_size
 from jaxhil.simulation.evaluation import run_tiles
 from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS, build_xla_flags, supported_options
-from tuning.gains.multistart_solver import compile_solver
+from tuning.gains.multistart_solver import MIN_PROBLEMS_PER_CALL, compile_solver
 from tuning.gains.tasks import build_task
 
 LEVEL = "--xla_backend_optimization_level"
@@ -43,9 +43,18 @@ def case(name, compensator):
 
 
 def batch(name, compensator):
-    """Return the external calls of a rollout batch on all devices."""
+    """Return the external calls of a rollout batch on all devices, with one tile per device."""
     model, loop, gains, scenarios = case(name, compensator)
-    return calls(lambda *parts: run_tiles((model, loop), *parts), *model.shard(scenarios, gains))
+    arguments = model.shard(scenarios, gains, at_least=4096, loop=loop)
+    assert arguments[-1].control_period.shape == (jax.device_count(), 1, 4096 // jax.device_count())
+    return calls(lambda *parts: run_tiles((model, loop), *parts), *arguments)
+
+
+@pytest.fixture(autouse=True)
+def _accelerator(monkeypatch):
+    """Divide batches into tiles as on an accelerator, with all lanes of a device in one tile."""
+    device = tile_size.DeviceDescription(is_cpu=False, memory=80 << 30)
+    monkeypatch.setattr(tile_size, "describe_devices", lambda: device)
 
 
 def jacobian(name, compensator):
@@ -68,6 +77,7 @@ def test_tuning_program_lowers_for_cuda(monkeypatch):
     monkeypatch.setattr(cached_programs, "compile_cached", lambda *program, options: programs.append(program))
     compile_solver([build_task(load_any("varying").mechanism, "phase_lead", 4, 0)], starts=1)
     ((function, static, arguments),) = programs
+    assert static[-1] == MIN_PROBLEMS_PER_CALL  # all problems of the call in one tile
     result = calls(lambda arguments: tuple(function(static, arguments)), arguments)
     assert result == CHOLESKY
 

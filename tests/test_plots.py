@@ -48,9 +48,9 @@ def result(error_size=(0.5, 0.05, 0.005)):
             error=size * generator.standard_normal(shape),
             peak_ratio=np.ones(shape),
             chatter=np.zeros(shape),
-            wanted=wanted,
+            is_scheduled=wanted,
             good=wanted,
-            unlike=np.zeros(shape, bool),
+            is_unlike_ideal=np.zeros(shape, bool),
         )
     summaries = {name: compute_error_metrics(outcome) for name, outcome in outcomes.items()}
     starts = [StartResult("converged", 3, 0.1 / n, [1.0, 0.5, 0.1 / n], {}) for n in (1, 3, 2)]

@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from sweep_cases import case, manifest
 from jaxhil.errors import InputError
 from tuning.gain_file import write_gain_file
 from tuning.statistics.intervals import SequentialState, is_narrow_enough, update_sequence
+from tuning.sweeps import run_sweep as run_sweep_module
 from tuning.sweeps.chunk_file import list_different_columns
 from tuning.sweeps.chunks import run_chunk
 from tuning.sweeps.replay import compute_motion, replay_scenario
@@ -96,8 +98,35 @@ def test_interrupted_sweep_keeps_written_rows(uninterrupted_sweep, tmp_path):
         run_sweep(store, lambda *_: None, interrupted)
     log = Log()
     store, _, again = log.sweep(tmp_path / "store")
-    assert log.found == 96
+    assert log.found == 96 + 32  # the chunk that was being written is also kept
     assert list_different_columns(all_rows(store), rows) == [] and again == tally
+
+
+def test_sweep_chunk_is_written_while_next_chunk_is_computed(tmp_path, monkeypatch):
+    store, next_begun = open_store(tmp_path / "store", MANIFEST, resume=False), threading.Event()
+
+    def computer(sweep, parts):
+        yield 0, run_chunk(sweep, *MANIFEST.chunk_range(0))
+        next_begun.set()
+        yield 1, run_chunk(sweep, *MANIFEST.chunk_range(1))
+
+    def write(store, part, rows):
+        assert next_begun.wait(60)
+        write_chunk(store, part, rows)
+
+    monkeypatch.setattr(run_sweep_module, "write_chunk", write)
+    counts = []
+    run_sweep(store, lambda *_: None, lambda rows, tally: counts.append(tally.scenarios), computer)
+    assert counts == [32, 64]
+    assert all(read_chunk(store, part) is not None for part in (0, 1))
+
+
+def test_sweep_reports_chunk_that_cannot_be_written(tmp_path):
+    store = open_store(tmp_path / "store", MANIFEST, resume=False)
+    store.chunk_path(2).mkdir()
+    with pytest.raises(InputError, match=r"part-000002\.parquet"):
+        run_sweep(store, lambda *_: None, lambda *_: None)
+    assert all(read_chunk(store, part) is not None for part in (0, 1))
 
 
 def test_killed_and_resumed_sweep_gives_store_of_uninterrupted_sweep(uninterrupted_sweep, tmp_path):

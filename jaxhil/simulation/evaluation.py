@@ -5,12 +5,13 @@ before they are divided into tiles. They are sorted by delay, because lanes with
 lines faster, and by expected duration, because a tile runs until its slowest lane has finished.
 
 Tiles are distributed to the devices in turn. Batches are padded with idle lanes to a few sizes, so that most
-calls reuse a compiled program.
+calls reuse a compiled program. On an accelerator, a batch is a single tile per device, as far as the memory
+allows (`jaxhil.simulation.tile_size`).
 """
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -19,12 +20,15 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
+from jaxhil.laws.compensators import get_compensator
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.simulation import cached_programs
 from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS, TICK_OPTIONS
 from jaxhil.simulation.outcome import Outcome
+from jaxhil.simulation.tile_size import count_bytes, find_tile_size
 
-TILE_SIZE = 64  # maximum number of lanes per tile: more do not fit into a core's first-level cache
+# Maximum number of lanes per tile on a processor: more do not fit into a core's first-level cache.
+TILE_SIZE = 64
 MIN_TILE_SIZE = 16  # minimum number of lanes per tile, for small batches
 DEVICE_AXIS = PartitionSpec("device")  # distributes arrays along their leading axis, one entry per device
 # Minimum number of tiles per delay: if there are fewer, lanes are sorted by expected duration only.
@@ -83,6 +87,10 @@ class RigModel(abc.ABC):
     @abc.abstractmethod
     def run(self, loop: Any, gains: Gains, scenario: Any) -> Outcome:
         """Run a batch of scenarios (JAX arrays) and return the outcome of every run."""
+
+    @abc.abstractmethod
+    def initial_state(self, loop: Any, gains: Gains, scenario: Any) -> Any:
+        """Return the state of the loop over ticks at the start of a batch of scenarios (JAX arrays)."""
 
     @abc.abstractmethod
     def at_rest(self, scenarios: Any, idle: np.ndarray) -> Any:
@@ -170,11 +178,15 @@ class RigModel(abc.ABC):
         wanted: Callable[[Outcome], Any] = lambda outcome: outcome,
     ) -> Callable[[], Any]:
         """Start an evaluation; return a function that waits for the outcome and returns `wanted(outcome)`."""
-        return self.begin_batch(loop, gains, self.place_batch(scenarios, at_least), wanted)
+        return self.begin_batch(loop, gains, self.place_batch(scenarios, at_least, loop), wanted)
 
-    def place_batch(self, scenarios: Any, at_least: int = 1) -> Batch:
-        """Distribute scenarios to the devices; see `evaluate` for the arguments."""
-        assignment = self._assign_tiles(scenarios, at_least)
+    def place_batch(self, scenarios: Any, at_least: int = 1, loop: Any = None) -> Batch:
+        """Distribute scenarios to the devices; see `evaluate` for the arguments.
+
+        On an accelerator, the memory per lane is estimated for `loop`. None means that no loop over ticks
+        runs these scenarios.
+        """
+        assignment = self._assign_tiles(scenarios, at_least, loop)
         positions = np.empty_like(assignment.lane, shape=count_lanes(scenarios))
         positions[assignment.lane[~assignment.idle]] = np.flatnonzero(~assignment.idle)
         # Place every leaf explicitly: for any other placement, JAX would compile the program again.
@@ -196,7 +208,7 @@ class RigModel(abc.ABC):
         return lambda: unfold_tiles(batch, outcome)
 
     def shard(
-        self, scenarios: Any, gains: Mapping[str, Any], at_least: int = 1
+        self, scenarios: Any, gains: Mapping[str, Any], at_least: int = 1, loop: Any = None
     ) -> tuple[dict[str, Any], dict[str, Any], Any]:
         """Arrange scenarios and gains in tiles; return the arguments of `run_tiles`.
 
@@ -204,7 +216,7 @@ class RigModel(abc.ABC):
         Arrays with one value per lane are padded with idle lanes and have the shape
         (devices, tiles, ..., lanes of a tile).
         """
-        assignment = self._assign_tiles(scenarios, at_least)
+        assignment = self._assign_tiles(scenarios, at_least, loop)
         return *_arrange_gains(assignment, scenarios, gains), self._arrange_scenarios(assignment, scenarios)
 
     def run_tiles(self, loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome:
@@ -212,18 +224,23 @@ class RigModel(abc.ABC):
         static, options = (self, loop), self.compiler_options
         return cached_programs.run_cached(run_tiles, static, common, per_lane, scenarios, options=options)
 
-    def _assign_tiles(self, scenarios: Any, at_least: int) -> "_TileAssignment":
+    def count_lane_bytes(self, loop: Any, scenarios: Any) -> int:
+        """Return the memory [bytes] of a scenario and, unless `loop` is None, of its state between ticks."""
+        leaves, structure = jax.tree.flatten(scenarios)
+        lane = tuple(jax.ShapeDtypeStruct((*leaf.shape[:-1], 1), leaf.dtype) for leaf in leaves)
+        return count_bytes(lane) + (_count_state_bytes(self, loop, structure, lane) if loop else 0)
+
+    def _assign_tiles(self, scenarios: Any, at_least: int, loop: Any) -> "_TileAssignment":
         """Assign the lanes of a batch to tiles on the devices; fill the tiles with idle lanes."""
         number = count_lanes(scenarios)
         capacity = max(number, at_least)
         devices = jax.device_count()
-        tile = TILE_SIZE
+        # Each number and size of tiles needs its own compiled program; both are therefore rounded up.
+        units = _round_up(-(-capacity // (TILE_SIZE * devices)))
+        tile = find_tile_size(units * TILE_SIZE, TILE_SIZE, lambda: self.count_lane_bytes(loop, scenarios))
         while tile > MIN_TILE_SIZE and tile * devices >= 2 * capacity:
             tile //= 2
-        # Round the number of tiles per device up to a power of two or, above 16, to a multiple of 16: each
-        # number needs its own compiled program.
-        tiles = -(-capacity // (tile * devices))
-        tiles = 1 << (tiles - 1).bit_length() if tiles <= 16 else -(-tiles // 16) * 16
+        tiles = _round_up(-(-capacity // (tile * devices)))
         lanes = tiles * tile * devices
 
         def fold(order):
@@ -314,6 +331,20 @@ class _TileAssignment(NamedTuple):
 
     lane: np.ndarray  # index of the lane in the batch
     idle: np.ndarray  # whether the lane only fills the tile
+
+
+def _round_up(number: int) -> int:
+    """Round up to a power of two or, above 16, to a multiple of 16."""
+    return 1 << (number - 1).bit_length() if number <= 16 else -(-number // 16) * 16
+
+
+@lru_cache(maxsize=32)
+def _count_state_bytes(model: RigModel, loop: Any, structure: Any, leaves: tuple[Any, ...]) -> int:
+    """Return the memory [bytes] of a lane's state between ticks; `leaves` are a scenario without values."""
+    lane = jax.tree.unflatten(structure, leaves)
+    compensator = get_compensator(model.compensator_name(loop), model.axes)
+    gains = {gain.name: lane.control_period for gain in compensator.gains}
+    return count_bytes(jax.eval_shape(partial(model.initial_state, loop), gains, lane))
 
 
 def _place_leaves(tree: Any, spec: PartitionSpec) -> Any:

@@ -15,8 +15,9 @@ from jaxhil.simulation.evaluation import RigModel
 from jaxhil.simulation.loop import Loop, RigConstants, build_rig_constants
 from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.outcome import Outcome, compare_with_ideal
-from jaxhil.simulation.rollout import rollout, run_contacts
+from jaxhil.simulation.rollout import rollout, run_contacts, start_rollout
 from jaxhil.simulation.scenario import Scenario, build_scenarios
+from jaxhil.simulation.tick import RunState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +46,10 @@ class OneAxis(RigModel):
     def run(self, loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
         """Run the contacts of a batch of scenarios and compare them with the ideal contacts."""
         return compare_with_ideal(loop, scenario, rollout(loop, gains, scenario))
+
+    def initial_state(self, loop: Loop, gains: Gains, scenario: Scenario) -> RunState:
+        """Return the state of the loop over ticks at the start of the first approach."""
+        return start_rollout(loop, self.prepared(loop, scenario), gains)
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
         """Return a copy of the scenarios in which `idle` lanes (which only fill a tile) have no contacts."""

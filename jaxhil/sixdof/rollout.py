@@ -96,10 +96,7 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> RolloutResult:
         after, _ = lax.scan(one_tick, progress, None, segment_ticks)
         return _finish_episodes(loop, rig, last, after)
 
-    reference = scenario.ideal_contact
-    if reference is None:
-        reference = compute_ideal_contact(scenario)
-    start = _start(loop, rig, scenario.start, reference)
+    start = start_rollout(loop, rig, scenario)
     ended = lax.while_loop(lambda progress: jnp.any(progress.active), body, start)
     time = ended.elapsed.astype(rig.period.dtype) * rig.period
     return RolloutResult(ended.episodes, ended.run.states, time)
@@ -115,8 +112,11 @@ def compute_ideal_contact(scenario: Scenario) -> IdealContactRecord:
     )
 
 
-def _start(loop: Loop, rig: RigConstants, states: States, reference: IdealContactRecord) -> EpisodeProgress:
-    """Return the state of the rollout at the start of the runs."""
+def start_rollout(loop: Loop, rig: RigConstants, scenario: Scenario) -> EpisodeProgress:
+    """Return the state of the rollout at the start of the runs; compute missing ideal contacts."""
+    states, reference = scenario.start, scenario.ideal_contact
+    if reference is None:
+        reference = compute_ideal_contact(scenario)
     none = jnp.zeros(rig.period.shape, jnp.int32)
     episode_start = EpisodeStart(states, none, relative_energy(rig, states), reference)
     tracker = start_tracking(rig, states, none)

@@ -21,7 +21,7 @@ from jaxhil.simulation.contact_bounds import is_contact_out_of_bounds
 from jaxhil.simulation.evaluation import RigModel, count_lanes, map_tiles, unfold_tiles
 from jaxhil.simulation.outcome import Outcome
 from jaxhil.sixdof import building
-from jaxhil.sixdof.loop import Loop
+from jaxhil.sixdof.loop import Loop, build_rig
 from jaxhil.sixdof.metrics import Metrics, evaluate
 from jaxhil.sixdof.rollout import (
     CAPTURED,
@@ -30,7 +30,9 @@ from jaxhil.sixdof.rollout import (
     NON_FINITE,
     REBOUNDED,
     TIMEOUT,
+    EpisodeProgress,
     compute_ideal_contact,
+    start_rollout,
 )
 from jaxhil.sixdof.scenario import Scenario
 
@@ -93,6 +95,10 @@ class SixAxes(RigModel):
     def run(self, loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
         """Simulate a batch of scenarios, and compare the episodes with the ideal contacts."""
         return to_outcome(evaluate(loop, gains, _separate_loops(scenario)).metrics, scenario)
+
+    def initial_state(self, loop: Loop, gains: Gains, scenario: Scenario) -> EpisodeProgress:
+        """Return the state of the loop over ticks at the start of a batch of scenarios."""
+        return start_rollout(loop, build_rig(loop, gains, scenario), scenario)
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
         """Return the scenarios with a duration of 0 in the `idle` lanes."""

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxhil.simulation import cached_programs
+from jaxhil.simulation.tile_size import find_tile_size
 from tuning.gains.objective import (
     RESIDUAL_SCALE,
     RMS_OBJECTIVE,
@@ -32,7 +33,8 @@ from tuning.optimisation.unit_box import GainBounds
 from tuning.transparency.probes import LANES_PER_SCENARIO
 
 MIN_PROBLEMS_PER_CALL, MAX_PROBLEMS_PER_CALL = 4, 32  # limits of problems per call
-LANES_PER_TILE = 64  # lanes that a device computes together; more would exceed the processor's cache
+# Number of lanes that a processor's core computes together; more would exceed its cache.
+LANES_PER_TILE = 64
 STEPS_BEFORE_SELECTION = 8  # solver steps of the first round
 MAX_CONTINUED_STARTS = 3  # number of starts per task that continue after the first round
 MAX_STEPS_PER_CALL = 32  # largest number of solver steps in one call
@@ -243,7 +245,12 @@ def _build_call(tasks, names, bounds, objectives, number):
     size = _choose_call_size(number)
     lanes = tasks[0].lanes
     terms = join_terms(objectives, tasks[0].probed, tasks[0].contacts)
-    static = (tasks[0].model, loop, names, terms), MAX_STEPS_PER_CALL, max(1, LANES_PER_TILE // lanes)
+    model, scenarios = tasks[0].model, tasks[0].scenarios
+    # The Jacobian has a copy of the state for each gain.
+    tile = find_tile_size(
+        size * lanes, LANES_PER_TILE, lambda: (1 + len(names)) * model.count_lane_bytes(loop, scenarios)
+    )
+    static = (model, loop, names, terms), MAX_STEPS_PER_CALL, max(1, tile // lanes)
 
     def call(members: list[_StartState], limit: int):
         order = assign_to_devices(size)
@@ -253,7 +260,7 @@ def _build_call(tasks, names, bounds, objectives, number):
         index = np.array([p.task for p in filled])
         starts = np.stack([p.coordinates for p in filled])
         scenarios, *columns = jax.tree.map(itemgetter(index), table)
-        return tasks[0].model.at_rest(scenarios, idle), *columns, starts, np.array(limit)
+        return model.at_rest(scenarios, idle), *columns, starts, np.array(limit)
 
     return static, call
 

@@ -36,6 +36,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxhil.errors import InputError, format_value
 from jaxhil.simulation.evaluation import RigModel
 from jaxhil.simulation.outcome import Outcome
+from jaxhil.simulation.tile_size import find_tile_size
 from tuning.gains.metrics_function import MetricsFunction, ScenarioMetrics, build_scenario_metrics
 from tuning.transparency.probes import mask_probes
 
@@ -43,7 +44,8 @@ from tuning.transparency.probes import mask_probes
 RESIDUAL_SCALE = 0.01
 # error e - e* [1] that is assigned to a contact that does not end or does not occur: a strong divergence
 FAILED_CONTACT_ERROR = 3.0
-PROBED_LANES_PER_TILE = 32  # lanes per tile if the scenarios have transparency probes
+# Number of lanes per tile on a processor if the scenarios have transparency probes.
+PROBED_LANES_PER_TILE = 32
 CVAR_TAIL_DIVISOR = 20  # cvar is the mean of the worst 1/20 of the contacts, at least of one contact
 NORM_POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # even exponents p of the norm in the residuals
 OBJECTIVE_NAMES = tuple(NORM_POWERS)
@@ -402,7 +404,8 @@ def _compute_norm_residuals(
 def _map_over_tiles(function: Callable[[Any], Outcome], arguments: Any) -> Outcome:
     """Apply `function` to groups (tiles) of lanes, so that a slow lane delays only its own tile."""
     lanes = jax.tree.leaves(arguments)[0].shape[-1]
-    size = math.gcd(lanes, PROBED_LANES_PER_TILE)
+    # On an accelerator, the memory already limits the number of problems, and thereby of lanes.
+    size = math.gcd(lanes, find_tile_size(lanes, PROBED_LANES_PER_TILE))
     chunks = jax.tree.map(
         lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes // size, size), -2, 0), arguments
     )

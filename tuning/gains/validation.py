@@ -184,18 +184,19 @@ class Validation:
     @cached_property
     def _evaluated_batch(self) -> Batch:
         # A small batch is padded to the number of training lanes, so that both batches share a program.
-        return self.tasks[0].model.place_batch(self.evaluated, at_least=count_lanes(self.training))
+        return self.tasks[0].model.place_batch(self.evaluated, count_lanes(self.training), self.loop)
 
     @cached_property
     def _noiseless_batch(self) -> Batch:
         # The noise is multiplied by 0, so that runs with and without noise share a program.
         model = self.tasks[0].model
-        return model.place_batch(model.without_noise(self.evaluated), at_least=count_lanes(self.training))
+        return model.place_batch(model.without_noise(self.evaluated), count_lanes(self.training), self.loop)
 
     @cached_property
     def _placed(self) -> Callable[[tuple[int, ...], int, int, int], tuple[Any, Batch]]:
         """Return `_place_training_scenarios` with a cache, because a search reuses the same scenarios."""
-        return lru_cache(maxsize=4)(partial(_place_training_scenarios, self.tasks[0].model, self.training))
+        model, loop = self.tasks[0].model, self.loop
+        return lru_cache(maxsize=4)(partial(_place_training_scenarios, model, loop, self.training))
 
     def gains(self, task: int, coordinates: Float[np.ndarray, "gains"]) -> dict[str, float]:
         """Convert unit coordinates to all gains of the compensator."""
@@ -223,7 +224,7 @@ def _keep_contact_terms(outcome: Any) -> Any:
 
 
 def _place_training_scenarios(
-    model: RigModel, training: Any, which: tuple[int, ...], points: int, number: int, lanes: int
+    model: RigModel, loop: Any, training: Any, which: tuple[int, ...], points: int, number: int, lanes: int
 ) -> tuple[Any, Batch]:
     """Repeat the first training scenarios of each task for each point; return copies for host and devices."""
 
@@ -232,7 +233,7 @@ def _place_training_scenarios(
         return picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
 
     scenarios = jax.tree.map(side_by_side, training)
-    return scenarios, model.place_batch(scenarios, at_least=lanes)
+    return scenarios, model.place_batch(scenarios, lanes, loop)
 
 
 def build_validation(

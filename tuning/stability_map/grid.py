@@ -18,6 +18,7 @@ from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import ONE_AXIS, evaluate
 from jaxhil.simulation.outcome import Outcome
 from jaxhil.simulation.scenario import Scenario, build_scenarios
+from jaxhil.simulation.tile_size import find_tile_size
 from tuning.caches.checkpoints import NO_CHECKPOINTS, Checkpoints, compute_digest
 from tuning.caches.cluster import WorkUnit, run_on_workers
 from tuning.caches.worker import get_process_setting
@@ -32,7 +33,7 @@ from tuning.stability_map.contact_growth import (
 )
 
 LINE_POINTS = 201  # number of points of each line through the nominal point
-MAX_TILE_RUNS = 2048  # largest number of runs computed at a time
+MAX_TILE_RUNS = 2048  # largest number of runs computed at a time on a processor
 MAX_EIGENVALUE_COST = 5e7  # largest cost of all eigenvalues; at a higher cost, the grid becomes coarser
 MIN_COARSE_POINTS = 15  # smallest number of points along an axis of the coarser grid
 
@@ -230,7 +231,7 @@ def _run_tiles(
     loop = build_loop(mechanism, compensator, scenarios)
     order = np.argsort(ONE_AXIS.expected_duration(scenarios))
     worst = np.empty((5, len(order)))
-    tiles = -(-len(order) // MAX_TILE_RUNS)
+    tiles = -(-len(order) // find_tile_size(len(order), MAX_TILE_RUNS))
     lanes = [order[number::tiles] for number in range(tiles)]
     inputs = compute_digest((to_plain_data(mechanism), compensator, gains, jax.tree.leaves(scenarios)))
     finished = 0
@@ -251,7 +252,7 @@ def _run_tiles(
 
     missing = []
     for number in range(tiles):
-        stored = checkpoints.read(f"part {number}", (inputs, number), np.ndarray)
+        stored = checkpoints.read(f"part {number}", (inputs, tiles, number), np.ndarray)
         missing.append(number) if stored is None else store(number, stored)
     if scheduler is None:
         computed = ((number, run_tile(*arguments)) for number, arguments in work_units(missing))
@@ -260,7 +261,7 @@ def _run_tiles(
             scheduler, run_tile, work_units(missing), get_process_setting(), f"map-{inputs[:16]}"
         )
     for number, values in computed:
-        checkpoints.write(f"part {number}", (inputs, number), values)
+        checkpoints.write(f"part {number}", (inputs, tiles, number), values)
         store(number, values)
     return worst
 

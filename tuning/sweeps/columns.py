@@ -208,7 +208,7 @@ def select_read_fields(mechanism: AnyMechanism, works: bool, outcome: Outcome) -
     }
     metrics = outcome.metrics
     unread_metrics: Any = dict.fromkeys(set(metrics._fields) - names)
-    unread: Any = dict.fromkeys(("chatter", "wanted", "good", "unlike"))
+    unread: Any = dict.fromkeys(("chatter", "is_scheduled", "good", "is_unlike_ideal"))
     return outcome._replace(metrics=metrics._replace(**unread_metrics), **unread)
 
 

@@ -8,7 +8,9 @@ chunks are evaluated in the order of their numbers, even if they finish in anoth
 depends on the rows only. Later chunks are removed.
 """
 
-from collections.abc import Callable, Generator, Iterable
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from typing import Any, NamedTuple
 
@@ -21,6 +23,7 @@ from tuning.sweeps.store import SweepStore, read_chunk, remove_chunks, write_chu
 from tuning.sweeps.tally import Tally, add_to_tally, build_empty_tally
 
 COMPARED_SCENARIOS = 4096  # number of scenarios of a float32 sweep that are also run in float64
+MAX_WAITING_CHUNKS = 2  # maximum number of chunks in memory that wait to be written
 
 # Called after each chunk with the chunk's number of rows and the tally of all chunks so far.
 ChunkProgress = Callable[[int, Tally], None]
@@ -63,8 +66,7 @@ def run_sweep(
             continue
         tally = add_to_tally(tally, rows)
         found(len(rows["index"]), tally)
-    for part, rows in computer(sweep, missing):
-        write_chunk(store, part, rows)
+    for rows in _write_chunks(store, computer(sweep, missing)):
         tally = add_to_tally(tally, rows)
         computed(len(rows["index"]), tally)
     return sweep, tally
@@ -90,6 +92,24 @@ def compare_precisions(sweep: SweepProgram, number: int = COMPARED_SCENARIOS) ->
 def count_outcomes(tally: Tally) -> dict[str, int]:
     """Return the number of scenarios with each outcome, without the outcomes that did not occur."""
     return {name: count for name, count in zip(SCENARIO_OUTCOMES, tally.outcomes, strict=True) if count}
+
+
+def _write_chunks(store: SweepStore, chunks: Iterable[tuple[int, Rows]]) -> Iterator[Rows]:
+    """Encode and write chunks in a thread, while the next are computed; yield the rows of written chunks."""
+    waiting = deque()
+    with ThreadPoolExecutor(max_workers=1) as writer:
+        for part, rows in chunks:
+            waiting.append((writer.submit(write_chunk, store, part, rows), rows))
+            if len(waiting) == MAX_WAITING_CHUNKS:
+                yield _wait_for_chunk(*waiting.popleft())
+        for chunk in waiting:
+            yield _wait_for_chunk(*chunk)
+
+
+def _wait_for_chunk(writing: Future[None], rows: Rows) -> Rows:
+    """Return the rows of a chunk when its file is written; raise `InputError` if writing failed."""
+    writing.result()
+    return rows
 
 
 def _run_until_narrow(
