@@ -37,7 +37,7 @@ def test_logs_are_read_with_the_mapping_file_drafted_from_them(tmp_path, names, 
     assert 'files = "contact*.csv"' in text and 'files = ["morning.csv"]' in text
 
 
-def test_drafted_mapping_recognises_columns_of_jaxhil_and_refuses_unknown_columns(tmp_path):
+def test_drafted_mapping_recognises_columns_of_jaxhil_and_lists_unknown_columns(tmp_path):
     names = (
         "time",
         "force_measured",
@@ -53,9 +53,6 @@ def test_drafted_mapping_recognises_columns_of_jaxhil_and_refuses_unknown_column
         assert f'{name} = {{ column = "{name}"' in text
     assert 'contact_index = { column = "contact" }' in text
     path = write_csv(tmp_path / "a.csv", {"a": LOG["t"], "b": LOG["xd"]})
-    with pytest.raises(
-        InputError, match="found no column with a name like position_desired, expected one; columns: a, b"
-    ):
-        draft_mapping([path])
+    assert '# position_measured = { column = "" }  # which of: "b"' in draft_mapping([path])
     with pytest.raises(InputError, match="logs: found none"):
         draft_mapping([])

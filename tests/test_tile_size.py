@@ -52,7 +52,8 @@ def assert_same_outcomes(first, second):
     """Compare outcomes to rounding; numbers are compared only in the contacts that exist."""
     np.testing.assert_array_equal(first.metrics.status, second.metrics.status)
     for name in ("error", "reference_restitution", "peak_ratio"):
-        ours, theirs = (getattr(outcome, name)[first.is_scheduled & first.good] for outcome in (first, second))
+        comparable = first.is_scheduled & first.good
+        ours, theirs = (getattr(outcome, name)[comparable] for outcome in (first, second))
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
 
 

@@ -23,6 +23,10 @@ from tuning.identification.records import DEFAULT_MECHANISM_NAME, Campaign
 SCHEMA = "jaxhil/identification/1"
 MAX_ORDER = 4  # highest order of a motion simulator that `--order` accepts
 MECHANISM_FILE, DOCUMENT_FILE = "mechanism.toml", "identification.json"
+# Head of the mechanism file, below the verdict.
+SPREAD_COMMENT = """\
+[uncertainty] is the uncertainty of the estimate from these logs, of one rig on one day.
+It does not contain how the mechanism varies with temperature, wear or from specimen to specimen."""
 PLOTS = ("bode.png", "delay.png", "contacts.png", "residuals.png", "compare.png")
 
 
@@ -110,7 +114,7 @@ def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], fo
     with report_write_errors(folder / DOCUMENT_FILE):
         write_atomically(folder / DOCUMENT_FILE, terminal.format_json(document).encode("ascii"))
     with report_write_errors(folder / MECHANISM_FILE):
-        write_atomically(folder / MECHANISM_FILE, to_toml(mechanism, verdict).encode())
+        write_atomically(folder / MECHANISM_FILE, to_toml(mechanism, f"{verdict}\n{SPREAD_COMMENT}").encode())
 
 
 def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) -> None:
@@ -131,9 +135,10 @@ def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) 
 
 def _print_draft_mapping(options: IdentifyOptions, logs: list[Path]) -> int:
     """Print a draft of the file that maps the logs' columns; return exit code 0."""
+    from tuning.identification.logs.mapping import TextFormat, load_text_format
     from tuning.identification.logs.mapping_draft import draft_mapping
 
-    text = draft_mapping(logs)
+    text = draft_mapping(logs, TextFormat() if options.map is None else load_text_format(options.map))
     if options.json:
         terminal.emit_json({"mapping": text})
     else:
@@ -306,7 +311,10 @@ def _build_document(
 
 
 def _estimate_entry(estimate, prior: Mechanism | None) -> dict[str, Any]:
-    """Return the JSON entry of an estimate, with its deviation from the prior in standard deviations."""
+    """Return the JSON entry of an estimate, with its change from the prior.
+
+    The entry `change` is relative to the prior, and `deviation` is in standard deviations of the estimate.
+    """
     expected = _prior_value(prior, estimate.key)
     return {
         "key": estimate.key,
@@ -317,6 +325,7 @@ def _estimate_entry(estimate, prior: Mechanism | None) -> dict[str, Any]:
         "unit": estimate.unit,
         "known": estimate.is_fixed,
         "prior": expected,
+        "change": (estimate.value - expected) / abs(expected) if expected else None,
         "deviation": None
         if expected is None or not estimate.std
         else (estimate.value - expected) / estimate.std,
@@ -340,7 +349,7 @@ def _prior_value(prior: Mechanism | None, key: str) -> float | None:
 def _print(document: dict[str, Any], folder: Path | None) -> None:
     runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
     rows = [_estimate_row(entry) for entry in (*document["estimates"], *document["combinations"])]
-    headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "off the prior"]
+    headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "change"]
     items: list[Any] = [terminal.build_table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
     items.append(_check_table(document, "What the model does not explain"))
     items += [
@@ -374,11 +383,11 @@ def _estimate_row(entry: dict[str, Any]) -> list[Any]:
     digits = 4
     if entry["std"] and entry["value"]:
         digits = min(max(1 + math.ceil(math.log10(abs(entry["value"]) / entry["std"])), 2), 9)
-    deviation = entry["deviation"]
+    change = entry["change"]
     return [
         entry["key"],
         *(terminal.format_number(float(entry[name]), digits) for name in ("value", "low", "high")),
         entry["unit"],
         entry["prior"],
-        "-" if deviation is None else f"{deviation:+.1f} std",
+        "-" if change is None else f"{100.0 * change:+.2g} %",
     ]

@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.mechanism.structs import Mechanism
-from tuning.identification.logs import checks, clock, contact_detection
+from tuning.identification.logs import checks, clock, contact_detection, row_rate
 from tuning.identification.logs.channels import NUMERIC_CHANNELS, read_channels
 from tuning.identification.logs.force_command_check import check_command
 from tuning.identification.logs.lost_rows import LogSegment, split_at_gaps
@@ -286,11 +286,15 @@ def _make_timing(mapping: LogMapping, prior: Mechanism | None) -> CampaignTiming
         raise InputError(
             "timing.control_period: found nothing, expected a number > 0 s in the mapping or in a prior"
         )
-    rate = mapping.channels.time.rate
-    if rate is not None and abs(rate * period - 1.0) > 1e-6:
-        raise InputError(
-            f"channels.time.rate: found {rate:g} Hz, expected 1 / control_period, {1 / period:g} Hz"
-        )
+    rate, rows = mapping.channels.time.rate, spec.rows_per_period
+    if rate is not None:
+        ratio = rate * period / (rows or max(round(rate * period), 1))
+        if abs(ratio - 1.0) > 1e-6 or rate * period > row_rate.MAX_ROWS_PER_PERIOD + 0.5:
+            times = "" if rows in (None, 1) else f"{rows} times "
+            raise InputError(
+                f"channels.time.rate: found {rate:g} Hz, expected {times}1 / control_period, "
+                f"{(rows or 1) / period:g} Hz"
+            )
     hold = spec.command_hold or (rig.command_hold if rig else "linear")
     latency = spec.command_latency if spec.command_latency is not None else rig.command_latency if rig else 0
     computing_delay, has_two_clocks = spec.computing_delay, spec.clock == "separate"

@@ -8,9 +8,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from jaxhil.errors import InputError, format_value, to_one_line
-from tuning.identification.logs import checks, clock, resampling
+from tuning.identification.logs import checks, clock, resampling, row_rate
+from tuning.identification.logs.log_reader import ColumnsByName
 from tuning.identification.logs.mapping import Channel, LogMapping, get_si_conversion
-from tuning.identification.logs.readers import ColumnsByName, OpenLog
+from tuning.identification.logs.readers import OpenLog
+from tuning.identification.logs.resampling import MASTER_CHANNEL as MASTER
+from tuning.identification.logs.units import COUNTS_UNIT, parse_unit
 
 NUMERIC_CHANNELS = (
     "position_desired",
@@ -45,30 +48,68 @@ def read_channels(
         required = name in ("position_desired", "position_measured")
         if channel is not None and (required or channel.column in log.names):
             wanted[name] = channel.column
-    stamps = [channels.time.column, *(getattr(channels, name).time for name in wanted if name != "mode")]
+    stamps = [
+        channels.time.column,
+        channels.time.nanoseconds,
+        *(getattr(channels, name).time for name in wanted if name != "mode"),
+    ]
     read = log.read(list(dict.fromkeys([*wanted.values(), *(name for name in stamps if name is not None)])))
-    columns: ColumnsByName = {}
-    for name, column in wanted.items():
-        values = read[column]
-        if name != "mode":
-            channel: Channel = getattr(channels, name)
-            if values.dtype == object:
-                raise InputError(
-                    f"{log.label}: column {format_value(column)}: found {format_value(values[0])}, "
-                    "expected numbers"
-                )
-            factor, offset = get_si_conversion(channel, name)
-            values = values if (factor, offset) == (1.0, 0.0) else factor * values + offset
-        columns[name] = values
-    clocks = _read_channel_stamps(log, mapping, wanted, read)
+    columns, notes = _convert_to_si(log, mapping, wanted, read)
+    begin, clocks = 0.0, _read_channel_stamps(log, mapping, wanted, read)
     if clocks is None:
         time = channels.time.column
         resampling.check_lengths(log.label, columns | ({"time": read[time]} if time else {}), wanted)
-        return columns, *_read_row_stamps(log.label, read, mapping), []
-    columns, stamps, notes = resampling.resample_to_rows(log.label, columns, clocks, wanted, period)
-    first = clocks[resampling.MASTER_CHANNEL]
-    begin = 0.0 if first is None else float(first[0])
-    return columns, stamps - begin, begin, notes
+        stamps, begin = _read_row_stamps(log, read, mapping)
+        clocks = None if stamps is None else resampling.split_sparse_rows(columns, stamps)
+        if clocks is None:
+            rows, more = _select_tick_rows(log, mapping, columns[MASTER], stamps, period)
+            columns = {name: values[rows] for name, values in columns.items()}
+            return columns, None if stamps is None else stamps[rows], begin, [*notes, *more]
+    master = clocks[MASTER]
+    if master is not None:
+        resampling.check_clock(log.label, wanted[MASTER], master, len(columns[MASTER]))
+        rows, more = _select_tick_rows(log, mapping, columns[MASTER], master, period)
+        notes += more
+        for name in [name for name, t in clocks.items() if resampling.has_same_stamps(t, master)]:
+            columns[name], clocks[name] = columns[name][rows], master[rows]
+    columns, stamps, more = resampling.resample_to_rows(log.label, columns, clocks, wanted, period)
+    first = 0.0 if (master := clocks[MASTER]) is None else float(master[0])
+    return columns, stamps - first, begin + first, [*notes, *more]
+
+
+def _convert_to_si(
+    log: OpenLog, mapping: LogMapping, wanted: Mapping[str, str], read: ColumnsByName
+) -> tuple[ColumnsByName, list[str]]:
+    """Return the channels in SI units, and notes on units that differ from those that the file states."""
+    columns, notes = ColumnsByName(), list[str]()
+    for name, column in wanted.items():
+        columns[name] = values = read[column]
+        if name == "mode":
+            continue
+        channel: Channel = getattr(mapping.channels, name)
+        where = f"{log.label}: column {format_value(column)}"
+        if values.dtype == object:
+            raise InputError(f"{where}: found {format_value(values[0])}, expected numbers")
+        stated = log.reader.units.get(column)
+        unit = parse_unit(stated or "", name)
+        if unit is not None and channel.unit not in (None, COUNTS_UNIT, unit):
+            notes.append(f"{where}: read in {channel.unit}, as the mapping states; the file states {unit}")
+        factor, offset = get_si_conversion(channel, name, stated)
+        if (factor, offset) != (1.0, 0.0):
+            columns[name] = factor * values + offset
+    return columns, notes
+
+
+def _select_tick_rows(
+    log: OpenLog, mapping: LogMapping, x: np.ndarray, stamps: np.ndarray | None, period: float
+) -> tuple[np.ndarray | slice, list[str]]:
+    """Select the rows at the ticks, and return notes; without stamps, `rate` states the rows per period."""
+    rows, rate = mapping.timing.rows_per_period, mapping.channels.time.rate
+    if mapping.timing.clock == "index":
+        stamps, rows = None, rows or 1
+    elif stamps is None and rate is not None:
+        rows = rows or round(rate * period)
+    return row_rate.select_tick_rows(log.label, x, stamps, period, rows)
 
 
 def _read_channel_stamps(
@@ -79,17 +120,17 @@ def _read_channel_stamps(
     if any(named.values()):
         return _read_mapped_stamps(log.label, mapping, named, read)
     _check_stamps_in_groups(log, mapping, wanted)
-    stamps_by_column = log.clocks(list(wanted.values()))
+    stamps_by_column = log.clocks(list(wanted.values()), mapping.channels.time.column)
     clocks = {name: stamps_by_column.get(column) for name, column in wanted.items()}
-    master = clocks[resampling.MASTER_CHANNEL]
+    master = clocks[MASTER]
     different = [wanted[name] for name, t in clocks.items() if not resampling.has_same_stamps(t, master)]
     if not different:
         return None
     time, reason = mapping.channels.time, f"because {format_value(different[0])} has separate time stamps"
     if mapping.timing.clock == "index":
         raise InputError(f'{log.label}: timing.clock: found "index", expected "stamps", {reason}')
-    if time.column is not None and time.column not in log.stamps:
-        expected = ", ".join(sorted(to_one_line(column, 40) for column in log.stamps)[:4])
+    if time.column is not None and time.column not in log.reader.stamps:
+        expected = ", ".join(sorted(to_one_line(column, 40) for column in log.reader.stamps)[:4])
         finding = f"column {format_value(time.column)}"
         raise InputError(f"{log.label}: time: found {finding}, expected one of {expected}, {reason}")
     return clocks
@@ -101,7 +142,7 @@ def _check_stamps_in_groups(log: OpenLog, mapping: LogMapping, wanted: Mapping[s
     In HDF5, MAT and TDMS files, the column names contain the group names.
     """
     time = mapping.channels.time
-    if time.column is None or log.stamps:
+    if time.column is None or log.reader.stamps:
         return
     for name, column in wanted.items():
         for stamps in _find_other_stamps(column, time.column, log.names):
@@ -171,7 +212,9 @@ def _read_mapped_stamps(
     return {name: scaled[column] if column else None for name, column in columns.items()}
 
 
-def _read_row_stamps(label: str, read: ColumnsByName, mapping: LogMapping) -> tuple[np.ndarray | None, float]:
+def _read_row_stamps(
+    log: OpenLog, read: ColumnsByName, mapping: LogMapping
+) -> tuple[np.ndarray | None, float]:
     """Return the time stamps of the rows relative to the first one, and the first one [s].
 
     The time stamps are None if the mapping names no column of time stamps.
@@ -180,13 +223,18 @@ def _read_row_stamps(label: str, read: ColumnsByName, mapping: LogMapping) -> tu
     if time.column is None:
         return None, 0.0
     stamps = read[time.column]
-    if time.time_format is not None:
-        return clock.parse_stamps(stamps, time.time_format, label)
-    if stamps.dtype == object:
-        expected = "numbers, or channels.time.time_format for texts"
-        where = f"{label}: column {format_value(time.column)}"
-        raise InputError(f"{where}: found {format_value(stamps[0])}, expected {expected}")
-    checks.check_values(label, "time", stamps)
+    if time.time_format is not None or stamps.dtype == object:
+        return clock.parse_stamps(stamps, time.time_format, log.label)
+    checks.check_values(log.label, "time", stamps)
     # Time stamps may be relative to an epoch: subtract the first one before the conversion to keep precision.
-    factor = get_si_conversion(Channel(column=time.column, unit=time.unit), "time")[0]
-    return factor * (stamps - stamps[:1]), factor * float(stamps[0]) if len(stamps) else 0.0
+    channel = Channel(column=time.column, unit=time.unit)
+    factor = get_si_conversion(channel, "time", log.reader.units.get(time.column))[0]
+    relative = factor * (stamps - stamps[:1])
+    if time.nanoseconds is not None:
+        nanoseconds = read[time.nanoseconds]
+        if nanoseconds.dtype == object:
+            where = f"{log.label}: column {format_value(time.nanoseconds)}"
+            raise InputError(f"{where}: found {format_value(nanoseconds[0])}, expected numbers")
+        checks.check_values(log.label, "time", nanoseconds)
+        relative = relative + 1e-9 * (nanoseconds - nanoseconds[:1])
+    return relative, factor * float(stamps[0]) if len(stamps) else 0.0

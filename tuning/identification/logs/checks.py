@@ -25,7 +25,8 @@ MIN_FAR_SIDE_CONTACT_GAP = 0.01  # s, minimum time between two contacts at the s
 MIN_FAR_SIDE_IMPULSE_SHARE = 0.3  # minimum ratio of impulse to change of momentum at the second surface
 MIN_CLIPPED_READINGS = 10  # minimum number of successive readings at the maximum that shows clipping
 MAX_ABSOLUTE_VALUE = 1e30  # largest valid number; time stamps in nanoseconds are about 1e18
-MAX_STROKE = 1.0  # m, largest plausible range of positions
+USUAL_STROKE = 1.0  # m, largest range of positions without a note; of press runs, the largest plausible one
+MAX_STROKE = 20.0  # m, largest plausible range of positions
 MIN_STROKE = 1e-5  # m, smallest plausible range of positions
 MAX_SPEED = 5.0  # m/s, largest plausible speed
 MAX_POSITION_LAG = 400  # ticks, longest delay between position command and reading in the search
@@ -74,13 +75,13 @@ def check_motion(label: str, kind: str, segment: LogSegment, period: float, hold
         raise InputError(
             f"{label}: position_measured: found {measured[0]:g} m in every row, expected readings that change"
         )
-    _check_size(label, x, measured, period)
+    notes = _check_size(label, kind, x, measured, period)
     if hold == "linear" and (rows := find_change_interval(x)) > 1:
         expected = 'one in every row, or command_hold = "zoh" if the drives hold each command so long'
         raise InputError(
             f"{label}: position_desired: found a new command every {rows} rows, expected {expected}"
         )
-    return [*_note_held_readings(label, x, measured), *_check_following(label, kind, x, measured)]
+    return [*notes, *_note_held_readings(label, x, measured), *_check_following(label, kind, x, measured)]
 
 
 def check_force(
@@ -197,13 +198,16 @@ def _detect_resolution(values: np.ndarray) -> float:
     return least if np.median(np.abs(steps / least - np.rint(steps / least))) < 0.01 else 0.0
 
 
-def _check_size(label: str, x: np.ndarray, measured: np.ndarray, period: float) -> None:
-    """Raise `InputError` if the stroke or speed of a position channel indicates a wrong unit."""
+def _check_size(label: str, kind: str, x: np.ndarray, measured: np.ndarray, period: float) -> list[str]:
+    """Raise `InputError` if a position's stroke or speed indicates a wrong unit; return notes."""
+    largest, notes = USUAL_STROKE if kind == "press" else MAX_STROKE, []
     for name, values in (("position_desired", x), ("position_measured", measured)):
         stroke = float(np.ptp(values))
-        if not MIN_STROKE <= stroke <= MAX_STROKE:
-            allowed = f"{MIN_STROKE:g} to {MAX_STROKE:g} m (is its unit right?)"
+        if not MIN_STROKE <= stroke <= largest:
+            allowed = f"{MIN_STROKE:g} to {largest:g} m (is its unit right?)"
             raise InputError(f"{label}: {name}: found a stroke of {stroke:.3g} m, expected {allowed}")
+        if stroke > USUAL_STROKE:
+            notes.append(f"{label}: {name}: a stroke of {stroke:.3g} m: is its unit right?")
         speed = float(np.percentile(np.abs(values[SPEED_SPAN_TICKS:] - values[:-SPEED_SPAN_TICKS]), 95)) / (
             SPEED_SPAN_TICKS * period
         )
@@ -216,6 +220,7 @@ def _check_size(label: str, x: np.ndarray, measured: np.ndarray, period: float) 
         raise InputError(
             f"{label}: position_measured: found {stroke_text}, expected a factor of 0.02 to 50 (wrong unit?)"
         )
+    return notes
 
 
 def _check_following(label: str, kind: str, x: np.ndarray, measured: np.ndarray) -> list[str]:

@@ -15,6 +15,7 @@ from datetime import datetime
 from typing import NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from jaxhil.errors import InputError, format_value
 from tuning.identification.records import StampClock
@@ -145,17 +146,22 @@ def number_rows(rows: int, period: float) -> RowTicks:
     return RowTicks(np.arange(rows, dtype=np.int64), StampClock(period, 0.0, 0.0, 0))
 
 
-def parse_stamps(stamps: np.ndarray, time_format: str, label: str) -> tuple[np.ndarray, float]:
+def parse_stamps(stamps: np.ndarray, time_format: str | None, label: str) -> tuple[np.ndarray, float]:
     """Convert time stamps from text to seconds.
 
     Args:
         stamps: Texts of the time stamps.
-        time_format: Format of the texts (`strptime`).
+        time_format: Format of the texts (`strptime`); None for ISO 8601, as Python and .NET write it.
         label: Name of the log in messages.
 
     Returns:
         Time stamps relative to the first one [s], and the first time stamp in seconds since 1970.
+
+    Raises:
+        InputError: If a text has another format.
     """
+    if time_format is None:
+        return _parse_iso_stamps(stamps, label)
     dates = []
     for row, stamp in enumerate(stamps):
         try:
@@ -167,6 +173,31 @@ def parse_stamps(stamps: np.ndarray, time_format: str, label: str) -> tuple[np.n
             ) from None
     begin = (dates[0].replace(tzinfo=None) - datetime(1970, 1, 1)).total_seconds() if dates else 0.0
     return np.array([(date - dates[0]).total_seconds() for date in dates]), begin
+
+
+def _parse_iso_stamps(stamps: np.ndarray, label: str) -> tuple[np.ndarray, float]:
+    """Convert time stamps from ISO 8601, with or without zone and fraction, to seconds."""
+    texts = [str(stamp).strip().replace(",", ".") for stamp in stamps]
+    for kind in (pa.timestamp("ns"), pa.timestamp("ns", "UTC")):
+        try:
+            # Integers of nanoseconds: a float has too few digits for times since 1970.
+            times = pa.array(texts, pa.string()).cast(kind).cast(pa.int64()).to_numpy(zero_copy_only=False)
+        except pa.ArrowInvalid:
+            continue
+        return 1e-9 * (times - times[:1]), 1e-9 * float(times[0]) if len(times) else 0.0
+
+    def is_valid(text: str) -> bool:
+        try:
+            datetime.fromisoformat(text)
+        except ValueError:
+            return False
+        return True
+
+    row = next((row for row, text in enumerate(texts) if not is_valid(text)), 0)
+    expected = (
+        "numbers, texts in ISO 8601 (2026-03-01T10:00:00.001), or channels.time.time_format for other texts"
+    )
+    raise InputError(f"{label}: row {row + 1}: time: found {format_value(stamps[row])}, expected {expected}")
 
 
 def _check_rate(stamps: np.ndarray, steps: np.ndarray, period: float, label: str, column: str) -> None:

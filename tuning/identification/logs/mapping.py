@@ -2,9 +2,9 @@
 
     schema = "jaxhil/log/1"
     [channels]                  # a column's name, or a table: column, unit, scale, sign, offset
-    [timing]                    # control_period, command_hold, command_latency, row, clock
+    [timing]                    # control_period, command_hold, command_latency, row, clock, rows_per_period
     [bodies]                    # masses of the numerical model
-    [text]                      # skip_rows, delimiter, decimal, of text files
+    [text]                      # skip_rows, units_row, delimiter, decimal, of text files
     [[runs]]                    # files (patterns), kind
 
 A prior mechanism file provides the values that `[timing]` and `[bodies]` omit. The value of a channel, in its
@@ -24,7 +24,7 @@ from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.mechanism.conversion import KeyProblem, suggest_names, to_struct
 from jaxhil.mechanism.structs import Bodies, CommandHold, Mechanism, key_metadata
 from jaxhil.mechanism.toml_table import parse_toml, read_bytes
-from tuning.identification.logs.units import COUNTS_UNIT, UNITS_OF_CHANNEL
+from tuning.identification.logs.units import COUNTS_UNIT, UNITS_OF_CHANNEL, parse_unit
 from tuning.identification.records import RowConvention, RunKind
 
 SCHEMA = "jaxhil/log/1"
@@ -38,7 +38,8 @@ class Channel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Numeric column of a log and its conversion to SI units."""
 
     column: ColumnName  # name of the column
-    unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # SI unit if not specified
+    # If it is not specified, the unit that the file states, else the SI unit.
+    unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None
     # Factor; if the unit is "counts", the value of one count in SI units.
     scale: Annotated[float, key_metadata("of the column's number", "")] = 1.0
     sign: Annotated[int, key_metadata("of the whole", "", ge=-1, le=1)] = 1
@@ -52,7 +53,9 @@ class TimeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     column: ColumnName | None = None  # name of the column
     unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None  # s if not specified
     rate: Annotated[float, key_metadata("of rows without stamps", "Hz", gt=0.0)] | None = None
-    time_format: Annotated[str, Meta(min_length=1, max_length=100)] | None = None  # format of `strptime`
+    # Format of `strptime`; texts in the format of ISO 8601 need none.
+    time_format: Annotated[str, Meta(min_length=1, max_length=100)] | None = None
+    nanoseconds: ColumnName | None = None  # column of nanoseconds that are added to a column of whole seconds
 
 
 class ModeChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -90,15 +93,25 @@ class TimingSection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         int, key_metadata("periods from a reading to the command that answers it", ge=0, le=4)
     ] = 0
     clock: Literal["stamps", "index", "separate"] = "stamps"  # "separate": the forces have another clock
+    # Detected from stamps and commands if it is not specified.
+    rows_per_period: (
+        Annotated[int, key_metadata("rows of the log per control period", ge=1, le=20)] | None
+    ) = None
 
 
 class TextFormat(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Table `[text]`: format of text files."""
+    """Table `[text]`: format of text files; what is not specified is detected in each file."""
 
-    skip_rows: Annotated[int, key_metadata("lines above that of the columns' names", ge=0, le=10_000)] = 0
-    # If it is not specified, the delimiter is detected in the line of column names.
-    delimiter: Annotated[str, Meta(min_length=1, max_length=1)] | None = None
-    decimal: Literal[".", ","] = "."
+    skip_rows: (
+        Annotated[int, key_metadata("lines above that of the columns' names", ge=0, le=10_000)] | None
+    ) = None
+    units_row: bool | None = None  # whether a line of units follows that of the columns' names
+    delimiter: Annotated[str, Meta(min_length=1, max_length=1)] | None = None  # " ": one or more blanks
+    decimal: Literal[".", ","] | None = None
+
+
+class _TextTable(Struct, frozen=True):
+    text: TextFormat = TextFormat()
 
 
 class RunFiles(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -132,11 +145,21 @@ def load_mapping(path: str | os.PathLike[str]) -> LogMapping:
         InputError: If the file is missing or invalid.
     """
     label = to_one_line(os.fspath(path)) or "''"
+    return parse_mapping(_read_toml(path, label), label)
+
+
+def load_text_format(path: str | os.PathLike[str]) -> TextFormat:
+    """Load the table `[text]` of a mapping file that may lack all other tables.
+
+    Raises:
+        InputError: If the file is missing, or if the table is invalid.
+    """
+    label = to_one_line(os.fspath(path)) or "''"
+    raw = {"text": {}} | _read_toml(path, label)
     try:
-        data = read_bytes(Path(path), label, "a mapping")
-    except FileNotFoundError:
-        raise InputError(f"{label}: found no such file, expected a mapping file ({SCHEMA})") from None
-    return parse_mapping(parse_toml(data, label, "a mapping"), label)
+        return to_struct(_TextTable, {"text": raw["text"]}).text
+    except KeyProblem as problem:
+        raise InputError(f"{label}: {problem}") from None
 
 
 def parse_mapping(raw: Mapping[str, Any], label: str) -> LogMapping:
@@ -162,14 +185,28 @@ def make_simulation_mapping(kind: RunKind = "contact") -> LogMapping:
     )
 
 
-def get_si_conversion(channel: Channel, name: str) -> tuple[float, float]:
-    """Return the factor and the offset that convert a column to SI units: factor * number + offset."""
+def get_si_conversion(channel: Channel, name: str, stated: str | None = None) -> tuple[float, float]:
+    """Return the factor and the offset that convert a column to SI units: factor * number + offset.
+
+    Args:
+        channel: Column with its conversion.
+        name: Name of the channel.
+        stated: Unit that the file states, as it is spelled there; valid if the mapping specifies none.
+    """
     if channel.unit == COUNTS_UNIT or name not in UNITS_OF_CHANNEL:
         unit = 1.0
     else:
         units = UNITS_OF_CHANNEL[name]
-        unit = units[channel.unit or next(iter(units))]
+        unit = units[channel.unit or parse_unit(stated or "", name) or next(iter(units))]
     return channel.sign * unit * channel.scale, channel.sign * unit * channel.offset
+
+
+def _read_toml(path: str | os.PathLike[str], label: str) -> dict[str, Any]:
+    try:
+        data = read_bytes(Path(path), label, "a mapping")
+    except FileNotFoundError:
+        raise InputError(f"{label}: found no such file, expected a mapping file ({SCHEMA})") from None
+    return parse_toml(data, label, "a mapping")
 
 
 def _expand_shorthand(raw: Mapping[str, Any]) -> dict[str, Any]:
@@ -213,6 +250,9 @@ def _check_mapping(mapping: LogMapping) -> None:
     if (time.column is None) == (time.rate is None):
         finding = "neither" if time.rate is None else "both"
         raise KeyProblem(("channels", "time"), finding, "either a column of stamps or a rate of rows")
+    if time.nanoseconds is not None and (time.time_format is not None or time.unit not in (None, "s")):
+        expected = "none, because channels.time is not a column of seconds"
+        raise KeyProblem(("channels", "time", "nanoseconds"), format_value(time.nanoseconds), expected)
     if time.column is None or time.time_format is not None:
         for name in channels.__struct_fields__:
             stamps_column = getattr(getattr(channels, name), "time", None)

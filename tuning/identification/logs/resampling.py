@@ -21,6 +21,7 @@ MASTER_CHANNEL = "position_desired"  # channel whose times define the rows
 MAX_READING_PERIOD = 1.5  # control periods, maximum time between readings; a slower channel is rejected
 MIN_GAP_RATIO = 1.5  # minimum ratio of the time between two readings to its median if a reading was lost
 SIMULTANEITY_TOLERANCE = 0.02  # periods, maximum time between a row and a reading that count as simultaneous
+MIN_EMPTY_SHARE = 0.1  # minimum share of empty cells in a column if its log has rows of other topics
 HELD_CHANNELS = "contact_index", "mode"  # channels whose values are valid until the next reading
 NEAREST_READING_CHANNEL = "force_measured"  # channel with jumps, which is not interpolated
 FORCE_LATE_CHANNEL = "force_late"  # s, time from a row to the force reading that is used for it
@@ -41,6 +42,30 @@ def check_lengths(label: str, columns: Mapping[str, np.ndarray], named: Mapping[
             f"{len(x)} in {format_value(named.get(name, name))}" for name, x in columns.items()
         )
         raise InputError(f"{label}: found columns of different lengths ({lengths}), expected equal lengths")
+
+
+def split_sparse_rows(
+    columns: dict[str, np.ndarray], stamps: np.ndarray
+) -> dict[str, np.ndarray | None] | None:
+    """Replace columns with empty cells by their readings; return the time stamps of the readings [s].
+
+    Such a log has one row per message, with the channels of one topic. Returns None, and changes nothing, if
+    no column has so many empty cells.
+
+    Args:
+        columns: Values of each channel, changed in place.
+        stamps: Time stamps of the rows [s].
+    """
+    is_reading = {
+        name: values != "" if values.dtype == object else np.isfinite(values)
+        for name, values in columns.items()
+    }
+    shares = [np.mean(there) if len(there) else 1.0 for there in is_reading.values()]
+    if min(shares) > 1.0 - MIN_EMPTY_SHARE or min(shares) == 0.0:
+        return None
+    for name, there in is_reading.items():
+        columns[name] = columns[name][there]
+    return {name: stamps[there] for name, there in is_reading.items()}
 
 
 def resample_to_rows(
@@ -67,7 +92,7 @@ def resample_to_rows(
         InputError: If a channel has no valid time stamps, or no row has readings of all channels.
     """
     for name, stamps in clocks.items():
-        _check_clock(label, named[name], stamps, len(columns[name]))
+        check_clock(label, named[name], stamps, len(columns[name]))
     master = clocks[MASTER_CHANNEL]
     assert master is not None
     times = clock.remove_stamp_jitter(master, period, label, _label_stamps(named[MASTER_CHANNEL]))
@@ -106,7 +131,7 @@ def _label_stamps(column: str) -> str:
     return f"stamps of {format_value(column)}"
 
 
-def _check_clock(label: str, column: str, stamps: np.ndarray | None, rows: int) -> None:
+def check_clock(label: str, column: str, stamps: np.ndarray | None, rows: int) -> None:
     """Raise `InputError` if a column does not have one increasing time stamp per row."""
     if stamps is None:
         expected = "stamps, because other columns have separate stamps"

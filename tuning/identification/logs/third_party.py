@@ -1,8 +1,7 @@
-"""Readers of third-party log formats; the library of a format is imported when a log is opened.
+"""Readers of HDF5, MDF and TDMS files; the library of a format is imported when a log is opened.
 
-Every public function takes a path and returns a `LogReader`. A field of a structure becomes a column whose
-name contains a dot (`log.force`). The columns of a matrix are numbered from 1 (`log.signals_2`). Time stamps
-relative to an epoch are converted to seconds after the first time stamp of the log.
+Every public function takes a path and returns a `LogReader`. Time stamps relative to an epoch are converted
+to seconds after the first time stamp of the log.
 """
 
 # The libraries are optional.
@@ -10,64 +9,45 @@ relative to an epoch are converted to seconds after the first time stamp of the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+import gc
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from jaxhil.errors import format_value
-
-ColumnsByName = dict[str, np.ndarray]
-
-
-class LogReader(NamedTuple):
-    """Opened log: its column names, and functions that read columns and their time stamps."""
-
-    names: list[str]  # names of the columns
-    read: Callable[[Sequence[str]], ColumnsByName]
-    # Time stamps [s] of columns that were read, with a common origin; None if the format has no such stamps.
-    clocks: Callable[[Sequence[str]], dict[str, np.ndarray | None]] | None = None
-    stamps: Collection[str] = ()  # names of the columns that contain such time stamps
-
-
-def mat(path: Path) -> LogReader:
-    """Open a MATLAB MAT file, version 5 or 7.3."""
-    from pymatreader import read_mat
-
-    def flat(name: str, value: Any) -> ColumnsByName:
-        if isinstance(value, Mapping):
-            return _join_fields(name, value, flat)
-        return _split_columns(name, value)
-
-    content = read_mat(str(path))
-    columns = _join_fields(
-        "", {name: value for name, value in content.items() if not name.startswith("__")}, flat
-    )
-    if not columns:
-        export = "export signals as arrays, or as a structure with time"
-        raise ValueError(f"found no numbers, expected arrays or structures of numbers: {export}")
-    return _make_reader(columns)
+from tuning.identification.logs.log_reader import ColumnsByName, LogReader
 
 
 def hdf5(path: Path) -> LogReader:
     """Open an HDF5 file; the columns are its datasets, named by their paths without the first slash."""
     import h5py
 
-    locations: dict[str, tuple[str, str | None, int | None]] = {}
+    locations: dict[str, tuple[str, Any]] = {}  # dataset of each column, and its part
+    units: dict[str, str] = {}
     with h5py.File(path, "r") as file:
 
         def visit(name: str, item: Any) -> None:
             if not isinstance(item, h5py.Dataset) or item.ndim not in (1, 2):
                 return
             if item.dtype.names:
-                locations.update({f"{name}.{part}": (name, part, None) for part in item.dtype.names})
-            elif item.ndim == 1:
-                locations[name] = name, None, None
+                parts = {f"{name}.{part}": part for part in item.dtype.names}
+            elif item.ndim == 1 or item.shape[0] == 1:
+                parts = {name: () if item.ndim == 1 else 0}
             else:
-                locations.update(
-                    {f"{name}_{column + 1}": (name, None, column) for column in range(item.shape[1])}
-                )
+                # A matrix has a signal in each row if it has more columns than rows.
+                is_in_rows = item.shape[0] < item.shape[1]
+                parts = {
+                    f"{name}_{index + 1}": index if is_in_rows else (slice(None), index)
+                    for index in range(min(item.shape) if is_in_rows else item.shape[1])
+                }
+            locations.update({column: (name, part) for column, part in parts.items()})
+            unit = item.attrs.get("units", item.attrs.get("unit", ""))
+            unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else unit
+            if isinstance(unit, str) and unit:
+                units.update(dict.fromkeys(parts, unit))
 
         file.visititems(visit)
 
@@ -75,75 +55,73 @@ def hdf5(path: Path) -> LogReader:
         with h5py.File(path, "r") as file:
             columns = {}
             for column in wanted:
-                name, part, index = locations[column]
+                name, part = locations[column]
                 data: Any = file[name]
-                values = data[:, index] if index is not None else data[part] if part else data[()]
-                columns[column] = _convert_to_numbers(column, values)
+                columns[column] = _convert_to_numbers(column, data[part])
             return columns
 
-    return LogReader(list(locations), read)
-
-
-def bag(path: Path) -> LogReader:
-    """Open a ROS 2 bag (sqlite3 or MCAP).
-
-    The columns are named `/topic.field`; `/topic.time` is the recording time of the messages.
-    """
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
-    rows: dict[str, dict[str, list[float]]] = {}
-    folder = path.parent if path.suffix and (path.parent / "metadata.yaml").is_file() else path
-    with AnyReader([folder], default_typestore=get_typestore(Stores.LATEST)) as reader:
-        for connection, stamp, raw in reader.messages():
-            topic = rows.setdefault(connection.topic, {})
-            topic.setdefault("time", []).append(stamp)
-            for name, value in _flatten_fields(reader.deserialize(raw, connection.msgtype)):
-                topic.setdefault(name, []).append(value)
-    columns, topics, stamps = {}, {}, {}
-    zero = min((fields["time"][0] for fields in rows.values()), default=0)
-    for topic, fields in rows.items():
-        # Subtract integers: nanoseconds since an epoch have more digits than a float.
-        stamps[topic] = 1e-9 * (np.array(fields["time"]) - zero)
-        for name, values in fields.items():
-            if len(values) == len(fields["time"]):
-                column = f"{topic}.{name}"
-                columns[column] = stamps[topic] if name == "time" else np.array(values, float)
-                topics[column] = topic
-    return LogReader(
-        list(columns),
-        lambda wanted: {name: columns[name] for name in wanted},
-        lambda wanted: {name: stamps[topics[name]] for name in wanted},
-        {f"{topic}.time" for topic in stamps},
-    )
+    return LogReader(list(locations), read, units=units)
 
 
 def mdf(path: Path) -> LogReader:
-    """Open an ASAM MDF file; the column `time` contains the time stamps of the first requested channel."""
-    from asammdf import MDF
+    """Open an ASAM MDF file; the column `time` contains the time stamps of the first requested channel.
 
-    with MDF(path) as file:
-        groups = {name: locations[0][0] for name, locations in file.channels_db.items() if name != "time"}
-    names = list(groups)
+    A channel whose name occurs in several groups is named `group/channel`.
+    """
+    places: dict[str, tuple[int, int]] = {}  # group and index of each channel
+    units: dict[str, str] = {}
+    with _open_mdf(path) as file:
+        titles = [
+            getattr(group.channel_group, "acq_name", "") or f"group {index + 1}"
+            for index, group in enumerate(file.groups)
+        ]
+        for name, locations in file.channels_db.items():
+            if name == "time":
+                continue
+            is_unique = len({group for group, _ in locations}) == 1
+            for group, index in locations:
+                title = titles[group] if titles.count(titles[group]) == 1 else f"{titles[group]} {group + 1}"
+                column = name if is_unique else f"{title}/{name}"
+                places.setdefault(column, (group, index))
+                if unit := file.get_channel_unit(group=group, index=index):
+                    units[column] = unit
+    names = list(places)
     masters: dict[int, np.ndarray] = {}  # stamps of each group that was read
 
     def read(wanted: Sequence[str]) -> ColumnsByName:
         columns = {}
-        with MDF(path) as file:
+        with _open_mdf(path) as file:
             signals = [name for name in wanted if name != "time"]
             for name in signals or names[:1]:
-                signal = file.get(name)
-                masters.setdefault(groups[name], np.asarray(signal.timestamps, float))
+                group, index = places[name]
+                signal = file.get(group=group, index=index)
+                masters.setdefault(group, np.asarray(signal.timestamps, float))
                 if name in wanted:
                     columns[name] = _convert_to_numbers(name, signal.samples)
             if "time" in wanted:
-                columns["time"] = masters[groups[(signals or names)[0]]]
+                columns["time"] = masters[places[(signals or names)[0]][0]]
         return columns
 
-    def clocks(wanted: Sequence[str]) -> dict[str, np.ndarray | None]:
-        return {name: masters[groups[name]] for name in wanted if name != "time"}
+    def clocks(wanted: Sequence[str], time: str | None) -> dict[str, np.ndarray | None]:
+        return {name: masters[places[name][0]] for name in wanted if name != "time"}
 
-    return LogReader(["time", *names], read, clocks, {"time"})
+    return LogReader(["time", *names], read, clocks, {"time"}, units)
+
+
+def _open_mdf(path: Path) -> Any:
+    """Open an MDF file; if this fails, no destructor of the library prints a traceback."""
+    from asammdf import MDF
+
+    try:
+        return MDF(path)
+    except Exception as error:
+        message = str(error) or type(error).__name__
+        hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        gc.collect()
+    finally:
+        sys.unraisablehook = hook
+    raise ValueError(message)
 
 
 def tdms(path: Path) -> LogReader:
@@ -195,13 +173,15 @@ def tdms(path: Path) -> LogReader:
         return columns
 
     time_columns = [f"{name}.time" for name in waves]
+    units = {name: str(channel.properties.get("unit_string", "")) for name, channel in channels.items()}
     return LogReader(
         [*channels, *time_columns],
         read,
-        lambda wanted: {
+        lambda wanted, time: {
             name: stamps(name.removesuffix(".time") if name in time_columns else name) for name in wanted
         },
         time_columns,
+        {name: unit for name, unit in units.items() if unit},
     )
 
 
@@ -209,44 +189,6 @@ def _to_nanoseconds(stamp: Any) -> int:
     """Return a date in nanoseconds since 1970."""
     stamp = stamp.as_datetime64("ns") if hasattr(stamp, "as_datetime64") else stamp
     return int(np.datetime64(stamp).astype("datetime64[ns]").astype(np.int64))
-
-
-def _join_fields(
-    name: str, parts: Mapping[str, Any], flat: Callable[[str, Any], ColumnsByName]
-) -> ColumnsByName:
-    columns: ColumnsByName = {}
-    for part, value in parts.items():
-        columns |= flat(f"{name}.{part}".lstrip("."), value)
-    return columns
-
-
-def _split_columns(name: str, value: Any) -> ColumnsByName:
-    """Return the columns of a numeric vector or matrix by name; an empty dictionary for other values."""
-    try:
-        array = np.asarray(value)
-    except ValueError:
-        return {}
-    if array.dtype.kind not in "biuf" or array.ndim not in (1, 2):
-        return {}
-    if array.ndim == 1:
-        return {name: array.astype(float)}
-    return {f"{name}_{index + 1}": column.astype(float) for index, column in enumerate(array.T)}
-
-
-def _flatten_fields(message: Any, name: str = "") -> list[tuple[str, float]]:
-    """Return all numbers in a message, each with the dotted path of its field."""
-    fields: list[tuple[str, float]] = []
-    for part, value in vars(message).items():
-        path = f"{name}.{part}".lstrip(".")
-        if part.startswith("__"):
-            continue
-        if isinstance(value, (bool, int, float, np.number)):
-            fields.append((path, float(value)))
-        elif hasattr(value, "__dataclass_fields__"):
-            fields += _flatten_fields(value, path)
-        elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-            fields += [(f"{path}_{index + 1}", float(number)) for index, number in enumerate(value.ravel())]
-    return fields
 
 
 def _convert_to_numbers(name: str, values: Any) -> np.ndarray:
@@ -260,7 +202,3 @@ def _convert_to_numbers(name: str, values: Any) -> np.ndarray:
             "per row"
         )
     return array.astype(float)
-
-
-def _make_reader(columns: ColumnsByName) -> LogReader:
-    return LogReader(list(columns), lambda wanted: {name: columns[name] for name in wanted})
