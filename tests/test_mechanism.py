@@ -173,7 +173,7 @@ def test_zero_and_negative_mechanism_values_are_refused_if_key_forbids_them(path
         ("approach.contacts", 1, 0),
         ("approach.contacts", 1, 1.0),
         ("rig.control_period", 0.1, 0.11),
-        ("rig.command_latency", 1, 2),
+        ("rig.command_latency", 4, 5),
         ("rig.command_latency", 0, -1),
         ("rig.simulator.delay", 1.0, 1.01),
         ("rig.force_sensor.delay", 1.0, 1.01),

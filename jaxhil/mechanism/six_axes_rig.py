@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, Struct, field
 
 from jaxhil.mechanism.structs import (
+    MAX_LATENCY,
     Coefficient,
     CommandHold,
     Integrator,
@@ -228,7 +229,7 @@ class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         "semi_implicit_euler"
     )
     command_latency: Annotated[
-        int, key_metadata("periods until a command reaches the drives", "1", ge=0, le=1)
+        int, key_metadata("periods until a command reaches the drives", "1", ge=0, le=MAX_LATENCY)
     ] = 0
     command_hold: Annotated[CommandHold, key_metadata("hold of the command within a period")] = "linear"
     simulator: Annotated[Simulator, key_metadata("the motion simulator")]

@@ -46,6 +46,7 @@ __all__ = [
 
 SCHEMA = "jaxhil/mechanism/1"
 MAX_CONTACTS = 1000
+MAX_LATENCY = 4  # [periods]; of a command, with the periods that a co-simulation adds
 # limits on nonzero numbers, so that a product of three neither overflows nor underflows
 MAGNITUDE_LIMITS = 1e-100, 1e100
 NO_METADATA: Mapping[str, Any] = {}
@@ -228,7 +229,7 @@ class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         "semi_implicit_euler"
     )
     command_latency: Annotated[
-        int, key_metadata("periods until a command reaches the drives", "1", ge=0, le=1)
+        int, key_metadata("periods until a command reaches the drives", "1", ge=0, le=MAX_LATENCY)
     ] = 0
     command_hold: Annotated[CommandHold, key_metadata("hold of the command within a period")] = "linear"
     contact_plane: Annotated[

@@ -72,6 +72,7 @@ class ExportResult:
 
 
 ALL_LIMITS = {**SIX_AXIS_LIMITS, **LIMITS}  # of one axis and of six
+FmiVersions = AllowedValues(2, 3, words="2 or 3")
 ProbabilityRange = AllowedValues(0.0, 1.0, words="0 to 1")
 
 
@@ -92,6 +93,7 @@ class ExportOptions:
         arg(metavar="PROBABILITY", help="Acceptable share of bad runs that the watchdog does not stop."),
         ProbabilityRange,
     ] = 0.02
+    fmi: Annotated[int, number_option("Version of FMI for the format fmu: 2 or 3."), FmiVersions] = 3
     seed: Annotated[int, number_option("Seed of the test vectors."), SeedRange] = 0
     sign: Annotated[
         str | None,
@@ -118,7 +120,7 @@ def export(
         folder: folder of the bundle. A new or empty folder, or a bundle, which is replaced.
         sweep: result of `tuning.sweep` for these gains, or the folder with such a result. Limits and alarm
             rates are computed from its runs.
-        formats: additional formats of the gains: "ros2", "matlab", "csv", "c99"; None for all.
+        formats: additional formats of the gains: "ros2", "matlab", "csv", "c99", "fmu"; None: all but "fmu".
         limits: limits of this rig by name [SI units], which replace the computed limits; a value of None
             removes a limit.
         progress: report the progress on standard error.
@@ -158,7 +160,7 @@ def export(
         arguments.check_has_runtime(loaded.compensator, axes)
         _check_limit_names(user_limits, axes)
         check_same_mechanism(target, loaded.mechanism.name)
-        format_names = _select_formats(formats)
+        format_names = _select_formats(formats, settings.fmi)
         allowed = settings.false_alarms, settings.missed
         calibration = _calibrate_limits(loaded, sweep, user_limits, allowed, progress)
         limits_and_rates = calibration.limits, calibration.rates
@@ -294,11 +296,13 @@ def _check_formats(formats: Any) -> None:
     from tuning.bundle.writers import WRITERS
 
     for name in formats or ():
-        arguments.check_choice(tuple(WRITERS), format=name)
+        arguments.check_choice(tuple(name for name in WRITERS if name != "fmu2"), format=name)
 
 
-def _select_formats(formats: Sequence[str] | None) -> list[str]:
-    """Return the names of the requested formats, by default all, in the order of `WRITERS`."""
-    from tuning.bundle.writers import WRITERS
+def _select_formats(formats: Sequence[str] | None, fmi: int) -> list[str]:
+    """Return the names of the requested formats in the order of `WRITERS`, by default all but FMUs."""
+    from tuning.bundle.writers import ON_REQUEST, WRITERS
 
-    return [name for name in WRITERS if not formats or name in formats]
+    names = formats or [name for name in WRITERS if name not in ON_REQUEST]
+    chosen = ["fmu2" if name == "fmu" and fmi == 2 else name for name in names]
+    return [name for name in WRITERS if name in chosen]

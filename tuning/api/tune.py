@@ -99,7 +99,7 @@ def tune_each(
     from tuning.gains.search_progress import SearchProgress
     from tuning.gains.tune_all import tune_all
 
-    mechanisms = [entry.mechanism for entry in loaded]
+    mechanisms = [options.add_extra_periods(entry.mechanism) for entry in loaded]
     settings, earlier = options.settings(max(map(axes_of, mechanisms))), options.load_start_gains()
     number = len(loaded)
     work = SearchProgress(lambda text, share, before: bar.tell(text, share * number, before * number))
@@ -115,5 +115,10 @@ def tune_each(
     for index, result in results:
         yield (
             index,
-            TunedGains(result, loaded[index].sha256, arguments.choose_limit(options.limit, result.mechanism)),
+            TunedGains(
+                result,
+                loaded[index].sha256,
+                arguments.choose_limit(options.limit, result.mechanism),
+                extra_periods=options.extra_periods,
+            ),
         )

@@ -6,11 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
+from msgspec import structs
 from tyro.conf import arg
 
 from jaxhil.errors import to_one_line
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.mechanism.structs import MAX_LATENCY
 from tuning.api import arguments, tune_pareto
 from tuning.api.arguments import ArgumentError
 from tuning.api.options import (
@@ -131,6 +133,11 @@ class TuneOptions:
             help="Also search the full range of all gains for better gains, with 50 times the evaluations.",
         ),
     ] = False
+    extra_periods: Annotated[
+        int,
+        number_option("Periods that a co-simulation with FMUs adds to rig.command_latency."),
+        AllowedValues(0, MAX_LATENCY),
+    ] = 0
     seed: Annotated[int, number_option("Seed of scenarios and starts."), SeedRange] = 0
     limit: OptionalLimit = None
     scheduler: Scheduler = None
@@ -155,6 +162,15 @@ class TuneOptions:
             tune_pareto.check_six_axis_cost(self.pareto_against)
         if callable(self.objective):
             arguments.check_one_axis_arguments(mechanism, objective=self.objective)
+
+    def add_extra_periods(self, mechanism: AnyMechanism) -> AnyMechanism:
+        """Return the mechanism with the command latency of the co-simulation; see `extra_periods`."""
+        latency, rig = mechanism.rig.command_latency + self.extra_periods, mechanism.rig
+        if latency > MAX_LATENCY:
+            most = MAX_LATENCY - rig.command_latency
+            allowed = f"at most {most}: rig.command_latency is at most {MAX_LATENCY}"
+            raise ArgumentError("extra_periods", str(self.extra_periods), allowed, mechanism.name)
+        return structs.replace(mechanism, rig=structs.replace(rig, command_latency=latency))
 
     def settings(self, axes: int = 1) -> "TuneSettings":
         """Build the settings of the tuning for 1 or 6 axes; raise `InputError` if an option is invalid."""

@@ -28,12 +28,14 @@ class TunedGains:
         mechanism_sha256: SHA-256 digest of the mechanism file.
         limit: largest rms error for which the verdict is good [1].
         pareto: points of the Pareto front; empty if no front was requested.
+        extra_periods: periods of the mechanism's command latency that a co-simulation adds [periods].
     """
 
     tune_result: "TuneResult"
     mechanism_sha256: str
     limit: float
     pareto: "tuple[TradedGains, ...]" = ()
+    extra_periods: int = 0
 
     @property
     def mechanism(self) -> AnyMechanism:
@@ -74,6 +76,11 @@ class TunedGains:
         from tuning.gains.tune import compute_metrics_by_error
 
         return compute_metrics_by_error(self.tune_result)
+
+    @property
+    def co_simulation(self) -> dict[str, dict[str, int]]:
+        """Return the gain file's entry on the co-simulation; empty without extra periods."""
+        return {"co_simulation": {"extra_periods": self.extra_periods}} if self.extra_periods else {}
 
     @property
     def verdict(self) -> str:
@@ -137,6 +144,7 @@ class TunedGains:
                 "robust": result.figures,
                 "tuned_intervals": result.intervals.plain() if result.intervals else None,
                 **self.parts,
+                **self.co_simulation,
                 "without_noise": result.without_noise,
                 "command": self.command,
                 "warnings": self.warnings,
@@ -228,7 +236,7 @@ class TradedGains:
             result.mechanism,
             self.tuned.mechanism_sha256,
             _validity_envelope(result),
-            {**figures, "pareto": self.traded},
+            {**figures, **self.tuned.co_simulation, "pareto": self.traded},
             result.settings.seed,
             {},
         )

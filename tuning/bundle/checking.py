@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from jaxhil.errors import InputError, format_value, to_one_line
 from tuning.bundle import selftest
 from tuning.bundle.content import bundle_files, code_files, find_formats
+from tuning.bundle.fmu.archive import find_library
 from tuning.bundle.manifest import package_version
 
 SELFTEST_TIMEOUT = 600.0  # longest duration of the self-test [s]
@@ -127,10 +128,14 @@ def _check_manifest(folder: Path, signed_by: SignatureCheck | None) -> BundleChe
 
 
 def _export_again(files: Mapping[str, bytes], document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the files that this version exports for a gain document, with the bundle's vectors and plot."""
+    """Return the files that this version exports for a gain document.
+
+    The test vectors, the plot and the libraries of FMUs are those of the bundle.
+    """
     plot = PLOT.search(files["summary.html"])
     drawn = base64.b64decode(plot[1], validate=True) if plot else b""
-    return bundle_files(document, find_formats(files, document), files["vectors.csv"], drawn)
+    libraries = {name: find_library(content) for name, content in files.items() if name.endswith(".fmu")}
+    return bundle_files(document, find_formats(files, document), files["vectors.csv"], drawn, libraries)
 
 
 def _find_export_differences(

@@ -46,7 +46,11 @@ def code_files(compensator: str, axes: int = 1) -> dict[str, bytes]:
 
 
 def bundle_files(
-    document: Mapping[str, Any], formats: Sequence[str], vectors: bytes, plot: bytes | None = None
+    document: Mapping[str, Any],
+    formats: Sequence[str],
+    vectors: bytes,
+    plot: bytes | None = None,
+    libraries: Mapping[str, bytes | None] | None = None,
 ) -> dict[str, bytes]:
     """Return all files of a bundle for a checked gain document.
 
@@ -55,6 +59,7 @@ def bundle_files(
         formats: names of the additional formats of the gains.
         vectors: content of the file vectors.csv.
         plot: plot for the summary, as PNG; None to draw a new plot.
+        libraries: libraries of the FMUs by the FMU's path; None to compile them.
 
     Returns:
         Content of each file by its path in the bundle.
@@ -64,6 +69,7 @@ def bundle_files(
         KeyError: If the runtime does not know the compensator.
         ValueError: If the runtime's modules cannot be joined into one file.
     """
+    from tuning.bundle.fmu.archive import add_library, compile_library
     from tuning.bundle.readme import readme_text
     from tuning.bundle.summary import summary_html
     from tuning.bundle.writers import WRITERS
@@ -82,6 +88,9 @@ def bundle_files(
     }
     for name in formats:
         files.update(WRITERS[name](document))
+    for name in [name for name in files if name.endswith(".fmu")]:
+        library = compile_library(files[name]) if libraries is None else libraries.get(name)
+        files[name] = add_library(files[name], library)
     files["README.md"] = readme_text(document, files).encode()
     files[selftest.MANIFEST_FILE] = manifest_text(files, document)
     return files

@@ -26,6 +26,8 @@ FILE_DESCRIPTIONS = {
     "udp_controller.py": "program that runs the controller as a process, which answers a rig over UDP",
     "udp_protocol.py": "protocol between this process and a rig",
     "c99": "controller in C99, its gains, and its test program",
+    "fmi3": "FMUs of FMI 3.0 with sources: the controller and, for one axis, the simulated rig",
+    "fmi2": "FMUs of FMI 2.0 with sources: the controller and, for one axis, the simulated rig",
     "ros2.yaml": "gains as ROS 2 parameters",
     "gains.mat": "gains for MATLAB",
     "gains.csv": "gains as a table",

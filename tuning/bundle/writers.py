@@ -1,4 +1,4 @@
-"""Export of gain documents to the formats of other programs: ROS 2 parameters, MATLAB, CSV and C99.
+"""Export of gain documents to the formats of other programs: ROS 2, MATLAB, CSV, C99 and FMUs.
 
 `WRITERS` maps the name of each format (`--format`) to a function that takes a checked gain document and
 returns the content of each file by its path. All formats preserve the bits of the numbers. A limit of null is
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxhil.errors import InputError, format_value
-from tuning.bundle.controller_kind import kind_of
+from tuning.bundle.controller_kind import ONE_AXIS, kind_of
 
 ROS2_NODE = "/jaxhil_controller"
 MAX_MATLAB_NAME_LENGTH = 63  # longest name of a struct's field in MATLAB [characters]
@@ -143,12 +143,35 @@ def c99_files(document: Mapping[str, Any]) -> dict[str, bytes]:
     return {f"c99/{name}": text.encode("ascii") for name, text in generate_c99(document).items()}
 
 
+def fmi3_files(document: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return the sources of FMUs of FMI 3.0: the controller and, for one axis, the rig, in `fmi3`."""
+    return _fmu_files(document, 3)
+
+
+def fmi2_files(document: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return the sources of FMUs of FMI 2.0, in the folder `fmi2`; see `fmi3_files`."""
+    return _fmu_files(document, 2)
+
+
+def _fmu_files(document: Mapping[str, Any], fmi: int) -> dict[str, bytes]:
+    from tuning.bundle.fmu import controller, rig
+
+    files = {f"fmi{fmi}/{controller.IDENTIFIER}.fmu": controller.controller_fmu(document, fmi)}
+    if kind_of(document) is ONE_AXIS:
+        files[f"fmi{fmi}/{rig.IDENTIFIER}.fmu"] = rig.rig_fmu(document, fmi)
+    return files
+
+
 WRITERS: dict[str, Callable[[Mapping[str, Any]], dict[str, bytes]]] = {
     "ros2": ros2_files,
     "matlab": matlab_files,
     "csv": csv_files,
     "c99": c99_files,
+    "fmu": fmi3_files,
+    "fmu2": fmi2_files,
 }
+# Formats that are written only on request: FMUs contain a library of this computer's compiler.
+ON_REQUEST = ("fmu", "fmu2")
 
 
 def _format_cell(value: float | str | None) -> str:

@@ -34,7 +34,7 @@ class Export(ExportOptions):
         UseAppendAction[tuple[str, ...]],
         text_option(
             "NAME[,NAME]",
-            "Additional format of the gains: ros2, matlab, csv or c99; repeatable; by default all.",
+            "Additional format of the gains: ros2, matlab, csv, c99, fmu; repeatable; default: all but fmu.",
             name="format",
         ),
     ] = ()

@@ -11,12 +11,14 @@ This module computes stages 1, 4 and 5 of `jaxhil.simulation.loop` without JAX, 
 
 import math
 from random import Random
+from typing import NamedTuple
 
 from jaxhil.contact.float_law import FloatLaw
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.structs import Contact, Mechanism
 from tuning.rig.discretisation import (
     DELAY_ROUNDING_TOLERANCE,
+    DiscreteSimulator,
     MotionRows,
     discretise_simulator,
     evaluate_row,
@@ -26,6 +28,39 @@ from tuning.rig.sensor_lag import MotionState, apply_sensor_lag, deepest_penetra
 
 # Motion of the mechanism when the force sensor samples, at the sampling interval's start and at its end.
 SamplingInterval = tuple[MotionState, MotionState | None, MotionState | None]
+
+
+class PlantConstants(NamedTuple):
+    """Constants of the simulated hardware that follow from a mechanism."""
+
+    rows: DiscreteSimulator  # response of the motion simulator
+    sample_time: float  # time of the force sensor's sample in its sampling interval [s]
+    # The force is sampled `contact_intervals` intervals after the command that causes it, and read
+    # `force_intervals` intervals after the sample.
+    contact_intervals: int
+    force_intervals: int
+    position_intervals: int  # intervals from the sample of the position to its reading
+    ring_size: int  # length of the ring buffers, a power of two
+
+
+def compute_plant_constants(mechanism: Mechanism) -> PlantConstants:
+    """Return the constants of a mechanism's simulated hardware."""
+    rig = mechanism.rig
+    simulator, period = rig.simulator, rig.control_period
+    force_intervals, force_fraction = split_delay(simulator.delay + rig.force_sensor.delay, period)
+    position_intervals, position_fraction = split_delay(simulator.delay + rig.position_sensor.delay, period)
+    contact_delay = simulator.delay / period + force_fraction
+    contact_intervals = math.ceil(contact_delay - DELAY_ROUNDING_TOLERANCE) - 1
+    force_intervals -= contact_intervals
+    longest = max(force_intervals, position_intervals, contact_intervals)
+    return PlantConstants(
+        rows=discretise_simulator(simulator, period, rig.command_hold, force_fraction, position_fraction),
+        sample_time=force_fraction * period,
+        contact_intervals=contact_intervals,
+        force_intervals=force_intervals,
+        position_intervals=position_intervals,
+        ring_size=1 << (longest + 2).bit_length(),
+    )
 
 
 class RigHardware:
@@ -38,28 +73,18 @@ class RigHardware:
 
     def __init__(self, mechanism: Mechanism, seed: int = 0) -> None:
         rig = mechanism.rig
-        simulator, period = rig.simulator, rig.control_period
-        force_delay, position_delay = rig.force_sensor.delay, rig.position_sensor.delay
-        force_intervals, force_fraction = split_delay(simulator.delay + force_delay, period)
-        position_intervals, position_fraction = split_delay(simulator.delay + position_delay, period)
-        self._period, self._contact = period, mechanism.contact
+        simulator, constants = rig.simulator, compute_plant_constants(mechanism)
+        self._period, self._contact = rig.control_period, mechanism.contact
         self._clearance, self._plane = mechanism.contact.clearance, rig.contact_plane
         self._hold, self._latency = rig.command_hold, rig.command_latency
         self._force_sensor, self._position_sensor = rig.force_sensor, rig.position_sensor
-        self._sample_time, self._noise = force_fraction * period, Random(seed)
+        self._sample_time, self._noise = constants.sample_time, Random(seed)
         self._limits = simulator.velocity_limit, simulator.acceleration_limit
         self._has_rate_limits = math.isfinite(min(self._limits))
-        self._rows = discretise_simulator(
-            simulator, period, rig.command_hold, force_fraction, position_fraction
-        )
-        # The force is sampled `_contact_intervals` intervals after the command that causes it, and read
-        # `_force_intervals` intervals after the sample.
-        contact_delay = simulator.delay / period + force_fraction
-        self._contact_intervals = math.ceil(contact_delay - DELAY_ROUNDING_TOLERANCE) - 1
-        self._force_intervals = force_intervals - self._contact_intervals
-        self._position_intervals = position_intervals
-        longest = max(self._force_intervals, position_intervals, self._contact_intervals)
-        self._size = 1 << (longest + 2).bit_length()
+        self._rows, self._size = constants.rows, constants.ring_size
+        self._contact_intervals = constants.contact_intervals
+        self._force_intervals = constants.force_intervals
+        self._position_intervals = constants.position_intervals
         self.begin(-1.0, 0.0, -1.0, 0)
 
     def begin(self, position: float, velocity: float, command: float, number: int) -> None:

@@ -1,0 +1,240 @@
+/* Functions of FMI 3.0 for co-simulation. Functions of other kinds of FMUs return errors. */
+#include "fmi3Functions.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "fmu.h"
+
+typedef struct {
+    fmu_state state;
+    fmi3LogMessageCallback log;
+    fmi3InstanceEnvironment environment;
+} fmu_instance;
+
+/* Report an error, if there is one, and return the status. */
+static fmi3Status finish(const fmu_instance *instance, const char *subject, const char *problem) {
+    char message[256];
+    if (problem == NULL) {
+        return fmi3OK;
+    }
+    if (instance != NULL && instance->log != NULL) {
+        snprintf(message, sizeof message, "%s: %s", subject, problem);
+        instance->log(instance->environment, fmi3Error, "logStatusError", message);
+    }
+    return fmi3Error;
+}
+
+static fmi3Status missing(fmi3Instance instance, const char *function) {
+    return finish((const fmu_instance *)instance, function, "this FMU has no such function");
+}
+
+/* Functions that read or write values of one type: `stored` is the type in fmi3.h, `kind` in fmu.h. */
+#define GET(function, stored, kind)                                                                           \
+    fmi3Status function(fmi3Instance instance, const fmi3ValueReference references[], size_t count,           \
+                        stored values[], size_t size) {                                                       \
+        fmu_instance *const self = (fmu_instance *)instance;                                                  \
+        double value = 0.0;                                                                                   \
+        if (self == NULL || count != size || (count > 0 && (references == NULL || values == NULL))) {         \
+            return finish(self, #function, "an argument is missing, or the numbers of values differ");        \
+        }                                                                                                     \
+        for (size_t n = 0; n < count; n++) {                                                                  \
+            const char *const problem = fmu_get(&self->state, kind, references[n], &value);                   \
+            if (problem != NULL) {                                                                            \
+                return finish(self, fmu_name_of(references[n]), problem);                                     \
+            }                                                                                                 \
+            values[n] = (stored)value;                                                                        \
+        }                                                                                                     \
+        return fmi3OK;                                                                                        \
+    }
+
+#define SET(function, stored, kind)                                                                           \
+    fmi3Status function(fmi3Instance instance, const fmi3ValueReference references[], size_t count,           \
+                        const stored values[], size_t size) {                                                 \
+        fmu_instance *const self = (fmu_instance *)instance;                                                  \
+        if (self == NULL || count != size || (count > 0 && (references == NULL || values == NULL))) {         \
+            return finish(self, #function, "an argument is missing, or the numbers of values differ");        \
+        }                                                                                                     \
+        for (size_t n = 0; n < count; n++) {                                                                  \
+            const char *const problem = fmu_set(&self->state, kind, references[n], (double)values[n]);        \
+            if (problem != NULL) {                                                                            \
+                return finish(self, fmu_name_of(references[n]), problem);                                     \
+            }                                                                                                 \
+        }                                                                                                     \
+        return fmi3OK;                                                                                        \
+    }
+
+/* Functions for types that no variable has; they succeed only for no values. */
+#define NO_VALUES(name, stored)                                                                               \
+    fmi3Status fmi3Get##name(fmi3Instance instance, const fmi3ValueReference references[], size_t count,      \
+                             stored values[], size_t size) {                                                  \
+        (void)references, (void)values, (void)size;                                                           \
+        return count == 0 && instance != NULL ? fmi3OK : missing(instance, "fmi3Get" #name);                  \
+    }                                                                                                         \
+    fmi3Status fmi3Set##name(fmi3Instance instance, const fmi3ValueReference references[], size_t count,      \
+                             const stored values[], size_t size) {                                            \
+        (void)references, (void)values, (void)size;                                                           \
+        return count == 0 && instance != NULL ? fmi3OK : missing(instance, "fmi3Set" #name);                  \
+    }
+
+GET(fmi3GetFloat64, fmi3Float64, FMU_REAL)
+SET(fmi3SetFloat64, fmi3Float64, FMU_REAL)
+GET(fmi3GetInt32, fmi3Int32, FMU_INTEGER)
+SET(fmi3SetInt32, fmi3Int32, FMU_INTEGER)
+GET(fmi3GetBoolean, fmi3Boolean, FMU_BOOLEAN)
+SET(fmi3SetBoolean, fmi3Boolean, FMU_BOOLEAN)
+NO_VALUES(Float32, fmi3Float32)
+NO_VALUES(Int8, fmi3Int8)
+NO_VALUES(UInt8, fmi3UInt8)
+NO_VALUES(Int16, fmi3Int16)
+NO_VALUES(UInt16, fmi3UInt16)
+NO_VALUES(UInt32, fmi3UInt32)
+NO_VALUES(Int64, fmi3Int64)
+NO_VALUES(UInt64, fmi3UInt64)
+NO_VALUES(String, fmi3String)
+
+const char *fmi3GetVersion(void) {
+    return fmi3Version;
+}
+
+fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t count, const fmi3String names[]) {
+    (void)on, (void)count, (void)names; /* errors are always reported */
+    return instance != NULL ? fmi3OK : fmi3Error;
+}
+
+fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources,
+                                         fmi3Boolean visible, fmi3Boolean logging, fmi3Boolean events,
+                                         fmi3Boolean early, const fmi3ValueReference required[], size_t count,
+                                         fmi3InstanceEnvironment environment, fmi3LogMessageCallback log,
+                                         fmi3IntermediateUpdateCallback update) {
+    fmu_instance *self;
+    (void)resources, (void)visible, (void)logging, (void)events, (void)early, (void)required, (void)update;
+    if (name == NULL || token == NULL || strcmp(token, FMU_TOKEN) != 0 || count > 0) {
+        if (log != NULL) {
+            log(environment, fmi3Error, "logStatusError",
+                "instantiation: a name is missing, the token is that of another FMU, or intermediate values "
+                "are required");
+        }
+        return NULL;
+    }
+    self = (fmu_instance *)calloc(1, sizeof *self);
+    if (self != NULL) {
+        self->log = log;
+        self->environment = environment;
+        fmu_reset(&self->state);
+    }
+    return self;
+}
+
+void fmi3FreeInstance(fmi3Instance instance) {
+    free(instance);
+}
+
+fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean has_tolerance, fmi3Float64 tolerance,
+                                       fmi3Float64 start, fmi3Boolean has_stop, fmi3Float64 stop) {
+    fmu_instance *const self = (fmu_instance *)instance;
+    (void)has_tolerance, (void)tolerance, (void)has_stop, (void)stop;
+    return self == NULL ? fmi3Error : finish(self, "initialisation", fmu_begin(&self->state, start));
+}
+
+fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
+    fmu_instance *const self = (fmu_instance *)instance;
+    return self == NULL ? fmi3Error : finish(self, "initialisation", fmu_exit_initialisation(&self->state));
+}
+
+fmi3Status fmi3Terminate(fmi3Instance instance) {
+    fmu_instance *const self = (fmu_instance *)instance;
+    return self == NULL ? fmi3Error : finish(self, "termination", fmu_terminate(&self->state));
+}
+
+fmi3Status fmi3Reset(fmi3Instance instance) {
+    if (instance == NULL) {
+        return fmi3Error;
+    }
+    fmu_reset(&((fmu_instance *)instance)->state);
+    return fmi3OK;
+}
+
+fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 time, fmi3Float64 step, fmi3Boolean no_return,
+                      fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early, fmi3Float64 *reached) {
+    fmu_instance *const self = (fmu_instance *)instance;
+    fmi3Status status;
+    (void)no_return;
+    if (self == NULL || event == NULL || terminate == NULL || early == NULL || reached == NULL) {
+        return finish(self, "step", "an argument is missing");
+    }
+    status = finish(self, "step", fmu_step(&self->state, time, step));
+    *event = *terminate = *early = false;
+    *reached = self->state.time;
+    return status;
+}
+
+fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *copy) {
+    const fmu_instance *const self = (const fmu_instance *)instance;
+    if (self == NULL || copy == NULL) {
+        return finish(self, "state", "an argument is missing");
+    }
+    if (*copy == NULL) {
+        *copy = malloc(sizeof self->state);
+    }
+    if (*copy == NULL) {
+        return finish(self, "state", "no memory is left");
+    }
+    memcpy(*copy, &self->state, sizeof self->state);
+    return fmi3OK;
+}
+
+fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState copy) {
+    fmu_instance *const self = (fmu_instance *)instance;
+    if (self == NULL || copy == NULL) {
+        return finish(self, "state", "an argument is missing");
+    }
+    memcpy(&self->state, copy, sizeof self->state);
+    return fmi3OK;
+}
+
+fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *copy) {
+    if (instance == NULL) {
+        return fmi3Error;
+    }
+    if (copy != NULL) {
+        free(*copy);
+        *copy = NULL;
+    }
+    return fmi3OK;
+}
+
+fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState copy, size_t *size) {
+    if (instance == NULL || copy == NULL || size == NULL) {
+        return finish((const fmu_instance *)instance, "state", "an argument is missing");
+    }
+    *size = fmu_serialised_size();
+    return fmi3OK;
+}
+
+fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState copy, fmi3Byte bytes[], size_t size) {
+    if (instance == NULL || copy == NULL || bytes == NULL || size != fmu_serialised_size()) {
+        return finish((const fmu_instance *)instance, "state", "an argument is missing, or the size differs");
+    }
+    fmu_serialise((const fmu_state *)copy, bytes);
+    return fmi3OK;
+}
+
+fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte bytes[], size_t size,
+                                   fmi3FMUState *copy) {
+    const fmu_instance *const self = (const fmu_instance *)instance;
+    fmu_state *restored;
+    const char *problem;
+    if (self == NULL || bytes == NULL || copy == NULL) {
+        return finish(self, "state", "an argument is missing");
+    }
+    restored = (fmu_state *)(*copy != NULL ? *copy : malloc(sizeof *restored));
+    problem = restored == NULL ? "no memory is left" : fmu_deserialise(restored, bytes, size);
+    if (problem != NULL && *copy == NULL) {
+        free(restored);
+        restored = NULL;
+    }
+    *copy = restored;
+    return finish(self, "state", problem);
+}

@@ -1,0 +1,51 @@
+"""FMU of the controller: its C99 code of the bundle as a co-simulation FMU."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from tuning.bundle.c99 import GAINS_FILE, HEADER_FILE, SOURCE_FILE, generate_c99
+from tuning.bundle.controller_kind import ONE_AXIS, kind_of
+from tuning.bundle.fmu.archive import build_fmu
+from tuning.bundle.fmu.sources import read_source
+from tuning.bundle.fmu.variables import c_names, controller_variables
+
+IDENTIFIER = "jaxhil_controller"
+
+
+def controller_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
+    """Return the archive of the controller's FMU, without library, for a checked gain document.
+
+    Args:
+        document: gain document.
+        fmi: version of FMI, 2 or 3.
+
+    Raises:
+        InputError: If the compensator cannot be translated to C.
+    """
+    variables = controller_variables(document)
+    names = c_names(variables)
+    gains = [name for name in names if name.startswith("V_GAINS_")]
+    limits = [name for name in names if name.startswith("V_LIMITS_")]
+    code = generate_c99(document)
+    is_one_axis = kind_of(document) is ONE_AXIS
+    return build_fmu(
+        identifier=IDENTIFIER,
+        name=f"{IDENTIFIER}: {document['compensator']}",
+        description="Controller of a docking rig; co-simulation with a rig adds a control period to the loop",
+        period=float(document["control_period"]),
+        variables=variables,
+        files={
+            HEADER_FILE: code[HEADER_FILE],
+            SOURCE_FILE: code[SOURCE_FILE],
+            GAINS_FILE: code[GAINS_FILE],
+            "fmu_model.h": read_source("controller.h"),
+            "fmu_model.c": read_source("controller_one_axis.c" if is_one_axis else "controller_six_axes.c"),
+            "controller_events.h": read_source("controller_events.h"),
+        },
+        constants={
+            "FMU_GAIN_COUNT": len(gains),
+            "FMU_FIRST_GAIN": names.index(gains[0]) if gains else 0,
+            "FMU_FIRST_LIMIT": names.index(limits[0]),
+        },
+        fmi=fmi,
+    )

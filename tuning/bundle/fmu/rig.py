@@ -1,0 +1,227 @@
+"""FMU of the rig: numerical model, motion simulator, contact and sensors of a mechanism with one axis.
+
+The C code has the equations of `tuning.rig.plant`; this module generates its constants.
+"""
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from msgspec import structs
+
+from jaxhil.errors import InputError, format_value
+from jaxhil.mechanism.file import from_plain_data
+from jaxhil.mechanism.structs import Contact, Mechanism
+from tuning.bundle.c99_tables import format_double
+from tuning.bundle.fmu.archive import build_fmu
+from tuning.bundle.fmu.sources import read_source
+from tuning.bundle.fmu.variables import TIME, Variable
+from tuning.rig.plant import PlantConstants, compute_plant_constants
+
+IDENTIFIER = "jaxhil_rig"
+LAWS = (
+    *("linear", "kelvin_voigt", "hunt_crossley", "piecewise_linear"),
+    *("hardening", "depth_damped", "elastoplastic", "preloaded"),
+)
+INTEGRATORS = ("semi_implicit_euler", "zoh", "explicit_euler")
+MAX_SEED = 2**31 - 1
+# Bounds of the parameters: values from which a simulation remains finite.
+MASSES, SPEEDS, FORCES, DISTANCES = (1e-9, 1e12), (1e-9, 1e3), (0.0, 1e9), (0.0, 1e3)
+SOURCE_FILES = ("contact_law.h", "contact_law.c", "sensor_lag.h", "sensor_lag.c")
+
+_CONSTANTS_TEMPLATE = """\
+/* Constants of the rig, from the mechanism file; numbers in SI units. */
+#ifndef RIG_CONSTANTS_H
+#define RIG_CONSTANTS_H
+
+#include <math.h>
+
+enum {{ {laws} }};
+enum {{ {integrators} }};
+
+{macros}
+{tables}
+#endif
+"""
+
+
+def rig_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
+    """Return the archive of the rig's FMU, without library, for the mechanism of a gain document.
+
+    Args:
+        document: gain document of one axis.
+        fmi: version of FMI, 2 or 3.
+
+    Raises:
+        InputError: If the contact law is not a built-in one.
+    """
+    mechanism = _without_extra_periods(document)
+    if mechanism.contact.law not in LAWS:
+        found = f"found {format_value(mechanism.contact.law)}, expected one of {', '.join(LAWS)}"
+        raise InputError(f"fmu: contact.law: {found}; use `--format c99` to export without the rig")
+    return build_fmu(
+        identifier=IDENTIFIER,
+        name=f"{IDENTIFIER}: {mechanism.name}",
+        description="Simulated docking rig: numerical model, motion simulator, contact and sensors",
+        period=mechanism.rig.control_period,
+        variables=rig_variables(mechanism),
+        files={
+            **{name: read_source(name) for name in SOURCE_FILES},
+            "fmu_model.h": read_source("rig.h"),
+            "fmu_model.c": read_source("rig.c"),
+            "rig_constants.h": rig_constants(mechanism),
+        },
+        constants={},
+        fmi=fmi,
+    )
+
+
+def _without_extra_periods(document: Mapping[str, Any]) -> Mechanism:
+    """Return the mechanism without the command latency that the co-simulation itself adds."""
+    mechanism = from_plain_data(copy.deepcopy(document["mechanism"]), "gain document")
+    extra = document.get("figures", {}).get("co_simulation", {}).get("extra_periods", 0)
+    if not 0 <= extra <= mechanism.rig.command_latency:
+        expected = f"0 to {mechanism.rig.command_latency}, the rig.command_latency"
+        raise InputError(
+            f"figures.co_simulation.extra_periods: found {format_value(extra)}, expected {expected}"
+        )
+    latency = mechanism.rig.command_latency - extra
+    return structs.replace(mechanism, rig=structs.replace(mechanism.rig, command_latency=latency))
+
+
+def rig_variables(mechanism: Mechanism) -> list[Variable]:
+    """Return the variables of the rig's FMU."""
+    rig, approach = mechanism.rig, mechanism.approach
+    force, position = rig.force_sensor, rig.position_sensor
+
+    def parameter(name: str, unit: str, description: str, start: float, lowest: float, highest: float):
+        return Variable(name, "parameter", "real", description, unit, start, lowest, highest)
+
+    def output(name: str, unit: str, description: str):
+        return Variable(name, "output", "real", description, unit)
+
+    return [
+        TIME,
+        Variable("force_command", "input", "real", "force of the controller on the numerical model", "N"),
+        Variable("position_command", "input", "real", "position command to the motion simulator", "m"),
+        Variable("next_run", "input", "boolean", "true in a step that begins a run, at the rebound speed"),
+        Variable("contact", "input", "integer", "index of the next contact in the mechanism's lists"),
+        output("force_measured", "N", "reading of the force sensor, compression positive"),
+        output("position_measured", "m", "position reading of the motion simulator"),
+        output("position", "m", "position of the numerical model"),
+        output("velocity", "m/s", "velocity of the numerical model"),
+        output("acceleration", "m/s^2", "acceleration of the numerical model in the last period"),
+        output("contact_force", "N", "real contact force, without the effects of the sensor"),
+        output("position_shortfall", "m", "distance between the requested and the rate-limited command"),
+        parameter("equivalent_mass", "kg", "mass of the relative motion", mechanism.bodies.mass, *MASSES),
+        parameter("approach_velocity", "m/s", "speed of the first approach", approach.velocity, *SPEEDS),
+        parameter("approach_phase", "1", "phase of the contact in its period", approach.phase, 0.0, 1.0),
+        parameter("force_noise", "N", "standard deviation of its noise", force.noise_std, *FORCES),
+        parameter("position_noise", "m", "standard deviation of its noise", position.noise_std, *DISTANCES),
+        Variable("seed", "parameter", "integer", "seed of the noise", lowest=0, highest=MAX_SEED),
+    ]  # fmt: skip
+
+
+def rig_constants(mechanism: Mechanism) -> str:
+    """Return the text of `rig_constants.h` for a mechanism."""
+    rig, contact = mechanism.rig, mechanism.contact
+    force, simulator = rig.force_sensor, rig.simulator
+    plant = compute_plant_constants(mechanism)
+    stiffness, damping, depths = _contact_tables(contact)
+    integers = {
+        "RIG_ORDER": max(1, len(plant.rows.transition)),  # arrays have no length of 0
+        "RIG_LATENCY": rig.command_latency,
+        "RIG_LINEAR_HOLD": int(rig.command_hold == "linear"),
+        "RIG_RING": plant.ring_size,
+        "RIG_CONTACT_INTERVALS": plant.contact_intervals,
+        "RIG_FORCE_INTERVALS": plant.force_intervals,
+        "RIG_POSITION_INTERVALS": plant.position_intervals,
+        "RIG_CONTACTS": len(stiffness),
+        "RIG_LAYERS": len(stiffness[0]),
+        "RIG_LAW": f"LAW_{contact.law.upper()}",
+        "RIG_TENSION": int(bool(getattr(contact, "tension", False))),
+        "RIG_INTEGRATOR": f"INTEGRATOR_{rig.integrator.upper()}",
+    }
+    numbers = {
+        "RIG_PERIOD": rig.control_period,
+        "RIG_SAMPLE_TIME": plant.sample_time,
+        "RIG_PLANE": rig.contact_plane,
+        "RIG_CLEARANCE": contact.clearance,
+        "RIG_VELOCITY_LIMIT": simulator.velocity_limit,
+        "RIG_ACCELERATION_LIMIT": simulator.acceleration_limit,
+        "RIG_TIME_CONSTANT": force.time_constant,
+        "RIG_FORCE_QUANTUM": force.quantum,
+        "RIG_DEAD_ZONE": force.dead_zone,
+        "RIG_FORCE_BIAS": force.bias,
+        "RIG_FORCE_RANGE": force.range,
+        "RIG_POSITION_QUANTUM": rig.position_sensor.quantum,
+        "RIG_EXPONENT": _contact_number(contact, "exponent", 1.0),
+        "RIG_REFERENCE_DEPTH": _contact_number(contact, "reference_depth", 1.0),
+        "RIG_UNLOADING_RATIO": _contact_number(contact, "unloading_ratio", 1.0),
+        "RIG_PRELOAD": _contact_number(contact, "preload", 0.0),
+        "RIG_FRICTION": _contact_number(contact, "friction", 0.0),
+    }
+    macros = integers | {name: _parenthesised(value) for name, value in numbers.items()}
+    tables = [
+        _table("rig_stiffness[RIG_CONTACTS][RIG_LAYERS]", stiffness),
+        _table("rig_damping[RIG_CONTACTS]", damping),
+        _table("rig_depths[RIG_LAYERS]", depths),
+        *_simulator_tables(plant),
+    ]
+    return _CONSTANTS_TEMPLATE.format(
+        laws=", ".join(f"LAW_{name.upper()}" for name in LAWS),
+        integrators=", ".join(f"INTEGRATOR_{name.upper()}" for name in INTEGRATORS),
+        macros="".join(f"#define {name} {value}\n" for name, value in macros.items()),
+        tables="".join(tables),
+    )
+
+
+def _simulator_tables(plant: PlantConstants) -> list[str]:
+    """Return the C tables of the motion simulator; an ideal simulator gets a state that is always 0."""
+    rows = plant.rows
+    order = max(1, len(rows.transition))
+
+    def padded(row: Sequence[float]) -> list[float]:
+        return [0.0] * (order + 2 - len(row)) + [*row]
+
+    transition = [padded(row) for row in rows.transition] or [[0.0] * (order + 2)]
+    pairs = {"start": rows.start, "sample": rows.sample, "end": rows.end}
+    return [
+        _table("rig_transition[RIG_ORDER][RIG_ORDER + 2]", transition),
+        *(_table(f"rig_{name}[2][RIG_ORDER + 2]", [*map(padded, pair)]) for name, pair in pairs.items()),
+        _table("rig_measured[RIG_ORDER + 2]", padded(rows.measured)),
+        _table("rig_steady_command[RIG_ORDER]", rows.steady_command or [0.0]),
+        _table("rig_steady_step[RIG_ORDER]", rows.steady_step or [0.0]),
+    ]
+
+
+def _contact_tables(contact: Contact) -> tuple[list[list[float]], list[float], list[float]]:
+    """Return stiffness and damping of each contact, and the depths at which layers end."""
+    count = max(len(contact.stiffness), len(contact.damping))
+    slopes = [contact.stiffness[min(number, len(contact.stiffness) - 1)] for number in range(count)]
+    damping = [float(contact.damping[min(number, len(contact.damping) - 1)]) for number in range(count)]
+    depths = getattr(contact, "depths", None) or []
+    return [row if isinstance(row, list) else [row] for row in slopes], damping, [*depths, math.inf]
+
+
+def _contact_number(contact: Contact, name: str, default: float) -> float:
+    """Return a number that only some contact laws have; `default` for other laws."""
+    value = getattr(contact, name, None)
+    return default if value is None else float(value)
+
+
+def _table(declaration: str, values: Any) -> str:
+    return f"static const double {declaration} = {_initialiser(values)};\n"
+
+
+def _initialiser(values: Any) -> str:
+    if isinstance(values, int | float):
+        return format_double(float(values))
+    return f"{{{', '.join(map(_initialiser, values))}}}"
+
+
+def _parenthesised(value: float) -> str:
+    """Return a C literal that can follow an operator."""
+    text = format_double(value)
+    return f"({text})" if text.startswith("-") else text
