@@ -183,11 +183,9 @@ def long_document(law: str) -> dict[str, Any]:
     return sign(document)
 
 
-@functools.cache
-def delays(law: str) -> frozenset[str]:
+def delays(law: str) -> set[str]:
     """Return the names of gains and limits that are delays of delay lines in the C controller."""
-    header = generate_c99(gain_document(law))["jaxhil_controller.h"]
-    return frozenset(name.lower() for name in re.findall(r"#define JAXHIL_(\w+)_SAMPLES", header))
+    return {"alignment", "identification_delay"} & {*LIMITS, *COMPENSATORS[law].gains}
 
 
 def packed(law: str, gain_file: GainFile) -> np.ndarray:

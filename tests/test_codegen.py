@@ -55,13 +55,8 @@ def sums_of_ints(a: float, b: float) -> float:
     return float(total - more * 3000000) + float(more - int(b + 1.0))
 
 
-def remainders(a: float, b: float) -> float:
-    return a // b + a % b
-
-
 def remainders_of_ints(a: float, b: float) -> float:
-    first, second = int(a), int(b)
-    return float(first // second + 100 * (first % second))
+    return float(100 * (int(a) % int(b)))
 
 
 def early_return(a: float, b: float) -> float:
@@ -123,7 +118,6 @@ class Outer:
 
     inner: Inner
     matrix: Annotated[list[list[float]], 3, 2]
-    _line: Annotated[DelayLine, "lag"]
 
     def __init__(self, scale: float, period: Positive) -> None:
         self.inner = Inner(scale)
@@ -173,7 +167,6 @@ FUNCTIONS = (
     whole,
     product_of_ints,
     sums_of_ints,
-    remainders,
     remainders_of_ints,
     early_return,
     conditions,
@@ -184,7 +177,7 @@ OF_INTS = (whole, product_of_ints, sums_of_ints, remainders_of_ints)
 def compiled(tmp_path, program: CProgram, more: str = "") -> ctypes.CDLL:
     """Return the program as a shared library, compiled with the controller's strict flags."""
     output = program.output()
-    text = f"{HEADER}#define T_LAG_SAMPLES 4\n{output.declarations}\n{output.definitions}\n{more}"
+    text = f"{HEADER}#define T_DELAY_LINE_SAMPLES 4\n{output.declarations}\n{output.definitions}\n{more}"
     (tmp_path / "program.c").write_text(text)
     return ctypes.CDLL(str(c99_cases.compiled(tmp_path, "program.c", "program.so", *STRICT)))
 
@@ -278,8 +271,17 @@ def calls_itself(a: float, b: float) -> float:
     return a if b > 0.0 else calls_itself(a, b + 1.0)
 
 
+def assigns_none(a: float, b: float) -> float:
+    value = None
+    return a + b if value is None else b
+
+
 def has_a_dictionary(a: float, b: float) -> float:
     return {1: a}[1] + b
+
+
+def divides_to_an_integer(a: float, b: float) -> float:
+    return a // b
 
 
 def hides_a_branch(a: float, b: float) -> float:
@@ -363,6 +365,20 @@ class Sharing:
         self.first[0] = 0.0
 
 
+class Defaulting:
+    """Class attribute that is a default value: `__init__` does not assign it, but a method does."""
+
+    count: int = 3
+
+    def __init__(self, start: float) -> None:
+        self.total = start
+
+    def step(self, a: float, b: float) -> float:
+        self.total += a * self.count
+        self.count = 2
+        return self.total + b
+
+
 @pytest.mark.parametrize(
     ("function", "line", "message"),
     [
@@ -372,16 +388,30 @@ class Sharing:
         (has_no_annotation, 0, "found no type in C for a of has_no_annotation, expected an annotation"),
         (uses_text, 1, "found len of a text, expected len of a list"),
         (calls_itself, 0, "found calls_itself calling itself, expected a loop"),
+        (assigns_none, 1, "found a value without equivalent in C, expected a number, a bool or a text"),
         (has_a_dictionary, 1, "found Dict, expected an expression of numbers"),
+        (
+            divides_to_an_integer,
+            1,
+            "found FloorDiv, expected +, -, *, / or ** of numbers, %, &, | or ^ of ints",
+        ),
         (hides_a_branch, 1, "found With, expected assignments, if, for"),
         (Sharing.__init__, 2, "found a list that is shared and changed in place, expected a copy"),
+        (
+            Defaulting.step,
+            2,
+            "found the first assignment to count, which has a default, expected an assignment",
+        ),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
 def test_python_construct_outside_c99_subset_is_rejected_with_file_and_line(function, line, message):
     program = CProgram("t_")
+    owner = {Sharing.__init__: Sharing, Defaulting.step: Defaulting}.get(function)
     with pytest.raises(SubsetError) as error:
-        program.add(function, Sharing if function is Sharing.__init__ else None)
+        if owner is not None:
+            program.add(owner.__init__, owner)
+        program.add(function, owner)
         program.output()
     location = f"{inspect.getsourcefile(function)}:{inspect.getsourcelines(function)[1] + line}: "
     assert str(error.value).startswith(location + message), error.value

@@ -13,28 +13,9 @@ C_HELPERS = {
 const volatile double exact = exponent;
 return pow(base, exact);
 }""",
-    "modulo": """double @modulo(double value, double divisor) {
-const double rest = fmod(value, divisor);
-if (rest == 0.0) {
-return copysign(0.0, divisor);
-}
-return (divisor < 0.0) != (rest < 0.0) ? rest + divisor : rest;
-}""",
-    "floor_division": """double @floor_division(double value, double divisor) {
-const double rest = fmod(value, divisor);
-const bool is_below = rest != 0.0 && (divisor < 0.0) != (rest < 0.0);
-const double quotient = (value - rest) / divisor - (is_below ? 1.0 : 0.0);
-const double whole = floor(quotient);
-return quotient == 0.0 ? copysign(0.0, value / divisor) : quotient - whole > 0.5 ? whole + 1.0 : whole;
-}""",
-    "modulo_int": """int64_t @modulo_int(int64_t value, int64_t divisor) {
+    "modulo": """int64_t @modulo(int64_t value, int64_t divisor) {
 const int64_t rest = divisor == -1 ? 0 : value % divisor;
 return rest != 0 && (rest < 0) != (divisor < 0) ? rest + divisor : rest;
-}""",
-    "floor_division_int": """int64_t @floor_division_int(int64_t value, int64_t divisor) {
-const int64_t quotient = divisor == -1 ? -value : value / divisor;
-const int64_t rest = divisor == -1 ? 0 : value % divisor;
-return rest != 0 && (rest < 0) != (divisor < 0) ? quotient - 1 : quotient;
 }""",
 }
 
@@ -46,39 +27,36 @@ def escape_comment(text: str) -> str:
 
 def format_comment(text: str | None) -> str:
     """Format a docstring as a C comment; return "" for an empty docstring."""
-    lines = escape_comment(inspect.cleandoc(text or "")).splitlines()
-    if len(lines) < 2:
-        return f"/* {lines[0]} */\n" if lines else ""
-    return "\n".join([f"/* {lines[0]}", *(f" * {line}".rstrip() for line in lines[1:]), " */\n"])
+    first, *lines = escape_comment(inspect.cleandoc(text or "")).split("\n")
+    if not lines:
+        return f"/* {first} */\n" if first else ""
+    return "\n".join([f"/* {first}", *(f" * {line}".rstrip() for line in lines), " */\n"])
 
 
 def indent_lines(lines: Iterable[str]) -> str:
     """Join lines of C code: indent them by the depth of their braces, and break long lines."""
-    depth, result = 0, []
+    depth, result = 0, ""
     for line in lines:
         depth -= line.startswith("}")
-        result.append(_break_line("    " * depth + line))
+        result += _break_line("    " * depth, line) + "\n"
         depth += line.endswith("{")
-    return "\n".join(result) + "\n"
+    return result
 
 
-def _break_line(line: str) -> str:
+def _break_line(indent: str, line: str) -> str:
     """Break a long line after a comma or before an operator, at the lowest depth of parentheses."""
-    indent = " " * (len(line) - len(line.lstrip()))
+    line = indent + line
     if len(line) <= MAX_LINE_LENGTH:
         return line
     if line.lstrip().startswith("/*"):
-        return "\n".join(
-            textwrap.wrap(line, MAX_LINE_LENGTH, initial_indent="", subsequent_indent=f"{indent} * ")
-        )
+        return "\n".join(textwrap.wrap(line, MAX_LINE_LENGTH, subsequent_indent=f"{indent} * "))
     breaks, depth = [], 0
     for index, character in enumerate(line[:MAX_LINE_LENGTH]):
-        depth += {"(": 1, ")": -1}.get(character, 0)
+        depth += (character == "(") - (character == ")")
         is_break = line[index - 1 : index + 1] == ", " or re.match(r" (&&|\|\||[-+*/?:]) ", line[index:])
         if is_break and index > len(indent) + 12:
             breaks.append((-depth, index))
     if not breaks:
         return line
     index = max(breaks)[1]
-    rest = indent + " " * 8 * (len(indent) % 8 != 4 or 1) + line[index:].lstrip()
-    return f"{line[:index].rstrip()}\n{_break_line(rest)}"
+    return f"{line[:index].rstrip()}\n{_break_line(indent + ' ' * 8, line[index:].lstrip())}"

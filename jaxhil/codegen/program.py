@@ -7,27 +7,11 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from .lowering import Lowering
 from .printing import C_HELPERS, escape_comment, format_comment, indent_lines
 from .python_source import find_annotations, find_definition, find_name_lines, read_constant_comment
-from .records import StructLowering
 from .statements import BodyLowering
-from .subset import (
-    BOOL,
-    C_RESERVED_WORDS,
-    FLOAT,
-    INT,
-    TEXT,
-    UNARY,
-    CExpression,
-    Locations,
-    SubsetError,
-    ValueType,
-    as_float,
-    refusal,
-    sign_of,
-    type_of_annotation,
-)
+from .subset import C_RESERVED_WORDS, FLOAT, INT, Locations, SubsetError, ValueType, type_of_annotation
+from .values import CExpression, Rank, constant
 
 
 class CFunction:
@@ -51,7 +35,8 @@ class CFunction:
         self.retained: dict[str, Locations] = {}  # list parameters that the function assigns to attributes
         self.shared: dict[Any, SubsetError] = {}  # errors for local lists that are also attributes
         self.replaced: Locations = frozenset()  # attributes that get a new list or object
-        self.fails, self.reason = False, ""  # whether the function may fail; file, line and reason
+        self.fails = False  # whether the function may fail
+        self.reason: tuple[str, int, str] | None = None  # file, line and reason of the first test
         self.name, self.error = "", "error"
         self.lines: list[str] = []
 
@@ -68,12 +53,12 @@ class GeneratedCode(NamedTuple):
     definitions: str
 
 
-class CProgram(StructLowering):
+class CProgram:
     """C program with lowered functions, their structs, constants and helpers.
 
     Args:
         prefix: prefix of all C names.
-        structs: signs of the fields of structs such as `jaxhil_gains`, by struct and field.
+        structs: least values of the fields of structs such as `jaxhil_gains`, by struct and field.
         names: C names of classes, without the prefix, if they differ from the names in Python.
         public: functions that the header declares, with their C names.
         bindings: classes that replace types in annotations; for example, a compensator replaces its protocol.
@@ -83,17 +68,19 @@ class CProgram(StructLowering):
     def __init__(
         self,
         prefix: str,
-        structs: Mapping[str, Mapping[str, str]] | None = None,
+        structs: Mapping[str, Mapping[str, float]] | None = None,
         names: Mapping[type, str] | None = None,
         public: Mapping[Callable[..., Any], str] | None = None,
         bindings: Mapping[type, type] | None = None,
         enumerators: Mapping[str, int] | None = None,
     ) -> None:
-        super().__init__(prefix, names or {}, bindings or {})
-        self.struct_signs, self.public = structs or {}, public or {}
-        self.enumerators = enumerators or {}
+        self.prefix, self.lowest, self.names, self.public = prefix, structs or {}, names or {}, public or {}
+        self.bindings, self.enumerators = bindings or {}, enumerators or {}
+        self.fields: dict[type, dict[str, ValueType]] = {}  # types of the attributes of each class
+        self.changed_in_place: Locations = frozenset()  # locations of lists that change in place
+        self.shared: list[tuple[Locations, SubsetError]] = []  # locations of one list, and the error
+        self.under_way: list[Any] = []  # keys of the functions that are being lowered
         self.functions: dict[Any, CFunction] = {}
-        self.under_way: list[Any] = []
         self.constants: dict[str, tuple[str, str]] = {}  # C code and comment of each constant, by name
         self.helpers: set[str] = set()
 
@@ -103,25 +90,19 @@ class CProgram(StructLowering):
 
     def parameters(self, function: Callable[..., Any], owner: type | None) -> dict[str, ValueType]:
         """Return the types of a function's parameters, and of its result under the key "return"."""
-        protocols = [protocol for protocol, bound in self.bindings.items() if bound is owner]
-        hints = find_annotations(function, *protocols[:1])
-        types = {}
+        protocol = next((protocol for protocol, bound in self.bindings.items() if bound is owner), None)
+        hints, types = find_annotations(function, protocol), {}
         for name in [*inspect.signature(function).parameters, "return"]:
             type_ = type_of_annotation(hints.get(name, None if name == "return" else ...), self.bindings)
-            if type_ is None and name != "self":
+            if name != "self" and type_ is None:
                 node, file = find_definition(function)
                 found = f"no type in C for {name} of {function.__name__}"
-                raise refusal(file, node.lineno, found, "an annotation such as float, int or bool")
-            if name != "self" and type_ is not None:
-                types[name] = type_
+                raise SubsetError(file, node.lineno, found, "an annotation such as float, int or bool")
+            types |= {name: type_} if name != "self" else {}
         return types
 
     def function(
-        self,
-        function: Callable[..., Any],
-        owner: type | None,
-        types: Mapping[str, ValueType],
-        caller: Lowering | None,
+        self, function: Any, owner: type | None, types: Mapping[str, ValueType], caller: Any
     ) -> CFunction:
         """Return the C function for a Python function with parameter types; lower it on the first call."""
         key = (function, owner, *((n, t.length, t.of) for n, t in types.items() if t.kind == "list"))
@@ -153,81 +134,89 @@ class CProgram(StructLowering):
         return next(text for text in (base, *alternatives) if text not in taken and not text.endswith("_"))
 
     def local_type(self, function: CFunction, node: ast.expr) -> ValueType | None:
-        """Return the type of a local variable's annotation; None if C has no equivalent."""
         try:
             hint = eval(compile(ast.Expression(node), function.file, "eval"), function.namespace)
         except Exception:
             return None
         return type_of_annotation(hint, self.bindings)
 
-    def constant(self, value: Any) -> CExpression | None:
-        """Return the C expression for a constant; None if it is not a number, bool, text or sequence."""
-        if isinstance(value, (str, tuple, list, frozenset)):
-            return CExpression("", TEXT, constant=value)
-        if isinstance(value, bool):
-            return CExpression("true" if value else "false", BOOL, constant=value)
-        if not isinstance(value, (int, float)):
-            return None
-        special = {math.inf: "INFINITY", -math.inf: "-INFINITY"}
-        text = "NAN" if math.isnan(value) else special.get(value, repr(value))
-        span = (value, value) if math.isfinite(value) else None
-        rank = UNARY if text.startswith("-") else 16
-        type_ = INT if isinstance(value, int) else FLOAT
-        return CExpression(text, type_, rank, sign=sign_of(value), span=span, constant=value)
+    def class_name(self, class_: type) -> str:
+        snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", class_.__name__).lower()
+        return self.prefix + self.names.get(class_, snake)
 
-    def literal(self, value: Any) -> CExpression:
-        """Return the C expression for a constant, with empty code if C has no equivalent."""
-        return self.constant(value) or CExpression("", TEXT, constant=value)
+    def c_type(self, type_: ValueType) -> str:
+        simple = {"float": "double", "int": type_.c_int, "bool": "bool", "none": "void", "list": "void"}
+        simple["struct"] = f"{self.prefix}{type_.of}"
+        return simple[type_.kind] if type_.kind in simple else self.class_name(type_.of)
 
-    def named_constant(self, name: str, namespace: dict[str, Any]) -> CExpression | None:
-        """Return the C name of a module's constant as an expression; None if C has no equivalent."""
-        value = namespace[name]
-        result, named = self.constant(value), f"{self.prefix}{name}".upper()
-        if result is not None and self.enumerators.get(name) == value:
-            return result._replace(text=named, rank=16)
+    def declaration(self, type_: ValueType, name: str) -> str:
+        """Return the C declaration of a name, without the semicolon."""
+        while type_.kind == "list":
+            name, type_ = f"{name}[{type_.length or type_.capacity}]", type_.of
+        return f"{self.c_type(type_)} {name}"
+
+    def local(self, name: str) -> str:
+        return f"{name}_" if name in C_RESERVED_WORDS else name
+
+    def class_of(self, function: Any, node: ast.expr) -> type | None:
+        """Return the class whose constructor an expression calls; None if it calls no constructor."""
+        called = node.func if isinstance(node, ast.Call) else None
+        value = function.namespace.get(called.id) if isinstance(called, ast.Name) else None
+        is_class = inspect.isclass(value) and not issubclass(value, tuple) and value.__module__ != "builtins"
+        return value if is_class else None
+
+    def field_name(self, class_: type, name: str) -> str:
+        plain = name.lstrip("_")
+        taken = {*self.fields.get(class_, {}), *getattr(class_, "__slots__", ())}
+        return self.local(plain if plain == name or plain not in taken else f"{plain}_")
+
+    def named_constant(self, name: str, namespace: dict[str, Any]) -> CExpression:
+        """Return the C name of a module's constant as an expression."""
+        value, named = namespace[name], f"{self.prefix}{name}".upper()
+        result = constant(value)
+        if self.enumerators.get(name) == value:
+            return result._replace(text=named, rank=Rank.ATOM)
         if isinstance(value, tuple) and value and all(isinstance(element, (int, float)) for element in value):
             type_ = FLOAT if any(isinstance(element, float) for element in value) else INT
             joined = ", ".join(repr(float(element) if type_ is FLOAT else element) for element in value)
             named = f"{self.prefix}{name.lstrip('_')}".lower()
             text = f"static const {self.c_type(type_)} {named}[{len(value)}] = {{{joined}}};"
             result = CExpression(named, ValueType("list", type_, len(value)), constant=value)
-        elif result is None or not isinstance(value, (int, float)) or not math.isfinite(value):
+        elif not isinstance(value, (int, float)) or not math.isfinite(value):
             return result
         else:
-            text, result = result.at(16), result._replace(text=named, rank=16)
+            text, result = result.at(Rank.ATOM), result._replace(text=named, rank=Rank.ATOM)
         if self.constants.get(named, (text, ""))[0] != text:
-            return self.constant(value)  # a different module uses the same name for a different value
+            return constant(value)  # a different module uses the same name for a different value
         self.constants[named] = (text, read_constant_comment(name, namespace))
         return result
 
     def helper(self, name: str, *texts: str) -> str:
-        """Return the C code for a call of a helper."""
         self.helpers.add(name)
         return f"{self.prefix}{name}({', '.join(texts)})"
 
-    def stored(self, required: ValueType, value: CExpression) -> str:
-        """Return the C code for a value that is assigned to a variable or parameter of the required type."""
-        if required.kind == "object":
-            return value.text if value.is_pointer else f"&{value.text}"
-        if required.kind == "float" and value.type.kind == "int":
-            return as_float(value).text
-        is_cast = required.kind == "int" and required.c_int not in ("int64_t", value.type.c_int)
-        return f"({required.c_int}){value.at(UNARY)}" if is_cast and value.constant is None else value.text
+    def capacities(self, owner: Any) -> dict[str, int]:
+        """Return the lengths of an object's lists of run-time length, by the names of their capacities."""
+        result: dict[str, int] = {}
+        for name, type_ in self.fields.get(type(owner), {}).items():
+            lengths = {type_.capacity: len(getattr(owner, name))} if type_.capacity else {}
+            lengths |= self.capacities(getattr(owner, name)) if type_.kind == "object" else {}
+            result |= {key: max(length, result.get(key, 0)) for key, length in lengths.items()}
+        return result
 
     def output(self) -> GeneratedCode:
         """Return the C code of all lowered functions with their structs, constants and helpers."""
         for keys, error in self.shared:
             if self.changed_in_place & keys:
                 raise error
-        lowered = [*self.functions.values()]
-        public = [function for function in lowered if function.function in self.public]
+        public = [function for function in self.functions.values() if function.function in self.public]
         for function in public:
-            if function.fails:
-                found = f"{function.reason} within {function.name}"
-                raise SubsetError(f"{found}, expected an operation that cannot raise, or `try` around it")
+            if function.reason and function.fails:
+                file, line, reason = function.reason
+                expected = "an operation that cannot raise, or `try` around it"
+                raise SubsetError(file, line, f"{reason} within {function.name}", expected)
         prototypes = (f"\n{format_comment(ast.get_docstring(f.node))}{self._signature(f)};\n" for f in public)
-        structs = self.structs([function.owner for function in lowered if function.owner])
-        functions = "".join(self._definition(function) for function in lowered)
+        functions = "".join(map(self._definition, self.functions.values()))
         texts = []
         for name, (value, note) in self.constants.items():
             if re.search(rf"\b{name}\b", functions):
@@ -235,15 +224,33 @@ class CProgram(StructLowering):
                 texts.append(f"{head} /* {escape_comment(note)} */\n" if note else f"{head}\n")
         for name in sorted(self.helpers):
             texts.append("\nstatic " + indent_lines(C_HELPERS[name].replace("@", self.prefix).splitlines()))
-        return GeneratedCode(structs + "".join(prototypes), "".join(texts) + functions)
+        return GeneratedCode(self._structs() + "".join(prototypes), "".join(texts) + functions)
+
+    def _structs(self) -> str:
+        """Return the C structs of all classes, ordered so that a struct follows its member structs."""
+        texts: dict[type, str] = {}
+
+        def visit(class_: type) -> None:
+            lines, name = [], self.class_name(class_)
+            for field, type_ in self.fields.get(class_, {}).items():
+                if type_.kind in ("object", "record") and type_.of not in texts:
+                    visit(type_.of)
+                if type_.kind != "text":
+                    lines.append(f"{self.declaration(type_, self.field_name(class_, field))};")
+            lines = lines or ["char nothing; /* C has no empty structs */"]
+            text = indent_lines([f"typedef struct {name} {{", *lines, f"}} {name};"])
+            texts[class_] = f"\n{format_comment(inspect.getdoc(class_))}{text}"
+
+        owners = [function.owner for function in self.functions.values() if function.owner]
+        for class_ in dict.fromkeys([*self.fields, *owners]):
+            if class_ not in texts:
+                visit(class_)
+        return "".join(texts.values())
 
     def _signature(self, function: CFunction) -> str:
-        constant, parts = "" if function.writes else "const ", []
+        const, parts = "" if function.writes else "const ", []
         if function.owner:
-            parts.append(f"{constant}{self.class_name(function.owner)} *self")
-            for name in self.samples_in(function.owner):
-                is_first = function.node.name == "__init__"
-                parts += [f"{constant}double *{name}"] + [f"int64_t {name}_capacity"] * is_first
+            parts.append(f"{const}{self.class_name(function.owner)} *self")
         parts += [self._parameter(function, name, type_) for name, type_ in function.parameters.items()]
         parts += [f"{self.c_type(function.returns.of)} *result"] if function.returns.kind == "list" else []
         parts += ["bool *error"] if function.fails else []
@@ -263,7 +270,7 @@ class CProgram(StructLowering):
     def _definition(self, function: CFunction) -> str:
         lines = [line.replace("@const@", "" if function.writes else "const ") for line in function.lines]
         names = ["self"] * bool(function.owner)
-        names += [*map(self.local, function.parameters), *self.samples_in(function.owner)]
+        names += map(self.local, function.parameters)
         unused = [f"(void){name};" for name in names if not re.search(rf"\b{name}\b", "\n".join(lines))]
         note = "" if function.function in self.public else format_comment(ast.get_docstring(function.node))
         return f"\n{note}{indent_lines([f'{self._signature(function)} {{', *unused, *lines, '}'])}"

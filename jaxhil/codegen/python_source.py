@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from .subset import refusal
+from .subset import SubsetError
 
 
 @cache
@@ -30,13 +30,13 @@ def find_definition(function: Callable[..., Any]) -> tuple[ast.FunctionDef, str]
         node = None
     if not isinstance(node, ast.FunctionDef):
         found = f"no source code of {function.__qualname__}"
-        raise refusal(code.co_filename, code.co_firstlineno, found, "a function in a file")
+        raise SubsetError(code.co_filename, code.co_firstlineno, found, "a function in a file")
     return node, code.co_filename
 
 
-def find_annotations(function: Callable[..., Any], protocol: type | None = None) -> dict[str, Any]:
+def find_annotations(function: Callable[..., Any], protocol: type | None) -> dict[str, Any]:
     """Return the annotations of a function; annotations of the protocol's method take precedence."""
-    method = vars(protocol).get(function.__name__) if protocol is not None else None
+    method = vars(protocol).get(function.__name__) if protocol else None
     method = method.fget if isinstance(method, property) else method
     more = typing.get_type_hints(method, include_extras=True) if inspect.isfunction(method) else {}
     return typing.get_type_hints(function, include_extras=True) | more
@@ -67,10 +67,10 @@ def read_constant_comment(name: str, namespace: dict[str, Any]) -> str:
 def find_name_lines(function: ast.FunctionDef) -> dict[str, list[tuple[int, bool]]]:
     """Return the occurrences of each local name: line number, and whether it is an assignment."""
     targets = [loop.target for loop in ast.walk(function) if isinstance(loop, (ast.For, ast.comprehension))]
-    loops = {id(name) for target in targets for name in ast.walk(target)}
+    loops = {name for target in targets for name in ast.walk(target)}
     result: dict[str, list[tuple[int, bool]]] = {}
     for node in ast.walk(function):
         if isinstance(node, ast.Name):
-            is_store = isinstance(node.ctx, ast.Store) and id(node) not in loops
+            is_store = isinstance(node.ctx, ast.Store) and node not in loops
             result.setdefault(node.id, []).append((node.lineno, is_store))
     return {name: sorted(uses) for name, uses in result.items() if any(store for _, store in uses)}

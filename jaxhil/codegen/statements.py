@@ -2,12 +2,13 @@
 
 import ast
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .calls import CallLowering
-from .lists import has_text
-from .lowering import NumberFact
-from .subset import ATOM, FLOAT, INT, TEXT, UNARY, CExpression, Locations, ValueType
+from .printing import escape_comment
+from .python_source import read_comment_before
+from .subset import FLOAT, INT, Locations, ValueType
+from .values import ZEROS, CExpression, Rank, constant
 
 if TYPE_CHECKING:
     from .program import CFunction, CProgram
@@ -24,18 +25,17 @@ class BodyLowering(CallLowering):
         self.aliases: list[tuple[str, CExpression, int]] = []
         for name, type_ in function.parameters.items():
             text, is_list = program.local(name), type_.kind == "list"
-            reads: Locations = frozenset({("parameter", name)}) if is_list else frozenset()
+            reads: Locations = frozenset({("parameter", name)} if is_list else ())
             value = CExpression(text, type_, reads=reads, sign=type_.sign, is_pointer=type_.kind == "object")
             if type_.kind == "optional":
-                value = value._replace(text=f"*{text}", type=FLOAT, rank=UNARY, length="optional")
+                value = value._replace(text=f"*{text}", type=FLOAT, rank=Rank.UNARY, length="optional")
             self.names[name] = value
-        self.names |= dict.fromkeys(function.texts, CExpression("", TEXT))
+        self.names |= dict.fromkeys(function.texts, constant(""))
         if function.owner is not None:
-            owner, samples = ValueType("object", function.owner), program.samples_in(function.owner)
-            self.names["self"] = CExpression("self", owner, is_pointer=True, samples=samples)
+            owner = ValueType("object", function.owner)
+            self.names["self"] = CExpression("self", owner, is_pointer=True)
 
     def run(self) -> list[str]:
-        """Lower the function; return its lines of C code."""
         self.block(self.function.node.body)
         lines = self.lines[:-1] if self.lines[-1:] == ["return;"] else self.lines
         return [*self.hoisted, *lines]
@@ -47,37 +47,38 @@ class BodyLowering(CallLowering):
         for statement in body:
             is_constant = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
             if not is_constant and not isinstance(statement, ast.Pass):
-                self.explain(statement)
-                lower = getattr(self, f"do_{type(statement).__name__.lower()}", None)
-                if lower is None:
-                    expected = "assignments, if, for, while, return"
-                    raise self.refuse(statement, type(statement).__name__, expected)
+                if text := read_comment_before(self.function.file, statement):
+                    self.emit(f"/* {escape_comment(text)} */")
+                kind = type(statement).__name__
+                lower: Any = getattr(self, f"do_{kind.lower()}", None)
+                self.require(lower, statement, kind, "assignments, if, for, while, return")
                 leaves = bool(lower(statement)) or leaves
         self.span = outer
         return leaves
 
-    def do_assign(self, node: ast.Assign) -> None:
+    def do_assign(self, node: Any) -> None:
         is_simple = isinstance(node.value, (ast.Constant, ast.Attribute, ast.Name))
-        if len(node.targets) > 1 and not is_simple:
-            raise self.refuse(node, "one expression for several targets", "an assignment for each target")
+        expected = "an assignment for each target"
+        self.require(
+            len(node.targets) == 1 or is_simple, node, "one expression for several targets", expected
+        )
         for target in reversed(node.targets):
             if isinstance(target, ast.Tuple):
                 self._unpack(node, target)
             else:
                 self._assign(node, target, node.value)
 
-    def do_annassign(self, node: ast.AnnAssign) -> None:
+    def do_annassign(self, node: Any) -> None:
         required = self.program.local_type(self.function, node.annotation)
-        if node.value is None or required is None:
-            expected = "`name: TYPE = value`, where TYPE is float, int, bool or a class"
-            raise self.refuse(node, f"`{ast.unparse(node)}`", expected)
+        expected = "`name: TYPE = value`, where TYPE is float, int, bool or a class"
+        self.require(node.value and required, node, f"`{ast.unparse(node)}`", expected)
         self._assign(node, node.target, node.value, required)
 
-    def do_augassign(self, node: ast.AugAssign) -> None:
+    def do_augassign(self, node: Any) -> None:
         value = ast.copy_location(ast.BinOp(node.target, node.op, node.value), node)
         self._store(node, node.target, self.number(value))
 
-    def _unpack(self, node: ast.Assign, target: ast.Tuple) -> None:
+    def _unpack(self, node: Any, target: Any) -> None:
         if isinstance(node.value, ast.Tuple):
             values = [self.expression(element) for element in node.value.elts]
             stored = {getattr(target, "id", getattr(target, "attr", "")) for target in target.elts}
@@ -86,61 +87,49 @@ class BodyLowering(CallLowering):
                 values = [self.temporary(value, "value") if value.is_number else value for value in values]
         else:
             value = self.expression(node.value)
-            if value.type.kind != "list" or value.type.length is None:
-                raise self.refuse(node, f"a {value.type.kind} for several names", "a list of fixed length")
-            values = [self.at(value, str(index)) for index in range(value.type.length)]
-        if len(values) != len(target.elts):
-            found = f"{len(target.elts)} targets for {len(values)} values"
-            raise self.refuse(node, found, "as many targets as values")
+            is_list = value.type.kind == "list" and value.type.length is not None
+            self.require(is_list, node, f"a {value.type.kind} for several names", "a list of fixed length")
+            values = [self.at(value, str(index)) for index in range(value.type.length or 0)]
+        found = f"{len(target.elts)} targets for {len(values)} values"
+        self.require(len(values) == len(target.elts), node, found, "as many targets as values")
         for element, value in zip(target.elts, values, strict=True):
-            if getattr(element, "id", "") == "_":
-                continue
-            if value.type.kind in ("object", "list") and isinstance(element, ast.Name):
-                self._alias(node, element, value)
-            else:
+            if getattr(element, "id", "") != "_":
                 self._store(node, element, value)
 
-    def _assign(
-        self, node: ast.stmt, target: ast.expr, source: ast.expr, required: ValueType | None = None
-    ) -> None:
+    def _assign(self, node: Any, target: Any, source: Any, required: ValueType | None = None) -> None:
         class_ = self.program.class_of(self.function, source)
-        if isinstance(target, ast.Attribute) and isinstance(source, ast.Call) and class_ is not None:
-            owner = self.expression(target.value)
-            field = self.program.new_field(self, owner, target, ValueType("object", class_))
+        if isinstance(target, ast.Attribute) and class_ is not None:
+            owner, type_ = self.expression(target.value), ValueType("object", class_)
+            field = self.field(owner, target.attr, target, lambda: type_)
             self.construct(field, class_, source)
             self.replace(node, field.reads)
         elif self.is_display(source):
             self._assign_list(node, target, source)
         else:
-            value = self.expression(source)
-            if value.type.kind in ("object", "list") and isinstance(target, ast.Name):
-                self._alias(node, target, value)
-            elif value.type.kind != "text":
-                self._store(node, target, value, required)
+            self._store(node, target, self.expression(source), required)
 
-    def _alias(self, node: ast.stmt, target: ast.Name, value: CExpression) -> None:
-        """Bind a local name to an object or a list."""
+    def _alias(self, node: Any, target: Any, value: CExpression) -> None:
         occurrences = self.function.occurrences[target.id]
-        is_local = all(self.span[0] <= line <= self.span[1] for line, _ in occurrences)
-        if target.id in self.names or sum(is_store for _, is_store in occurrences) > 1 or not is_local:
-            expected = "a name that is assigned once, and used only within its block"
-            raise self.refuse(node, f"{target.id} assigned twice", expected)
-        uses, tree = [line for line, _ in occurrences], ast.walk(self.function.node)
-        loops = [n for n in tree if isinstance(n, (ast.For, ast.While)) and n.lineno > target.lineno]
+        uses = [line for line, _ in occurrences]
+        is_once = sum(is_store for _, is_store in occurrences) == 1 and target.id not in self.names
+        is_local = self.span[0] <= uses[0] and uses[-1] <= self.span[1]
+        expected = "a name that is assigned once, and used only within its block"
+        self.require(is_once and is_local, node, f"{target.id} assigned twice", expected)
         # A use in a loop may follow the last statement of the loop, in the next iteration.
-        uses += [(loop.end_lineno or 0) + 1 for loop in loops if loop.lineno <= uses[-1]]
-        self.aliases.append((target.id, value, max(uses)))
-        name, type_ = self.program.local(target.id), value.type
-        is_own = type_.kind == "list" and any(key[0] == "local" for key in value.reads)
-        if not is_own and not (type_.kind == "list" and type_.of.kind == "list"):
-            text = value.text if type_.kind == "list" else self.pointer(value)
+        loops = [n for n in ast.walk(self.function.node) if isinstance(n, (ast.For, ast.While))]
+        ends = [(loop.end_lineno or 0) + 1 for loop in loops if target.lineno < loop.lineno <= uses[-1]]
+        self.aliases.append((target.id, value, max(uses + ends)))
+        name, type_, is_list = self.program.local(target.id), value.type, value.type.kind == "list"
+        is_new = is_list and any(key[0] == "local" for key in value.reads)
+        if not is_new and not (is_list and type_.of.kind == "list"):
+            text = value.text if is_list else value.pointer
             if text != name:
-                base = self.program.c_type(type_.of if type_.kind == "list" else type_)
+                base = self.program.c_type(type_.of if is_list else type_)
                 self.emit(f"@const@{base} *const {name} = {text};")
-            value = value._replace(text=name, is_pointer=True, rank=ATOM)
+            value = value._replace(text=name, is_pointer=True, rank=Rank.ATOM)
         self.names[target.id] = value
 
-    def replace(self, node: ast.stmt | ast.expr, keys: Locations, of_element: bool = False) -> None:
+    def replace(self, node: Any, keys: Locations, of_element: bool = False) -> None:
         """Record attributes to which an assignment gives a new list or object.
 
         Raise SubsetError if a local name of the old one is used later: in Python it still means the old one.
@@ -148,95 +137,95 @@ class BodyLowering(CallLowering):
         self.function.replaced |= keys
         for name, value, last in self.aliases:
             is_outer = of_element and value.type.kind == "list" and value.type.of.kind == "list"
-            if value.reads & keys and not is_outer and last > (node.end_lineno or 0):
-                expected = f"`[:] = ` in place, or a copy, `{name} = list(...)`"
-                raise self.refuse(node, f"a new list or object while {name} uses the old one", expected)
+            is_used = value.reads & keys and not is_outer and last > node.end_lineno
+            found, expected = f"a new list or object while {name} uses the old one", f"`{name} = list(...)`"
+            self.require(not is_used, node, found, f"`[:] = ` in place, or a copy, {expected}")
 
-    def _assign_list(self, node: ast.stmt, target: ast.expr, source: ast.expr) -> None:
+    def _assign_list(self, node: Any, target: Any, source: Any) -> None:
         if isinstance(target, ast.Name):
             self._alias(node, target, self.array(source, None, self.program.local(target.id)))
             return
-        field = None if isinstance(target, ast.Attribute) else self.expression(target)
+
+        def new_type() -> ValueType:
+            with self.captured():
+                return self.array(source, None).type
+
         if isinstance(target, ast.Attribute):
             owner = self.expression(target.value)
             if isinstance(source, ast.BinOp) and (count := self.number(source.right)).constant is None:
-                self.program.new_samples(self, owner, target, count)
-                owner = self.expression(target.value)
-            field = self.program.known_field(self, owner, target)
-            if field is None:
-                with self.captured():
-                    type_ = self.array(source, None).type
-                field = self.program.new_field(self, owner, target, type_)
-        if field is None or field.type.kind != "list":
-            raise self.refuse(node, "a list assigned to an element", "a number")
+                self.new_samples(owner, target, count)
+            field = self.field(owner, target.attr, target, new_type)
+        else:
+            field = self.expression(target)
+        self.require(field.type.kind == "list", node, "a list assigned to an element", "a number")
         self.array(source, field)
         self._replace_at(node, target, field)
         self.changed(field, isinstance(target, ast.Subscript))
 
-    def _store(
-        self, node: ast.stmt, target: ast.expr, value: CExpression, required: ValueType | None = None
-    ) -> None:
+    def _store(self, node: Any, target: Any, value: CExpression, required: ValueType | None = None) -> None:
         """Emit the assignment of a value to a name, an attribute or an element."""
-        if isinstance(target, ast.Name):
-            self._store_name(node, target.id, value, required)
-            return
+        is_name, is_element = isinstance(target, ast.Name), isinstance(target, ast.Subscript)
+        if value.type.kind in ("object", "list") and is_name:
+            return self._alias(node, target, value)
+        if value.type.kind == "text":
+            is_text = isinstance(value.constant, (str, tuple, list, frozenset))
+            return self.require(
+                is_text, node, "a value without equivalent in C", "a number, a bool or a text"
+            )
+        if is_name:
+            return self._store_name(node, target.id, value, required)
         if value.fails:
             value = self.temporary(value, self.hint_of(target))
         if isinstance(target, ast.Attribute):
             owner = self.expression(target.value)
-            existing = self.program.known_field(self, owner, target)
-            field = existing or self.program.new_field(self, owner, target, value.type)
-        elif isinstance(target, ast.Subscript):
-            field = self.expression(target)
+            field = self.field(owner, target.attr, target, lambda: value.type)
         else:
-            raise self.refuse(node, "this target", "a name, an attribute or an element")
+            self.require(is_element, node, "this target", "a name, an attribute or an element")
+            field = self.expression(target)
         if field.type.kind == "list":
             self.copy(field, value, node)
             self._replace_at(node, target, field)
             self.share(node, field.reads, value)
         elif field.type.kind != "text":
             self._emit_store(node, field, value)
-        self.changed(field, isinstance(target, ast.Subscript))
+        self.changed(field, is_element)
         if value.sign:
-            self.facts[field.text] = NumberFact(value.sign, field.reads)
+            self.facts[field.text] = field._replace(sign=value.sign)
 
-    def _replace_at(self, node: ast.stmt, target: ast.expr, field: CExpression) -> None:
-        """Record that an assignment replaces a list, unless it is an assignment in place."""
+    def _replace_at(self, node: Any, target: Any, field: CExpression) -> None:
         if not (isinstance(target, ast.Subscript) and isinstance(target.slice, ast.Slice)):
             self.replace(node, field.reads, isinstance(target, ast.Subscript))
 
-    def _emit_store(self, node: ast.stmt, field: CExpression, value: CExpression) -> None:
+    def _emit_store(self, node: Any, field: CExpression, value: CExpression) -> None:
         self.fit(node, field.type, value, f"for a {field.type.kind}", "one type for each name")
-        text = self.program.stored(field.type, value)
+        text = value.stored(field.type)
         operation = re.match(rf"{re.escape(field.text)} ([-+*/&|^]) ", text)
         if operation and isinstance(node, ast.AugAssign):
             self.emit(f"{field.text} {operation[1]}= {text[operation.end() :]};")
         elif text != field.text:
             self.emit(f"{field.text} = {text};")
 
-    def _store_name(self, node: ast.stmt, name: str, value: CExpression, required: ValueType | None) -> None:
+    def _store_name(self, node: Any, name: str, value: CExpression, required: ValueType | None) -> None:
         text, existing = self.program.local(name), self.names.get(name)
         if existing is None:
-            occurrences = self.function.occurrences[name]
-            type_ = required or value.type._replace(c_int="int64_t", sign="")
+            lines = [line for line, _ in self.function.occurrences[name]]
+            is_once = sum(is_store for _, is_store in self.function.occurrences[name]) == 1
+            type_ = required or value.type.plain._replace(is_index=value.type.is_index)
             declared = f"{self.program.c_type(type_)} {text}"
-            is_once = sum(is_store for _, is_store in occurrences) == 1
-            first, last = max(self.span[0], node.lineno), self.span[1]
-            is_here = all(first <= line <= last for line, _ in occurrences)
-            zero = {"float": " = 0.0", "int": " = 0", "bool": " = false"}.get(type_.kind, "")
-            if is_here:
-                head = "const " if is_once else ""
-                self.emit(f"{head}{declared} = {self.program.stored(type_, value)};")
+            if max(self.span[0], node.lineno) <= lines[0] and lines[-1] <= self.span[1]:
+                declared = f"{'const ' if is_once else ''}{declared}"
             else:
+                zero = f" = {ZEROS[type_.kind]}" if type_.kind in ZEROS else ""
                 self.hoisted.append(f"{declared}{zero};")
-                self.emit(f"{text} = {self.program.stored(type_, value)};")
+                declared = text
+            self.emit(f"{declared} = {value.stored(type_)};")
             self.names[name] = CExpression(text, type_, sign=type_.sign, span=value.span if is_once else None)
         else:
             self._emit_store(node, existing._replace(text=text), value)
         self.check(value)
         self.facts.pop(text, None)
         if value.sign:
-            self.facts[text] = NumberFact(value.sign)
+            self.facts[text] = CExpression(text, value.type, sign=value.sign)
 
     def changed(self, field: CExpression, in_place: bool) -> None:
         """Record an assignment to an attribute or an element."""
@@ -247,7 +236,7 @@ class BodyLowering(CallLowering):
             for key in field.reads & self.function.shared.keys():
                 raise self.function.shared[key]
 
-    def share(self, node: ast.AST, target: Locations, value: CExpression) -> None:
+    def share(self, node: Any, target: Locations, value: CExpression) -> None:
         """Record a list that an attribute shares with a second name; such a list must not change in place."""
         error = self.refuse(node, "a list that is shared and changed in place", "a copy of it, `list(...)`")
         for key in value.reads:
@@ -258,15 +247,14 @@ class BodyLowering(CallLowering):
             else:
                 self.program.shared.append((target | value.reads, error))
 
-    def do_expr(self, node: ast.Expr) -> None:
+    def do_expr(self, node: Any) -> None:
         value = self.expression(node.value)
-        if not isinstance(node.value, ast.Call):
-            raise self.refuse(node, "an expression without effect", "a call")
+        self.require(isinstance(node.value, ast.Call), node, "an expression without effect", "a call")
         if value.type.kind != "list":
             self.emit(f"{value.text};" if value.type.kind == "none" else f"(void){value.text};")
             self.check(value)
 
-    def do_return(self, node: ast.Return) -> bool:
+    def do_return(self, node: Any) -> bool:
         returns = self.function.returns
         if node.value is None or returns.kind == "none":
             self.emit("return;")
@@ -277,15 +265,15 @@ class BodyLowering(CallLowering):
             self._return(node, self.expression(node.value))
         return True
 
-    def _return(self, node: ast.stmt, value: CExpression) -> None:
+    def _return(self, node: Any, value: CExpression) -> None:
         self.fit(node, self.function.returns, value, "returned")
-        self.emit(f"return {self.program.stored(self.function.returns, value)};")
+        self.emit(f"return {value.stored(self.function.returns)};")
 
-    def do_raise(self, node: ast.Raise) -> bool:
+    def do_raise(self, node: Any) -> bool:
         self.fail(node, "a raise")
         return True
 
-    def do_if(self, node: ast.If) -> bool:
+    def do_if(self, node: Any) -> bool:
         test = self.truth(node.test)
         if test.constant is not None:
             return self.block(node.body if test.constant else node.orelse)
@@ -307,11 +295,10 @@ class BodyLowering(CallLowering):
         self.facts = right if first else left if second else dict(left.items() & right.items())
         return first and second
 
-    def do_for(self, node: ast.For) -> None:
+    def do_for(self, node: Any) -> None:
         loop = self.loop(node.iter)
-        if node.orelse or not loop.stop or has_text(loop.constants):
-            found = "a loop over text, or with else"
-            raise self.refuse(node, found, "a loop over numbers, without else")
+        is_numeric = not (node.orelse or loop.texts)
+        self.require(is_numeric, node, "a loop over text, or with else", "a loop over numbers, without else")
         names = self.targets(node.target, len(loop.values("")))
         is_range = loop.values("i")[0].text == "i" and len(names) == 1 and names[0] != "_"
         index = self.program.local(names[0]) if is_range else self.fresh("i")
@@ -320,65 +307,63 @@ class BodyLowering(CallLowering):
             stop = self.temporary(CExpression(stop, INT), "stop").text
         test, step = ("<", "++") if loop.step == 1 else (">", "--")
         self.emit(f"for (int64_t {index} = {loop.start}; {index} {test} {stop}; {index}{step}) {{")
-        hidden, self.facts = dict(self.names), {}
+        hidden, self.facts, aliases = dict(self.names), {}, len(self.aliases)
         for name, value in zip(names, loop.values(index), strict=True):
+            self.aliases.append(("the loop", value, node.end_lineno + 1))
             if value.text != index and name != "_" and value.type.kind != "list":
                 text = self.program.local(name)
                 constant = "" if name in self.function.occurrences else "const "
                 self.emit(f"{constant}{self.program.c_type(value.type)} {text} = {value.text};")
-                value = value._replace(text=text, reads=frozenset(), rank=ATOM)
+                value = value._replace(text=text, reads=frozenset(), rank=Rank.ATOM)
             self.names[name] = value
-        before = len(self.aliases)
-        self.aliases += [("the loop", value, (node.end_lineno or 0) + 1) for value in loop.values(index)]
         self.block(node.body)
-        del self.aliases[before:]
+        del self.aliases[aliases:]
         self.emit("}")
-        others = {name: value for name, value in self.names.items() if name not in names}
-        self.names = others | {name: hidden[name] for name in names if name in hidden}
+        for name in names:
+            self.names.pop(name, None)
+            self.names |= {name: hidden[name]} if name in hidden else {}
         self.facts = {}
 
-    def do_while(self, node: ast.While) -> None:
+    def do_while(self, node: Any) -> None:
         self.facts = {}
         with self.captured() as lines:
             test = self.truth(node.test)
-        leave = [f"if (!{test.at(UNARY)}) {{", "break;", "}"]
+        leave = [f"if (!{test.at(Rank.UNARY)}) {{", "break;", "}"]
         self.emit(f"while ({'true' if lines else test.text}) {{", *lines, *leave * bool(lines))
         self.block(node.body)
         self.emit("}")
         self.facts = {}
 
-    def do_break(self, node: ast.Break | ast.Continue) -> bool:
+    def do_break(self, node: Any) -> bool:
         self.emit("break;" if isinstance(node, ast.Break) else "continue;")
         return True
 
     do_continue = do_break
 
-    def do_try(self, node: ast.Try) -> bool:
-        """Lower `try` around a single call with `except Exception`."""
-        statement = node.body[0]
-        if len(node.body + node.handlers) != 2 or node.orelse or node.finalbody:
-            raise self.refuse(node, "this try", "`try` with a single call and a single `except Exception`")
-        if not isinstance(statement, (ast.Assign, ast.Return)) or not isinstance(statement.value, ast.Call):
-            raise self.refuse(node, "this try", "`try` with `name = call(...)` or `return call(...)`")
-        function, failures, position = self.function, self.failures, len(self.lines)
-        before = function.error, function.fails, function.reason
+    def do_try(self, node: Any) -> bool:
+        statement, function = node.body[0], self.function
+        is_single = len(node.body + node.handlers) == 2 and not (node.orelse or node.finalbody)
+        is_return = isinstance(statement, ast.Return)
+        is_call = isinstance(getattr(statement, "value", None), ast.Call)
+        is_simple = is_single and is_call and (is_return or isinstance(statement, ast.Assign))
+        expected = "`name = call(...)` or `return call(...)`, and a single `except Exception`"
+        self.require(is_simple, node, "this try", expected)
+        before, failures, position = (function.fails, function.reason), self.failures, len(self.lines)
         flag = self.fresh("failed")
         function.error = f"&{flag}"
         value = self.expression(statement.value)
-        if self.failures > failures:
-            raise self.refuse(node, "an operation in try that may raise", "only a call")
-        function.error, function.fails, function.reason = before
+        self.require(self.failures == failures, node, "an operation in try that may raise", "only a call")
+        function.error, (function.fails, function.reason) = "error", before
         fails, value = value.fails, value._replace(fails=False)
         if fails:
             self.lines.insert(position, f"bool {flag} = false;")
-            if isinstance(statement, ast.Return):
-                value = self.temporary(value, "value")
-        if isinstance(statement, ast.Assign):
+            value = self.temporary(value, "value") if is_return else value
+        if not is_return:
             self._store(statement, statement.targets[0], value)
         if fails:
             self.emit(f"if ({flag}) {{")
             self.block(node.handlers[0].body)
             self.emit("}")
-        if isinstance(statement, ast.Return):
+        if is_return:
             self._return(statement, value)
-        return isinstance(statement, ast.Return)
+        return is_return

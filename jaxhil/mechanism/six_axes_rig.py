@@ -10,10 +10,11 @@ from msgspec import Meta, Struct, field
 
 from jaxhil.mechanism.structs import (
     MAX_LATENCY,
-    Coefficient,
     CommandHold,
+    CubicCoefficients,
+    Denominator,
     Integrator,
-    Polynomial,
+    Numerator,
     SimulatorModel,
     key_metadata,
 )
@@ -112,19 +113,9 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ) = None
     damping_ratio: Annotated[list[Ratio], six_axis_metadata("damping ratio of second_order")] | None = None
     time_constant: Annotated[list[Second], six_axis_metadata("time constant of first_order")] | None = None
-    coefficients: (
-        Annotated[
-            list[Coefficient],
-            Meta(min_length=3, max_length=3, description="[a1, a2, a3] of 1/(1 + a1 s + a2 s^2 + a3 s^3)"),
-        ]
-        | None
-    ) = None
-    numerator: (
-        Annotated[Polynomial, Meta(description="numerator of G(s), in descending powers of s")] | None
-    ) = None
-    denominator: (
-        Annotated[Polynomial, Meta(description="denominator of G(s), in descending powers of s")] | None
-    ) = None
+    coefficients: CubicCoefficients | None = None
+    numerator: Numerator | None = None
+    denominator: Denominator | None = None
     delay: Annotated[list[Second], six_axis_metadata("transport delay of the motion")] = field(
         default_factory=zeros(6)
     )

@@ -71,11 +71,16 @@ DAMPING_UNITS = "in s/m for {}, none for {}".format(
     " and ".join(law.name for law in CONTACT_LAWS.values() if law.dissipation_process),
 )
 Factor = Annotated[float, key_metadata("factor on the nominal value", "1", gt=0.0)]
-Coefficient = Annotated[float, key_metadata("coefficient of the n-th power of s", "s^n", gt=0.0)]
+CubicCoefficients = Annotated[
+    list[Annotated[float, key_metadata("coefficient of the n-th power of s", "s^n", gt=0.0)]],
+    Meta(min_length=3, max_length=3, description="[a1, a2, a3] of 1/(1 + a1 s + a2 s^2 + a3 s^3)"),
+]
 Polynomial = Annotated[
     list[Annotated[float, key_metadata("coefficient of the n-th power of s", "s^n")]],
     Meta(min_length=1, max_length=21),
 ]
+Numerator = Annotated[Polynomial, Meta(description="numerator of G(s), in descending powers of s")]
+Denominator = Annotated[Polynomial, Meta(description="denominator of G(s), in descending powers of s")]
 UncertainKey = Annotated[str, Meta(min_length=1, max_length=100)]
 CorrelationRow = Annotated[
     list[Annotated[float, key_metadata("correlation of two keys' normal numbers", "1", ge=-1.0, le=1.0)]],
@@ -175,19 +180,9 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ) = None
     damping_ratio: Annotated[float, key_metadata("damping ratio of second_order", "1", gt=0.0)] | None = None
     time_constant: Annotated[float, key_metadata("time constant of first_order", "s", ge=0.0)] | None = None
-    coefficients: (
-        Annotated[
-            list[Coefficient],
-            Meta(min_length=3, max_length=3, description="[a1, a2, a3] of 1/(1 + a1 s + a2 s^2 + a3 s^3)"),
-        ]
-        | None
-    ) = None
-    numerator: (
-        Annotated[Polynomial, Meta(description="numerator of G(s), in descending powers of s")] | None
-    ) = None
-    denominator: (
-        Annotated[Polynomial, Meta(description="denominator of G(s), in descending powers of s")] | None
-    ) = None
+    coefficients: CubicCoefficients | None = None
+    numerator: Numerator | None = None
+    denominator: Denominator | None = None
     delay: Annotated[float, key_metadata("transport delay of the motion", "s", ge=0.0, le=1.0)] = 0.0
     velocity_limit: Annotated[
         float, key_metadata("velocity limit of the position command", "m/s", gt=0.0, infinite=True)

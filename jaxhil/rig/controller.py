@@ -6,8 +6,6 @@ faults and reactions. A trip is latched until `reset`: the force ramps to 0 and 
 rest out of contact. After construction no method raises, and each method takes bounded time.
 """
 
-import os
-from collections.abc import Mapping
 from math import isfinite, nan
 from typing import Any
 
@@ -26,7 +24,7 @@ from jaxhil.rig.faults import (
     TARE,
     UNUSABLE,
 )
-from jaxhil.rig.gain_file import GainFile, check_gain_document, read_gain_document
+from jaxhil.rig.gain_file import GainFile, check_gain_document
 from jaxhil.rig.inputs import InputGuard, Tare
 from jaxhil.rig.law_status import UNSTATED
 from jaxhil.rig.outputs import ForceGuard, PositionGuard
@@ -49,6 +47,7 @@ class Controller(ControllerBase):
         "_watchdog", "cause", "faults", "seen",
     )  # fmt: skip
     fault_table = FAULTS
+    _check = staticmethod(check_gain_document)
     _law: Compensator
     _watchdog: Watchdog
 
@@ -78,44 +77,6 @@ class Controller(ControllerBase):
         self._stopped = False
         self.cause = 0
         self.reset()
-
-    @classmethod
-    def from_file(cls, path: str | os.PathLike[str]) -> "Controller":
-        """Create a controller from a gain file.
-
-        Args:
-            path: path of the gain file.
-
-        Raises:
-            GainFileError: if the file is invalid.
-        """
-        source = os.fspath(path)
-        return cls(check_gain_document(read_gain_document(source), source), source)
-
-    @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> "Controller":
-        """Create a controller from the content of a gain file.
-
-        Args:
-            document: content of a gain file.
-
-        Raises:
-            GainFileError: if the document is invalid.
-
-        Example:
-            >>> from jaxhil.rig import Controller, digest
-            >>> document = {
-            ...     "schema": "jaxhil/gains/1",
-            ...     "compensator": "none",
-            ...     "gains": {},
-            ...     "control_period": 0.001,
-            ...     "mechanism": {"rig": {"control_period": 0.001}, "contact": {}},
-            ... }
-            >>> controller = Controller.from_dict(document | {"sha256": digest(document)})
-            >>> controller.step(10.0, 0.001, -0.005, 0.0012)
-            10.0
-        """
-        return cls(check_gain_document(document))
 
     @property
     def at_rest(self) -> bool:

@@ -1,10 +1,12 @@
 """Common part of the controllers for one axis and for six axes: faults, trips, clock and statuses."""
 
-from collections.abc import Sequence
-from typing import Any, ClassVar
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, Self
 
 from jaxhil.rig.clock import Clock
 from jaxhil.rig.faults import EMERGENCY_STOP, Fault, fault_names
+from jaxhil.rig.gain_document import read_gain_document
 from jaxhil.rig.law_status import STATUS_NAMES, ContactCount, ContactRecord, contact_record
 from jaxhil.rig.types import Bits, Positive, SmallInt
 
@@ -20,6 +22,7 @@ class ControllerBase:
 
     __slots__ = ()
     fault_table: ClassVar[Sequence[Fault]]
+    _check: ClassVar[Callable[..., Any]]  # checks a gain document and returns its content
     cause: Bits
     faults: Bits
     seen: Bits
@@ -29,6 +32,47 @@ class ControllerBase:
     _period: Positive
     _stopped: bool
     _watchdog: Any
+
+    def __init__(self, gain_file: Any, source: str = "gain document") -> None:
+        raise NotImplementedError
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> Self:
+        """Create a controller from a gain file.
+
+        Args:
+            path: path of the gain file.
+
+        Raises:
+            GainFileError: if the file is invalid.
+        """
+        source = os.fspath(path)
+        return cls(cls._check(read_gain_document(source), source), source)
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Create a controller from the content of a gain file.
+
+        Args:
+            document: content of a gain file.
+
+        Raises:
+            GainFileError: if the document is invalid.
+
+        Example:
+            >>> from jaxhil.rig import Controller, digest
+            >>> document = {
+            ...     "schema": "jaxhil/gains/1",
+            ...     "compensator": "none",
+            ...     "gains": {},
+            ...     "control_period": 0.001,
+            ...     "mechanism": {"rig": {"control_period": 0.001}, "contact": {}},
+            ... }
+            >>> controller = Controller.from_dict(document | {"sha256": digest(document)})
+            >>> controller.step(10.0, 0.001, -0.005, 0.0012)
+            10.0
+        """
+        return cls(cls._check(document))
 
     @property
     def control_period(self) -> float:

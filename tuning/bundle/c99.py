@@ -3,14 +3,11 @@
 `jaxhil.codegen` translates the Python code of the controller, its guards and the compensator. This module and
 `c99_tables` add three more parts: checks of the compiler's options; tables of gains, limits, faults and
 statuses; and the function `jaxhil_init`, which checks gains and limits. The test program is `test_vectors.c`.
-The constant `JAXHIL_<NAME>_SAMPLES` is the number of samples in the delay line whose delay is the gain or
-limit NAME.
+A constant `JAXHIL_<CLASS>_<ATTRIBUTE>` is the capacity of a list whose length depends on gains or limits.
 """
 
 import functools
 import inspect
-import math
-import re
 from collections.abc import Mapping
 from importlib import resources
 from typing import Any
@@ -32,9 +29,6 @@ from tuning.bundle.controller_kind import ONE_AXIS, ControllerKind, kind_of
 HEADER_FILE, SOURCE_FILE = "jaxhil_controller.h", "jaxhil_controller.c"
 GAINS_FILE, TEST_FILE = "jaxhil_gains.h", "test_vectors.c"
 COMPILER_FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
-TEST_PROGRAM_FOLDER = resources.files("tuning") / "bundle"
-
-_DELAY_LINE_LENGTH = re.compile(r"\bJAXHIL_([A-Z0-9_]+)_SAMPLES\b")
 
 _HEADER_TEMPLATE = """\
 /* Controller of a hardware-in-the-loop docking rig, with the compensator `{law}`.
@@ -71,7 +65,7 @@ _HEADER_TEMPLATE = """\
 #if FLT_EVAL_METHOD != 0 && FLT_EVAL_METHOD != 1
 #error "double must be computed in double precision (32-bit x86: use -msse2 -mfpmath=sse)"
 #endif
-{lengths}
+{capacities}
 #ifdef __cplusplus
 extern "C" {{
 #endif
@@ -184,13 +178,15 @@ def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> 
     """
     kind = kind_of(document)
     gain_file = kind.check_document(document, source)
-    kind.controller(gain_file, source)  # raises an error if a delay is too long for every delay line
+    controller = kind.controller(gain_file, source)  # raises an error if a delay is too long for a delay line
     law = gain_file.compensator
-    declarations, definitions = _generate_code(law, kind.compensators[law], kind.axes)
+    program, declarations, definitions = _generate_code(law, kind.compensators[law], kind.axes)
+    comment = "/* Capacity of each of these lists; increase it for longer delays. */"
+    capacities = [f"\n{comment}\n#define {key} {n}\n" for key, n in program.capacities(controller).items()]
     return {
         HEADER_FILE: _HEADER_TEMPLATE.format(
             law=law,
-            lengths=_define_lengths(declarations, gain_file),
+            capacities="".join(capacities),
             declarations=declarations,
             exported="" if kind is ONE_AXIS else ",\n *                 &jaxhil_exported_constants",
         ),
@@ -198,13 +194,19 @@ def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> 
         GAINS_FILE: _GAINS_TEMPLATE.format(
             law=law, digest=document["sha256"], constants=gain_file_constants(gain_file, kind)
         ),
-        TEST_FILE: (TEST_PROGRAM_FOLDER / kind.test_program).read_text(encoding="utf-8"),
+        TEST_FILE: _read_test_program(TEST_FILE).replace(
+            "@columns@\n", _read_test_program(kind.test_program)
+        ),
     }
 
 
+def _read_test_program(file: str) -> str:
+    return (resources.files("tuning") / "bundle" / file).read_text(encoding="utf-8")
+
+
 @functools.cache
-def _generate_code(law: str, class_: type[Any], axes: int) -> tuple[str, str]:
-    """Return the C declarations and definitions of the controller with the compensator `law`."""
+def _generate_code(law: str, class_: type[Any], axes: int) -> tuple[CProgram, str, str]:
+    """Return the program of the controller with the compensator `law`, its declarations and definitions."""
     kind = kind_of({"axes": axes})
     members = {name: inspect.getattr_static(kind.controller, name) for name in kind.methods}
     functions: dict[str, Any] = {
@@ -232,7 +234,8 @@ def _generate_code(law: str, class_: type[Any], axes: int) -> tuple[str, str]:
         defined = f"{defined}\n{constants_check()}"
     has_status = "status" in program.fields.get(class_, {})  # else it is a constant
     prototypes, init = _initialisation(kind, constructor.fails, guard.fails, has_status)
-    return f"{declared}{output.declarations}{prototypes}", f"{defined}\n{output.definitions}{init}"
+    definitions = f"{defined}\n{output.definitions}{init}"
+    return program, f"{declared}{output.declarations}{prototypes}", definitions
 
 
 def _program(class_: type[Any], kind: ControllerKind, functions: Mapping[str, Any]) -> CProgram:
@@ -242,8 +245,8 @@ def _program(class_: type[Any], kind: ControllerKind, functions: Mapping[str, An
     return CProgram(
         "jaxhil_",
         structs={
-            "gains": {name: _sign_condition(gain.lowest) for name, gain in class_.gains.items()},
-            "limits": {name: _sign_condition(limit.lowest) for name, limit in kind.limits.items()},
+            "gains": {name: gain.lowest for name, gain in class_.gains.items()},
+            "limits": {name: limit.lowest for name, limit in kind.limits.items()},
         },
         names={class_: "law", ContactCount: "contact_record", **kind.c_names},
         public={functions[name]: f"jaxhil_{c_name}" for name, c_name in kind.methods.items()},
@@ -283,21 +286,3 @@ def _initialisation(
     if is_one_axis:
         return f"{prototypes}{_IDENTIFIED_PROTOTYPE}", f"{init}{_IDENTIFIED}"
     return prototypes, init
-
-
-def _sign_condition(lowest: float) -> str:
-    """Return the C condition that a value's lower bound imposes on its sign; empty if there is none."""
-    return "> 0" if lowest > 0.0 else ">= 0" if lowest >= 0.0 else ""
-
-
-def _define_lengths(declarations: str, gain_file: Any) -> str:
-    """Return the C macros that define the number of samples in each delay line."""
-    lines = []
-    delays = {**gain_file.limits, **gain_file.gains}
-    for name in dict.fromkeys(_DELAY_LINE_LENGTH.findall(declarations)):
-        whole = math.floor(delays[name.lower()] / gain_file.control_period + 1e-9)
-        lines.append(
-            f"\n/* Samples in the delay line of `{name.lower()}`; increase the number for longer delays. */\n"
-            f"#define JAXHIL_{name}_SAMPLES {whole + 2}\n"
-        )
-    return "".join(lines)

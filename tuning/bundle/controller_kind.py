@@ -37,7 +37,7 @@ class ControllerKind(NamedTuple):
     faults: tuple[Fault, ...]
     methods: Mapping[str, str]  # name in C of each method or property of the controller, in C's order
     c_names: Mapping[type, str]  # name in C of each class whose name differs in Python
-    test_program: str  # file of the test program in C
+    test_program: str  # file of the part of the C test program that depends on the number of axes
 
 
 COMMON_METHODS = ("emergency_stop", "reset", "next_contact", "tripped", "at_rest", "bias")
@@ -61,7 +61,7 @@ ONE_AXIS = ControllerKind(
         "_last_count": "last_contact",
     },
     c_names={Tare: "bias_tare"},
-    test_program="test_vectors.c",
+    test_program="test_vectors_one_axis.c",
 )
 SIX_AXES = ControllerKind(
     axes=6,

@@ -1,7 +1,7 @@
 /* Replays recorded ticks (vectors.csv, argv[1]) through the controller and compares bit for bit.
  *
- * Exit code 0: all the same. 1: a line differs; its number, the column, what was found and what was expected
- * are printed. 2: the vectors cannot be read.
+ * Exit code 0: all values are equal. 1: a line differs; the program prints its number, the column, and the
+ * found and expected values. 2: the vectors cannot be read.
  */
 #include <errno.h>
 #include <math.h>
@@ -11,15 +11,6 @@
 
 #include "jaxhil_controller.h"
 #include "jaxhil_gains.h"
-
-enum {
-    RUN, EVENT, FORCE_MEASURED, POSITION_DESIRED, VELOCITY_DESIRED, POSITION_MEASURED, TIME,
-    POSITION, VELOCITY, ACCELERATION, FORCE_COMMAND, POSITION_COMMAND, FAULTS, FORCE_SIMULATED, COLUMNS
-};
-
-static const char header[] =
-    "run,event,force_measured,position_desired,velocity_desired,position_measured,time,position,velocity,"
-    "acceleration,force_command,position_command,faults,force_simulated";
 
 static jaxhil_controller controller;
 static char line[65536];
@@ -38,6 +29,7 @@ static int differs(const char *file, long number, const char *column, double fou
     return 1;
 }
 
+@columns@
 /* The row's numbers; an empty field is NaN and `given` 0. False if the line is not COLUMNS numbers. */
 static int read_row(char *text, double *row, int *given) {
     for (int column = 0; column < COLUMNS; column++) {
@@ -60,30 +52,11 @@ static int read_row(char *text, double *row, int *given) {
     return 1;
 }
 
-/* One row through the controller: 0 if it does what the row says. */
-static int replay(const char *name, long number, const double *row, const int *given) {
-    const double force =
-        jaxhil_step(&controller, row[FORCE_MEASURED], row[POSITION_DESIRED], row[VELOCITY_DESIRED],
-                    row[POSITION_MEASURED], given[TIME] ? &row[TIME] : NULL);
-    const double position =
-        jaxhil_position_command(&controller, row[POSITION], row[VELOCITY], row[ACCELERATION]);
-    const double faults = (double)controller.faults;
-    if (!is_same(force, row[FORCE_COMMAND])) {
-        return differs(name, number, "force_command", force, row[FORCE_COMMAND]);
-    }
-    if (!is_same(position, row[POSITION_COMMAND])) {
-        return differs(name, number, "position_command", position, row[POSITION_COMMAND]);
-    }
-    return is_same(faults, row[FAULTS]) ? 0 : differs(name, number, "faults", faults, row[FAULTS]);
-}
-
 /* What comes before the row's tick: a run begins (1), the next contact does (2), nothing (0). */
 static int begin(const char *name, long number, double event, int *begun) {
     if (event == 1.0) {
         *begun = 1;
-        return jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits)
-                   ? 0
-                   : unreadable(name, number, "the controller refuses its own gains");
+        return start() ? 0 : unreadable(name, number, "the controller refuses its own gains");
     }
     if (event == 2.0 && *begun) {
         jaxhil_next_contact(&controller);

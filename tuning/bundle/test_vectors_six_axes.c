@@ -1,17 +1,3 @@
-/* Replays recorded ticks (vectors.csv, argv[1]) through the controller and compares bit for bit.
- *
- * Exit code 0: all values are equal. 1: a line differs; the program prints its number, the column, and the
- * found and expected values. 2: the vectors cannot be read.
- */
-#include <errno.h>
-#include <math.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-
-#include "jaxhil_controller.h"
-#include "jaxhil_gains.h"
-
 /* Index of each quantity's first column; a vector has six columns. */
 enum {
     RUN = 0,
@@ -42,43 +28,9 @@ static const char header[] =
     "faults,wrench_simulated_x,wrench_simulated_y,wrench_simulated_z,wrench_simulated_rx,"
     "wrench_simulated_ry,wrench_simulated_rz";
 
-static jaxhil_controller controller;
-static char line[65536];
-
-static int is_same(double found, double expected) {
-    return (isnan(found) && isnan(expected)) || memcmp(&found, &expected, sizeof found) == 0;
-}
-
-static int unreadable(const char *file, long number, const char *what) {
-    fprintf(stderr, "%s:%ld: %s\n", file, number, what);
-    return 2;
-}
-
-static int differs(const char *file, long number, const char *column, double found, double expected) {
-    printf("%s:%ld: %s: found %.17g, expected %.17g\n", file, number, column, found, expected);
-    return 1;
-}
-
-/* The row's numbers; an empty field is NaN and `given` 0. False if the line is not COLUMNS numbers. */
-static int read_row(char *text, double *row, int *given) {
-    for (int column = 0; column < COLUMNS; column++) {
-        const char last = column + 1 < COLUMNS ? ',' : '\0';
-        given[column] = *text != last;
-        row[column] = NAN;
-        if (given[column]) {
-            char *end;
-            row[column] = strtod(text, &end);
-            if (end == text || *text == ' ' || *text == '\t') {
-                return 0;
-            }
-            text = end;
-        }
-        if (*text != last) {
-            return 0;
-        }
-        text += last == ',';
-    }
-    return 1;
+static bool start(void) {
+    return jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits,
+                       &jaxhil_exported_constants);
 }
 
 /* One row through the controller: 0 if it does what the row says. */
@@ -97,54 +49,4 @@ static int replay(const char *name, long number, const double *row, const int *g
         }
     }
     return is_same(faults, row[FAULTS]) ? 0 : differs(name, number, "faults", faults, row[FAULTS]);
-}
-
-/* What comes before the row's tick: a run begins (1), the next contact does (2), nothing (0). */
-static int begin(const char *name, long number, double event, int *begun) {
-    if (event == 1.0) {
-        *begun = 1;
-        return jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits,
-                           &jaxhil_exported_constants)
-                   ? 0
-                   : unreadable(name, number, "the controller refuses its own gains");
-    }
-    if (event == 2.0 && *begun) {
-        jaxhil_next_contact(&controller);
-    } else if (event != 0.0 || !*begun) {
-        return unreadable(name, number, "an unknown event, or a tick before a run");
-    }
-    return 0;
-}
-
-int main(int count, char **arguments) {
-    const char *const name = count == 2 ? arguments[1] : "vectors.csv";
-    FILE *const file = fopen(name, "rb");
-    double row[COLUMNS];
-    int given[COLUMNS];
-    int begun = 0;
-    int failed = 0;
-    long number = 0;
-
-    if (file == NULL) {
-        return unreadable(name, 0, strerror(errno));
-    }
-    while (!failed && fgets(line, (int)sizeof line, file) != NULL) {
-        number++;
-        line[strcspn(line, "\r\n")] = '\0';
-        if (number == 1) {
-            failed = strcmp(line, header) != 0 ? unreadable(name, number, "unknown columns") : 0;
-            continue;
-        }
-        failed = read_row(line, row, given) ? begin(name, number, row[EVENT], &begun)
-                                            : unreadable(name, number, "not a row of numbers");
-        failed = failed ? failed : replay(name, number, row, given);
-    }
-    if (!failed && (ferror(file) || number < 2)) {
-        failed = unreadable(name, number, "no rows");
-    }
-    fclose(file);
-    if (!failed) {
-        printf("%s: %ld ticks, the same bit for bit\n", name, number - 1);
-    }
-    return failed;
 }

@@ -7,6 +7,15 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from tuning.api.options import Json, Timings, folder_option, number_option, text_option
 
+ColumnMap = Annotated[
+    str | None,
+    text_option(
+        "FILE",
+        "TOML file with the meaning of the columns and the kind of each run; by default the columns are "
+        "those of jaxhil simulate --log.",
+    ),
+]
+
 
 @dataclass(frozen=True)
 class IdentifyOptions:
@@ -26,14 +35,7 @@ class IdentifyOptions:
             "Log files: text, Parquet; with jaxhil[logs] also MAT, HDF5, ROS 2 bags, MDF4, TDMS.",
         ),
     ] = ()
-    map: Annotated[
-        str | None,
-        text_option(
-            "FILE",
-            "TOML file with the meaning of the columns and the kind of each run; by default the columns are "
-            "those of jaxhil simulate --log.",
-        ),
-    ] = None
+    map: ColumnMap = None
     guess: Annotated[
         FlagCreatePairsOff[bool],
         text_option(
@@ -136,13 +138,6 @@ class MonitorOptions:
         Positional[tuple[str, ...]],
         text_option("LOG [LOG ...]", "Logs of contacts, in the order of their recording."),
     ] = ()
-    map: Annotated[
-        str | None,
-        text_option(
-            "FILE",
-            "TOML file with the meaning of the columns and the kind of each run; by default the columns are "
-            "those of jaxhil simulate --log.",
-        ),
-    ] = None
+    map: ColumnMap = None
     json: Json = False
     timings: Timings = False

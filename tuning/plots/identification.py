@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from jaxhil.simulation.contact_plot import (
     BLACK,
     BLUE,
-    GREEN,
     ORANGE,
     SKY_BLUE,
     VERMILION,
@@ -27,7 +26,6 @@ from tuning.plots.parts import INTERVAL_SIGMAS, legend_above
 
 DOT_STYLE: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 2.5, "markeredgewidth": 0}
 PLOTTED_CONTACTS = 3  # number of contacts that are plotted over time
-RUN_COLOURS = (BLUE, ORANGE, GREEN)
 # Limits of the lags at which the correlations of the residuals are plotted [rows of the log].
 MAX_AUTOCORRELATION_LAG, MIN_CROSS_CORRELATION_LAG, MAX_CROSS_CORRELATION_LAG = 25, -20, 100
 # Smallest distance from 0 [standard deviations] at which an estimate's relative deviations are plotted.

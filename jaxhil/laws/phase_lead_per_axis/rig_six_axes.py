@@ -3,19 +3,20 @@
 from collections.abc import Mapping
 from typing import ClassVar
 
+from jaxhil.laws.phase_lead.rig_six_axes import PhaseLead
 from jaxhil.rig.bounds import FILTER_TIMES, TIMES
 from jaxhil.rig.registry import GainSpecification
 from jaxhil.rig.six_axes.filters import WrenchLead
-from jaxhil.rig.six_axes.registry import ModelConstants, SixAxisCompensator, register_six_axes
-from jaxhil.rig.six_axes.vectors import COORDINATES, LAG_LEADS, lead_pose
+from jaxhil.rig.six_axes.registry import ModelConstants, register_six_axes
+from jaxhil.rig.six_axes.vectors import COORDINATES, LAG_LEADS
 from jaxhil.rig.types import Gains, Positive
 
 
 @register_six_axes("phase_lead_per_axis")
-class PhaseLeadPerAxis(SixAxisCompensator):
+class PhaseLeadPerAxis(PhaseLead):
     """Compensator F_c = (1 + T_1 s)/(1 + T_2 s) F for each channel F, with its own T_1 and a common T_2."""
 
-    __slots__ = ("_lead", "_pose_leads")
+    __slots__ = ()
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
         **{f"phase_lead_{axis}": GainSpecification("s", *TIMES) for axis in COORDINATES},
@@ -28,15 +29,3 @@ class PhaseLeadPerAxis(SixAxisCompensator):
             [gains[f"phase_lead_{axis}"] for axis in COORDINATES], gains["lead_filter"], period
         )
         self._pose_leads = [gains[name] for name in LAG_LEADS]
-
-    def step(self, wrench, pose_desired, twist_desired, pose_measured):
-        """Return the measured wrench after the lead filters [N, N m]."""
-        return self._lead.step(wrench)
-
-    def pose_command(self, pose, rates):
-        """Return the pose command [m, rad]: the pose extrapolated by the lead times `lag_lead_...`."""
-        return lead_pose(self._pose_leads, pose, rates)
-
-    def reset(self) -> None:
-        """Restart the filters."""
-        self._lead.reset()

@@ -6,8 +6,7 @@ the wrench with the compensator that the gain file names, and limits the outputs
 raises, and each method takes bounded time. C and T are the frames of the chaser's and the target's interface.
 """
 
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from math import nan
 from typing import Any
 
@@ -16,7 +15,6 @@ from jaxhil.rig.controller_base import ControllerBase
 from jaxhil.rig.conversion import as_float
 from jaxhil.rig.errors import make_gain_file_error
 from jaxhil.rig.faults import CLOCK, LAW_IN_DOUBT, TARE, UNUSABLE
-from jaxhil.rig.gain_document import read_gain_document
 from jaxhil.rig.law_status import UNSTATED
 from jaxhil.rig.six_axes.faults import SIX_AXIS_FAULTS
 from jaxhil.rig.six_axes.gain_file import SixAxisGainFile, check_six_axis_document
@@ -45,6 +43,7 @@ class Controller6(ControllerBase):
         "_stopped", "_tare", "_watchdog", "cause", "faults", "seen",
     )  # fmt: skip
     fault_table = SIX_AXIS_FAULTS
+    _check = staticmethod(check_six_axis_document)
     _command: Vector
     _sent: Vector
     _law: SixAxisCompensator
@@ -76,31 +75,6 @@ class Controller6(ControllerBase):
         self._stopped = False
         self.cause = 0
         self._restart()
-
-    @classmethod
-    def from_file(cls, path: str | os.PathLike[str]) -> "Controller6":
-        """Create a controller from a gain file.
-
-        Args:
-            path: path of the gain file.
-
-        Raises:
-            GainFileError: if the file is invalid.
-        """
-        source = os.fspath(path)
-        return cls(check_six_axis_document(read_gain_document(source), source), source)
-
-    @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> "Controller6":
-        """Create a controller from the content of a gain file.
-
-        Args:
-            document: content of a gain file.
-
-        Raises:
-            GainFileError: if the document is invalid.
-        """
-        return cls(check_six_axis_document(document))
 
     @property
     def channels(self) -> int:

@@ -4,7 +4,6 @@ All are in the axes of target frame T (notebooks/guide/six_axes.md, section 1). 
 their terms. C is the frame of the chaser's docking interface.
 """
 
-from collections.abc import Sequence
 from math import isfinite, sqrt
 from typing import Annotated
 
@@ -98,11 +97,6 @@ def coordinate_rates(pose: Vector, twist: Vector) -> Vector:
 def lead_pose(leads: Vector, pose: Vector, rates: Vector) -> Vector:
     """Extrapolate each coordinate of the pose by its lead time [s] at its rate."""
     return [at + lead * rate for at, lead, rate in zip(pose, leads, rates, strict=True)]
-
-
-def matrix_of(rows: Sequence[Sequence[float]]) -> list[list[float]]:
-    """Return a matrix as lists of floats."""
-    return [[float(entry) for entry in row] for row in rows]
 
 
 def is_finite(vector: Vector) -> bool:

@@ -1,7 +1,5 @@
 """Alignment: delays the measured position and velocity by the delay of the force measurement."""
 
-from typing import Annotated
-
 from jaxhil.rig.filters import DelayLine
 from jaxhil.rig.types import Positive
 
@@ -10,7 +8,6 @@ class Alignment:
     """Delay of the measured position and velocity by the force delay `delay` [s]."""
 
     __slots__ = ("_last", "_line", "_middle", "_period", "_share")
-    _line: Annotated[DelayLine, "identification_delay"]
     _period: Positive
 
     def __init__(self, delay: float, period: Positive) -> None:
