@@ -5,7 +5,7 @@ import copy
 import pytest
 
 from jaxhil.errors import InputError
-from jaxhil.mechanism.file import from_plain_data, load
+from jaxhil.mechanism.file import MAX_PROBLEMS, from_plain_data, load
 
 # Every key of the schema, except keys of other laws and models, and keys that exclude each other.
 FULL = {
@@ -132,9 +132,11 @@ def tables(node=FULL, path=""):
 
 
 def file_refusal(path, overrides=(), unset=()):
-    """Return the one-line message for a refused file after checking that it begins with the file name."""
+    """Return the message for a refused file after checking that it has a printable line for each key."""
     with pytest.raises(InputError) as caught:
         load(path, overrides, unset)
     message = str(caught.value)
-    assert message.isprintable() and len(message) < 700
+    lines = message.split("\n")
+    assert all(line.isprintable() and len(line) < 700 for line in lines) and len(lines) <= MAX_PROBLEMS
+    assert len(set(lines)) == len(lines) and len({line.split(": ")[0] for line in lines}) == 1
     return message

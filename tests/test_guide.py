@@ -200,3 +200,14 @@ def test_guide_examples_run(path, tmp_path):
     # The text block below the last example of a page is that example's output.
     *_, shown = re.findall(r"^```text\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S)
     assert path.name == "README.md" or ran.stdout.endswith(shown)
+
+
+def test_delays_of_butterworth_filters_in_data_sheet_table_are_group_delays_at_low_frequency():
+    from scipy import signal
+
+    page = (GUIDE / "first_ten_minutes.md").read_text()
+    factors = re.search(r"plus (0\.\d+) / f, (0\.\d+) / f or (0\.\d+) / f", page).groups()
+    for order, factor in zip((2, 3, 4), factors, strict=True):
+        numerator, denominator = signal.butter(order, 2 * np.pi, analog=True)
+        _, response = signal.freqs(numerator, denominator, [2 * np.pi * 1e-3])
+        assert -np.angle(response[0]) / (2 * np.pi * 1e-3) == pytest.approx(float(factor), abs=5e-4)

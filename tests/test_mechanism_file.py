@@ -114,6 +114,24 @@ def test_unusable_mechanism_file_content_is_refused(written, content, reason):
     assert message.startswith(f"{path}: ") and reason in message
 
 
+def test_all_invalid_keys_of_mechanism_file_are_named_in_one_message(written):
+    text = TEXT.replace("velocity = ", "velocity = -").replace("[bodies]", "[bodies]\nequivalent_mas = 300")
+    path = written(text.replace("control_period = 0.001", "control_period = 1.0"))
+    keys = [line.removeprefix(f"{path}: ").split(": ")[0] for line in file_refusal(path).split("\n")]
+    assert keys == ["bodies.equivalent_mas", "approach.velocity", "rig.control_period"]
+    # Rules that involve several keys follow when each key has a valid value.
+    changes = ["bodies={ chaser_mass = 300 }", "contact.law=hardening", "rig.simulator.time_constant=0.1"]
+    lines = file_refusal(written(TEXT), changes).split("\n")
+    assert [line.split(": ")[2] for line in lines] == [
+        "bodies.target_mass",
+        "contact.reference_depth",
+        "rig.simulator.time_constant",
+    ]
+    with pytest.raises(InputError) as caught:
+        from_plain_data({}, "data")
+    assert str(caught.value) == "data: schema: found nothing, expected jaxhil/mechanism/1"
+
+
 def test_long_texts_and_lists_in_mechanism_file_are_accepted(written):
     lists = ", ".join(["0.5 "] * 1000)
     text = TEXT.replace("[395.8]", f"[{lists}]") + "# " + "a.b" * 500

@@ -49,6 +49,52 @@ def test_contact_law_requires_its_keys_and_checks_their_ranges(contact):
     assert f': uncertainty."{key}": found a draw of 0' in refusal(changed({**contact, "uncertainty": low}))
 
 
+@pytest.mark.parametrize(
+    "law", [{"contact.law": "kelvin_voigt"}, {"contact.law": "hardening", "contact.reference_depth": 2e-4}]
+)
+def test_damping_ratio_gives_damping_of_each_contact(law):
+    stiffness = [1e5, 4e5, 9e5]
+    raw = changed(
+        {**law, "contact.stiffness": stiffness, "contact.damping": 0, "contact.damping_ratio": [0.1, 0.2]}
+    )
+    mechanism = from_plain_data(raw, "f")
+    critical = [2 * math.sqrt(k * mechanism.bodies.mass) for k in stiffness]
+    np.testing.assert_allclose(
+        mechanism.contact.damping, [0.1 * critical[0], 0.2 * critical[1], 0.2 * critical[2]]
+    )
+    # The file of results contains the damping itself.
+    assert "damping_ratio" not in to_plain_data(mechanism)["contact"]
+    one = from_plain_data(changed({**law, "contact.damping": 0, "contact.damping_ratio": 0.05}), "f")
+    assert len(one.contact.damping) == len(one.contact.stiffness)
+
+
+def test_damping_ratio_without_meaning_is_refused():
+    ratio = {"contact.damping": 0, "contact.damping_ratio": 0.1}
+    for change, reason in (
+        (
+            {"contact.law": "linear"},
+            "contact.damping_ratio: found [0.1], expected nothing (only for law kelvin_voigt",
+        ),
+        (
+            {"contact.law": "kelvin_voigt", "contact.damping": 3.0},
+            "found [0.1] and a damping, expected either",
+        ),
+        (
+            {"contact.law": "kelvin_voigt", "contact.damping_ratio": -0.1},
+            "damping_ratio[0]: found -0.1, expected",
+        ),
+        (
+            {"contact.law": "kelvin_voigt", "bodies": {"chaser_mass": 3.0}},
+            "bodies.target_mass: found nothing",
+        ),
+        (
+            {"contact.law": "kelvin_voigt", "contact.stiffness": [[1e5]]},
+            "contact.stiffness[0]: found [100000.0]",
+        ),
+    ):
+        assert reason in refusal(changed({**ratio, **change}))
+
+
 @pytest.mark.parametrize("path", OF_OTHERS)
 def test_mechanism_keys_of_other_contact_laws_and_simulator_models_are_refused(path):
     message = refusal(changed({path: OF_OTHERS[path]}))

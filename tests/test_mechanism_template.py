@@ -83,13 +83,15 @@ def test_new_mechanism_file_contains_description_of_every_key():
 def test_mechanism_key_descriptions_state_unit_range_and_contact_laws():
     keys = {f"{table.path}.{key.name}": key for table in describe_tables() for key in table.keys}
     numbers = {path for path in keys if '"' not in path and keys[path].unit is not None}
-    others = {"approach.contacts", "rig.command_latency", "correlation.matrix"}  # integer keys
+    # Integer keys, and keys that stand for others.
+    others = {"approach.contacts", "rig.command_latency", "correlation.matrix", "contact.damping_ratio"}
     assert numbers - others == set(numeric_keys())
     assert all(keys[path].unit == numeric_keys()[path].unit for path in numbers - others)
     assert keys["approach.contacts"].allowed == f"an integer from 1 to {MAX_CONTACTS}"
     assert keys["contact.preload"].users == ("preloaded",)
     assert keys["rig.simulator.coefficients"].users == ("third_order",)
     assert "elastoplastic" not in keys["contact.damping"].users
+    assert keys["contact.damping_ratio"].users == ("kelvin_voigt", "hardening")
     assert keys["approach.velocity"].required and not keys["approach.contacts"].required
 
 

@@ -171,9 +171,35 @@ def test_ideal_simulator_has_no_bandwidth():
         ),
         (
             "contact.stiffness",
-            [29.61],
-            [29.60],
-            "frequency of 0.05 Hz (contact 1), expected at least 0.05 Hz",
+            [118.44],
+            [118.43],
+            "expected at least 0.1 Hz (is the stiffness in N/mm, or a mass in g?)",
+        ),
+        (
+            "bodies.equivalent_mass",
+            2.69e5,
+            2.71e5,
+            "frequency of 0.0998 Hz (contact 1), expected at least 0.1 Hz",
+        ),
+        (
+            "rig.simulator.natural_frequency",
+            50.0,
+            75.4,
+            "natural_frequency: found 75.4 Hz, expected at most 50 Hz (is it in rad/s? then it is 12 Hz)",
+        ),
+        (
+            "rig.force_sensor.dead_zone",
+            28.0,
+            29.0,
+            "found 29 N, expected less than 28.3 N, the peak force of ideal contact 1 (is it in mN?)",
+        ),
+        ("rig.force_sensor.bias", -28.0, -29.0, "bias: found -29 N, expected less than 28.3 N"),
+        ("rig.force_sensor.noise_std", 28.0, 500.0, "noise_std: found 500 N, expected less than 28.3 N"),
+        (
+            "rig.position_sensor.quantum",
+            2.6e-4,
+            2.7e-4,
+            "quantum: found 0.00027 m, expected less than 0.000265 m, about the depth of ideal contact 1",
         ),
         ("approach.velocity", 1.0, 1.001, "approach.velocity: found 1.001 m/s, expected at most 1 m/s"),
         (
@@ -343,7 +369,7 @@ def test_simulate_output_begins_with_mechanism_summary_line(jaxhil):
     assert ran.out.startswith("rig-300kg: equivalent mass 300 kg; contact at 3 Hz, ")
     assert ran.err == (
         "warning: rig-300kg: rig.force_sensor.range: found 10 N, expected more than 28.3 N, the "
-        "peak force of ideal contact 1\n"
+        "peak force of ideal contact 1 (is it in kN?)\n"
     )
     result = jaxhil("simulate", "rig-300kg", "--json", "--set", "rig.force_sensor.range=1e9").document[
         "meaning"

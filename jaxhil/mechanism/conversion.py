@@ -11,7 +11,7 @@ import difflib
 import functools
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import msgspec
@@ -37,6 +37,8 @@ __all__ = [
     "find_member_type",
     "format_entry_count",
     "format_key_path",
+    "raise_problems",
+    "run_checks",
     "suggest_names",
     "to_mechanism",
     "to_struct",
@@ -47,7 +49,7 @@ KeyPath = tuple[str | int, ...]
 TypeMetadata = Mapping[str, Any]  # `extra` of the metadata from `jaxhil.contact.keys.key_metadata`
 
 # Lists for which a bare number stands for a list of one entry.
-SCALAR_LIST_KEYS = ("contact", "stiffness"), ("contact", "damping")
+SCALAR_LIST_KEYS = ("contact", "stiffness"), ("contact", "damping"), ("contact", "damping_ratio")
 # Polynomials, whose leading zeros have no effect and are dropped.
 _POLYNOMIALS = {("rig", "simulator", "numerator"), ("rig", "simulator", "denominator")}
 
@@ -56,17 +58,42 @@ _type_info = functools.cache(inspect.type_info)
 
 
 class KeyProblem(Exception):
-    """Exception for an invalid key: its path, the value found, and the expected values in words."""
+    """Exception for an invalid key: its path, the value found, and the expected values in words.
+
+    Attributes:
+        further: Problems of other keys in the same table or file.
+    """
 
     def __init__(self, path: KeyPath, found: str, expected: str):
         super().__init__(path, found, expected)
         self.path = path
         self.found = found
         self.expected = expected
+        self.further: tuple[KeyProblem, ...] = ()
 
     def __str__(self) -> str:
         where = f"{format_key_path(self.path)}: " if self.path else ""
         return f"{where}found {self.found}, expected {self.expected}"
+
+
+def raise_problems(problems: Sequence[KeyProblem]) -> None:
+    """Raise the first problem with all others as its attribute `further`; do nothing if there is none."""
+    if problems:
+        first, *others = problems
+        further = [problem for other in others for problem in (other, *other.further)]
+        first.further = (*first.further, *further)
+        raise first
+
+
+def run_checks(checks: Iterable[Callable[[], object]]) -> None:
+    """Run all checks, and raise `KeyProblem` with the problems of those that fail."""
+    problems = []
+    for check in checks:
+        try:
+            check()
+        except KeyProblem as problem:
+            problems.append(problem)
+    raise_problems(problems)
 
 
 def format_key_path(path: KeyPath) -> str:
@@ -99,10 +126,10 @@ def add_magnitude_limits(allowed: object) -> str:
 
 
 def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
-    """Convert a parsed table to a `Mechanism`. Raise `KeyProblem` for the first unknown or invalid key.
+    """Convert a parsed table to a `Mechanism`. Raise `KeyProblem` for unknown or invalid keys.
 
-    Integers are accepted as numbers. `contact.stiffness` and `contact.damping` may be a single number instead
-    of a list. Leading zeros of a transfer function's polynomials are dropped.
+    Integers are accepted as numbers. `contact.stiffness`, `contact.damping` and `contact.damping_ratio` may
+    be a single number instead of a list. Leading zeros of a transfer function's polynomials are dropped.
     """
     return msgspec.convert(_convert(mechanism_type(), raw, (), NO_METADATA), Mechanism)
 
@@ -250,19 +277,21 @@ def _convert(kind: inspect.Type, value: Any, path: KeyPath, extra: TypeMetadata)
 
 
 def _convert_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: KeyPath) -> dict[str, Any]:
-    """Convert a table to plain data of the struct type `kind`. Raise `KeyProblem` for an invalid key."""
+    """Convert a table to plain data of the struct type `kind`. Raise `KeyProblem` for all invalid keys."""
     names = {entry.encode_name for entry in kind.fields}
-    for key in value:
-        # Unknown keys are reported first, because a misspelt key also looks like a missing one.
-        if key not in names:
-            raise _unknown_key(kind, str(key), path)
-    converted = {}
+    problems = [_unknown_key(kind, str(key), path) for key in value if key not in names]
+    has_unknown, converted = bool(problems), {}
     for entry in kind.fields:
         name = entry.encode_name
         if name in value:
-            converted[name] = _convert(entry.type, value[name], (*path, name), NO_METADATA)
-        elif entry.required:
-            raise KeyProblem((*path, name), "nothing", describe_allowed(entry.type, NO_METADATA))
+            try:
+                converted[name] = _convert(entry.type, value[name], (*path, name), NO_METADATA)
+            except KeyProblem as problem:
+                problems.append(problem)
+        elif entry.required and not has_unknown:
+            # A misspelt key also looks like a missing one.
+            problems.append(KeyProblem((*path, name), "nothing", describe_allowed(entry.type, NO_METADATA)))
+    raise_problems(problems)
     return converted
 
 

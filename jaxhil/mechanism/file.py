@@ -48,6 +48,7 @@ DEFAULT_MECHANISM = "varying"
 Overrides = Sequence[str] | Mapping[str, Any]
 MechanismType = TypeVar("MechanismType", Mechanism, AnyMechanism)
 
+MAX_PROBLEMS = 20  # maximum number of invalid keys of a file in a message
 SUITE_PREFIX = "suite-"  # prefix of the names of the mechanisms for benchmarks
 
 _SIX_INFINITIES = [math.inf] * 6  # default of limits for six axes
@@ -87,12 +88,14 @@ def load(
         unset: PATHs of keys to remove afterwards, as for ``--unset``.
 
     Raises:
-        InputError: if the file or a change is invalid, or the mechanism has six axes.
+        InputError: if the file or a change is invalid, or the mechanism has six axes. The message has one
+            line for each invalid key.
     """
     raw, sha256, label = _read_table(path_or_name)
-    return LoadedMechanism(
-        _store_file_hash(from_plain_data(raw, label, overrides, unset), sha256), sha256, label
-    )
+    _check_one_axis(raw, label)
+    mechanism = _convert_table(raw, label, overrides, unset, MAX_PROBLEMS)
+    assert isinstance(mechanism, Mechanism)
+    return LoadedMechanism(_store_file_hash(mechanism, sha256), sha256, label)
 
 
 def load_any(
@@ -100,9 +103,8 @@ def load_any(
 ) -> LoadedAnyMechanism:
     """Load and validate a one-axis or six-axis mechanism; for the arguments, see `load`."""
     raw, sha256, label = _read_table(path_or_name)
-    return LoadedAnyMechanism(
-        _store_file_hash(any_from_plain_data(raw, label, overrides, unset), sha256), sha256, label
-    )
+    mechanism = _convert_table(raw, label, overrides, unset, MAX_PROBLEMS)
+    return LoadedAnyMechanism(_store_file_hash(mechanism, sha256), sha256, label)
 
 
 def source_sha256(mechanism: AnyMechanism) -> str:
@@ -119,11 +121,7 @@ def from_plain_data(
     `label` names the source in messages; for `overrides` and `unset`, see `load`. Raise `InputError` if the
     data are invalid or describe a six-axis mechanism.
     """
-    if is_six_axes(raw):
-        expected = f"{SCHEMA}, because this command or function supports one axis only"
-        raise InputError(
-            f"{to_one_line(label)}: schema: found {SIX_AXIS_SCHEMA} (six axes), expected {expected}"
-        )
+    _check_one_axis(raw, label)
     mechanism = any_from_plain_data(raw, label, overrides, unset)
     assert isinstance(mechanism, Mechanism)
     return mechanism
@@ -133,6 +131,22 @@ def any_from_plain_data(
     raw: Mapping[str, Any], label: str, overrides: Overrides = (), unset: Sequence[str] = ()
 ) -> AnyMechanism:
     """Convert plain data to a validated one-axis or six-axis mechanism, as `from_plain_data` does."""
+    return _convert_table(raw, label, overrides, unset, 1)
+
+
+def _check_one_axis(raw: Mapping[str, Any], label: str) -> None:
+    """Raise `InputError` if a parsed table describes a six-axis mechanism."""
+    if is_six_axes(raw):
+        expected = f"{SCHEMA}, because this command or function supports one axis only"
+        raise InputError(
+            f"{to_one_line(label)}: schema: found {SIX_AXIS_SCHEMA} (six axes), expected {expected}"
+        )
+
+
+def _convert_table(
+    raw: Mapping[str, Any], label: str, overrides: Overrides, unset: Sequence[str], problems: int
+) -> AnyMechanism:
+    """Convert a parsed table with changes; the message of an error has a line for up to `problems` keys."""
     changed, label = raw, to_one_line(label)
     all_changes = _requested_changes(overrides, unset)
     for option, changes in all_changes.items():
@@ -145,7 +159,8 @@ def any_from_plain_data(
         return _validate(changed)
     except KeyProblem as problem:
         options = "" if str(problem) == _find_problem(raw) else _format_changes(all_changes)
-        raise InputError(f"{label}{options}: {problem}") from None
+        lines = [f"{label}{options}: {invalid}" for invalid in (problem, *problem.further)]
+        raise InputError("\n".join(lines[:problems])) from None
 
 
 def to_plain_data(mechanism: AnyMechanism) -> dict[str, Any]:
@@ -236,7 +251,7 @@ def _validate(raw: Mapping[str, Any]) -> AnyMechanism:
         found = format_value(raw["schema"]) if "schema" in raw else "no schema"
         expected = f"{SIX_AXIS_SCHEMA}, because target and chaser are six-axis keys"
         raise KeyProblem(("schema",), f"{found} with the tables target and chaser", expected)
-    mechanism = to_mechanism(raw)
+    mechanism = mechanism_rules.resolve_damping_ratio(to_mechanism(raw))
     mechanism_rules.check_mechanism_rules(mechanism)
     return mechanism
 

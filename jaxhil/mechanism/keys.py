@@ -15,7 +15,7 @@ from msgspec import NODEFAULT, inspect
 from jaxhil.contact.laws import CONTACT_KEYS, CONTACT_LAWS, laws_with_key
 from jaxhil.mechanism.conversion import describe_allowed
 from jaxhil.mechanism.rules import KEYS_OF_MODELS
-from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.structs import DAMPING_RATIO_LAWS, Mechanism
 
 __all__ = ["KeyDescription", "TableDescription", "describe_tables"]
 
@@ -140,6 +140,8 @@ def _find_users(path: str) -> tuple[str, ...]:
     if table == "contact":
         if name == "damping":
             return tuple(law.name for law in CONTACT_LAWS.values() if not law.dissipation_process)
+        if name == "damping_ratio":
+            return DAMPING_RATIO_LAWS
         return laws_with_key(CONTACT_KEYS[name]) if name in CONTACT_KEYS else ()
     if table == "rig.simulator":
         return tuple(model for model, keys in KEYS_OF_MODELS.items() if name in keys)

@@ -14,13 +14,15 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from jaxhil.contact.keys import ContactKey
 from jaxhil.contact.laws import CONTACT_KEYS, ContactLaw, find_contact_law, laws_with_key
 from jaxhil.errors import format_value
-from jaxhil.mechanism.conversion import KeyPath, KeyProblem, describe_allowed_at
+from jaxhil.mechanism.conversion import KeyPath, KeyProblem, describe_allowed_at, run_checks
 from jaxhil.mechanism.correlation import check_correlation
 from jaxhil.mechanism.structs import (
+    DAMPING_RATIO_LAWS,
     Contact,
     Mechanism,
     Simulator,
@@ -38,6 +40,7 @@ __all__ = [
     "format_allowed_velocity_limit",
     "is_damped",
     "is_hurwitz",
+    "resolve_damping_ratio",
 ]
 
 # Keys that each model of the motion simulator requires.
@@ -52,16 +55,67 @@ _ALL_MODEL_KEYS = sorted({key for keys in KEYS_OF_MODELS.values() for key in key
 
 
 def check_mechanism_rules(mechanism: Mechanism) -> None:
-    """Check all rules for a one-axis mechanism. Raise `KeyProblem` for the first violation."""
-    check_texts(mechanism)
-    _check_bodies(mechanism)
-    check_contact_law(("contact",), mechanism.contact, mechanism.uncertainty, CONTACT_KEYS.values())
-    check_simulator_model(mechanism.rig.simulator)
-    _check_hold(mechanism)
-    spans = {path: check_uncertainty(mechanism, path) for path in mechanism.uncertainty}
+    """Check all rules for a one-axis mechanism. Raise `KeyProblem` for all rules that are violated."""
+    contact, uncertainty = mechanism.contact, mechanism.uncertainty
+    spans: dict[str, Span] = {}
+    run_checks(
+        [
+            lambda: check_texts(mechanism),
+            lambda: _check_damping_ratio(contact),
+            lambda: _check_bodies(mechanism),
+            lambda: check_contact_law(("contact",), contact, uncertainty, CONTACT_KEYS.values()),
+            lambda: check_simulator_model(mechanism.rig.simulator),
+        ]
+    )
+    run_checks(
+        [
+            lambda: _check_hold(mechanism),
+            *(
+                lambda path=path: spans.update({path: check_uncertainty(mechanism, path)})
+                for path in uncertainty
+            ),
+        ]
+    )
     check_correlation(mechanism)
-    _check_velocity_limit(mechanism, spans)
-    _check_gap(mechanism, spans)
+    run_checks([lambda: _check_velocity_limit(mechanism, spans), lambda: _check_gap(mechanism, spans)])
+
+
+def resolve_damping_ratio(mechanism: Mechanism) -> Mechanism:
+    """Return the mechanism with the damping that its key `contact.damping_ratio` states.
+
+    The mechanism is returned unchanged if it has no such key, or if `check_mechanism_rules` will reject it.
+    """
+    contact, bodies = mechanism.contact, mechanism.bodies
+    if contact.damping_ratio is None:
+        return mechanism
+    try:
+        _check_damping_ratio(contact)
+        _check_bodies(mechanism)
+        damping = [
+            2.0 * ratio * math.sqrt(stiffness * bodies.mass)
+            for ratio, stiffness in _repeat_last(contact.damping_ratio, contact.stiffness)
+        ]
+    except (KeyProblem, TypeError):
+        return mechanism
+    return replace(mechanism, contact=replace(contact, damping=damping, damping_ratio=None))
+
+
+def _check_damping_ratio(contact: Contact) -> None:
+    """Raise `KeyProblem` if a damping ratio has no meaning for the contact law, or if there is a damping."""
+    path = ("contact", "damping_ratio")
+    if contact.damping_ratio is None:
+        return
+    found = format_value(contact.damping_ratio)
+    if contact.law not in DAMPING_RATIO_LAWS:
+        raise KeyProblem(path, found, f"nothing (only for law {' or '.join(DAMPING_RATIO_LAWS)})")
+    if any(contact.damping):
+        raise KeyProblem(path, f"{found} and a damping", "either damping or damping_ratio")
+
+
+def _repeat_last(*lists: Sequence[Any]) -> list[tuple[Any, ...]]:
+    """Return the entries of lists together; the last entry of a shorter list repeats."""
+    length = max(map(len, lists))
+    return [tuple(entries[min(i, len(entries) - 1)] for entries in lists) for i in range(length)]
 
 
 def is_hurwitz(polynomial: Sequence[float]) -> bool:

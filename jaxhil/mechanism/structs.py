@@ -62,6 +62,13 @@ Distribution = Literal["uniform", "loguniform", "normal"]
 Stiffness = Annotated[float, key_metadata("slope of the force", "N/m", gt=0.0)]
 Slopes = Annotated[list[Stiffness], Meta(min_length=1, max_length=21)]
 Damping = Annotated[float, key_metadata("damping of the contact", "N s/m", ge=0.0)]
+DampingRatio = Annotated[float, key_metadata("damping ratio of the contact", "1", ge=0.0)]
+# Laws whose damping follows from a damping ratio, a stiffness and the equivalent mass.
+DAMPING_RATIO_LAWS = tuple(
+    law.name
+    for law in CONTACT_LAWS.values()
+    if law.is_damped and not law.is_segmented and (law.stiffness_unit, law.damping_unit) == ("N/m", "N s/m")
+)
 # Parts of the descriptions of stiffness and damping, for the laws with other units.
 STIFFNESS_UNITS = "in N/m^exponent for " + " and ".join(
     law.name for law in CONTACT_LAWS.values() if law.stiffness_unit == "N/m^n"
@@ -141,6 +148,18 @@ class ContactOfAnyLaw(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             description=f"damping of each contact; {DAMPING_UNITS}",
         ),
     ] = field(default_factory=_single_entry(0.0))
+    damping_ratio: (
+        Annotated[
+            list[DampingRatio],
+            Meta(
+                min_length=1,
+                max_length=MAX_CONTACTS,
+                description="instead of damping: damping / (2 sqrt(stiffness * equivalent mass)) of each "
+                f"contact; for {', '.join(DAMPING_RATIO_LAWS)}",
+            ),
+        ]
+        | None
+    ) = None
     clearance: Annotated[
         float, key_metadata("gap between two surfaces; infinite for one surface", "m", gt=0.0, infinite=True)
     ] = math.inf
@@ -350,7 +369,8 @@ def ranges_of(kind: msgspec.inspect.Type, names: Mapping[str, Sequence[str]]) ->
         match kind:
             case msgspec.inspect.StructType(fields=fields):
                 for entry in fields:
-                    if entry.name != "correlation":  # its numbers describe other keys
+                    if entry.name not in ("correlation", "damping_ratio") or path == "rig.simulator":
+                        # These numbers describe other keys.
                         visit(entry.type, f"{path}.{entry.encode_name}".lstrip("."))
             case msgspec.inspect.Metadata(type=inner):
                 visit(inner, path, kind.extra or NO_METADATA)

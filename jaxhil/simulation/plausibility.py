@@ -27,6 +27,8 @@ MAX_CONTACT_TICKS = 1e7  # maximum number of ticks of a contact, including its a
 MAX_RUN_TICKS = 1e9  # maximum number of ticks of a run; ticks are counted in 32 bits
 
 PLAUSIBLE_FREQUENCIES = 0.05, 50.0  # Hz; lowest and highest plausible contact frequency
+MIN_FREQUENCY_RATIO = 1e-4  # [1]; lowest plausible contact frequency as a fraction of the control rate
+MAX_PLAUSIBLE_BANDWIDTH = 50.0  # Hz; highest plausible natural frequency of a motion simulator
 MAX_FREQUENCY_RATIO = 0.1  # [1]; highest plausible contact frequency as a fraction of the control rate
 MAX_PLAUSIBLE_VELOCITY = 1.0  # m/s; highest plausible approach velocity
 MAX_LISTED_FREQUENCIES = 4  # a summary lists at most this number of contact frequencies, or only their range
@@ -322,24 +324,54 @@ def _find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) -
         )
     elif fastest.frequency > highest:
         warnings.append(f"{_format_frequency(fastest)}, expected at most {highest:g} Hz")
+    lowest = max(lowest, MIN_FREQUENCY_RATIO / rig.control_period)
     if slowest.frequency < lowest:
-        warnings.append(f"{_format_frequency(slowest)}, expected at least {lowest:g} Hz")
+        hint = "is the stiffness in N/mm, or a mass in g?"
+        warnings.append(f"{_format_frequency(slowest)}, expected at least {lowest:g} Hz ({hint})")
     if mechanism.approach.velocity > MAX_PLAUSIBLE_VELOCITY:
         velocity = f"{mechanism.approach.velocity:.4g} m/s"
         warnings.append(
-            f"approach.velocity: found {velocity}, expected at most {MAX_PLAUSIBLE_VELOCITY:g} m/s"
+            f"approach.velocity: found {velocity}, expected at most {MAX_PLAUSIBLE_VELOCITY:g} m/s (is it in "
+            "mm/s?)"
         )
     if strongest.peak_force > rig.force_sensor.range:
         peak = f"{strongest.peak_force:.3g} N, the peak force of ideal contact {strongest.number}"
         warnings.append(
-            f"rig.force_sensor.range: found {rig.force_sensor.range:.4g} N, expected more than {peak}"
+            f"rig.force_sensor.range: found {rig.force_sensor.range:.4g} N, expected more than {peak} (is it "
+            "in kN?)"
         )
+    frequency = rig.simulator.natural_frequency
+    if frequency is not None and frequency > MAX_PLAUSIBLE_BANDWIDTH:
+        warnings.append(
+            f"rig.simulator.natural_frequency: found {frequency:.4g} Hz, expected at most "
+            f"{MAX_PLAUSIBLE_BANDWIDTH:g} Hz (is it in rad/s? then it is {frequency / (2 * math.pi):.3g} Hz)"
+        )
+    warnings += _check_sensors(mechanism, strongest)
     if not find_contact_law(contact.law).is_damped and any(contact.damping):
         largest = max(contact.damping)
         warnings.append(
             f"contact.damping: found {largest:.4g} N s/m, expected 0: law {contact.law} has no damping"
         )
     return warnings + _check_delays(mechanism, min(contacts, key=lambda item: item.duration))
+
+
+def _check_sensors(mechanism: Mechanism, strongest: ContactSummary) -> list[str]:
+    """Return a warning for every error of a sensor that hides the whole ideal contact."""
+    depth = mechanism.approach.velocity / (2 * math.pi * strongest.frequency)
+    limits = (
+        ("force_sensor", strongest.peak_force, "N", "the peak force", "mN"),
+        ("position_sensor", depth, "m", "about the depth", "um or mm"),
+    )
+    warnings = []
+    for sensor, limit, unit, meaning, smaller in limits:
+        for key in ("noise_std", "quantum", "dead_zone", "bias"):
+            value = getattr(getattr(mechanism.rig, sensor), key, 0.0)
+            if 0.0 < limit <= abs(value):
+                warnings.append(
+                    f"rig.{sensor}.{key}: found {value:.4g} {unit}, expected less than {limit:.3g} {unit}, "
+                    f"{meaning} of ideal contact {strongest.number} (is it in {smaller}?)"
+                )
+    return warnings
 
 
 def _format_frequency(contact: ContactSummary) -> str:
