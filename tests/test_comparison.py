@@ -18,7 +18,7 @@ from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.scenario import build_scenarios
-from tuning.benchmark.runs import build_scenario_set, evaluate_gains
+from tuning.benchmark.runs import build_scenario_set
 from tuning.gains.common_program import group_by_common_program
 from tuning.transparency.damping_perturbations import MAX_DAMPING_RATIO, perturb_damping
 from tuning.transparency.metrics import (
@@ -40,7 +40,7 @@ def evaluate_compensator(raw, law, gains=None, number=LANES):
     parsed = validated({**raw, "uncertainty": SPREAD})
     [(_, form)] = group_by_common_program([parsed])
     scene = build_scenario_set(parsed, form, number, SEED)
-    return evaluate_gains(scene, law, gains or {}, LIMIT, SEED)
+    return scene.evaluate(law, gains or {}, LIMIT, SEED)
 
 
 def test_ideal_rig_has_zero_error_and_full_transparency():

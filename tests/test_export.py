@@ -168,6 +168,10 @@ def test_export_takes_limits_from_the_specified_sweep(jaxhil, gains, tmp_path):
     written = load_gain_file(folder / "gains.json").document
     rates = written["figures"]["watchdog"]
     assert rates["limit"] == 5.0
+    sweep = written["figures"]["sweep"]
+    assert sweep["scenarios"] == 40 and sweep["failed"] == 0 and sweep["limit"] == 5.0
+    sentence = "Sweep: failure probability 0 (95 %: 0 to 0.0881). 0 of 40 scenarios failed; "
+    assert sentence in (folder / "summary.html").read_text() and sentence in " ".join(ran.out.split())
     assert rates["calibrated_on"]["scenarios"] == 40 and rates["calibrated_on"]["sweep_sha256"]
     alarms, runs = (rates["false_alarms"][name] for name in ("alarms", "runs"))
     assert 0 < runs < 40 and f"false alarms {alarms} of {runs} good runs (95 %: " in ran.out

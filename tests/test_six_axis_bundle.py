@@ -4,11 +4,15 @@ import json
 import shutil
 import subprocess
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import c99_cases
+import jax
 import numpy as np
 import pytest
 from bundles import run_selftest
+from msgspec import structs
 from six_axis_documents import LIMITS, six_axis_document
 
 import tuning
@@ -22,9 +26,14 @@ from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.jax_environment import jax_context
 from tuning.bundle.bundle import build_bundle, write_bundle
 from tuning.bundle.selftest import SIX_AXIS_VECTOR_COLUMNS
+from tuning.bundle.summary import summary_html
 from tuning.bundle.vectors_six_axes import compare_with_record, record_inputs, run_controller
+from tuning.sweeps.draws import draw_scenarios
+from tuning.sweeps.manifest import ManifestOptions, build_manifest
+from tuning.sweeps.store import SweepStore
 from tuning.verification.six_axes import run_six_axis_loop
 from tuning.verification.six_axis_replay import command_difference, compare_record, record_runs
+from tuning.watchdog import six_axes
 from tuning.watchdog.six_axes import DrawnRun, alarm_rates, calibrate_six_axes, longest_sum, signal_limits
 
 
@@ -172,6 +181,54 @@ def test_calibrated_limits_accept_good_runs_and_stop_a_wrong_mass():
     assert stopped["false_alarms"]["alarms"] == len(records)
     limits = signal_limits(records, 1e-3, loaded.mechanism)
     assert limits["force_limit"] > 1.4 * max(np.max(np.abs(record.command[:, :3])) for record in records)
+
+
+def test_six_axis_limits_follow_from_the_scenarios_of_a_sweep(monkeypatch):
+    """Record the sweep's scenarios in chunks, up to the number of draws."""
+
+    class Recorded(Exception):
+        pass
+
+    document, batches = six_axis_document(), []
+
+    def record(mechanism, compensator, gains, batch):
+        batches.append(batch)
+        if len(batches) == 2:
+            raise Recorded
+        return SimpleNamespace(status=np.full((1, 4), 1), twist_error=np.full((1, 4), 0.1)), [None] * 4
+
+    monkeypatch.setattr(six_axes, "record_scenarios", record)
+    monkeypatch.setattr(six_axes, "LANES", 4)
+    with jax_context():
+        loaded = check_document(document, any_axes=True)
+        manifest = build_manifest(loaded, ManifestOptions(100, seed=5, sampling="sobol", limit=0.3))
+        with pytest.raises(Recorded):
+            calibrate_six_axes(loaded, SweepStore(Path("sweep"), manifest), scenarios=6)
+        _, expected = draw_scenarios(loaded.mechanism, "sobol", 5, 4, 2)
+    for leaf, other in zip(jax.tree.leaves(batches[1]), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(leaf, other)
+    other = structs.replace(manifest, gains_sha256="0" * 64)
+    with pytest.raises(InputError, match=r"sweep: gains_sha256: found 000000000000"):
+        calibrate_six_axes(loaded, SweepStore(Path("sweep"), other))
+
+
+def test_alarms_count_as_missed_above_the_limit_of_the_sweep(built):
+    gain_file = check_six_axis_document(built.document)
+    with jax_context():
+        loaded = check_document(built.document, any_axes=True)
+        _, [record] = record_runs(loaded.mechanism, loaded.compensator, loaded.gains, 0, 0)
+    runs = [DrawnRun(record, 0.2, False)]
+    assert alarm_rates(gain_file, LIMITS, runs, 0.1)["missed_alarms"]["runs"] == 1
+    assert alarm_rates(gain_file, LIMITS, runs, 0.3)["missed_alarms"]["runs"] == 0
+
+
+def test_six_axis_summary_states_the_failure_probability_of_the_sweep():
+    probability = {"value": 0.0125, "low": 0.002, "high": 0.04, "method": "binomial, exact"}
+    sweep = {"scenarios": 80, "failed": 1, "limit": 0.05, "failure_probability": probability}
+    document = six_axis_document(limits=LIMITS)
+    page = summary_html({**document, "figures": {**document["figures"], "sweep": sweep}}, b"").decode()
+    assert "<p>Sweep: failure probability 0.0125 (95 %: 0.002 to 0.04). 1 of 80 scenarios failed; " in page
+    assert "limit of the twist error 0.05.</p>" in page
 
 
 @pytest.mark.slow

@@ -43,7 +43,7 @@ def test_public_functions_accept_six_axis_mechanisms():
         (lambda: tuning.tune(mechanism, "passivity"), "'passivity', expected one of none, impulse_ledger"),
         (lambda: tuning.tune(mechanism, "phase_lead", chatter_weight=1.0), "chatter_weight: found 1.0"),
         (lambda: tuning.tune("rig-300kg", "phase_lead_per_axis"), "'phase_lead_per_axis', expected none"),
-        (lambda: tuning.compare(mechanism), "supports one axis only"),
+        (lambda: tuning.compare(mechanism, ["passivity"]), "found 'passivity', expected one of none, imp"),
         (lambda: package.jacobian(mechanism, by=("target.mass",)), "found jaxhil/mechanism/2 (six axes)"),
     ):  # fmt: skip
         with pytest.raises(InputError) as caught:
@@ -63,8 +63,28 @@ def test_unsupported_six_axis_features_are_refused_with_one_line_message(jaxhil,
             "--noise-weight: found 1.0",
         ),
         (
-            ["map", "petals", "--x", "a=1:2", "--y", "b=1:2"],
-            "supports one axis only",
+            ["compare", "petals", "--compensators", "passivity", "-o", tmp_path],
+            "--compensators: found 'passivity', expected one of none, impulse_ledger",
+        ),
+        (
+            ["compare", "petals", "rig-300kg", "-o", tmp_path],
+            "rig-300kg: found a mechanism with one axis, expected one with six axes, as petals",
+        ),
+        (
+            ["compare", "petals", "--suites", "-o", tmp_path],
+            "--suites: found the six-axis mechanism petals, expected no --suites: there are no suites",
+        ),
+        (
+            ["map", "petals", "--x", "contact.edges.stiffness=1:2", "--y", "target.mass", "-o", tmp_path],
+            "--x: found 'contact.edges.stiffness', expected the key of a number",
+        ),
+        (
+            ["map", "petals", "--x", "target.mass=-1:1", "--y", "chaser.mass", "-o", tmp_path],
+            "target.mass: found -1.0",
+        ),
+        (
+            ["map", "petals", "--x", "target.mass", "--y", "chaser.mass", "--setting", "x", "-o", tmp_path],
+            "--setting: found 'x', expected none: none has no settings",
         ),
     ):
         ran = jaxhil(*given)

@@ -13,6 +13,7 @@ from jaxhil.rig import digest
 from tuning.sweeps.chunk_file import decode_chunk, encode_chunk, list_different_columns
 from tuning.sweeps.columns import CONTACT_STATUSES, SCENARIO_OUTCOMES, classify_outcomes, list_error_columns
 from tuning.sweeps.manifest import list_process_differences
+from tuning.sweeps.run_sweep import summarise_failures
 from tuning.sweeps.store import (
     lock_store,
     open_store,
@@ -63,6 +64,15 @@ def store(tmp_path):
     for part in range(MANIFEST.parts):
         write_chunk(made, part, fake_rows(part))
     return made
+
+
+def test_summary_of_sweep_counts_the_failures_of_all_chunks(store):
+    failed = np.concatenate([fake_rows(part)["failed"] for part in range(MANIFEST.parts)])
+    summary = summarise_failures(store)
+    assert summary["scenarios"] == 100 and summary["failed"] == np.sum(failed)
+    probability = summary["failure_probability"]
+    assert probability["value"] == np.mean(failed) and probability["low"] < np.mean(failed)
+    assert summary["sweep_sha256"] == MANIFEST.sha256
 
 
 def refused(*words):

@@ -165,8 +165,8 @@ def compensator_names() -> tuple[str, ...]:
     return tuple(dict.fromkeys([*built_in_compensators(), *(module.COMPENSATORS if module else ())]))
 
 
-def check_setting_name(compensator: str, value: Any) -> None:
-    """Raise `ArgumentError` unless `value` is None or the name of one of the compensator's settings.
+def check_setting_name(compensator: str, value: Any, axes: int = 1) -> None:
+    """Raise `ArgumentError` unless `value` is None or one of the compensator's settings for 1 or 6 axes.
 
     Unless `value` is None, this function imports jax.
     """
@@ -174,7 +174,7 @@ def check_setting_name(compensator: str, value: Any) -> None:
         return
     from jaxhil.laws.compensators import get_compensator
 
-    names = get_compensator(compensator).settings
+    names = get_compensator(compensator, axes).settings
     if value not in names:
         allowed = ", ".join(names) or f"none: {compensator} has no settings"
         raise ArgumentError("setting", format_value(value), allowed)

@@ -1,21 +1,22 @@
 """Function `tuning.compare`, which tunes compensators and compares them on the same fresh scenarios."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import FlagCreatePairsOff
 
 from jaxhil.errors import InputError, format_value
 from jaxhil.laws import built_in_compensators
-from jaxhil.mechanism.file import LoadedMechanism
+from jaxhil.mechanism.file import LoadedAnyMechanism
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.jax_environment import jax_context
 from tuning import terminal
 from tuning.api import arguments, mechanism_summary
 from tuning.api.options import (
     AllowedValues,
-    LimitRange,
+    OptionalLimit,
     Scheduler,
     SeedRange,
     add_options,
@@ -59,7 +60,8 @@ class Board:
         document: all results, as `jaxhil compare --json` prints them under `mechanisms`.
         figures: metrics by compensator, then by set of gains ("literature", "tuned", or the name of a
             setting). The metrics are the attributes rms, p99, worst, early, late, slope, peak [1] and more;
-            each is a `ComparedMetric`.
+            each is a `ComparedMetric`. For six axes, rms, p99 and worst are those of the twist error, and
+            energy_rms and not_ended replace the metrics of transparency.
         gains: gains [SI units] by compensator, then by set of gains as in `figures`, then by the gain's name.
         winners: for each metric, the compensator that is better than all others by more than the confidence
             intervals, or None if there is no such compensator.
@@ -77,7 +79,9 @@ class CompareOptions:
 
     compensators: Annotated[
         tuple[str, ...],
-        text_option("NAME [NAME ...]", "Compensators to compare; by default all built-in ones."),
+        text_option(
+            "NAME [NAME ...]", "Compensators to compare; by default all built-in ones for the number of axes."
+        ),
     ] = ()
     untuned: Annotated[
         FlagCreatePairsOff[bool],
@@ -85,21 +89,29 @@ class CompareOptions:
     ] = False
     scenarios: Annotated[int, number_option("Scenarios to tune on."), AllowedValues(1)] = 32
     judged: Annotated[int, number_option("Fresh scenarios for the evaluation."), AllowedValues(2)] = 256
-    limit: Annotated[
-        float, arg(metavar="NUMBER", help="Restitution error above which a scenario fails."), LimitRange
-    ] = 0.01
+    limit: OptionalLimit = None
     seed: Annotated[int, number_option("Seed of scenarios, starts and resampling."), SeedRange] = 0
     scheduler: Scheduler = None
 
     def check(self) -> None:
         """Raise `InputError` if the value of an option is not allowed."""
         check_options(self)
-        arguments.check_compensators(self.laws, "compensators")
+        for name in self.compensators:
+            arguments.check_supports_mechanism(name, None, "compensators")
 
-    @property
-    def laws(self) -> tuple[str, ...]:
-        """Return the names of the compensators to compare, each once; by default all built-in ones."""
-        return tuple(dict.fromkeys(self.compensators or built_in_compensators()))
+    def with_defaults(self, loaded: Sequence[LoadedAnyMechanism]) -> Self:
+        """Return the options with all compensators and the limit, which depend on the number of axes.
+
+        Raise `InputError` if two mechanisms have the same name or different numbers of axes, or if a
+        compensator does not support the number of axes.
+        """
+        check_mechanisms(loaded)
+        mechanism = loaded[0].mechanism
+        names = self.compensators or built_in_compensators(6 if _has_six_axes(loaded[0]) else 1)
+        for name in names:
+            arguments.check_supports_mechanism(name, mechanism, "compensators")
+        limit = arguments.choose_limit(self.limit, mechanism)
+        return replace(self, compensators=tuple(dict.fromkeys(names)), limit=limit)
 
 
 @arguments.convert_os_errors
@@ -117,9 +129,11 @@ def compare(
     the command starts a process for each core.
 
     Args:
-        mechanism: result of `jaxhil.load`, or a name or path that `jaxhil.load` accepts; or a list of these.
-        compensators: names of built-in or registered compensators; by default all built-in ones. A
-            compensator that has settings is evaluated with each setting instead of being tuned.
+        mechanism: result of `jaxhil.load`, or a name or path that `jaxhil.load` accepts; or a list of these,
+            all with the same number of axes.
+        compensators: names of built-in or registered compensators; by default all built-in ones for the
+            mechanism's number of axes. A compensator that has settings is evaluated with each setting instead
+            of being tuned.
         progress: report the progress on standard error.
         **options: see `CompareOptions`.
 
@@ -135,13 +149,14 @@ def compare(
         >>> sorted(board.figures)
         ['none', 'phase_lead']
     """
-    loaded, is_list = arguments.load_mechanisms(mechanism)
+    loaded, is_list = arguments.load_any_mechanisms(mechanism)
     settings = CompareOptions(compensators=tuple(_as_compensator_list(compensators)), **options)
     settings.check()
     arguments.check_booleans(progress=progress)
-    check_distinct_names(loaded)
+    settings = settings.with_defaults(loaded)
     results: dict[str, dict[str, CompensatorMetrics]] = {entry.mechanism.name: {} for entry in loaded}
-    with jax_context(), terminal.show_progress(len(loaded) * len(settings.laws), "results", progress) as bar:
+    number = len(loaded) * len(settings.compensators)
+    with jax_context(), terminal.show_progress(number, "results", progress) as bar:
         for result in compare_each(loaded, settings, 0, bar):
             results[result.mechanism][result.compensator] = result
         boards = [build_board(entry, settings, results[entry.mechanism.name]) for entry in loaded]
@@ -149,7 +164,7 @@ def compare(
 
 
 def compare_each(
-    loaded: Sequence[LoadedMechanism],
+    loaded: Sequence[LoadedAnyMechanism],
     options: CompareOptions,
     processes: int,
     bar: terminal.Progress,
@@ -159,7 +174,7 @@ def compare_each(
 
     Args:
         loaded: mechanisms.
-        options: options of the comparison.
+        options: options of the comparison, from `CompareOptions.with_defaults`.
         processes: number of processes; 0 for the current process.
         bar: progress display.
         checkpoints: results of finished work, which is not repeated; new results are added.
@@ -170,6 +185,7 @@ def compare_each(
     from tuning.benchmark.comparison import CompareSettings, compare_compensators
     from tuning.caches.checkpoints import NO_CHECKPOINTS
 
+    assert options.limit is not None
     settings = CompareSettings(
         options.scenarios,
         judged=options.judged,
@@ -182,7 +198,7 @@ def compare_each(
     mechanisms = [entry.mechanism for entry in loaded]
     yield from compare_compensators(
         mechanisms,
-        options.laws,
+        options.compensators,
         settings,
         processes,
         bar.tell,
@@ -191,10 +207,16 @@ def compare_each(
     )
 
 
-def check_distinct_names(loaded: Sequence[LoadedMechanism]) -> None:
-    """Raise `InputError` if two mechanisms have the same name."""
+def check_mechanisms(loaded: Sequence[LoadedAnyMechanism]) -> None:
+    """Raise `InputError` if two mechanisms have the same name or different numbers of axes."""
     labels: dict[str, str] = {}
     for entry in loaded:
+        if (has_six := _has_six_axes(entry)) != _has_six_axes(loaded[0]):
+            axes = ("six axes", "one axis") if has_six else ("one axis", "six axes")
+            raise InputError(
+                f"{entry.label}: found a mechanism with {axes[0]}, expected one with {axes[1]}, as "
+                f"{loaded[0].label}: their errors cannot be compared"
+            )
         name = entry.mechanism.name
         if name in labels:
             raise InputError(
@@ -203,22 +225,28 @@ def check_distinct_names(loaded: Sequence[LoadedMechanism]) -> None:
         labels[name] = entry.label
 
 
+def _has_six_axes(entry: LoadedAnyMechanism) -> bool:
+    return isinstance(entry.mechanism, SixAxisMechanism)
+
+
 def build_board(
-    entry: LoadedMechanism, options: CompareOptions, results: "Mapping[str, CompensatorMetrics]"
+    entry: LoadedAnyMechanism, options: CompareOptions, results: "Mapping[str, CompensatorMetrics]"
 ) -> Board:
     """Return the comparison for one mechanism, from the results of the finished compensators."""
-    from jaxhil.laws.compensators import COMPENSATORS
+    from jaxhil.laws.compensators import axes_of, get_compensator
     from tuning.benchmark.tables import find_winners
 
-    laws = [results[law] for law in options.laws if law in results]
+    axes = axes_of(entry.mechanism)
+    laws = [results[law] for law in options.compensators if law in results]
     best = find_winners(laws) if laws else {}
     document = {
         "mechanism": entry.mechanism.name,
+        "axes": axes,
         "file": entry.label,
         "laws": [
             {
                 "law": result.compensator,
-                "knows": list(COMPENSATORS[result.compensator].knows),
+                "knows": list(get_compensator(result.compensator, axes).knows),
                 "gains": result.gains,
                 "figures": result.figures,
             }

@@ -162,12 +162,16 @@ def export(
         check_same_mechanism(target, loaded.mechanism.name)
         format_names = _select_formats(formats, settings.fmi)
         allowed = settings.false_alarms, settings.missed
-        calibration = _calibrate_limits(loaded, sweep, user_limits, allowed, progress)
+        from tuning.sweeps.run_sweep import summarise_failures
+
+        content = loaded.document
+        with _open_sweep(sweep) as store:
+            calibration = _calibrate_limits(loaded, store, user_limits, allowed, progress)
+            if store is not None:
+                content = {**content, "figures": {**content["figures"], "sweep": summarise_failures(store)}}
         limits_and_rates = calibration.limits, calibration.rates
         with terminal.show_stages(2, progress) as stages:
-            bundle = build_bundle(
-                loaded.document, format_names, *limits_and_rates, settings.seed, stages.begin, key
-            )
+            bundle = build_bundle(content, format_names, *limits_and_rates, settings.seed, stages.begin, key)
             if not bundle.reasons:
                 write_bundle(target, bundle.files)
     document = _build_document(loaded, bundle, format_names, calibration.rates)
@@ -189,6 +193,7 @@ def _build_document(loaded, bundle, format_names, rates) -> dict[str, Any]:
     return {
         "bundle": None,
         "mechanism": loaded.mechanism.name,
+        "axes": bundle.document.get("axes", 1),
         "compensator": loaded.compensator,
         "gains_sha256": bundle.document["sha256"],
         "formats": format_names,
@@ -196,6 +201,7 @@ def _build_document(loaded, bundle, format_names, rates) -> dict[str, Any]:
         "signed": SIGNATURE_FILE in bundle.files,
         "limits": bundle.document.get("limits"),
         "rates": rates,
+        "sweep": bundle.document["figures"].get("sweep"),
         "ticks": bundle.ticks,
         "runs": bundle.runs,
         "ended": bundle.ended,
@@ -207,45 +213,33 @@ def _build_document(loaded, bundle, format_names, rates) -> dict[str, Any]:
 
 
 def _calibrate_limits(
-    loaded, sweep: Any, replaced: dict[str, float | None], allowed: tuple[float, float], progress: bool
+    loaded,
+    store: "SweepStore | None",
+    replaced: dict[str, float | None],
+    allowed: tuple[float, float],
+    progress,
 ):
     """Compute the watchdog's limits, and its rates of false and missed alarms.
 
     `replaced` contains the limits that the user set; `allowed` contains the acceptable rates of both alarms.
     """
+    from tuning.watchdog.verdict import AllowedAlarmRates
+
+    rates = AllowedAlarmRates(*allowed)
     if loaded.document.get("axes", 1) == 6:
-        return _calibrate_six_axes(loaded, sweep, replaced, allowed, progress)
+        from tuning.watchdog.six_axes import SIX_AXIS_DRAWS, calibrate_six_axes
+
+        with terminal.show_progress(SIX_AXIS_DRAWS, "runs", progress) as bar:
+            bar.reach(0, "computing the limits")
+            return calibrate_six_axes(loaded, store, replaced, rates, bar.advance)
     from tuning.watchdog.calibration import DEFAULT_DRAWS, calibrate, count_stored_scenarios
     from tuning.watchdog.fault_injection import INJECTED_FAULTS, count_fault_scenarios
-    from tuning.watchdog.verdict import AllowedAlarmRates
 
     faulty = count_fault_scenarios(allowed[1])
-    with _open_sweep(sweep) as store:
-        runs = DEFAULT_DRAWS if store is None else count_stored_scenarios(store)
-        with terminal.show_progress(runs + len(INJECTED_FAULTS) * faulty, "runs", progress) as bar:
-            bar.reach(0, "computing the limits")
-            return calibrate(
-                loaded,
-                store,
-                replaced=replaced,
-                allowed=AllowedAlarmRates(*allowed),
-                progress=bar.advance,
-                faulty=faulty,
-            )
-
-
-def _calibrate_six_axes(
-    loaded, sweep: Any, replaced: dict[str, float | None], allowed: tuple[float, float], progress: bool
-):
-    """Compute the watchdog's limits and alarm rates on six axes, like `_calibrate_limits` on one axis."""
-    from tuning.watchdog.six_axes import SIX_AXIS_DRAWS, calibrate_six_axes
-    from tuning.watchdog.verdict import AllowedAlarmRates
-
-    if sweep is not None:
-        raise ArgumentError("sweep", "a sweep", "none: limits in six axes are computed from fresh draws")
-    with terminal.show_progress(SIX_AXIS_DRAWS, "runs", progress) as bar:
+    runs = DEFAULT_DRAWS if store is None else count_stored_scenarios(store)
+    with terminal.show_progress(runs + len(INJECTED_FAULTS) * faulty, "runs", progress) as bar:
         bar.reach(0, "computing the limits")
-        return calibrate_six_axes(loaded, replaced, AllowedAlarmRates(*allowed), bar.advance)
+        return calibrate(loaded, store, replaced=replaced, allowed=rates, progress=bar.advance, faulty=faulty)
 
 
 def _check_limit_names(limits: Mapping[str, Any], axes: int) -> None:

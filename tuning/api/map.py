@@ -1,4 +1,4 @@
-"""Function `tuning.map`, which computes the restitution error as a function of two keys, and margins."""
+"""Function `tuning.map`, which computes the error of a contact as a function of two keys, and margins."""
 
 import os
 from collections.abc import Mapping
@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from tyro.conf import arg
 
 from jaxhil.errors import InputError
 from jaxhil.files import report_write_errors, write_atomically
-from jaxhil.mechanism.loading import as_mechanism
-from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.file import AnyMechanism
+from jaxhil.mechanism.loading import as_any_mechanism
 from jaxhil.rig import digest
 from jaxhil.simulation.jax_environment import jax_context
 from tuning import terminal
@@ -26,6 +25,7 @@ from tuning.api.options import (
     add_options,
     check_options,
     number_option,
+    text_option,
 )
 
 if TYPE_CHECKING:
@@ -39,15 +39,18 @@ MAX_POINTS = 1000  # largest number of points along an axis; the number of runs 
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """Result of `map`: restitution and restitution error as functions of two keys, at the points of a grid.
+    """Result of `map`: error and restitution as functions of two keys, at the points of a grid.
+
+    The error is the restitution error or, for six axes, the twist error.
 
     Attributes:
         document: all results, as `jaxhil map --json` prints them.
         x: values of the key along x, (columns,), in the unit of the key.
         y: values of the key along y, (rows,), in the unit of the key.
-        error: error e - e* with the largest magnitude among the contacts, (rows, columns) [1]; NaN if a
-            contact did not end.
-        restitution: restitution e of the contact with this error, (rows, columns) [1].
+        error: error with the largest magnitude among the contacts, (rows, columns) [1]; NaN if a contact did
+            not end, or if nothing touched.
+        restitution: restitution e of the contact with this error, (rows, columns) [1]; for six axes NaN
+            unless there is a single touch.
         results: the same results as arrays, with theory and margins (`tuning.stability_map.grid.MapResults`).
     """
 
@@ -81,8 +84,14 @@ class MapOptions:
         int, number_option("Number of points along each axis."), AllowedValues(2, MAX_POINTS)
     ] = 100
     limit: Annotated[
-        float, arg(metavar="NUMBER", help="Restitution error that limits the margins."), LimitRange
-    ] = 0.01
+        float | None,
+        text_option(
+            "NUMBER",
+            "Error that limits the margins: the restitution error, by default 0.01; in six axes the twist "
+            "error, by default 0.05.",
+        ),
+        LimitRange,
+    ] = None
     resume: Resume = False
     scheduler: Scheduler = None
     seed: Annotated[
@@ -93,7 +102,7 @@ class MapOptions:
 @arguments.convert_os_errors
 @add_options(MapOptions)
 def map(
-    mechanism: Mechanism | str | os.PathLike[str],
+    mechanism: AnyMechanism | str | os.PathLike[str],
     x: str,
     y: str,
     compensator: str = "none",
@@ -103,15 +112,15 @@ def map(
     progress: bool = False,
     **options: Any,
 ) -> StabilityMap:
-    """Compute a stability map: the restitution error as a function of two keys, and closed-form predictions.
+    """Compute a stability map: the error of a contact as a function of two keys, and closed-form predictions.
 
     The gains at every point are those of the nominal mechanism, so that the map shows the effect of changes
     that are unknown to the controller. If compensator and contact law are linear, the map also contains the
     spectral radius of the sampled loop in contact and, at the nominal point, its derivative with respect to
-    each gain.
+    each gain. For six axes, the error is the twist error, and there are no predictions.
 
     Args:
-        mechanism: a `Mechanism`, the name of a built-in mechanism, or the path of a mechanism file.
+        mechanism: result of `jaxhil.load`, the name of a built-in mechanism, or the path of a mechanism file.
         x: key along x, "PATH" or "PATH=LOW:HIGH" in SI units, or "gains.NAME". The default range is the key's
             [uncertainty] in the file or, if there is none, 0.3 to 3 times the nominal value; for a gain, it
             is the gain's bounds. The entries of a list are scaled together, and the values along the axis are
@@ -140,14 +149,14 @@ def map(
     arguments.check_booleans(progress=progress)
     if settings.resume and folder is None:
         raise arguments.ArgumentError("resume", "no folder", "the folder of an interrupted map")
-    checked = as_mechanism(mechanism)
+    checked = as_any_mechanism(mechanism)
     target = None if folder is None else arguments.check_path("folder", folder)
     with jax_context():
         return _compute(checked, (x, y), compensator, gains, settings, target, progress)
 
 
 def _compute(
-    mechanism: Mechanism,
+    mechanism: AnyMechanism,
     keys: tuple[str, str],
     compensator: str,
     gains: Any,
@@ -163,7 +172,8 @@ def _compute(
     name, values = choose_gains(mechanism, compensator, gains)
     axes = _axes(mechanism, name, values, *keys)
     mechanism_summary.check_can_be_simulated(mechanism)
-    points, limit, seed = settings.points, settings.limit, settings.seed
+    points, seed = settings.points, settings.seed
+    limit = arguments.choose_limit(settings.limit, mechanism)
     checkpoints = Checkpoints(None if target is None else target / CHECKPOINT_FOLDER, settings.resume)
     with terminal.show_progress(count_runs(points), "runs", progress) as bar:
         others = settings.scheduler, checkpoints
@@ -178,13 +188,13 @@ def _compute(
 
 
 def _axes(
-    mechanism: Mechanism, compensator: str, gains: Mapping[str, float], x: str, y: str
+    mechanism: AnyMechanism, compensator: str, gains: Mapping[str, float], x: str, y: str
 ) -> "tuple[MapAxis, MapAxis]":
     """Build both axes of the map; if this fails, raise an `InputError` that names the wrong option."""
-    from jaxhil.laws.compensators import COMPENSATORS
+    from jaxhil.laws.compensators import axes_of, get_compensator
     from tuning.stability_map.axes import check_axes, parse_axis
 
-    law = COMPENSATORS[compensator]
+    law = get_compensator(compensator, axes_of(mechanism))
     try:
         axes = parse_axis("x", x, mechanism, law, gains), parse_axis("y", y, mechanism, law, gains)
         check_axes(mechanism, axes)
@@ -202,7 +212,7 @@ def _write(stability_map: StabilityMap, folder: Path) -> None:
 
 
 def _build_document(
-    mechanism: Mechanism,
+    mechanism: AnyMechanism,
     compensator: str,
     gains: Mapping[str, float],
     computed: "MapResults",
@@ -217,6 +227,7 @@ def _build_document(
     document = {
         "schema": SCHEMA,
         "mechanism": mechanism.name,
+        "axes": computed.rig_axes,
         "compensator": compensator,
         "gains": dict(gains),
         **{

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from jaxhil.errors import to_one_line
-from jaxhil.mechanism.file import to_plain_data
-from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.file import AnyMechanism, to_plain_data
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.jax_environment import DEVICE_COUNT_FLAG, MIN_DEVICES, prepare_jax
 from tuning.caches.checkpoints import NO_CHECKPOINTS, Checkpoints, compute_digest
 from tuning.caches.cluster import WorkUnit, run_on_workers
@@ -42,7 +42,7 @@ class CompareSettings:
     polish: int = 20  # number of evaluations per gain in the derivative-free search after the optimisation
     scanned: int = 64  # number of points that are scanned to find starting points
     judged: int = 256  # number of scenarios for the evaluation
-    limit: float = 0.01  # restitution error above which a contact counts as a failure [1]
+    limit: float = 0.01  # restitution or twist error above which a contact counts as a failure [1]
     seed: int = 0  # seed of scenarios, starting points and bootstrap
     tuned: bool = True  # whether to tune the gains
 
@@ -59,7 +59,8 @@ class CompensatorMetrics(NamedTuple):
     gains: dict[str, dict[str, float]]  # gains by name, for each set
     figures: dict[
         str, dict[str, IntervalEstimate]
-    ]  # metrics by name (`tuning.transparency.metrics`), for each set
+    ]  # metrics by name (`tuning.transparency.metrics`, `tuning.benchmark.six_axis_runs`), for each set
+    axes: int = 1  # number of axes of the mechanism
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -79,7 +80,7 @@ GroupResult = tuple[list[Any], str, list[CompensatorMetrics] | CompensatorFailur
 
 
 def compare_compensators(
-    mechanisms: Sequence[Mechanism],
+    mechanisms: Sequence[AnyMechanism],
     compensators: Sequence[str],
     settings: CompareSettings,
     processes: int,
@@ -90,7 +91,7 @@ def compare_compensators(
     """Evaluate every compensator on every mechanism; yield each result when it is complete.
 
     Args:
-        mechanisms: mechanisms to simulate.
+        mechanisms: mechanisms to simulate, all with the same number of axes.
         compensators: names of the compensators.
         settings: settings of the comparison.
         processes: number of processes. With 0, this process computes all results, and an error ends the
@@ -124,8 +125,12 @@ def compare_compensators(
 
         This order balances the load of the processes.
         """
+        axes = 6 if isinstance(left[0], SixAxisMechanism) else 1
+        counts = {compensator: _count_gains(compensator, axes) for compensator in compensators}
         order = (
-            sorted(compensators, key=_count_gains, reverse=True) if processes or scheduler else compensators
+            sorted(compensators, key=counts.__getitem__, reverse=True)
+            if processes or scheduler
+            else compensators
         )
         return [
             (g, compensator)
@@ -153,7 +158,7 @@ def compare_compensators(
 
 
 def _read_cached_results(
-    mechanisms: Sequence[Mechanism],
+    mechanisms: Sequence[AnyMechanism],
     compensators: Sequence[str],
     settings: CompareSettings,
     checkpoints: Checkpoints,
@@ -171,7 +176,7 @@ def _read_cached_results(
 
 
 def _describe_checkpoint(
-    group: list[Mechanism], compensator: str, settings: CompareSettings
+    group: list[AnyMechanism], compensator: str, settings: CompareSettings
 ) -> tuple[str, Any]:
     """Return the name and the inputs under which the result of one task is cached."""
     return f"compare {compensator} {group[0].name}", (
@@ -230,7 +235,7 @@ def _describe_failure(compensator: str, error: BaseException) -> CompensatorFail
 
 def _evaluate_in_processes(
     processes: int,
-    mechanisms: list[Mechanism],
+    mechanisms: list[AnyMechanism],
     settings: CompareSettings,
     missing: Callable[[list[list[Any]]], list[tuple[list[Any], str]]],
     tell: ComparisonProgress,
@@ -263,25 +268,34 @@ def _evaluate_in_processes(
             raise
 
 
-def _count_gains(compensator: str) -> int:
+def _count_gains(compensator: str, axes: int) -> int:
     """Return the number of a compensator's gains, which determines the compilation time."""
     from jaxhil.rig import COMPENSATORS
+    from jaxhil.rig.six_axes import SIX_AXIS_COMPENSATORS
 
-    return len(COMPENSATORS[compensator].gains)
+    return len((SIX_AXIS_COMPENSATORS if axes == 6 else COMPENSATORS)[compensator].gains)
 
 
-def build_scenario_sets(mechanisms: list[Mechanism], settings: CompareSettings) -> list[list[Any]]:
-    """Build the scenarios of all mechanisms, one `tuning.benchmark.runs.ScenarioSet` for each.
+def build_scenario_sets(mechanisms: list[AnyMechanism], settings: CompareSettings) -> list[list[Any]]:
+    """Build the scenarios of all mechanisms.
 
-    Mechanisms that share a compiled program are in the same inner list.
+    Each entry is a `tuning.benchmark.runs.ScenarioSet` or, for six axes, a
+    `tuning.benchmark.six_axis_runs.SixAxisScenarioSet`. Mechanisms that share a compiled program are in the
+    same inner list.
     """
     from tuning.benchmark.runs import build_scenario_set
+    from tuning.benchmark.six_axis_runs import build_six_axis_scenario_set
     from tuning.gains.common_program import group_by_common_program
 
-    seed = settings.seed + SEED_OFFSET
+    drawn = settings.judged, settings.seed + SEED_OFFSET
+
+    def build(mechanism: AnyMechanism, common: Any) -> Any:
+        if isinstance(mechanism, SixAxisMechanism):
+            return build_six_axis_scenario_set(mechanism, *drawn)
+        return build_scenario_set(mechanism, common, *drawn)
+
     return [
-        [build_scenario_set(mechanisms[i], common, settings.judged, seed) for i in group]
-        for group, common in group_by_common_program(mechanisms)
+        [build(mechanisms[i], common) for i in group] for group, common in group_by_common_program(mechanisms)
     ]
 
 
@@ -295,16 +309,17 @@ def evaluate_compensator(
 
     `tell` is a callback, called with a description of the current work and the completed fraction.
     """
-    from jaxhil.laws.compensators import COMPENSATORS, literature_gains
-    from tuning.benchmark.runs import count_evaluated_lanes, evaluate_gains
+    from jaxhil.laws.compensators import axes_of, get_compensator, literature_gains
     from tuning.gains.search_progress import SearchProgress
     from tuning.gains.settings import TuneSettings
     from tuning.gains.tune_all import tune_all
 
     mechanisms = [scene.mechanism for scene in scenes]
+    axes = axes_of(mechanisms[0])
+    specification = get_compensator(compensator, axes)
     further = [
         name
-        for name in COMPENSATORS[compensator].settings
+        for name in specification.settings
         if any(literature_gains(m, compensator, name) != literature_gains(m, compensator) for m in mechanisms)
     ]
     gains = [
@@ -315,12 +330,10 @@ def evaluate_compensator(
         for mechanism in mechanisms
     ]
     # A compensator whose settings hold for all mechanisms is not tuned.
-    tuned = settings.tuned and not COMPENSATORS[compensator].settings
-    tuned = tuned and any(
-        gain.tuned(mechanism) for gain in COMPENSATORS[compensator].gains for mechanism in mechanisms
-    )
+    tuned = settings.tuned and not specification.settings
+    tuned = tuned and any(gain.tuned(mechanism) for gain in specification.gains for mechanism in mechanisms)
     work = SearchProgress(lambda text, share, _: tell(f"{compensator}, {text}", share))
-    lanes = {scene.mechanism.name: count_evaluated_lanes(scene) for scene in scenes}
+    lanes = {scene.mechanism.name: scene.lanes for scene in scenes}
     work.runs_after_group = (1 + len(further) + tuned) * sum(lanes.values())
     if tuned:
         tuning = TuneSettings(
@@ -339,9 +352,9 @@ def evaluate_compensator(
         metrics = {}
         for which, values in by_name.items():
             work.say(f"{scene.mechanism.name}: evaluating {which} gains")
-            metrics[which] = evaluate_gains(scene, compensator, values, settings.limit, settings.seed)
+            metrics[which] = scene.evaluate(compensator, values, settings.limit, settings.seed)
             work.report_runs(lanes[scene.mechanism.name])
-        results.append(CompensatorMetrics(compensator, scene.mechanism.name, by_name, metrics))
+        results.append(CompensatorMetrics(compensator, scene.mechanism.name, by_name, metrics, axes))
     return results
 
 

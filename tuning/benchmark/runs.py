@@ -1,4 +1,4 @@
-"""Runs of one compensator on one mechanism for the comparison, with and without perturbations.
+"""Runs of one compensator on one mechanism with one axis for the comparison, with and without perturbations.
 
 The perturbations are pushes and additional damping. All mechanisms that share a `CommonProgram` use the same
 compiled program of a compensator.
@@ -32,13 +32,48 @@ from tuning.transparency.pushes import (
 
 
 class ScenarioSet(NamedTuple):
-    """Scenarios of one mechanism in which every compensator is evaluated, as NumPy arrays."""
+    """Scenarios of one mechanism with one axis in which every compensator is evaluated, as NumPy arrays."""
 
     mechanism: Mechanism  # mechanism with its uncertainty
     common: CommonProgram  # program that the mechanism shares with other mechanisms
     plain: Scenario  # scenarios without a perturbation
     damped: Scenario  # the same scenarios with additional damping
     ideal_contacts: IdealContacts  # first ideal contact of each scenario
+
+    @property
+    def lanes(self) -> int:
+        """Return the number of lanes that `evaluate` simulates, for progress messages."""
+        return (
+            len(PerturbedOutcomes._fields)
+            * len(self.plain.velocity)
+            * (1 + (self.mechanism.approach.contacts > 1))
+        )
+
+    def evaluate(
+        self, law: str, gains: Mapping[str, float], limit: float, seed: int
+    ) -> dict[str, IntervalEstimate]:
+        """Simulate a compensator with the given gains in all scenarios, and compute its metrics by name.
+
+        `limit` [1] is the limit of the restitution error, `seed` the seed of the bootstrap.
+        """
+        contacts, ideal_contacts = self.mechanism.approach.contacts, self.ideal_contacts
+        runs = _run_scenarios(self, law, gains, ideal_contacts)
+        if contacts > 1:
+            # The approach speeds of later contacts depend on the compensator, and so do their ideal contacts.
+            plain: Any = runs.plain
+            velocity = np.where(plain.good, plain.metrics.approach_velocity, _broadcast_velocity(self.plain))
+            contact_law = self.common.law(precomputed=False)
+            ideal_contacts = compute_ideal_contacts(contact_law, self.plain, velocity, contacts)
+            runs = _run_scenarios(self, law, gains, ideal_contacts)
+        return compute_metrics(
+            runs,
+            (ideal_contacts.early, ideal_contacts.late),
+            ideal_contacts.restitution[0],
+            np.max(ideal_contacts.depth, axis=1),
+            _compute_amplification(self, law, gains),
+            limit,
+            seed,
+        )
 
 
 def build_scenario_set(mechanism: Mechanism, common: CommonProgram, scenarios: int, seed: int) -> ScenarioSet:
@@ -53,42 +88,6 @@ def build_scenario_set(mechanism: Mechanism, common: CommonProgram, scenarios: i
         plain,
         damped,
         compute_ideal_contacts(common.law(precomputed=False), plain, _broadcast_velocity(plain), 1),
-    )
-
-
-def evaluate_gains(
-    scene: ScenarioSet, law: str, gains: Mapping[str, float], limit: float, seed: int
-) -> dict[str, IntervalEstimate]:
-    """Simulate a compensator with the given gains in all scenarios, and compute its metrics by name.
-
-    `limit` [1] is the limit of the restitution error, `seed` the seed of the bootstrap.
-    """
-    contacts, ideal_contacts = scene.mechanism.approach.contacts, scene.ideal_contacts
-    runs = _run_scenarios(scene, law, gains, ideal_contacts)
-    if contacts > 1:
-        # The approach speeds of later contacts depend on the compensator, and so do their ideal contacts.
-        plain: Any = runs.plain
-        velocity = np.where(plain.good, plain.metrics.approach_velocity, _broadcast_velocity(scene.plain))
-        contact_law = scene.common.law(precomputed=False)
-        ideal_contacts = compute_ideal_contacts(contact_law, scene.plain, velocity, contacts)
-        runs = _run_scenarios(scene, law, gains, ideal_contacts)
-    return compute_metrics(
-        runs,
-        (ideal_contacts.early, ideal_contacts.late),
-        ideal_contacts.restitution[0],
-        np.max(ideal_contacts.depth, axis=1),
-        _compute_amplification(scene, law, gains),
-        limit,
-        seed,
-    )
-
-
-def count_evaluated_lanes(scene: ScenarioSet) -> int:
-    """Return the number of lanes that `evaluate_gains` simulates, for progress messages."""
-    return (
-        len(PerturbedOutcomes._fields)
-        * len(scene.plain.velocity)
-        * (1 + (scene.mechanism.approach.contacts > 1))
     )
 
 

@@ -11,7 +11,7 @@ from tuning.benchmark.comparison import LITERATURE_GAINS, TUNED_GAINS, Compensat
 from tuning.statistics.intervals import IntervalEstimate
 from tuning.transparency.metrics import find_winner
 
-PERCENT_METRICS = ("rms", "p99", "worst", "failures", "trajectory")
+PERCENT_METRICS = ("rms", "p99", "worst", "failures", "trajectory", "energy_rms")
 METRIC_HEADINGS = {
     "rms": "rms %",
     "p99": "p99 %",
@@ -24,8 +24,23 @@ METRIC_HEADINGS = {
     "trajectory": "path %",
     "noise": "noise",
 }
+SIX_AXIS_METRIC_HEADINGS = {
+    "energy_rms": "E rms %",
+    "rms": "V rms %",
+    "p99": "V p99 %",
+    "worst": "V worst %",
+    "failures": "fail %",
+    "peak": "peak",
+    "not_ended": "not ended",
+}
+ERROR_NAMES = {1: "restitution error", 6: "twist error"}  # error that is compared, by number of axes
 UNLIMITED_WIDTH = 10_000  # console width [characters] that does not limit a table
 WINNER_MARK = "*"  # marks the metric of a compensator that is significantly better than all others
+
+
+def choose_metric_headings(axes: int) -> dict[str, str]:
+    """Return the metrics of a table, with their headings, for mechanisms with 1 or 6 axes."""
+    return SIX_AXIS_METRIC_HEADINGS if axes == 6 else METRIC_HEADINGS
 
 
 def find_winners(results: Sequence[CompensatorMetrics], which: str = TUNED_GAINS) -> dict[str, str | None]:
@@ -34,7 +49,8 @@ def find_winners(results: Sequence[CompensatorMetrics], which: str = TUNED_GAINS
     A compensator without the gains `which` is compared with its gains from the literature.
     """
     by_law = {result.compensator: choose_best_metrics(result, which) for result in results}
-    return {name: find_winner(name, {law: m[name] for law, m in by_law.items()}) for name in METRIC_HEADINGS}
+    headings = choose_metric_headings(results[0].axes)
+    return {name: find_winner(name, {law: m[name] for law, m in by_law.items()}) for name in headings}
 
 
 def choose_best_metrics(result: CompensatorMetrics, which: str = TUNED_GAINS) -> dict[str, IntervalEstimate]:
@@ -44,7 +60,7 @@ def choose_best_metrics(result: CompensatorMetrics, which: str = TUNED_GAINS) ->
 
 def build_mechanism_table(name: str, results: Sequence[CompensatorMetrics]) -> Table:
     """Build the table of one mechanism: one row for each compensator and set of gains."""
-    winners = find_winners(results)
+    winners, headings = find_winners(results), choose_metric_headings(results[0].axes)
     rows = []
     for result in results:
         for which, metrics in result.figures.items():
@@ -54,17 +70,17 @@ def build_mechanism_table(name: str, results: Sequence[CompensatorMetrics]) -> T
                     result.compensator if which == LITERATURE_GAINS else f"  {which}",
                     *(
                         format_metric(key, metrics[key], is_best and winners[key] == result.compensator)
-                        for key in METRIC_HEADINGS
+                        for key in headings
                     ),
                 ]
             )
     tuned = ", then tuned, but for those with settings" * _has_tuned_gains(results)
     title = f"{name}: each compensator with the literature's gains{tuned}"
-    return _set_compact_style(terminal.build_table(title, ["law", *METRIC_HEADINGS.values()], rows))
+    return _set_compact_style(terminal.build_table(title, ["law", *headings.values()], rows))
 
 
 def build_leaderboard(names: Sequence[str], results: Mapping[str, Sequence[CompensatorMetrics]]) -> Table:
-    """Build the table of rms restitution errors [%], with a row for each mechanism.
+    """Build the table of rms errors [%], restitution or twist error, with a row for each mechanism.
 
     The columns are the compensators, and their named settings.
     """
@@ -94,7 +110,7 @@ def build_leaderboard(names: Sequence[str], results: Mapping[str, Sequence[Compe
         else "each compensator with the literature's gains"
     )
     table = _set_compact_style(
-        terminal.build_table(f"Leaderboard: restitution error, rms [%], {how}", headings, rows)
+        terminal.build_table(f"Leaderboard: {ERROR_NAMES[flat[0].axes]}, rms [%], {how}", headings, rows)
     )
     table.padding = (0, 0)
     table.width = Console(width=UNLIMITED_WIDTH).measure(table).maximum

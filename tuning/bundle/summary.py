@@ -60,6 +60,7 @@ def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> byt
         f"SHA-256 of the gains' content <code>{escape(document['sha256'])}</code></p>",
         f'<img alt="{error_name}, and ranges of the uncertainty" src="data:image/png;base64,{plot}">',
         *(line for table in error_tables for line in _error_table(document, *table)),
+        *(f"<p>{escape(text)}</p>" for text in describe_sweep(document["figures"].get("sweep"), error_name)),
         '<div class="columns"><div>',
         *_gain_table(document),
         *_watchdog_section(document),
@@ -132,6 +133,23 @@ def _error_table(document: Mapping[str, Any], key: str, title: str) -> Iterator[
         yield from _html_table(title, heads, rows)
     else:
         yield f"<p>The gain file contains no {title.partition(' |')[0].removesuffix(' [1]').lower()}s.</p>"
+
+
+def describe_sweep(sweep: Any, error_name: str) -> Iterator[str]:
+    """Yield a sentence with the failure probability of a sweep; yield nothing without a sweep.
+
+    Args:
+        sweep: result of `tuning.sweeps.run_sweep.summarise_failures`, or None.
+        error_name: name of the error to which the sweep's limit applies.
+    """
+    if isinstance(sweep, Mapping) and isinstance(sweep.get("failure_probability"), Mapping):
+        value, low, high = (sweep["failure_probability"].get(key) for key in ("value", "low", "high"))
+        interval = f"95 %: {_format_number(low, 3)} to {_format_number(high, 3)}"
+        limit = f"{error_name.removesuffix(' [1]').lower()} {_format_number(sweep.get('limit'))}"
+        yield (
+            f"Sweep: failure probability {_format_number(value)} ({interval}). {sweep.get('failed')} of "
+            f"{sweep.get('scenarios')} scenarios failed; limit of the {limit}."
+        )
 
 
 def _gain_table(document: Mapping[str, Any]) -> Iterator[str]:

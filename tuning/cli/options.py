@@ -92,6 +92,14 @@ class SimulateOptions:
     reference: Annotated[
         bool, arg(help="Six axes only: simulate the ideal contact of the two bodies, without the rig.")
     ] = False
+    one_axis: Annotated[
+        str | None,
+        text_option(
+            "NEW",
+            "Six axes without friction: write a one-axis mechanism file with the effective mass along the "
+            "normal of the first touch.",
+        ),
+    ] = None
     limit: OptionalLimit = None
     seed: Annotated[int, number_option("Seed of the sensor noise.")] = 0
     json: Json = False
@@ -174,6 +182,7 @@ class Compare(CompareOptions):
     Example: jaxhil compare rig-300kg varying --compensators phase_lead response_error
 
     Writes DIR/compare.json, which contains all metrics with confidence intervals and all gains, and plots.
+    All files have the same number of axes.
     """
 
     files: Files = ()

@@ -24,11 +24,12 @@ AXIS_METAVAR = "PATH[=LOW:HIGH]"
 
 @dataclass(frozen=True, kw_only=True)
 class Map(MapOptions):
-    """Compute a stability map: the restitution error as a function of two keys, and closed-form predictions.
+    """Compute a stability map: the error of a contact as a function of two keys, and closed-form predictions.
 
     Example: jaxhil map rig-300kg --x contact.stiffness=5e4:5e5 --y rig.force_sensor.delay
 
-    Writes DIR/map.json and DIR/map.png. The gains are those of the nominal mechanism at every point.
+    Writes DIR/map.json and DIR/map.png. The gains are those of the nominal mechanism at every point. The
+    error is the restitution error or, for six axes, the twist error, without closed-form predictions.
     """
 
     x: Annotated[

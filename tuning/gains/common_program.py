@@ -18,6 +18,7 @@ from jaxtyping import Array
 from jaxhil.contact.ideal_contact import IdealContact
 from jaxhil.contact.laws import ContactLaw, ContactParameters, find_contact_law
 from jaxhil.contact.mixture import LawMixture
+from jaxhil.mechanism.six_axes import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw_extremes
 from jaxhil.simulation.cells import NO_CELLS, CellCounts, merge_cell_counts
@@ -116,8 +117,19 @@ def _compute_ideal_contact(
     return law.ideal_contact(contact, mass, velocity)
 
 
-def group_by_common_program(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], CommonProgram]]:
-    """Group mechanisms that can share a compiled program; return (indices, program) of each group."""
+def group_by_common_program(mechanisms: Sequence[AnyMechanism]) -> list[tuple[list[int], Any]]:
+    """Group mechanisms that can share a compiled program; return (indices, program) of each group.
+
+    The program is a `CommonProgram`. Each six-axis mechanism is a group of its own, with None as the program.
+    """
+    one_axis = [index for index, mechanism in enumerate(mechanisms) if isinstance(mechanism, Mechanism)]
+    alone = [([index], None) for index in range(len(mechanisms)) if index not in one_axis]
+    groups = _group_one_axis([mechanism for mechanism in mechanisms if isinstance(mechanism, Mechanism)])
+    return [*(([one_axis[i] for i in group], common) for group, common in groups), *alone]
+
+
+def _group_one_axis(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], CommonProgram]]:
+    """Group one-axis mechanisms that can share a program; return (indices, program) of each group."""
     # These scenarios have the ends of all uncertain ranges, and so need every part that a draw can need.
     batches = [build_scenarios(mechanism, draw_extremes(mechanism)) for mechanism in mechanisms]
     loops = [build_loop(m, "none", batch) for m, batch in zip(mechanisms, batches, strict=True)]

@@ -17,7 +17,7 @@ from jaxhil.simulation.contact_plot import (
     legend_below,
 )
 from tuning.benchmark.comparison import LITERATURE_GAINS, TUNED_GAINS, CompensatorMetrics
-from tuning.benchmark.tables import choose_best_metrics
+from tuning.benchmark.tables import ERROR_NAMES, choose_best_metrics
 from tuning.plots.parts import MARKERS, name_rows
 
 MAX_PANEL_COLUMNS = 4  # largest number of panels side by side
@@ -43,7 +43,9 @@ def plot_errors(
     rows = -(-len(names) // columns)
     height = 0.9 + (0.14 + 0.06 * len(keys)) * len(laws)
     size = (2.2 + 2.6 * columns, 1.2 + height * rows)
-    figure = create_figure(size, "Restitution error on fresh scenarios", above=0.9, below=0.75)
+    error_name = ERROR_NAMES[results[names[0]][0].axes]
+    title = f"{error_name.capitalize()} on fresh scenarios"
+    figure = create_figure(size, title, above=0.9, below=0.75)
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for panel, name in zip(panels.flat, names, strict=False):
         by_law = {result.compensator: result for result in results[name]}
@@ -73,7 +75,7 @@ def plot_errors(
         name_rows(panel, laws)
     figure.subplots_adjust(left=1.6 / size[0], hspace=0.42 / height, wspace=0.08)
     for panel in list(panels.flat)[max(0, len(names) - columns) : len(names)]:
-        panel.set_xlabel("rms of |e - e*| [%]")
+        panel.set_xlabel(f"rms of {'|e - e*|' if error_name == ERROR_NAMES[1] else error_name} [%]")
         panel.tick_params(labelbottom=True)
     legend_below(figure, panels[0, 0], 4)
     return figure

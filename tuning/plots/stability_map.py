@@ -62,35 +62,48 @@ def _draw_error(
     figure: Figure, axes: Axes, stability_map: MapResults, x: np.ndarray, y: np.ndarray, limit: float
 ) -> list[Any]:
     """Draw the error in colours with contours, and return the entries for the legend."""
-    error = stability_map.error
-    anchors = [BLUE, SKY_BLUE, "white", PALE_ORANGE, VERMILION]
+    error, has_sign = stability_map.error, stability_map.rig_axes == 1
+    anchors = [*([BLUE, SKY_BLUE] if has_sign else []), "white", PALE_ORANGE, VERMILION]
     colours = LinearSegmentedColormap.from_list("error", anchors).with_extremes(bad="0.75")
     finite = np.abs(error[np.isfinite(error)])
     drawn = limit if 0 < limit < np.inf else 0.01
     most = float(np.clip(np.max(finite, initial=0.0), 3 * drawn, MAX_COLOUR_ERROR))
     mesh = axes.pcolormesh(
         x, y, np.ma.masked_invalid(np.clip(error, -most, most)), cmap=colours, shading="nearest",
-        norm=SymLogNorm(drawn, vmin=-most, vmax=most), rasterized=True,
+        norm=SymLogNorm(drawn, vmin=-most if has_sign else 0.0, vmax=most), rasterized=True,
     )  # fmt: skip
+
+    def write(value: float) -> str:
+        return f"{value:+.3g}" if has_sign else f"{value:.3g}"
+
     bar = figure.colorbar(mesh, ax=axes, pad=0.02, fraction=0.05)
-    bar.set_label("largest error of a contact, e - e* [1]  (above 0: divergence)")
+    bar.set_label(
+        "largest error of a contact, e - e* [1]  (above 0: divergence)"
+        if has_sign
+        else "largest twist error of a contact [1]"
+    )
     bar.ax.yaxis.set_major_locator(
-        FixedLocator([0.0, *_contour_levels(np.array([-most, most]), drawn, MAX_COLOUR_TICKS)])
+        FixedLocator([0.0, *_contour_levels(np.array([-most * has_sign, most]), drawn, MAX_COLOUR_TICKS)])
     )
     bar.ax.yaxis.set_minor_locator(NullLocator())
-    bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:+.3g}" if value else "0"))
+    bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: write(value) if value else "0"))
     handles: list[Any] = []
     levels = [level for level in _contour_levels(error, drawn) if abs(level) != drawn]
     if levels:
         lines = axes.contour(x, y, error, levels=levels, colors=BLACK, linewidths=0.8, linestyles="-")
-        axes.clabel(lines, fmt=lambda value: f"{value:+.2g}", fontsize=8)
+        axes.clabel(lines, fmt=write, fontsize=8)
         handles.append(Line2D([], [], color=BLACK, linewidth=0.8, label="contours of the error"))
     if np.any(finite <= drawn) and np.any(finite > drawn):
         axes.contour(x, y, np.abs(error), levels=[drawn], colors=BLACK, linewidths=2.2)
         handles.append(Line2D([], [], color=BLACK, linewidth=2.2, label=f"error of {drawn:g}, the limit"))
     if np.any(~np.isfinite(error)):
-        handles.append(Patch(color="0.75", label="a contact did not end"))
+        handles.append(Patch(color="0.75", label=describe_missing_error(stability_map.rig_axes)))
     return handles
+
+
+def describe_missing_error(axes: int) -> str:
+    """Return a text that states why a point of a map for 1 or 6 axes has no error."""
+    return "a contact did not end" if axes == 1 else "a contact did not end, or nothing touched"
 
 
 def _draw_theory(

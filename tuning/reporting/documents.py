@@ -190,12 +190,13 @@ class ComparedMechanism(Struct):
 class ComparisonDocument(Struct):
     """JSON document compare.json: a comparison of compensators on one or several mechanisms."""
 
-    limit: float | None  # restitution error above which a scenario fails [1]
+    limit: float | None  # restitution or twist error above which a scenario fails [1]
     seed: int
     scenarios: int  # number of scenarios for the tuning
     judged: int  # number of evaluation scenarios, which are not used for tuning
     tuned: bool  # whether compensators without settings were tuned
     mechanisms: list[ComparedMechanism]
+    axes: int = 1  # number of axes of all mechanisms
 
 
 class AxisOfMap(Struct):
@@ -284,3 +285,4 @@ class MapDocument(Struct):
     limit: float | None = None
     peak_force_ratio: list[list[float | None]] | None = None
     duration_ratio: list[list[float | None]] | None = None
+    axes: int = 1  # number of axes of the rig

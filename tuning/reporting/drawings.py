@@ -217,4 +217,5 @@ def _map_from_document(document: MapDocument) -> MapResults:
         radii=radii,
         no_growth=radius.none_because,
         nominal=point,
+        rig_axes=document.axes,
     )

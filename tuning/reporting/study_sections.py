@@ -14,6 +14,14 @@ METRIC_HEADINGS = {  # headings of the comparison's table by name of the metric
     "rms": "rms |e - e*|", "p99": "99th percentile", "worst": "worst", "failures": "failures",
     "early": "early", "late": "late", "slope": "slope", "peak": "peak", "noise": "noise",
 }  # fmt: skip
+SIX_AXIS_METRIC_HEADINGS = {  # likewise for six axes
+    "energy_rms": "rms energy error",
+    "rms": "rms twist error",
+    "p99": "99th pct of twist error",
+    "failures": "failures",
+    "peak": "peak ratio",
+    "not_ended": "not ended",
+}
 TRANSPARENCY_NOTE = (
     "Early, late: transparency, that is, effect on e of a push on the hardware at 25 or 75 % of the ideal "
     "contact's duration, divided by the effect on the ideal contact (1: perfect, 0: none). Slope: slope of e "
@@ -112,21 +120,23 @@ def comparison_section(results: Results) -> Section | None:
     compared = results.comparison
     if compared is None:
         return None
-    subject, tables, texts = results.subject, [], [TRANSPARENCY_NOTE]
+    subject, tables, texts = results.subject, [], [] if compared.axes == 6 else [TRANSPARENCY_NOTE]
+    headings = SIX_AXIS_METRIC_HEADINGS if compared.axes == 6 else METRIC_HEADINGS
     for entry in compared.mechanisms:
         if subject is not None and entry.mechanism != subject.mechanism.name:
             continue
         rows = [
-            (f"{law.law}, {gains_name}", *(_format_metric(figures.get(key)) for key in METRIC_HEADINGS))
+            (f"{law.law}, {gains_name}", *(_format_metric(figures.get(key)) for key in headings))
             for law in entry.laws
             for gains_name, figures in law.figures.items()
         ]
-        tables.append(ReportTable((entry.mechanism, *METRIC_HEADINGS.values()), rows))
+        tables.append(ReportTable((entry.mechanism, *headings.values()), rows))
     texts.append(
         f"All compensators are evaluated on the same {compared.judged} fresh scenarios. Brackets contain "
         "95 % intervals."
     )
-    return Section("comparison", "Transparency, and other compensators", texts, tables)
+    title = "Other compensators" if compared.axes == 6 else "Transparency, and other compensators"
+    return Section("comparison", title, texts, tables)
 
 
 def map_section(results: Results, say: Callable[[str], None]) -> Section | None:
@@ -152,7 +162,7 @@ def map_section(results: Results, say: Callable[[str], None]) -> Section | None:
         )
     margins = document.nominal.margins
     for condition, margin in (
-        (f"|e - e*| within {format_number(document.limit)}", margins.error),
+        (f"{results.error} within {format_number(document.limit)}", margins.error),
         (CONTACT_BOUNDS_TEXT, margins.contact),
         ("spectral radius at most 1", margins.spectral_radius),
     ):

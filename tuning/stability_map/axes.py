@@ -11,10 +11,12 @@ import numpy as np
 
 from jaxhil.errors import InputError, format_value
 from jaxhil.laws.simulation_base import Compensator
+from jaxhil.laws.six_axis_base import SixAxisCompensator
 from jaxhil.mechanism.conversion import format_key_path, suggest_names
-from jaxhil.mechanism.file import from_plain_data, to_plain_data
+from jaxhil.mechanism.file import AnyMechanism, any_from_plain_data, to_plain_data
 from jaxhil.mechanism.overrides import KeyProblem, parse_key
-from jaxhil.mechanism.structs import Mechanism, numeric_keys, value_at
+from jaxhil.mechanism.six_axes import SixAxisMechanism, numeric_keys_of
+from jaxhil.mechanism.structs import value_at
 from jaxhil.mechanism.uncertainty import compute_quantiles, count_dimensions, draw_extremes
 from jaxhil.simulation.gain_file import resolve_gain_bounds
 from jaxhil.simulation.plausibility import check_run
@@ -24,6 +26,7 @@ GAIN_PREFIX = "gains."
 DEFAULT_RANGE_FACTORS = 0.3, 3.0  # axis' ends for a key without uncertainty, divided by its nominal value
 NORMAL_RANGE_PROBABILITIES = 0.001, 0.999  # quantiles of a normal distribution that are the axis' ends
 MIN_LOGARITHMIC_RATIO = 5.0  # smallest ratio of the axis' ends for a logarithmic scale
+AnyCompensator = Compensator | SixAxisCompensator
 AXIS_FORMAT = "PATH or PATH=LOW:HIGH, such as contact.stiffness=5e4:5e5"
 
 
@@ -49,7 +52,7 @@ class MapAxis(NamedTuple):
 
 
 def parse_axis(
-    name: str, text: Any, mechanism: Mechanism, law: Compensator, gains: Mapping[str, float]
+    name: str, text: Any, mechanism: AnyMechanism, law: AnyCompensator, gains: Mapping[str, float]
 ) -> MapAxis:
     """Parse a text PATH or PATH=LOW:HIGH to an axis.
 
@@ -69,7 +72,7 @@ def parse_axis(
 
 
 def mechanism_draws(
-    mechanism: Mechanism, axes: Sequence[MapAxis], values: np.ndarray
+    mechanism: AnyMechanism, axes: Sequence[MapAxis], values: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Convert points of a map, (lanes, axes), to values by key of the mechanism file, each (lanes, ...).
 
@@ -88,7 +91,7 @@ def mechanism_draws(
     return drawn
 
 
-def check_axes(mechanism: Mechanism, axes: Sequence[MapAxis]) -> None:
+def check_axes(mechanism: AnyMechanism, axes: Sequence[MapAxis]) -> None:
     """Raise `InputError` if both axes have the same key, or if a corner of the map cannot be simulated."""
     if axes[0].key == axes[1].key:
         raise InputError(f"y: found {axes[1].key}, expected a key that differs from the key of x")
@@ -99,12 +102,22 @@ def check_axes(mechanism: Mechanism, axes: Sequence[MapAxis]) -> None:
         for second in (axes[1].low, axes[1].high):
             drawn = mechanism_draws(mechanism, axes, np.array([[first, second]]))
             changes = {path: value[0].tolist() for path, value in drawn.items()}
-            corner = from_plain_data(raw, mechanism.name, changes)  # pyright: ignore[reportArgumentType]
-            check_run(corner)
+            _check_corner(any_from_plain_data(raw, mechanism.name, changes))
+
+
+def _check_corner(mechanism: AnyMechanism) -> None:
+    """Raise `InputError` if the mechanism at a corner of the map cannot be simulated."""
+    if not isinstance(mechanism, SixAxisMechanism):
+        check_run(mechanism)
+        return
+    from jaxhil.sixdof.building import build_scenarios
+    from jaxhil.sixdof.plausibility import check_scenario
+
+    check_scenario(mechanism, build_scenarios(mechanism))
 
 
 def _gain_axis(
-    name: str, key: str, mechanism: Mechanism, law: Compensator, gains: Mapping[str, float]
+    name: str, key: str, mechanism: AnyMechanism, law: AnyCompensator, gains: Mapping[str, float]
 ) -> MapAxis:
     """Return the axis of a gain, by default between its bounds; raise `InputError` for an unknown gain."""
     gain_by_name = {gain.name: gain for gain in law.gains}
@@ -118,7 +131,7 @@ def _gain_axis(
 
 
 def _key_axis(
-    name: str, key: str, mechanism: Mechanism, law: Compensator, gains: Mapping[str, float]
+    name: str, key: str, mechanism: AnyMechanism, law: AnyCompensator, gains: Mapping[str, float]
 ) -> MapAxis:
     """Return the axis of a key with its default range; raise `InputError` if the key cannot be an axis."""
     try:
@@ -127,7 +140,7 @@ def _key_axis(
         raise InputError(f"{name}: found {format_value(key)}, expected {AXIS_FORMAT}") from None
     entry = tuple(part for part in parts if isinstance(part, int))
     path = format_key_path(parts[: len(parts) - len(entry)])
-    paths = [name for name in numeric_keys() if not name.startswith("uncertainty")]
+    paths = [name for name in numeric_keys_of(mechanism) if not name.startswith("uncertainty")]
     if path not in paths:
         raise InputError(
             f"{name}: found {format_value(key)}, expected the key of a number{suggest_names(path, paths)}"
@@ -144,7 +157,7 @@ def _key_axis(
 
 
 def _default_range(
-    mechanism: Mechanism, path: str, entry: tuple[int, ...], nominal: float
+    mechanism: AnyMechanism, path: str, entry: tuple[int, ...], nominal: float
 ) -> tuple[float, float]:
     """Return the default range of a key.
 
@@ -168,7 +181,7 @@ def _default_range(
     if not np.isfinite(nominal) or nominal == 0:
         return nominal, nominal
     low, high = sorted(factor * nominal for factor in DEFAULT_RANGE_FACTORS)
-    allowed = numeric_keys()[path]
+    allowed = numeric_keys_of(mechanism)[path]
     return (low if allowed.allows(low) else nominal), (high if allowed.allows(high) else allowed.high)
 
 

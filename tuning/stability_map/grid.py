@@ -1,4 +1,4 @@
-"""Computation of a stability map: restitution error on a grid of two keys, theory, margins.
+"""Computation of a stability map: restitution or twist error on a grid of two keys, theory, margins.
 
 The gains are the same at every point, so that the map shows the effect of changes that the controller does
 not know. The margins of the nominal point follow from runs along two lines through this point, one for each
@@ -11,13 +11,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxhil.mechanism.file import to_plain_data
+from jaxhil.mechanism.file import AnyMechanism, to_plain_data
 from jaxhil.mechanism.structs import Mechanism
-from jaxhil.simulation.loop import Loop
-from jaxhil.simulation.loop_construction import build_loop
-from jaxhil.simulation.one_axis import ONE_AXIS, evaluate
+from jaxhil.rig_models import choose_rig_model
+from jaxhil.simulation.evaluation import RigModel
 from jaxhil.simulation.outcome import Outcome
-from jaxhil.simulation.scenario import Scenario, build_scenarios
 from jaxhil.simulation.tile_size import find_tile_size
 from tuning.caches.checkpoints import NO_CHECKPOINTS, Checkpoints, compute_digest
 from tuning.caches.cluster import WorkUnit, run_on_workers
@@ -35,6 +33,7 @@ from tuning.stability_map.contact_growth import (
 LINE_POINTS = 201  # number of points of each line through the nominal point
 MAX_TILE_RUNS = 2048  # largest number of runs computed at a time on a processor
 MAX_EIGENVALUE_COST = 5e7  # largest cost of all eigenvalues; at a higher cost, the grid becomes coarser
+NO_THEORY_REASON = "closed forms and growth rates exist for one axis only"
 MIN_COARSE_POINTS = 15  # smallest number of points along an axis of the coarser grid
 
 
@@ -54,7 +53,10 @@ class SpectralRadii(NamedTuple):
 
 
 class NominalPoint(NamedTuple):
-    """Results at the nominal point of a stability map; the mechanism file defines this point."""
+    """Results at the nominal point of a stability map; the mechanism file defines this point.
+
+    For six axes, `error` is the twist error, and a contact is an episode (a contact with all its touches).
+    """
 
     restitution: float | None  # e of the contact with the largest error [1]
     error: float | None  # largest error e - e* [1]; None if a contact did not end
@@ -77,17 +79,20 @@ class MapResults(NamedTuple):
     x: np.ndarray  # values along x, (columns,), in the unit of its key
     y: np.ndarray  # values along y, (rows,), in the unit of its key
     restitution: np.ndarray  # e of the contact with the largest error, (rows, columns) [1]
-    error: np.ndarray  # largest error e - e*, (rows, columns) [1]; NaN if a contact did not end
+    # largest error e - e* or, for six axes, twist error, (rows, columns) [1]; NaN if a contact did not end
+    # or nothing touched
+    error: np.ndarray
     peak_force_ratio: np.ndarray  # as in `NominalPoint` (rows, columns) [1]; NaN if a contact did not end
     duration_ratio: np.ndarray  # as in `NominalPoint` (rows, columns) [1]; NaN if a contact did not end
     closed: ClosedForms  # closed forms, each (rows, columns)
     radii: SpectralRadii | None  # spectral radii of the loop in contact; None if the loop is not linear
     no_growth: str | None  # reason if `radii` is None
     nominal: NominalPoint
+    rig_axes: int = 1  # number of axes of the rig, 1 or 6
 
 
 def compute_map(
-    mechanism: Mechanism,
+    mechanism: AnyMechanism,
     compensator: str,
     gains: Mapping[str, float],
     axes: tuple[MapAxis, MapAxis],
@@ -98,7 +103,9 @@ def compute_map(
     scheduler: str | None = None,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> MapResults:
-    """Compute a stability map: restitution errors and theory on a grid of two keys, and nominal margins.
+    """Compute a stability map: errors and theory on a grid of two keys, and nominal margins.
+
+    The error is the restitution error or, for six axes, the twist error. There is no theory for six axes.
 
     Args:
         mechanism: nominal mechanism.
@@ -117,7 +124,9 @@ def compute_map(
         The results at all points and at the nominal point.
     """
 
-    def batch(values: np.ndarray) -> tuple[dict[str, Any], Scenario]:
+    model = choose_rig_model(mechanism)
+
+    def batch(values: np.ndarray) -> tuple[dict[str, Any], Any]:
         return _point_gains(gains, axes, values), _build_scenarios(mechanism, axes, values, seed)
 
     x, y = (axis.values(points) for axis in axes)
@@ -126,13 +135,19 @@ def compute_map(
     across, up = np.repeat(middle, LINE_POINTS, axis=0), np.repeat(middle, LINE_POINTS, axis=0)
     across[:, 0], up[:, 1] = lines
     point_gains, scenarios = batch(np.concatenate([_grid_points(x, y), across, up, middle]))
-    worst = _run_tiles(mechanism, compensator, point_gains, scenarios, tell, scheduler, checkpoints)
+    work = model, mechanism, compensator, point_gains, scenarios
+    worst = _run_tiles(*work, tell, scheduler, checkpoints)
     restitution, error, force, duration = (row[: points**2].reshape(points, points) for row in worst[:4])
 
-    tell("eigenvalues of the loop in contact", count_runs(points))
-    reason = explain_nonlinearity(mechanism, compensator)
     nominal, radii = _nominal_point(worst, points**2, axes, lines, limit), None
-    if reason is None:
+    if isinstance(mechanism, Mechanism):
+        tell("eigenvalues of the loop in contact", count_runs(points))
+        reason = explain_nonlinearity(mechanism, compensator)
+        closed = compute_closed_forms(mechanism, compensator, batch(_grid_points(x, y))[1])
+    else:
+        reason = NO_THEORY_REASON
+        closed = ClosedForms(None, None, None, reason)
+    if isinstance(mechanism, Mechanism) and reason is None:
         plain = {name: float(value) for name, value in gains.items()}
         nominal_growth = compute_growth(mechanism, compensator, plain, batch(middle)[1])
         coarse = min(
@@ -150,7 +165,6 @@ def compute_map(
         on_lines = all_radii[coarse**2 :].reshape(2, LINE_POINTS)
         margins = _line_margins(axes, lines, on_lines, 1.0) if nominal_growth.spectral_radius <= 1 else None
         nominal = nominal._replace(growth=nominal_growth, radius_margins=margins)
-    closed = compute_closed_forms(mechanism, compensator, batch(_grid_points(x, y))[1])
     return MapResults(
         axes=axes,
         x=x,
@@ -163,6 +177,7 @@ def compute_map(
         radii=radii,
         no_growth=reason,
         nominal=nominal,
+        rig_axes=model.axes,
     )
 
 
@@ -209,16 +224,20 @@ def count_runs(points: int) -> int:
     return points**2 + 2 * LINE_POINTS + 1
 
 
-def run_tile(loop: Loop, gains: Mapping[str, Any], scenarios: Scenario, at_least: int) -> np.ndarray:
+def run_tile(
+    model: RigModel, loop: Any, gains: Mapping[str, Any], scenarios: Any, at_least: int
+) -> np.ndarray:
     """Simulate a tile (scenarios that are computed together); return `_worst_contact`, (5, lanes)."""
-    return np.stack(_worst_contact(evaluate(loop, gains, scenarios, at_least=at_least)))
+    outcome = model.evaluate(loop, gains, scenarios, at_least=at_least)
+    return np.stack(_worst_contact(model.select_verdict_error(outcome)))
 
 
 def _run_tiles(
-    mechanism: Mechanism,
+    model: RigModel,
+    mechanism: AnyMechanism,
     compensator: str,
     gains: Mapping[str, Any],
-    scenarios: Scenario,
+    scenarios: Any,
     tell: Callable[[str, float], None],
     scheduler: str | None,
     checkpoints: Checkpoints,
@@ -228,8 +247,8 @@ def _run_tiles(
     Each tile (runs that are computed together) contains both long and short runs, for a similar time per
     tile.
     """
-    loop = build_loop(mechanism, compensator, scenarios)
-    order = np.argsort(ONE_AXIS.expected_duration(scenarios))
+    loop = model.loop(mechanism, compensator, scenarios)
+    order = np.argsort(model.expected_duration(scenarios))
     worst = np.empty((5, len(order)))
     tiles = -(-len(order) // find_tile_size(len(order), MAX_TILE_RUNS))
     lanes = [order[number::tiles] for number in range(tiles)]
@@ -248,7 +267,7 @@ def _run_tiles(
             tile = lanes[number]
             tile_gains = {name: value[tile] if np.ndim(value) else value for name, value in gains.items()}
             tile_scenarios = jax.tree.map(lambda leaf, tile=tile: np.asarray(leaf)[..., tile], scenarios)
-            yield WorkUnit(number, (loop, tile_gains, tile_scenarios, len(lanes[0])))
+            yield WorkUnit(number, (model, loop, tile_gains, tile_scenarios, len(lanes[0])))
 
     missing = []
     for number in range(tiles):
@@ -281,13 +300,17 @@ def _reshape_forms(closed: ClosedForms, points: int) -> ClosedForms:
 
 
 def _build_scenarios(
-    mechanism: Mechanism, axes: tuple[MapAxis, MapAxis], values: np.ndarray, seed: int
-) -> Scenario:
+    mechanism: AnyMechanism, axes: tuple[MapAxis, MapAxis], values: np.ndarray, seed: int
+) -> Any:
     """Build the scenarios for points `values`, (lanes, 2), all with the same sensor noise."""
-    phase = {"approach.phase": np.full(len(values), mechanism.approach.phase)}
-    scenarios = build_scenarios(mechanism, phase | mechanism_draws(mechanism, axes, values), seed)
+    # A value of every lane determines the number of lanes, even if both axes are gains.
+    period = {"rig.control_period": np.full(len(values), mechanism.rig.control_period)}
+    if isinstance(mechanism, Mechanism):
+        period = {"approach.phase": np.full(len(values), mechanism.approach.phase)}
+    draws = period | mechanism_draws(mechanism, axes, values)
+    scenarios = choose_rig_model(mechanism).scenarios(mechanism, draws, seed)
     # All lanes get the noise of the first lane, so that points differ only in the keys of the axes.
-    return scenarios._replace(key=np.broadcast_to(scenarios.key[:, :1], scenarios.key.shape))  # pyright: ignore[reportArgumentType]
+    return scenarios._replace(key=np.broadcast_to(scenarios.key[:, :1], scenarios.key.shape))
 
 
 def _point_gains(
@@ -308,12 +331,12 @@ def _point_gains(
 def _worst_contact(outcome: Outcome) -> tuple[np.ndarray, ...]:
     """Return five arrays (lanes,) with the worst values among the contacts of each lane.
 
-    The values are e and e - e* of the contact with the largest |e - e*|, the largest peak force ratio, the
-    duration ratio farthest from 1, and 1 if the peak force or duration of a real contact is out of bounds,
-    else 0. All values are NaN if a contact did not end.
+    The values are restitution and error of the contact with the error of largest magnitude, the largest peak
+    force ratio, the duration ratio farthest from 1, and 1 if the peak force or duration of a real contact is
+    out of bounds, else 0. All values are NaN if a contact did not end, or if there is no contact.
     """
     used = outcome.is_scheduled & outcome.good
-    ended = ~np.any(outcome.is_scheduled & ~outcome.good, axis=0)
+    ended = np.any(outcome.is_scheduled, axis=0) & ~np.any(outcome.is_scheduled & ~outcome.good, axis=0)
 
     def at_largest(size: Any, *values: Any) -> Iterator[np.ndarray]:
         index = np.argmax(np.where(used, np.nan_to_num(size), -1.0), axis=0)[None]

@@ -24,13 +24,18 @@ def draw_scenarios(
     mechanism: AnyMechanism, sampling: str, seed: int, first: int, number: int
 ) -> tuple[dict[str, np.ndarray], Any]:
     """Draw scenarios `first` to `first + number - 1`; return the drawn values by key, and the scenarios."""
-    if sampling == "random":
-        draws = draw(mechanism, number, seed, first)
-    else:
-        draws = draw_at_points(
-            mechanism, draw_sobol_points(sum(count_dimensions(mechanism).values()), seed, first, number)
-        )
+    draws = draw_values(mechanism, sampling, seed, first, number)
     return draws, choose_rig_model(mechanism).scenarios(mechanism, draws, seed, first)
+
+
+def draw_values(
+    mechanism: AnyMechanism, sampling: str, seed: int, first: int, number: int
+) -> dict[str, np.ndarray]:
+    """Draw the values of scenarios `first` to `first + number - 1`, and return them by key."""
+    if sampling == "random":
+        return draw(mechanism, number, seed, first)
+    dimensions = sum(count_dimensions(mechanism).values())
+    return draw_at_points(mechanism, draw_sobol_points(dimensions, seed, first, number))
 
 
 def draw_sobol_points(dimension: int, seed: int, first: int, number: int) -> np.ndarray:

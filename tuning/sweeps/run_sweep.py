@@ -19,8 +19,8 @@ import numpy as np
 from tuning.statistics.intervals import is_narrow_enough
 from tuning.sweeps.chunks import Rows, SweepProgram, build_sweep, run_chunk, run_chunks
 from tuning.sweeps.columns import SCENARIO_OUTCOMES, list_contact_columns
-from tuning.sweeps.store import SweepStore, read_chunk, remove_chunks, write_chunk
-from tuning.sweeps.tally import Tally, add_to_tally, build_empty_tally
+from tuning.sweeps.store import SweepStore, read_chunk, read_intact_chunk, remove_chunks, write_chunk
+from tuning.sweeps.tally import Tally, add_to_tally, build_empty_tally, estimate_failure_probability
 
 COMPARED_SCENARIOS = 4096  # number of scenarios of a float32 sweep that are also run in float64
 MAX_WAITING_CHUNKS = 2  # maximum number of chunks in memory that wait to be written
@@ -70,6 +70,28 @@ def run_sweep(
         tally = add_to_tally(tally, rows)
         computed(len(rows["index"]), tally)
     return sweep, tally
+
+
+def summarise_failures(store: SweepStore) -> dict[str, Any]:
+    """Return the failure probability of a stored sweep, with counts and limit, as plain data.
+
+    Raise `InputError` if a chunk is damaged.
+    """
+    manifest = store.manifest
+    looked_at = manifest.until_width is not None
+    tally = build_empty_tally(manifest.replicates, manifest.scenarios, looked_at)
+    for part in range(manifest.parts):
+        rows = read_intact_chunk(store, part)
+        if rows is None:
+            break
+        tally = add_to_tally(tally, rows)
+    return {
+        "scenarios": tally.scenarios,
+        "failed": tally.failed,
+        "limit": manifest.limit,
+        "failure_probability": estimate_failure_probability(tally)._asdict(),
+        "sweep_sha256": manifest.sha256,
+    }
 
 
 def compare_precisions(sweep: SweepProgram, number: int = COMPARED_SCENARIOS) -> PrecisionComparison:

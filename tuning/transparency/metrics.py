@@ -15,7 +15,7 @@ Most intervals are bootstrap intervals. They resample whole scenarios, because t
 not independent. The interval of `failures` is a Clopper-Pearson interval.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,31 +64,47 @@ def compute_metrics(
         seed: seed of the bootstrap.
     """
     plain: Any = outcomes.plain
-    good = plain.good
-    magnitudes = np.abs(plain.error[good])
-    ends = compute_error_intervals(plain.error, good, seed=seed)
-    if np.any(plain.is_scheduled & ~good):
+    metrics = compute_error_metrics(plain, limit, seed)
+    metrics |= compute_transparency_metrics(outcomes, pushed, unpushed, seed)
+    metrics |= compute_ratio_metrics(plain, ("peak_force_ratio", "duration_ratio"), seed)
+    metrics["trajectory"] = bootstrap_metric(
+        _compute_resampled_rms, seed, plain.good, plain.metrics.trajectory_error / depth
+    )
+    metrics["noise"] = IntervalEstimate(amplification, np.nan, np.nan)
+    return metrics
+
+
+def compute_error_metrics(outcome: Any, limit: float, seed: int) -> dict[str, IntervalEstimate]:
+    """Compute the metrics `rms`, `p99`, `worst` and `failures` of an outcome (slots, scenarios).
+
+    `limit` [1] is the limit of the error, `seed` the seed of the bootstrap.
+    """
+    good = outcome.good
+    magnitudes = np.abs(outcome.error[good])
+    ends = compute_error_intervals(outcome.error, good, seed=seed)
+    if np.any(outcome.is_scheduled & ~good):
         # Some contacts did not end. The errors of the others cannot be compared with the errors of a
         # compensator with which all contacts end.
         ends = ErrorIntervals(UNDEFINED_INTERVAL, UNDEFINED_INTERVAL)
-    beyond = good & ((np.abs(plain.error) > limit) | plain.is_unlike_ideal)
-    has_failed = np.any((plain.is_scheduled & ~good) | beyond, axis=0)
-    metrics = {
+    beyond = good & ((np.abs(outcome.error) > limit) | outcome.is_unlike_ideal)
+    has_failed = np.any((outcome.is_scheduled & ~good) | beyond, axis=0)
+    return {
         "rms": IntervalEstimate(_compute_rms(magnitudes), *ends.rms),
         "p99": IntervalEstimate(_compute_percentile(magnitudes, 99), *ends.p99),
         "worst": IntervalEstimate(float(np.max(magnitudes)) if len(magnitudes) else np.nan, np.nan, np.nan),
         "failures": estimate_share(has_failed),
     }
-    metrics |= compute_transparency_metrics(outcomes, pushed, unpushed, seed)
-    metrics["peak_force_ratio"] = bootstrap_metric(
-        _compute_99th_percentile, seed, good, plain.peak_force_ratio
-    )
-    metrics["duration_ratio"] = bootstrap_metric(_compute_99th_percentile, seed, good, plain.duration_ratio)
-    metrics["trajectory"] = bootstrap_metric(
-        _compute_resampled_rms, seed, good, plain.metrics.trajectory_error / depth
-    )
-    metrics["noise"] = IntervalEstimate(amplification, np.nan, np.nan)
-    return metrics
+
+
+def compute_ratio_metrics(outcome: Any, names: Sequence[str], seed: int) -> dict[str, IntervalEstimate]:
+    """Compute the 99th percentiles of ratios to the ideal contact, which are attributes of an outcome.
+
+    `names` are the names of the attributes, `seed` is the seed of the bootstrap.
+    """
+    return {
+        name: bootstrap_metric(_compute_99th_percentile, seed, outcome.good, getattr(outcome, name))
+        for name in names
+    }
 
 
 def compute_transparency_metrics(
@@ -110,7 +126,7 @@ def compute_transparency_metrics(
     metrics["slope"] = bootstrap_metric(
         fit_slope, seed, damped.good, damped.metrics.restitution, damped.reference_restitution
     )
-    metrics["peak"] = bootstrap_metric(_compute_99th_percentile, seed, plain.good, plain.peak_ratio)
+    metrics["peak"] = compute_ratio_metrics(plain, ["peak_ratio"], seed)["peak_ratio"]
     return metrics
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from math import inf
+from typing import Any
 
 import jax.numpy as jnp
 import msgspec
@@ -39,16 +40,28 @@ def draw_scenarios(mechanism: SixAxisMechanism, number: int, seed: int) -> Scena
     """Draw `number` scenarios with the nominal control period; return the nominal scenario for 0."""
     if not number:
         return build_scenarios(mechanism, seed=seed)
-    # The gain file fixes the control period.
-    drawn = {k: v for k, v in draw(mechanism, number, seed).items() if k != "rig.control_period"}
-    return build_scenarios(mechanism, drawn, seed=seed)
+    return build_drawn_scenarios(mechanism, draw(mechanism, number, seed), seed)
+
+
+def build_drawn_scenarios(
+    mechanism: SixAxisMechanism, draws: Mapping[str, Any], seed: int, first: int = 0
+) -> Scenario:
+    """Build scenarios with drawn values, but with the nominal control period, which the gain file fixes."""
+    drawn = {path: values for path, values in draws.items() if path != "rig.control_period"}
+    return build_scenarios(mechanism, drawn, seed, first)
 
 
 def record_runs(
     mechanism: SixAxisMechanism, compensator: str, gains: Mapping[str, float], number: int, seed: int
 ) -> tuple[Metrics, list[ControllerRecord]]:
     """Return metrics and records of `number` drawn runs; those of the nominal run for 0."""
-    scenario = draw_scenarios(mechanism, number, seed)
+    return record_scenarios(mechanism, compensator, gains, draw_scenarios(mechanism, number, seed))
+
+
+def record_scenarios(
+    mechanism: SixAxisMechanism, compensator: str, gains: Mapping[str, float], scenario: Scenario
+) -> tuple[Metrics, list[ControllerRecord]]:
+    """Return metrics and records of the runs of a batch of scenarios."""
     loop = six_axis_loop(mechanism, compensator, scenario)
     return record_controller(loop, {name: jnp.asarray(value) for name, value in gains.items()}, scenario)
 

@@ -87,8 +87,8 @@ def calibrate(
     Raises:
         InputError: If the sweep used another gain file or has fewer scenarios, or if no run ends.
     """
-    chosen = _choose_scenarios(loaded, store, scenarios)
-    limit = _error_limit(limit, store)
+    chosen = choose_scenarios(loaded, store, scenarios)
+    limit = choose_error_limit(limit, store, DEFAULT_ERROR_LIMIT)
     rules, free_distance = build_audit_rules(loaded)
     parts = []
     for chunk in record_selection(loaded, chosen, lanes):
@@ -131,11 +131,11 @@ def _origin(
     }
 
 
-def _error_limit(limit: float | None, store: SweepStore | None) -> float:
-    """Return `limit` or, if it is None, the sweep's limit (without a sweep, `DEFAULT_ERROR_LIMIT`)."""
+def choose_error_limit(limit: float | None, store: SweepStore | None, default: float) -> float:
+    """Return `limit` or, if it is None, the sweep's limit (without a sweep, `default`)."""
     if limit is None and store is not None:
         limit = store.manifest.limit
-    limit = DEFAULT_ERROR_LIMIT if limit is None else limit
+    limit = default if limit is None else limit
     if not 0 < limit < np.inf:
         raise InputError(f"--limit: found {limit!r}, expected a number above 0")
     return limit
@@ -284,7 +284,7 @@ def _has_status(loaded: LoadedGains) -> bool:
     return compensator.status != UNSTATED
 
 
-def _choose_scenarios(
+def choose_scenarios(
     loaded: LoadedGains, store: SweepStore | None, scenarios: int | None
 ) -> ScenarioSelection:
     """Return the scenarios to simulate: those of the sweep or, without a sweep, random draws.

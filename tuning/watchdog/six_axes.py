@@ -1,10 +1,11 @@
 """Calibration of the limits of a six-axis gain file, and the watchdog's rates of false and missed alarms.
 
 Runs of drawn scenarios are recorded. A run is good if its contacts end well and its twist error is at most
-half of `ERROR_LIMIT`. One part of the runs determines the limits: the extreme signals of its good runs times
+half of the limit. One part of the runs determines the limits: the extreme signals of its good runs times
 a margin. The other part is replayed through the rig's controller with these limits. An alarm in a good run is
-false. An alarm is missed if a run with a larger error than `ERROR_LIMIT`, or a good run with a wrong mass of
-the numerical model, causes none.
+false. An alarm is missed if a run with a larger error than the limit, or a good run with a wrong mass of the
+numerical model, causes none. The limit is that of the sweep whose scenarios are recorded or, without a sweep,
+`ERROR_LIMIT`.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,11 +21,20 @@ from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.sixdof.controller_record import ControllerRecord
 from jaxhil.sixdof.rollout import CAPTURED, REBOUNDED
 from tuning.statistics.intervals import binomial_interval
-from tuning.verification.six_axis_replay import record_runs, replay_record
-from tuning.watchdog.calibration import Calibration
+from tuning.sweeps.draws import draw_values
+from tuning.sweeps.store import SweepStore
+from tuning.verification.six_axis_replay import (
+    build_drawn_scenarios,
+    draw_scenarios,
+    record_scenarios,
+    replay_record,
+)
+from tuning.watchdog.calibration import Calibration, choose_error_limit, choose_scenarios
+from tuning.watchdog.recording import ScenarioSelection
 from tuning.watchdog.verdict import DEFAULT_ALLOWED_RATES, AllowedAlarmRates, add_verdict
 
-SIX_AXIS_DRAWS = 512  # number of draws; enough for a false-alarm rate of 1 % if 75 % of the runs are good
+# Number of draws (of a sweep at most its first ones); enough for a false-alarm rate of 1 % if 75 % are good.
+SIX_AXIS_DRAWS = 512
 LANES = 128  # number of scenarios that are recorded together
 FITTED_SHARE = 4  # every fourth run determines the limits
 ERROR_LIMIT = 0.1  # maximum twist error [1]; the watchdog should stop a run with a larger error
@@ -45,11 +55,12 @@ class DrawnRun(NamedTuple):
 
     record: ControllerRecord
     error: float  # twist error [1]; NaN if the contacts have not ended
-    good: bool  # whether the contacts end well, with at most half of `ERROR_LIMIT`
+    good: bool  # whether the contacts end well, with at most half of the limit of the error
 
 
 def calibrate_six_axes(
     loaded: LoadedGains,
+    store: SweepStore | None = None,
     replaced: Mapping[str, float | None] | None = None,
     allowed: AllowedAlarmRates = DEFAULT_ALLOWED_RATES,
     progress: Callable[[int], None] = lambda runs: None,
@@ -60,14 +71,24 @@ def calibrate_six_axes(
 
     Args:
         loaded: gain file.
+        store: sweep of this gain file whose first scenarios are simulated again. None: draw new scenarios.
         replaced: limits that replace calibrated limits, also for the alarm rates; None removes a limit.
         allowed: maximum acceptable alarm rates.
         progress: callback, called with the number of runs that have been completed since the last call.
-        scenarios: number of draws.
-        seed: seed of the draws.
+        scenarios: number of draws, or of a sweep's scenarios if it has as many.
+        seed: seed of the draws without a sweep.
+
+    Raises:
+        InputError: If the sweep used another gain file.
     """
     gain_file = check_six_axis_document(loaded.document)
-    runs = list(_recorded(loaded, scenarios, seed, progress))
+    chosen = None
+    if store is not None:
+        chosen = choose_scenarios(loaded, store, None)
+        chosen = chosen._replace(number=min(chosen.number, scenarios))
+        scenarios, seed = chosen.number, chosen.seed
+    limit = choose_error_limit(None, store, ERROR_LIMIT)
+    runs = _record(loaded, scenarios, seed, chosen, limit, progress)
     fitted = [run for index, run in enumerate(runs) if index % FITTED_SHARE == 0]
     used = [run for run in fitted if run.good] or [run for run in fitted if np.isfinite(run.error)] or fitted
     limits = signal_limits([run.record for run in used], gain_file.control_period, loaded.mechanism)
@@ -75,25 +96,40 @@ def calibrate_six_axes(
     plain = {name: float(value) for name, value in limits.items()}
     final = {name: plain.get(name) for name in SIX_AXIS_LIMITS} | dict(replaced or {})
     held_out = [run for index, run in enumerate(runs) if index % FITTED_SHARE]
-    rates = alarm_rates(gain_file, final, held_out)
+    rates = alarm_rates(gain_file, final, held_out, limit)
     rates = add_verdict(rates, allowed, scenarios)
-    rates["calibrated_on"] = {"runs": "good" if used[0].good else "ended", "number": len(used), "seed": seed}
+    rates["calibrated_on"] = {
+        "runs": "good" if used[0].good else "ended",
+        "number": len(used),
+        "seed": seed,
+        "sampling": "random" if chosen is None else chosen.sampling,
+        "sweep_sha256": None if store is None else store.manifest.sha256,
+    }
     return Calibration(final, rates)
 
 
-def _recorded(
-    loaded: LoadedGains, scenarios: int, seed: int, progress: Callable[[int], None]
+def _record(
+    loaded: LoadedGains,
+    scenarios: int,
+    seed: int,
+    chosen: ScenarioSelection | None,
+    limit: float,
+    progress: Callable[[int], None],
 ) -> list[DrawnRun]:
-    """Record runs with drawn values of the mechanism's uncertain quantities."""
-    runs = []
+    """Record runs with drawn values of the mechanism's uncertain quantities, or those `chosen` of a sweep."""
+    runs, mechanism = [], loaded.mechanism
     for first in range(0, scenarios, LANES):
         number = min(LANES, scenarios - first)
-        subject = loaded.mechanism, loaded.compensator, loaded.gains
-        metrics, records = record_runs(*subject, number, seed + first)
+        if chosen is None:
+            batch = draw_scenarios(mechanism, number, seed + first)
+        else:
+            draws = draw_values(mechanism, chosen.sampling, seed, first, number)
+            batch = build_drawn_scenarios(mechanism, draws, seed, first)
+        metrics, records = record_scenarios(mechanism, loaded.compensator, loaded.gains, batch)
         ended = np.isin(np.asarray(metrics.status)[0], (REBOUNDED, CAPTURED))
         errors = np.where(ended, np.asarray(metrics.twist_error)[0], np.nan)
         runs += [
-            DrawnRun(record, float(error), bool(error <= 0.5 * ERROR_LIMIT))
+            DrawnRun(record, float(error), bool(error <= 0.5 * limit))
             for record, error in zip(records, errors, strict=True)
         ]
         progress(number)
@@ -194,13 +230,19 @@ def _audit_limits(gain_file: SixAxisGainFile, records: list[ControllerRecord]) -
 
 
 def alarm_rates(
-    gain_file: SixAxisGainFile, limits: Mapping[str, float | None], runs: list[DrawnRun]
+    gain_file: SixAxisGainFile,
+    limits: Mapping[str, float | None],
+    runs: list[DrawnRun],
+    error_limit: float = ERROR_LIMIT,
 ) -> dict[str, Any]:
-    """Return the rates of false and missed alarms with these limits, with 95 % confidence intervals."""
+    """Return the rates of false and missed alarms with these limits, with 95 % confidence intervals.
+
+    The watchdog should stop the runs whose twist error is larger than `error_limit` [1].
+    """
     values = {name: value for name, value in limits.items() if value is not None}
     limited = gain_file._replace(limits=complete_six_axis_limits(values))
     good = [run.record for run in runs if run.good]
-    bad = [run.record for run in runs if not run.error <= ERROR_LIMIT]
+    bad = [run.record for run in runs if not run.error <= error_limit]
     constants = gain_file.constants
     wrong = constants._replace(
         mass_matrix=[[WRONG_MASS * entry for entry in row] for row in constants.mass_matrix],
@@ -220,6 +262,7 @@ def alarm_rates(
     return {
         "false_alarms": _rate(sum(is_stopped(limited, record) for record in good), len(good)),
         "missed_alarms": _rate(sum(not is_stopped(limited, record) for record in bad), len(bad)),
+        "limit": error_limit,
         "held_out_runs": len(runs),
         "fault_runs": [mass],
     }

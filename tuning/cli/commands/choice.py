@@ -3,14 +3,7 @@
 from pathlib import Path
 
 from jaxhil.errors import InputError, format_value, to_one_line
-from jaxhil.mechanism.file import (
-    AnyMechanism,
-    any_from_plain_data,
-    from_plain_data,
-    load,
-    load_any,
-    to_plain_data,
-)
+from jaxhil.mechanism.file import AnyMechanism, any_from_plain_data, load_any, to_plain_data
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 from tuning.api import arguments
@@ -18,21 +11,11 @@ from tuning.cli.options import SimulateOptions
 from tuning.cli.options_report import Map
 
 
-def load_named_mechanism(options: SimulateOptions | Map) -> Mechanism | None:
-    """Load the one-axis mechanism of FILE; return None if the gain file's mechanism is used instead.
-
-    Raise `InputError` if FILE is unusable or has six axes, or if the compensator is unknown. This function
-    does not import jax.
-    """
-    return (
-        load(options.file, options.overrides, options.unset).mechanism if _check_uses_file(options) else None
-    )
-
-
-def load_any_named_mechanism(options: SimulateOptions) -> AnyMechanism | None:
+def load_any_named_mechanism(options: SimulateOptions | Map) -> AnyMechanism | None:
     """Load the mechanism of FILE, with one or six axes; return None if the gain file's mechanism is used.
 
-    Raise `InputError` if FILE is unusable or the compensator does not support its axes.
+    Raise `InputError` if FILE is unusable or the compensator does not support its axes. This function does
+    not import jax.
     """
     if options.compensator is not None:
         arguments.check_supports_mechanism(options.compensator, None)
@@ -61,32 +44,45 @@ def load_six_axis_mechanism(options: SimulateOptions) -> SixAxisMechanism | None
     return changed
 
 
-def _check_uses_file(options: SimulateOptions | Map) -> bool:
-    """Check the compensator's name; return True if FILE names the mechanism, False if the gain file does."""
-    if options.compensator is not None:
-        arguments.check_compensators([options.compensator])
-    return options.gains is None or options.file is not None
-
-
 def select_compensator(
-    options: SimulateOptions | Map, mechanism: Mechanism | None
+    options: SimulateOptions, mechanism: Mechanism | None
 ) -> tuple[Mechanism, str, str | Path | None]:
+    """Return the one-axis mechanism, the compensator's name, and the source of the gains.
+
+    See `select_any_compensator`. Raise `InputError` if the gain file is for six axes.
+    """
+    selected, compensator, gains = _select(options, mechanism, any_axes=False)
+    assert isinstance(selected, Mechanism)
+    return selected, compensator, gains
+
+
+def select_any_compensator(
+    options: SimulateOptions | Map, mechanism: AnyMechanism | None
+) -> tuple[AnyMechanism, str, str | Path | None]:
     """Return the mechanism, the compensator's name, and the source of the gains.
 
     The source is the name of a setting, the path of a gain file, or None for the literature's gains.
-    `mechanism` is the result of `load_named_mechanism`. Raise `InputError` if an option is unusable. This
-    function imports jax.
+    `mechanism` is the result of `load_any_named_mechanism`. Raise `InputError` if an option is unusable, or
+    if mechanism and gain file have different numbers of axes. This function imports jax.
     """
+    return _select(options, mechanism, any_axes=not isinstance(mechanism, Mechanism))
+
+
+def _select(
+    options: SimulateOptions | Map, mechanism: AnyMechanism | None, any_axes: bool
+) -> tuple[AnyMechanism, str, str | Path | None]:
+    """Return the values of `select_any_compensator`; reject six-axis gain files unless `any_axes`."""
     if options.gains is None:
         assert mechanism is not None
         compensator = options.compensator or "none"
-        arguments.check_setting_name(compensator, options.setting)
+        axes = 6 if isinstance(mechanism, SixAxisMechanism) else 1
+        arguments.check_setting_name(compensator, options.setting, axes)
         return mechanism, compensator, options.setting
 
     from jaxhil.simulation.gain_file import load_gain_file
 
     _check_setting(options)
-    loaded = load_gain_file(options.gains)
+    loaded = load_gain_file(options.gains, any_axes)
     label = to_one_line(options.gains)
     if options.compensator not in (None, loaded.compensator):
         raise InputError(
@@ -94,7 +90,7 @@ def select_compensator(
         )
     if mechanism is None:
         raw = to_plain_data(loaded.mechanism)
-        mechanism = from_plain_data(raw, label, options.overrides, options.unset)
+        mechanism = any_from_plain_data(raw, label, options.overrides, options.unset)
     return mechanism, loaded.compensator, Path(options.gains)
 
 

@@ -4,17 +4,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxhil.errors import InputError
 from jaxhil.files import report_write_errors, write_atomically
-from jaxhil.mechanism.file import LoadedMechanism, load, suite_names
+from jaxhil.mechanism.file import LoadedAnyMechanism, load_any, suite_names
+from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.rig import digest
 from jaxhil.simulation.jax_environment import count_usable_cores, prepare_jax
 from tuning import terminal
-from tuning.api.compare import build_board, check_distinct_names, compare_each
+from tuning.api.compare import build_board, compare_each
 from tuning.cli.commands import checks
 from tuning.cli.commands.checkpoints import open_checkpoints, warn_about_checkpoints
 from tuning.cli.options import Compare
 
-PLOTS = ("errors.png", "honesty.png")
+PLOTS = ("errors.png", "honesty.png")  # of six axes only the first
 
 
 def run(options: Compare) -> int:
@@ -26,6 +28,8 @@ def run(options: Compare) -> int:
     """
     options.check()
     loaded = _load(options)
+    options = options.with_defaults(loaded)
+    has_six_axes = isinstance(loaded[0].mechanism, SixAxisMechanism)
     folder = Path(options.output)
     checks.prepare_output_folder(folder)
     names = [entry.mechanism.name for entry in loaded]
@@ -34,7 +38,7 @@ def run(options: Compare) -> int:
     from tuning.benchmark.comparison import CompensatorFailure
     from tuning.transparency.pushes import PUSH_DEFINITION
 
-    laws = options.laws
+    laws = options.compensators
     results: dict[str, dict[str, Any]] = {name: {} for name in names}
     interrupted, problems = False, []
     checkpoints = open_checkpoints(options.output, options.resume)
@@ -52,8 +56,9 @@ def run(options: Compare) -> int:
     finished_names = [name for name in names if ordered[name]]
     document = {
         **{key: getattr(options, key) for key in ("limit", "seed", "scenarios", "judged")},
+        "axes": 6 if has_six_axes else 1,
         "tuned": not options.untuned,
-        "transparency": PUSH_DEFINITION,
+        "transparency": None if has_six_axes else PUSH_DEFINITION,
         "mechanisms": [
             build_board(entry, options, results[entry.mechanism.name]).document for entry in loaded
         ],
@@ -81,25 +86,27 @@ def run(options: Compare) -> int:
     return 1 if problems else 0
 
 
-def _load(options: Compare) -> list[LoadedMechanism]:
-    """Load the mechanisms of the files and, with `--suites`, those of the built-in sets (suites)."""
+def _load(options: Compare) -> list[LoadedAnyMechanism]:
+    """Load the mechanisms of the files and, with `--suites`, those of the built-in sets (suites).
+
+    Raise `InputError` if the suites are requested together with a six-axis mechanism.
+    """
     files: list[str | None] = [*options.files, *(suite_names() if options.suites else [])]
-    loaded = [load(file, options.overrides, options.unset) for file in files or [None]]
-    check_distinct_names(loaded)
+    loaded = [load_any(file, options.overrides, options.unset) for file in files or [None]]
+    if options.suites and isinstance(loaded[0].mechanism, SixAxisMechanism):
+        allowed = "no --suites: there are no suites of mechanisms with six axes"
+        raise InputError(f"--suites: found the six-axis mechanism {loaded[0].label}, expected {allowed}")
     return loaded
 
 
-def _measure_tick_times(loaded: LoadedMechanism, ordered: Mapping[str, Sequence[Any]]) -> dict[str, float]:
+def _measure_tick_times(loaded: LoadedAnyMechanism, ordered: Mapping[str, Sequence[Any]]) -> dict[str, float]:
     """Return the computing time per tick [us] of every compensator, for the first mechanism."""
     from tuning.benchmark.comparison import LITERATURE_GAINS
     from tuning.benchmark.computing_time import measure_tick_time
 
     mechanism = loaded.mechanism
-    period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
     return {
-        result.compensator: measure_tick_time(
-            result.compensator, result.gains[LITERATURE_GAINS], period, clearance, mechanism.approach.velocity
-        )
+        result.compensator: measure_tick_time(mechanism, result.compensator, result.gains[LITERATURE_GAINS])
         for result in ordered[mechanism.name]
     }
 
@@ -108,16 +115,18 @@ def _draw(options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence
     from jaxhil.simulation.contact_plot import save_figure
     from tuning.plots.comparison import plot_errors, plot_transparency
 
-    figures = plot_errors(names, ordered, options.limit), plot_transparency(names, ordered)
-    for name, figure in zip(PLOTS, figures, strict=True):
+    assert options.limit is not None
+    figures = [plot_errors(names, ordered, options.limit)]
+    if ordered[names[0]][0].axes == 1:
+        figures.append(plot_transparency(names, ordered))
+    for name, figure in zip(PLOTS, figures, strict=False):
         save_figure(figure, Path(options.output) / name)
 
 
 def _print(
     options: Compare, names: Sequence[str], ordered: Mapping[str, Sequence[Any]], document: dict[str, Any]
 ) -> None:
-    from jaxhil.laws.compensators import COMPENSATORS
-    from jaxhil.simulation.contact_bounds import MAX_DURATION_RATIO, MAX_PEAK_FORCE_RATIO, MIN_DURATION_RATIO
+    from jaxhil.laws.compensators import get_compensator
     from tuning.benchmark.tables import build_leaderboard, build_mechanism_table, describe_least_errors
 
     for name in names:
@@ -127,7 +136,8 @@ def _print(
     if text := describe_least_errors(names, ordered):
         terminal.emit(text)
     costs = document["timings"]["microseconds_per_tick"]
-    rows = [[law, ", ".join(COMPENSATORS[law].knows) or "nothing", cost] for law, cost in costs.items()]
+    knowledge = {law: get_compensator(law, document["axes"]).knows for law in costs}
+    rows = [[law, ", ".join(knowledge[law]) or "nothing", cost] for law, cost in costs.items()]
     terminal.emit(
         terminal.build_table(
             "Prior knowledge and computing time of each compensator",
@@ -135,13 +145,33 @@ def _print(
             rows,
             texts=(0, 1),
         ),
-        f"rms, p99, worst: |e - e*|. fail: scenarios with an error above {100 * options.limit:g} %, with a",
-        f"contact that does not end, or with a real contact above {MAX_PEAK_FORCE_RATIO:g} times the ideal "
-        f"peak force or outside {MIN_DURATION_RATIO:g} to {MAX_DURATION_RATIO:g} times the ideal duration.",
-        f"early, late: transparency to {document['transparency']} (1: perfect, 0: none).",
-        "slope: of e against e* for damping perturbations. peak: peak command divided by the ideal peak",
-        "force, 99th percentile. path: trajectory error of x_d. noise: amplification of the sensor noise.",
+        *_explain_columns(document),
         "*: better than every other tuned compensator by more than the 95 % intervals.",
         f"wrote {options.output}/compare.json" + (" and plots" if names else ""),
         "",
     )
+
+
+def _explain_columns(document: Mapping[str, Any]) -> list[str]:
+    """Return sentences that explain the columns of the tables."""
+    from jaxhil.simulation.contact_bounds import MAX_DURATION_RATIO, MAX_PEAK_FORCE_RATIO, MIN_DURATION_RATIO
+
+    failures = [
+        f"fail: scenarios with an error above {100 * document['limit']:g} %, with a",
+        f"contact that does not end, or with a real contact above {MAX_PEAK_FORCE_RATIO:g} times the ideal "
+        f"peak force or outside {MIN_DURATION_RATIO:g} to {MAX_DURATION_RATIO:g} times the ideal duration.",
+    ]
+    if document["axes"] == 6:
+        return [
+            f"E: energy error. V: twist error. {failures[0]}",
+            failures[1],
+            "peak: largest force on the numerical model divided by the ideal peak force, 99th percentile.",
+            "not ended: number of contacts that did not end.",
+        ]
+    return [
+        f"rms, p99, worst: |e - e*|. {failures[0]}",
+        failures[1],
+        f"early, late: transparency to {document['transparency']} (1: perfect, 0: none).",
+        "slope: of e against e* for damping perturbations. peak: peak command divided by the ideal peak",
+        "force, 99th percentile. path: trajectory error of x_d. noise: amplification of the sensor noise.",
+    ]

@@ -55,7 +55,7 @@ def _parse_limits(settings: tuple[str, ...]) -> dict[str, float | None]:
 
 
 def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
-    from tuning.bundle.summary import describe_alarm_rates, is_user_limit
+    from tuning.bundle.summary import ERROR_TABLES, describe_alarm_rates, describe_sweep, is_user_limit
 
     tables = []
     if document["limits"]:
@@ -72,6 +72,8 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
         for number, end in enumerate(document["ended"])
         if end
     ]
+    error_name = ERROR_TABLES[document["axes"]][0][1].partition(" |")[0]
+    lines += describe_sweep(document["sweep"], error_name)
     if document["rates"]:
         lines += [f"Watchdog: {text}" for text in describe_alarm_rates(document["rates"])]
     if document["bundle"]:

@@ -1,4 +1,4 @@
-"""Command `jaxhil map`: computes the restitution error as a function of two keys of a mechanism."""
+"""Command `jaxhil map`: computes the error of a contact as a function of two keys of a mechanism."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
@@ -12,18 +12,19 @@ from tuning.api import mechanism_summary
 from tuning.api.map import DOCUMENT_FILE, PLOT, MapOptions, map
 from tuning.api.options import check_options
 from tuning.cli.commands import checks
-from tuning.cli.commands.choice import load_named_mechanism, select_compensator
+from tuning.cli.commands.choice import load_any_named_mechanism, select_any_compensator
 from tuning.cli.options_report import Map
+from tuning.plots.stability_map import describe_missing_error
 
 
 def run(options: Map) -> int:
     """Compute a stability map, and write and print it; return exit code 0."""
     check_options(options)
-    mechanism = load_named_mechanism(options)
+    mechanism = load_any_named_mechanism(options)
     target = Path(options.output)
     checks.prepare_output_folder(target)
     prepare_jax()
-    mechanism, compensator, gains = select_compensator(options, mechanism)
+    mechanism, compensator, gains = select_any_compensator(options, mechanism)
     checks.check_earlier_results(target / DOCUMENT_FILE, "theory", [PLOT], [mechanism.name])
     settings = {field.name: getattr(options, field.name) for field in fields(MapOptions)}
     stability_map = map(
@@ -43,11 +44,11 @@ def _describe_map(document: Mapping[str, Any]) -> Iterator[str]:
     nominal, limit = document["nominal"], document["limit"]
     error = nominal["error"]
     if error is None:
-        yield "Nominal: a contact did not end."
+        yield f"Nominal: {describe_missing_error(document['axes'])}."
     else:
         kind = "divergence" if error > 0 else "convergence"
-        within = "within" if abs(error) <= limit else "beyond"
-        yield f"Nominal: largest error {error:+.4f} ({kind}), {within} {limit:g}."
+        text = f"error {error:+.4f} ({kind})" if document["axes"] == 1 else f"twist error {error:.4f}"
+        yield f"Nominal: largest {text}, {'within' if abs(error) <= limit else 'beyond'} {limit:g}."
         within = "beyond" if nominal["margins"]["contact"] is None else "within"
         yield (
             f"Nominal: real peak force {nominal['peak_force_ratio']:.3f} times, duration "
@@ -78,7 +79,8 @@ def _describe_map(document: Mapping[str, Any]) -> Iterator[str]:
                 f"{text}, with a spectral radius of at most 1."
                 for text in _describe_margins(document, margins)
             )
-    if (reason := document["theory"]["none_because"]) is not None:
+    reason = document["theory"]["none_because"]
+    if reason not in (None, document["spectral_radius"]["none_because"]):
         yield f"No closed form applies: {reason}."
 
 

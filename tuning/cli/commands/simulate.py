@@ -29,8 +29,9 @@ def run(options: SimulateOptions) -> int:
     arguments.check_integers(0, seed=options.seed)
     if options.plot is not None:
         checks.check_plot(options.plot)
-    if options.log is not None:
-        checks.check_file_path(options.log)
+    for path in (options.log, options.one_axis):
+        if path is not None:
+            checks.check_file_path(path)
     mechanism = load_any_named_mechanism(options)
     if mechanism is None:
         prepare_jax()
@@ -39,6 +40,9 @@ def run(options: SimulateOptions) -> int:
         simulate_six.check_six_axis_options(options)
         prepare_jax()
         return simulate_six.run(options, mechanism)
+    if options.one_axis is not None:
+        allowed = "no --one-axis: the mechanism already has one axis"
+        raise InputError(f"--one-axis: found {format_value(options.one_axis)}, expected {allowed}")
     if options.animate is not None:
         allowed = "no animation of a one-axis mechanism"
         raise InputError(f"--animate: found {format_value(options.animate)}, expected {allowed}")

@@ -66,6 +66,7 @@ def run(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
     good = good and not any(_is_unlike_ideal(result))
     terminal.warn(f"{mechanism.name}: {warning}" for warning in result.summary.warnings)
     _write(options, result)
+    _write_one_axis_file(options, mechanism, result.episodes[0])
     if options.json:
         terminal.emit_json(_build_document(limit, result, good))
     else:
@@ -83,6 +84,7 @@ def _run_ideal_contact(options: SimulateOptions, mechanism: SixAxisMechanism) ->
 
     result = simulate_ideal_contact(mechanism)
     episode = result.episode
+    _write_one_axis_file(options, mechanism, episode)
     if options.json:
         episodes = [episode._asdict()] if episode.reference_touches else []
         document = {"mechanism": mechanism.name, "axes": 6, "episodes": episodes}
@@ -151,6 +153,22 @@ def _write(options: SimulateOptions, result: "SixAxisRun") -> None:
     if options.log is not None:
         result.to_csv(options.log)
         terminal.note(f"wrote {options.log}")
+
+
+def _write_one_axis_file(options: SimulateOptions, mechanism: SixAxisMechanism, episode: Any) -> None:
+    """Write the one-axis file that `--one-axis` requests, if any; note the keys that the file leaves out."""
+    if options.one_axis is None:
+        return
+    from jaxhil.files import report_write_errors, resolve_output_path, write_atomically
+    from jaxhil.mechanism.template import format_mechanism_file
+    from jaxhil.sixdof.one_axis import convert_to_one_axis
+
+    converted = convert_to_one_axis(mechanism, episode)
+    with report_write_errors(options.one_axis):
+        content = format_mechanism_file(converted.mechanism).encode("utf-8")
+        write_atomically(resolve_output_path(options.one_axis), content)
+    left_out = f", without {', '.join(converted.left_out)}" if converted.left_out else ""
+    terminal.note(f"wrote {options.one_axis}{left_out}")
 
 
 def _build_document(limit: float, result: "SixAxisRun", good: bool) -> dict[str, Any]:
