@@ -55,8 +55,13 @@ def sums_of_ints(a: float, b: float) -> float:
     return float(total - more * 3000000) + float(more - int(b + 1.0))
 
 
+def remainders(a: float, b: float) -> float:
+    return a // b + a % b
+
+
 def remainders_of_ints(a: float, b: float) -> float:
-    return float(100 * (int(a) % int(b)))
+    first, second = int(a), int(b)
+    return float(first // second + 100 * (first % second))
 
 
 def early_return(a: float, b: float) -> float:
@@ -167,6 +172,7 @@ FUNCTIONS = (
     whole,
     product_of_ints,
     sums_of_ints,
+    remainders,
     remainders_of_ints,
     early_return,
     conditions,
@@ -271,17 +277,8 @@ def calls_itself(a: float, b: float) -> float:
     return a if b > 0.0 else calls_itself(a, b + 1.0)
 
 
-def assigns_none(a: float, b: float) -> float:
-    value = None
-    return a + b if value is None else b
-
-
 def has_a_dictionary(a: float, b: float) -> float:
     return {1: a}[1] + b
-
-
-def divides_to_an_integer(a: float, b: float) -> float:
-    return a // b
 
 
 def hides_a_branch(a: float, b: float) -> float:
@@ -386,15 +383,9 @@ class Defaulting:
         (has_two_types, 2, "found a float for a int, expected one type for each name"),
         (shares_a_list, 1, "found Sharing(...) here, expected `self.name = Class(...)`"),
         (has_no_annotation, 0, "found no type in C for a of has_no_annotation, expected an annotation"),
-        (uses_text, 1, "found len of a text, expected len of a list"),
+        (uses_text, 1, "found len of a non-number, expected len of a list"),
         (calls_itself, 0, "found calls_itself calling itself, expected a loop"),
-        (assigns_none, 1, "found a value without equivalent in C, expected a number, a bool or a text"),
         (has_a_dictionary, 1, "found Dict, expected an expression of numbers"),
-        (
-            divides_to_an_integer,
-            1,
-            "found FloorDiv, expected +, -, *, / or ** of numbers, %, &, | or ^ of ints",
-        ),
         (hides_a_branch, 1, "found With, expected assignments, if, for"),
         (Sharing.__init__, 2, "found a list that is shared and changed in place, expected a copy"),
         (

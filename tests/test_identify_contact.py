@@ -10,10 +10,10 @@ from scipy.linalg import expm
 
 from jaxhil.contact.laws import find_contact_law
 from tuning.identification import contact_profile
-from tuning.identification.contact_fit import exclude_rows_after_gaps, split_long_run
 from tuning.identification.contact_laws import kelvin_voigt
 from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import compute_posterior
+from tuning.identification.contact_runs import exclude_rows_after_gaps, split_long_run
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.law_choice import choose_contact_law, search_coarsely
 from tuning.identification.motion import MotionResponse, compute_matrix_exponential

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from jaxhil.contact.laws import find_contact_law
-from tuning.identification.contact_fit import split_long_run
 from tuning.identification.contact_laws import kelvin_voigt
 from tuning.identification.contact_problem import ContactProblem
+from tuning.identification.contact_runs import split_long_run
 from tuning.identification.deep_contact import (
     LANES_FOR_LAW_CHOICE,
     find_deep_lanes,

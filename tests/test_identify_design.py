@@ -12,7 +12,7 @@ from scipy import optimize
 from jaxhil.errors import InputError
 from jaxhil.rig import digest
 from jaxhil.simulation.gain_choice import choose_gains
-from tuning.identification import contact_fit, free_motion
+from tuning.identification import contact_fit, contact_runs, free_motion
 from tuning.identification.design import powers, waveform
 from tuning.identification.design.excitation import MULTISINE_PERIODS, design_excitation, differentiate_error
 from tuning.identification.identify import MIN_REST_ROWS
@@ -134,7 +134,7 @@ def test_excitation_design_predicts_scatter_over_many_campaigns():
     for seed in range(16):
         run = campaign_rigs.commanded("clean", "press", planned.press.position, seed)
         fit = contact_fit.fit_contact(
-            contact_fit.split_long_run(run, 1e-3), model, timing, noise, "kelvin_voigt"
+            contact_runs.split_long_run(run, 1e-3), model, timing, noise, "kelvin_voigt"
         )
         estimates = dict(zip(fit.posterior.names, fit.posterior.mean, strict=True))
         rows.append([estimates["delay"], estimates["stiffness.0"], estimates["damping"]])

@@ -8,7 +8,7 @@ import pytest
 from campaign_rigs import commanded
 
 from jaxhil.errors import InputError
-from tuning.identification import contact_fit
+from tuning.identification import contact_fit, contact_runs
 from tuning.identification.motion import MotionResponse
 from tuning.identification.noise import estimate_noise
 from tuning.identification.press_bias import find_bias_prior
@@ -36,7 +36,7 @@ def rest(noise=1.0, bias=0.0):
 
 
 def fit(run, noise):
-    pieces = contact_fit.split_long_run(run, TIMING.control_period)
+    pieces = contact_runs.split_long_run(run, TIMING.control_period)
     return contact_fit.fit_contact(pieces, MODEL, TIMING, noise, "kelvin_voigt")
 
 

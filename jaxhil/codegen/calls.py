@@ -6,7 +6,6 @@ import sys
 import types
 import typing
 from collections.abc import Callable
-from functools import partialmethod
 from typing import Any
 
 from .lists import ListLowering
@@ -24,8 +23,10 @@ MATH_DOMAIN_ERRORS = {
     "fmod": "isinf({0}) || {1} == 0.0",
     **dict.fromkeys(("atan", "atan2", "tanh", "fabs", "copysign"), ""),
 }
-# Signs of operands for which a function does not raise.
-SAFE_SIGNS = {"sqrt": Sign.NONNEGATIVE, "log": Sign.POSITIVE}
+SAFE_SIGNS = {
+    "sqrt": Sign.NONNEGATIVE,
+    "log": Sign.POSITIVE,
+}  # signs of operands for which a function does not raise
 INT_CONVERSIONS = {"floor": "floor({})", "ceil": "ceil({})", "round": "nearbyint({})"}
 FLOAT_TESTS = ("isfinite", "isnan", "isinf")
 
@@ -59,8 +60,10 @@ class CallLowering(ListLowering):
         is_object = owner.type.kind == "object" or new_type is None
         self.require(is_object, node, f"an attribute of a {owner.type.kind}", "an object")
         self.function.reads |= keys
-        fields = self.program.fields.setdefault(class_, {})
-        default = inspect.getattr_static(class_, name, None)
+        default, fields = (
+            inspect.getattr_static(class_, name, None),
+            self.program.fields.setdefault(class_, {}),
+        )
         if name not in fields and isinstance(default, (bool, int, float)):
             if new_type is None:
                 return self._class_constant(class_, name, default)
@@ -77,9 +80,12 @@ class CallLowering(ListLowering):
     def _class_constant(self, class_: type, name: str, value: float) -> CExpression:
         """Return the value of a class attribute, by its name if the class's module names it."""
         owner = next(owner for owner in class_.__mro__ if name in vars(owner))
-        namespace, result = vars(sys.modules[owner.__module__]), constant(value)
-        numbers = self.program.enumerators.items()
-        names = [name for name, number in numbers if namespace.get(name) == number == value]
+        namespace, numbers, result = (
+            vars(sys.modules[owner.__module__]),
+            self.program.enumerators,
+            constant(value),
+        )
+        names = [name for name, number in numbers.items() if namespace.get(name) == number == value]
         return result._replace(text=f"{self.program.prefix}{names[0]}".upper()) if names else result
 
     def field_type(self, type_: ValueType, name: str, node: ast.AST) -> ValueType:
@@ -120,10 +126,10 @@ class CallLowering(ListLowering):
                 self.require(is_method, node, f"a call of .{name}", "a method of a class with source code")
                 return self.invoke(method, value, node)
             target = getattr(target, name, None)
-        elif name not in namespace and hasattr(self, f"builtin_{name}"):
-            return getattr(self, f"builtin_{name}")(node)
         else:
-            target = namespace.get(name)
+            target = namespace.get(name, getattr(self, f"builtin_{name}", None))
+        if inspect.ismethod(target):
+            return target(node)
         if inspect.isfunction(target):
             return self.invoke(target, None, node)
         if inspect.isclass(target):
@@ -155,7 +161,8 @@ class CallLowering(ListLowering):
             sign = max((value.sign for value in values if value.sign & Sign.NONNEGATIVE), default=0)
         return extreme._replace(sign=sign)
 
-    builtin_min = partialmethod(builtin_max, mark="<")
+    def builtin_min(self, node: Any) -> CExpression:
+        return self.builtin_max(node, "<")
 
     def builtin_float(self, node: Any) -> CExpression:
         return as_float(self.number(node.args[0]))
@@ -163,7 +170,8 @@ class CallLowering(ListLowering):
     def builtin_bool(self, node: Any) -> CExpression:
         return self.truth(node.args[0])
 
-    builtin_list = ListLowering.lower_list
+    def builtin_list(self, node: Any) -> CExpression:
+        return self.array(node, None)
 
     def builtin_len(self, node: Any) -> CExpression:
         value = self.expression(node.args[0])
@@ -184,7 +192,8 @@ class CallLowering(ListLowering):
             self.fail_if(condition, node, "a float to int conversion that may fail")
         return CExpression(f"(int64_t){text}", INT, Rank.UNARY, sign=value.sign & Sign.NONNEGATIVE)
 
-    builtin_round = partialmethod(builtin_int, form=INT_CONVERSIONS["round"])
+    def builtin_round(self, node: Any) -> CExpression:
+        return self.builtin_int(node, INT_CONVERSIONS["round"])
 
     def _math(self, node: Any, name: str) -> CExpression:
         if name in INT_CONVERSIONS:
@@ -213,12 +222,14 @@ class CallLowering(ListLowering):
             self.fail_if(test.format(*texts, r=value.text), node, f"{name} that may raise")
         return value
 
-    def power(self, node: Any, left: CExpression, right: CExpression) -> CExpression:
-        """Lower a power of floats to a call of a helper function."""
+    def call_helper(self, node: Any, left: CExpression, right: CExpression, name: str) -> CExpression:
+        if name != "power":
+            right = self.divisor(node, right)
+            sign = right.sign & Sign.NONNEGATIVE * name.startswith("modulo")
+            text = self.program.helper(name, left.text, right.text)
+            return combine(text, left.type.plain, Rank.ATOM, left, right, sign=sign)
         left, right = self.simple(left, "base"), self.simple(right, "exponent")
-        value = self.temporary(
-            CExpression(self.program.helper("power", left.text, right.text), FLOAT), "power"
-        )
+        value = self.temporary(CExpression(self.program.helper(name, left.text, right.text), FLOAT), "power")
         base, exponent = left.text, right.text
         tests = [f"(isinf({value.text}) && isfinite({base}) && isfinite({exponent}))"]
         if not (isinstance(right.constant, float) and right.constant.is_integer() and right.constant > 0.0):
@@ -247,7 +258,7 @@ class CallLowering(ListLowering):
         owner = receiver.type.of if receiver else None
         types_ = self.program.parameters(function, owner)
         arguments = self._arguments(function, node)
-        values = self._lowered({k: v for k, v in arguments.items() if types_[k].kind != "text"})
+        values = self._lowered({k: v for k, v in arguments.items() if types_[k].kind != "non-number"})
         for name, value in values.items():
             required = types_[name]
             if required.kind == value.type.kind == "list" and required.length in (None, value.type.length):
@@ -287,7 +298,7 @@ class CallLowering(ListLowering):
     def _record(self, target: Any, node: Any) -> CExpression:
         values, record = self._lowered(self._arguments(target, node)), ValueType("record", target)
         required = {name: self.field_type(record, name, node) for name in target._fields}
-        texts = [values[name].stored(t) for name, t in required.items() if t.kind != "text"]
+        texts = [values[name].stored(t) for name, t in required.items() if t.kind != "non-number"]
         name = self.fresh("record")
         self.emit(f"const {self.program.c_type(record)} {name} = {{{', '.join(texts)}}};")
         return CExpression(name, record)

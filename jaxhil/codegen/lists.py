@@ -226,7 +226,9 @@ class ListLowering(ExpressionLowering):
         return index.text if is_above else f"{index.text} < 0 ? {index.text} + {length} : {index.text}"
 
     def _entry(self, node: Any, value: CExpression) -> CExpression:
-        texts = {name: value.constant for name, value in self.names.items() if value.type.kind == "text"}
+        texts = {
+            name: value.constant for name, value in self.names.items() if value.type.kind == "non-number"
+        }
         try:
             code = compile(ast.Expression(node.slice), self.function.file, "eval")
             key = eval(code, {"__builtins__": {}}, texts)

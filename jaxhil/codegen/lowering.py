@@ -15,10 +15,12 @@ from .values import ZEROS, CExpression, Rank, as_float, combine, constant, sign_
 if TYPE_CHECKING:
     from .program import CFunction, CProgram
 
+# C operators, and functions of the module `operator` that compute their values at export.
 NODES = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Lt, ast.LtE, ast.Gt, ast.GtE, ast.Eq, ast.NotEq)
 MARKS: dict[Any, str] = dict(zip(NODES, "+ - * / < <= > >= == !=".split(), strict=True))
 FUNCTIONS: dict[Any, str] = dict(zip(NODES, "add sub mul truediv lt le gt ge eq ne".split(), strict=True))
 BIT_MARKS = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}
+HELPERS = {ast.FloorDiv: "floor_division", ast.Mod: "modulo", ast.Pow: "power"}
 LARGEST_INT = 2**53  # largest int of the subset; a double represents all smaller ints exactly
 MAX_SQUARABLE_INT = 94906265  # largest int whose square is at most LARGEST_INT
 SMALL = 2**10  # with this increment every millisecond, a counter needs 278 years to reach LARGEST_INT
@@ -40,7 +42,7 @@ class ExpressionLowering:
     """Lowering of expressions; emits the C statements that must precede an expression."""
 
     array: Callable[[Any, None], CExpression]
-    power: Callable[..., CExpression]
+    call_helper: Callable[..., CExpression]
 
     def __init__(self, program: "CProgram", function: "CFunction") -> None:
         self.program, self.function = program, function
@@ -219,13 +221,9 @@ class ExpressionLowering:
             return combine(text, INT, Rank.BITS, left, right)
         if not is_int or op in (ast.Div, ast.Pow):
             left, right, is_int = as_float(left), as_float(right), False
-        if op is ast.Pow:
-            return self.power(node, left, right)
-        if op is ast.Mod and is_int:
-            right = self.divisor(node, right)
-            text = self.program.helper("modulo", left.text, right.text)
-            return combine(text, INT, Rank.ATOM, left, right, sign=right.sign & Sign.NONNEGATIVE)
-        expected = "+, -, *, / or ** of numbers, %, &, | or ^ of ints, `floor(a / b)` or `math.fmod`"
+        if op in HELPERS:
+            return self.call_helper(node, left, right, HELPERS[op] + "_int" * is_int)
+        expected = "+, -, *, /, //, % or ** of numbers, &, | or ^ of ints"
         self.require(op in MARKS, node, op.__name__, expected)
         mark, rank = MARKS[op], Rank.SUM if op in (ast.Add, ast.Sub) else Rank.PRODUCT
         if op is ast.Div:

@@ -13,9 +13,28 @@ C_HELPERS = {
 const volatile double exact = exponent;
 return pow(base, exact);
 }""",
-    "modulo": """int64_t @modulo(int64_t value, int64_t divisor) {
+    "modulo": """double @modulo(double value, double divisor) {
+const double rest = fmod(value, divisor);
+if (rest == 0.0) {
+return copysign(0.0, divisor);
+}
+return (divisor < 0.0) != (rest < 0.0) ? rest + divisor : rest;
+}""",
+    "floor_division": """double @floor_division(double value, double divisor) {
+const double rest = fmod(value, divisor);
+const bool is_below = rest != 0.0 && (divisor < 0.0) != (rest < 0.0);
+const double quotient = (value - rest) / divisor - (is_below ? 1.0 : 0.0);
+const double whole = floor(quotient);
+return quotient == 0.0 ? copysign(0.0, value / divisor) : quotient - whole > 0.5 ? whole + 1.0 : whole;
+}""",
+    "modulo_int": """int64_t @modulo_int(int64_t value, int64_t divisor) {
 const int64_t rest = divisor == -1 ? 0 : value % divisor;
 return rest != 0 && (rest < 0) != (divisor < 0) ? rest + divisor : rest;
+}""",
+    "floor_division_int": """int64_t @floor_division_int(int64_t value, int64_t divisor) {
+const int64_t quotient = divisor == -1 ? -value : value / divisor;
+const int64_t rest = divisor == -1 ? 0 : value % divisor;
+return rest != 0 && (rest < 0) != (divisor < 0) ? quotient - 1 : quotient;
 }""",
 }
 

@@ -24,7 +24,7 @@ class CFunction:
         self.function, self.owner, self.returns = function, owner, types["return"]
         self.namespace = {**function.__globals__, **inspect.getclosurevars(function).nonlocals}
         types = {name: type_ for name, type_ in types.items() if name != "return"}
-        self.parameters = {name: type_ for name, type_ in types.items() if type_.kind != "text"}
+        self.parameters = {name: type_ for name, type_ in types.items() if type_.kind != "non-number"}
         self.texts = [name for name in types if name not in self.parameters]
         self.occurrences = find_name_lines(self.node)
         names = {node.id for node in ast.walk(self.node) if isinstance(node, ast.Name)} | {*types, "self"}
@@ -195,12 +195,12 @@ class CProgram:
         self.helpers.add(name)
         return f"{self.prefix}{name}({', '.join(texts)})"
 
-    def capacities(self, owner: Any) -> dict[str, int]:
+    def capacities(self, owner: Any, class_: type) -> dict[str, int]:
         """Return the lengths of an object's lists of run-time length, by the names of their capacities."""
         result: dict[str, int] = {}
-        for name, type_ in self.fields.get(type(owner), {}).items():
+        for name, type_ in self.fields.get(class_, {}).items():
             lengths = {type_.capacity: len(getattr(owner, name))} if type_.capacity else {}
-            lengths |= self.capacities(getattr(owner, name)) if type_.kind == "object" else {}
+            lengths |= self.capacities(getattr(owner, name, None), type_.of) if type_.kind == "object" else {}
             result |= {key: max(length, result.get(key, 0)) for key, length in lengths.items()}
         return result
 
@@ -235,7 +235,7 @@ class CProgram:
             for field, type_ in self.fields.get(class_, {}).items():
                 if type_.kind in ("object", "record") and type_.of not in texts:
                     visit(type_.of)
-                if type_.kind != "text":
+                if type_.kind != "non-number":
                     lines.append(f"{self.declaration(type_, self.field_name(class_, field))};")
             lines = lines or ["char nothing; /* C has no empty structs */"]
             text = indent_lines([f"typedef struct {name} {{", *lines, f"}} {name};"])

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from .calls import CallLowering
 from .printing import escape_comment
 from .python_source import read_comment_before
-from .subset import FLOAT, INT, Locations, ValueType
-from .values import ZEROS, CExpression, Rank, constant
+from .subset import FLOAT, INT, TEXT, Locations, ValueType
+from .values import ZEROS, CExpression, Rank
 
 if TYPE_CHECKING:
     from .program import CFunction, CProgram
@@ -30,7 +30,7 @@ class BodyLowering(CallLowering):
             if type_.kind == "optional":
                 value = value._replace(text=f"*{text}", type=FLOAT, rank=Rank.UNARY, length="optional")
             self.names[name] = value
-        self.names |= dict.fromkeys(function.texts, constant(""))
+        self.names |= dict.fromkeys(function.texts, CExpression("", TEXT))
         if function.owner is not None:
             owner = ValueType("object", function.owner)
             self.names["self"] = CExpression("self", owner, is_pointer=True)
@@ -167,7 +167,7 @@ class BodyLowering(CallLowering):
         is_name, is_element = isinstance(target, ast.Name), isinstance(target, ast.Subscript)
         if value.type.kind in ("object", "list") and is_name:
             return self._alias(node, target, value)
-        if value.type.kind == "text":
+        if value.type.kind == "non-number":
             is_text = isinstance(value.constant, (str, tuple, list, frozenset))
             return self.require(
                 is_text, node, "a value without equivalent in C", "a number, a bool or a text"
@@ -186,7 +186,7 @@ class BodyLowering(CallLowering):
             self.copy(field, value, node)
             self._replace_at(node, target, field)
             self.share(node, field.reads, value)
-        elif field.type.kind != "text":
+        elif field.type.kind != "non-number":
             self._emit_store(node, field, value)
         self.changed(field, is_element)
         if value.sign:

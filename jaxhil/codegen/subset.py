@@ -47,7 +47,9 @@ class SubsetError(ValueError):
 class ValueType(NamedTuple):
     """Type of a Python value, with the properties that its C type needs."""
 
-    kind: str  # float, int, bool, text, none, list, object, record, struct (of gains or limits), optional
+    # float, int, bool, list, object, record, struct (of gains or limits), optional, none, or
+    # non-number, which has no equivalent in C
+    kind: str
     of: Any = None  # element type of a list, class of an object or record, name of a struct
     length: int | None = None  # length of a list; None if it is known only at run time
     sign: int = 0  # sign of a number
@@ -60,7 +62,7 @@ class ValueType(NamedTuple):
         return self._replace(sign=0, c_int="int64_t", is_index=False)
 
 
-FLOAT, INT, BOOL, TEXT, NONE = (ValueType(kind) for kind in ("float", "int", "bool", "text", "none"))
+FLOAT, INT, BOOL, TEXT, NONE = (ValueType(kind) for kind in ("float", "int", "bool", "non-number", "none"))
 
 
 def type_of_annotation(hint: Any, bindings: Mapping[Any, Any]) -> ValueType | None:

@@ -9,8 +9,9 @@ import numpy as np
 
 from jaxhil.laws.six_axis_base import SixAxisConstants
 from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, supported_options
-from jaxhil.sixdof.loop import Loop, controller_constants, run
+from jaxhil.sixdof.loop import Loop, run
 from jaxhil.sixdof.metrics import Metrics, evaluate
+from jaxhil.sixdof.numerical_model import controller_constants
 from jaxhil.sixdof.scenario import Scenario
 
 MIN_TICKS = 256  # minimum number of ticks of a program, a power of two, so that most runs share a program

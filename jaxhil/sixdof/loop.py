@@ -21,7 +21,6 @@ from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.laws.six_axis_base import SixAxisConstants, SixAxisSignals
 from jaxhil.simulation.sensors import apply_lag, quantise, white_noise
-from jaxhil.sixdof.approach import begin as place
 from jaxhil.sixdof.axes import (
     Axes,
     AxisMotion,
@@ -33,10 +32,10 @@ from jaxhil.sixdof.axes import (
     static_lags,
 )
 from jaxhil.sixdof.bodies import SHARES
-from jaxhil.sixdof.equations import product, solve
 from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
 from jaxhil.sixdof.kinematics import Kinematics, RigidMotion, to_rigid_motion
 from jaxhil.sixdof.latch import Latch, LatchState, init_latch, latch_wrench
+from jaxhil.sixdof.numerical_model import controller_constants, model_motion
 from jaxhil.sixdof.relative import (
     Pair,
     Pose,
@@ -44,11 +43,9 @@ from jaxhil.sixdof.relative import (
     Twist,
     Wrench,
     advance,
-    coordinates,
-    mass_matrix,
     relative,
 )
-from jaxhil.sixdof.rotations import exponential, identity
+from jaxhil.sixdof.rotations import exponential
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.sensor import (
     Sensor,
@@ -56,12 +53,11 @@ from jaxhil.sixdof.sensor import (
     read_moving,
     sample,
     tool_load,
-    tool_mass,
     undo_fixed,
     undo_moving,
     weight,
 )
-from jaxhil.sixdof.vectors import assembled, vector
+from jaxhil.sixdof.vectors import vector
 
 SIDES = ("fixed", "moving")  # sides of the rig on which the force sensor may be
 # Number of ticks for settling before a run, if axis positions are not linear functions of the coordinates.
@@ -349,34 +345,6 @@ def actuated(
         controller=state.controller._replace(lag=sensed.lag),
         tick=state.tick + 1,
     )
-
-
-def model_motion(bodies: Pair, states: States) -> tuple[Array, Array, Array]:
-    """Return coordinates, their rates and the twist of the numerical model, (6, *batch) each.
-
-    They describe chaser frame C relative to target frame T; `states` are those of the model's bodies.
-    """
-    pose, twist = relative(bodies, states)
-    at, rates = coordinates(pose, twist)
-    return assembled(at), assembled(rates), assembled(twist)
-
-
-def controller_constants(scenario: Scenario, has_tool: bool) -> SixAxisConstants:
-    """Return the constants of the rig that the compensator knows.
-
-    `has_tool` states whether the force sensor carries a tool, whose inertia it also reads.
-    """
-    bodies, period = scenario.bodies, scenario.control_period
-    zero = jnp.zeros_like(period)
-    still = vector(jnp.zeros((3, *period.shape), period.dtype))
-    docked = place(bodies, Pose(still, identity(zero)), Twist(still, still), zero)
-    mass = mass_matrix(bodies, docked)
-    unit = jnp.broadcast_to(jnp.eye(6, dtype=period.dtype).reshape(6, 6, *[1] * period.ndim), mass.shape)
-    inverse = solve(mass, unit)
-    correction = unit
-    if has_tool:
-        correction = solve(unit - product(tool_mass(scenario.sensor.assumed_tool), inverse), unit)
-    return SixAxisConstants(period, mass, inverse, correction)
 
 
 def _measured_pose(loop: Loop, rig: RigConstants, state: RunState, measured: Array) -> Array:

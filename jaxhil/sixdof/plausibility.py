@@ -18,7 +18,7 @@ from jaxhil.sixdof.building_contacts import candidate_names
 from jaxhil.sixdof.candidates import motion_at
 from jaxhil.sixdof.forces import deepest
 from jaxhil.sixdof.latch import init_latch, latch_wrench
-from jaxhil.sixdof.loop import model_motion
+from jaxhil.sixdof.numerical_model import model_motion
 from jaxhil.sixdof.relative import relative
 from jaxhil.sixdof.rollout import SEGMENT_TICKS
 from jaxhil.sixdof.scenario import Scenario

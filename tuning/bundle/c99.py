@@ -181,8 +181,9 @@ def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> 
     controller = kind.controller(gain_file, source)  # raises an error if a delay is too long for a delay line
     law = gain_file.compensator
     program, declarations, definitions = _generate_code(law, kind.compensators[law], kind.axes)
-    comment = "/* Capacity of each of these lists; increase it for longer delays. */"
-    capacities = [f"\n{comment}\n#define {key} {n}\n" for key, n in program.capacities(controller).items()]
+    comment = "/* Capacity of this list in its struct; increase it for longer delays. */"
+    lengths = program.capacities(controller, kind.controller)
+    capacities = [f"\n{comment}\n#define {name} {length}\n" for name, length in lengths.items()]
     return {
         HEADER_FILE: _HEADER_TEMPLATE.format(
             law=law,

@@ -22,14 +22,10 @@ import zlib
 from collections import namedtuple
 
 MANIFEST_FILE, SIGNATURE_FILE, PYTHON_CACHE = "manifest.json", "manifest.sig", "__pycache__/"
-PATH_PATTERN = re.compile(
-    r"(?:\w[\w.-]{0,99}/){0,3}\w[\w.-]{0,99}", re.ASCII
-)  # path of a file in the manifest
-MAX_FILES, MAX_BUNDLE_BYTES, MAX_TEXT_BYTES = (
-    1000,
-    1 << 26,
-    1 << 23,
-)  # of a bundle, and bytes of a text file in it
+# Pattern of a file's path in the manifest.
+PATH_PATTERN = re.compile(r"(?:\w[\w.-]{0,99}/){0,3}\w[\w.-]{0,99}", re.ASCII)
+# Limits of a bundle: files and bytes; and bytes of a text file in it.
+MAX_FILES, MAX_BUNDLE_BYTES, MAX_TEXT_BYTES = 1000, 1 << 26, 1 << 23
 SCHEMA = "jaxhil/bundle/1"
 MAX_REPORTED_DIFFERENCES = 8  # largest number of reported differences in one file
 C_SOURCES = ("c99/test_vectors.c", "c99/jaxhil_controller.c")

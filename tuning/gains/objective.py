@@ -23,7 +23,7 @@ outside the worst 5 %, and take steps that move these contacts into the worst 5 
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -36,7 +36,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxhil.errors import InputError, format_value
 from jaxhil.simulation.evaluation import RigModel
 from jaxhil.simulation.outcome import Outcome
-from jaxhil.simulation.tile_size import find_tile_size
+from tuning.gains.lane_tiles import flatten_lanes, map_over_tiles
 from tuning.gains.metrics_function import MetricsFunction, ScenarioMetrics, build_scenario_metrics
 from tuning.transparency.probes import mask_probes
 
@@ -44,8 +44,6 @@ from tuning.transparency.probes import mask_probes
 RESIDUAL_SCALE = 0.01
 # error e - e* [1] that is assigned to a contact that does not end or does not occur: a strong divergence
 FAILED_CONTACT_ERROR = 3.0
-# Number of lanes per tile on a processor if the scenarios have transparency probes.
-PROBED_LANES_PER_TILE = 32
 CVAR_TAIL_DIVISOR = 20  # cvar is the mean of the worst 1/20 of the contacts, at least of one contact
 NORM_POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # even exponents p of the norm in the residuals
 OBJECTIVE_NAMES = tuple(NORM_POWERS)
@@ -207,7 +205,7 @@ def compute_residuals(
     if terms.chatter:
         loop = dataclasses.replace(loop, chatter=True)
     number, lanes = len(gains), jax.tree.leaves(problems.rig)[0].shape[-1]
-    rig = jax.tree.map(_flatten_lanes, problems.rig)
+    rig = jax.tree.map(flatten_lanes, problems.rig)
     values: dict[str, Any] = {name: gains[:, i] for i, name in enumerate(names)}
     values = {name: jnp.repeat(value, lanes) for name, value in {**problems.fixed, **values}.items()}
 
@@ -215,7 +213,7 @@ def compute_residuals(
         values, rig = arguments
         return model.outcome(loop, values, rig)
 
-    outcome = _map_over_tiles(run, (values, rig)) if terms.transparency else run((values, rig))
+    outcome = map_over_tiles(run, (values, rig)) if terms.transparency else run((values, rig))
     outcome = model.select_verdict_error(outcome)
 
     def by_problem(leaf):
@@ -399,20 +397,3 @@ def _compute_norm_residuals(
     total = jnp.sum((size / unit) ** power, axis=1, keepdims=True)
     norm = unit * jnp.where(largest > 0, total, 1) ** (1 / power)
     return error * (size / norm) ** (power // 2 - 1) / number.astype(error.dtype) ** (1 / power)
-
-
-def _map_over_tiles(function: Callable[[Any], Outcome], arguments: Any) -> Outcome:
-    """Apply `function` to groups (tiles) of lanes, so that a slow lane delays only its own tile."""
-    lanes = jax.tree.leaves(arguments)[0].shape[-1]
-    # On an accelerator, the memory already limits the number of problems, and thereby of lanes.
-    size = math.gcd(lanes, find_tile_size(lanes, PROBED_LANES_PER_TILE))
-    chunks = jax.tree.map(
-        lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes // size, size), -2, 0), arguments
-    )
-    results = lax.map(function, chunks)
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], lanes), results)
-
-
-def _flatten_lanes(leaf: Array) -> Array:
-    """Join the axes of problems and scenarios: reshape (problems, ..., scenarios) to (..., lanes)."""
-    return jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], leaf.shape[0] * leaf.shape[-1])

@@ -114,13 +114,10 @@ def tune_group(
     )
     work.runs_after_group -= evaluating - precomputed
     clock.lap("tune")
-    work.begin(
-        f"evaluating on {settings.validation} fresh scenarios", evaluating - (precomputed if baselines else 0)
-    )
-    best = [
-        result.best.gains if result.best else task.literature
-        for result, task in zip(searched, tasks, strict=True)
-    ]
+    left = evaluating - (precomputed if baselines else 0)
+    work.begin(f"evaluating on {settings.validation} fresh scenarios", left)
+    pairs = zip(searched, tasks, strict=True)
+    best = [result.best.gains if result.best else task.literature for result, task in pairs]
     evaluated = {**(baselines or _evaluate_baselines(validation)), "tuned": validation.evaluate(best)}
     noisy = [has_sensor_noise(task.mechanism) for task in tasks]
     noiseless = validation.evaluate(best, noise=False) if any(noisy) else []

@@ -34,11 +34,6 @@ from tuning.identification.sensor_lag import (
     estimate_sensor_lag,
 )
 
-SETTLING_TIME = 0.5  # s, settling time that is assumed for a motion simulator
-SEGMENT_LENGTH = 1.0  # s, length of the segments of a long run
-MEMORY_TIME_CONSTANTS = 10.0  # time constants of the motion simulator; older commands have no effect
-SPEED_ROWS = 5  # a speed is the difference of two positions that are this many rows apart
-MAX_SPEED_CHANGE = 0.01  # maximum relative change of the speed in a motion that counts as uniform
 SPECIFIED_DEAD_ZONE_STD = 1e-3  # relative standard deviation of a specified dead zone
 UNKNOWN_SURFACE_STD = 5e-5  # m; standard deviation of a surface position that is assumed to be 0
 DEAD_ZONE_MARGIN = 4.0  # minimum distance of a used force above the dead zone, in standard deviations
@@ -47,53 +42,6 @@ ASSUMED_NOISE_SHARE = 0.01  # standard deviation of unknown noise, relative to t
 MIN_NOISE_SHARE = 1e-6  # minimum noise as a share of the largest force; simulated logs may be noise-free
 MIN_DEAD_ZONE_SIGMAS = 3.0  # minimum size of a significant dead zone, in standard deviations
 MAX_REDUCED_CHI_SQUARE = 1.3  # chi-squared per degree of freedom above which the intervals are widened
-
-
-def split_long_run(run: LoggedRun, period: float) -> list[LoggedRun]:
-    """Divide a long run into segments of about one second, so that all runs have a similar length.
-
-    Each segment begins with additional rows, in which the motion simulator settles. Fits omit these rows.
-    """
-    settling, length = round(SETTLING_TIME / period), round(SEGMENT_LENGTH / period)
-    if len(run.tick) <= settling + 2 * length:
-        return [run]
-    segments = []
-    for begin in range(settling, len(run.tick), length):
-        part = slice(begin - settling, min(begin + length, len(run.tick)))
-        names = ("tick", "position_desired", "position_measured", "force_measured", "velocity_desired",
-                 "force_command", "contact_index", "force_late")  # fmt: skip
-        arrays = {name: None if getattr(run, name) is None else getattr(run, name)[part] for name in names}
-        valid = run.valid[part].copy()
-        valid[:settling] = False
-        segments.append(replace(run, valid=valid, **arrays))
-    return segments
-
-
-def exclude_rows_after_gaps(runs: Sequence[LoggedRun], model: MotionModel, period: float) -> list[LoggedRun]:
-    """Mark the rows after a gap in the log as not valid if the lost commands affect the motion in these rows.
-
-    The lost commands affect the motion for ten time constants of the motion simulator plus all delays. If a
-    run begins in uniform motion, the motion is assumed to have been uniform during the gap, and all rows
-    remain valid.
-    """
-    slowest = max((-1.0 / pole.real for pole in np.roots(model.fraction[1])), default=0.0)
-    settling = int(
-        np.ceil((MEMORY_TIME_CONSTANTS * slowest + max(model.delay, 0.0) + MAX_FORCE_DELAY) / period)
-    )
-    result, ends = [], {}
-    for run in runs:
-        lost = ends.get(run.source, run.tick[0]) + 1 < run.tick[0]
-        ends[run.source] = int(run.tick[-1])
-        if lost and not _is_uniform_motion(run.position_desired):
-            run = replace(run, valid=run.valid & (np.arange(len(run.tick)) >= settling))
-        result.append(run)
-    return result
-
-
-def _is_uniform_motion(position: np.ndarray) -> bool:
-    """Return whether the speed is constant in the first rows of a run."""
-    first, second = np.diff(position[: 2 * SPEED_ROWS + 1 : SPEED_ROWS])
-    return bool(abs(second - first) <= MAX_SPEED_CHANGE * abs(first))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -28,6 +28,7 @@ from tuning.identification.contact_regression import (
 )
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
+from tuning.identification.nearby_rows import NearbyRows, Onsets
 from tuning.identification.packed_rows import PackedRows, pack_rows
 from tuning.identification.sensor_filter import (
     compute_lag_weights,
@@ -37,29 +38,8 @@ from tuning.identification.sensor_filter import (
 
 MAX_FORCE_DELAY = 0.02  # s, longest force delay in the search range of a fit
 COARSE_DELAY_STEP = 0.0005  # s, step between the delays of a first search
-MAX_NEWTON_STEPS = 6  # maximum number of Newton steps in the search for a surface position
-MIN_LIKELIHOOD_GAIN = 2.0  # Newton's method stops when a step increases the log likelihood by less
 STEP = 1e-7  # m, step of finite differences with respect to the surface position
 FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants after which a filter's response is below rounding errors
-
-
-class _NearbyRows(NamedTuple):
-    """Rows that are in contact for at least one of several surface positions."""
-
-    rows: np.ndarray  # (rows,), indices of the rows
-    depth: np.ndarray  # m, (surface positions, rows), penetration; 0 out of contact
-    rate: np.ndarray  # m/s, (rows,), rate of the penetration
-    columns: np.ndarray  # (surface positions, coefficients, rows), regressors of the law, without the bias
-
-
-class _Onsets(NamedTuple):
-    """Onsets of contact between two rows, and the weights of the force in the next, lagged reading."""
-
-    plane: np.ndarray  # (onsets,), index of the surface position
-    row: np.ndarray  # (onsets,), index into `_NearbyRows.rows` of the row after the onset
-    columns: np.ndarray  # (coefficients, onsets), regressors of the law just after the onset
-    after: np.ndarray  # (onsets,), weight of the force just after the onset (`compute_onset_weights`)
-    end: np.ndarray  # (onsets,), weight of the force at the end of the period
 
 
 class ContactProblem:
@@ -194,12 +174,12 @@ class ContactProblem:
         position, rate = self._get_motion(delay)[0]
         return np.unique(position[(rate > 0.0) & (position > low) & (position < high)])
 
-    def _find_nearby_rows(self, position, rate, where, planes: np.ndarray) -> _NearbyRows:
+    def _find_nearby_rows(self, position, rate, where, planes: np.ndarray) -> NearbyRows:
         """Return the rows that are in contact for at least one of the surface positions `planes` [m]."""
         # Finite differences also need the rows that would be in contact with a slightly nearer surface.
         rows = np.flatnonzero(position > planes.min() - (STEP if self.time_constant else 0.0))
         depth, rate = np.maximum(position[rows] - planes[:, None], 0.0), rate[rows]
-        return _NearbyRows(rows, depth, rate, self._tabulate(depth, rate, where[rows]))
+        return NearbyRows(rows, depth, rate, self._tabulate(depth, rate, where[rows]))
 
     def _tabulate(self, depth: np.ndarray, rate: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return the law's regressors in the given rows, shape (surface positions, coefficients, rows)."""
@@ -213,7 +193,7 @@ class ContactProblem:
             columns[:, i] = column
         return columns
 
-    def _flag_rows_in_contact(self, near: _NearbyRows, coefficients: np.ndarray | None) -> np.ndarray:
+    def _flag_rows_in_contact(self, near: NearbyRows, coefficients: np.ndarray | None) -> np.ndarray:
         """Return flags that mark the rows in contact in which the force of the law is not negative."""
         inside = near.depth > 0.0
         if coefficients is None or self.law.pulls or not self.damping_indices:
@@ -225,8 +205,8 @@ class ContactProblem:
         return np.where(sound[:, None], pushing, inside)
 
     def _find_onsets(
-        self, near: _NearbyRows, positions: list[np.ndarray], planes: np.ndarray
-    ) -> _Onsets | None:
+        self, near: NearbyRows, positions: list[np.ndarray], planes: np.ndarray
+    ) -> Onsets | None:
         """Find the onsets of contact between two rows; return None if the sensor has no lag.
 
         `positions` contains the positions [m] at all rows and half a period before all rows.
@@ -240,9 +220,9 @@ class ContactProblem:
         plane, row = np.nonzero(left)
         columns = self._tabulate(np.zeros((1, len(row))), near.rate[row], self.needed_rows[near.rows[row]])[0]
         rate = self.motion.period / self.time_constant
-        return _Onsets(plane, row, columns, *compute_onset_weights(rate, left[plane, row]))
+        return Onsets(plane, row, columns, *compute_onset_weights(rate, left[plane, row]))
 
-    def _pack_nearby_rows(self, near: list[_NearbyRows]) -> PackedRows:
+    def _pack_nearby_rows(self, near: list[NearbyRows]) -> PackedRows:
         """Return the rows near contact and the later rows that depend on them through the filters."""
         return pack_rows([part.rows for part in near], self.readings.force.shape, self.memory)
 
@@ -298,7 +278,7 @@ class ContactProblem:
         return np.concatenate([used, bias], axis=1)
 
     def _build_design(
-        self, near: list[_NearbyRows], flags: list[np.ndarray], onsets: _Onsets | None
+        self, near: list[NearbyRows], flags: list[np.ndarray], onsets: Onsets | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return design (surface positions, coefficients, rows) and readings near contact.
 
@@ -337,7 +317,7 @@ class ContactProblem:
         return fit_coefficients(design, target, (count, total, square), self.bias_alone, self.readings.bias)
 
     def _differentiate_by_plane(
-        self, delay: float, plane: float, coefficients, near: list[_NearbyRows], flag: np.ndarray
+        self, delay: float, plane: float, coefficients, near: list[NearbyRows], flag: np.ndarray
     ) -> np.ndarray:
         """Differentiate the predicted readings with respect to the surface position.
 
@@ -408,29 +388,6 @@ class ContactProblem:
         flags = [self._flag_rows_in_contact(part, repeated) for part in near]
         onsets = self._find_onsets(near[0], [x for x, _ in moved], planes) if len(moved) > 1 else None
         return near, flags, onsets
-
-    def find_best_surface(self, delay: float, plane: float) -> tuple[float, CoefficientFit, float]:
-        """Find the surface position with the smallest misfit at one force delay by Newton's method.
-
-        Args:
-            delay: Force delay [s].
-            plane: Starting value of the surface position [m].
-
-        Returns:
-            The best surface position [m], the fit before the last Newton step, and the increase of the log
-            likelihood in this step.
-        """
-        inner = self.at(delay, plane)
-        for _ in range(MAX_NEWTON_STEPS):
-            if self.plane is not None or inner.curvature <= 0.0:
-                return plane, inner, 0.0
-            shift = inner.slope / inner.curvature
-            gain = 0.5 * inner.slope * shift
-            plane = plane - shift
-            if gain < MIN_LIKELIHOOD_GAIN:
-                return plane, inner, gain
-            inner = self.at(delay, plane)
-        return plane, inner, 0.0
 
 
 def _whiten(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:

@@ -20,6 +20,7 @@ from tuning.identification import press_bias
 from tuning.identification.contact_problem import COARSE_DELAY_STEP, MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_regression import CoefficientFit
 from tuning.identification.normal_draws import factorise_covariance
+from tuning.identification.surface_search import find_best_surface
 
 FINE_DELAY_STEP = 2e-5  # s, step between the delays of the second grid
 SMOOTHING_DELAYS = 7  # number of adjacent delays of the second grid whose surface positions are averaged
@@ -135,7 +136,7 @@ def _scan_delays(
     """Return, at each delay, the best surface position, its standard deviation and the log posterior."""
     planes, stds, heights = [], [], []
     for delay in delays:
-        plane, inner, gain = problem.find_best_surface(delay, start)
+        plane, inner, gain = find_best_surface(problem, delay, start)
         stds.append(1.0 if problem.plane is not None else 1.0 / np.sqrt(max(inner.curvature, 1e-300)))
         planes.append(plane)
         heights.append(inner.evidence + gain + np.log(stds[-1]))

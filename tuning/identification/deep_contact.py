@@ -21,6 +21,7 @@ from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProble
 from tuning.identification.contact_profile import estimate_surface_from_onset
 from tuning.identification.contact_regression import CoefficientFit, PseudoRows, compute_force
 from tuning.identification.motion import MotionResponse
+from tuning.identification.surface_search import find_best_surface
 
 MIN_DEEP_LANES = 6  # minimum number of deep lanes for which pseudo-rows save time
 LANES_FOR_LAW_CHOICE = 8  # number of deep lanes that suffice to fit the shape of a contact law
@@ -72,8 +73,8 @@ def _approximate_surface(problem: ContactProblem) -> float:
     """Return the specified surface position [m]; if there is none, fit it for a typical force delay."""
     if problem.plane is not None:
         return problem.plane
-    return problem.find_best_surface(
-        MAX_FORCE_DELAY / 4.0, estimate_surface_from_onset(problem, MAX_FORCE_DELAY / 4.0)
+    return find_best_surface(
+        problem, MAX_FORCE_DELAY / 4.0, estimate_surface_from_onset(problem, MAX_FORCE_DELAY / 4.0)
     )[0]
 
 

@@ -57,11 +57,7 @@ def make_mechanism(
             if key.startswith("contact."):
                 set_value(document, key, value)
     rig = dict(document.get("rig", {}))
-    rig |= {
-        "control_period": timing.control_period,
-        "command_latency": timing.command_latency,
-        "command_hold": timing.command_hold,
-    }
+    rig |= {key: getattr(timing, key) for key in ("control_period", "command_latency", "command_hold")}
     rig |= {} if campaign.integrator is None else {"integrator": campaign.integrator}
     simulator = {
         key[len(SIMULATOR_PREFIX) :]: value

@@ -18,6 +18,7 @@ from tuning.identification import contact_fit as contacts
 from tuning.identification.bootstrap import bootstrap
 from tuning.identification.contact_fit import ContactFit
 from tuning.identification.contact_profile import POSTERIOR_DRAWS
+from tuning.identification.contact_runs import exclude_rows_after_gaps, split_long_run
 from tuning.identification.estimates import estimate_combinations, get_unit, make_estimates
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.identified_mechanism import compute_bound_excess, make_mechanism
@@ -119,10 +120,8 @@ def identify(
 def _select_runs_in_contact(campaign: Campaign, model: MotionModel) -> list[LoggedRun]:
     """Return the runs in contact; long runs are divided into segments."""
     period = campaign.timing.control_period
-    runs = contacts.exclude_rows_after_gaps(
-        [run for run in campaign.runs if run.kind in CONTACT_KINDS], model, period
-    )
-    return [segment for run in runs for segment in contacts.split_long_run(run, period)]
+    runs = exclude_rows_after_gaps([run for run in campaign.runs if run.kind in CONTACT_KINDS], model, period)
+    return [segment for run in runs for segment in split_long_run(run, period)]
 
 
 def _estimate_frequency(contact: ContactFit | None, mass: float) -> float:

@@ -15,6 +15,7 @@ from scipy import special
 from tuning.identification.contact_problem import ContactProblem
 from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
 from tuning.identification.normal_draws import factorise_covariance
+from tuning.identification.surface_search import find_best_surface
 
 MAX_SURFACE_STD = 0.01  # m, upper limit of the surface position's standard deviation
 MAX_REDRAWS = 50  # maximum number of repetitions of draws with a negative damping coefficient
@@ -32,7 +33,7 @@ def compute_posterior_near(problem: ContactProblem, delays: np.ndarray, plane: f
     step, free = delays[1] - delays[0], problem.plane is None
     surfaces, fits, deviations, changes, heights = [], [], [], [], []
     for delay in delays:
-        surface, fit, gain = problem.find_best_surface(float(delay), plane)
+        surface, fit, gain = find_best_surface(problem, float(delay), plane)
         deviation = min(1.0 / np.sqrt(max(fit.curvature, 1e-300)), MAX_SURFACE_STD) if free else 0.0
         change = np.zeros(len(fit.coefficients)) if fit.by_plane is None else fit.by_plane
         mean = fit.coefficients + change * (surface - fit.plane)

@@ -30,6 +30,7 @@ from tuning.identification.contact_profile import estimate_surface_from_onset
 from tuning.identification.deep_contact import select_representative_lanes
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
+from tuning.identification.surface_search import find_best_surface
 
 MIN_CONTACTS_FOR_CROSS_VALIDATION = 4  # minimum number of contacts for cross-validation
 # Maximum deficit of an acceptable law in log likelihood, in standard errors of the deficit.
@@ -186,7 +187,7 @@ def search_coarsely(problem: ContactProblem, guess: CoarseFit | None = None, rea
             delays = best[0] + width * np.array([-1.0, -0.5, 0.5, 1.0])
             delays = np.clip(delays, problem.min_delay, MAX_FORCE_DELAY)
         for delay in delays:
-            plane, inner, gain = problem.find_best_surface(float(delay), best[1])
+            plane, inner, gain = find_best_surface(problem, float(delay), best[1])
             if inner.misfit - 2.0 * gain < best[2]:
                 best = (float(delay), plane, inner.misfit - 2.0 * gain)
     return best

@@ -17,6 +17,7 @@ from tuning.identification.contact_fit import ContactFit
 from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import Posterior
 from tuning.identification.contact_regression import CoefficientFit
+from tuning.identification.contact_runs import exclude_rows_after_gaps, split_long_run
 from tuning.identification.edge_check import check_contact_edges
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.free_motion import FreeMotion
@@ -62,8 +63,8 @@ def check_against_mechanism(
     free = [run for run in campaign.runs if run.kind == "free"]
     mass, period = campaign.equivalent_mass, campaign.timing.control_period
     touches = [run for run in campaign.runs if run.kind in ("contact", "press", "tap")]
-    touches = contacts.exclude_rows_after_gaps(touches, model, period) if touches else []
-    touching = [segment for run in touches for segment in contacts.split_long_run(run, period)]
+    touches = exclude_rows_after_gaps(touches, model, period) if touches else []
+    touching = [segment for run in touches for segment in split_long_run(run, period)]
     motion = free_motion.compare_free_motion(free, campaign.timing, model)
     contact = None
     if touching:

@@ -134,10 +134,9 @@ def audit_contacts(signals: RecordedSignals, rules: AuditRules, slots: int) -> A
             command_before = np.where(begins, 0.0, command_before)
             deflection = _compute_deflection(alignment.step(measured, velocity, begins), clearance)
             aligned_before = np.where(begins, 0.0, aligned_before)
-            in_contact = (_compute_deflection(position, clearance) != 0) | (
-                _compute_deflection(measured, clearance) != 0
-            )
-            in_contact |= rules.has_status & (command_before != 0)
+            in_contact = rules.has_status & (command_before != 0)
+            for deflected in (position, measured):
+                in_contact |= _compute_deflection(deflected, clearance) != 0
             side = np.where(position > middle, 1.0, -1.0)
             starts = live & ~state.open & in_contact
             if np.any(starts):
@@ -156,14 +155,12 @@ def audit_contacts(signals: RecordedSignals, rules: AuditRules, slots: int) -> A
                 x = np.where(inside, side_open * (deflection + aligned_before) * 0.5, 0.0)
                 v = np.where(inside, side_open * (deflection - aligned_before) / period, 0.0)
                 f = np.where(inside, side_open * (force + force_before) * 0.5, 0.0)
-                for name, product in zip(
-                    LEAST_SQUARES_SUMS, (x * x, x * v, v * v, x * f, v * f), strict=True
-                ):
+                products = (x * x, x * v, v * v, x * f, v * f)
+                for name, product in zip(LEAST_SQUARES_SUMS, products, strict=True):
                     state.sums[name] += product
                 negligible = FORCE_DECAY_RATIO * mass * np.abs(state.entry) / MAX_DECAY_WAIT
                 free_ticks = state.ticks_without_contact
-                faded = command_magnitude <= FORCE_DECAY_RATIO * state.peak
-                faded |= command_magnitude <= negligible
+                faded = command_magnitude <= np.fmax(FORCE_DECAY_RATIO * state.peak, negligible)
                 faded |= free_ticks >= max_ticks
                 leaves = ~in_contact & (free_ticks >= min_ticks) & (side_open * velocity < 0) & faded
                 has_ended = in_progress & (leaves | (side != side_open))

@@ -12,10 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy import optimize
 
 import jaxhil
 from jaxhil.contact.laws import find_contact_law
@@ -24,6 +22,7 @@ from jaxhil.mechanism.file import from_plain_data, to_plain_data
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification import hold, mechanism_models
 from tuning.identification.design import powers, waveform
+from tuning.identification.design.press_force import LIMIT_SHARE, differentiate_force, find_preload
 from tuning.identification.mechanism_file import set_value
 
 MULTISINE_PERIOD = 5.0  # s
@@ -34,13 +33,11 @@ START_CLEARANCE = 0.001  # m, distance to the surface at the start of a press ru
 MIN_TOP_FREQUENCY = 45.0  # Hz, minimum of the highest frequency line, which is usually 3 times the bandwidth
 FLAT_POWER_SHARE = 0.2  # share of the power that is distributed evenly among the frequency lines
 ASSUMED_CREST_FACTOR = 1.6  # assumed crest factor for the comparison of powers with limits
-PRELOAD_SHARE = 0.45  # mean force of a press run as a share of the largest allowed force
 SWING_SHARE = 0.4  # amplitude of the force about its mean, as a share of the largest allowed force
 # Weight of the parameters' relative errors, which is added to the weight of their effect on e - e*.
 RELATIVE_ERROR_WEIGHT = 0.01
 CONTACT_PHASES = (0.0, 0.25, 0.5, 0.75)  # evaluated phases of the contact within a control period
 ASSUMED_NOISE_STD = 5e-6, 0.5  # m and N, noise of position and force if the mechanism specifies none
-LIMIT_SHARE = 0.9  # maximum used share of the limits of speed, acceleration and force
 DAMPING_KEY = "contact.damping.0"
 TRIAL_DAMPING_RATIO = 0.01  # damping ratio of the contact at which the resolution of damping is computed
 SIMULATOR_KEYS = {
@@ -212,8 +209,8 @@ def _plan_with_detectable_damping(
     a linear prediction of their uncertainty would be infinite. For a low damping, its standard deviation is
     inversely proportional to the damping. The lowest detectable damping equals its own standard deviation.
     """
-    stiffness, _ = _differentiate_force(mechanism, undamped.depth)
-    _, rate = _differentiate_force(_replace_damping(mechanism, 1.0), undamped.depth)
+    stiffness, _ = differentiate_force(mechanism, undamped.depth)
+    _, rate = differentiate_force(_replace_damping(mechanism, 1.0), undamped.depth)
     trial = 2.0 * TRIAL_DAMPING_RATIO * np.sqrt(stiffness * mechanism.bodies.mass) / rate
     plan = _MultisinePlan(_replace_damping(mechanism, trial), stroke)
     groups, index = [plan.free, plan.press], plan.keys.index(DAMPING_KEY)
@@ -253,7 +250,7 @@ class _MultisinePlan:
         self.hold = hold.compute_hold_response(
             self.frequency, self.period, rig.command_hold, rig.command_latency
         )
-        self.depth, greatest = _find_preload(mechanism)
+        self.depth, greatest = find_preload(mechanism)
         self.plane = rig.contact_plane
         sensors = zip((rig.position_sensor, rig.force_sensor), ASSUMED_NOISE_STD, strict=True)
         stds = [
@@ -297,7 +294,7 @@ class _MultisinePlan:
         sensor, position = mechanism.rig.force_sensor, mechanism.rig.position_sensor
         motion = mechanism_models.make_motion_model(mechanism).response(self.s) * self.hold
         delay_exponent = self.s * (sensor.delay - position.delay)
-        slope, rate = _differentiate_force(mechanism, self.depth)
+        slope, rate = differentiate_force(mechanism, self.depth)
         return motion, (slope + rate * self.s) * motion * np.exp(-delay_exponent) / (
             1.0 + self.s * sensor.time_constant
         )
@@ -362,46 +359,3 @@ def _find_stiffness_key(mechanism: Mechanism, depth: float) -> list[str]:
     if not find_contact_law(contact.law).is_segmented:
         return ["contact.stiffness.0"]
     return [f"contact.stiffness.0.{np.searchsorted(contact.depths, depth)}"]
-
-
-def _compute_force(mechanism: Mechanism, depth: np.ndarray, rate: float = 0.0) -> np.ndarray:
-    law, numbers = (
-        mechanism_models.make_regression_law(mechanism.contact),
-        mechanism_models.get_regression_coefficients(mechanism.contact, 0),
-    )
-    return np.array(numbers) @ np.array(law.entry_functions(depth, np.full_like(depth, rate)))
-
-
-def _differentiate_force(mechanism: Mechanism, depth: float) -> tuple[float, float]:
-    """Differentiate the force at a depth [m] with respect to depth [N/m] and to rate [N s/m]."""
-    step = 1e-3 * depth
-    low, high = _compute_force(mechanism, np.array([depth - step, depth + step]))
-    back, forth = (float(_compute_force(mechanism, np.array([depth]), rate)[0]) for rate in (-step, step))
-    return float(high - low) / (2.0 * step), (forth - back) / (2.0 * step)
-
-
-def _find_preload(mechanism: Mechanism) -> tuple[float, float]:
-    """Return the depth at the preload [m] and the largest allowed force [N] of a press run.
-
-    The force must exceed neither the sensor's range nor the peak force of a contact at the approach speed.
-    """
-    energy = 0.5 * mechanism.bodies.mass * mechanism.approach.velocity**2
-
-    def excess_energy(depth: float) -> float:
-        grid = np.linspace(0.0, depth, 400)
-        return float(np.trapezoid(_compute_force(mechanism, grid), grid)) - energy
-
-    upper = 1e-6
-    while excess_energy(upper) < 0.0:
-        upper *= 2.0
-    deepest: Any = optimize.brentq(excess_energy, 0.0, upper)
-    greatest = min(
-        float(_compute_force(mechanism, np.array([deepest]))[0]),
-        LIMIT_SHARE * mechanism.rig.force_sensor.range,
-    )
-    pressed: Any = optimize.brentq(
-        lambda depth: float(_compute_force(mechanism, np.array([depth]))[0]) - PRELOAD_SHARE * greatest,
-        0.0,
-        deepest,
-    )
-    return float(pressed), greatest

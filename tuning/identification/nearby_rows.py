@@ -1,0 +1,24 @@
+"""Rows near contact at several surface positions, and onsets of contact between rows."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class NearbyRows(NamedTuple):
+    """Rows that are in contact for at least one of several surface positions."""
+
+    rows: np.ndarray  # (rows,), indices of the rows
+    depth: np.ndarray  # m, (surface positions, rows), penetration; 0 out of contact
+    rate: np.ndarray  # m/s, (rows,), rate of the penetration
+    columns: np.ndarray  # (surface positions, coefficients, rows), regressors of the law, without the bias
+
+
+class Onsets(NamedTuple):
+    """Onsets of contact between two rows, and the weights of the force in the next, lagged reading."""
+
+    plane: np.ndarray  # (onsets,), index of the surface position
+    row: np.ndarray  # (onsets,), index into `NearbyRows.rows` of the row after the onset
+    columns: np.ndarray  # (coefficients, onsets), regressors of the law just after the onset
+    after: np.ndarray  # (onsets,), weight of the force just after the onset (`compute_onset_weights`)
+    end: np.ndarray  # (onsets,), weight of the force at the end of the period
