@@ -38,12 +38,12 @@ class Records(NamedTuple):
         return ModelConstants(*(matrix[..., lane].tolist() for matrix in matrices), self.longest_delay)
 
 
-def recorded(mechanism, compensator, lanes, seed=1):
-    """Record drawn runs of a mechanism with the gains from the literature."""
+def recorded(mechanism, compensator, lanes, seed=1, changes=None):
+    """Record drawn runs of a mechanism with the gains from the literature, some of them changed."""
     with jax_context():
         scenario = build_scenarios(mechanism, draw(mechanism, lanes, seed), seed=seed)
         loop = dataclasses.replace(make_loop(mechanism, compensator, scenario), measures_pose=True)
-        gains = literature_gains(mechanism, compensator)
+        gains = {**literature_gains(mechanism, compensator), **(changes or {})}
         arrays = {name: jnp.asarray(value) for name, value in gains.items()}
         _, records = record_controller(loop, arrays, scenario)
         constants = known_constants(loop, scenario)

@@ -22,6 +22,7 @@ from jaxhil.rig.law_status import IDENTIFIED, OUT_OF_CONTACT, STATUS_NAMES
 from jaxhil.rig.six_axes import SIX_AXIS_COMPENSATORS as ON_THE_RIG
 from jaxhil.rig.six_axes import ModelConstants
 from jaxhil.rig.six_axes.vectors import coordinate_rates
+from jaxhil.sixdof.loop import SETTLING_TICKS
 
 LIMIT = 1e-9  # maximum difference, divided by the commands' range
 NOISY = "probe-drogue"  # mechanism whose force and pose readings have noise
@@ -49,6 +50,15 @@ def test_every_built_in_compensator_has_a_rig_class_with_the_same_gains():
         for gain in law.gains:
             for value in (gain.lower(mechanism), gain.nominal(mechanism), gain.upper(mechanism)):
                 assert specified[gain.name].admits(value), (name, gain.name, value)
+
+
+@pytest.mark.parametrize("name", ["phase_lead", "phase_lead_per_axis", "response_error"])
+def test_six_axis_lead_can_be_twice_as_long_as_the_delay_of_the_loop(name):
+    """Tuned leads of contacts with a latch are longer than this delay."""
+    mechanism = load_any("ring-capture").mechanism
+    delay = 0.0037 + max(0.8 / (np.pi * 14.0) + 4e-3, 0.8 / (np.pi * 11.0) + 5e-3)
+    uppers = [gain.upper(mechanism) for gain in SIX_AXIS_COMPENSATORS[name].gains if "phase" in gain.name]
+    np.testing.assert_allclose(uppers, 2 * delay, rtol=1e-12)
 
 
 def check_agreement(name, gains, constants, period, readings, expected):
@@ -80,6 +90,18 @@ def test_rig_and_jax_commands_agree_on_recorded_readings(name):
             gains = literature_gains(records.mechanism, other)
             expected = simulated_alone(other, gains, constants, period, readings)
             check_agreement(other, gains, constants, period, readings, expected)
+
+
+def test_rig_and_jax_commands_agree_if_a_contact_begins_within_the_loop_delay_of_the_start():
+    """Use a hexapod whose delay line is longer than its settling, and noise that counts as contact."""
+    changes = {"rig.control_period": 2.5e-4, "rig.force_sensor.noise_std": {"force": 100.0, "torque": 10.0}}
+    mechanism = load_any("hydraulic-hexapod", changes).mechanism
+    records = recorded(mechanism, "impulse_ledger", 1, changes={"force_noise": 0.0, "torque_noise": 0.0})
+    assert records.longest_delay > SETTLING_TICKS * 2.5e-4
+    [record] = records.lanes
+    assert np.any(record.command[: int(0.02 / 2.5e-4)] != 0)
+    commands, _ = rig_commands("impulse_ledger", records.gains, records.on_the_rig(0), 2.5e-4, record[:4])
+    assert relative_difference(commands, record.command) <= LIMIT
 
 
 def test_pose_commands_are_extrapolated_by_lag_leads():

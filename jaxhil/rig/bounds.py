@@ -14,7 +14,7 @@ The bounds admit every rig with these properties:
 The bounds are slightly wider than the gains that published rules, tuning and the shipped settings yield for
 such a rig (`jaxhil/laws` has narrower bounds for a given rig):
 
-    times           2 x 1 s + 0.02 s, the largest lead and alignment that tuning tries
+    times           2 x (1 s + 1 s) + 0.02 s, twice the loop's delay, the largest lead that tuning tries
     stiffness       5 M omega^2 = 5e11 N/m for 1000 t at 50 Hz
     damping         4 M omega = 1.3e9 N s/m for 1000 t at 50 Hz
     stiffness / M   omega^2 = 1e5/s^2 at 50 Hz
@@ -27,7 +27,7 @@ or a command that changes faster than 10 m/s trips the controller.
 
 # Each pair below contains the lowest and the highest value.
 CONTROL_PERIODS = 1e-5, 0.1  # [s]
-TIMES = 0.0, 2.1  # [s]
+TIMES = 0.0, 4.1  # [s]
 FILTER_TIMES = 1e-6, 2.1  # [s]; a filter with a time constant of 0 would divide by 0 or ring
 FORCES = 0.0, 1e6  # [N]
 STIFFNESSES = 0.0, 1e12  # [N/m]

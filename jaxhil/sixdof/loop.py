@@ -60,7 +60,8 @@ from jaxhil.sixdof.sensor import (
 from jaxhil.sixdof.vectors import vector
 
 SIDES = ("fixed", "moving")  # sides of the rig on which the force sensor may be
-# Number of ticks for settling before a run, if axis positions are not linear functions of the coordinates.
+# Minimum number of ticks for settling before a run, if axis positions are not linear functions of the
+# coordinates; a power of two.
 SETTLING_TICKS = 256
 
 
@@ -213,16 +214,18 @@ def begin(loop: Loop, rig: RigConstants, states: States) -> RunState:
     law = SIX_AXIS_COMPENSATORS[loop.compensator]
     position, rates, twist = model_motion(rig.bodies, states)
     stride = rates * rig.period[None]
-    history = 0 if rig.kinematics.is_linear else SETTLING_TICKS
-    first = law.pose_command(rig.gains, position, rates) - history * stride
-    legs, leg_rates = jax.jvp(rig.kinematics.command, (first,), (stride,))
+    # A multiple of the delay line's length, because `start_uniform_motion` fills the line for a start at tick
+    # 0.
+    history = 0 if rig.kinematics.is_linear else max(SETTLING_TICKS, loop.ring)
+    sent = law.pose_command(rig.gains, position, rates)
+    legs, leg_rates = jax.jvp(rig.kinematics.command, (sent - history * stride,), (stride,))
     hardware = start_uniform_motion(rig.axes, legs, leg_rates, rig.period, loop.hold, loop.latency, loop.ring)
 
     def before(hardware, tick):
-        command = rig.kinematics.command(first + (tick + 1).astype(position.dtype) * stride)
+        command = rig.kinematics.command(sent + (tick + 1).astype(position.dtype) * stride)
         return actuate(rig.axes, hardware, tick, command, loop.hold, loop.latency), None
 
-    hardware, _ = lax.scan(before, hardware, jnp.arange(history, dtype=jnp.int32))
+    hardware, _ = lax.scan(before, hardware, jnp.arange(-history, 0, dtype=jnp.int32))
     zero = vector(jnp.zeros_like(position[:3]))
     nothing = Wrench(zero, zero)
     pose, _ = relative(rig.bodies, states)
@@ -244,7 +247,7 @@ def begin(loop: Loop, rig: RigConstants, states: States) -> RunState:
             (nothing, nothing) if loop.has_lag else None,
             law.init(rig.prepared, rig.constants, start, loop.controller_ring),
         ),
-        tick=jnp.array(history, jnp.int32),
+        tick=jnp.array(0, jnp.int32),
     )
 
 
@@ -294,13 +297,12 @@ def sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
         latched.append(latch_state)
     measured = None if samples.measured is None else _measured_pose(loop, rig, state, samples.measured)
     wrench, lag = _measured_wrench(loop, rig, state, contact, motion, measured)
-    first = 0 if rig.kinematics.is_linear else SETTLING_TICKS
     signals = SixAxisSignals(
         wrench=tuple(jax.tree.leaves(wrench)),
         pose_desired=state.near,
         twist_desired=state.twist,
         pose_measured=measured,
-        age=jnp.zeros(rig.period.shape, jnp.int32) + (state.tick - first),
+        age=jnp.broadcast_to(state.tick, rig.period.shape),
     )
     return Sensed(motion, contact, forces, memories, tuple(latched), lag, signals)
 
@@ -388,7 +390,7 @@ def _measured_wrench(
 
 def _lagged_reading(rig: RigConstants, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:
     """Return the output of the force sensor's lag; its input is interpolated linearly between ticks."""
-    first, zero = now == (0 if rig.kinematics.is_linear else SETTLING_TICKS), jnp.zeros_like(rig.period)
+    first, zero = now == 0, jnp.zeros_like(rig.period)
 
     def lagged_channel(now: Array, before: Array, lagged: Array) -> Array:
         before, lagged = jnp.where(first, now, before), jnp.where(first, now, lagged)

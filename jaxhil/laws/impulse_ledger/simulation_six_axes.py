@@ -48,12 +48,14 @@ class ImpulseLedger(SixAxisCompensator):
         period = constants.control_period
         delay = gains["identification_delay"]
         filter_lag = jnp.minimum(gains["pose_filter"], delay)
+        correction, inverse = constants.tool_correction, constants.inverse_mass
         return PreparedLedger(
             gains=gains,
             constants=constants,
             pole=filter_lag / (filter_lag + period),
             back=(delay - filter_lag) / period,
             prior=begin_estimate(tuple(gains[name] for name in SPREADS)),
+            noise_metric=jnp.einsum("ki...,kl...,lj...->ij...", correction, inverse, correction),
         )
 
     def init(self, prepared, constants, start, ring):

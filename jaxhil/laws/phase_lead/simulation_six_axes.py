@@ -11,9 +11,14 @@ from jaxhil.laws.shared.lead_filter import (
     apply_lead_filter,
     build_lead_filter,
 )
-from jaxhil.laws.shared.nominal_values import FORCE_DELAY
+from jaxhil.laws.shared.nominal_values import FORCE_DELAY, axis_lags, force_delay
 from jaxhil.laws.simulation_base import Gain, Gains
 from jaxhil.laws.six_axis_base import COORDINATES, SixAxisCompensator, lag_leads
+
+# The best lead of a contact with friction or a latch can be longer than the delay of the whole loop.
+SIX_AXIS_PHASE_LEAD = PHASE_LEAD._replace(
+    upper=lambda mechanism: 2 * (force_delay(mechanism) + max(axis_lags(mechanism)))
+)
 
 
 class PhaseLead(SixAxisCompensator):
@@ -21,7 +26,7 @@ class PhaseLead(SixAxisCompensator):
 
     name: ClassVar[str] = "phase_lead"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)
-    gains: ClassVar[tuple[Gain, ...]] = (PHASE_LEAD, LEAD_FILTER, *lag_leads(equalise=False))
+    gains: ClassVar[tuple[Gain, ...]] = (SIX_AXIS_PHASE_LEAD, LEAD_FILTER, *lag_leads(equalise=False))
 
     def channel(self, gains: Gains, name: str) -> Gains:
         """Return the gains of the lead filter for one channel of the wrench, by name."""

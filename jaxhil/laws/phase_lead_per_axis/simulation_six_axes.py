@@ -6,7 +6,7 @@ channels have the same time constant of the lead filter.
 
 from typing import ClassVar
 
-from jaxhil.laws.phase_lead.simulation_six_axes import PhaseLead
+from jaxhil.laws.phase_lead.simulation_six_axes import SIX_AXIS_PHASE_LEAD, PhaseLead
 from jaxhil.laws.shared.lead_filter import LEAD_FILTER, PHASE_LEAD
 from jaxhil.laws.simulation_base import Gain
 from jaxhil.laws.six_axis_base import COORDINATES, lag_leads
@@ -17,7 +17,7 @@ class PhaseLeadPerAxis(PhaseLead):
 
     name: ClassVar[str] = "phase_lead_per_axis"
     gains: ClassVar[tuple[Gain, ...]] = (
-        *(PHASE_LEAD._replace(name=f"{PHASE_LEAD.name}_{axis}") for axis in COORDINATES),
+        *(SIX_AXIS_PHASE_LEAD._replace(name=f"{PHASE_LEAD.name}_{axis}") for axis in COORDINATES),
         LEAD_FILTER,
         *lag_leads(equalise=False),
     )

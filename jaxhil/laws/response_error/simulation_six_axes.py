@@ -12,6 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxhil.laws.phase_lead.simulation_six_axes import SIX_AXIS_PHASE_LEAD
 from jaxhil.laws.shared.delay_line import (
     DelayInPeriods,
     DelayLine,
@@ -21,7 +22,6 @@ from jaxhil.laws.shared.delay_line import (
 )
 from jaxhil.laws.shared.lead_filter import (
     LEAD_FILTER,
-    PHASE_LEAD,
     LeadFilter,
     LeadState,
     apply_lead_filter,
@@ -94,7 +94,7 @@ class ResponseError(SixAxisCompensator):
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)
     reads_pose: ClassVar[bool] = True
     gains: ClassVar[tuple[Gain, ...]] = (
-        PHASE_LEAD,
+        SIX_AXIS_PHASE_LEAD,
         LEAD_FILTER._replace(tuned=_never),
         rig_gain("response_error", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0, neutral=0.0),
         rig_gain("response_error_damping", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0, neutral=0.0),

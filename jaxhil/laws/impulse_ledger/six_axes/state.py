@@ -20,6 +20,7 @@ class PreparedLedger(NamedTuple):
     pole: Float[Array, "*batch"]  # pole of the pose filter [1]
     back: Float[Array, "*batch"]  # age of the force reading minus the lag of the pose filter [ticks]
     prior: Estimate  # prior of the tangent model
+    noise_metric: Float[Array, "6 6 *batch"]  # A^T M^-1 A, with which |A W|^2 is a quadratic form of W
 
 
 class FreeFlightState(NamedTuple):

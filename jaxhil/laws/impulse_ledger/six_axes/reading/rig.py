@@ -50,9 +50,10 @@ class SixAxisReader:
 
     __slots__ = (
         "_age", "_back", "_back_share", "_back_ticks", "_bias", "_filter_gain", "_filtered", "_first",
-        "_flight_ticks", "_force_variance", "_inverse", "_longest_flight", "_mass", "_noise_angular",
-        "_noise_linear", "_period", "_pole", "_readings", "_rows", "_settle", "_tool_correction",
-        "_torque_variance", "lag", "loud", "moved", "pose", "quiet", "tool", "twist", "variance", "wrench",
+        "_flight_ticks", "_force_variance", "_inverse", "_longest_flight", "_mass", "_metric",
+        "_noise_angular", "_noise_linear", "_period", "_pole", "_readings", "_rows", "_settle",
+        "_tool_correction", "_torque_variance", "lag", "loud", "moved", "pose", "quiet", "tool", "twist",
+        "variance", "wrench",
     )  # fmt: skip
     _age: Count  # number of ticks since the beginning of the run
     _period: Positive
@@ -60,6 +61,7 @@ class SixAxisReader:
     _back_ticks: Count
     _inverse: Matrix
     _mass: Matrix
+    _metric: Matrix  # A^T M^-1 A, with which |A W|^2 is a quadratic form of W
     _tool_correction: Matrix
     lag: Vector
     twist: Vector
@@ -80,9 +82,11 @@ class SixAxisReader:
         self._back_share = self._back - self._back_ticks
         self._force_variance = gains["force_noise"] * gains["force_noise"]
         self._torque_variance = gains["torque_noise"] * gains["torque_noise"]
-        inverse = constants.inverse_mass
-        self._noise_linear = inverse[0][0] + inverse[1][1] + inverse[2][2]
-        self._noise_angular = inverse[3][3] + inverse[4][4] + inverse[5][5]
+        columns = [[row[j] for row in constants.tool_correction] for j in range(AXES)]
+        metric = [[dot(left, product(self._inverse, right)) for right in columns] for left in columns]
+        self._metric = metric
+        self._noise_linear = metric[0][0] + metric[1][1] + metric[2][2]
+        self._noise_angular = metric[3][3] + metric[4][4] + metric[5][5]
         self._settle = gains["settle"]
         self._longest_flight = MAX_FLIGHT / period
         self._rows = [[0.0] * ROWS for _ in range(SAMPLES)]
@@ -140,9 +144,7 @@ class SixAxisReader:
         corrected = product(self._tool_correction, wrench_at_chaser(wrench, pose))
         unbiased = subtract(corrected, self._bias)
         self.wrench = unbiased
-        square = pose[0] * pose[0] + pose[1] * pose[1] + pose[2] * pose[2]
-        moment = self._torque_variance + self._force_variance * square
-        self.variance = self._noise_linear * self._force_variance + self._noise_angular * moment
+        self.variance = self._noise_variance(pose)
         settles = self._age * period < self._settle
         is_recent = self.is_recent
         gate = ONSET_SIGMAS * ONSET_SIGMAS * self.variance
@@ -153,6 +155,19 @@ class SixAxisReader:
         if not in_contact and not self.loud:
             self._fly(corrected, subtract(pose_desired, pose), twist_desired, not is_recent)
         self._age += 1
+
+    def _noise_variance(self, pose: Vector) -> float:
+        """Return the mean |W|^2 of a corrected wrench W that is only noise; `pose` moves it to frame C."""
+        metric, angular = self._metric, self._noise_angular
+        x, y, z = pose[:3]
+        coupling = (metric[2][4] - metric[1][5]) * x + (metric[0][5] - metric[2][3]) * y
+        coupling += (metric[1][3] - metric[0][4]) * z
+        # The noise f of one force channel is the wrench (f, -p x f) about C's origin at p.
+        moment = (angular - metric[3][3]) * x * x + (angular - metric[4][4]) * y * y
+        moment += (angular - metric[5][5]) * z * z
+        moment -= 2.0 * (metric[3][4] * x * y + metric[3][5] * x * z + metric[4][5] * y * z)
+        force = self._noise_linear + 2.0 * coupling + moment
+        return self._force_variance * force + self._torque_variance * angular
 
     def weigh_tool(self) -> None:
         """Update `tool` with the tool's part of this reading."""

@@ -86,12 +86,16 @@ def _computed_once(components: tuple[Array, ...], tick: Int[Array, ""]) -> tuple
 
 
 def noise_variance(prepared: PreparedLedger, pose: Six) -> Float[Array, "*batch"]:
-    """Return the mean |W|^2 of a wrench W that is only noise; `pose` moves its torque to the frame C."""
-    gains, inverse_mass = prepared.gains, prepared.constants.inverse_mass
-    force, torque = gains["force_noise"] ** 2, gains["torque_noise"] ** 2
-    moment = torque + force * jnp.sum(pose[:3] ** 2, axis=0)
-    linear, angular = (sum(inverse_mass[i, i] for i in part) for part in (range(3), range(3, 6)))
-    return linear * force + angular * moment
+    """Return the mean |W|^2 of a corrected wrench W that is only noise; `pose` moves it to the frame C."""
+    gains, metric, position = prepared.gains, prepared.noise_metric, pose[:3]
+    linear, angular = (sum(metric[i, i] for i in part) for part in (range(3), range(3, 6)))
+    coupling = jnp.stack(
+        [metric[2, 4] - metric[1, 5], metric[0, 5] - metric[2, 3], metric[1, 3] - metric[0, 4]]
+    )
+    # The noise f of one force channel is the wrench (f, -p x f) about C's origin at p.
+    moment = angular * dot(position, position) - dot(position, product(metric[3:, 3:], position))
+    force = linear + 2 * dot(coupling, position) + moment
+    return gains["force_noise"] ** 2 * force + gains["torque_noise"] ** 2 * angular
 
 
 def _aligned(

@@ -111,11 +111,12 @@ class TangentModel:
         self.damping = min(max(damping, 0.0), self._most_damping)
 
     def restoring(self, change: float) -> float:
-        """Return the change of the elastic force [m/s^2] for a change of the depth [m]."""
+        """Return the change of the elastic force [m/s^2] for a change of the depth [m], of the same sign."""
         path, speed = self._path, self._speed
         later = path + change / speed
         bend = later * abs(later) - path * abs(path)
-        return self.stiffness * change + self.curvature * speed * bend
+        force = self.stiffness * change + self.curvature * speed * bend
+        return max(force, 0.0) if change > 0.0 else min(force, 0.0)
 
     def bridge(self, force: float, least: float, deeper: float, velocity: float, duration: float) -> None:
         """Predict impulse and final force of the reference: integrate a unit mass against the model.

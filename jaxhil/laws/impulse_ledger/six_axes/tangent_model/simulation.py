@@ -77,10 +77,14 @@ def learn(
 
 
 def restoring(tangent: Tangent, change: Array) -> Float[Array, "*batch"]:
-    """Return the change of the tangent model's elastic force for a change of the depth."""
+    """Return the change of the tangent model's elastic force for a change of the depth.
+
+    Both changes have the same sign. Otherwise, a negative curvature could push apart bodies that separate.
+    """
     later = tangent.path + change / tangent.speed
     bend = later * jnp.abs(later) - tangent.path * jnp.abs(tangent.path)
-    return tangent.stiffness * change + tangent.curvature * tangent.speed * bend
+    force = tangent.stiffness * change + tangent.curvature * tangent.speed * bend
+    return jnp.where(change > 0, jnp.maximum(force, 0), jnp.minimum(force, 0))
 
 
 def bridge(
