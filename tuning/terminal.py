@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shlex
 import sys
 import threading
 import time
@@ -39,6 +40,11 @@ def emit(*things: RenderableType, wrap: bool = True) -> None:
 def emit_line(text: str) -> None:
     """Print one line on standard output, without wrapping."""
     emit(text, wrap=False)
+
+
+def suggest(*words: str) -> None:
+    """Print the next command to run: `jaxhil` with these words."""
+    emit_line(f"Next: jaxhil {shlex.join(words)}")
 
 
 def emit_json(document: Mapping[str, Any]) -> None:

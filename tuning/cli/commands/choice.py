@@ -6,9 +6,22 @@ from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.mechanism.file import AnyMechanism, any_from_plain_data, load_any, to_plain_data
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
+from tuning import terminal
 from tuning.api import arguments
 from tuning.cli.options import SimulateOptions
 from tuning.cli.options_report import Map
+
+
+def suggest_next(options: SimulateOptions, compensator: str) -> None:
+    """Print the command after a simulation: a sweep of the gain file, or the tuning of the compensator."""
+    if options.gains is not None:
+        terminal.suggest("sweep", options.gains)
+        return
+    words = [] if options.file is None else [options.file]
+    words += [] if compensator == "none" else ["--compensator", compensator]
+    for option, changes in (("--set", options.overrides), ("--unset", options.unset)):
+        words += [word for change in changes for word in (option, change)]
+    terminal.suggest("tune", *words)
 
 
 def load_any_named_mechanism(options: SimulateOptions | Map) -> AnyMechanism | None:

@@ -1,5 +1,6 @@
 """Command `jaxhil compare`: tunes compensators, and compares them on the same scenarios."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -77,6 +78,7 @@ def run(options: Compare) -> int:
         terminal.emit_json(document)
     else:
         _print(options, finished_names, ordered, document)
+        _suggest_next(options, [result for name in finished_names[:1] for result in ordered[name]])
     warn_about_checkpoints(checkpoints)
     if interrupted:
         finished = sum(len(finished_laws) for finished_laws in ordered.values())
@@ -84,6 +86,17 @@ def run(options: Compare) -> int:
         terminal.note(f"jaxhil: interrupted, {progress}; to continue, repeat the command with --resume")
         return 130
     return 1 if problems else 0
+
+
+def _suggest_next(options: Compare, results: Sequence[Any]) -> None:
+    """Print the command that tunes the compensator with the smallest rms error on the first mechanism."""
+    from tuning.benchmark.tables import choose_best_metrics
+
+    errors = {result.compensator: choose_best_metrics(result)["rms"].value for result in results}
+    finite = {name: rms for name, rms in errors.items() if name != "none" and rms < math.inf}
+    if finite:
+        best = min(finite, key=lambda name: finite[name])
+        terminal.suggest("tune", *options.files[:1], "--compensator", best)
 
 
 def _load(options: Compare) -> list[LoadedAnyMechanism]:

@@ -31,6 +31,8 @@ def run(options: Export) -> int:
         terminal.emit_json(result.document)
     else:
         _print(result.document, result.sizes)
+        if result.document["bundle"]:
+            terminal.suggest("verify", str(result.document["bundle"]))
     return 0 if result.good else 1
 
 

@@ -86,6 +86,10 @@ def run(options: IdentifyOptions) -> int:
         terminal.emit_json(document)
     else:
         _print(document, None if result.mechanism is None else folder)
+        if result.mechanism is not None:
+            # Runs with the designed commands determine the numbers better.
+            step = ("tune",) if result.good else ("identify", "--design")
+            terminal.suggest(*step, str(folder / MECHANISM_FILE))
     return 0 if result.good else 1
 
 

@@ -124,3 +124,4 @@ def _print(document: dict[str, Any], folder: Path) -> None:
     files = ", ".join(str(folder / name) for name in ("free.csv", "press.csv"))
     items.append(f"Wrote {files} and {folder / DOCUMENT_FILE}")
     terminal.emit(*items)
+    terminal.suggest("identify", "--guess", "LOGS")

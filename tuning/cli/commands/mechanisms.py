@@ -46,7 +46,7 @@ def run(options: MechanismsOptions) -> int:
     rows = [[*(entry[key] for key in SIX_AXIS_COLUMNS), " ".join(entry["laws"])] for entry in six_axes]
     terminal.emit(
         terminal.build_table(
-            "Built-in mechanisms of six axes (simulate alone knows them so far)",
+            "Built-in mechanisms of six axes",
             ["name", "masses [kg]", "pairs of shapes", "laws"], rows, texts=(0, 1, 3),
         ),
         *(f"{entry['name']}: {entry['source']}\n" for entry in six_axes),

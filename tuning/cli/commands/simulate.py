@@ -10,7 +10,12 @@ from jaxhil.simulation.jax_environment import prepare_jax
 from tuning import terminal
 from tuning.api import arguments, mechanism_summary
 from tuning.cli.commands import checks, simulate_six
-from tuning.cli.commands.choice import load_any_named_mechanism, load_six_axis_mechanism, select_compensator
+from tuning.cli.commands.choice import (
+    load_any_named_mechanism,
+    load_six_axis_mechanism,
+    select_compensator,
+    suggest_next,
+)
 from tuning.cli.options import SimulateOptions
 
 if TYPE_CHECKING:
@@ -84,6 +89,7 @@ def run(options: SimulateOptions) -> int:
         )
     else:
         _print(options, limit, result, contacts, reasons)
+        suggest_next(options, result.compensator)
     return 1 if reasons else 0
 
 
@@ -140,6 +146,7 @@ def _print(
     headings += ["speed [mm/s]"]
     headings += [*(ESTIMATE_COLUMNS[name][0] for name in estimates), "status"]
     rule = "the gain file's gains" if options.gains is not None else "gains by the literature's rule"
+    rule = rule if options.setting is None else f"gains of the setting {options.setting}"
     title = f"{result.mechanism.name}, compensation: {result.compensator}"
     title += f", {rule}" if result.compensator != "none" else ""
     total = len(result.contacts)

@@ -9,6 +9,7 @@ from jaxhil.mechanism.six_axes import SixAxisMechanism
 from tuning import terminal
 from tuning.api import arguments
 from tuning.cli.commands import checks
+from tuning.cli.commands.choice import suggest_next
 from tuning.cli.options import SimulateOptions
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ def run(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
     else:
         terminal.emit_line(result.summary.line(mechanism.name))
         _print(options, limit, result, good)
+        suggest_next(options, "phase_lead" if result.compensator == "none" else result.compensator)
     return 0 if good else 1
 
 

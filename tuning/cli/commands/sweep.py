@@ -25,6 +25,10 @@ def run(options: Sweep) -> int:
         terminal.emit_json(study.document)
     else:
         sweep_tables.print_sweep(study.document)
+        if study.verdict == "good":
+            terminal.suggest("export", str(path), "--sweep", str(folder), "-o", "bundle")
+        elif study.document["worst"]:
+            terminal.suggest("replay", str(folder), str(study.document["worst"][0]["index"]))
     if study.unwritten:
         raise study.unwritten[0]
     return 0 if study.verdict == "good" else 1

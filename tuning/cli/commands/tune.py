@@ -67,6 +67,8 @@ def run(options: Tune) -> int:
                 "verdict": _verdict(entries, problems, interrupted),
             }
         )
+    elif entries:
+        terminal.suggest("sweep", entries[0]["gain_file"])
     if interrupted:
         finished = f"{len(entries)} of {len(loaded)} mechanisms finished and saved"
         terminal.note(f"jaxhil: interrupted, {finished}; to continue, repeat the command with --resume")

@@ -1,5 +1,6 @@
 """Command `jaxhil verify`: checks that the rig's controller code reproduces the simulated controller."""
 
+from pathlib import Path
 from typing import Any
 
 from tuning import terminal
@@ -21,6 +22,10 @@ def run(options: Verify) -> int:
         terminal.emit_json(document)
     else:
         _print(document)
+        if result.good and Path(options.path).is_dir():
+            terminal.suggest("rig", options.path)
+        elif result.good:
+            terminal.suggest("export", options.path, "-o", "bundle")
     return 0 if result.good else 1
 
 
