@@ -75,7 +75,7 @@ def _error_table(options: Tune, result: Any, better: bool) -> Any:
             label = "tuned (NOT better than the literature's)"
         shares = f"{100 * metrics.diverging:.0f} %", f"{metrics.peak_ratio:.3f}", f"{metrics.chatter:.3f}"
         rows.append((label, *_cells(metrics), *shares, metrics.failed))
-    count = int(result.outcomes["tuned"].wanted.sum())
+    count = int(result.outcomes["tuned"].is_scheduled.sum())
     return terminal.build_table(
         f"{result.mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
         ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "chatter", "not ended"],
@@ -94,7 +94,7 @@ def _six_axis_error_table(options: Tune, result: Any, entry: dict[str, Any]) -> 
             metrics = entry[error][key]
             cells = *_cells(metrics), f"{metrics.peak_ratio:.3f}", metrics.failed
             rows.append((label if error == "energy_error" else "", error.replace("_", " "), *cells))
-    count = int(result.outcomes["tuned"].wanted.sum()) // 2
+    count = int(result.outcomes["tuned"].is_scheduled.sum()) // 2
     return terminal.build_table(
         f"{result.mechanism.name}: errors of {count} episodes in {options.validation} fresh scenarios",
         ["gains", "error", "rms", "99th pct", "max", "mean", "peak ratio", "not ended"],
