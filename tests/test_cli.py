@@ -127,6 +127,19 @@ def test_tune_command_prints_tables_or_json_if_requested(jaxhil, table, tmp_path
     assert json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())["sha256"] == again["sha256"]
 
 
+def test_commands_end_with_next_command(jaxhil, table):
+    tuned, _, out, _ = table
+    assert out.splitlines()[-1] == f"Next: jaxhil sweep {tuned / 'gains.json'}"
+    change = ("--set", "rig.force_sensor.delay=0.003")
+    for arguments, words in (
+        (("rig-300kg", *change), "tune rig-300kg --set rig.force_sensor.delay=0.003"),
+        (("rig-300kg", "--compensator", "phase_lead"), "tune rig-300kg --compensator phase_lead"),
+        (("--gains", tuned / "gains.json"), f"sweep {tuned / 'gains.json'}"),
+    ):
+        ran = jaxhil("simulate", *arguments)
+        assert ran.out.splitlines()[-1] == f"Next: jaxhil {words}"
+
+
 def test_json_output_of_tune_states_sensor_noise(jaxhil, tmp_path):
     ran = jaxhil("tune", "suite-noisy", "--compensator", "none", "-o", tmp_path, "--json", *TINY)
     (entry,) = ran.document["mechanisms"]

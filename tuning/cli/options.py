@@ -36,7 +36,8 @@ class InitOptions:
 
     Example: jaxhil init rig-300kg --output my-rig.toml
 
-    An existing file is never overwritten.
+    A file with six axes is a copy of the built-in file with its comments. An existing file is never
+    overwritten.
     """
 
     name: Annotated[
