@@ -16,7 +16,7 @@ from tuning.bundle.fmu.archive import add_library, compile_library, find_compile
 from tuning.bundle.fmu.variables import POSE_PARTS, TWIST_PARTS, WRENCH_PARTS
 from tuning.rig.contact_detector import ContactDetector, RigContact
 
-fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed")
+fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed (pip install jaxhil[fmu])")
 validate_fmu = importlib.import_module("fmpy.validation").validate_fmu
 if find_compiler() is None:
     pytest.skip("no C compiler on this machine", allow_module_level=True)
@@ -194,3 +194,26 @@ def run_loop(controller: RunningFmu, rig: RunningFmu, mechanism: Any) -> list[Ri
                 watch.begin(len(contacts))
         rig.step()
     return contacts
+
+
+def run_parallel_loop(controller: RunningFmu, rig: RunningFmu, mechanism: Any) -> RigContact:
+    """Run both FMUs as a parallel master, and return the first contact; the controller integrates the model.
+
+    A parallel master exchanges all values before each step, so that a command takes effect one step later.
+    """
+    watch = ContactDetector(mechanism)
+    watch.begin(0)
+    start = rig.get("position", "velocity")
+    desired = {"position_desired": start["position"], "velocity_desired": start["velocity"]}
+    controller.reset(integrates_model=True, **desired)
+    while True:
+        sensed = rig.get("force_measured", "position_measured", "contact_force")
+        model = controller.get("model_position", "model_velocity")
+        rig.set(controller.get("force_command", "position_command"))
+        controller.set({name: sensed[name] for name in ("force_measured", "position_measured")})
+        controller.step()
+        rig.step()
+        force = controller.get("force_command")["force_command"]
+        contact = watch.observe(*model.values(), force, sensed["contact_force"], sensed["force_measured"])
+        if contact is not None:
+            return contact

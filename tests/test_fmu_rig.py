@@ -6,7 +6,7 @@ import re
 import pytest
 from bundles import document
 from cases import CASES
-from fmus import RunningFmu, compile_sources, extract, run_loop, validate_fmu, write_fmu
+from fmus import RunningFmu, compile_sources, extract, run_loop, run_parallel_loop, validate_fmu, write_fmu
 from lanes import validated
 from test_plant import AGAINST_THE_ORACLE
 
@@ -84,20 +84,30 @@ def test_rig_fmu_draws_noise_with_specified_deviation_and_seed(tmp_path):
     rig.close()
 
 
-def run_both(name, compensator, fmi, tmp_path, overrides=NOISELESS):
-    """Return the contacts of controller and rig as FMUs, and of `simulate` with one more period."""
-    mechanism, made = load(name, overrides).mechanism, document(name, compensator, overrides)
-    running = [
+def both(name, compensator, fmi, tmp_path, overrides=NOISELESS):
+    """Return controller and rig as running FMUs."""
+    made = document(name, compensator, overrides)
+    return [
         RunningFmu(extract(write_fmu(tmp_path / f"{part}{fmi}.fmu", build(made, fmi))))
         for part, build in (("controller", controller_fmu), ("rig", rig_fmu))
     ]
-    contacts = run_loop(*running, mechanism)
+
+
+def simulated(name, compensator, extra, overrides=NOISELESS):
+    """Return the contacts of `simulate` with `extra` more periods of command latency."""
+    latency = load(name, overrides).mechanism.rig.command_latency + extra
+    mechanism = load(name, (*overrides, f"rig.command_latency={latency}")).mechanism
+    gains = {name: entry["value"] for name, entry in document(name, compensator, overrides)["gains"].items()}
+    return jaxhil.simulate(mechanism, compensator, gains).contacts
+
+
+def run_both(name, compensator, fmi, tmp_path):
+    """Return the contacts of controller and rig as FMUs, and of `simulate` with one more period."""
+    running = both(name, compensator, fmi, tmp_path)
+    contacts = run_loop(*running, load(name, NOISELESS).mechanism)
     for fmu in running:
         fmu.close()
-    latency = f"rig.command_latency={mechanism.rig.command_latency + 1}"
-    gains = {name: entry["value"] for name, entry in made["gains"].items()}
-    expected = jaxhil.simulate(load(name, (*overrides, latency)).mechanism, compensator, gains)
-    return contacts, expected.contacts
+    return contacts, simulated(name, compensator, 1)
 
 
 def assert_same_contacts(contacts, expected):
@@ -113,6 +123,14 @@ def test_controller_and_rig_fmus_reproduce_simulation_with_one_more_period(fmi, 
     assert_same_contacts(contacts, expected)
     without = jaxhil.simulate(load("rig-300kg", NOISELESS).mechanism, "phase_lead").contacts
     assert abs(contacts[0].restitution - without[0].restitution) > 1e-3
+
+
+@pytest.mark.parametrize("integrator", ["semi_implicit_euler", "zoh", "explicit_euler"])
+def test_parallel_master_adds_one_period_if_controller_integrates_model(integrator, tmp_path):
+    overrides = (*NOISELESS, f"rig.integrator={integrator}")
+    running = both("rig-300kg", "phase_lead", 3, tmp_path, overrides)
+    contact = run_parallel_loop(*running, load("rig-300kg", overrides).mechanism)
+    assert_same_contacts([contact], simulated("rig-300kg", "phase_lead", 1, overrides))
 
 
 # Two surfaces, sensor effects, layers with several contacts, memory, and an ideal simulator.

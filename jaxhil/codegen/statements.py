@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from .calls import CallLowering
 from .printing import escape_comment
 from .python_source import read_comment_before
-from .subset import FLOAT, INT, TEXT, Locations, ValueType
-from .values import ZEROS, CExpression, Rank
+from .subset import FLOAT, INT, Locations, ValueType
+from .values import ZEROS, CExpression, Rank, constant
 
 if TYPE_CHECKING:
     from .program import CFunction, CProgram
@@ -30,7 +30,7 @@ class BodyLowering(CallLowering):
             if type_.kind == "optional":
                 value = value._replace(text=f"*{text}", type=FLOAT, rank=Rank.UNARY, length="optional")
             self.names[name] = value
-        self.names |= dict.fromkeys(function.texts, CExpression("", TEXT))
+        self.names |= dict.fromkeys(function.texts, constant(""))
         if function.owner is not None:
             owner = ValueType("object", function.owner)
             self.names["self"] = CExpression("self", owner, is_pointer=True)

@@ -196,7 +196,7 @@ def _build_document(loaded, bundle, format_names, rates) -> dict[str, Any]:
         "axes": bundle.document.get("axes", 1),
         "compensator": loaded.compensator,
         "gains_sha256": bundle.document["sha256"],
-        "formats": format_names,
+        "formats": ["fmu" if name == "fmu2" else name for name in format_names],
         "files": sorted(bundle.files),
         "signed": SIGNATURE_FILE in bundle.files,
         "limits": bundle.document.get("limits"),

@@ -29,7 +29,7 @@ def build_fmu(
     period: float,
     variables: Sequence[Variable],
     files: Mapping[str, str],
-    constants: dict[str, int],
+    constants: Mapping[str, int | str],
     fmi: int,
 ) -> bytes:
     """Return the archive of an FMU with sources, without a library.

@@ -40,12 +40,13 @@ def controller_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
             GAINS_FILE: code[GAINS_FILE],
             "fmu_model.h": read_source("controller.h"),
             "fmu_model.c": read_source("controller_one_axis.c" if is_one_axis else "controller_six_axes.c"),
-            "controller_events.h": read_source("controller_events.h"),
+            **{name: read_source(name) for name in ("controller_events.h", "numerical_model.h")},
         },
         constants={
             "FMU_GAIN_COUNT": len(gains),
             "FMU_FIRST_GAIN": names.index(gains[0]) if gains else 0,
             "FMU_FIRST_LIMIT": names.index(limits[0]),
+            "FMU_INTEGRATOR": f"INTEGRATOR_{document['mechanism']['rig']['integrator'].upper()}",
         },
         fmi=fmi,
     )

@@ -16,7 +16,7 @@ from jaxhil.mechanism.structs import Contact, Mechanism
 from tuning.bundle.c99_tables import format_double
 from tuning.bundle.fmu.archive import build_fmu
 from tuning.bundle.fmu.sources import read_source
-from tuning.bundle.fmu.variables import TIME, Variable
+from tuning.bundle.fmu.variables import MODEL_MASSES, TIME, Variable
 from tuning.rig.plant import PlantConstants, compute_plant_constants
 
 IDENTIFIER = "jaxhil_rig"
@@ -24,11 +24,10 @@ LAWS = (
     *("linear", "kelvin_voigt", "hunt_crossley", "piecewise_linear"),
     *("hardening", "depth_damped", "elastoplastic", "preloaded"),
 )
-INTEGRATORS = ("semi_implicit_euler", "zoh", "explicit_euler")
 MAX_SEED = 2**31 - 1
 # Bounds of the parameters: values from which a simulation remains finite.
-MASSES, SPEEDS, FORCES, DISTANCES = (1e-9, 1e12), (1e-9, 1e3), (0.0, 1e9), (0.0, 1e3)
-SOURCE_FILES = ("contact_law.h", "contact_law.c", "sensor_lag.h", "sensor_lag.c")
+SPEEDS, FORCES, DISTANCES = (1e-9, 1e3), (0.0, 1e9), (0.0, 1e3)
+SOURCE_FILES = ("numerical_model.h", "contact_law.h", "contact_law.c", "sensor_lag.h", "sensor_lag.c")
 
 _CONSTANTS_TEMPLATE = """\
 /* Constants of the rig, from the mechanism file; numbers in SI units. */
@@ -38,7 +37,6 @@ _CONSTANTS_TEMPLATE = """\
 #include <math.h>
 
 enum {{ {laws} }};
-enum {{ {integrators} }};
 
 {macros}
 {tables}
@@ -114,7 +112,7 @@ def rig_variables(mechanism: Mechanism) -> list[Variable]:
         output("acceleration", "m/s^2", "acceleration of the numerical model in the last period"),
         output("contact_force", "N", "real contact force, without the effects of the sensor"),
         output("position_shortfall", "m", "distance between the requested and the rate-limited command"),
-        parameter("equivalent_mass", "kg", "mass of the relative motion", mechanism.bodies.mass, *MASSES),
+        parameter("equivalent_mass", "kg", "mass of the model", mechanism.bodies.mass, *MODEL_MASSES),
         parameter("approach_velocity", "m/s", "speed of the first approach", approach.velocity, *SPEEDS),
         parameter("approach_phase", "1", "phase of the contact in its period", approach.phase, 0.0, 1.0),
         parameter("force_noise", "N", "standard deviation of its noise", force.noise_std, *FORCES),
@@ -171,7 +169,6 @@ def rig_constants(mechanism: Mechanism) -> str:
     ]
     return _CONSTANTS_TEMPLATE.format(
         laws=", ".join(f"LAW_{name.upper()}" for name in LAWS),
-        integrators=", ".join(f"INTEGRATOR_{name.upper()}" for name in INTEGRATORS),
         macros="".join(f"#define {name} {value}\n" for name, value in macros.items()),
         tables="".join(tables),
     )

@@ -1,6 +1,6 @@
 """C sources of an FMU: its variables as generated tables, and the files that all FMUs share."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tuning.bundle.c99_tables import format_double
@@ -59,7 +59,7 @@ const fmu_variable fmu_variables[V_COUNT] = {{
 
 
 def variable_files(
-    variables: Sequence[Variable], token: str, period: float, constants: dict[str, int]
+    variables: Sequence[Variable], token: str, period: float, constants: Mapping[str, int | str]
 ) -> dict[str, str]:
     """Return the generated C files with the variables of an FMU.
 

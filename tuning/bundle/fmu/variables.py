@@ -4,11 +4,13 @@ The position of a variable in the list is its value reference; the first variabl
 axes are six successive variables.
 """
 
+import copy
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
+from jaxhil.mechanism.file import from_plain_data
 from jaxhil.rig.faults import UNUSABLE
 from jaxhil.rig.law_status import STATUSES
 from tuning.bundle.controller_kind import ONE_AXIS, kind_of
@@ -36,6 +38,7 @@ class Variable(NamedTuple):
         return f"V_{re.sub('[^A-Za-z0-9]', '_', self.name).upper()}"
 
 
+MODEL_MASSES = 1e-9, 1e12  # [kg]; bounds of the equivalent mass
 TIME = Variable("time", "independent", "real", "time of the communication point", "s")
 EVENTS = (
     Variable("next_contact", "input", "boolean", "true in the first step of each run of a series"),
@@ -45,19 +48,19 @@ EVENTS = (
     Variable("has_tick_time", "input", "boolean", "whether tick_time is the time of a steady clock"),
     Variable("tick_time", "input", "real", "time of the tick, for the detection of missed ticks", "s"),
 )
-UNSTATED_NAMES = ", ".join(f"{status.number} {status.name}" for status in STATUSES)
+STATUS_CODES = ", ".join(f"{status.number} {status.name}" for status in STATUSES)
 STATUS_OUTPUTS = (
     Variable("tripped", "output", "boolean", "whether a fault has tripped the controller"),
     Variable("at_rest", "output", "boolean", "whether the drives' command has come to rest after a trip"),
     Variable("tare_done", "output", "boolean", "whether the tare has ended"),
-    Variable("status", "output", "integer", f"status of the compensator: {UNSTATED_NAMES}"),
+    Variable("status", "output", "integer", f"status of the compensator: {STATUS_CODES}"),
     Variable("faults", "output", "integer", "bits of this tick's faults"),
     Variable("seen_faults", "output", "integer", "bits of all faults since the reset"),
     Variable("trip_cause", "output", "integer", "bits of the faults that tripped the controller; 0: none"),
     Variable("missed_ticks", "output", "integer", "number of missed ticks since the reset"),
     Variable("late_ticks", "output", "integer", "number of late ticks since the reset"),
     Variable("contact_number", "output", "integer", "number of the last audited contact; 0: none"),
-    Variable("contact_status", "output", "integer", f"status of the last audited contact: {UNSTATED_NAMES}"),
+    Variable("contact_status", "output", "integer", f"status of the last audited contact: {STATUS_CODES}"),
 )
 
 
@@ -71,7 +74,7 @@ def controller_variables(document: Mapping[str, Any]) -> list[Variable]:
         Time, inputs, outputs, gains and limits, in the order of their value references.
     """
     kind = kind_of(document)
-    signals = _one_axis_signals() if kind is ONE_AXIS else _six_axis_signals()
+    signals = _one_axis_signals(document) if kind is ONE_AXIS else _six_axis_signals()
     bits = {fault.bit: fault.name for fault in kind.faults} | {UNUSABLE: "unusable"}
     names = "; ".join(f"{bit:#x} {name}" for bit, name in bits.items())
     outputs = [
@@ -86,7 +89,9 @@ def c_names(variables: Iterable[Variable]) -> list[str]:
     return [variable.c_name for variable in variables]
 
 
-def _one_axis_signals() -> list[Variable]:
+def _one_axis_signals(document: Mapping[str, Any]) -> list[Variable]:
+    mass = from_plain_data(copy.deepcopy(document["mechanism"]), "gain document").bodies.mass
+
     def signal(name: str, causality: Any, unit: str, description: str) -> Variable:
         return Variable(name, causality, "real", description, unit)
 
@@ -104,7 +109,17 @@ def _one_axis_signals() -> list[Variable]:
         signal("force_delay", "output", "s", "estimated delay of the force measurement; 0: none"),
         signal("stiffness", "output", "N/m", "identified stiffness; 0: none"),
         signal("damping", "output", "N s/m", "identified damping; 0: none"),
-    ]
+        signal("model_position", "output", "m", "newest position of the numerical model"),
+        signal("model_velocity", "output", "m/s", "newest velocity of the numerical model"),
+        Variable(
+            "integrates_model", "parameter", "boolean",
+            "whether the FMU itself integrates the numerical model; each run begins from the desired motion",
+        ),
+        Variable(
+            "equivalent_mass", "parameter", "real", "mass of the numerical model, if the FMU integrates it",
+            "kg", mass, *MODEL_MASSES,
+        ),
+    ]  # fmt: skip
 
 
 def _six_axis_signals() -> list[Variable]:

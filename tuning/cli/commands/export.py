@@ -88,6 +88,11 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
             ),
             f"On the rig: python {Path(document['bundle']).name}/selftest.py",
         ]
+        if "fmu" in document["formats"]:
+            lines.append(
+                "Co-simulation, with the controller's FMU stepped before the rig's, adds one control period "
+                "to the loop: tune with `--extra-periods 1`."
+            )
     lines += [f"Bad: {reason}" for reason in document["reasons"]]
     lines += [f"Unknown: {text}." for text in document["unknown"]]
     if document["verdict"] != "bad":

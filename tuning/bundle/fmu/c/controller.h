@@ -3,10 +3,13 @@
 #define FMU_MODEL_H
 
 #include "jaxhil_controller.h"
+#include "numerical_model.h"
 
 typedef struct {
     jaxhil_controller controller;
     bool stopped; /* whether the emergency stop is active */
+    bool begins;  /* whether the next step is the first step of a run */
+    numerical_model model; /* only if the FMU integrates the numerical model */
 } fmu_model;
 
 #endif

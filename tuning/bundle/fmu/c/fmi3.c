@@ -1,4 +1,7 @@
 /* Functions of FMI 3.0 for co-simulation. Functions of other kinds of FMUs return errors. */
+#if defined(__clang__)
+#pragma clang diagnostic ignored "-Wstrict-prototypes" /* in the header of the standard */
+#endif
 #include "fmi3Functions.h"
 
 #include <stdio.h>

@@ -4,6 +4,9 @@
  */
 #include <stddef.h>
 
+#if defined(__clang__)
+#pragma clang diagnostic ignored "-Wstrict-prototypes" /* in the header of the standard */
+#endif
 #include "fmi3Functions.h"
 
 #if defined(__GNUC__)

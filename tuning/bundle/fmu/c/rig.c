@@ -66,9 +66,9 @@ static void begin_run(fmu_state *state, double velocity) {
     const double drive = command - RIG_LATENCY * stride + (RIG_LINEAR_HOLD ? 0.0 : stride);
     double before[RIG_ORDER];
     double first;
-    rig->position = start;
-    rig->velocity = velocity;
-    rig->acceleration = 0.0;
+    rig->model.position = start;
+    rig->model.velocity = velocity;
+    rig->model.acceleration = 0.0;
     rig->law = contact_law_of((int)values[V_CONTACT]);
     for (int n = 0; n <= RIG_LATENCY; n++) {
         rig->commands[n] = command - n * stride;
@@ -181,20 +181,6 @@ static void move_hardware(fmu_model *rig, double command) {
     rig->tick++;
 }
 
-/* Integrate the numerical model over one period. */
-static void move_model(fmu_model *rig, double force, double mass) {
-    const double increment = RIG_PERIOD * (-force / mass);
-    rig->acceleration = -force / mass;
-    if (RIG_INTEGRATOR == INTEGRATOR_EXPLICIT_EULER) {
-        rig->position += RIG_PERIOD * rig->velocity;
-    } else if (RIG_INTEGRATOR == INTEGRATOR_ZOH) {
-        rig->position += RIG_PERIOD * (rig->velocity + increment / 2.0);
-    } else {
-        rig->position += RIG_PERIOD * (rig->velocity + increment);
-    }
-    rig->velocity += increment;
-}
-
 /* Read the sensors, and set the outputs. */
 static void set_outputs(fmu_state *state) {
     fmu_model *const rig = &state->model;
@@ -208,9 +194,9 @@ static void set_outputs(fmu_state *state) {
     values[V_FORCE_MEASURED] = fmin(fmax(force, -RIG_FORCE_RANGE), RIG_FORCE_RANGE);
     position = quantise(position + draw_noise(rig, values[V_POSITION_NOISE]), RIG_POSITION_QUANTUM);
     values[V_POSITION_MEASURED] = position;
-    values[V_POSITION] = rig->position;
-    values[V_VELOCITY] = rig->velocity;
-    values[V_ACCELERATION] = rig->acceleration;
+    values[V_POSITION] = rig->model.position;
+    values[V_VELOCITY] = rig->model.velocity;
+    values[V_ACCELERATION] = rig->model.acceleration;
     values[V_CONTACT_FORCE] = rig->force;
     values[V_POSITION_SHORTFALL] = rig->shortfall;
 }
@@ -229,9 +215,10 @@ bool fmu_model_begin(fmu_state *state) {
 void fmu_model_step(fmu_state *state) {
     fmu_model *const rig = &state->model;
     if (state->values[V_NEXT_RUN] != 0.0) {
-        begin_run(state, fabs(rig->velocity)); /* the speed at which the last run ended */
+        begin_run(state, fabs(rig->model.velocity)); /* the speed at which the last run ended */
     } else {
-        move_model(rig, state->values[V_FORCE_COMMAND], state->values[V_EQUIVALENT_MASS]);
+        move_model(&rig->model, RIG_INTEGRATOR, RIG_PERIOD, state->values[V_FORCE_COMMAND],
+                   state->values[V_EQUIVALENT_MASS]);
         move_hardware(rig, state->values[V_POSITION_COMMAND]);
     }
     if (!rig->in_contact && (int)state->values[V_CONTACT] != rig->law.number) {

@@ -4,6 +4,7 @@
 
 #include <stdint.h>
 
+#include "numerical_model.h"
 #include "sensor_lag.h"
 
 typedef struct {
@@ -12,7 +13,7 @@ typedef struct {
 } sampling_interval;
 
 typedef struct {
-    double position, velocity, acceleration; /* of the numerical model */
+    numerical_model model;
     double commands[RIG_LATENCY + 1];        /* newest position commands [m], the newest one first */
     double requested, step, shortfall;       /* of the rate limits [m] */
     double simulator[RIG_ORDER];             /* state of the motion simulator */
