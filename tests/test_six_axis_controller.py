@@ -110,7 +110,7 @@ def test_changing_an_output_list_does_not_change_the_controller():
         (lambda d: d["constants"]["mass_matrix"][0].__setitem__(0, math.inf), "JSON"),
         (lambda d: d["constants"]["inverse_mass"][2].__setitem__(2, 0.01), "the inverse of"),
         (lambda d: d["constants"].update(more=1), "an extra key 'more'"),
-        (lambda d: d["constants"].update(longest_delay=3.0), "constants.longest_delay"),
+        (lambda d: d["constants"].update(longest_delay=5.0), "constants.longest_delay"),
         (lambda d: d["limits"].update(stroke={"value": 1.0, "unit": "m"}), "an unknown limit"),
         (lambda d: d["limits"]["force_range"].update(unit="N m"), "limits.force_range.unit"),
         (lambda d: d["limits"]["command_lowest_x"].update(value=0.41), "is not below"),

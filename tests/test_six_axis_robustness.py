@@ -1,0 +1,71 @@
+"""Errors of the six-axis impulse ledger if one parameter of the rig differs from the specified value.
+
+Each of these parameters is wrong alone: bias of the force sensor, mass of the tool, mass matrix, force delay.
+"""
+
+import functools
+
+import jax.numpy as jnp
+import pytest
+from six_axis_ranges import load_wide
+from test_six_axis_ledger import LAW, check_good, evaluated, rms
+
+from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS, literature_gains
+from jaxhil.laws.impulse_ledger.simulation_six_axes import ImpulseLedger
+from jaxhil.sixdof.equations import solve
+
+WRONG_MASS = "impulse_ledger_with_wrong_mass"
+# Largest rms energy errors, on the hexapod divided by the undisturbed error. It has no tool on its sensor.
+LIMITS = {
+    "probe-drogue": {"bias": 0.055, "tool": 0.055, "mass": 0.06, "delay": 0.13},
+    "hydraulic-hexapod": {"bias": 1.3, "mass": 1.5, "delay": 4.6},
+}
+
+
+class LedgerWithWrongMass(ImpulseLedger):
+    """Impulse ledger that assumes masses and inertias 10 % above those of the numerical model."""
+
+    name = WRONG_MASS
+
+    def prepare(self, gains, constants):
+        mass, inverse, correction = constants[1:]
+        unit = jnp.broadcast_to(jnp.eye(6).reshape(6, 6, *[1] * gains["settle"].ndim), mass.shape)
+        tool = unit - solve(correction, unit)  # M_t M^-1
+        wrong = (1.1 * mass, inverse / 1.1, solve(unit - tool / 1.1, unit))
+        return super().prepare(gains, type(constants)(constants.control_period, *wrong))
+
+
+def biased(scenarios):
+    sensor = scenarios.sensor
+    errors = sensor.errors._replace(bias=sensor.errors.bias.at[2].set(5.0))
+    return scenarios._replace(sensor=sensor._replace(errors=errors))
+
+
+def light_tool(scenarios):
+    tool = scenarios.sensor.assumed_tool
+    return scenarios._replace(
+        sensor=scenarios.sensor._replace(assumed_tool=tool._replace(mass=0.98 * tool.mass))
+    )
+
+
+@functools.cache
+def energy_error(name, wrong):
+    """Return the rms energy error if a parameter, or None, is wrong."""
+    mechanism = load_wide(name)
+    scenario = {"bias": biased, "tool": light_tool}.get(wrong)
+    change = {}
+    if wrong == "delay":
+        change["identification_delay"] = literature_gains(mechanism, LAW)["identification_delay"] - 1e-3
+    law = WRONG_MASS if wrong == "mass" else LAW
+    [metrics] = evaluated(mechanism, law, change, scenario=scenario)
+    check_good(metrics)
+    return rms(metrics["energy_error"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "wrong"), [(name, wrong) for name in LIMITS for wrong in LIMITS[name]])
+def test_ledger_errors_stay_small_if_one_rig_parameter_is_wrong(name, wrong, monkeypatch):
+    monkeypatch.setitem(SIX_AXIS_COMPENSATORS, WRONG_MASS, LedgerWithWrongMass())
+    error, undisturbed = energy_error(name, wrong), energy_error(name, None)
+    print(f"{name}, {wrong}: energy error {error:.4f}, undisturbed {undisturbed:.4f}")
+    assert error <= LIMITS[name][wrong] * (1 if name == "probe-drogue" else undisturbed)
