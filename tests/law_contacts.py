@@ -10,8 +10,8 @@ from jaxhil.mechanism.file import load, to_plain_data
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.rig import Controller
+from tuning.rig.numerical_model import NumericalModel
 from tuning.rig.plant import RigHardware
-from tuning.rig.udp_protocol import NumericalModel
 
 LAW = "impulse_ledger"
 AFTER = 60  # ticks simulated after model and hardware have left the surface

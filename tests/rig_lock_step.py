@@ -11,18 +11,11 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.rig import Controller
 from jaxhil.rig.gain_file import GainFile
 from tuning.rig.contact_detector import ContactDetector, RigContact
+from tuning.rig.numerical_model import APPROACH_TIME, NumericalModel, OneAxisModelInLoop
 from tuning.rig.plant import RigHardware
-from tuning.rig.rig_task import RigTask
-from tuning.rig.udp_protocol import (
-    APPROACH_TIME,
-    PREPARE,
-    READY,
-    TICK,
-    AnswerPacket,
-    ControllerTask,
-    NumericalModel,
-    ReadingPacket,
-)
+from tuning.rig.rig_task import RigTask, build_simulated_rig
+from tuning.rig.udp_protocol import PREPARE, READY, TICK, AnswerPacket, ReadingPacket
+from tuning.rig.udp_task import ControllerTask
 
 ANY = st.floats(width=64)
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
@@ -93,7 +86,9 @@ def packets(
     `delivered(way, packet)` returns the packets that arrive at this tick when `packet` is sent `"there"` or
     `"back"`.
     """
-    rig, task = RigTask(mechanism, seed, resets=resets), ControllerTask(law, to_plain_data(mechanism))
+    period = mechanism.rig.control_period
+    rig = RigTask(build_simulated_rig(mechanism, seed), period, resets=resets)
+    task = task_of(law, mechanism)
     answers = []
     for _ in range(ticks):
         packet: ReadingPacket = rig.reading()
@@ -109,18 +104,28 @@ def packets(
 
 def same(one, other):
     """Return whether two packets hold the same numbers, including NaN."""
-    return all(a == b or (a != a and b != b) for a, b in zip(one, other, strict=True))
+
+    def entries(packet):
+        return [entry for field in packet for entry in (field if isinstance(field, tuple) else (field,))]
+
+    return all(a == b or (a != a and b != b) for a, b in zip(entries(one), entries(other), strict=True))
 
 
 def a_reading(tick, sequence=None, force=0.0, position=-1.0, event=TICK, run=1):
     """Return the reading packet of a tick."""
     sequence = tick + 10 if sequence is None else sequence
-    return ReadingPacket(event, sequence, run, tick, 0.001 * sequence, force, position, -1.0, 0.005)
+    time = 0.001 * sequence
+    return ReadingPacket(event, sequence, run, tick, time, (force,), (position,), (-1.0, 0.005))
+
+
+def task_of(law, mechanism):
+    """Return the controller's task with a runtime controller."""
+    return ControllerTask(law, OneAxisModelInLoop(law, to_plain_data(mechanism)))
 
 
 def prepared(mechanism, **limits):
     """Return the controller's task with compensator `none`, ready for a run."""
     law = controller(mechanism, "none", {}, **limits)
-    task = ControllerTask(law, to_plain_data(mechanism))
+    task = task_of(law, mechanism)
     assert task.answer(a_reading(0, 1, event=PREPARE)).flags == READY
     return task

@@ -35,8 +35,8 @@ from tuning.bundle.bundle import build_limits_section
 from tuning.gain_file import build_document
 from tuning.gains.tasks import build_task
 from tuning.rig.contact_detector import ContactDetector
+from tuning.rig.numerical_model import NumericalModel
 from tuning.rig.plant import RigHardware
-from tuning.rig.udp_protocol import NumericalModel
 from tuning.statistics.intervals import binomial_interval
 from tuning.watchdog.calibration import calibrate
 

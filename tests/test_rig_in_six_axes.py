@@ -25,7 +25,8 @@ from jaxhil.sixdof.candidates import ChaserSpheres
 from jaxhil.sixdof.forces import ContactGroup
 from jaxhil.sixdof.friction import Regularised
 from jaxhil.sixdof.kinematics import TaskSpace
-from jaxhil.sixdof.loop import Loop, run
+from jaxhil.sixdof.loop import run
+from jaxhil.sixdof.loop_state import Loop
 from jaxhil.sixdof.relative import Pair, States
 from jaxhil.sixdof.rotations import Quaternion
 from jaxhil.sixdof.scenario import Scenario

@@ -1,6 +1,7 @@
 """The rig's six-axis compensators agree with the JAX compensators for recorded and random readings."""
 
 import functools
+import math
 
 import numpy as np
 import pytest
@@ -17,12 +18,13 @@ from six_axis_records import (
 
 from jaxhil.laws import built_in_compensators
 from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS, literature_gains
+from jaxhil.laws.impulse_ledger.six_axes.tangent_model.rig import SPREADS, TangentModel
 from jaxhil.mechanism.file import load_any, six_axis_names
 from jaxhil.rig.law_status import IDENTIFIED, OUT_OF_CONTACT, STATUS_NAMES
 from jaxhil.rig.six_axes import SIX_AXIS_COMPENSATORS as ON_THE_RIG
 from jaxhil.rig.six_axes import ModelConstants
 from jaxhil.rig.six_axes.vectors import coordinate_rates
-from jaxhil.sixdof.loop import SETTLING_TICKS
+from jaxhil.sixdof.loop_state import SETTLING_TICKS
 
 LIMIT = 1e-9  # maximum difference, divided by the commands' range
 NOISY = "probe-drogue"  # mechanism whose force and pose readings have noise
@@ -174,3 +176,12 @@ def test_rig_and_jax_commands_agree_on_random_readings(name, runs):
         magnified += check_agreement(name, gains, constants, period, readings, expected)
     assert acting > 0.9 * runs
     assert magnified <= (0.25 * runs if name == "impulse_ledger" else 0)
+
+
+@pytest.mark.parametrize("curvature", [1e7, -1e7])
+def test_ledger_prediction_with_a_wrong_estimate_is_finite(curvature):
+    gains = dict.fromkeys(SPREADS, 1.0) | {"forgetting": 1.0}
+    model = TangentModel(gains, 0.001)
+    model.stiffness, model.curvature = 1e6, curvature
+    model.bridge(force=1e3, least=-1e3, deeper=0.01, velocity=1.0, duration=0.3)
+    assert math.isfinite(model.impulse) and math.isfinite(model.force)

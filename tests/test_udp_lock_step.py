@@ -7,24 +7,21 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rig_lock_step import ANY, FINITE, a_reading, closed_loop, controller, packets, prepared, same
+from rig_lock_step import ANY, FINITE, a_reading, closed_loop, controller, packets, prepared, same, task_of
 
 from jaxhil.laws.compensators import literature_gains
-from jaxhil.mechanism.file import load, to_plain_data
+from jaxhil.mechanism.file import load
 from jaxhil.rig import faults
-from tuning.rig import udp_protocol
 from tuning.rig.udp_protocol import (
-    MAX_INTERPOLATED_TICKS,
-    MISSED_TICK,
     PREPARE,
     READY,
     RESET,
     TICK,
-    ControllerTask,
     ReadingPacket,
     decode_answer,
     encode_answer,
 )
+from tuning.rig.udp_task import LAW_IN_DOUBT, MAX_INTERPOLATED_TICKS, MISSED_TICK
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +72,7 @@ def test_udp_rig_compensates_for_lost_and_late_packets(varying, drops, ticks):
     rig, task, answers = packets(mechanism, law, 2500, Unreliable(drops, ticks, seed=1))
     assert not rig.tripped and task.interpolated > (10 if drops else 0)
     assert (task.stale > 0) == (ticks > 0)
-    assert all(math.isfinite(answer.position_command) for answer in answers)
+    assert all(math.isfinite(*answer.position_command) for answer in answers)
     assert len(rig.contacts) >= 5
     for result, expected in zip(rig.contacts, whole.contacts, strict=False):
         assert result.status == "ok"
@@ -87,7 +84,7 @@ def test_udp_controller_counts_contacts_without_status_identified():
     mechanism = load("suite-fast", ["contact.stiffness=[884316.0]"]).mechanism
     gains = literature_gains(mechanism, "impulse_ledger")
     rig, task, answers = packets(mechanism, controller(mechanism, "impulse_ledger", gains), 900)
-    assert udp_protocol.LAW_IN_DOUBT == faults.LAW_IN_DOUBT and MISSED_TICK == faults.MISSED_TICK
+    assert LAW_IN_DOUBT == faults.LAW_IN_DOUBT and MISSED_TICK == faults.MISSED_TICK
     reported = [answer for answer in answers if answer.faults & faults.LAW_IN_DOUBT]
     assert len(rig.contacts) >= 3 and not rig.tripped
     assert task.quality_flags == {"too_short": len(reported)} and len(reported) in (
@@ -116,10 +113,11 @@ def test_readings_of_a_long_gap_are_not_interpolated(varying):
     assert task.interpolated == 0 and not answer.trip_reason and answer.faults & MISSED_TICK
     # The model continued during the gap under the last force.
     mass, period = mechanism.bodies.equivalent_mass, mechanism.rig.control_period
-    assert answer.velocity == pytest.approx(first.velocity - (gap + 1) * period * 7.0 / mass, rel=1e-12)
+    expected = first.velocity[0] - (gap + 1) * period * 7.0 / mass
+    assert answer.velocity == pytest.approx((expected,), rel=1e-12)
     tripped = task.answer(a_reading(60, force=7.0))
-    assert "missed_tick" in tripped.trip_reason and tripped.force_command == 0.0
-    assert math.isfinite(tripped.position_command) and math.isfinite(tripped.command_rate)
+    assert "missed_tick" in tripped.trip_reason and tripped.force_command == (0.0,)
+    assert math.isfinite(*tripped.position_command) and math.isfinite(*tripped.command_rate)
 
 
 def test_outdated_packets_are_dropped_and_counted(varying):
@@ -144,7 +142,8 @@ SMALL = st.integers(0, 40)
             st.integers(0, 3),
             SMALL,
             FINITE,
-            *[ANY] * 4,
+            *[st.tuples(ANY)] * 2,
+            st.tuples(ANY, ANY),
         ),
         max_size=30,
     ),
@@ -153,11 +152,11 @@ SMALL = st.integers(0, 40)
 def test_any_packets_of_a_rig_are_answered_with_finite_commands(varying, readings, compensator):
     mechanism, gains = varying
     law = controller(mechanism, compensator, gains if compensator == "response_error" else {})
-    task = ControllerTask(law, to_plain_data(mechanism))
+    task = task_of(law, mechanism)
     for number, reading in enumerate(readings):
         answer = task.answer(reading._replace(sequence=reading.sequence + 2 * number))
         if answer is not None:
-            assert math.isfinite(answer.position_command) and math.isfinite(answer.force_command)
+            assert math.isfinite(*answer.position_command) and math.isfinite(*answer.force_command)
             assert same(decode_answer(encode_answer(answer, 1), 1), answer)
 
 
@@ -211,17 +210,17 @@ def test_failed_sensor_trips_the_controller_and_rig_stays_safe(varying):
         if way == "there":
             count += 1
             if count > 60:
-                packet = packet._replace(force=math.nan)
+                packet = packet._replace(force=(math.nan,))
         return [packet]
 
     rig, _, answers = packets(mechanism, law, 1500, broken)
     rig.finish()
     assert "force_not_finite" in rig.tripped
     assert [contact.status for contact in rig.contacts] == ["tripped"]
-    assert all(math.isfinite(one.position_command) for one in answers) and rig.commanded.not_finite == 0
+    assert all(math.isfinite(*one.position_command) for one in answers) and rig.commanded.not_finite == 0
     last = answers[-1]
-    assert last.position_command < 0.0 and last.command_rate == 0.0 and last.force_command == 0.0
-    steps = np.diff([one.position_command for one in answers[60:]])
+    assert last.position_command < (0.0,) and last.command_rate == last.force_command == (0.0,)
+    steps = np.diff([one.position_command[0] for one in answers[60:]])
     assert np.max(np.abs(steps)) <= 0.1 * mechanism.rig.control_period * (1 + 1e-9)
 
 

@@ -13,6 +13,7 @@ from jaxhil.mechanism.file import load
 from tuning.rig.contact_detector import RigContact
 from tuning.rig.loop import EmptyTask, PacketTimes, answered_packet_number, run_loop
 from tuning.rig.network import Injection, Network
+from tuning.rig.one_axis_rig import ideal_restitutions
 from tuning.rig.rig_task import MAX_COMMAND_AGE
 from tuning.rig.session import (
     CAUSE_CONTROLLER,
@@ -25,7 +26,7 @@ from tuning.rig.session import (
     compute_quantiles,
     find_miss_causes,
 )
-from tuning.rig.session_report import ideal_restitutions, is_stalled
+from tuning.rig.session_report import is_stalled
 from tuning.rig.udp_controller import TickRecord, replay_slow_ticks
 from tuning.rig.udp_protocol import (
     encode_reading,
@@ -132,11 +133,11 @@ def test_contacts_without_commands_due_to_a_stall_are_not_evaluated(varying):
     figures, times = None, None
     run = LoopReport(figures, times, causes, {})  # pyright: ignore[reportArgumentType]
     contact = RigContact(0, 0.005, 0.5, 1.0, 0.1, "ok", 3)
-    setup = SessionSettings(SOURCE_FOLDER, SOURCE_FOLDER, varying[0], (-1, 1), 1.0, 0.0, Injection(), 0)
-    old = contact._replace(packets=(10, 50), oldest_command=MAX_COMMAND_AGE + 1)
+    setup = SessionSettings(SOURCE_FOLDER, SOURCE_FOLDER, varying[0], ((-1,), (1,)), 1.0, 0.0, Injection(), 0)
+    old = {**contact._asdict(), "packets": (10, 50), "oldest_command": MAX_COMMAND_AGE + 1}
     assert is_stalled(old, setup, run)
-    assert not is_stalled(old._replace(oldest_command=MAX_COMMAND_AGE), setup, run)
-    assert not is_stalled(old._replace(packets=(10, 60)), setup, run)
+    assert not is_stalled({**old, "oldest_command": MAX_COMMAND_AGE}, setup, run)
+    assert not is_stalled({**old, "packets": (10, 60)}, setup, run)
     assert not is_stalled(old, setup._replace(injection=Injection(drops=0.1)), run)
 
 

@@ -9,6 +9,7 @@ from rig_lock_step import ANY, FINITE, same
 
 from tuning.rig.udp_protocol import (
     FLAGS,
+    FORMATS,
     MAX_SEQUENCE_STEP,
     PREPARE,
     READY,
@@ -21,19 +22,27 @@ from tuning.rig.udp_protocol import (
     SequenceFilter,
     SessionNumbers,
     decode_answer,
+    decode_opening,
     decode_reading,
-    decode_session,
     encode_answer,
     encode_reading,
     encode_session_request,
 )
 
 WORD = st.integers(0, 2**32 - 1)
+AXES = st.sampled_from([FORMATS[1], FORMATS[6]])
+EVENTS = st.sampled_from([PREPARE, TICK, STOP, RESET])
+
+
+def numbers(count):
+    return st.tuples(*[ANY] * count)
 
 
 @given(
-    st.builds(
-        ReadingPacket, st.sampled_from([PREPARE, TICK, STOP, RESET]), WORD, WORD, WORD, FINITE, *[ANY] * 4
+    AXES.flatmap(
+        lambda form: st.builds(
+            ReadingPacket, EVENTS, *[WORD] * 3, FINITE, *[numbers(form.axes)] * 2, numbers(form.start)
+        )
     )
 )
 def test_reading_packets_survive_encoding_and_decoding(reading):
@@ -44,8 +53,16 @@ printable = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size
 
 
 @given(
-    st.builds(
-        AnswerPacket, st.integers(0, FLAGS), *[WORD] * 3, *[ANY] * 5, st.integers(0, 2**64 - 1), printable
+    AXES.flatmap(
+        lambda form: st.builds(
+            AnswerPacket,
+            st.integers(0, FLAGS),
+            *[WORD] * 3,
+            *[numbers(form.axes)] * 5,
+            numbers(form.bodies),
+            st.integers(0, 2**64 - 1),
+            printable,
+        )
     )
 )
 def test_answer_packets_survive_encoding_and_decoding(answer):
@@ -53,8 +70,14 @@ def test_answer_packets_survive_encoding_and_decoding(answer):
 
 
 SESSION = 2**64 - 2
-READING = encode_reading(ReadingPacket(TICK, 1, 2, 3, 4.0, 5.0, 6.0, 7.0, 8.0), SESSION)
-ANSWER = encode_answer(AnswerPacket(READY, 1, 2, 3, *[4.0] * 5, 5, "ok"), SESSION)
+READING = encode_reading(ReadingPacket(TICK, 1, 2, 3, 4.0, (5.0,), (6.0,), (7.0, 8.0)), SESSION)
+ANSWER = encode_answer(AnswerPacket(READY, 1, 2, 3, *[(4.0,)] * 5, (), 5, "ok"), SESSION)
+SIX_AXIS_READING = encode_reading(
+    ReadingPacket(TICK, 1, 2, 3, 4.0, (5.0,) * 6, (6.0,) * 6, (7.0,) * 26), SESSION
+)
+SIX_AXIS_ANSWER = encode_answer(
+    AnswerPacket(READY, 1, 2, 3, *[(4.0,) * 6] * 5, (1.0,) * 26, 5, "ok"), SESSION
+)
 
 
 def mutated(packet):
@@ -76,17 +99,17 @@ def mutated(packet):
     )
 
 
-@given(mutated(READING))
+@given(st.one_of(mutated(READING), mutated(SIX_AXIS_READING)))
 def test_arbitrary_bytes_are_refused_or_decoded_as_reading_packet(packet):
     try:
         reading = decode_reading(packet, SESSION)
     except PacketError:
         return
-    assert len(packet) == len(READING) and math.isfinite(reading.time)
+    assert len(packet) == FORMATS[len(reading.force)].reading.size and math.isfinite(reading.time)
     assert same(decode_reading(encode_reading(reading, SESSION), SESSION), reading)
 
 
-@given(mutated(ANSWER))
+@given(st.one_of(mutated(ANSWER), mutated(SIX_AXIS_ANSWER)))
 def test_arbitrary_bytes_are_refused_or_decoded_as_answer_packet(packet):
     try:
         answer = decode_answer(packet, SESSION)
@@ -97,29 +120,44 @@ def test_arbitrary_bytes_are_refused_or_decoded_as_answer_packet(packet):
 
 
 def test_packets_of_another_session_are_refused():
-    for decode, packet in ((decode_reading, READING), (decode_answer, ANSWER)):
+    packets = ((decode_reading, READING), (decode_answer, ANSWER))
+    packets += ((decode_reading, SIX_AXIS_READING), (decode_answer, SIX_AXIS_ANSWER))
+    for decode, packet in packets:
         assert decode(packet, SESSION) == decode(packet, None)
         for other in (0, SESSION + 1, SESSION - 1):
             with pytest.raises(PacketError, match="another session"):
                 decode(packet, other)
 
 
+def test_packets_for_another_number_of_axes_are_refused():
+    for decode, one, six in (
+        (decode_reading, READING, SIX_AXIS_READING),
+        (decode_answer, ANSWER, SIX_AXIS_ANSWER),
+    ):
+        for axes, packet, other in ((1, one, six), (6, six, one)):
+            assert decode(packet, SESSION, axes) == decode(packet, SESSION)
+            with pytest.raises(PacketError, match=f"expected {axes}"):
+                decode(other, SESSION, axes)
+
+
 def test_session_number_is_sent_to_requesting_address_and_differs_by_address():
     sessions, rig, number = SessionNumbers(), ("127.0.0.1", 4000), 2**63 + 5
-    answer = sessions.answer(encode_session_request(number), rig)
-    assert answer is not None and len(answer) == len(encode_session_request(number))
-    assert decode_session(answer, number) == sessions.number(rig)
+    answer = sessions.answer(encode_session_request(number, 1), rig)
+    assert answer is not None and len(answer) == len(encode_session_request(number, 1))
+    assert decode_opening(answer, number) == (sessions.number(rig), 1)
     with pytest.raises(PacketError):
-        decode_session(answer, number + 1)
+        decode_opening(answer, number + 1)
+    six = SessionNumbers(6).answer(encode_session_request(number, 1), rig)
+    assert six is not None and decode_opening(six, number).axes == 6
     others = [("127.0.0.1", 4001), ("127.0.0.2", 4000), ("127.0.0.1", 400)]
     assert len({sessions.number(one) for one in (rig, *others)}) == 4
     assert SessionNumbers().number(rig) != sessions.number(rig)
 
 
-@given(st.one_of(st.binary(max_size=40), mutated(encode_session_request(3)), mutated(READING)))
+@given(st.one_of(st.binary(max_size=40), mutated(encode_session_request(3, 6)), mutated(READING)))
 def test_session_is_opened_only_by_a_session_request(packet):
     answer = SessionNumbers().answer(packet, ("127.0.0.1", 4000))
-    assert (answer is not None) == (len(packet) == 24 and packet[:5] == encode_session_request(3)[:5])
+    assert (answer is not None) == (len(packet) == 24 and packet[:5] == encode_session_request(3, 6)[:5])
 
 
 def accept_numbers(sequence: SequenceFilter, *numbers: int) -> list[bool]:

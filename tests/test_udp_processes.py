@@ -43,7 +43,13 @@ def test_rig_command_refuses_bundle_with_modified_controller(jaxhil, tmp_path):
     (folder / "__pycache__" / "jaxhil_runtime.cpython-311.pyc").write_bytes(b"of Python's own making")
     arguments = ("rig", folder, "--duration", 0.2, "--json", "--limit", "inf")
     assert jaxhil(*arguments).document["run"]["ticks"] == 200
-    for name in ("jaxhil_runtime.py", "udp_controller.py", "udp_protocol.py", "selftest.py"):
+    for name in (
+        "jaxhil_runtime.py",
+        "udp_controller.py",
+        "udp_protocol.py",
+        "numerical_model.py",
+        "selftest.py",
+    ):
         for other, content in signed({**made.files, name: made.files[name] + trap}, made.document).items():
             (folder / other).write_bytes(content)
         ran = jaxhil(*arguments)

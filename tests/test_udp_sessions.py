@@ -17,7 +17,7 @@ from tuning.rig.udp_protocol import (
     VERSION,
     PacketError,
     decode_answer,
-    decode_session,
+    decode_opening,
     encode_reading,
     encode_session_request,
 )
@@ -38,8 +38,8 @@ class Rig:
         self.socket.sendto(packet, self.address)
 
     def open(self):
-        self.send(encode_session_request(self.number))
-        self.session = decode_session(self.socket.recv(1000), self.number)
+        self.send(encode_session_request(self.number, 1))
+        self.session = decode_opening(self.socket.recv(1000), self.number).session
 
     def tell(self, reading):
         self.send(encode_reading(reading, self.session))
@@ -121,7 +121,7 @@ def test_controller_process_answers_only_the_rig_of_its_session(process):
     guesser.session = rig.session
     guesser.tell(a_reading(0, 2**32 - 1))
     guesser.tell(a_reading(0, 99, event=STOP))
-    guesser.send(encode_session_request(5))
+    guesser.send(encode_session_request(5, 1))
     for tick in range(5):
         answer = rig.ask(a_reading(tick))
         assert (answer.tick, answer.sequence, answer.trip_reason) == (tick, tick + 10, "")
@@ -188,7 +188,7 @@ def test_packets_from_other_addresses_do_not_keep_a_session_open(process):
     rig, stranger = served.rig(), served.rig()
     rig.prepare()
     begun = time.monotonic()
-    garbage = ((stranger, b"garbage"), (stranger, encode_session_request(3)), (rig, b"garbage"))
+    garbage = ((stranger, b"garbage"), (stranger, encode_session_request(3, 1)), (rig, b"garbage"))
     with flood(*garbage, (stranger, encode_reading(a_reading(1), rig.session))) as once:
         while time.monotonic() < begun + 2 * SILENCE:
             once()
@@ -202,7 +202,7 @@ def test_controller_process_without_session_ends_despite_session_requests(proces
     rig = served.rig()
     begun = time.monotonic()
     while time.monotonic() < begun + 0.6:
-        rig.send(encode_session_request(3) if opened else b"garbage")
+        rig.send(encode_session_request(3, 1) if opened else b"garbage")
         time.sleep(0.02)
     code, result = served.ended()
     assert code == 1 and result["ended"] == "silent"
@@ -224,7 +224,7 @@ def test_restarted_rig_does_not_continue_the_old_session(process):
     assert rig.ask(a_reading(0)).tick == 0
     again = served.rig()
     for one in (again, rig):  # from another port, then from the same port
-        one.send(encode_session_request(77))
+        one.send(encode_session_request(77, 1))
         assert one.hears_nothing()
     code, result = served.ended()
     assert code == 1 and result["ended"] == "silent" and result["ignored"] == 2
@@ -233,13 +233,13 @@ def test_restarted_rig_does_not_continue_the_old_session(process):
 def test_lost_session_request_or_answer_is_sent_again(process):
     served = process()
     rig = served.rig()
-    rig.send(encode_session_request(1)[:-1])
-    rig.send(encode_session_request(1))  # the rig does not wait for the answer
+    rig.send(encode_session_request(1, 1)[:-1])
+    rig.send(encode_session_request(1, 1))  # the rig does not wait for the answer
     first = rig.socket.recv(1000)
     rig.prepare()
-    assert decode_session(first, 1) == rig.session
+    assert decode_opening(first, 1).session == rig.session
     with pytest.raises(PacketError):
-        decode_session(first, 2)
+        decode_opening(first, 2)
     rig.tell(a_reading(0, 99, event=STOP))
     code, result = served.ended()
     assert code == 0 and result["ignored"] == 1
@@ -248,7 +248,7 @@ def test_lost_session_request_or_answer_is_sent_again(process):
 def test_rig_of_another_version_is_ignored(process):
     served = process()
     rig = served.rig()
-    packet = bytearray(encode_session_request(1))
+    packet = bytearray(encode_session_request(1, 1))
     packet[4] = VERSION - 1
     rig.send(bytes(packet))
     assert rig.hears_nothing()

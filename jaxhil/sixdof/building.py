@@ -20,7 +20,8 @@ from jaxhil.sixdof.building_contacts import build_groups, build_latches
 from jaxhil.sixdof.drawn_values import DrawnValues
 from jaxhil.sixdof.forces import ContactGroup
 from jaxhil.sixdof.kinematics import Kinematics, TaskSpace, TwoRobots
-from jaxhil.sixdof.loop import Loop, build_loop
+from jaxhil.sixdof.loop import build_loop
+from jaxhil.sixdof.loop_state import Loop
 from jaxhil.sixdof.relative import Pair, Pose, States, Twist
 from jaxhil.sixdof.rotations import Quaternion, exponential
 from jaxhil.sixdof.scenario import Scenario

@@ -9,7 +9,8 @@ import numpy as np
 
 from jaxhil.laws.six_axis_base import SixAxisConstants
 from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, supported_options
-from jaxhil.sixdof.loop import Loop, run
+from jaxhil.sixdof.loop import run
+from jaxhil.sixdof.loop_state import Loop
 from jaxhil.sixdof.metrics import Metrics, evaluate
 from jaxhil.sixdof.numerical_model import controller_constants
 from jaxhil.sixdof.scenario import Scenario

@@ -15,7 +15,7 @@ from jaxhil.lanes import select_lanes
 from jaxhil.simulation.contact_tracking import COMMAND_DECAY_RATIO, MAX_DECAY_WAIT
 from jaxhil.sixdof.forces import deepest
 from jaxhil.sixdof.ideal_contact import IdealContactRecord, is_in_gap
-from jaxhil.sixdof.loop import RigConstants, Tick
+from jaxhil.sixdof.loop_state import RigConstants, Tick
 from jaxhil.sixdof.peaks import Peak, update_peak, zero_peak
 from jaxhil.sixdof.relative import States, relative
 from jaxhil.sixdof.sensor import Sensor

@@ -8,149 +8,39 @@ The contact wrench is computed at the hardware's pose, in the axes of target fra
 acts on the numerical model at the origin of the model's frame T.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Float
 
 from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS
 from jaxhil.laws.simulation_base import Gains
-from jaxhil.laws.six_axis_base import SixAxisConstants, SixAxisSignals
-from jaxhil.simulation.sensors import apply_lag, quantise, white_noise
-from jaxhil.sixdof.axes import (
-    Axes,
-    AxisMotion,
-    Hardware,
-    actuate,
-    build_axes,
-    read_samples,
-    start_uniform_motion,
-    static_lags,
-)
+from jaxhil.laws.six_axis_base import SixAxisSignals
+from jaxhil.sixdof.axes import actuate, build_axes, start_uniform_motion, static_lags
 from jaxhil.sixdof.bodies import SHARES
-from jaxhil.sixdof.forces import ContactGroup, Forces, Memory, contact_wrench
-from jaxhil.sixdof.kinematics import Kinematics, RigidMotion, to_rigid_motion
-from jaxhil.sixdof.latch import Latch, LatchState, init_latch, latch_wrench
+from jaxhil.sixdof.latch import init_latch
+from jaxhil.sixdof.loop_state import (
+    SETTLING_TICKS,
+    Loop,
+    NumericalController,
+    RigConstants,
+    RunState,
+    Sensed,
+    Tick,
+)
 from jaxhil.sixdof.numerical_model import controller_constants, model_motion
 from jaxhil.sixdof.relative import (
-    Pair,
-    Pose,
     States,
-    Twist,
     Wrench,
     advance,
     relative,
 )
-from jaxhil.sixdof.rotations import exponential
 from jaxhil.sixdof.scenario import Scenario
-from jaxhil.sixdof.sensor import (
-    Sensor,
-    read_fixed,
-    read_moving,
-    sample,
-    tool_load,
-    undo_fixed,
-    undo_moving,
-    weight,
-)
+from jaxhil.sixdof.sensing import sense
 from jaxhil.sixdof.vectors import vector
-
-SIDES = ("fixed", "moving")  # sides of the rig on which the force sensor may be
-# Minimum number of ticks for settling before a run, if axis positions are not linear functions of the
-# coordinates; a power of two.
-SETTLING_TICKS = 256
-
-
-class Loop(eqx.Module):
-    """Structure of the loop: static fields, for each combination of which a program is compiled."""
-
-    integrator: str = eqx.field(static=True)  # integrator of the numerical model, a name of `SHARES`
-    hold: str = eqx.field(static=True)  # hold of the command within a period, "linear" or "zoh"
-    latency: int = eqx.field(static=True)  # latency of the command [control periods], 0 or 1
-    # length of the delay line [control periods], a power of two above the longest delay
-    ring: int = eqx.field(static=True)
-    side: str = eqx.field(static=True, default="fixed")  # side of the force sensor, one of `SIDES`
-    has_noise: bool = eqx.field(static=True, default=False)  # whether the force sensor has noise
-    has_lag: bool = eqx.field(static=True, default=True)  # whether the force sensor has a lag
-    # whether the force sensor has a quantum, a dead zone or a range
-    has_sample_effects: bool = eqx.field(static=True, default=True)
-    has_pose_errors: bool = eqx.field(static=True, default=False)  # whether the pose has noise or a quantum
-    # whether the pose is measured even if neither the sensor's tool nor the compensator needs it
-    measures_pose: bool = eqx.field(static=True, default=False)
-    # length of the compensator's own delay line [control periods], a power of two
-    controller_ring: int = eqx.field(static=True, default=1)
-    # name of the compensator, one of `SIX_AXIS_COMPENSATORS`
-    compensator: str = eqx.field(static=True, default="none")
-    episodes: int = eqx.field(static=True, default=1)  # number of evaluated episodes
-    # whether a run continues after its last evaluated episode until the end of its duration
-    whole: bool = eqx.field(static=True, default=False)
-
-
-class RigConstants(NamedTuple):
-    """Constants of a batch of runs: bodies, hardware, sensors and compensator."""
-
-    bodies: Pair  # bodies of the numerical model
-    axes: Axes  # axes of the motion simulator, with the sensors' delays
-    kinematics: Kinematics
-    groups: tuple[ContactGroup, ...]  # groups of shape pairs that may touch
-    latches: tuple[Latch, ...]
-    sensor: Sensor
-    period: Float[Array, "*batch"]  # control period T [s]
-    key: UInt32[Array, "2 *batch"]  # key of the sensors' noise
-    gains: Gains  # gains of the compensator, (*batch)
-    constants: SixAxisConstants  # constants of the rig that the compensator knows
-    prepared: Any  # constants that the compensator's `prepare` computes
-
-
-class NumericalController(NamedTuple):
-    """States of the force sensor's lag and of the compensator."""
-
-    # last input and last output of the lag; None without a lag
-    lag: tuple[Wrench, Wrench] | None
-    law: Any  # state of the compensator
-
-
-class RunState(NamedTuple):
-    """State of a batch of runs between two ticks."""
-
-    states: States  # states of the numerical model's bodies
-    near: Float[Array, "6 *batch"]  # coordinates of the numerical model's pose
-    twist: Float[Array, "6 *batch"]  # twist of the numerical model
-    hardware: Hardware
-    memories: tuple[Memory, ...]  # states of the contact and friction laws
-    latch_states: tuple[LatchState, ...]  # states of the latches
-    controller: NumericalController
-    tick: Int[Array, ""]  # index of the next tick
-
-
-class Tick(NamedTuple):
-    """Record of one tick: numerical model, hardware, and wrenches."""
-
-    states: States  # states of the numerical model's bodies at the tick
-    pose: Pose  # pose of the hardware at the force sensor's sampling instant
-    twist: Twist  # twist of the hardware at the force sensor's sampling instant
-    contact: Wrench  # wrench of contacts and latches at the sampling instant
-    forces: tuple[Forces, ...]  # contact forces of each group at the sampling instant
-    latch_states: tuple[LatchState, ...]  # states of the latches
-    signals: SixAxisSignals  # inputs of the compensator
-    command: Wrench  # wrench command, which acts on the numerical model
-    sent: Float[Array, "6 *batch"]  # pose command after the tick [m, rad]
-
-
-class Sensed(NamedTuple):
-    """Real contact and sensor readings of a tick."""
-
-    motion: RigidMotion  # motion of the hardware at the force sensor's sampling instant
-    contact: Wrench  # wrench of contacts and latches at the sampling instant
-    forces: tuple[Forces, ...]  # contact forces of each group at the sampling instant
-    memories: tuple[Memory, ...]  # next states of the contact laws
-    latch_states: tuple[LatchState, ...]  # next states of the latches
-    lag: tuple[Wrench, Wrench] | None  # next state of the force sensor's lag
-    signals: SixAxisSignals  # inputs of the compensator
 
 
 def build_loop(scenario: Scenario, **static: Any) -> Loop:
@@ -206,10 +96,13 @@ def build_rig_constants(loop: Loop, gains: Gains, scenario: Scenario) -> RigCons
     )
 
 
-def begin(loop: Loop, rig: RigConstants, states: States) -> RunState:
+def begin(
+    loop: Loop, rig: RigConstants, states: States, command: Float[Array, "6 *batch"] | None = None
+) -> RunState:
     """Return the state of the loop before tick 0, from the states of the bodies at tick 0.
 
-    Before tick 0, the pose command is assumed to move uniformly with the bodies' relative rates.
+    Before tick 0, the pose command is assumed to move uniformly with the bodies' relative rates. `command` is
+    the pose command of tick 0; None: that of the compensator.
     """
     law = SIX_AXIS_COMPENSATORS[loop.compensator]
     position, rates, twist = model_motion(rig.bodies, states)
@@ -217,13 +110,13 @@ def begin(loop: Loop, rig: RigConstants, states: States) -> RunState:
     # A multiple of the delay line's length, because `start_uniform_motion` fills the line for a start at tick
     # 0.
     history = 0 if rig.kinematics.is_linear else max(SETTLING_TICKS, loop.ring)
-    sent = law.pose_command(rig.gains, position, rates)
-    legs, leg_rates = jax.jvp(rig.kinematics.command, (sent - history * stride,), (stride,))
+    command = law.pose_command(rig.gains, position, rates) if command is None else command
+    legs, leg_rates = jax.jvp(rig.kinematics.command, (command - history * stride,), (stride,))
     hardware = start_uniform_motion(rig.axes, legs, leg_rates, rig.period, loop.hold, loop.latency, loop.ring)
 
     def before(hardware, tick):
-        command = rig.kinematics.command(sent + (tick + 1).astype(position.dtype) * stride)
-        return actuate(rig.axes, hardware, tick, command, loop.hold, loop.latency), None
+        legs = rig.kinematics.command(command + (tick + 1).astype(position.dtype) * stride)
+        return actuate(rig.axes, hardware, tick, legs, loop.hold, loop.latency), None
 
     hardware, _ = lax.scan(before, hardware, jnp.arange(-history, 0, dtype=jnp.int32))
     zero = vector(jnp.zeros_like(position[:3]))
@@ -268,7 +161,52 @@ def tick(loop: Loop, rig: RigConstants, state: RunState) -> tuple[RunState, Tick
     command = jax.tree.unflatten(jax.tree.structure(sensed.contact), commands)
     states, position, rates, twist = integrate(loop, rig, state, command)
     sent = law.pose_command(rig.gains, position, rates)
-    after = actuated(loop, rig, state, sensed, (states, position, twist), sent)
+    after, seen = complete_tick(loop, rig, state, sensed, command, (states, position, twist), sent)
+    return after._replace(controller=after.controller._replace(law=law_state)), seen
+
+
+def integrate(
+    loop: Loop, rig: RigConstants, state: RunState, command: Wrench
+) -> tuple[States, Array, Array, Array]:
+    """Return the numerical model's next states, and its next coordinates, rates and twist (6, *batch)."""
+    states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
+    return states, *model_motion(rig.bodies, states)
+
+
+def complete_tick(
+    loop: Loop,
+    rig: RigConstants,
+    state: RunState,
+    sensed: Sensed,
+    command: Wrench,
+    model: tuple[States, Array, Array],
+    sent: Float[Array, "6 *batch"],
+) -> tuple[RunState, Tick]:
+    """Move the hardware; return the next state, with the compensator's old state, and the tick's record.
+
+    Args:
+        loop: structure of the loop.
+        rig: constants of the run.
+        state: state before the tick.
+        sensed: real contact and readings of the tick.
+        command: wrench command of the tick, which has moved the numerical model.
+        model: next states, coordinates and twist of the numerical model.
+        sent: pose command [m, rad].
+    """
+    states, position, twist = model
+    hardware = actuate(
+        rig.axes, state.hardware, state.tick, rig.kinematics.command(sent), loop.hold, loop.latency
+    )
+    after = RunState(
+        states=states,
+        near=position,
+        twist=twist,
+        hardware=hardware,
+        memories=sensed.memories,
+        latch_states=sensed.latch_states,
+        controller=state.controller._replace(lag=sensed.lag),
+        tick=state.tick + 1,
+    )
     seen = Tick(
         states=state.states,
         pose=sensed.motion.pose,
@@ -280,135 +218,4 @@ def tick(loop: Loop, rig: RigConstants, state: RunState) -> tuple[RunState, Tick
         command=command,
         sent=sent,
     )
-    controller = NumericalController(sensed.lag, law_state)
-    return after._replace(controller=controller), seen
-
-
-def sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
-    """Return the real contact at a tick, and the readings of force sensor and position sensor."""
-    samples = read_samples(rig.axes, state.hardware, state.tick)
-    motion = to_rigid_motion(rig.kinematics.coordinates(samples.motion, state.near))
-    pose, twist, _ = motion
-    contact, forces, memories = contact_wrench(rig.groups, state.memories, pose, twist, rig.period)
-    latched = []
-    for latch, before in zip(rig.latches, state.latch_states, strict=True):
-        latch_force, latch_state = latch_wrench(latch, before, pose, twist)
-        contact = jax.tree.map(jnp.add, contact, latch_force)
-        latched.append(latch_state)
-    measured = None if samples.measured is None else _measured_pose(loop, rig, state, samples.measured)
-    wrench, lag = _measured_wrench(loop, rig, state, contact, motion, measured)
-    signals = SixAxisSignals(
-        wrench=tuple(jax.tree.leaves(wrench)),
-        pose_desired=state.near,
-        twist_desired=state.twist,
-        pose_measured=measured,
-        age=jnp.broadcast_to(state.tick, rig.period.shape),
-    )
-    return Sensed(motion, contact, forces, memories, tuple(latched), lag, signals)
-
-
-def integrate(
-    loop: Loop, rig: RigConstants, state: RunState, command: Wrench
-) -> tuple[States, Array, Array, Array]:
-    """Return the numerical model's next states, and its next coordinates, rates and twist (6, *batch)."""
-    states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
-    return states, *model_motion(rig.bodies, states)
-
-
-def actuated(
-    loop: Loop,
-    rig: RigConstants,
-    state: RunState,
-    sensed: Sensed,
-    model: tuple[States, Array, Array],
-    sent: Float[Array, "6 *batch"],
-) -> RunState:
-    """Return the state after a tick; only the compensator's state is still the old one.
-
-    Args:
-        loop: structure of the loop.
-        rig: constants of the run.
-        state: state before the tick.
-        sensed: real contact and readings of the tick.
-        model: next states, coordinates and twist of the numerical model.
-        sent: pose command [m, rad].
-    """
-    states, position, twist = model
-    hardware = actuate(
-        rig.axes, state.hardware, state.tick, rig.kinematics.command(sent), loop.hold, loop.latency
-    )
-    return RunState(
-        states=states,
-        near=position,
-        twist=twist,
-        hardware=hardware,
-        memories=sensed.memories,
-        latch_states=sensed.latch_states,
-        controller=state.controller._replace(lag=sensed.lag),
-        tick=state.tick + 1,
-    )
-
-
-def _measured_pose(loop: Loop, rig: RigConstants, state: RunState, measured: Array) -> Array:
-    """Convert the measured axis positions to measured coordinates, including noise and rounding."""
-    still = AxisMotion(measured, jnp.zeros_like(measured), None)
-    position = rig.kinematics.coordinates(still, state.near).position
-    if not loop.has_pose_errors:
-        return position
-    noisy = position + rig.sensor.position_noise_std * _noise(rig, state.tick, 1)
-    return quantise(noisy, rig.sensor.position_quantum)
-
-
-def _measured_wrench(
-    loop: Loop,
-    rig: RigConstants,
-    state: RunState,
-    contact: Wrench,
-    motion: RigidMotion,
-    measured: Array | None,
-) -> tuple[Wrench, tuple[Wrench, Wrench] | None]:
-    """Return the measured wrench about T's origin, and the next state of the sensor's lag."""
-    sensor, last = rig.sensor, state.controller
-    if motion.acceleration is None:
-        raw = read_fixed(contact, sensor.mounting)
-    else:
-        load = tool_load(sensor.tool, motion.pose, motion.twist, motion.acceleration, sensor.gravity)
-        raw = read_moving(contact, load, motion.pose)
-    lagged = raw if last.lag is None else _lagged_reading(rig, state.tick, raw, *last.lag)
-    noise = sensor.noise_std * _noise(rig, state.tick, 0) if loop.has_noise else None
-    reading = sample(lagged, sensor.errors, noise, loop.has_sample_effects)
-    unbiased: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
-    if motion.acceleration is None:
-        wrench = undo_fixed(unbiased, sensor.mounting)
-    else:
-        assert measured is not None
-        pose = Pose(vector(measured[:3]), exponential(vector(measured[3:])))
-        load = weight(sensor.assumed_tool, pose.attitude, sensor.assumed_gravity)
-        wrench = undo_moving(unbiased, load, pose)
-    return wrench, None if last.lag is None else (raw, lagged)
-
-
-def _lagged_reading(rig: RigConstants, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:
-    """Return the output of the force sensor's lag; its input is interpolated linearly between ticks."""
-    first, zero = now == 0, jnp.zeros_like(rig.period)
-
-    def lagged_channel(now: Array, before: Array, lagged: Array) -> Array:
-        before, lagged = jnp.where(first, now, before), jnp.where(first, now, lagged)
-        middle = (before + now) / 2
-        return apply_lag(lagged, zero, rig.period, zero, [before, middle, now], rig.sensor.time_constant)
-
-    reading: Wrench = jax.tree.map(lagged_channel, raw, last, lagged)
-    return reading
-
-
-def _wrench(channels: Array) -> Wrench:
-    """Convert six channels (6, *batch) to a wrench."""
-    return Wrench(vector(channels[:3]), vector(channels[3:]))
-
-
-def _noise(rig: RigConstants, now: Array, sensor: int) -> Array:
-    """Return standard normal noise for the six channels of a sensor: 0 for the force, 1 for the pose."""
-    channel = jnp.arange(6, dtype=jnp.int32).reshape(6, *[1] * rig.period.ndim)
-    count = jnp.broadcast_to(6 * now + channel, (6, *rig.period.shape))
-    stream = jnp.full(rig.period.shape, sensor, jnp.int32)
-    return white_noise(rig.key, stream, count, rig.period.dtype)
+    return after, seen

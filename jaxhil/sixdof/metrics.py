@@ -23,7 +23,7 @@ from jaxhil.sixdof.ideal_contact_integration import (
     integrate_until,
     start_integration,
 )
-from jaxhil.sixdof.loop import Loop
+from jaxhil.sixdof.loop_state import Loop
 from jaxhil.sixdof.relative import Pair, Pose, States, Twist, mass_matrix, relative
 from jaxhil.sixdof.rollout import CAPTURED, MISS, EpisodeBatch, rollout
 from jaxhil.sixdof.scenario import Scenario

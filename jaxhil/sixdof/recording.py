@@ -15,7 +15,8 @@ from jaxhil.sixdof.building import build_scenarios, make_loop
 from jaxhil.sixdof.building_contacts import candidate_names
 from jaxhil.sixdof.forces import ContactGroup, Forces
 from jaxhil.sixdof.ideal_contact_integration import IdealContactModel, sample_ideal_contact
-from jaxhil.sixdof.loop import Loop, run
+from jaxhil.sixdof.loop import run
+from jaxhil.sixdof.loop_state import Loop
 from jaxhil.sixdof.relative import Pair, States, coordinates, relative
 from jaxhil.sixdof.rollout import rollout
 from jaxhil.sixdof.scenario import Scenario

@@ -34,7 +34,8 @@ from jaxhil.sixdof.ideal_contact import (
     summary_at,
 )
 from jaxhil.sixdof.ideal_contact_integration import IdealContactModel
-from jaxhil.sixdof.loop import Loop, RigConstants, RunState, begin, build_rig_constants, tick
+from jaxhil.sixdof.loop import begin, build_rig_constants, tick
+from jaxhil.sixdof.loop_state import Loop, RigConstants, RunState, Tick
 from jaxhil.sixdof.relative import States
 from jaxhil.sixdof.scenario import Scenario
 
@@ -90,13 +91,13 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> RolloutResult:
     segment_ticks = SEGMENT_TICKS if loop.episodes == 1 else 1
 
     def one_tick(progress: EpisodeProgress, _) -> tuple[EpisodeProgress, None]:
-        return _tick(loop, rig, last, progress), None
+        return follow_tick(rig, last, progress, *tick(loop, rig, progress.run)), None
 
     def body(progress: EpisodeProgress) -> EpisodeProgress:
         after, _ = lax.scan(one_tick, progress, None, segment_ticks)
-        return _finish_episodes(loop, rig, last, after)
+        return turn_over(loop, rig, last, after)
 
-    start = start_rollout(loop, rig, scenario)
+    start = start_scenario(loop, rig, scenario)
     ended = lax.while_loop(lambda progress: jnp.any(progress.active), body, start)
     time = ended.elapsed.astype(rig.period.dtype) * rig.period
     return RolloutResult(ended.episodes, ended.run.states, time)
@@ -112,11 +113,22 @@ def compute_ideal_contact(scenario: Scenario) -> IdealContactRecord:
     )
 
 
-def start_rollout(loop: Loop, rig: RigConstants, scenario: Scenario) -> EpisodeProgress:
+def start_scenario(loop: Loop, rig: RigConstants, scenario: Scenario) -> EpisodeProgress:
     """Return the state of the rollout at the start of the runs; compute missing ideal contacts."""
-    states, reference = scenario.start, scenario.ideal_contact
+    reference = scenario.ideal_contact
     if reference is None:
         reference = compute_ideal_contact(scenario)
+    return start_rollout(loop, rig, begin(loop, rig, scenario.start), reference)
+
+
+def start_rollout(
+    loop: Loop, rig: RigConstants, run: RunState, reference: IdealContactRecord
+) -> EpisodeProgress:
+    """Return the state of the rollout at the start of the runs, from the state of the loop before tick 0.
+
+    `reference` is the ideal contact from the same start.
+    """
+    states = run.states
     none = jnp.zeros(rig.period.shape, jnp.int32)
     episode_start = EpisodeStart(states, none, relative_energy(rig, states), reference)
     tracker = start_tracking(rig, states, none)
@@ -126,7 +138,7 @@ def start_rollout(loop: Loop, rig: RigConstants, scenario: Scenario) -> EpisodeP
         episode._replace(status=none + MISS),
     )
     return EpisodeProgress(
-        run=begin(loop, rig, states),
+        run=run,
         episode_start=episode_start,
         tracker=tracker,
         episodes=episodes,
@@ -136,10 +148,21 @@ def start_rollout(loop: Loop, rig: RigConstants, scenario: Scenario) -> EpisodeP
     )
 
 
-def _tick(loop: Loop, rig: RigConstants, last: Array, progress: EpisodeProgress) -> EpisodeProgress:
-    """Simulate one tick. In lanes whose run has ended, the states of the bodies do not change."""
+def follow_tick(
+    rig: RigConstants, last: Array, progress: EpisodeProgress, after: RunState, seen: Tick
+) -> EpisodeProgress:
+    """Update the state of the rollout with a tick.
+
+    In lanes whose run has ended, the states of the bodies do not change.
+
+    Args:
+        rig: constants of the runs.
+        last: largest number of ticks of each run, (*batch).
+        progress: state of the rollout before the tick.
+        after: state of the loop after the tick.
+        seen: record of the tick.
+    """
     run, tracker = progress.run, progress.tracker
-    after, seen = tick(loop, rig, run)
     runs = progress.active & (progress.elapsed < last) & ~tracker.is_out_of_reach
     elapsed = progress.elapsed + runs.astype(jnp.int32)
     watched = track_tick(rig, progress.episode_start, tracker, seen, after.states, elapsed)
@@ -184,9 +207,7 @@ def _episode(
     )
 
 
-def _finish_episodes(
-    loop: Loop, rig: RigConstants, last: Array, progress: EpisodeProgress
-) -> EpisodeProgress:
+def turn_over(loop: Loop, rig: RigConstants, last: Array, progress: EpisodeProgress) -> EpisodeProgress:
     """Store the results of finished episodes, and begin the next episodes."""
     tracker, run, episode_start, age = (
         progress.tracker,

@@ -19,7 +19,7 @@ from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, jax_context, supported_options
 from jaxhil.simulation.run import check_seed
 from jaxhil.sixdof.building import build_scenarios, make_loop
-from jaxhil.sixdof.loop import Loop
+from jaxhil.sixdof.loop_state import Loop
 from jaxhil.sixdof.mechanism_summary import SixAxisSummary, summarise_six_axes
 from jaxhil.sixdof.metrics import Metrics, compute_ideal_states, evaluate
 from jaxhil.sixdof.plausibility import check_scenario
@@ -187,11 +187,7 @@ def _result(
     """Build the `SixAxisRun` from the arrays that the compiled simulation returns (`outcome`)."""
     metrics, time, final, tangential = outcome
     check_integrated(mechanism, metrics)
-    episodes = tuple(
-        _episode(metrics, slot)
-        for slot in range(metrics.status.shape[0])
-        if slot == 0 or STATUS_NAMES[int(metrics.status[slot, 0])] != "miss"
-    )
+    episodes = episodes_of(metrics)
     bad = [episode.status for episode in episodes if episode.status not in GOOD_STATUSES]
     first = episodes[0]
     duration = math.nan if metrics.reference_captured[0, 0] else first.reference_duration
@@ -214,6 +210,15 @@ def _result(
         status=status,
         final=_final(float(time[0]), final),
         summary=summary,
+    )
+
+
+def episodes_of(metrics: Metrics) -> tuple[Episode, ...]:
+    """Return the episodes of a run with one lane, without misses after the first episode."""
+    return tuple(
+        _episode(metrics, slot)
+        for slot in range(metrics.status.shape[0])
+        if slot == 0 or STATUS_NAMES[int(metrics.status[slot, 0])] != "miss"
     )
 
 

@@ -21,7 +21,8 @@ from jaxhil.simulation.contact_bounds import is_contact_out_of_bounds
 from jaxhil.simulation.evaluation import RigModel, count_lanes, map_tiles, unfold_tiles
 from jaxhil.simulation.outcome import Outcome
 from jaxhil.sixdof import building
-from jaxhil.sixdof.loop import Loop, build_rig_constants
+from jaxhil.sixdof.loop import build_rig_constants
+from jaxhil.sixdof.loop_state import Loop
 from jaxhil.sixdof.metrics import Metrics, evaluate
 from jaxhil.sixdof.rollout import (
     CAPTURED,
@@ -32,7 +33,7 @@ from jaxhil.sixdof.rollout import (
     TIMEOUT,
     EpisodeProgress,
     compute_ideal_contact,
-    start_rollout,
+    start_scenario,
 )
 from jaxhil.sixdof.scenario import Scenario
 
@@ -98,7 +99,7 @@ class SixAxes(RigModel):
 
     def initial_state(self, loop: Loop, gains: Gains, scenario: Scenario) -> EpisodeProgress:
         """Return the state of the loop over ticks at the start of a batch of scenarios."""
-        return start_rollout(loop, build_rig_constants(loop, gains, scenario), scenario)
+        return start_scenario(loop, build_rig_constants(loop, gains, scenario), scenario)
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
         """Return the scenarios with a duration of 0 in the `idle` lanes."""

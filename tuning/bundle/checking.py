@@ -64,7 +64,7 @@ def check_bundle(folder: Path, signed_by: SignatureCheck | None = None) -> Bundl
     return checked._replace(document={} if reasons else document, reasons=reasons)
 
 
-def find_code_differences(folder: Path, compensator: str) -> list[str]:
+def find_code_differences(folder: Path, compensator: str, axes: int = 1) -> list[str]:
     """Compare the Python code in a bundle with the code that this version exports for the compensator.
 
     Return descriptions of the differences; the list is empty without differences. This does not import JAX.
@@ -73,7 +73,7 @@ def find_code_differences(folder: Path, compensator: str) -> list[str]:
     # Python's cache is not a reason, because the code is not run from this folder.
     reasons = [reason for reason in checked.reasons if selftest.PYTHON_CACHE not in reason]
     code = {name: content for name, content in checked.files.items() if name.endswith(".py")}
-    return reasons or _find_export_differences(checked.files, code, lambda: code_files(compensator))
+    return reasons or _find_export_differences(checked.files, code, lambda: code_files(compensator, axes))
 
 
 def run_selftest(checked: BundleCheck, name: str) -> tuple[list[str], list[str]]:

@@ -11,19 +11,19 @@ from typing import Any
 
 from jaxhil.errors import InputError
 from tuning.bundle import selftest
-from tuning.bundle.controller_kind import ONE_AXIS, kind_of
+from tuning.bundle.controller_kind import kind_of
 from tuning.bundle.manifest import manifest_text
 
 TUNING_FOLDER = Path(__file__).parents[1]
 # Files that are copied unchanged into a bundle.
 SELFTEST = "bundle/selftest.py"
-UDP_FILES = ("rig/udp_controller.py", "rig/udp_protocol.py")  # only in bundles of one axis
+UDP_FILES = ("rig/udp_controller.py", "rig/udp_protocol.py", "rig/udp_task.py")
 
 
 def code_files(compensator: str, axes: int = 1) -> dict[str, bytes]:
     """Return the Python files that every bundle of a compensator contains.
 
-    These are the runtime, the self-test and, for one axis, the UDP controller.
+    These are the runtime, the self-test, and the program that runs the controller as a process.
 
     Args:
         compensator: name of the compensator.
@@ -39,7 +39,7 @@ def code_files(compensator: str, axes: int = 1) -> dict[str, bytes]:
     from tuning.bundle.single_file import build_runtime_source
 
     kind = kind_of({"axes": axes})
-    names = (SELFTEST, *UDP_FILES) if kind is ONE_AXIS else (SELFTEST,)
+    names = (SELFTEST, *UDP_FILES, kind.numerical_model)
     copied = {Path(name).name: (TUNING_FOLDER / name).read_bytes() for name in names}
     runtime = build_runtime_source(compensator, kind.package, kind.table)
     return {"jaxhil_runtime.py": runtime.encode(), **copied}

@@ -1,6 +1,6 @@
 """Descriptions of the rig's one-axis and six-axis controllers, which exports use."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from jaxhil.rig.six_axes.gain_file import check_six_axis_document
 from jaxhil.rig.six_axes.inputs import WrenchTare
 from jaxhil.rig.six_axes.limits import SIX_AXIS_LIMITS, SIX_AXIS_ORDER, SIX_AXIS_RANGES
 from jaxhil.rig.six_axes.registry import SIX_AXIS_COMPENSATORS, ModelConstants, SixAxisCompensator
+from jaxhil.rig.six_axes.vectors import COORDINATES
 
 
 class ControllerKind(NamedTuple):
@@ -38,6 +39,8 @@ class ControllerKind(NamedTuple):
     methods: Mapping[str, str]  # name in C of each method or property of the controller, in C's order
     c_names: Mapping[type, str]  # name in C of each class whose name differs in Python
     test_program: str  # file of the part of the C test program that depends on the number of axes
+    stroke: tuple[Sequence[str], Sequence[str]]  # names of the limits of position commands: lowest, highest
+    numerical_model: str  # file with the numerical model of the docking, in the folder of `tuning`
 
 
 COMMON_METHODS = ("emergency_stop", "reset", "next_contact", "tripped", "at_rest", "bias")
@@ -62,6 +65,8 @@ ONE_AXIS = ControllerKind(
     },
     c_names={Tare: "bias_tare"},
     test_program="test_vectors_one_axis.c",
+    stroke=(("command_lowest",), ("command_highest",)),
+    numerical_model="rig/numerical_model.py",
 )
 SIX_AXES = ControllerKind(
     axes=6,
@@ -87,6 +92,11 @@ SIX_AXES = ControllerKind(
     },
     c_names={Controller6: "controller", ModelConstants: "constants", WrenchTare: "bias_tare"},
     test_program="test_vectors_six_axes.c",
+    stroke=(
+        [f"command_lowest_{axis}" for axis in COORDINATES],
+        [f"command_highest_{axis}" for axis in COORDINATES],
+    ),
+    numerical_model="rig/numerical_model_six_axes.py",
 )
 
 

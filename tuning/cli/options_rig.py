@@ -6,7 +6,7 @@ from typing import Annotated
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from tuning.api.export import ExportOptions
-from tuning.api.options import Json, Limit, Timings, folder_option, number_option, text_option
+from tuning.api.options import Json, OptionalLimit, Timings, folder_option, number_option, text_option
 from tuning.api.verify import VerifyOptions
 
 DEFAULT_RIG_PLOT = "jaxhil-out/rig.png"
@@ -75,8 +75,8 @@ class RigOptions:
     Example: jaxhil rig jaxhil-out/varying/gains.json --duration 600 --plot
 
     First, an empty loop, which only exchanges packets, runs for comparison. The exit code is 1 if the
-    controller causes a missed tick, a restitution error exceeds the limit, or the controller trips although
-    no faults are injected.
+    controller causes a missed tick, a restitution error (six axes: twist error) exceeds the limit, or the
+    controller trips although no faults are injected.
     """
 
     path: Annotated[
@@ -109,6 +109,6 @@ class RigOptions:
             help=f"Write a plot of latencies (.png, .pdf or .svg); without a name to {DEFAULT_RIG_PLOT}.",
         ),
     ] = None
-    limit: Limit = 0.01
+    limit: OptionalLimit = None
     json: Json = False
     timings: Timings = False

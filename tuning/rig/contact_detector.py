@@ -30,6 +30,10 @@ class RigContact(NamedTuple):
     # largest age of a position command during the contact [periods], set by `RigTask`
     oldest_command: int = 0
 
+    def as_tripped(self) -> "RigContact":
+        """Return the contact of a controller that has tripped; its restitution says nothing."""
+        return self._replace(status="tripped", restitution=math.nan)
+
 
 class ContactDetector:
     """Detector of the contacts of one run; a mechanism with two surfaces has several contacts in a run."""

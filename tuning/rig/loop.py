@@ -17,6 +17,7 @@ from typing import Protocol
 from tuning.rig.network import Network
 from tuning.rig.udp_protocol import (
     EMPTY_LOOP,
+    FORMATS,
     TICK,
     AnswerPacket,
     PacketError,
@@ -29,6 +30,7 @@ ANSWER_SHARE = 0.8  # longest time until an answer [periods]; the rig needs the 
 MAX_CATCH_UP_PERIODS = 10  # largest delay of the rig [periods] after which it still executes the due ticks
 BUSY_WAIT_TIME = 100_000  # time before a tick [ns] in which the loop polls the clock; a sleep may be too long
 START_DELAY = 50_000_000  # time from the start of the loop to the first tick [ns]
+MAX_SILENCE = 2.0  # time without an answer after which the loop ends: the controller has ended or hangs [s]
 TIME_AFTER_TRIP = 1.0  # time for which the rig continues after the controller has tripped [s]
 
 
@@ -47,23 +49,13 @@ class EmptyTask:
 
     tripped = ""
 
-    def __init__(self) -> None:
-        self._sequence = -1
+    def __init__(self, axes: int = 1) -> None:
+        self._axes, self._sequence = axes, -1
 
     def reading(self) -> ReadingPacket:
         """Return a packet with sensor readings of zero."""
         self._sequence += 1
-        return ReadingPacket(
-            event=TICK,
-            sequence=self._sequence,
-            run=0,
-            tick=self._sequence & 0xFFFF,
-            time=0.0,
-            force=0.0,
-            position=0.0,
-            start_position=0.0,
-            start_velocity=0.0,
-        )
+        return build_empty_reading(self._axes, TICK, self._sequence)
 
     def take(self, answer: AnswerPacket) -> bool:
         """Return whether the answer belongs to the newest packet."""
@@ -71,6 +63,12 @@ class EmptyTask:
 
     def advance(self) -> None:
         """Do nothing, since there is no hardware to move."""
+
+
+def build_empty_reading(axes: int, event: int, sequence: int) -> ReadingPacket:
+    """Return a packet with sensor readings of zero for a number of axes."""
+    zero, start = (0.0,) * axes, (0.0,) * FORMATS[axes].start
+    return ReadingPacket(event, sequence, 0, sequence & 0xFFFF, 0.0, zero, zero, start)
 
 
 class PacketTimes:
@@ -81,13 +79,14 @@ class PacketTimes:
         round_trip: time from each packet to its answer [ns], 0 without an answer, (ticks,).
         answered_in_time: 1 if the packet and its answer were in time, else 0, (ticks,).
         ticks: number of executed ticks.
+        newest_answer: number of the latest packet that was answered, -1 without any answer.
         clock_shift: total time by which the rig's clock was shifted [ns].
     """
 
     def __init__(self, ticks: int) -> None:
         self.late, self.round_trip = (array("q", bytes(8 * ticks)) for _ in range(2))
         self.answered_in_time = array("b", bytes(ticks))
-        self.ticks, self.clock_shift = 0, 0
+        self.ticks, self.clock_shift, self.newest_answer = 0, 0, -1
 
 
 def run_loop(
@@ -100,7 +99,8 @@ def run_loop(
 ) -> None:
     """Execute ticks in real time until `timing` is full, or until 1 s after the controller has tripped.
 
-    After an interruption, `timing` holds the ticks executed so far.
+    The loop also ends if the controller's process sends no answer for `MAX_SILENCE`. After an interruption,
+    `timing` holds the ticks executed so far.
 
     Args:
         task: work of the rig in each tick.
@@ -135,6 +135,8 @@ def run_loop(
             timing.ticks = number + 1
             if number % second == 0:
                 tell(number)
+            if number - timing.newest_answer > MAX_SILENCE / period:
+                break
             if task.tripped and last == total:
                 last = number + round(TIME_AFTER_TRIP / period)
             if number >= last:
@@ -156,6 +158,7 @@ def _await_answer(
             except PacketError:
                 continue
             number = answer.sequence
+            timing.newest_answer = max(timing.newest_answer, number)
             if number < len(send_times) and send_times[number] and not timing.round_trip[number]:
                 timing.round_trip[number] = arrived - send_times[number]
             is_answered = task.take(answer) or is_answered

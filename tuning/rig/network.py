@@ -14,7 +14,7 @@ from collections.abc import Callable
 from random import Random
 from typing import NamedTuple
 
-MAX_PACKET_BYTES = 512  # size of the receive buffer, larger than any packet of `udp_protocol`
+MAX_PACKET_BYTES = 1024  # size of the receive buffer, larger than any packet of `udp_protocol`
 
 
 class Injection(NamedTuple):

@@ -7,20 +7,19 @@ periods without an answer, the command is held.
 """
 
 import math
-from random import Random
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, Protocol
 
+from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
-from tuning.rig.contact_detector import ContactDetector, RigContact
-from tuning.rig.plant import RigHardware
 from tuning.rig.udp_protocol import (
-    APPROACH_TIME,
     PREPARE,
     READY,
     RESET,
     TICK,
     TRIPPED,
     AnswerPacket,
+    Numbers,
     ReadingPacket,
 )
 
@@ -29,30 +28,63 @@ MAX_COMMAND_AGE = 3  # [periods]; if a command is older, its effects are not the
 # Reasons for a trip that an old command can cause.
 TRIPS_BY_OLD_COMMANDS = ("tripped: restitution", "tripped: missed_tick")
 PAUSE_TICKS = 5  # number of ticks between two runs
+BEGIN_TICKS = 3  # smallest number of ticks between the begin of a run, which may be slow, and its tick 0
 STALLED = "stalled"  # status of a contact in which the computer delayed the commands too long
+
+
+class SimulatedRig(Protocol):
+    """Simulated rig with one axis or six axes; vectors have one number for each axis.
+
+    Its contacts have at least the fields and the method of `RehearsedRun`, except for its state.
+    """
+
+    axes: int  # number of axes
+    error_name: str  # name of the error that decides the verdict, in the results of `evaluate`
+
+    @property
+    def good_statuses(self) -> Sequence[str]: ...  # statuses of contacts that ended as they should
+    def prepare(self, last: Any, /) -> Numbers: ...  # prepare the run after this contact; return its start
+    def begin(self, command: Numbers) -> None: ...
+    def read(self) -> tuple[Numbers, Numbers]: ...
+    def advance(self, answer: AnswerPacket | None, command: Numbers) -> Any: ...
+    def continues_after(self, contact: Any, /) -> bool: ...  # whether the same run has a further contact
+    def cut(self, status: str) -> Any: ...
+    def evaluate(self, contacts: Sequence[Any]) -> list[dict[str, Any]]: ...
+
+
+def build_simulated_rig(mechanism: AnyMechanism, seed: int = 0) -> SimulatedRig:
+    """Build the simulated rig of a mechanism; JAX is imported only for six axes.
+
+    Args:
+        mechanism: mechanism and rig to simulate.
+        seed: seed of the sensor noise and of the phases.
+    """
+    if isinstance(mechanism, Mechanism):
+        from tuning.rig.one_axis_rig import OneAxisRig
+
+        return OneAxisRig(mechanism, seed)
+    from tuning.rig.six_axis_rig import SixAxisRig
+
+    return SixAxisRig(mechanism, seed)
 
 
 class CommandRange(NamedTuple):
     """Extreme values of the commands that the controller has sent."""
 
-    lowest: float  # lowest position command [m]
-    highest: float  # highest position command [m]
+    lowest: Numbers  # lowest position command of each axis [m, rad]
+    highest: Numbers  # highest position command of each axis [m, rad]
     not_finite: int  # number of answers with NaN or infinite commands, which do not reach the drives
     beyond_limits: int  # number of position commands outside the drives' stroke, which are clipped
-    largest_force: float  # largest magnitude of the force command F_c [N]
+    largest_force: Numbers  # largest magnitude of the force command of each axis [N, N m]
 
 
 class RigTask:
-    """Endless series of runs of one mechanism, without network and clock.
-
-    If the mechanism has one surface, every run has one contact and starts at the nominal approach speed. If
-    the mechanism has two surfaces, every run has `approach.contacts` contacts. The runs cycle through the
-    lists of stiffness and damping. From the second cycle on, the phase of each run is random.
+    """Endless series of runs on a simulated rig, without network and clock.
 
     Args:
-        mechanism: mechanism and rig to simulate.
-        seed: seed of the sensor noise and of the phases.
-        stroke: lowest and highest position of the drives [m].
+        rig: simulated rig.
+        period: control period [s].
+        stroke: lowest and highest positions of the drives [m, rad]; None without limits.
         resets: whether to reset a controller that trips because of old commands. This applies if a command
             was older than `MAX_COMMAND_AGE` periods and `TRIPS_BY_OLD_COMMANDS` contains the trip's reason.
 
@@ -62,28 +94,25 @@ class RigTask:
 
     def __init__(
         self,
-        mechanism: Mechanism,
-        seed: int = 0,
-        stroke: tuple[float, float] = (-math.inf, math.inf),
+        rig: SimulatedRig,
+        period: float,
+        stroke: tuple[Numbers, Numbers] | None = None,
         resets: bool = False,
     ) -> None:
-        self._mechanism, self._period = mechanism, mechanism.rig.control_period
-        self._two_sided = math.isfinite(mechanism.contact.clearance)
-        self._plant, self._detector = RigHardware(mechanism, seed), ContactDetector(mechanism)
-        self._phases = Random(seed + 1)
+        self._rig, self._period = rig, period
+        low, high = (-math.inf,) * rig.axes, (math.inf,) * rig.axes
+        self._stroke = (low, high) if stroke is None else stroke
         self._sequence, self._run = -1, 0
-        self._contacts: list[RigContact] = []
-        self._lowest, self._highest, self._largest = math.inf, -math.inf, 0.0
+        self._contacts: list[Any] = []
+        self._lowest, self._highest, self._largest = high, low, (0.0,) * rig.axes
         self._not_finite = self._beyond = 0
-        self._stroke = stroke
         self._newest: AnswerPacket | None = None
-        self._force = 0.0
         self.tripped, self._first, self._oldest = "", 0, 0
         self._resets, self._reset_trips, self._requests_reset = resets, [], False
-        self._next_run(0)
+        self._next_run(None)
 
     @property
-    def contacts(self) -> tuple[RigContact, ...]:
+    def contacts(self) -> tuple[Any, ...]:
         """Return the contacts that have ended, in the order of time."""
         return tuple(self._contacts)
 
@@ -100,34 +129,35 @@ class RigTask:
     def reading(self) -> ReadingPacket:
         """Read the sensors; return the packet to send, with a new sequence number."""
         self._sequence += 1
-        self._force, position = self._plant.read()
+        force, position = self._rig.read()
         time = self._sequence * self._period
         event = TICK if self._tick >= 0 else RESET if self._requests_reset else PREPARE
         tick = max(self._tick, 0)
-        return ReadingPacket(
-            event, self._sequence, self._run, tick, time, self._force, position, *self._start
-        )
+        return ReadingPacket(event, self._sequence, self._run, tick, time, force, position, self._start)
 
     def take(self, answer: AnswerPacket) -> bool:
         """Accept an answer of the controller; return whether it answers the current tick's packet."""
-        if answer.run != self._run:
+        if answer.run != self._run or len(answer.position_command) != self._rig.axes:
             return False
         if answer.flags & TRIPPED:
             self.tripped = answer.trip_reason or "tripped"
+        command = answer.position_command
         if self._tick < 0:
-            if answer.flags & READY and math.isfinite(answer.position_command):
+            if answer.flags & READY and _is_finite(command):
                 self._newest = answer._replace(tick=-1)
             return answer.sequence == self._sequence
         if answer.flags & READY:
             return False
-        command, (low, high) = answer.position_command, self._stroke
-        if not all(map(math.isfinite, (command, answer.command_rate, answer.force_command))):
+        if not all(map(_is_finite, (command, answer.command_rate, answer.force_command, answer.bodies))):
             self._not_finite += 1
         elif self._newest is None or answer.tick > self._newest.tick:
             self._newest = answer
-            self._beyond += not low <= command <= high
-            self._lowest, self._highest = min(self._lowest, command), max(self._highest, command)
-            self._largest = max(self._largest, abs(answer.force_command))
+            self._beyond += self._clip(command) != command
+            self._lowest, self._highest = (
+                _combine(min, self._lowest, command),
+                _combine(max, self._highest, command),
+            )
+            self._largest = _combine(max, self._largest, map(abs, answer.force_command))
         return answer.tick == self._tick
 
     def advance(self) -> None:
@@ -144,15 +174,10 @@ class RigTask:
         self._oldest = max(self._oldest, age)
         command = newest.position_command
         if age > 0:
-            command += min(age, MAX_EXTRAPOLATED_PERIODS) * self._period * newest.command_rate
-        command = min(max(command, self._stroke[0]), self._stroke[1])
-        plant, detector = self._plant, self._detector
-        if newest.tick >= 0:
-            model = newest.position, newest.velocity, newest.force_command
-        else:
-            model = *self._start, 0.0
-        contact = detector.observe(*model, plant.force, self._force)
-        plant.move(command)
+            time = min(age, MAX_EXTRAPOLATED_PERIODS) * self._period
+            rates = newest.command_rate
+            command = tuple(value + time * rate for value, rate in zip(command, rates, strict=True))
+        contact = self._rig.advance(newest if newest.tick >= 0 else None, self._clip(command))
         self._tick += 1
         if contact is not None:
             self._finish_contact(contact)
@@ -160,9 +185,14 @@ class RigTask:
     def finish(self) -> None:
         """End the session; if the controller has tripped, store the current contact as "tripped"."""
         if self._tick >= 0 and self.tripped and all(c.status != "tripped" for c in self._contacts):
-            aborted_contact = self._detector.cut("tripped")
+            aborted_contact = self._rig.cut("tripped")
             if aborted_contact is not None:
                 self._contacts.append(aborted_contact)
+
+    def _clip(self, command: Numbers) -> Numbers:
+        """Return the position command within the drives' stroke."""
+        low, high = self._stroke
+        return _combine(min, _combine(max, command, low), high)
 
     def _largest_command_age(self) -> int:
         """Return the largest command age [periods] in the current (between runs: in the last) contact."""
@@ -174,55 +204,53 @@ class RigTask:
         """Abort this run, prepare the next one, and request a reset of the controller."""
         self._reset_trips.append(self.tripped)
         self.tripped = ""
-        number = self._number
-        if self._tick >= 0:
-            aborted_contact = self._detector.cut(STALLED)
-            if aborted_contact is not None:
-                self._store(aborted_contact)
-                following = (aborted_contact.number + 1) % self._mechanism.approach.contacts
-                number = 0 if self._two_sided else following
-        self._next_run(number)
+        aborted_contact = self._rig.cut(STALLED) if self._tick >= 0 else None
+        if aborted_contact is not None:
+            self._store(aborted_contact)
+        self._next_run(aborted_contact)
         self._requests_reset = True
 
     def _pause_or_begin(self) -> None:
         """Count down the pause before a run; begin the run once the controller is ready."""
         self._pause -= 1
         newest = self._newest
-        if newest is None or self._pause > 0 or self.tripped:
+        if newest is None or self.tripped:
             return
-        self._plant.begin(*self._start, newest.position_command, self._number)
-        self._detector.begin(self._number)
-        self._tick = 0
+        if not self._has_begun:
+            self._rig.begin(newest.position_command)
+            self._has_begun, self._pause = True, max(self._pause, BEGIN_TICKS)
+        elif self._pause <= 0:
+            self._tick = 0
 
-    def _finish_contact(self, contact: RigContact) -> None:
+    def _finish_contact(self, contact: Any) -> None:
         """Store a contact that has ended and prepare the next one."""
         if self.tripped:
             # After a trip, the rig keeps moving, but its contacts are not used to evaluate the controller.
             if all(c.status != "tripped" for c in self._contacts):
-                self._store(contact._replace(status="tripped", restitution=math.nan))
+                self._store(contact.as_tripped())
             return
         self._store(contact)
-        following = contact.number + 1
-        if self._two_sided and contact.status == "ok" and following < self._mechanism.approach.contacts:
-            self._plant.expect(following)
-            return
-        self._next_run(0 if self._two_sided else following % self._mechanism.approach.contacts)
+        if not self._rig.continues_after(contact):
+            self._next_run(contact)
 
-    def _store(self, contact: RigContact) -> None:
+    def _store(self, contact: Any) -> None:
         self._contacts.append(
             contact._replace(packets=(self._first, self._sequence), oldest_command=self._oldest)
         )
         self._first, self._oldest = self._sequence + 1, 0
 
-    def _next_run(self, number: int) -> None:
-        approach = self._mechanism.approach
+    def _next_run(self, last: Any) -> None:
+        """Prepare the run after the contact `last`."""
         self._run += 1
-        is_first_cycle = self._run <= (1 if self._two_sided else approach.contacts)
-        phase = approach.phase if is_first_cycle else self._phases.random()
-        nearer = min(self._mechanism.rig.contact_plane, 0.0)
-        position = nearer - approach.velocity * (APPROACH_TIME + phase * self._period)
-        self._start, self._number = (position, approach.velocity), number
-        self._tick, self._pause, self._newest = -1, PAUSE_TICKS, None
+        self._tick, self._pause, self._newest, self._has_begun = -1, PAUSE_TICKS, None, False
         self._oldest, self._requests_reset = 0, False
-        # During the pause before the run, the mechanism is free and at rest.
-        self._plant.begin(position, 0.0, position, number)
+        self._start = self._rig.prepare(last)
+
+
+def _is_finite(values: Numbers) -> bool:
+    return all(map(math.isfinite, values))
+
+
+def _combine(function: Any, left: Iterable[float], right: Iterable[float]) -> Numbers:
+    """Apply a function of two numbers to each axis."""
+    return tuple(map(function, left, right))

@@ -25,17 +25,24 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxhil.errors import InputError, to_one_line
-from jaxhil.mechanism.structs import Mechanism
-from tuning.rig.contact_detector import RigContact
-from tuning.rig.loop import ANSWER_SHARE, EmptyTask, PacketTimes, answered_packet_number, run_loop
+from jaxhil.mechanism.file import AnyMechanism
+from tuning.rig.loop import (
+    ANSWER_SHARE,
+    EmptyTask,
+    PacketTimes,
+    answered_packet_number,
+    build_empty_reading,
+    run_loop,
+)
 from tuning.rig.network import Injection, Network
-from tuning.rig.rig_task import CommandRange, RigTask
+from tuning.rig.rig_task import CommandRange, RigTask, SimulatedRig
 from tuning.rig.udp_controller import MAX_CPU_SHARE, request_real_time_priority
 from tuning.rig.udp_protocol import (
+    MAX_PACKET_NUMBER,
     STOP,
+    Numbers,
     PacketError,
-    ReadingPacket,
-    decode_session,
+    decode_opening,
     encode_reading,
     encode_session_request,
 )
@@ -46,17 +53,6 @@ END_TIMEOUT = 120.0  # longest time until the controller's process ends, includi
 SILENCE_TIMEOUT = 2.0  # time without a packet after which the controller's process ends the session [s]
 
 SOURCE_FOLDER = Path(__file__).parent
-STOP_READING = ReadingPacket(
-    event=STOP,
-    sequence=0xFFFFFFFF,
-    run=0,
-    tick=0,
-    time=0.0,
-    force=0.0,
-    position=0.0,
-    start_position=0.0,
-    start_velocity=0.0,
-)
 
 
 class Quantiles(NamedTuple):
@@ -103,7 +99,7 @@ class SessionReport(NamedTuple):
 
     empty: LoopReport | None  # loop without a rig; None if the session ended before it
     run: LoopReport | None  # loop with the simulated rig; None if the session ended before it
-    contacts: tuple[RigContact, ...]  # contacts that have ended
+    contacts: tuple[Any, ...]  # contacts that have ended (for six axes, runs)
     commanded: CommandRange | None  # extreme values of the commands
     tripped: str  # reason for the controller's trip; empty if it has not tripped
     interrupted: bool  # whether the user interrupted the session
@@ -116,8 +112,8 @@ class SessionSettings(NamedTuple):
 
     folder: Path  # folder that holds `udp_controller.py`: a bundle, or `SOURCE_FOLDER`
     gains: Path  # gain file of the controller
-    mechanism: Mechanism  # mechanism that the gain file contains
-    stroke: tuple[float, float]  # lowest and highest position of the drives [m]
+    mechanism: AnyMechanism  # mechanism that the gain file contains
+    stroke: tuple[Numbers, Numbers]  # lowest and highest positions of the drives [m, rad]
     duration: float  # duration of the run with the simulated rig [s]
     empty_duration: float  # duration of the empty loop before the run [s]
     injection: Injection  # network faults that are injected into the run
@@ -126,12 +122,17 @@ class SessionSettings(NamedTuple):
 
 
 def run_session(
-    setup: SessionSettings, scratch: Path, say: Callable[[str], None], progress: Callable[[int, int], None]
+    setup: SessionSettings,
+    rig: SimulatedRig,
+    scratch: Path,
+    say: Callable[[str], None],
+    progress: Callable[[int, int], None],
 ) -> SessionReport:
     """Run an empty loop for comparison, then the loop with the simulated rig.
 
     Args:
         setup: settings of the session.
+        rig: simulated rig of the mechanism.
         scratch: folder for the records that the controller's process writes.
         say: callback, called with a description of each loop before it starts.
         progress: callback, called once a second with the completed and the total number of ticks.
@@ -139,19 +140,19 @@ def run_session(
     Raises:
         InputError: if the controller's process does not start or does not write its record.
     """
-    task = RigTask(setup.mechanism, setup.seed, setup.stroke, resets=not setup.injection.any)
     period, empty, run, interrupted = setup.mechanism.rig.control_period, None, None, False
+    task = RigTask(rig, period, setup.stroke, resets=not setup.injection.any)
     try:
         if setup.empty_duration >= period:
             say(f"empty loop at {1 / period:g} Hz, {setup.empty_duration:g} s")
             faultless = Injection()
             empty, interrupted = _run_controller_loop(
-                setup, EmptyTask(), setup.empty_duration, faultless, scratch, progress
+                setup, EmptyTask(rig.axes), rig.axes, setup.empty_duration, faultless, scratch, progress
             )
         if not interrupted:
             say(f"{setup.mechanism.name} at {1 / period:g} Hz, {setup.duration:g} s")
             run, interrupted = _run_controller_loop(
-                setup, task, setup.duration, setup.injection, scratch, progress
+                setup, task, rig.axes, setup.duration, setup.injection, scratch, progress
             )
     except KeyboardInterrupt:
         interrupted = True
@@ -164,6 +165,7 @@ def run_session(
 def _run_controller_loop(
     setup: SessionSettings,
     task: RigTask | EmptyTask,
+    axes: int,
     duration: float,
     injection: Injection,
     scratch: Path,
@@ -183,7 +185,7 @@ def _run_controller_loop(
     try:
         port = read_listening_port(process)
         network = Network(("127.0.0.1", port), injection, setup.seed, ticks, answered_packet_number)
-        session = open_session(network)
+        session = open_session(network, axes)
         try:
             with real_time_priority(setup.priority):
                 run_loop(task, network, session, period, timing, lambda done: progress(done, ticks))
@@ -192,7 +194,8 @@ def _run_controller_loop(
         finally:
             # The stop packet is sent twice, because a full network buffer may drop a packet.
             for _ in range(2):
-                network.send_without_faults(encode_reading(STOP_READING, session))
+                stop = build_empty_reading(axes, STOP, MAX_PACKET_NUMBER)
+                network.send_without_faults(encode_reading(stop, session))
             network.close()
         process.wait(END_TIMEOUT)
         document = json.loads(record.read_text(encoding="utf-8"))
@@ -255,19 +258,26 @@ def read_listening_port(process: subprocess.Popen) -> int:
     return int(line[1])
 
 
-def open_session(network: Network) -> int:
+def open_session(network: Network, axes: int) -> int:
     """Request a session until the controller's process answers; return the session's number.
 
-    Raise InputError if there is no answer within `START_TIMEOUT`.
+    Raise InputError if there is no answer within `START_TIMEOUT`, or if the controller has another number of
+    axes than the rig.
     """
     number = secrets.randbits(64)
     until = time.monotonic() + START_TIMEOUT
     while time.monotonic() < until:
-        packet = network.ask(encode_session_request(number), REQUEST_INTERVAL)
+        packet = network.ask(encode_session_request(number, axes), REQUEST_INTERVAL)
         try:
-            return decode_session(packet or b"", number)
+            opening = decode_opening(packet or b"", number)
         except PacketError:
             continue
+        if opening.axes == axes:
+            return opening.session
+        network.close()
+        raise InputError(
+            f"udp_controller.py: axes of the controller: found {opening.axes}, expected the rig's {axes}"
+        )
     network.close()
     raise InputError(
         f"udp_controller.py: the process did not answer a request for a session within {START_TIMEOUT:g} s"

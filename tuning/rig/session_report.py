@@ -6,53 +6,28 @@ from typing import Any
 
 import numpy as np
 
-from jaxhil.mechanism.structs import Mechanism
-from tuning.rig.contact_detector import MAX_CONTACT_DURATION, RigContact
-from tuning.rig.rig_task import MAX_COMMAND_AGE, STALLED
+from tuning.rig.contact_detector import MAX_CONTACT_DURATION
+from tuning.rig.rig_task import MAX_COMMAND_AGE, STALLED, SimulatedRig
 from tuning.rig.session import CAUSE_CONTROLLER, LoopReport, SessionReport, SessionSettings
 
 
-def ideal_restitutions(mechanism: Mechanism, contacts: Sequence[RigContact]) -> list[float]:
-    """Return the ideal restitution e* of each contact at its approach speed; this imports JAX."""
-    if not contacts:
-        return []
-    from jaxhil.simulation.jax_environment import prepare_jax
-
-    prepare_jax()
-    import jax
-
-    from jaxhil.contact.laws import find_contact_law
-    from jaxhil.simulation.outcome import parameters_by_slot
-    from jaxhil.simulation.scenario import build_scenarios
-
-    scenario = build_scenarios(mechanism)
-    number = np.array([contact.number for contact in contacts])
-    parameters = jax.tree.map(lambda leaf: leaf[number], scenario.contact)
-    speeds = [contact.approach_velocity for contact in contacts]
-    velocity = np.array([speed if speed > 0.0 else 1.0 for speed in speeds])[:, None]
-    mass = np.broadcast_to(scenario.equivalent_mass, velocity.shape)
-    law = find_contact_law(mechanism.contact.law).simulation_law
-    ideal = jax.jit(lambda contact, *motion: law.ideal_contact(parameters_by_slot(contact), *motion))
-    return [float(value) for value in np.asarray(ideal(parameters, mass, velocity).restitution)[:, 0]]
-
-
-def is_stalled(contact: RigContact, setup: SessionSettings, run: LoopReport | None) -> bool:
+def is_stalled(contact: dict[str, Any], setup: SessionSettings, run: LoopReport | None) -> bool:
     """Return whether the computer, and not the controller, delayed the commands during a contact.
 
     This is the case if a command was older than `MAX_COMMAND_AGE` periods and the controller did not cause
     any missed tick of the contact. Such a contact says nothing about the controller. If faults are injected,
     the result is always False.
     """
-    if run is None or setup.injection.any or contact.oldest_command <= MAX_COMMAND_AGE:
+    if run is None or setup.injection.any or contact["oldest_command"] <= MAX_COMMAND_AGE:
         return False
-    first, last = contact.packets
+    first, last = contact["packets"]
     return not np.any(run.causes[first : last + 1] == CAUSE_CONTROLLER)
 
 
 def evaluate_session(
     setup: SessionSettings,
+    rig: SimulatedRig,
     session: SessionReport,
-    references: Sequence[float],
     limit: float,
     compensator: str,
 ) -> dict[str, Any]:
@@ -60,27 +35,26 @@ def evaluate_session(
 
     Args:
         setup: settings of the session.
+        rig: simulated rig of the session.
         session: results of the session.
-        references: ideal restitution e* of each contact.
-        limit: largest permitted magnitude of the restitution error e - e* [1].
+        limit: largest permitted magnitude of the restitution error e - e*; for six axes, of the twist error
+            [1].
         compensator: name of the compensator.
     """
-    contacts = [
-        {
-            **contact._asdict(),
-            "status": STALLED if is_stalled(contact, setup, session.run) else contact.status,
-            "reference_restitution": reference,
-            "error": contact.restitution - reference if contact.status == "ok" else None,
-        }
-        for contact, reference in zip(session.contacts, references, strict=True)
-    ]
-    errors = [contact["error"] for contact in contacts if contact["status"] == "ok"]
-    reasons = _failure_reasons(setup, session, [contact["status"] for contact in contacts], errors, limit)
-    good = f"the controller caused no missed tick, and every restitution error is within {limit:g}."
+    contacts = rig.evaluate(session.contacts)
+    for contact in contacts:
+        if is_stalled(contact, setup, session.run):
+            contact["status"] = STALLED
+    errors = [contact[rig.error_name] for contact in contacts if contact["status"] in rig.good_statuses]
+    reasons = _failure_reasons(
+        setup, rig, session, [contact["status"] for contact in contacts], errors, limit
+    )
+    good = f"the controller caused no missed tick, and every {_describe_error(rig)} is within {limit:g}."
     if session.tripped:
         good = "the injected faults caused the trip, and every command was finite and within its limits."
     return {
         "mechanism": setup.mechanism.name,
+        "axes": rig.axes,
         "compensator": compensator,
         "control_period": setup.mechanism.rig.control_period,
         "duration": setup.duration,
@@ -93,8 +67,8 @@ def evaluate_session(
         "judged": len(errors),
         "stalled": sum(contact["status"] == STALLED for contact in contacts),
         "largest_error": max(errors, key=abs, default=None),
-        "commanded": None if session.commanded is None else session.commanded._asdict(),
-        "stroke": setup.stroke,
+        "commanded": None if session.commanded is None else _plain(session.commanded._asdict()),
+        "stroke": _plain(setup.stroke),
         "tripped": session.tripped,
         "resets": session.resets,
         "interrupted": session.interrupted,
@@ -103,6 +77,20 @@ def evaluate_session(
         "good": good,
         "verdict": "bad" if reasons else "good",
     }
+
+
+def _describe_error(rig: SimulatedRig) -> str:
+    """Return the name of the error that decides the verdict."""
+    return "restitution error" if rig.axes == 1 else rig.error_name.replace("_", " ")
+
+
+def _plain(value: Any) -> Any:
+    """Replace tuples with one number, which one axis has, by this number."""
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items()}
+    if not isinstance(value, tuple):
+        return value
+    return value[0] if len(value) == 1 else [_plain(entry) for entry in value]
 
 
 def _loop_document(loop: LoopReport | None) -> dict[str, Any] | None:
@@ -125,6 +113,7 @@ def _loop_document(loop: LoopReport | None) -> dict[str, Any] | None:
 
 def _failure_reasons(
     setup: SessionSettings,
+    rig: SimulatedRig,
     session: SessionReport,
     statuses: Sequence[str],
     errors: Sequence[float],
@@ -143,15 +132,17 @@ def _failure_reasons(
     wrong = [error for error in errors if not abs(error) <= limit]
     if wrong:
         worst = max(wrong, key=abs)
-        kind = "divergence" if worst > 0 else "convergence"
+        kind = f"{worst:.4f}"
+        if rig.axes == 1:
+            kind = f"{worst:+.4f} ({'divergence' if worst > 0 else 'convergence'})"
         reasons.append(
-            f"{len(wrong)} of {len(errors)} contacts have a restitution error beyond {limit:g}; the largest "
-            f"is {worst:+.4f} ({kind})."
+            f"{len(wrong)} of {len(errors)} contacts have a {_describe_error(rig)} beyond {limit:g}; the "
+            f"largest is {kind}."
         )
-    failed = [status for status in statuses if status not in ("ok", "tripped", STALLED)]
+    failed = [status for status in statuses if status not in (*rig.good_statuses, "tripped", STALLED)]
     if failed:
         reasons.append(f"{len(failed)} contacts have no valid result: {', '.join(sorted(set(failed)))}.")
-    if "timeout" in failed:
+    if "timeout" in failed and rig.axes == 1:
         reasons.append(f"timeout: the contact lasted longer than {MAX_CONTACT_DURATION:g} s.")
     if session.tripped and not setup.injection.any:
         reasons.append("the controller tripped although no faults were injected.")
@@ -162,5 +153,5 @@ def _failure_reasons(
     if not errors and not session.tripped and not session.interrupted:
         reasons.append("no contact could be evaluated: the run was too short, or the computer too busy.")
     if math.isnan(sum(errors)):
-        reasons.append("a restitution error is NaN.")
+        reasons.append(f"a {_describe_error(rig)} is NaN.")
     return reasons

@@ -2,9 +2,10 @@
 
     python -I udp_controller.py [--port 0] [--record ticks.json] [--empty] ...
 
-This program runs in a bundle's folder and needs only three files of the bundle: `gains.json`,
-`jaxhil_runtime.py` and `udp_protocol.py`, which defines the packets. When it listens, it prints `port NUMBER`
-to standard output. The rig requests a session until it gets an answer. Then the rig sends these packets:
+This program runs in a bundle's folder and needs only these files of the bundle: `gains.json`,
+`jaxhil_runtime.py`, `udp_protocol.py` (packets), `udp_task.py` (answers), and `numerical_model.py` or, for
+six axes, `numerical_model_six_axes.py`. When it listens, it prints `port NUMBER` to standard output. The rig
+requests a session until it gets an answer. Then the rig sends these packets:
 
     PREPARE  the mechanism is free: tare, then prepare the start of a run; repeated until the answer is READY
     RESET    reset a controller that has tripped, then do the same as for PREPARE
@@ -14,7 +15,7 @@ to standard output. The rig requests a session until it gets an answer. Then the
 The process also ends the session if the rig sends no valid packet for the time `--silence`. It serves one
 session, with the address and port of the first valid packet. It ignores and counts packets from other
 addresses or with another session number. A new session needs a new process. The process also integrates the
-numerical model M x'' = -F_c, once per period.
+numerical model of the docking, once per period.
 
 The process records the time of each tick, from the arrival of the packet to the answer, and its CPU time. It
 writes both at the end. If a tick used too much CPU time (`MAX_CPU_SHARE`), the process replays all packets at
@@ -24,6 +25,7 @@ virtual machine was the cause, it is fast. With `--empty`, the process answers a
 
 import argparse
 import gc
+import importlib
 import json
 import math
 import os
@@ -42,33 +44,49 @@ if (SCRIPT_FOLDER / "jaxhil_runtime.py").is_file():
     sys.path.insert(0, str(SCRIPT_FOLDER))
     # Bytecode files would change the content of the bundle.
     sys.dont_write_bytecode = True
+    import jaxhil_runtime as runtime  # pyright: ignore[reportMissingImports]
     import udp_protocol as udp  # pyright: ignore[reportMissingImports]
-    from jaxhil_runtime import Controller  # pyright: ignore[reportMissingImports]
+    from udp_task import MAX_INTERPOLATED_TICKS, ControllerTask  # pyright: ignore[reportMissingImports]
+
+    MODEL_PACKAGE = ""
 else:
     # The script is in the source tree, not in a bundle.
     if not __package__:
         sys.path.insert(0, str(SCRIPT_FOLDER.parents[1]))
-    from jaxhil.rig import Controller
+    import jaxhil.rig as runtime
     from tuning.rig import udp_protocol as udp
+    from tuning.rig.udp_task import MAX_INTERPOLATED_TICKS, ControllerTask
 
+    MODEL_PACKAGE = "tuning.rig."
+
+# Class of the controller, and module and class of the numerical model, for each number of axes; a bundle has
+# those for one number.
+MODELS = {
+    1: ("Controller", "numerical_model", "OneAxisModelInLoop"),
+    6: ("Controller6", "numerical_model_six_axes", "SixAxisModelInLoop"),
+}
 MAX_CPU_SHARE = 0.5  # largest CPU time of the controller for a tick [periods]
 REPLAY_COUNT = 3  # number of replays; the shortest CPU time of a tick counts
+MAX_READING_BYTES = max(form.reading.size for form in udp.FORMATS.values())
 REAL_TIME_PRIORITY = 20  # priority requested from the operating system, in the class SCHED_FIFO [1 to 99]
 
 
 class EmptyControllerTask:
     """Task for an empty loop: it answers every packet and computes nothing."""
 
+    axes = None  # any number
     stale = interpolated = 0
+    executed = 1
     status = "ok"
     quality_flags: ClassVar[dict[str, int]] = {}
 
     def answer(self, reading: udp.ReadingPacket) -> udp.AnswerPacket:
         """Return an answer to the reading's packet, with commands of zero."""
         _, sequence, run, tick, *_ = reading
-        return udp.AnswerPacket(
-            udp.EMPTY_LOOP | udp.READY, sequence, run, tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0, ""
-        )
+        form = udp.FORMATS[len(reading.force)]
+        zero, bodies = (0.0,) * form.axes, (0.0,) * form.bodies
+        fields = udp.EMPTY_LOOP | udp.READY, sequence, run, tick, *[zero] * 5, bodies, 0, ""
+        return udp.AnswerPacket._make(fields)
 
 
 class TickRecord:
@@ -81,39 +99,44 @@ class TickRecord:
         sequence: sequence number of each tick's packet.
         wall: time from each packet to its answer [ns].
         cpu: CPU time of each answer [ns].
+        executed: number of ticks that each answer required; above 1 after missing packets.
         count: number of recorded ticks.
         packet_count: number of recorded packets.
     """
 
     def __init__(self, capacity: int) -> None:
-        self.sequence, self.wall, self.cpu = (array("q", bytes(8 * capacity)) for _ in range(3))
-        self._packets, self._size = bytearray(udp.READING_FORMAT.size * capacity), udp.READING_FORMAT.size
-        self.count = self.packet_count = 0
+        columns = (array("q", bytes(8 * capacity)) for _ in range(4))
+        self.sequence, self.wall, self.cpu, self.executed = columns
+        self._packets: list[bytes] = []
+        self.count = 0
         self.capacity = capacity
+
+    @property
+    def packet_count(self) -> int:
+        """Return the number of stored packets."""
+        return len(self._packets)
 
     def store_packet(self, packet: bytes | bytearray) -> None:
         """Store a packet from the rig, for a replay."""
-        count = self.packet_count
-        if count < self.capacity:
-            self._packets[count * self._size : (count + 1) * self._size] = packet
-            self.packet_count = count + 1
+        if self.packet_count < self.capacity:
+            self._packets.append(bytes(packet))
 
-    def add(self, sequence: int, wall: int, cpu: int) -> None:
-        """Store the time and the CPU time [ns] of one tick."""
+    def add(self, sequence: int, wall: int, cpu: int, executed: int = 1) -> None:
+        """Store the time and the CPU time [ns] of an answer, which required `executed` ticks."""
         count = self.count
         if count < self.capacity:
             self.sequence[count], self.wall[count], self.cpu[count] = sequence, wall, cpu
+            self.executed[count] = executed
             self.count = count + 1
 
     def readings(self) -> Iterator[udp.ReadingPacket]:
         """Decode and yield the stored packets in the order of arrival."""
-        for index in range(self.packet_count):
-            packet = self._packets[index * self._size : (index + 1) * self._size]
-            yield udp.decode_reading(packet, None)
+        return map(udp.decode_reading, self._packets)
 
     def above(self, limit: float) -> dict[int, int]:
-        """Return the CPU times [ns] that exceed `limit` [ns], as a dictionary by sequence number."""
-        return {self.sequence[i]: self.cpu[i] for i in range(self.count) if self.cpu[i] > limit}
+        """Return the CPU times [ns] per executed tick that exceed `limit` [ns], by sequence number."""
+        times = {self.sequence[i]: self.cpu[i] // self.executed[i] for i in range(self.count)}
+        return {sequence: cpu for sequence, cpu in times.items() if cpu > limit}
 
     def document(self) -> dict[str, list[int]]:
         """Return sequence numbers and times of the ticks as JSON data."""
@@ -121,11 +144,12 @@ class TickRecord:
 
 
 def replay_slow_ticks(
-    make_task: Callable[[], udp.ControllerTask], record: TickRecord, limit: float
+    make_task: Callable[[], ControllerTask], record: TickRecord, limit: float
 ) -> dict[int, int]:
     """Replay all packets if a tick used more CPU time than `limit` [ns].
 
     Return, by sequence number, the shortest CPU time [ns] of each such tick in the session and the replays.
+    A tick that follows missing packets also executes these; its time is divided by the number of ticks.
     `make_task` returns a new task of the same controller for each replay.
     """
     times, cpu_now = record.above(limit), time.thread_time_ns
@@ -134,7 +158,7 @@ def replay_slow_ticks(
         for reading in record.readings():
             start = cpu_now()
             task.answer(reading)
-            duration = cpu_now() - start
+            duration = (cpu_now() - start) // task.executed
             if reading.sequence in times:
                 times[reading.sequence] = min(times[reading.sequence], duration)
     return times
@@ -149,7 +173,7 @@ class SessionEnd(NamedTuple):
 
 def serve(
     receiver: socket.socket,
-    task: udp.ControllerTask | EmptyControllerTask,
+    task: ControllerTask | EmptyControllerTask,
     record: TickRecord,
     wait: float,
     silence: float,
@@ -163,9 +187,9 @@ def serve(
         wait: longest time until the first packet [s].
         silence: longest time between two valid packets [s].
     """
-    packet = bytearray(udp.READING_FORMAT.size + 1)
+    packet = bytearray(MAX_READING_BYTES + 1)
     now, cpu_now, clock = time.monotonic_ns, time.thread_time_ns, time.monotonic
-    sessions, peer, session, ignored = udp.SessionNumbers(), None, 0, 0
+    sessions, peer, session, ignored = udp.SessionNumbers(task.axes), None, 0, 0
     until = clock() + wait
     while True:
         # Only valid packets of the session extend this deadline, because any process can send other packets.
@@ -187,7 +211,7 @@ def serve(
         reading = None
         if peer is None or sender == peer:
             try:
-                reading = udp.decode_reading(packet[:size], session)
+                reading = udp.decode_reading(packet[:size], session, task.axes)
             except udp.PacketError:
                 pass
         if reading is None:
@@ -204,7 +228,7 @@ def serve(
         wall, cpu = now() - start, cpu_now() - cpu_start
         record.store_packet(packet[:size])
         if sent and reading.event == udp.TICK:
-            record.add(reading.sequence, wall, cpu)
+            record.add(reading.sequence, wall, cpu, task.executed)
 
 
 def _send(receiver: socket.socket, packet: bytes, peer: Any) -> bool:
@@ -246,7 +270,7 @@ def main(arguments: list[str] | None = None) -> int:
     limit = math.inf
     try:
         if options.empty:
-            task: udp.ControllerTask | EmptyControllerTask = EmptyControllerTask()
+            task: ControllerTask | EmptyControllerTask = EmptyControllerTask()
         else:
             task = load_task(options.gains)
             limit = MAX_CPU_SHARE * task.period * 1e9
@@ -284,16 +308,25 @@ def main(arguments: list[str] | None = None) -> int:
     return 0 if ended.reason == "stopped" else 1
 
 
-def load_task(path: str) -> udp.ControllerTask:
+def load_task(path: str) -> ControllerTask:
     """Return the task for the controller and mechanism of a gain file.
 
     Raise ValueError, OSError, KeyError, TypeError or AttributeError if the file is invalid.
     """
-    controller = Controller.from_file(path)
     document = json.loads(Path(path).read_text(encoding="utf-8"))
+    axes = document.get("axes", 1)
+    name, module, model = MODELS.get(axes, ("", "", ""))
+    controller_class = getattr(runtime, name, None)
+    if controller_class is None:
+        expected = " or ".join(str(number) for number, (name, *_) in MODELS.items() if hasattr(runtime, name))
+        raise ValueError(f"{path}: axes: found {axes!r}, expected {expected}")
+    controller = controller_class.from_file(path)
+    model_class = getattr(importlib.import_module(MODEL_PACKAGE + module), model)
     limit = document.get("limits", {}).get("missed_in_a_row", {}).get("value")
-    return udp.ControllerTask(
-        controller, document["mechanism"], udp.MAX_INTERPOLATED_TICKS if limit is None else limit
+    return ControllerTask(
+        controller,
+        model_class(controller, document["mechanism"]),
+        MAX_INTERPOLATED_TICKS if limit is None else limit,
     )
 
 

@@ -20,21 +20,12 @@ from jaxhil.rig.six_axes import Controller6
 from jaxhil.rig.six_axes.gain_file import SixAxisGainFile, check_six_axis_document
 from jaxhil.rig.six_axes.limits import NO_SIX_AXIS_LIMITS
 from jaxhil.simulation.gain_file import LoadedGains
-from jaxhil.sixdof.loop import (
-    Loop,
-    RigConstants,
-    RunState,
-    Sensed,
-    actuated,
-    begin,
-    build_rig_constants,
-    integrate,
-    model_motion,
-    run,
-    sense,
-)
+from jaxhil.sixdof.loop import begin, build_rig_constants, complete_tick, integrate, run
+from jaxhil.sixdof.loop_state import Loop, RigConstants, RunState, Sensed
+from jaxhil.sixdof.numerical_model import model_motion
 from jaxhil.sixdof.relative import Wrench
 from jaxhil.sixdof.scenario import Scenario
+from jaxhil.sixdof.sensing import sense
 from jaxhil.sixdof.vectors import vector
 from tuning.verification.six_axis_replay import (
     SIX_AXIS_REPLAY_LIMIT,
@@ -128,10 +119,12 @@ def run_six_axis_loop(
             np.asarray(signals.twist_desired)[:, 0].tolist(),
             np.asarray(signals.pose_measured)[:, 0].tolist(),
         )
-        model = _integrate(loop, rig, state, np.array(command)[:, None])
+        column = np.array(command)[:, None]
+        model = _integrate(loop, rig, state, column)
         position, twist = (np.asarray(part)[:, 0].tolist() for part in (model[1], model[3]))
         sent = controller.pose_command(position, twist)
-        state = _advance(loop, rig, state, sensed, (model[0], model[1], model[3]), np.array(sent)[:, None])
+        next_model = model[0], model[1], model[3]
+        state = _advance(loop, rig, state, sensed, column, next_model, np.array(sent)[:, None])
     controller.next_contact()
     found = np.asarray(state.twist)[:, 0]
     worst = 0.0
@@ -158,15 +151,20 @@ def _sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
 @partial(jax.jit, static_argnums=0)
 def _integrate(loop: Loop, rig: RigConstants, state: RunState, command: Any) -> tuple[Any, ...]:
     """Return the numerical model after a tick with the wrench `command` (6, lanes)."""
-    return integrate(loop, rig, state, Wrench(vector(command[:3]), vector(command[3:])))
+    return integrate(loop, rig, state, _wrench(command))
 
 
 @partial(jax.jit, static_argnums=0)
 def _advance(
-    loop: Loop, rig: RigConstants, state: RunState, sensed: Sensed, model: Any, sent: Any
+    loop: Loop, rig: RigConstants, state: RunState, sensed: Sensed, command: Any, model: Any, sent: Any
 ) -> RunState:
-    """Return the state of the loop after a tick with the pose command `sent` (6, lanes)."""
-    return actuated(loop, rig, state, sensed, model, sent)
+    """Return the state after a tick with the wrench `command` and the pose command `sent`, (6, lanes)."""
+    return complete_tick(loop, rig, state, sensed, _wrench(command), model, sent)[0]
+
+
+def _wrench(command: Any) -> Wrench:
+    """Convert an array (6, lanes) to a wrench."""
+    return Wrench(vector(command[:3]), vector(command[3:]))
 
 
 @partial(jax.jit, static_argnums=(0, 1))

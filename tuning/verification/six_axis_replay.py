@@ -14,7 +14,7 @@ from jaxhil.mechanism.uncertainty import draw
 from jaxhil.rig.six_axes import Controller6
 from jaxhil.sixdof.building import build_scenarios, make_loop
 from jaxhil.sixdof.controller_record import ControllerRecord, record_controller
-from jaxhil.sixdof.loop import Loop
+from jaxhil.sixdof.loop_state import Loop
 from jaxhil.sixdof.metrics import Metrics
 from jaxhil.sixdof.scenario import Scenario
 

@@ -29,16 +29,19 @@ def run(options: RigOptions) -> int:
     if options.plot is not None:
         checks.check_plot(options.plot)
     gains = arguments.find_gain_file(options.path)
-    document, mechanism = load_checked_gains(gains)
-    check_bundle_code(Path(options.path), document["compensator"])
+    document, mechanism, stroke = load_checked_gains(gains)
+    axes = document.get("axes", 1)
+    check_bundle_code(Path(options.path), document["compensator"], axes)
+    limit = arguments.choose_limit(options.limit, mechanism)
     period = mechanism.rig.control_period
     if not period <= options.duration <= MAX_TICKS * period:
         allowed = f"{period:g} to {MAX_TICKS * period:g} s, {MAX_TICKS} control periods"
         raise InputError(f"--duration: found {options.duration:g}, expected {allowed}")
 
     from tuning.rig.network import Injection
+    from tuning.rig.rig_task import build_simulated_rig
     from tuning.rig.session import SessionSettings, real_time_priority, run_session
-    from tuning.rig.session_report import evaluate_session, ideal_restitutions
+    from tuning.rig.session_report import evaluate_session
 
     try:
         with real_time_priority(options.realtime):
@@ -53,20 +56,20 @@ def run(options: RigOptions) -> int:
     with tempfile.TemporaryDirectory(prefix="jaxhil-rig-") as temporary:
         scratch = Path(temporary)
         setup = SessionSettings(
-            folder=write_controller_files(document["compensator"], scratch),
+            folder=write_controller_files(document["compensator"], axes, scratch),
             gains=gains,
             mechanism=mechanism,
-            stroke=read_command_limits(document),
+            stroke=stroke,
             duration=options.duration,
             empty_duration=min(MAX_EMPTY_LOOP_DURATION, EMPTY_LOOP_SHARE * options.duration),
             injection=Injection(options.drops, options.jitter, options.delay),
             seed=options.seed,
             priority=options.realtime,
         )
-        session = run_session(setup, scratch, terminal.note, _LoopProgress(period).tell)
-    # The next function imports jax, which would disturb the real-time loop if it was still running.
-    references = ideal_restitutions(mechanism, session.contacts)
-    result = evaluate_session(setup, session, references, options.limit, document["compensator"])
+        rig = build_simulated_rig(mechanism, options.seed)
+        session = run_session(setup, rig, scratch, terminal.note, _LoopProgress(period).tell)
+    # For one axis, only the next function imports jax, which would disturb the real-time loop.
+    result = evaluate_session(setup, rig, session, limit, document["compensator"])
     if options.plot is not None:
         from jaxhil.simulation.contact_plot import save_figure
         from tuning.plots.latency import latency_plot
@@ -83,49 +86,52 @@ def run(options: RigOptions) -> int:
     return 0 if result["verdict"] == "good" else 1
 
 
-def check_bundle_code(folder: Path, compensator: str) -> None:
+def check_bundle_code(folder: Path, compensator: str, axes: int) -> None:
     """Raise `InputError` if the folder is a bundle that is damaged or contains code of another version."""
     from tuning.bundle.checking import find_code_differences
     from tuning.bundle.manifest import is_bundle
 
-    reasons = find_code_differences(folder, compensator) if is_bundle(folder) else []
+    reasons = find_code_differences(folder, compensator, axes) if is_bundle(folder) else []
     if reasons:
         raise InputError(f"{to_one_line(str(folder))}: {reasons[0]}: for details, run jaxhil verify")
 
 
-def write_controller_files(compensator: str, scratch: Path) -> Path:
+def write_controller_files(compensator: str, axes: int, scratch: Path) -> Path:
     """Write the code of the controller's process, as in a bundle, to `scratch`; return this folder."""
     from tuning.bundle.content import code_files
 
-    for name, content in code_files(compensator).items():
+    for name, content in code_files(compensator, axes).items():
         (scratch / name).write_bytes(content)
     return scratch
 
 
-def load_checked_gains(gains: Path) -> tuple[dict[str, Any], Any]:
-    """Make the checks of the rig's runtime on a gain file; return the file's document and mechanism.
+def load_checked_gains(gains: Path) -> tuple[dict[str, Any], Any, tuple[Any, Any]]:
+    """Make the checks of the rig's runtime on a gain file.
 
-    Raise `InputError` if a check fails.
+    Return the file's document and mechanism, and the lowest and the highest position commands [m, rad] that
+    it allows. Raise `InputError` if a check fails.
     """
-    from jaxhil.mechanism.file import from_plain_data
+    from jaxhil.mechanism.file import any_from_plain_data
+    from jaxhil.mechanism.six_axes import is_six_axes
     from jaxhil.rig import GainFileError
-    from jaxhil.rig.gain_file import check_gain_document, read_gain_document
+    from jaxhil.rig.gain_document import read_gain_document
+    from tuning.bundle.controller_kind import kind_of
 
     source = to_one_line(str(gains))
     try:
         document = read_gain_document(gains)
-        check_gain_document(document, source)
+        kind, mechanism = kind_of(document), document.get("mechanism")
+        if isinstance(mechanism, dict) and is_six_axes(mechanism) != (kind.axes == 6):
+            other = 7 - kind.axes
+            raise InputError(
+                f"{source}: mechanism: found one with {other} axes, expected {kind.axes} (key axes)"
+            )
+        limits = kind.check_document(document, source).limits
     except GainFileError as error:
         raise InputError(str(error)) from None
-    return document, from_plain_data(document["mechanism"], f"{source}: mechanism")
-
-
-def read_command_limits(document: dict[str, Any]) -> tuple[float, float]:
-    """Return the smallest and the largest position command [m] that a gain document allows."""
-    from jaxhil.rig.gain_file import check_gain_document
-
-    limits = check_gain_document(document).limits
-    return limits["command_lowest"], limits["command_highest"]
+    mechanism = any_from_plain_data(document["mechanism"], f"{source}: mechanism")
+    lowest, highest = (tuple(limits[name] for name in names) for names in kind.stroke)
+    return document, mechanism, (lowest, highest)
 
 
 class _LoopProgress:
@@ -188,20 +194,53 @@ def _build_tables(document: dict[str, Any], loops: dict[str, Any]) -> list[Any]:
         ],
         texts=(0, 1),
     )
+    headings, row = _CONTACT_TABLES[document["axes"]]
     rows = [
-        (
-            *(number, contact["number"] + 1, terminal.format_number(contact["restitution"], 5)),
-            *(
-                terminal.format_number(contact["reference_restitution"], 5),
-                terminal.format_error(contact["error"]),
-            ),
-            *(contact["peak_force"], 1e3 * contact["duration"], contact["status"]),
-        )
+        (number, *row(contact), contact["status"])
         for number, contact in enumerate(document["contacts"][:MAX_TABLE_ROWS], start=1)
     ]
-    headings = ["contact", "entry", "e", "e*", "error", "peak force [N]", "duration [ms]", "status"]
-    contacts = terminal.build_table(f"Contacts: {len(document['contacts'])}", headings, rows, texts=(7,))
+    contacts = terminal.build_table(
+        f"Contacts: {len(document['contacts'])}",
+        ["contact", *headings, "status"],
+        rows,
+        texts=(len(headings) + 1,),
+    )
     return [ticks, times, *([contacts] if rows else [])]
+
+
+def _one_axis_row(contact: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the entries of a contact's row in the table for one axis."""
+    return (
+        contact["number"] + 1,
+        terminal.format_number(contact["restitution"], 5),
+        terminal.format_number(contact["reference_restitution"], 5),
+        terminal.format_error(contact["error"]),
+        contact["peak_force"],
+        1e3 * contact["duration"],
+    )
+
+
+def _six_axis_row(contact: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the entries of an episode's row in the table for six axes."""
+    return (
+        contact["run"] + 1,
+        f"{contact['energy_error']:+.4f}",
+        f"{contact['twist_error']:.4f}",
+        contact["peak_force"],
+        contact["peak_moment"],
+        1e3 * contact["duration"],
+        contact["touches"],
+    )
+
+
+# Headings of the columns between number and status, and function that returns their entries, by axes.
+_CONTACT_TABLES = {
+    1: (["entry", "e", "e*", "error", "peak force [N]", "duration [ms]"], _one_axis_row),
+    6: (
+        ["run", "energy error", "twist error", "peak [N]", "peak [N m]", "in touch [ms]", "touches"],
+        _six_axis_row,
+    ),
+}
 
 
 def _session_remarks(document: dict[str, Any], loops: dict[str, Any]) -> list[str]:

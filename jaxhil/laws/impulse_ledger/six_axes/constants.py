@@ -22,6 +22,8 @@ MAX_DAMPING = 0.5  # [1]; limit on the damping times the control period
 BRIDGE_STEPS = 12  # number of integration steps from the last reading to the present
 AHEAD = 0.5  # control periods; the prediction ends in the middle of the command's period
 HIGHEST = 2.0  # [1]; limit on the predicted force, divided by the larger of expected and measured peak
+# m/s^2; limit on the force per unit mass in the prediction: without it, a wrong estimate overflows to NaN
+MAX_PUSH = 1e6
 MIN_STIFFNESS = 100.0  # 1/s^2; lower bound of the stiffness in the limit of the correction
 LONG_AGO = 1e9  # ticks; at the beginning of a run, the last contact counts as this long ago
 FEW_READINGS = 5.0  # minimum number of readings of the tangent model; with fewer the status is `unsure`

@@ -12,6 +12,7 @@ from jaxhil.laws.impulse_ledger.six_axes.constants import (
     FEATURES,
     MAX_DAMPING,
     MAX_GROWTH,
+    MAX_PUSH,
     MIN_ERROR,
     MISFIT,
 )
@@ -136,11 +137,11 @@ class TangentModel:
         depth, speed, impulse = 0.0, velocity, 0.0
         for _ in range(BRIDGE_STEPS):
             push = start + self.restoring(depth + half * speed - deeper) + damping * (speed - velocity)
-            push = max(push, least) / divisor
+            push = min(max(push, least), MAX_PUSH) / divisor
             later = speed - push * step
             depth += half * (speed + later)
             speed = later
             impulse += push * step
         self.impulse = impulse
         push = start + self.restoring(depth - deeper) + damping * (speed - velocity)
-        self.force = max(push, least)
+        self.force = min(max(push, least), MAX_PUSH)

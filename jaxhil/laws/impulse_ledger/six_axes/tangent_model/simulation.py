@@ -16,6 +16,7 @@ from jaxhil.laws.impulse_ledger.six_axes.constants import (
     BRIDGE_STEPS,
     FEATURES,
     MAX_GROWTH,
+    MAX_PUSH,
     MIN_ERROR,
     MISFIT,
 )
@@ -108,7 +109,8 @@ def bridge(
 
     def force_at(depth: Array, speed: Array) -> Array:
         elastic = restoring(tangent, depth - deeper) - start
-        return jnp.maximum(force + elastic + tangent.damping * (speed - velocity), least)
+        push = jnp.maximum(force + elastic + tangent.damping * (speed - velocity), least)
+        return jnp.minimum(push, MAX_PUSH)
 
     def advance(_, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         depth, speed, impulse = state

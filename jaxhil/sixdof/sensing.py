@@ -1,0 +1,105 @@
+"""Sensors of the six-axis rig: real contact at a tick, and the readings of wrench and pose."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxhil.laws.six_axis_base import SixAxisSignals
+from jaxhil.simulation.sensors import apply_lag, quantise, white_noise
+from jaxhil.sixdof.axes import AxisMotion, read_samples
+from jaxhil.sixdof.forces import contact_wrench
+from jaxhil.sixdof.kinematics import RigidMotion, to_rigid_motion
+from jaxhil.sixdof.latch import latch_wrench
+from jaxhil.sixdof.loop_state import Loop, RigConstants, RunState, Sensed
+from jaxhil.sixdof.relative import Pose, Wrench
+from jaxhil.sixdof.rotations import exponential
+from jaxhil.sixdof.sensor import read_fixed, read_moving, sample, tool_load, undo_fixed, undo_moving, weight
+from jaxhil.sixdof.vectors import vector
+
+
+def sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
+    """Return the real contact at a tick, and the readings of force sensor and position sensor."""
+    samples = read_samples(rig.axes, state.hardware, state.tick)
+    motion = to_rigid_motion(rig.kinematics.coordinates(samples.motion, state.near))
+    pose, twist, _ = motion
+    contact, forces, memories = contact_wrench(rig.groups, state.memories, pose, twist, rig.period)
+    latched = []
+    for latch, before in zip(rig.latches, state.latch_states, strict=True):
+        latch_force, latch_state = latch_wrench(latch, before, pose, twist)
+        contact = jax.tree.map(jnp.add, contact, latch_force)
+        latched.append(latch_state)
+    measured = None if samples.measured is None else _measured_pose(loop, rig, state, samples.measured)
+    wrench, lag = _measured_wrench(loop, rig, state, contact, motion, measured)
+    signals = SixAxisSignals(
+        wrench=tuple(jax.tree.leaves(wrench)),
+        pose_desired=state.near,
+        twist_desired=state.twist,
+        pose_measured=measured,
+        age=jnp.broadcast_to(state.tick, rig.period.shape),
+    )
+    return Sensed(motion, contact, forces, memories, tuple(latched), lag, signals)
+
+
+def _measured_pose(loop: Loop, rig: RigConstants, state: RunState, measured: Array) -> Array:
+    """Convert the measured axis positions to measured coordinates, including noise and rounding."""
+    still = AxisMotion(measured, jnp.zeros_like(measured), None)
+    position = rig.kinematics.coordinates(still, state.near).position
+    if not loop.has_pose_errors:
+        return position
+    noisy = position + rig.sensor.position_noise_std * _noise(rig, state.tick, 1)
+    return quantise(noisy, rig.sensor.position_quantum)
+
+
+def _measured_wrench(
+    loop: Loop,
+    rig: RigConstants,
+    state: RunState,
+    contact: Wrench,
+    motion: RigidMotion,
+    measured: Array | None,
+) -> tuple[Wrench, tuple[Wrench, Wrench] | None]:
+    """Return the measured wrench about T's origin, and the next state of the sensor's lag."""
+    sensor, last = rig.sensor, state.controller
+    if motion.acceleration is None:
+        raw = read_fixed(contact, sensor.mounting)
+    else:
+        load = tool_load(sensor.tool, motion.pose, motion.twist, motion.acceleration, sensor.gravity)
+        raw = read_moving(contact, load, motion.pose)
+    lagged = raw if last.lag is None else _lagged_reading(rig, state.tick, raw, *last.lag)
+    noise = sensor.noise_std * _noise(rig, state.tick, 0) if loop.has_noise else None
+    reading = sample(lagged, sensor.errors, noise, loop.has_sample_effects)
+    unbiased: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
+    if motion.acceleration is None:
+        wrench = undo_fixed(unbiased, sensor.mounting)
+    else:
+        assert measured is not None
+        pose = Pose(vector(measured[:3]), exponential(vector(measured[3:])))
+        load = weight(sensor.assumed_tool, pose.attitude, sensor.assumed_gravity)
+        wrench = undo_moving(unbiased, load, pose)
+    return wrench, None if last.lag is None else (raw, lagged)
+
+
+def _lagged_reading(rig: RigConstants, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:
+    """Return the output of the force sensor's lag; its input is interpolated linearly between ticks."""
+    first, zero = now == 0, jnp.zeros_like(rig.period)
+
+    def lagged_channel(now: Array, before: Array, lagged: Array) -> Array:
+        before, lagged = jnp.where(first, now, before), jnp.where(first, now, lagged)
+        middle = (before + now) / 2
+        return apply_lag(lagged, zero, rig.period, zero, [before, middle, now], rig.sensor.time_constant)
+
+    reading: Wrench = jax.tree.map(lagged_channel, raw, last, lagged)
+    return reading
+
+
+def _wrench(channels: Array) -> Wrench:
+    """Convert six channels (6, *batch) to a wrench."""
+    return Wrench(vector(channels[:3]), vector(channels[3:]))
+
+
+def _noise(rig: RigConstants, now: Array, sensor: int) -> Array:
+    """Return standard normal noise for the six channels of a sensor: 0 for the force, 1 for the pose."""
+    channel = jnp.arange(6, dtype=jnp.int32).reshape(6, *[1] * rig.period.ndim)
+    count = jnp.broadcast_to(6 * now + channel, (6, *rig.period.shape))
+    stream = jnp.full(rig.period.shape, sensor, jnp.int32)
+    return white_noise(rig.key, stream, count, rig.period.dtype)
