@@ -114,8 +114,13 @@ def restitution(mechanism: Mechanism) -> float:
     return math.exp(-ratio / math.sqrt(1 - ratio**2) * (math.pi - 2 * math.asin(ratio)))
 
 
+KNOWN_LIMIT = pytest.mark.xfail(strict=True, reason="known limit: a lag hides a part of the damping")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("lag", [0.0, 1e-3, 3e-3])
+@pytest.mark.parametrize(
+    "lag", [0.0, pytest.param(1e-3, marks=KNOWN_LIMIT), pytest.param(3e-3, marks=KNOWN_LIMIT)]
+)
 def test_contact_with_status_identified_is_accurate_for_damper_with_unmodelled_lag(lag):
     """The lag hides the energy loss of the damper, so that the readings suggest no damper."""
     contacts, mechanism_known = 60, load("suite-damped").mechanism
