@@ -112,7 +112,7 @@ ONE_AXIS_RESULTS = {name: name for name in ("force_command", "position_command",
 
 
 def bits(value: float) -> bytes:
-    """Return the bytes of a number; all NaNs are the same."""
+    """Return the bytes of a number; all NaNs have the same bytes."""
     return b"nan" if value != value else struct.pack("<d", value)
 
 
@@ -157,7 +157,7 @@ def _columns(vectors: tuple[str, ...]) -> dict[str, str]:
 
 
 def compile_sources(folder: Path, compiler: str, *options: str) -> str:
-    """Compile the sources of an extracted FMU in an own folder; return the compiler's messages."""
+    """Compile the sources of an extracted FMU in a separate folder; return the compiler's messages."""
     sources = sorted((folder / "sources").glob("*.c"))
     command = [compiler, *options, "-fsyntax-only", *map(str, sources)]
     ran = subprocess.run(command, capture_output=True, text=True)

@@ -28,7 +28,7 @@ def text(
     names: str, separator: str = ",", *, scale: float = 1.0, time: Callable[[float], str] = repr, head: str = "",
     units: str = "", decimal: str = ".", encoding: str = "utf-8", end: str = "", more: dict[str, Any] | None = None,
 ) -> Callable[[Path], None]:  # fmt: skip
-    """Return a writer of rows of time, command, position and force; lengths are multiplied by `scale`."""
+    """Return a function that writes time, command, position and force; lengths are multiplied by `scale`."""
     times = [time(float(t)) for t in LOG["t"]]
     columns = [
         times,
@@ -49,7 +49,7 @@ def at(t: float) -> datetime:
 
 
 def net(t: float) -> str:
-    """Format a time as .NET's `o` does."""
+    """Format a time as .NET's format `o` does."""
     return f"{at(t):%Y-%m-%dT%H:%M:%S}.{at(t).microsecond * 10:07d}+01:00"
 
 
@@ -74,7 +74,7 @@ Delta_X\t0.001\t0.001\t0.001\t
 
 
 def merged(path: Path, steps: dict[str, int], late: dict[str, float]) -> None:
-    """Write topics with own clocks as PlotJuggler does: a row for each message, other cells empty."""
+    """Write topics with separate clocks as PlotJuggler does: a row for each message, other cells empty."""
     rows = []
     for index, name in enumerate(("xd", "xm", "F")):
         for t, value in zip(LOG["t"][:: steps[name]], LOG[name][:: steps[name]].tolist(), strict=True):
@@ -125,7 +125,7 @@ def mat_to_file(path: Path) -> None:
 
 
 def mat_to_workspace(path: Path) -> None:
-    """Write Simulink's "To Workspace" array: a column per signal, time beside."""
+    """Write Simulink's "To Workspace" array: a column per signal, with the times in `tout`."""
     from scipy.io import savemat
 
     savemat(path, {"tout": LOG["t"][:, None], "yout": np.array([LOG[name] for name in ("xd", "xm", "F")]).T})
@@ -145,7 +145,7 @@ def control_desk(path: Path) -> None:
 
 
 def hdf5_rows(path: Path) -> None:
-    """Write row vectors, as MATLAB's `h5write` of column-major data leaves them."""
+    """Write row vectors, as MATLAB's `h5write` does."""
     import h5py
 
     with h5py.File(path, "w") as file:
@@ -210,7 +210,7 @@ def tdms_units(path: Path) -> None:
 
 
 def bag_joint_states(path: Path) -> Path:
-    """Write JointStates whose names say what is what, with header stamps better than the recording's."""
+    """Write JointStates with named joints; their header stamps are more accurate than the recording times."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 

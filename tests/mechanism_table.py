@@ -132,7 +132,7 @@ def tables(node=FULL, path=""):
 
 
 def file_refusal(path, overrides=(), unset=()):
-    """Return the message for a refused file after checking that it has a printable line for each key."""
+    """Check that the message for an invalid file has a printable line for each key; return the message."""
     with pytest.raises(InputError) as caught:
         load(path, overrides, unset)
     message = str(caught.value)

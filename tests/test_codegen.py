@@ -363,7 +363,7 @@ class Sharing:
 
 
 class Defaulting:
-    """Class attribute that is a default value: `__init__` does not assign it, but a method does."""
+    """Class with an attribute that has a default and that only a method assigns, not `__init__`."""
 
     count: int = 3
 

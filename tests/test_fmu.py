@@ -1,4 +1,4 @@
-"""FMUs of the controller: valid descriptions, compilation, the bits of the runtime, errors, states."""
+"""FMUs of the controller: valid descriptions, compilation, results equal to the runtime's, errors, states."""
 
 import functools
 import json
@@ -78,7 +78,7 @@ def test_fmu_description_is_valid_and_has_units_and_bounds_of_the_code(axes, fmi
         assert variable.unit == (None if gain.unit == "1" else gain.unit)
 
 
-def test_unit_exponents_cover_products_quotients_and_powers():
+def test_fmu_unit_exponents_cover_products_quotients_and_powers():
     assert unit_exponents("N s/m") == {"kg": 1, "s": -1}
     assert unit_exponents("s^2/m^2") == {"s": 2, "m": -2}
     assert unit_exponents("1/s") == {"s": -1} and unit_exponents("parsec") is None
@@ -335,7 +335,7 @@ def test_fmu_of_every_compensator_reproduces_vectors_bit_for_bit(compensator, me
         running.close()
 
 
-def test_library_is_added_to_archive_and_found_again():
+def test_fmu_library_is_added_to_archive_and_found_again():
     archive = controller_fmu(document("rig-300kg", "none"), 2)
     library = compile_library(archive)
     assert library is not None and find_library(add_library(archive, library)) == library

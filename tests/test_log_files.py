@@ -1,4 +1,4 @@
-"""Log files as rigs and their tools write them: the drafted mapping reads them, or one line refuses them."""
+"""Log files of rigs and their tools: each is read with its drafted mapping, or rejected with one line."""
 
 # Each case is one line.
 # ruff: noqa: E501
@@ -126,14 +126,14 @@ def check_bytes(suffix, content):
 @pytest.mark.filterwarnings("ignore")
 @settings(deadline=None, max_examples=100)
 @given(st.sampled_from(SUFFIXES), st.booleans(), st.binary(max_size=400))
-def test_any_bytes_are_read_or_refused_with_one_line(suffix, has_head, content):
+def test_log_file_of_any_bytes_is_read_or_refused_with_one_line(suffix, has_head, content):
     check_bytes(suffix, HEADS.get(suffix, b"t,xd,xm,F\n") * has_head + content)
 
 
 @pytest.mark.filterwarnings("ignore")
 @settings(deadline=None, max_examples=40)
 @given(st.data())
-def test_damaged_file_of_any_format_is_read_or_refused_with_one_line(valid_files, data):
+def test_damaged_log_file_of_any_format_is_read_or_refused_with_one_line(valid_files, data):
     suffix, content = data.draw(st.sampled_from(valid_files))
     place = data.draw(st.integers(0, len(content) - 1))
     if data.draw(st.booleans()):
@@ -250,7 +250,7 @@ def test_text_layout_is_detected_only_where_it_is_not_specified():
 
 
 @given(st.lists(st.text(st.characters(exclude_characters="\r\n"), max_size=30), max_size=12))
-def test_any_lines_have_a_layout(lines):
+def test_text_layout_is_detected_for_any_lines(lines):
     layout = detect_layout(lines, TextFormat())
     assert len(layout.names) == len(layout.units) == len(layout.texts) and layout.skipped <= len(lines)
 
@@ -269,7 +269,7 @@ def test_log_with_several_rows_per_period_is_read_at_the_ticks(tmp_path, rows, h
             f"{rows} rows per control period, of which the row with the new command is used"
             in campaign.notes[0]
         )
-    # The rows of the ticks are those with new commands, wherever the log begins; a lost row shifts nothing.
+    # The ticks are the rows with new commands, also if the log begins between ticks or has lost rows.
     lines = path.read_text().split("\n")
     path.write_text("\n".join([lines[0], *lines[2:300], *lines[301:]]))
     (run,) = read(path, **absent).runs
@@ -299,7 +299,7 @@ def test_log_whose_commands_do_not_show_the_ticks_needs_rows_per_period(tmp_path
 
 
 @given(st.integers(2, 20), st.integers(0, 19), st.integers(0, 2**32 - 1), st.booleans())
-def test_rows_with_new_commands_are_found(rows, phase, seed, hold):
+def test_command_phase_is_that_of_rows_with_new_commands(rows, phase, seed, hold):
     commands = np.cumsum(np.random.default_rng(seed).standard_normal(60))
     tick = np.arange(rows * 58) + rows
     place = (tick - phase % rows) / rows
@@ -308,7 +308,7 @@ def test_rows_with_new_commands_are_found(rows, phase, seed, hold):
 
 
 @pytest.mark.parametrize("late", [0.0, 3e-4])
-def test_topics_in_sparse_rows_are_read_at_their_own_times(tmp_path, late):
+def test_log_topics_in_sparse_rows_are_read_at_their_own_times(tmp_path, late):
     path = tmp_path / "a.csv"
     names = {"time": "__time", "position_desired": "/cmd/position", "position_measured": "/drive/position/act",
              "force_measured": "/sensor/force", "velocity_desired": None, "force_command": None}  # fmt: skip
@@ -318,7 +318,7 @@ def test_topics_in_sparse_rows_are_read_at_their_own_times(tmp_path, late):
     np.testing.assert_array_equal(run.force_measured, LOG["F"][first : first + len(run.tick)])
     if late:
         np.testing.assert_allclose(run.force_late, late, atol=2e-6)
-    # Topics with unlike counts: a faster one is read, a slower one refused.
+    # Topics with different rates: a faster topic is read, a slower topic is rejected.
     merged(path, {"xd": 1, "xm": 1, "F": 2}, {"xd": 0.0, "xm": 1e-5, "F": late})
     with pytest.raises(
         InputError, match=r"'/sensor/force': found readings 0.002 s apart, expected the control"

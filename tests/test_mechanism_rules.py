@@ -77,7 +77,7 @@ def test_damping_ratio_without_meaning_is_refused():
         ),
         (
             {"contact.law": "kelvin_voigt", "contact.damping": 3.0},
-            "found [0.1] and a damping, expected either",
+            "found [0.1] and damping, expected either",
         ),
         (
             {"contact.law": "kelvin_voigt", "contact.damping_ratio": -0.1},

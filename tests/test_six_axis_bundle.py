@@ -213,7 +213,7 @@ def test_six_axis_limits_follow_from_the_scenarios_of_a_sweep(monkeypatch):
         calibrate_six_axes(loaded, SweepStore(Path("sweep"), other))
 
 
-def test_alarms_count_as_missed_above_the_limit_of_the_sweep(built):
+def test_missed_six_axis_alarms_are_counted_above_the_limit_of_the_sweep(built):
     gain_file = check_six_axis_document(built.document)
     with jax_context():
         loaded = check_document(built.document, any_axes=True)

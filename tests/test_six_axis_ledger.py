@@ -8,7 +8,7 @@ from compiling import QUICK
 from six_axis_ranges import POSE_NOISE, with_ranges
 
 from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS, literature_gains
-from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import Tangent, restoring
+from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import Tangent, compute_force_change
 from jaxhil.mechanism.file import load_any
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.jax_environment import jax_context
@@ -101,8 +101,10 @@ def test_elastic_force_of_the_tangent_model_changes_in_the_direction_of_the_dept
     changes = np.linspace(-1e-3, 1e-3, 201)
     with jax_context():
         model = Tangent(*(jnp.full(201, value) for value in (stiffness, curvature, 0.0, path, speed)))
-        force = np.asarray(restoring(model, jnp.asarray(changes)))
-        line = np.asarray(restoring(model._replace(curvature=jnp.zeros(201)), jnp.asarray(changes)))
+        force = np.asarray(compute_force_change(model, jnp.asarray(changes)))
+        line = np.asarray(
+            compute_force_change(model._replace(curvature=jnp.zeros(201)), jnp.asarray(changes))
+        )
     assert np.all(force * np.sign(changes) >= 0) and np.max(force) > 0 > np.min(force)
     np.testing.assert_allclose(line, stiffness * changes, atol=1e-15)
 

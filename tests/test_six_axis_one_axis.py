@@ -37,7 +37,7 @@ OFF_CENTRE = {
 
 
 def first_touch(**changes):
-    """Return the metrics of a first touch, of which only some are needed here."""
+    """Return the metrics of a first touch; those that the tests do not use are 1."""
     values = dict.fromkeys(Episode._fields, 1.0) | {"reference_touches": 1, "effective_mass": 250.0}
     values |= {"approach_velocity": 0.005, "point": (0.3, -0.2, 0.0), "normal": (0.0, 0.0, 1.0)}
     return Episode(**{**values, **changes})
@@ -69,14 +69,14 @@ def test_one_axis_file_has_the_values_of_the_first_touch():
         (
             {"contact.ball.friction": {"law": "regularised", "coefficient": 0.1, "slip": 0.01}},
             {},
-            "contact.ball.friction.coefficient: found 0.1, expected 0: friction couples",
+            "contact.ball.friction.coefficient: found 0.1, expected for a one-axis file: 0, because",
         ),
         (
             {"latch.head": {"chaser": [0, 0, 0], "depth": 0.001, "angle": 0.1, "stiffness": [1e5] * 6}},
             {},
-            "latch.head: found a latch, expected no latch",
+            "latch.head: found a latch, expected for a one-axis file: no latch",
         ),
-        ({}, {"reference_touches": 2}, "contact: found 2 touches in the ideal contact, expected one"),
+        ({}, {"reference_touches": 2}, "contact: found 2 touches in the ideal contact, expected for a"),
         ({}, {"reference_touches": 0}, "contact: found 0 touches"),
     ],
 )

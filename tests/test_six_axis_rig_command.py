@@ -51,9 +51,9 @@ def test_six_axis_rig_command_reports_results_of_a_short_run(jaxhil, gains):
 @pytest.mark.parametrize(
     "change, words",
     [
-        ({"axes": 1}, "mechanism: found one with 6 axes, expected 1 (key axes)"),
-        ({"mechanism": gain_document("none")["mechanism"]}, "mechanism: found one with 1 axes, expected 6"),
-        ({"axes": 3}, "mechanism: found one with 6 axes, expected 1 (key axes)"),
+        ({"axes": 1}, "mechanism: found 6 axes, expected 1 as in the key axes"),
+        ({"mechanism": gain_document("none")["mechanism"]}, "mechanism: found 1 axes, expected 6"),
+        ({"axes": 3}, "mechanism: found 6 axes, expected 1 as in the key axes"),
         ({"constants": None}, "constants: found null, expected an object"),
     ],
 )
@@ -84,7 +84,7 @@ def test_rig_refuses_controller_with_another_number_of_axes(gains):
     try:
         address = "127.0.0.1", read_listening_port(process)
         network = Network(address, Injection(), 0, 1, loop.answered_packet_number)
-        with pytest.raises(InputError, match="axes of the controller: found 6, expected the rig's 1"):
+        with pytest.raises(InputError, match="axes of the controller: found 6, expected 1, as the rig"):
             open_session(network, 1)
     finally:
         process.kill()

@@ -95,7 +95,7 @@ def test_rig_and_jax_commands_agree_on_recorded_readings(name):
 
 
 def test_rig_and_jax_commands_agree_if_a_contact_begins_within_the_loop_delay_of_the_start():
-    """Use a hexapod whose delay line is longer than its settling, and noise that counts as contact."""
+    """Use a hexapod whose delay line is longer than the settling time, and noise above the threshold."""
     changes = {"rig.control_period": 2.5e-4, "rig.force_sensor.noise_std": {"force": 100.0, "torque": 10.0}}
     mechanism = load_any("hydraulic-hexapod", changes).mechanism
     records = recorded(mechanism, "impulse_ledger", 1, changes={"force_noise": 0.0, "torque_noise": 0.0})

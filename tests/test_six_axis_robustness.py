@@ -1,6 +1,6 @@
 """Errors of the six-axis impulse ledger if one parameter of the rig differs from the specified value.
 
-Each of these parameters is wrong alone: bias of the force sensor, mass of the tool, mass matrix, force delay.
+Only one parameter at a time is wrong: bias of the force sensor, mass of the tool, mass matrix or force delay.
 """
 
 import functools
@@ -15,7 +15,7 @@ from jaxhil.laws.impulse_ledger.simulation_six_axes import ImpulseLedger
 from jaxhil.sixdof.equations import solve
 
 WRONG_MASS = "impulse_ledger_with_wrong_mass"
-# Largest rms energy errors, on the hexapod divided by the undisturbed error. It has no tool on its sensor.
+# Largest rms energy errors, on the hexapod divided by the undisturbed error. The hexapod has no tool.
 LIMITS = {
     "probe-drogue": {"bias": 0.055, "tool": 0.055, "mass": 0.06, "delay": 0.13},
     "hydraulic-hexapod": {"bias": 1.3, "mass": 1.5, "delay": 4.6},

@@ -16,8 +16,9 @@ from jaxhil.mechanism.file import load_any
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.sixdof.building import build_scenarios, make_loop
-from jaxhil.sixdof.loop import actuated, begin, build_rig_constants, integrate, sense
+from jaxhil.sixdof.loop import begin, build_rig_constants, complete_tick, integrate
 from jaxhil.sixdof.metrics import evaluate
+from jaxhil.sixdof.sensing import sense
 
 pytestmark = pytest.mark.slow
 NAME, LAW, LANES, TICKS = "probe-drogue", "impulse_ledger", 64, 700
@@ -29,9 +30,9 @@ IDEAL = {
 
 
 def final_twist(loop, gains, scenario, force, middle):
-    """Return the model's final twist (6, lanes), with a half sine of `force` (3, lanes) [N].
+    """Return the model's final twist (6, lanes) after a half-sine push with the peak `force` (3, lanes) [N].
 
-    Its middle is at the time `middle` [s] after the first touch of the hardware.
+    The middle of the push is `middle` [s] after the first touch of the hardware.
     """
     rig, law = build_rig_constants(loop, gains, scenario), SIX_AXIS_COMPENSATORS[loop.compensator]
 
@@ -51,7 +52,7 @@ def final_twist(loop, gains, scenario, force, middle):
         command = jax.tree.unflatten(jax.tree.structure(sensed.contact), commands)
         states, position, rates, twist = integrate(loop, rig, state, command)
         sent = law.pose_command(rig.gains, position, rates)
-        after = actuated(loop, rig, state, sensed, (states, position, twist), sent)
+        after, _ = complete_tick(loop, rig, state, sensed, command, (states, position, twist), sent)
         return (after._replace(controller=after.controller._replace(law=law_state)), touched), None
 
     start = begin(loop, rig, scenario.start), jnp.zeros(LANES, jnp.int32)
@@ -60,7 +61,7 @@ def final_twist(loop, gains, scenario, force, middle):
 
 
 def test_push_during_a_contact_changes_the_twist_as_in_the_ideal_contact():
-    """Compare pushes at 25 and 75 % of the contact, along its normal and across."""
+    """Compare pushes at 25 and 75 % of the contact, along the normal and perpendicular to it."""
     mechanism, ideal = load_wide(NAME), load_any(WIDE / f"{NAME}.toml", IDEAL).mechanism
     draws = draw(mechanism, LANES, 7)
     of_contact = {key: value for key, value in draws.items() if not key.startswith("rig.")}

@@ -49,7 +49,7 @@ def tile_shape(model, loop, gains, scenarios):
 
 
 def assert_same_outcomes(first, second):
-    """Compare outcomes to rounding; numbers are compared only in the contacts that exist."""
+    """Check that outcomes agree except for rounding errors; only contacts that exist are compared."""
     np.testing.assert_array_equal(first.metrics.status, second.metrics.status)
     for name in ("error", "reference_restitution", "peak_ratio"):
         comparable = first.is_scheduled & first.good

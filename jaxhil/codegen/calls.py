@@ -54,7 +54,7 @@ class CallLowering(ListLowering):
     def field(self, owner: CExpression, name: str, node: ast.AST, new_type: Any = None) -> CExpression:
         """Return the C expression for an attribute.
 
-        Raise SubsetError if it has no known type; for an assignment, `new_type` returns the type.
+        Raise SubsetError if the attribute has no known type. For an assignment, `new_type` returns the type.
         """
         class_, plain, keys = owner.type.of, name.lstrip("_"), frozenset({(owner.type.of, name)})
         is_object = owner.type.kind == "object" or new_type is None
@@ -78,7 +78,7 @@ class CallLowering(ListLowering):
         return CExpression(text, type_, reads=owner.reads | keys, sign=type_.sign, length=length)
 
     def _class_constant(self, class_: type, name: str, value: float) -> CExpression:
-        """Return the value of a class attribute, by its name if the class's module names it."""
+        """Return the value of a class attribute, as an enumerator if its module has an equal constant."""
         owner = next(owner for owner in class_.__mro__ if name in vars(owner))
         namespace, numbers, result = (
             vars(sys.modules[owner.__module__]),

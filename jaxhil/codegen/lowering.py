@@ -1,6 +1,7 @@
 """Lowering of expressions of one function: arithmetic, comparisons, conditions, names.
 
-It also has what all parts of the lowering use: output, error flag, evaluation order, facts about numbers.
+The module also has what all parts of the lowering share: output, error flag, evaluation order, and known
+signs and ranges of numbers.
 """
 
 import ast

@@ -58,7 +58,7 @@ class CProgram:
 
     Args:
         prefix: prefix of all C names.
-        structs: least values of the fields of structs such as `jaxhil_gains`, by struct and field.
+        structs: minimum values of fields, by struct (such as `jaxhil_gains`) and field.
         names: C names of classes, without the prefix, if they differ from the names in Python.
         public: functions that the header declares, with their C names.
         bindings: classes that replace types in annotations; for example, a compensator replaces its protocol.
@@ -78,7 +78,7 @@ class CProgram:
         self.bindings, self.enumerators = bindings or {}, enumerators or {}
         self.fields: dict[type, dict[str, ValueType]] = {}  # types of the attributes of each class
         self.changed_in_place: Locations = frozenset()  # locations of lists that change in place
-        self.shared: list[tuple[Locations, SubsetError]] = []  # locations of one list, and the error
+        self.shared: list[tuple[Locations, SubsetError]] = []  # locations of the same list, and its error
         self.under_way: list[Any] = []  # keys of the functions that are being lowered
         self.functions: dict[Any, CFunction] = {}
         self.constants: dict[str, tuple[str, str]] = {}  # C code and comment of each constant, by name
@@ -196,7 +196,7 @@ class CProgram:
         return f"{self.prefix}{name}({', '.join(texts)})"
 
     def capacities(self, owner: Any, class_: type) -> dict[str, int]:
-        """Return the lengths of an object's lists of run-time length, by the names of their capacities."""
+        """Return the capacities of an object's lists whose length is known at run time only, by name."""
         result: dict[str, int] = {}
         for name, type_ in self.fields.get(class_, {}).items():
             lengths = {type_.capacity: len(getattr(owner, name))} if type_.capacity else {}

@@ -29,7 +29,7 @@ Locations = frozenset[tuple[Any, str]]  # memory locations: pairs of class, "loc
 
 
 class Sign:
-    """Bits of the sign of a number; 0 is an unknown sign, and NaN has every sign."""
+    """Bits that state what is known about a number's sign; 0 if nothing is known. NaN satisfies all bits."""
 
     NONNEGATIVE, NONZERO, POSITIVE = 1, 2, 3
 

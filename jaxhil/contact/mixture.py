@@ -21,7 +21,7 @@ class LawMixture(ContactLaw):
     element has the parameters of its own law; the other laws are evaluated with damping 0.
 
     If `precomputed` is true, the scenarios contain the ideal contacts of laws without a closed form
-    (`Scenario.reference`), and the method `ideal_contact` returns NaN for these laws.
+    (`Scenario.reference`). The method `ideal_contact` then returns NaN for these laws.
     """
 
     laws: tuple[ContactLaw, ...]

@@ -146,7 +146,7 @@ def _check_one_axis(raw: Mapping[str, Any], label: str) -> None:
 def _convert_table(
     raw: Mapping[str, Any], label: str, overrides: Overrides, unset: Sequence[str], problems: int
 ) -> AnyMechanism:
-    """Convert a parsed table with changes; the message of an error has a line for up to `problems` keys."""
+    """Change and convert a parsed table; an error message has one line for each of up to `problems` keys."""
     changed, label = raw, to_one_line(label)
     all_changes = _requested_changes(overrides, unset)
     for option, changes in all_changes.items():

@@ -101,7 +101,7 @@ def resolve_damping_ratio(mechanism: Mechanism) -> Mechanism:
 
 
 def _check_damping_ratio(contact: Contact) -> None:
-    """Raise `KeyProblem` if a damping ratio has no meaning for the contact law, or if there is a damping."""
+    """Raise `KeyProblem` if the contact law has no damping ratio, or if `damping` is also specified."""
     path = ("contact", "damping_ratio")
     if contact.damping_ratio is None:
         return
@@ -109,11 +109,11 @@ def _check_damping_ratio(contact: Contact) -> None:
     if contact.law not in DAMPING_RATIO_LAWS:
         raise KeyProblem(path, found, f"nothing (only for law {' or '.join(DAMPING_RATIO_LAWS)})")
     if any(contact.damping):
-        raise KeyProblem(path, f"{found} and a damping", "either damping or damping_ratio")
+        raise KeyProblem(path, f"{found} and damping", "either damping or damping_ratio")
 
 
 def _repeat_last(*lists: Sequence[Any]) -> list[tuple[Any, ...]]:
-    """Return the entries of lists together; the last entry of a shorter list repeats."""
+    """Return a tuple of the lists' entries for each index; shorter lists repeat their last entry."""
     length = max(map(len, lists))
     return [tuple(entries[min(i, len(entries) - 1)] for entries in lists) for i in range(length)]
 

@@ -46,7 +46,7 @@ __all__ = [
 
 SCHEMA = "jaxhil/mechanism/1"
 MAX_CONTACTS = 1000
-MAX_LATENCY = 4  # [periods]; of a command, with the periods that a co-simulation adds
+MAX_LATENCY = 4  # [periods]; maximum command latency, including the periods that a co-simulation adds
 # limits on nonzero numbers, so that a product of three neither overflows nor underflows
 MAGNITUDE_LIMITS = 1e-100, 1e100
 NO_METADATA: Mapping[str, Any] = {}
@@ -370,7 +370,7 @@ def ranges_of(kind: msgspec.inspect.Type, names: Mapping[str, Sequence[str]]) ->
             case msgspec.inspect.StructType(fields=fields):
                 for entry in fields:
                     if entry.name not in ("correlation", "damping_ratio") or path == "rig.simulator":
-                        # These numbers describe other keys.
+                        # Correlations and damping ratios state values of other keys.
                         visit(entry.type, f"{path}.{entry.encode_name}".lstrip("."))
             case msgspec.inspect.Metadata(type=inner):
                 visit(inner, path, kind.extra or NO_METADATA)

@@ -11,8 +11,8 @@ The bounds admit every rig with these properties:
     positions                   within 50 m of the surface (rendezvous rigs have rails of about 25 m)
     speed of position command   below 10 m/s
 
-The bounds are slightly wider than the gains that published rules, tuning and the shipped settings yield for
-such a rig (`jaxhil/laws` has narrower bounds for a given rig):
+The bounds are slightly wider than the gains of published rules, of tuning and of the built-in settings for
+such a rig. `jaxhil/laws` has narrower bounds for a specific rig. The bounds are:
 
     times           2 x (1 s + 1 s) + 0.02 s, twice the loop's delay, the largest lead that tuning tries
     stiffness       5 M omega^2 = 5e11 N/m for 1000 t at 50 Hz

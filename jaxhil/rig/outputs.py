@@ -71,8 +71,8 @@ class PositionGuard:
     """Guard of the position command: range (stroke) and rate (`velocity_limit`).
 
     Two successive commands differ by at most one period's travel at `velocity_limit`. A run's first command
-    may differ from the measured position by at most this travel or, if the model is out of contact, by at
-    most `start_distance`, because moving drives lag behind. A command is outside the stroke only while it
+    may differ from the measured position by at most this travel. If the model is out of contact, the limit is
+    `start_distance` instead, because moving drives lag behind. A command is outside the stroke only while it
     returns into the stroke.
 
     Attributes:

@@ -2,11 +2,12 @@
 
 A contact begins on the first tick on which the model's or the measured position is beyond a specified
 surface, or on which the compensator acts (it may detect a nearer surface). The watchdog audits the contact as
-soon as none of these conditions has been true for the time `settling`, the model moves away and the force has
-decayed. It waits for the decay for at most `MAX_DECAY_WAIT`. No threshold depends on the noise, because a
-noisy force can be small by chance before it has given its whole impulse. The audit takes place at the latest
-in the middle between two surfaces, or at the call of `next_contact`. With v_in and v, the model's velocities
-on the tick before the contact and on the present tick, the audit checks three conditions:
+soon as none of these conditions has been true for the time `settling`. In addition, the model must move away
+and the force must have decayed. The watchdog waits for the decay for at most `MAX_DECAY_WAIT`. No threshold
+depends on the noise, because a noisy force can be small by chance before it has given its whole impulse. The
+audit takes place at the latest in the middle between two surfaces, or at the call of `next_contact`. With
+v_in and v, the model's velocities on the tick before the contact and on the present tick, the audit checks
+three conditions:
 
 - Energy: M (v^2 - v_in^2)/2 equals the work -T sum F_c(n) (v(n) + v(n+1))/2 of the controller's force. This
   is an identity for every integrator with v(n+1) = v(n) - T F_c(n)/M.

@@ -1,10 +1,10 @@
 """Real contact in one sampling interval, from the exact motion: sensor lag, work, peak force, duration.
 
 Each cell (`jaxhil.simulation.cells`) is divided into sections of monotone motion, at the instants at which
-the motion reverses. Each section is divided into spans at the surface, at the points at which the slope of
-the contact law changes, and at the points at which the force vanishes. In each span the force is a smooth
-function, which Gauss-Legendre quadrature integrates. All cells are computed in parallel. Only the state of a
-contact law with memory is passed from cell to cell.
+the motion reverses. Each section is divided into spans at the surface, at each change of the contact law's
+slope, and at each zero of the force. In each span the force is a smooth function, which Gauss-Legendre
+quadrature integrates. All cells are computed in parallel. Only the state of a contact law with memory is
+passed from cell to cell.
 """
 
 import functools

@@ -1,8 +1,8 @@
 """Evaluation of batches of scenarios on all cores, for rigs with one axis or with six axes.
 
 Each scenario of a batch is a lane. The lanes that run together on one device are a tile. Lanes are sorted
-before they are divided into tiles. They are sorted by delay, because lanes with equal delays read their delay
-lines faster, and by expected duration, because a tile runs until its slowest lane has finished.
+before they are divided into tiles. Sorting by delay lets lanes with equal delays read their delay lines
+faster. Sorting by expected duration saves time, because a tile runs until its slowest lane has finished.
 
 Tiles are distributed to the devices in turn. Batches are padded with idle lanes to a few sizes, so that most
 calls reuse a compiled program. On an accelerator, a batch is a single tile per device, as far as the memory

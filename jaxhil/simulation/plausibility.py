@@ -356,7 +356,7 @@ def _find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) -
 
 
 def _check_sensors(mechanism: Mechanism, strongest: ContactSummary) -> list[str]:
-    """Return a warning for every error of a sensor that hides the whole ideal contact."""
+    """Return a warning for every sensor error that is larger than the signal of all ideal contacts."""
     depth = mechanism.approach.velocity / (2 * math.pi * strongest.frequency)
     limits = (
         ("force_sensor", strongest.peak_force, "N", "the peak force", "mN"),

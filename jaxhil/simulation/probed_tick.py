@@ -22,7 +22,7 @@ def apply_probe(
     contact: IntervalContact,
     tracker: ContactTracker,
 ) -> tuple[LoopState, IntervalContact, ContactTracker]:
-    """Add the effects of the probe to the state, the contact and the watch of a tick.
+    """Add the effects of the probe to the state, the contact and the contact's record.
 
     Args:
         rig: Constants of the run.

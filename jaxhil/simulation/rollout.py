@@ -78,7 +78,7 @@ def run_until_done(loop: Loop, gains: Gains, rig: RigConstants) -> RunState:
 def segment_length(loop: Loop) -> int:
     """Return the number of ticks in a segment.
 
-    It is 1 for two surfaces, because the next contact may begin in the next tick.
+    The number is 1 for two surfaces, because the next contact may begin in the next tick.
     """
     return 1 if loop.is_two_sided else 16
 

@@ -1,10 +1,10 @@
 """Conversion of a six-axis mechanism to the one-axis mechanism of its first touch.
 
-Without friction, a contact is to first order in the rotation a contact with one axis along the normal of the
-first touch, with the effective mass at this touch (notebooks/guide/six_axes.md, section 1). An impulse along
-the normal moves all axes of the motion simulator. The motion along the normal is the sum of the axes'
-motions, each multiplied by its share: the wrench of a unit force, component by component, times the twist
-that this wrench causes, times the effective mass.
+To first order in the rotation, a contact without friction equals a contact with one axis along the normal of
+the first touch. Its mass is the effective mass at this touch (notebooks/guide/six_axes.md, section 1). An
+impulse along the normal moves all axes of the motion simulator. The motion along the normal is the weighted
+sum of the axes' motions. The weight (share) of an axis is the product of three numbers: the axis' component
+of the wrench of a unit force, its component of the twist that this wrench causes, and the effective mass.
 """
 
 import math
@@ -88,28 +88,29 @@ def convert_to_one_axis(mechanism: SixAxisMechanism, episode: Episode | IdealEpi
 
 
 def _check_has_equivalent(mechanism: SixAxisMechanism, episode: Episode | IdealEpisode) -> None:
-    """Raise `InputError` if the contact cannot be a contact with one axis."""
+    """Raise `InputError` if the contact has no equivalent with one axis."""
 
     def refuse(key: str, found: str, expected: str) -> None:
-        raise InputError(f"{mechanism.name}: {key}: found {found}, expected {expected} for a one-axis file")
+        raise InputError(f"{mechanism.name}: {key}: found {found}, expected for a one-axis file: {expected}")
 
     if mechanism.approach is None:
         refuse("start", "explicit states", "[approach]")
     for name in mechanism.latch:
-        refuse(f"latch.{name}", "a latch", "no latch: it holds all six axes")
+        refuse(f"latch.{name}", "a latch", "no latch, because a latch holds all six axes")
     for name, contact in mechanism.contact.items():
         if contact.friction is not None and contact.friction.coefficient > 0:
             found, key = f"{contact.friction.coefficient:g}", f"contact.{name}.friction.coefficient"
-            refuse(key, found, "0: friction couples the normal to the other axes")
+            refuse(key, found, "0, because friction couples the axes")
     touches = episode.reference_touches
     if touches != 1:
-        refuse("contact", f"{touches} touches in the ideal contact", "one: each touch has its own normal")
+        expected = "one, because each touch has its own normal"
+        refuse("contact", f"{touches} touches in the ideal contact", expected)
     simulator = mechanism.rig.simulator
     robot = simulator.target_robot
     lists = [[getattr(simulator, key), robot and getattr(robot, key)] for key in PER_AXIS_KEYS]
     values = [[entry for part in parts if part for entry in part] for parts in lists]
     if simulator.space != "task" and any(np.ptp(entries or [0.0]) > 0 for entries in values):
-        refuse("rig.simulator", "axes with different dynamics", "equal ones of legs or robots")
+        refuse("rig.simulator", "axes with different dynamics", "equal axes of legs or robots")
 
 
 def _find_touch(
@@ -139,7 +140,7 @@ def _convert_contact_keys(contact: Any) -> dict[str, Any]:
 
 
 def _convert_simulator(mechanism: SixAxisMechanism, shares: np.ndarray) -> dict[str, Any]:
-    """Return the motion simulator along the normal: means of the axes, with the mean lag of the axes.
+    """Return the motion simulator along the normal, with the axes' mean properties and mean lag.
 
     The means are weighted by the axes' shares. The delay is chosen so that the lag in uniform motion equals
     the weighted mean of the axes' lags.

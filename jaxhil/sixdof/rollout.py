@@ -185,7 +185,7 @@ def _episode(
 ) -> EpisodeBatch:
     """Return the results of the current episode.
 
-    In lanes where `has_ended` is false, it ends now, with the given `states` after `ticks` ticks.
+    In lanes where `has_ended` is false, the episode ends now, with the given `states` after `ticks` ticks.
     """
     period = rig.period
     elapsed = (jnp.where(has_ended, tracker.end_tick, ticks) - episode_start.tick).astype(

@@ -1,6 +1,7 @@
-"""Table of speeds for the device at hand; `tests/benchmarks/gpu.sh` prepares JAX and prints it.
+"""Table of computing speeds on this machine's device; `tests/benchmarks/gpu.sh` runs this script.
 
-A lane-step is one tick of one scenario. Ticks of lanes that wait for the slowest lane of their tile count.
+A lane-step is one tick of one scenario. The speeds include ticks of lanes that wait for the slowest lane of
+their tile.
 """
 
 import argparse
@@ -24,7 +25,7 @@ from jaxhil.simulation.tile_size import DeviceDescription
 from tuning.gain_file import write_gain_file
 from tuning.sweeps.chunks import convert_precision
 
-LIMIT, SMOKE_LIMIT = 480.0, 3600.0  # s; time of the whole table, with full and with tiny sizes
+LIMIT, SMOKE_LIMIT = 480.0, 3600.0  # s; maximum time for the table, with full and with tiny sizes
 REPEATS = 3
 ROOT = Path(__file__).parents[2]
 

@@ -1,4 +1,4 @@
-"""Script for graphics cards: every row of its table works, with tiny sizes on the device at hand."""
+"""Script for graphics cards: with tiny sizes, every row of its table has a result on this machine."""
 
 import subprocess
 from pathlib import Path

@@ -100,7 +100,7 @@ class CompareOptions:
             arguments.check_supports_mechanism(name, None, "compensators")
 
     def with_defaults(self, loaded: Sequence[LoadedAnyMechanism]) -> Self:
-        """Return the options with all compensators and the limit, which depend on the number of axes.
+        """Return the options with the defaults of compensators and limit, which depend on the number of axes.
 
         Raise `InputError` if two mechanisms have the same name or different numbers of axes, or if a
         compensator does not support the number of axes.
@@ -177,7 +177,7 @@ def compare_each(
         options: options of the comparison, from `CompareOptions.with_defaults`.
         processes: number of processes; 0 for the current process.
         bar: progress display.
-        checkpoints: results of finished work, which is not repeated; new results are added.
+        checkpoints: cache of finished results, which are not computed again; new results are added.
 
     Yields:
         Results of `tuning.benchmark.comparison.compare_compensators`.

@@ -114,10 +114,11 @@ def map(
 ) -> StabilityMap:
     """Compute a stability map: the error of a contact as a function of two keys, and closed-form predictions.
 
-    The gains at every point are those of the nominal mechanism, so that the map shows the effect of changes
-    that are unknown to the controller. If compensator and contact law are linear, the map also contains the
-    spectral radius of the sampled loop in contact and, at the nominal point, its derivative with respect to
-    each gain. For six axes, the error is the twist error, and there are no predictions.
+    The gains at every point are those of the nominal mechanism. The map therefore shows the effect of changes
+    that the controller does not know. If compensator and contact law are linear, the map also contains the
+    spectral radius of the sampled loop in contact. At the nominal point, it contains the derivative of this
+    radius with respect to each gain. For six axes, the error is the twist error, and there are no
+    predictions.
 
     Args:
         mechanism: result of `jaxhil.load`, the name of a built-in mechanism, or the path of a mechanism file.

@@ -164,7 +164,7 @@ class TuneOptions:
             arguments.check_one_axis_arguments(mechanism, objective=self.objective)
 
     def add_extra_periods(self, mechanism: AnyMechanism) -> AnyMechanism:
-        """Return the mechanism with the command latency of the co-simulation; see `extra_periods`."""
+        """Return the mechanism with `extra_periods` added to its command latency."""
         latency, rig = mechanism.rig.command_latency + self.extra_periods, mechanism.rig
         if latency > MAX_LATENCY:
             most = MAX_LATENCY - rig.command_latency

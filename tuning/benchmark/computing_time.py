@@ -60,7 +60,7 @@ def _build_tick(compensator: Any) -> Callable[[float, float, float], None]:
 def _build_six_axis_tick(
     mechanism: SixAxisMechanism, law: str, gains: Mapping[str, float]
 ) -> Callable[[float, float, float], None]:
-    """Return the function of `_build_tick` for a six-axis compensator, which moves along the docking axis."""
+    """Return such a function for a six-axis compensator; all motion is along the docking axis."""
     from jaxhil.sixdof.model_constants import model_constants
 
     constants = ModelConstants(**model_constants(mechanism))

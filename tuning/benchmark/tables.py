@@ -74,7 +74,7 @@ def build_mechanism_table(name: str, results: Sequence[CompensatorMetrics]) -> T
                     ),
                 ]
             )
-    tuned = ", then tuned, but for those with settings" * _has_tuned_gains(results)
+    tuned = ", then tuned, except those with settings" * _has_tuned_gains(results)
     title = f"{name}: each compensator with the literature's gains{tuned}"
     return _set_compact_style(terminal.build_table(title, ["law", *headings.values()], rows))
 
@@ -105,7 +105,7 @@ def build_leaderboard(names: Sequence[str], results: Mapping[str, Sequence[Compe
     headings = ["", *("\n".join(filter(None, [*law.split("_"), which])) for law, which in columns)]
     tuned = any(map(_has_tuned_gains, results.values()))
     how = (
-        "each compensator tuned, but for those with settings"
+        "each compensator tuned, except those with settings"
         if tuned
         else "each compensator with the literature's gains"
     )

@@ -30,7 +30,7 @@ static int differs(const char *file, long number, const char *column, double fou
 }
 
 @columns@
-/* The row's numbers; an empty field is NaN and `given` 0. False if the line is not COLUMNS numbers. */
+/* Read the numbers of a row; return whether there are COLUMNS numbers. An empty field is NaN, with `given` 0. */
 static int read_row(char *text, double *row, int *given) {
     for (int column = 0; column < COLUMNS; column++) {
         const char last = column + 1 < COLUMNS ? ',' : '\0';
@@ -52,7 +52,7 @@ static int read_row(char *text, double *row, int *given) {
     return 1;
 }
 
-/* What comes before the row's tick: a run begins (1), the next contact does (2), nothing (0). */
+/* Apply what precedes the row's tick: start of a run (1), start of the next contact (2), or nothing (0). */
 static int begin(const char *name, long number, double event, int *begun) {
     if (event == 1.0) {
         *begun = 1;

@@ -11,7 +11,7 @@ static bool start(void) {
     return jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits);
 }
 
-/* One row through the controller: 0 if it does what the row says. */
+/* Pass one row to the controller; return 0 if the results equal those of the row. */
 static int replay(const char *name, long number, const double *row, const int *given) {
     const double force =
         jaxhil_step(&controller, row[FORCE_MEASURED], row[POSITION_DESIRED], row[VELOCITY_DESIRED],

@@ -33,7 +33,7 @@ static bool start(void) {
                        &jaxhil_exported_constants);
 }
 
-/* One row through the controller: 0 if it does what the row says. */
+/* Pass one row to the controller; return 0 if the results equal those of the row. */
 static int replay(const char *name, long number, const double *row, const int *given) {
     double wrench[6], pose[6];
     jaxhil_step(&controller, row + WRENCH_MEASURED, row + POSE_DESIRED, row + TWIST_DESIRED,

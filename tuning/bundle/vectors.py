@@ -119,7 +119,7 @@ def record_vectors(
 def make_damaged_rows(
     nominal: Sequence[VectorRow], integrator: str, mass: float, gain_file: GainFile, seed: int
 ) -> list[VectorRow]:
-    """Return the rows of random segments of the nominal run with randomly corrupted inputs.
+    """Return rows from random segments of the nominal run, with randomly corrupted inputs.
 
     `mass` is the equivalent mass of the numerical model [kg], `integrator` its integration rule.
     """

@@ -1,8 +1,8 @@
 """Export of gain documents to the formats of other programs: ROS 2, MATLAB, CSV, C99 and FMUs.
 
-`WRITERS` maps the name of each format (`--format`) to a function that takes a checked gain document and
-returns the content of each file by its path. All formats preserve the bits of the numbers. A limit of null is
-written as its default. To add a format, add a function and its entry in `WRITERS`.
+`WRITERS` maps the name of each format (`--format`) to a function. The function takes a checked gain document
+and returns the content of each file by its path. All formats preserve the bits of the numbers. A limit of
+null is written as its default. To add a format, add a function and its entry in `WRITERS`.
 """
 
 import csv

@@ -183,13 +183,13 @@ class Compare(CompareOptions):
     Example: jaxhil compare rig-300kg varying --compensators phase_lead response_error
 
     Writes DIR/compare.json, which contains all metrics with confidence intervals and all gains, and plots.
-    All files have the same number of axes.
+    All files must have the same number of axes.
     """
 
     files: Files = ()
     suites: Annotated[
         FlagCreatePairsOff[bool],
-        text_option(None, "Compare on the standard suites of mechanisms too, in addition to FILE."),
+        text_option(None, "Also compare on the standard sets (suites) of mechanisms with one axis."),
     ] = False
     output: Annotated[str, folder_option("Folder for the results.")] = "jaxhil-out/compare"
     overrides: Overrides = ()

@@ -39,7 +39,9 @@ class IdentifyOptions:
     guess: Annotated[
         FlagCreatePairsOff[bool],
         text_option(
-            None, "Only print a draft of the file for --map, from the names and values of the columns."
+            None,
+            "Only print a draft of the mapping file, from the names and values of the columns. With --map, "
+            "the draft uses the table [text] of that file.",
         ),
     ] = False
     design: Annotated[

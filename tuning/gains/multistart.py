@@ -240,7 +240,7 @@ def polish_best_starts(
     seed: int,
     objective: Objectives = RMS_OBJECTIVE,
 ) -> list[StartResult | None]:
-    """Improve the best solver result of every task by a derivative-free search of `evaluations` evaluations.
+    """Improve every task's best solver result by a derivative-free search with `evaluations` evaluations.
 
     The search is `tuning.optimisation.derivative_free.polish`. A task without a valid result yields None.
     """

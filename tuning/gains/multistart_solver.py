@@ -32,7 +32,7 @@ from tuning.optimisation.solution import SOLVER_STATUSES, SolverResult
 from tuning.optimisation.unit_box import GainBounds
 from tuning.transparency.probes import LANES_PER_SCENARIO
 
-MIN_PROBLEMS_PER_CALL, MAX_PROBLEMS_PER_CALL = 4, 32  # limits of problems per call
+MIN_PROBLEMS_PER_CALL, MAX_PROBLEMS_PER_CALL = 4, 32  # limits of the number of problems per call
 # Number of lanes that a processor's core computes together; more would exceed its cache.
 LANES_PER_TILE = 64
 STEPS_BEFORE_SELECTION = 8  # solver steps of the first round

@@ -81,10 +81,10 @@ def tune_all(
 ) -> Iterator[tuple[int, TuneResult]]:
     """Tune the gains of `compensator` for many mechanisms; yield (index, result) of each finished mechanism.
 
-    Mechanisms that share a program are tuned together; a `common` program lets different kinds of mechanisms
-    share one. The tuned gains of the most similar mechanism in `tuned` are a start of each mechanism. In all
-    groups but the first, the gains of the most similar mechanism of the first group are a start too. These
-    starts never replace the literature's gains.
+    Mechanisms that share a program are tuned together. Different kinds of mechanisms can share a `common`
+    program. Each mechanism also starts from the gains of the most similar mechanism in `tuned`. After the
+    first group, each mechanism also starts from the gains of the most similar mechanism of that group. The
+    literature's gains always remain a start.
 
     `checkpoints` caches each result under the mechanism's name and its group, because the other mechanisms of
     the group affect the last bits. If `scheduler` is given, the workers of a cluster tune the groups.

@@ -137,7 +137,7 @@ class MotionResponse:
     def _after(self, fraction: float):
         """Return the three matrices that advance the state by a fraction of a period.
 
-        They multiply the state, the input at the start of the period and the input at its end.
+        The matrices multiply the state, the input at the start of the period and the input at its end.
         """
         n = self.order
         system = np.zeros((n + 2, n + 2))

@@ -1,4 +1,4 @@
-"""Rows near contact at several surface positions, and onsets of contact between rows."""
+"""Rows near contact for several assumed surface positions, and contact onsets between rows."""
 
 from typing import NamedTuple
 

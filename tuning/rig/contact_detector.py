@@ -31,7 +31,7 @@ class RigContact(NamedTuple):
     oldest_command: int = 0
 
     def as_tripped(self) -> "RigContact":
-        """Return the contact of a controller that has tripped; its restitution says nothing."""
+        """Return the contact with the status "tripped" and the restitution NaN."""
         return self._replace(status="tripped", restitution=math.nan)
 
 

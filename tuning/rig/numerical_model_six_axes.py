@@ -30,7 +30,7 @@ class FreeBody(NamedTuple):
 
 
 class BodyMotion(NamedTuple):
-    """BodyMotion of a body, in world axes."""
+    """Motion of a rigid body, in world axes."""
 
     position: Triple  # position of the centre of mass [m]
     velocity: Triple  # velocity of the centre of mass [m/s]
@@ -205,7 +205,7 @@ def _cross(left: Sequence[float], right: Sequence[float]) -> Triple:
 
 
 def _product(rows: Sequence[Sequence[float]], vector: Sequence[float]) -> Triple:
-    """Return the product of a matrix, given by its rows, and a vector."""
+    """Return the product of a matrix (a tuple of rows) and a vector."""
     x, y, z = vector
     first, second, third = (row[0] * x + row[1] * y + row[2] * z for row in rows)
     return first, second, third

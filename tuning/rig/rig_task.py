@@ -28,7 +28,7 @@ MAX_COMMAND_AGE = 3  # [periods]; if a command is older, its effects are not the
 # Reasons for a trip that an old command can cause.
 TRIPS_BY_OLD_COMMANDS = ("tripped: restitution", "tripped: missed_tick")
 PAUSE_TICKS = 5  # number of ticks between two runs
-BEGIN_TICKS = 3  # smallest number of ticks between the begin of a run, which may be slow, and its tick 0
+BEGIN_TICKS = 3  # minimum number of ticks between the start of a run, which may be slow, and its tick 0
 STALLED = "stalled"  # status of a contact in which the computer delayed the commands too long
 
 
@@ -42,7 +42,7 @@ class SimulatedRig(Protocol):
     error_name: str  # name of the error that decides the verdict, in the results of `evaluate`
 
     @property
-    def good_statuses(self) -> Sequence[str]: ...  # statuses of contacts that ended as they should
+    def good_statuses(self) -> Sequence[str]: ...  # statuses of contacts that ended normally
     def prepare(self, last: Any, /) -> Numbers: ...  # prepare the run after this contact; return its start
     def begin(self, command: Numbers) -> None: ...
     def read(self) -> tuple[Numbers, Numbers]: ...

@@ -276,7 +276,7 @@ def open_session(network: Network, axes: int) -> int:
             return opening.session
         network.close()
         raise InputError(
-            f"udp_controller.py: axes of the controller: found {opening.axes}, expected the rig's {axes}"
+            f"udp_controller.py: axes of the controller: found {opening.axes}, expected {axes}, as the rig"
         )
     network.close()
     raise InputError(

@@ -20,7 +20,8 @@ numerical model of the docking, once per period.
 The process records the time of each tick, from the arrival of the packet to the answer, and its CPU time. It
 writes both at the end. If a tick used too much CPU time (`MAX_CPU_SHARE`), the process replays all packets at
 the end. If the controller was the cause, the tick is slow again in the replay. If an interrupt or another
-virtual machine was the cause, it is fast. With `--empty`, the process answers at once and computes nothing.
+virtual machine was the cause, the tick is fast. With `--empty`, the process answers at once and computes
+nothing.
 """
 
 import argparse
@@ -59,8 +60,8 @@ else:
 
     MODEL_PACKAGE = "tuning.rig."
 
-# Class of the controller, and module and class of the numerical model, for each number of axes; a bundle has
-# those for one number.
+# Class of the controller, and module and class of the numerical model, by number of axes; a bundle contains
+# only the modules for its number of axes.
 MODELS = {
     1: ("Controller", "numerical_model", "OneAxisModelInLoop"),
     6: ("Controller6", "numerical_model_six_axes", "SixAxisModelInLoop"),

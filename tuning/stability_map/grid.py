@@ -303,7 +303,7 @@ def _build_scenarios(
     mechanism: AnyMechanism, axes: tuple[MapAxis, MapAxis], values: np.ndarray, seed: int
 ) -> Any:
     """Build the scenarios for points `values`, (lanes, 2), all with the same sensor noise."""
-    # A value of every lane determines the number of lanes, even if both axes are gains.
+    # This array determines the number of lanes, even if both axes are gains.
     period = {"rig.control_period": np.full(len(values), mechanism.rig.control_period)}
     if isinstance(mechanism, Mechanism):
         period = {"approach.phase": np.full(len(values), mechanism.approach.phase)}
@@ -331,9 +331,10 @@ def _point_gains(
 def _worst_contact(outcome: Outcome) -> tuple[np.ndarray, ...]:
     """Return five arrays (lanes,) with the worst values among the contacts of each lane.
 
-    The values are restitution and error of the contact with the error of largest magnitude, the largest peak
-    force ratio, the duration ratio farthest from 1, and 1 if the peak force or duration of a real contact is
-    out of bounds, else 0. All values are NaN if a contact did not end, or if there is no contact.
+    The first two values are restitution and error of the contact with the largest error. The next two are the
+    largest peak force ratio, and the duration ratio farthest from 1. The last value is 1 if a real contact's
+    peak force or duration is out of bounds, else 0. All values are NaN if a contact did not end, or if there
+    is no contact.
     """
     used = outcome.is_scheduled & outcome.good
     ended = np.any(outcome.is_scheduled, axis=0) & ~np.any(outcome.is_scheduled & ~outcome.good, axis=0)

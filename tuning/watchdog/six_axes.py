@@ -3,9 +3,10 @@
 Runs of drawn scenarios are recorded. A run is good if its contacts end well and its twist error is at most
 half of the limit. One part of the runs determines the limits: the extreme signals of its good runs times
 a margin. The other part is replayed through the rig's controller with these limits. An alarm in a good run is
-false. An alarm is missed if a run with a larger error than the limit, or a good run with a wrong mass of the
-numerical model, causes none. The limit is that of the sweep whose scenarios are recorded or, without a sweep,
-`ERROR_LIMIT`.
+false. A missed alarm is a run without an alarm, although its error exceeds the limit or the mass of the
+numerical model is wrong. The runs with a wrong mass are good runs that are repeated.
+
+The limit is that of the sweep whose scenarios are recorded or, without a sweep, `ERROR_LIMIT`.
 """
 
 from collections.abc import Callable, Mapping
@@ -75,7 +76,7 @@ def calibrate_six_axes(
         replaced: limits that replace calibrated limits, also for the alarm rates; None removes a limit.
         allowed: maximum acceptable alarm rates.
         progress: callback, called with the number of runs that have been completed since the last call.
-        scenarios: number of draws, or of a sweep's scenarios if it has as many.
+        scenarios: number of draws; with a sweep, the maximum number of its scenarios.
         seed: seed of the draws without a sweep.
 
     Raises:
@@ -190,7 +191,7 @@ def _motion_limits(records: list[ControllerRecord], period: float) -> dict[str, 
 
 
 def _stuck_limits(records: list[ControllerRecord]) -> dict[str, float]:
-    """Return the limits of the motion during which a reading may stay unchanged."""
+    """Return the limits on the motion while a reading stays unchanged."""
     travels, turns, under_force = [0.0], [0.0], [0.0]
     for record in records:
         moved = np.linalg.norm(np.diff(record.pose_measured[:, :3], axis=0), axis=1)

@@ -36,7 +36,7 @@ def build_fmu(
 
     Args:
         identifier: identifier of the model, which is also the name of the library.
-        name: name for the user.
+        name: name that other tools display.
         description: description in one line.
         period: control period [s].
         variables: variables in the order of their value references.

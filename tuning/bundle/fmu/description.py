@@ -30,7 +30,7 @@ class FmuDescription(NamedTuple):
     """Content of an FMU's description."""
 
     identifier: str  # identifier of the model, which is the name of the library
-    name: str  # name for the user
+    name: str  # name that other tools display
     description: str
     token: str  # identifies the content of the FMU
     period: float  # control period, which is the communication step [s]

@@ -114,10 +114,10 @@ def rig_variables(mechanism: Mechanism) -> list[Variable]:
         output("position_shortfall", "m", "distance between the requested and the rate-limited command"),
         parameter("equivalent_mass", "kg", "mass of the model", mechanism.bodies.mass, *MODEL_MASSES),
         parameter("approach_velocity", "m/s", "speed of the first approach", approach.velocity, *SPEEDS),
-        parameter("approach_phase", "1", "phase of the contact in its period", approach.phase, 0.0, 1.0),
-        parameter("force_noise", "N", "standard deviation of its noise", force.noise_std, *FORCES),
-        parameter("position_noise", "m", "standard deviation of its noise", position.noise_std, *DISTANCES),
-        Variable("seed", "parameter", "integer", "seed of the noise", lowest=0, highest=MAX_SEED),
+        parameter("approach_phase", "1", "phase of the first touch in a period", approach.phase, 0.0, 1.0),
+        parameter("force_noise", "N", "standard deviation of the noise", force.noise_std, *FORCES),
+        parameter("position_noise", "m", "standard deviation of the noise", position.noise_std, *DISTANCES),
+        Variable("seed", "parameter", "integer", "seed of the sensor noise", lowest=0, highest=MAX_SEED),
     ]  # fmt: skip
 
 

@@ -150,7 +150,7 @@ def _six_axis_signals() -> list[Variable]:
         Variable(
             "loop_delay", "output", "real", "delay of the hardware in the last contact; 0: unknown", "s"
         ),
-        Variable("unpaid_impulse", "output", "real", "impulse owed after the last contact, as a share of it"),
+        Variable("unpaid_impulse", "output", "real", "share of the last contact's impulse that is owed"),
     ]
 
 

@@ -17,7 +17,7 @@ from tuning.cli.commands import checks
 from tuning.cli.commands.checkpoints import open_checkpoints, warn_about_checkpoints
 from tuning.cli.options import Compare
 
-PLOTS = ("errors.png", "honesty.png")  # of six axes only the first
+PLOTS = ("errors.png", "honesty.png")  # for six axes, only the first plot exists
 
 
 def run(options: Compare) -> int:

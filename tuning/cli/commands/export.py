@@ -90,8 +90,8 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
         ]
         if "fmu" in document["formats"]:
             lines.append(
-                "Co-simulation, with the controller's FMU stepped before the rig's, adds one control period "
-                "to the loop: tune with `--extra-periods 1`."
+                "A co-simulation that steps the controller's FMU before the rig's FMU adds one control "
+                "period: tune with `--extra-periods 1`."
             )
     lines += [f"Bad: {reason}" for reason in document["reasons"]]
     lines += [f"Unknown: {text}." for text in document["unknown"]]

@@ -26,7 +26,7 @@ MECHANISM_FILE, DOCUMENT_FILE = "mechanism.toml", "identification.json"
 # Head of the mechanism file, below the verdict.
 SPREAD_COMMENT = """\
 [uncertainty] is the uncertainty of the estimate from these logs, of one rig on one day.
-It does not contain how the mechanism varies with temperature, wear or from specimen to specimen."""
+It does not include variation with temperature, wear or specimen."""
 PLOTS = ("bode.png", "delay.png", "contacts.png", "residuals.png", "compare.png")
 
 

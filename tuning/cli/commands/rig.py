@@ -106,7 +106,7 @@ def write_controller_files(compensator: str, axes: int, scratch: Path) -> Path:
 
 
 def load_checked_gains(gains: Path) -> tuple[dict[str, Any], Any, tuple[Any, Any]]:
-    """Make the checks of the rig's runtime on a gain file.
+    """Check a gain file as the rig's runtime does.
 
     Return the file's document and mechanism, and the lowest and the highest position commands [m, rad] that
     it allows. Raise `InputError` if a check fails.
@@ -124,7 +124,7 @@ def load_checked_gains(gains: Path) -> tuple[dict[str, Any], Any, tuple[Any, Any
         if isinstance(mechanism, dict) and is_six_axes(mechanism) != (kind.axes == 6):
             other = 7 - kind.axes
             raise InputError(
-                f"{source}: mechanism: found one with {other} axes, expected {kind.axes} (key axes)"
+                f"{source}: mechanism: found {other} axes, expected {kind.axes} as in the key axes"
             )
         limits = kind.check_document(document, source).limits
     except GainFileError as error:

@@ -325,7 +325,7 @@ def _prepare_drawing(mechanism, compensator: str) -> None:
 
 
 def is_better(metrics, other) -> bool:
-    """Return whether `metrics` has fewer failed contacts than `other` or, if equally many, a smaller rms."""
+    """Return whether `metrics` has fewer failed contacts than `other` or, with as many, a smaller rms."""
     return metrics.failed < other.failed or (metrics.failed == other.failed and metrics.rms < other.rms)
 
 

@@ -2,8 +2,8 @@
 
 The name of a column and the unit that the file states indicate the channel. If several columns fit equally,
 or none does, the guess lists them and the user decides. A unit that the file does not state is guessed from
-the values, the same for both positions. The signs are also guessed from the values, for the convention that
-positions increase towards contact and that a force which pushes the bodies apart is positive.
+the values, and both positions get the same unit. The signs are also guessed from the values. By convention,
+positions increase towards contact, and a force that pushes the bodies apart is positive.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def guess_channels(sample: LogSample, chosen: Mapping[str, Sequence[str]]) -> di
         if unit is not None:
             why = "by its name and unit"
         elif stated:
-            why = f'by its name; its unit {stated!r} is not known: give unit, or scale with unit = "counts"'
+            why = f'by its name; unit {stated!r} is not known: specify unit, or scale with unit = "counts"'
         elif channel in units:
             unit, reason = units[channel]
             why += reason

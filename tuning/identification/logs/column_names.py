@@ -29,7 +29,7 @@ OTHER_QUANTITIES = set(
     "mode state phase".split()
 )
 OTHER_UNITS = set("A mA Nm N*m deg rad rad/s °C C K % bar Hz m/s2 m/s^2".split())
-FILLERS = {"data", "value", "values", "out", "signal", "signals"}  # words that say nothing
+FILLERS = {"data", "value", "values", "out", "signal", "signals"}  # words without quantity or role
 QUANTITY_UNITS = {
     "time": TIME_UNITS, "velocity": SPEED_UNITS, "force": FORCE_UNITS, "position": LENGTH_UNITS
 }  # fmt: skip
@@ -62,8 +62,8 @@ class NameMatch(NamedTuple):
 def find_unit(name: str) -> str | None:
     """Return the unit at the end of a column name, as it is spelled there, or None.
 
-    It is in brackets, or after a slash, comma or underscore. The ending `_m` is not a unit, because it often
-    means "measured".
+    The unit is in brackets, or after a slash, comma or underscore. The ending `_m` is not a unit, because it
+    often means "measured".
     """
     match = _UNIT_PATTERN.search(name)
     if match is None:
@@ -108,7 +108,7 @@ def match_channel(name: str, unit: str | None) -> NameMatch | None:
 
 
 def _find_last(meanings: dict[str, str], above: list[str], last: list[str]) -> str | None:
-    """Return the meaning of the last word that has one; single letters d, c, m, a follow another letter."""
+    """Return the last meaning of a name's words; the letters d, c, m, a count only after a single letter."""
     letters = [word for word in last if len(word) == 1]
     for word in reversed([*above, *last]):
         if word in "dcma" and not (len(letters) >= 2 and len(last) == 2):
@@ -119,7 +119,7 @@ def _find_last(meanings: dict[str, str], above: list[str], last: list[str]) -> s
 
 
 def _split_words(part: str) -> Iterator[str]:
-    """Yield the words of a part of a name in lower case, without digits; `SetPos` and `setpos` are two."""
+    """Yield the words in a part of a name, in lower case and without digits; `setpos` has two words."""
     for token in re.findall(r"[^\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", part)):
         word = token.lower()
         if (match := re.fullmatch(r"([xyzvf])([dcma])", word)) is not None:
@@ -129,7 +129,7 @@ def _split_words(part: str) -> Iterator[str]:
 
 
 def _split_at_words(word: str) -> list[str] | None:
-    """Return a word as a sequence of known words, or None if it is not one."""
+    """Split a word into known words; return None if this is not possible."""
     if not word or word in _QUANTITY_OF or word in _ROLE_OF or word in OTHER_QUANTITIES:
         return [word] if word else []
     for begin in _WORDS:

@@ -1,4 +1,4 @@
-"""First rows of a log, and the guess of a channel's column from them."""
+"""First rows of a log, and records of the columns that are guessed from these rows."""
 
 from __future__ import annotations
 

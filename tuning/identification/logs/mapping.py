@@ -191,7 +191,7 @@ def get_si_conversion(channel: Channel, name: str, stated: str | None = None) ->
     Args:
         channel: Column with its conversion.
         name: Name of the channel.
-        stated: Unit that the file states, as it is spelled there; valid if the mapping specifies none.
+        stated: Unit that the file states, as it is spelled there; used if the mapping specifies none.
     """
     if channel.unit == COUNTS_UNIT or name not in UNITS_OF_CHANNEL:
         unit = 1.0

@@ -1,7 +1,7 @@
 """Draft of a mapping file from the names and values of a log's columns, for the user to check.
 
 The draft contains a line for every channel. If the names do not determine a channel, its line is a comment
-that lists the columns in question.
+that lists the candidate columns.
 """
 
 from __future__ import annotations

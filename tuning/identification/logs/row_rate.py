@@ -75,7 +75,7 @@ def select_tick_rows(
         tick = clock.assign_ticks(stamps, period / rows, label).tick
     phase = find_command_phase(tick, x, rows)
     if phase is None and is_detected:
-        return every, []  # The check of the rates states the finding.
+        return every, []  # A later check of the rates reports the problem.
     note = f"{label}: {rows} rows per control period, of which the row with the new command is used"
     if phase is None:
         note = (

@@ -1,7 +1,7 @@
 """Layout of text logs: delimiter, decimal mark, preamble, line of column names and line of units.
 
 The layout follows from the first lines of a file. The delimiter and the decimal mark are those with which
-most cells of the last of these lines are numbers. The column names stand above the first lines of data,
+most cells in the last lines read are numbers. The column names stand above the first lines of data,
 with a line of units between them in some files.
 """
 

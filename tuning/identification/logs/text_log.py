@@ -53,7 +53,7 @@ def _detect_encoding(sample: bytes) -> str:
 
 
 def _open_stream(path: Path, encoding: str, layout: TextLayout):
-    """Return what Arrow reads: the file, or its content with tabs for blanks."""
+    """Return the stream that Arrow reads: the file, or its content with blanks replaced by tabs."""
     if layout.delimiter != BLANKS:
         return path
     content = re.sub(

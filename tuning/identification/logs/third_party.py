@@ -25,7 +25,7 @@ def hdf5(path: Path) -> LogReader:
     """Open an HDF5 file; the columns are its datasets, named by their paths without the first slash."""
     import h5py
 
-    locations: dict[str, tuple[str, Any]] = {}  # dataset of each column, and its part
+    locations: dict[str, tuple[str, Any]] = {}  # path of each column's dataset, and the part of the dataset
     units: dict[str, str] = {}
     with h5py.File(path, "r") as file:
 

@@ -66,7 +66,7 @@ def guess_time(sample: LogSample, names: Sequence[str], position: str) -> Channe
 
 
 def find_step(sample: LogSample, time: ChannelGuess, column: str | None) -> float | None:
-    """Return the time between those rows [s] in which a column has a number, or None if it is not known."""
+    """Return the time between rows [s] in which a column has a number, or None if this time is not known."""
     if time.column is None:
         return None
     values = sample.values[time.column]

@@ -26,7 +26,7 @@ _SYNONYMS = {
     "newtons": "N", "meter": "m", "meters": "m", "metre": "m", "metres": "m", "micron": "um", "microns": "um",
     "inch": "in", "inches": "in",
 }  # fmt: skip
-_NO_UNITS = ("MN", "Mm")  # larger units by a factor of 1e9, which must not be read as mN or mm
+_NO_UNITS = ("MN", "Mm")  # meganewton and megametre; must not be read as mN or mm
 
 
 def parse_unit(text: str, channel: str | None = None) -> str | None:

@@ -7,7 +7,7 @@ static double larger(double value, double other) {
     return value > other ? value : other;
 }
 
-bool contact_law_remembers(void) {
+bool contact_law_has_memory(void) {
     return RIG_LAW == LAW_ELASTOPLASTIC;
 }
 
@@ -67,7 +67,7 @@ double contact_law_force(const contact_law *law, double depth, double rate) {
     return RIG_TENSION ? spring(law, depth, rate) : larger(spring(law, depth, rate), 0.0);
 }
 
-double contact_law_hold(const contact_law *law, double depth, double rate) {
+double contact_law_separation_function(const contact_law *law, double depth, double rate) {
     const double damping = rig_damping[law->number];
     switch (RIG_LAW) {
     case LAW_HUNT_CROSSLEY:
@@ -80,7 +80,7 @@ double contact_law_hold(const contact_law *law, double depth, double rate) {
     }
 }
 
-double contact_law_edge(const contact_law *law, double rate) {
+double contact_law_onset_force(const contact_law *law, double rate) {
     const double force = rig_damping[law->number] * rate;
     switch (RIG_LAW) {
     case LAW_HUNT_CROSSLEY:

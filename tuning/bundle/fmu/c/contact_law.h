@@ -12,7 +12,7 @@ typedef struct {
 } contact_law;
 
 /* Whether the force depends on the deepest penetration. */
-bool contact_law_remembers(void);
+bool contact_law_has_memory(void);
 
 /* Return the law of contact `number`; contacts beyond the end of a list use its last entry. */
 contact_law contact_law_of(int number);
@@ -20,10 +20,10 @@ contact_law contact_law_of(int number);
 /* Force [N] at a positive depth. */
 double contact_law_force(const contact_law *law, double depth, double rate);
 
-/* Positive until the surfaces separate. */
-double contact_law_hold(const contact_law *law, double depth, double rate);
+/* Number that is positive until the surfaces separate. */
+double contact_law_separation_function(const contact_law *law, double depth, double rate);
 
 /* Limit of the force [N] as the depth approaches 0 from above. */
-double contact_law_edge(const contact_law *law, double rate);
+double contact_law_onset_force(const contact_law *law, double rate);
 
 #endif

@@ -11,7 +11,7 @@ static double limited_integer(int64_t value) {
 /* Copy the parameters into the structs of gains and limits, which contain doubles in the same order. */
 static void copy_parameters(const fmu_state *state, jaxhil_gains *gains, jaxhil_limits *limits) {
     const size_t gain_bytes = FMU_GAIN_COUNT * sizeof(double);
-    *gains = jaxhil_exported_gains; /* its first fields are no parameters */
+    *gains = jaxhil_exported_gains; /* the first fields are no parameters */
     memcpy((char *)gains + sizeof *gains - gain_bytes, state->values + FMU_FIRST_GAIN, gain_bytes);
     memcpy(limits, state->values + FMU_FIRST_LIMIT, sizeof *limits);
 }

@@ -78,7 +78,7 @@ SET(fmi2SetInteger, fmi2Integer, FMU_INTEGER, NUMBER)
 GET(fmi2GetBoolean, fmi2Boolean, FMU_BOOLEAN)
 SET(fmi2SetBoolean, fmi2Boolean, FMU_BOOLEAN, TRUTH)
 
-/* No variable is a text: these functions succeed only for no values. */
+/* No variable is a text: these functions return an error if values are requested. */
 fmi2Status fmi2GetString(fmi2Component component, const fmi2ValueReference references[], size_t count,
                          fmi2String values[]) {
     (void)references, (void)values;
@@ -132,7 +132,7 @@ fmi2Status fmi2SetupExperiment(fmi2Component component, fmi2Boolean has_toleranc
     fmu_instance *const self = (fmu_instance *)component;
     (void)has_tolerance, (void)tolerance, (void)has_stop, (void)stop;
     if (self == NULL || self->state.phase != FMU_INSTANTIATED) {
-        return finish(self, "start time", "it is set only after instantiation or reset");
+        return finish(self, "start time", "the time can be set only after instantiation or reset");
     }
     self->start_time = start;
     return fmi2OK;
@@ -243,27 +243,27 @@ fmi2Status fmi2DeSerializeFMUstate(fmi2Component component, const fmi2Byte bytes
     return finish(self, "state", problem);
 }
 
-/* Derivatives, of which this FMU has none. */
+/* Functions for derivatives, which this FMU does not have. */
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component component, const fmi2ValueReference unknowns[],
                                         size_t unknown_count, const fmi2ValueReference knowns[],
                                         size_t known_count, const fmi2Real changes[], fmi2Real results[]) {
     (void)unknowns, (void)unknown_count, (void)knowns, (void)known_count, (void)changes, (void)results;
-    return finish((const fmu_instance *)component, "derivative", "this FMU has none");
+    return finish((const fmu_instance *)component, "derivative", "this FMU has no derivatives");
 }
 
 fmi2Status fmi2SetRealInputDerivatives(fmi2Component component, const fmi2ValueReference references[],
                                        size_t count, const fmi2Integer orders[], const fmi2Real values[]) {
     (void)references, (void)count, (void)orders, (void)values;
-    return finish((const fmu_instance *)component, "derivative", "this FMU has none");
+    return finish((const fmu_instance *)component, "derivative", "this FMU has no derivatives");
 }
 
 fmi2Status fmi2GetRealOutputDerivatives(fmi2Component component, const fmi2ValueReference references[],
                                         size_t count, const fmi2Integer orders[], fmi2Real values[]) {
     (void)references, (void)count, (void)orders, (void)values;
-    return finish((const fmu_instance *)component, "derivative", "this FMU has none");
+    return finish((const fmu_instance *)component, "derivative", "this FMU has no derivatives");
 }
 
-/* Status of a step that has not returned, of which there is none. Only the time of the last step is stated. */
+/* Status of an unfinished step: there is none, because every step is complete when its function returns. */
 fmi2Status fmi2GetRealStatus(fmi2Component component, const fmi2StatusKind kind, fmi2Real *value) {
     const fmu_instance *const self = (const fmu_instance *)component;
     if (self == NULL || value == NULL || kind != fmi2LastSuccessfulTime) {

@@ -68,7 +68,7 @@ static fmi3Status missing(fmi3Instance instance, const char *function) {
         return fmi3OK;                                                                                        \
     }
 
-/* Functions for types that no variable has; they succeed only for no values. */
+/* Functions for types that no variable has; they return an error if values are requested. */
 #define NO_VALUES(name, stored)                                                                               \
     fmi3Status fmi3Get##name(fmi3Instance instance, const fmi3ValueReference references[], size_t count,      \
                              stored values[], size_t size) {                                                  \

@@ -31,7 +31,7 @@ const char *fmu_exit_initialisation(fmu_state *state) {
         return "the instance is not being initialised";
     }
     if (!fmu_model_begin(state)) {
-        return "the parameters do not fit together: see the limits whose descriptions mention each other";
+        return "the limits contradict each other: compare the limits whose descriptions name another limit";
     }
     fmu_model_initial(state);
     state->phase = FMU_STEPPING;
@@ -83,7 +83,7 @@ const char *fmu_step(fmu_state *state, double time, double step) {
         return "the communication point is not finite";
     }
     if (!(fabs(step - FMU_PERIOD) <= step_tolerance * FMU_PERIOD)) {
-        return "the communication step differs from the control period, which is the only one possible";
+        return "the communication step differs from the control period; they must be equal";
     }
     fmu_model_step(state);
     state->time = state->values[V_TIME] = time + step;

@@ -25,7 +25,7 @@ typedef struct {
 
 /* Header of a serialised state; the bytes of the state follow. */
 typedef struct {
-    char token[40]; /* of the FMU, with a fill to whole words */
+    char token[40]; /* token of the FMU, padded to whole words */
     uint64_t size;
     uint64_t checksum;
 } fmu_header;

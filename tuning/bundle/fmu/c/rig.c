@@ -117,7 +117,7 @@ static double limit_command(fmu_model *rig, double requested) {
     return command;
 }
 
-/* Deepest penetration [m] of the contact until `end`; 0 if it has ended by then. */
+/* Deepest penetration [m] of the contact until `end`; 0 if the contact has ended by then. */
 static double deepest_until(const contact_law *law, double deepest, motion_state start, motion_state end,
                             double duration) {
     if (-RIG_CLEARANCE <= end.position && end.position <= 0.0) {
@@ -135,7 +135,7 @@ static double contact_force(fmu_model *rig, const sampling_interval *interval) {
     if (!interval->is_used) {
         return 0.0;
     }
-    if (contact_law_remembers()) {
+    if (contact_law_has_memory()) {
         law.deepest = deepest_until(&rig->law, deepest, interval->start, sample, RIG_SAMPLE_TIME);
         rig->deepest = deepest_until(&law, law.deepest, sample, interval->end, rest);
     }

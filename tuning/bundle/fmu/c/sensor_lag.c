@@ -39,22 +39,22 @@ static double inward_at(const segment *self, double s) {
 
 static contact_law law_at(const segment *self, double s) {
     contact_law law = *self->law;
-    if (contact_law_remembers()) {
+    if (contact_law_has_memory()) {
         law.deepest = s > self->turn ? self->bottom : larger(self->before, depth_at(self, s));
     }
     return law;
 }
 
-static double hold_at(const segment *self, double s) {
+static double separation_function_at(const segment *self, double s) {
     const contact_law law = law_at(self, s);
-    return contact_law_hold(&law, depth_at(self, s), inward_at(self, s));
+    return contact_law_separation_function(&law, depth_at(self, s), inward_at(self, s));
 }
 
 static double force_at(const segment *self, double s, bool at_surface) {
     const double rate = inward_at(self, s), depth = depth_at(self, s);
     const contact_law law = law_at(self, s);
     if (at_surface) {
-        return contact_law_edge(self->law, rate);
+        return contact_law_onset_force(self->law, rate);
     }
     return depth > 0.0 ? contact_law_force(&law, depth, rate) : 0.0;
 }
@@ -150,10 +150,10 @@ double apply_sensor_lag(double reading, const contact_law *law, motion_state sta
         return reading * exp(-duration / RIG_TIME_CONSTANT);
     }
     self.before = larger(deepest, depth_at(&self, 0.0));
-    self.bottom = larger(self.before, contact_law_remembers() ? depth_at(&self, self.turn) : 0.0);
-    self.turn = contact_law_remembers() ? self.turn : 1.0;
+    self.bottom = larger(self.before, contact_law_has_memory() ? depth_at(&self, self.turn) : 0.0);
+    self.turn = contact_law_has_memory() ? self.turn : 1.0;
     positive_interval(depth_at, &self, &enters, &leaves);
-    positive_interval(hold_at, &self, &starts, &ends);
+    positive_interval(separation_function_at, &self, &starts, &ends);
     first = larger(enters, starts);
     last = leaves < ends ? leaves : ends;
     if (!(first < last)) {

@@ -147,7 +147,7 @@ class Ledger:
         faster = rate + dot(direction, recalled[6:12]) - dot(direction, missing)
         self._corrected = force
         if reader.loud:
-            correction = tangent.restoring(-self._deeper) - tangent.damping * faster
+            correction = tangent.compute_force_change(-self._deeper) - tangent.damping * faster
             self._corrected = max(force + correction, min(force, 0.0))
         self._impulse = add_multiple(self._impulse, period, reader.wrench)
         self._impulse = add_multiple(self._impulse, period * (self._corrected - force), direction)

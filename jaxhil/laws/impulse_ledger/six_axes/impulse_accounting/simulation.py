@@ -17,8 +17,8 @@ from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import (
     Estimate,
     Tangent,
     bridge,
+    compute_force_change,
     learn,
-    restoring,
 )
 from jaxhil.laws.six_axis_base import Six, SixAxisSignals
 
@@ -101,7 +101,7 @@ def follow(
     deeper = -dot(direction, reading.pose - (desired - drift))
     faster = -dot(direction, reading.twist - (twist - missing))
     least = jnp.minimum(force, 0)
-    corrected = jnp.maximum(force + restoring(tangent, -deeper) - tangent.damping * faster, least)
+    corrected = jnp.maximum(force + compute_force_change(tangent, -deeper) - tangent.damping * faster, least)
     corrected = jnp.where(is_contact, corrected, force)
     booked = old.impulse + period[None] * (reading.wrench + (corrected - force)[None] * direction)
 

@@ -111,8 +111,8 @@ class TangentModel:
         self.curvature = curvature / BEND
         self.damping = min(max(damping, 0.0), self._most_damping)
 
-    def restoring(self, change: float) -> float:
-        """Return the change of the elastic force [m/s^2] for a change of the depth [m], of the same sign."""
+    def compute_force_change(self, change: float) -> float:
+        """Return the change of the elastic force [m/s^2] for a change of the depth [m], with equal sign."""
         path, speed = self._path, self._speed
         later = path + change / speed
         bend = later * abs(later) - path * abs(path)
@@ -132,16 +132,20 @@ class TangentModel:
         damping = self.damping
         step = duration / BRIDGE_STEPS
         half = 0.5 * step
-        start = force - self.restoring(-deeper)
+        start = force - self.compute_force_change(-deeper)
         divisor = 1.0 + half * damping
         depth, speed, impulse = 0.0, velocity, 0.0
         for _ in range(BRIDGE_STEPS):
-            push = start + self.restoring(depth + half * speed - deeper) + damping * (speed - velocity)
+            push = (
+                start
+                + self.compute_force_change(depth + half * speed - deeper)
+                + damping * (speed - velocity)
+            )
             push = min(max(push, least), MAX_PUSH) / divisor
             later = speed - push * step
             depth += half * (speed + later)
             speed = later
             impulse += push * step
         self.impulse = impulse
-        push = start + self.restoring(depth - deeper) + damping * (speed - velocity)
+        push = start + self.compute_force_change(depth - deeper) + damping * (speed - velocity)
         self.force = min(max(push, least), MAX_PUSH)

@@ -77,7 +77,7 @@ def learn(
     return Estimate(mean, covariance * jnp.where(grown < MAX_GROWTH, growth, 1)[None, None])
 
 
-def restoring(tangent: Tangent, change: Array) -> Float[Array, "*batch"]:
+def compute_force_change(tangent: Tangent, change: Array) -> Float[Array, "*batch"]:
     """Return the change of the tangent model's elastic force for a change of the depth.
 
     Both changes have the same sign. Otherwise, a negative curvature could push apart bodies that separate.
@@ -105,10 +105,10 @@ def bridge(
         Impulse of the force in this time, and force at its end.
     """
     step = duration / BRIDGE_STEPS
-    start = restoring(tangent, -deeper)
+    start = compute_force_change(tangent, -deeper)
 
     def force_at(depth: Array, speed: Array) -> Array:
-        elastic = restoring(tangent, depth - deeper) - start
+        elastic = compute_force_change(tangent, depth - deeper) - start
         push = jnp.maximum(force + elastic + tangent.damping * (speed - velocity), least)
         return jnp.minimum(push, MAX_PUSH)
 
