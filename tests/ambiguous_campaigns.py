@@ -103,6 +103,6 @@ def _errors(template, mechanisms, compensator, gains):
     draws["approach.phase"] = np.tile(PHASES, len(every))
     scenarios = build_scenarios(template, draws, 0)
     metrics = evaluate(build_loop(template, compensator, scenarios), gains, scenarios)
-    assert np.array_equal(metrics.good, metrics.wanted)
+    assert np.array_equal(metrics.good, metrics.is_scheduled)
     e, error = np.asarray(metrics.metrics.restitution)[0], np.asarray(metrics.error)[0]
     return np.array([e, error]).reshape(2, len(every), len(PHASES)).mean(axis=2).T

@@ -81,7 +81,7 @@ def test_common_program_gives_the_same_results_as_separate_programs():
         expected = compare_with_ideal(loop, batch, metrics)
         lanes = slice(index * LANES, (index + 1) * LANES)
         good = np.asarray(expected.good)
-        assert np.all(good == expected.wanted) and np.any(good)
+        assert np.all(good == expected.is_scheduled) and np.any(good)
         np.testing.assert_array_equal(together.good[:, lanes], good, err_msg=name)
         for figure in ("error", "reference_restitution", "peak_ratio"):
             joint, alone = getattr(together, figure)[:, lanes], np.asarray(getattr(expected, figure))

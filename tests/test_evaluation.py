@@ -44,9 +44,9 @@ def test_evaluation_of_a_scenario_does_not_depend_on_its_batch():
     whole = evaluate(loop, gains, scenarios)
     lanes = np.array([63, 2, 17])
     part = evaluate(loop, gains, lanes_of(scenarios, lanes))
-    wanted = part.wanted
+    is_scheduled = part.is_scheduled
     for field in ("error", "reference_restitution", "peak_ratio"):
-        ours, theirs = getattr(part, field)[wanted], getattr(whole, field)[..., lanes][wanted]
+        ours, theirs = getattr(part, field)[is_scheduled], getattr(whole, field)[..., lanes][is_scheduled]
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-13)
     np.testing.assert_array_equal(part.metrics.status, whole.metrics.status[..., lanes])
 
@@ -56,7 +56,7 @@ def test_evaluation_with_gains_per_scenario_equals_evaluation_with_common_gains(
     common = evaluate(loop, gains, scenarios)
     per_lane = evaluate(loop, {name: np.full(20, value) for name, value in gains.items()}, scenarios)
     np.testing.assert_allclose(
-        per_lane.error[per_lane.wanted], common.error[per_lane.wanted], rtol=1e-10, atol=1e-12
+        per_lane.error[per_lane.is_scheduled], common.error[per_lane.is_scheduled], rtol=1e-10, atol=1e-12
     )
 
 
@@ -68,7 +68,9 @@ def test_neutral_gains_give_the_result_of_no_compensation(compensator):
     plain, _, _ = setting("none")
     neutral = evaluate(loop, neutralise_gains(compensator, gains), scenarios)
     none = evaluate(plain, {}, scenarios)
-    np.testing.assert_allclose(neutral.error[none.wanted], none.error[none.wanted], rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(
+        neutral.error[none.is_scheduled], none.error[none.is_scheduled], rtol=1e-10, atol=1e-12
+    )
 
 
 def test_evaluation_reuses_program_for_other_mechanism_seed_and_batch_size():
@@ -90,10 +92,12 @@ def test_evaluation_compares_every_contact_with_its_own_ideal_contact():
     )
     root = np.sqrt(1 - damping_ratio**2)
     expected = np.exp(-damping_ratio / root * np.arctan2(2 * damping_ratio * root, 2 * damping_ratio**2 - 1))
-    wanted = outcome.is_scheduled
-    np.testing.assert_allclose(outcome.reference_restitution[wanted], expected[wanted], rtol=1e-12)
-    np.testing.assert_array_equal(wanted.sum(axis=0), scenarios.contacts)
-    assert outcome.good[wanted].all()
+    is_scheduled = outcome.is_scheduled
+    np.testing.assert_allclose(
+        outcome.reference_restitution[is_scheduled], expected[is_scheduled], rtol=1e-12
+    )
+    np.testing.assert_array_equal(is_scheduled.sum(axis=0), scenarios.contacts)
+    assert outcome.good[is_scheduled].all()
 
 
 def tiled(scenarios):

@@ -94,7 +94,7 @@ def test_global_search_uses_the_objective_of_the_solver(tasks, solved, validatio
         np.testing.assert_allclose(values, [start.rms for start in starts], rtol=1e-9)
         alone = evaluate(tasks[index].loop, starts[0].gains, tasks[index].scenarios)
         assert values[0] == pytest.approx(
-            evaluate_objective(RMS_OBJECTIVE, alone.error[alone.wanted]), rel=1e-9
+            evaluate_objective(RMS_OBJECTIVE, alone.error[alone.is_scheduled]), rel=1e-9
         )
 
 

@@ -357,7 +357,8 @@ def _find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) -
 
 def _check_sensors(mechanism: Mechanism, strongest: ContactSummary) -> list[str]:
     """Return a warning for every sensor error that is larger than the signal of all ideal contacts."""
-    depth = mechanism.approach.velocity / (2 * math.pi * strongest.frequency)
+    frequency = strongest.frequency  # 0 if the contact does not end
+    depth = mechanism.approach.velocity / (2 * math.pi * frequency) if frequency else math.inf
     limits = (
         ("force_sensor", strongest.peak_force, "N", "the peak force", "mN"),
         ("position_sensor", depth, "m", "about the depth", "um or mm"),

@@ -125,13 +125,10 @@ def compare_compensators(
 
         This order balances the load of the processes.
         """
-        axes = 6 if isinstance(left[0], SixAxisMechanism) else 1
-        counts = {compensator: _count_gains(compensator, axes) for compensator in compensators}
-        order = (
-            sorted(compensators, key=counts.__getitem__, reverse=True)
-            if processes or scheduler
-            else compensators
-        )
+        order = compensators
+        if processes or scheduler:
+            axes = 6 if isinstance(left[0], SixAxisMechanism) else 1
+            order = sorted(compensators, key=lambda name: _count_gains(name, axes), reverse=True)
         return [
             (g, compensator)
             for g in scenes
