@@ -62,11 +62,11 @@ class RunningFmu:
             getattr(self.instance, SETTERS[type_])(references, [values[name] for name in names])
 
     def get(self, *names: str) -> dict[str, Any]:
-        found = {}
+        values = {}
         for type_, group in self._by_type(names).items():
             references = [self.variables[name].valueReference for name in group]
-            found |= dict(zip(group, getattr(self.instance, GETTERS[type_])(references), strict=True))
-        return found
+            values |= dict(zip(group, getattr(self.instance, GETTERS[type_])(references), strict=True))
+        return values
 
     def step(self, step: float | None = None) -> None:
         self.instance.doStep(self.ticks * self.period, self.period if step is None else step)
@@ -131,9 +131,9 @@ def replay_vectors(fmu: RunningFmu, vectors: bytes) -> int:
         values["tick_time"] = float(row["time"] or 0.0)
         fmu.set(values)
         fmu.step()
-        found = fmu.get(*results)
+        outputs = fmu.get(*results)
         for variable, column in results.items():
-            assert bits(float(found[variable])) == bits(float(row[column])), (number, variable)
+            assert bits(float(outputs[variable])) == bits(float(row[column])), (number, variable)
     return len(rows)
 
 

@@ -65,14 +65,14 @@ def test_fmu_description_is_valid_and_has_units_and_bounds_of_the_code(axes, fmi
     made = DOCUMENTS[axes]()
     path = write_fmu(tmp_path / "controller.fmu", controller_fmu(made, fmi), with_library=False)
     assert validate_fmu(str(path)) == []
-    found = variables(fmpy.read_model_description(str(path)), "parameter")
+    parameters = variables(fmpy.read_model_description(str(path)), "parameter")
     table = COMPENSATORS if axes == "one axis" else SIX_AXIS_COMPENSATORS
     specifications = table["phase_lead"].gains
-    assert {name for name in found if name.startswith("gains.")} == {
+    assert {name for name in parameters if name.startswith("gains.")} == {
         f"gains.{name}" for name in specifications
     }
     for name, gain in specifications.items():
-        variable = found[f"gains.{name}"]
+        variable = parameters[f"gains.{name}"]
         assert float(variable.start) == made["gains"][name]["value"]
         assert (float(variable.min), float(variable.max)) == (gain.lowest, gain.highest)
         assert variable.unit == (None if gain.unit == "1" else gain.unit)
@@ -119,9 +119,10 @@ def test_six_axis_fmu_equals_runtime_bit_for_bit(fmi):
             }
         )
         running.step()
-        found = running.get(*results, "faults", "tripped")
-        assert [fmus.bits(found[name]) for name in results] == [fmus.bits(value) for value in expected], tick
-        assert (found["faults"], found["tripped"]) == (controller.faults, controller.tripped)
+        outputs = running.get(*results, "faults", "tripped")
+        commands = [fmus.bits(outputs[name]) for name in results]
+        assert commands == [fmus.bits(value) for value in expected], tick
+        assert (outputs["faults"], outputs["tripped"]) == (controller.faults, controller.tripped)
     assert controller.seen != 0
     running.close()
 

@@ -53,10 +53,10 @@ def test_rig_fmu_has_the_same_readings_as_python_plant(name, tmp_path):
     touched, depth = 0, 2e-3 + 0.5 * min(mechanism.contact.clearance, 1e-2)
     for tick in range(round(1.2 / period)):
         names = ("force_measured", "position_measured", "contact_force", "position_shortfall")
-        found = rig.get(*names)
+        outputs = rig.get(*names)
         force, position = plant.read()
         expected = dict(zip(names, (force, position, plant.force, plant.shortfall), strict=True))
-        assert found == pytest.approx(expected, rel=1e-9, abs=1e-12), tick
+        assert outputs == pytest.approx(expected, rel=1e-9, abs=1e-12), tick
         touched += plant.force != 0.0
         command = start + depth * math.sin(5.0 * tick * period)
         rig.set({"position_command": command, "force_command": force})
@@ -71,12 +71,12 @@ def test_rig_fmu_draws_noise_with_specified_deviation_and_seed(tmp_path):
 
     def readings(seed):
         rig.reset(force_noise=2.0, position_noise=1e-6, seed=seed)
-        found = []
+        forces = []
         for _ in range(2000):
             rig.set({"position_command": -0.1})
             rig.step()
-            found.append(rig.get("force_measured")["force_measured"])
-        return found
+            forces.append(rig.get("force_measured")["force_measured"])
+        return forces
 
     first = readings(1)
     assert first == readings(1) and first != readings(2)

@@ -139,11 +139,13 @@ def test_log_file_of_any_bytes_is_read_or_refused_with_one_line(examples):
 @given(st.data())
 def test_damaged_log_file_of_any_format_is_read_or_refused_with_one_line(valid_files, data):
     suffix, content = data.draw(st.sampled_from(valid_files))
-    place = data.draw(st.integers(0, len(content) - 1))
+    position = data.draw(st.integers(0, len(content) - 1))
     if data.draw(st.booleans()):
-        check_bytes(suffix, content[:place])
+        check_bytes(suffix, content[:position])
     else:
-        check_bytes(suffix, content[:place] + bytes([data.draw(st.integers(0, 255))]) + content[place + 1 :])
+        check_bytes(
+            suffix, content[:position] + bytes([data.draw(st.integers(0, 255))]) + content[position + 1 :]
+        )
 
 
 @pytest.fixture(scope="module")
@@ -306,8 +308,8 @@ def test_log_whose_commands_do_not_show_the_ticks_needs_rows_per_period(tmp_path
 def test_command_phase_is_that_of_rows_with_new_commands(rows, phase, seed, hold):
     commands = np.cumsum(np.random.default_rng(seed).standard_normal(60))
     tick = np.arange(rows * 58) + rows
-    place = (tick - phase % rows) / rows
-    x = commands[place.astype(int)] if hold else np.interp(place, np.arange(60), commands)
+    periods = (tick - phase % rows) / rows
+    x = commands[periods.astype(int)] if hold else np.interp(periods, np.arange(60), commands)
     assert find_command_phase(tick, x, rows) == phase % rows
 
 

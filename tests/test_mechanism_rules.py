@@ -64,8 +64,8 @@ def test_damping_ratio_gives_damping_of_each_contact(law):
     )
     # The file of results contains the damping itself.
     assert "damping_ratio" not in to_plain_data(mechanism)["contact"]
-    one = from_plain_data(changed({**law, "contact.damping": 0, "contact.damping_ratio": 0.05}), "f")
-    assert len(one.contact.damping) == len(one.contact.stiffness)
+    repeated = from_plain_data(changed({**law, "contact.damping": 0, "contact.damping_ratio": 0.05}), "f")
+    assert len(repeated.contact.damping) == len(repeated.contact.stiffness)
 
 
 def test_damping_ratio_without_meaning_is_refused():

@@ -77,8 +77,8 @@ def test_six_axis_latches_and_robots_are_built_as_specified():
     delay = 0.004 + 0.7 * (lag[0] + 0.008) + 0.3 * (lag[1] + 0.016)
     late = summarise_six_axes(mechanism, 1.0, 1.0, 1.0, 1.0, 1.0).delay
     np.testing.assert_allclose(late, max(delay, 0.004 + lag[1] + 0.008))
-    held = summarise_six_axes(mechanism, 1.0, 1.0, np.nan, 1.0, np.nan)
-    assert "; ideal contact: held by a latch, peak force 1 N; rig: delay" in held.line("claw")
+    latched = summarise_six_axes(mechanism, 1.0, 1.0, np.nan, 1.0, np.nan)
+    assert "; ideal contact: held by a latch, peak force 1 N; rig: delay" in latched.line("claw")
 
 
 def central_contact(name):

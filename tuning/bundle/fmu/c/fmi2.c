@@ -40,7 +40,7 @@ static fmi2Status finish(const fmu_instance *instance, const char *subject, cons
         fmu_instance *const self = (fmu_instance *)component;                                                 \
         double value = 0.0;                                                                                   \
         if (self == NULL || (count > 0 && (references == NULL || values == NULL))) {                          \
-            return finish(self, #function, "an argument is missing");                                         \
+            return finish(self, #function, fmu_argument_missing);                                         \
         }                                                                                                     \
         for (size_t n = 0; n < count; n++) {                                                                  \
             const char *const problem = fmu_get(&self->state, kind, references[n], &value);                   \
@@ -57,7 +57,7 @@ static fmi2Status finish(const fmu_instance *instance, const char *subject, cons
                         const stored values[]) {                                                              \
         fmu_instance *const self = (fmu_instance *)component;                                                 \
         if (self == NULL || (count > 0 && (references == NULL || values == NULL))) {                          \
-            return finish(self, #function, "an argument is missing");                                         \
+            return finish(self, #function, fmu_argument_missing);                                         \
         }                                                                                                     \
         for (size_t n = 0; n < count; n++) {                                                                  \
             const char *const problem = fmu_set(&self->state, kind, references[n], convert(values[n]));       \
@@ -176,23 +176,13 @@ fmi2Status fmi2CancelStep(fmi2Component component) {
 
 fmi2Status fmi2GetFMUstate(fmi2Component component, fmi2FMUstate *copy) {
     const fmu_instance *const self = (const fmu_instance *)component;
-    if (self == NULL || copy == NULL) {
-        return finish(self, "state", "an argument is missing");
-    }
-    if (*copy == NULL) {
-        *copy = malloc(sizeof self->state);
-    }
-    if (*copy == NULL) {
-        return finish(self, "state", "no memory is left");
-    }
-    memcpy(*copy, &self->state, sizeof self->state);
-    return fmi2OK;
+    return finish(self, "state", self == NULL ? fmu_argument_missing : fmu_copy(&self->state, copy));
 }
 
 fmi2Status fmi2SetFMUstate(fmi2Component component, fmi2FMUstate copy) {
     fmu_instance *const self = (fmu_instance *)component;
     if (self == NULL || copy == NULL) {
-        return finish(self, "state", "an argument is missing");
+        return finish(self, "state", fmu_argument_missing);
     }
     memcpy(&self->state, copy, sizeof self->state);
     return fmi2OK;
@@ -202,16 +192,13 @@ fmi2Status fmi2FreeFMUstate(fmi2Component component, fmi2FMUstate *copy) {
     if (component == NULL) {
         return fmi2Error;
     }
-    if (copy != NULL) {
-        free(*copy);
-        *copy = NULL;
-    }
+    fmu_free_copy(copy);
     return fmi2OK;
 }
 
 fmi2Status fmi2SerializedFMUstateSize(fmi2Component component, fmi2FMUstate copy, size_t *size) {
     if (component == NULL || copy == NULL || size == NULL) {
-        return finish((const fmu_instance *)component, "state", "an argument is missing");
+        return finish((const fmu_instance *)component, "state", fmu_argument_missing);
     }
     *size = fmu_serialised_size();
     return fmi2OK;
@@ -228,19 +215,8 @@ fmi2Status fmi2SerializeFMUstate(fmi2Component component, fmi2FMUstate copy, fmi
 fmi2Status fmi2DeSerializeFMUstate(fmi2Component component, const fmi2Byte bytes[], size_t size,
                                    fmi2FMUstate *copy) {
     const fmu_instance *const self = (const fmu_instance *)component;
-    fmu_state *restored;
-    const char *problem;
-    if (self == NULL || bytes == NULL || copy == NULL) {
-        return finish(self, "state", "an argument is missing");
-    }
-    restored = (fmu_state *)(*copy != NULL ? *copy : malloc(sizeof *restored));
-    problem = restored == NULL ? "no memory is left" : fmu_deserialise(restored, (const uint8_t *)bytes, size);
-    if (problem != NULL && *copy == NULL) {
-        free(restored);
-        restored = NULL;
-    }
-    *copy = restored;
-    return finish(self, "state", problem);
+    return finish(self, "state",
+                  self == NULL ? fmu_argument_missing : fmu_restore((const uint8_t *)bytes, size, copy));
 }
 
 /* Functions for derivatives, which this FMU does not have. */

@@ -165,7 +165,7 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 time, fmi3Float64 step,
     fmi3Status status;
     (void)no_return;
     if (self == NULL || event == NULL || terminate == NULL || early == NULL || reached == NULL) {
-        return finish(self, "step", "an argument is missing");
+        return finish(self, "step", fmu_argument_missing);
     }
     status = finish(self, "step", fmu_step(&self->state, time, step));
     *event = *terminate = *early = false;
@@ -175,23 +175,13 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 time, fmi3Float64 step,
 
 fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *copy) {
     const fmu_instance *const self = (const fmu_instance *)instance;
-    if (self == NULL || copy == NULL) {
-        return finish(self, "state", "an argument is missing");
-    }
-    if (*copy == NULL) {
-        *copy = malloc(sizeof self->state);
-    }
-    if (*copy == NULL) {
-        return finish(self, "state", "no memory is left");
-    }
-    memcpy(*copy, &self->state, sizeof self->state);
-    return fmi3OK;
+    return finish(self, "state", self == NULL ? fmu_argument_missing : fmu_copy(&self->state, copy));
 }
 
 fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState copy) {
     fmu_instance *const self = (fmu_instance *)instance;
     if (self == NULL || copy == NULL) {
-        return finish(self, "state", "an argument is missing");
+        return finish(self, "state", fmu_argument_missing);
     }
     memcpy(&self->state, copy, sizeof self->state);
     return fmi3OK;
@@ -201,16 +191,13 @@ fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *copy) {
     if (instance == NULL) {
         return fmi3Error;
     }
-    if (copy != NULL) {
-        free(*copy);
-        *copy = NULL;
-    }
+    fmu_free_copy(copy);
     return fmi3OK;
 }
 
 fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState copy, size_t *size) {
     if (instance == NULL || copy == NULL || size == NULL) {
-        return finish((const fmu_instance *)instance, "state", "an argument is missing");
+        return finish((const fmu_instance *)instance, "state", fmu_argument_missing);
     }
     *size = fmu_serialised_size();
     return fmi3OK;
@@ -227,17 +214,5 @@ fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState copy, fmi3B
 fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte bytes[], size_t size,
                                    fmi3FMUState *copy) {
     const fmu_instance *const self = (const fmu_instance *)instance;
-    fmu_state *restored;
-    const char *problem;
-    if (self == NULL || bytes == NULL || copy == NULL) {
-        return finish(self, "state", "an argument is missing");
-    }
-    restored = (fmu_state *)(*copy != NULL ? *copy : malloc(sizeof *restored));
-    problem = restored == NULL ? "no memory is left" : fmu_deserialise(restored, bytes, size);
-    if (problem != NULL && *copy == NULL) {
-        free(restored);
-        restored = NULL;
-    }
-    *copy = restored;
-    return finish(self, "state", problem);
+    return finish(self, "state", self == NULL ? fmu_argument_missing : fmu_restore(bytes, size, copy));
 }

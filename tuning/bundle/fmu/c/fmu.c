@@ -2,7 +2,10 @@
 #include "fmu.h"
 
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
+
+const char *const fmu_argument_missing = "an argument is missing";
 
 static const double step_tolerance = 1e-6; /* accepted difference from the control period, in periods */
 
@@ -124,7 +127,7 @@ void fmu_serialise(const fmu_state *state, uint8_t *bytes) {
     memcpy(bytes, &header, sizeof header);
 }
 
-const char *fmu_deserialise(fmu_state *state, const uint8_t *bytes, size_t size) {
+static const char *deserialise(fmu_state *state, const uint8_t *bytes, size_t size) {
     fmu_header expected;
     if (size != fmu_serialised_size()) {
         return "the serialised state has another size";
@@ -135,4 +138,42 @@ const char *fmu_deserialise(fmu_state *state, const uint8_t *bytes, size_t size)
     }
     memcpy(state, bytes + sizeof expected, sizeof *state);
     return NULL;
+}
+
+/* Allocate memory for a copy of a state, unless there is a copy already. */
+static const char *reserve(void **copy) {
+    if (copy == NULL) {
+        return fmu_argument_missing;
+    }
+    if (*copy == NULL) {
+        *copy = malloc(sizeof(fmu_state));
+    }
+    return *copy == NULL ? "no memory is left" : NULL;
+}
+
+const char *fmu_copy(const fmu_state *state, void **copy) {
+    const char *const problem = reserve(copy);
+    if (problem == NULL) {
+        memcpy(*copy, state, sizeof *state);
+    }
+    return problem;
+}
+
+const char *fmu_restore(const uint8_t *bytes, size_t size, void **copy) {
+    const bool is_new = copy != NULL && *copy == NULL;
+    const char *problem = bytes == NULL ? fmu_argument_missing : reserve(copy);
+    if (problem == NULL) {
+        problem = deserialise((fmu_state *)*copy, bytes, size);
+        if (problem != NULL && is_new) {
+            fmu_free_copy(copy);
+        }
+    }
+    return problem;
+}
+
+void fmu_free_copy(void **copy) {
+    if (copy != NULL) {
+        free(*copy);
+        *copy = NULL;
+    }
 }

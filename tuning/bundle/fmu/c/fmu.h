@@ -51,7 +51,13 @@ const char *fmu_name_of(uint32_t reference);
 /* Number of bytes of a serialised state. */
 size_t fmu_serialised_size(void);
 void fmu_serialise(const fmu_state *state, uint8_t *bytes);
-const char *fmu_deserialise(fmu_state *state, const uint8_t *bytes, size_t size);
+
+/* Copies of a state for the importing tool. The first two functions allocate memory if `*copy` is NULL. */
+const char *fmu_copy(const fmu_state *state, void **copy);
+const char *fmu_restore(const uint8_t *bytes, size_t size, void **copy);
+void fmu_free_copy(void **copy);
+
+extern const char *const fmu_argument_missing;
 
 /* Provided by fmu_model.c. The first function sets outputs before the first step, and the second one begins
  * with the parameters and returns false if it refuses their values. */
