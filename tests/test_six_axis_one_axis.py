@@ -93,6 +93,14 @@ def test_one_axis_option_is_refused_for_one_axis_mechanism(jaxhil, tmp_path):
     assert not (tmp_path / "new.toml").exists()
 
 
+def test_one_axis_option_does_not_overwrite_a_file(jaxhil, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("mine")
+    ran = jaxhil("simulate", "probe-drogue", "--reference", "--one-axis", path)
+    assert ran.code == 2 and "--one-axis: " in ran.err and "no file is overwritten" in ran.err
+    assert path.read_text() == "mine"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("compensator", ["none", "phase_lead"])
 def test_one_axis_file_has_the_restitution_of_the_off_centre_contact(jaxhil, tmp_path, compensator):
@@ -115,5 +123,5 @@ def test_simulate_writes_a_one_axis_file_that_loads(jaxhil, tmp_path):
     assert ran.code == 0 and "without approach.offset, approach.attitude, rig.force_sensor.tool" in ran.err
     mechanism = load(str(path)).mechanism
     assert mechanism.contact.law == "hunt_crossley" and mechanism.contact.stiffness == [3e6]
-    ran = jaxhil("simulate", "probe-drogue", "--reference", "--one-axis", path)
-    assert ran.code == 2 and "friction.coefficient: found 0.15, expected 0" in ran.err
+    ran = jaxhil("simulate", "probe-drogue", "--reference", "--one-axis", tmp_path / "two.toml")
+    assert ran.code == 2 and "friction.coefficient: found 0.15, expected for a one-axis file: 0" in ran.err

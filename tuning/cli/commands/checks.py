@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import InputError, format_value, to_one_line
-from jaxhil.files import open_regular, remove_stale, report_write_errors, resolve_output_path
+from jaxhil.files import open_regular, remove_stale, report_write_errors, resolve_output_path, write_new
 from tuning.cli.options import PLOT_SUFFIXES
 
 # Names that Windows reserves for devices, even with a suffix; results may be copied to a Windows system.
@@ -38,6 +38,23 @@ def check_file_path(path: str) -> None:
         target = resolve_output_path(target)
         target.parent.mkdir(parents=True, exist_ok=True)
         remove_stale(target.parent)
+
+
+def check_is_new(option: str, path: Path) -> None:
+    """Check that no file has the name that `option` gives to a new mechanism file."""
+    if os.path.lexists(path):
+        problem = "found an existing file, expected a new name: no file is overwritten"
+        raise InputError(f"{option}: {to_one_line(str(path))}: {problem}")
+
+
+def write_mechanism_file(option: str, path: Path, text: str) -> None:
+    """Write a new mechanism file. Raise `InputError` if the file exists or cannot be written."""
+    with report_write_errors(path):
+        try:
+            write_new(path, text.encode())
+        except FileExistsError:
+            check_is_new(option, path)
+            raise
 
 
 def prepare_output_folder(folder: Path) -> None:

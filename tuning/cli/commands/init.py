@@ -7,7 +7,6 @@ from pathlib import Path
 import msgspec
 
 from jaxhil.errors import InputError, format_value, to_one_line
-from jaxhil.files import report_write_errors, write_new
 from jaxhil.mechanism.file import (
     DEFAULT_MECHANISM,
     builtin_names,
@@ -44,12 +43,7 @@ def run(options: InitOptions) -> int:
     text = _six_axis_text(source, name) if source in six_axis_names() else _one_axis_text(source, name)
     label = to_one_line(str(path))
     checks.prepare_output_folder(path.parent)
-    with report_write_errors(path):
-        try:
-            write_new(path, text.encode())
-        except FileExistsError:
-            problem = "found an existing file, expected a new name: no file is overwritten"
-            raise InputError(f"--output: {label}: {problem}") from None
+    checks.write_mechanism_file("--output", path, text)
     if options.json:
         terminal.emit_json({"file": str(path), "name": name, "from": source})
     else:

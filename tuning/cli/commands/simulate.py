@@ -37,6 +37,8 @@ def run(options: SimulateOptions) -> int:
     for path in (options.log, options.one_axis):
         if path is not None:
             checks.check_file_path(path)
+    if options.one_axis is not None:
+        checks.check_is_new("--one-axis", Path(options.one_axis))
     mechanism = load_any_named_mechanism(options)
     if mechanism is None:
         prepare_jax()

@@ -161,14 +161,12 @@ def _write_one_axis_file(options: SimulateOptions, mechanism: SixAxisMechanism, 
     """Write the one-axis file that `--one-axis` requests, if any; note the keys that the file leaves out."""
     if options.one_axis is None:
         return
-    from jaxhil.files import report_write_errors, resolve_output_path, write_atomically
     from jaxhil.mechanism.template import format_mechanism_file
     from jaxhil.sixdof.one_axis import convert_to_one_axis
 
     converted = convert_to_one_axis(mechanism, episode)
-    with report_write_errors(options.one_axis):
-        content = format_mechanism_file(converted.mechanism).encode("utf-8")
-        write_atomically(resolve_output_path(options.one_axis), content)
+    text = format_mechanism_file(converted.mechanism)
+    checks.write_mechanism_file("--one-axis", Path(options.one_axis), text)
     left_out = f", without {', '.join(converted.left_out)}" if converted.left_out else ""
     terminal.note(f"wrote {options.one_axis}{left_out}")
 
