@@ -206,14 +206,14 @@ MAGNIFIED = {"impulse_ledger": 0.1}  # allowed share of lanes; 0.02 for other co
 
 
 @pytest.mark.parametrize(
-    "name, lanes",
+    "name, lanes, ticks",
     [
-        *((name, 60) for name in COMPENSATORS),
-        pytest.param("response_error", 510, marks=pytest.mark.slow),
+        *((name, 12, 500) if name in LONG_LAWS else (name, 60, 2000) for name in COMPENSATORS),
+        *(pytest.param(name, 60, 2000, marks=pytest.mark.slow) for name in LONG_LAWS),
+        pytest.param("response_error", 510, 2000, marks=pytest.mark.slow),
     ],
 )
-def test_runtime_and_jax_commands_agree_on_random_ticks(name, lanes):
-    ticks = RECORD if lanes == RUNS else 2000
+def test_runtime_and_jax_commands_agree_on_random_ticks(name, lanes, ticks):
     count = compare(name, random_readings(name, lanes, ticks, seed=1))
     print(name, count)
     assert count.ticks == ticks * lanes

@@ -86,6 +86,7 @@ def test_first_reason_of_verdict_is_status_or_error_of_the_contact(slow_simulato
     assert len(slow_simulator.reasons(limit=1e-6)) == 3
 
 
+@pytest.mark.slow
 def test_verify_reports_excessive_peak_force_of_closed_loop(slow_simulator):
     gains, mechanism = slow_simulator.gains, slow_simulator.mechanism
     report = verify(check_document(build_document(LAW, gains, mechanism, "0" * 64, {}, {}, 0, {})), 1)

@@ -165,6 +165,7 @@ def test_rig_fmu_leaves_out_the_extra_periods_of_the_co_simulation():
         rig_fmu({**made, "figures": {"co_simulation": {"extra_periods": 2}}}, 3)
 
 
+@pytest.mark.slow
 def test_gains_tuned_with_extra_periods_state_them_and_hold_in_co_simulation(tmp_path):
     tuned = tuning.tune(
         load("rig-300kg", NOISELESS).mechanism,

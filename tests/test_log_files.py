@@ -135,7 +135,7 @@ def test_log_file_of_any_bytes_is_read_or_refused_with_one_line(examples):
 
 
 @pytest.mark.filterwarnings("ignore")
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=20)
 @given(st.data())
 def test_damaged_log_file_of_any_format_is_read_or_refused_with_one_line(valid_files, data):
     suffix, content = data.draw(st.sampled_from(valid_files))

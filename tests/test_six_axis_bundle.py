@@ -163,6 +163,7 @@ def test_longest_sum_adds_successive_steps_only():
     assert longest_sum(np.ones(3), np.zeros(3, bool)) == 0.0
 
 
+@pytest.mark.slow
 def test_calibrated_limits_accept_good_runs_and_stop_a_wrong_mass():
     with jax_context():
         loaded = check_document(six_axis_document(), any_axes=True)

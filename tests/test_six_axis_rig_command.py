@@ -117,6 +117,7 @@ def test_killed_controller_ends_session_with_one_line_and_holds_the_command(gain
     assert len(commands) > 150 and commands[-1] == commands[-20]
 
 
+@pytest.mark.slow
 def test_one_axis_packets_are_ignored_by_six_axis_controller(gains):
     from rig_lock_step import a_reading
 

@@ -94,6 +94,7 @@ def test_rig_and_jax_commands_agree_on_recorded_readings(name):
             check_agreement(other, gains, constants, period, readings, expected)
 
 
+@pytest.mark.slow
 def test_rig_and_jax_commands_agree_if_a_contact_begins_within_the_loop_delay_of_the_start():
     """Use a hexapod whose delay line is longer than the settling time, and noise above the threshold."""
     changes = {"rig.control_period": 2.5e-4, "rig.force_sensor.noise_std": {"force": 100.0, "torque": 10.0}}
@@ -160,7 +161,7 @@ def random_constants(rng):
     return ModelConstants(*matrices, (RING - 2) * 1e-3)
 
 
-@pytest.mark.parametrize("runs", [12, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [4, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", built_in_compensators(6))
 def test_rig_and_jax_commands_agree_on_random_readings(name, runs):
     """Compare commands for random readings, few of which magnify rounding errors."""

@@ -42,13 +42,7 @@ from tuning.rig.udp_task import MISSED_TICK, ControllerTask
 
 STATE_TOLERANCE = 1e-8  # of the largest (angular) velocity
 MECHANISMS = ("probe-drogue", "ring-capture", "hydraulic-hexapod", "petals", "claw-two-arms")
-CASES = [
-    (mechanism, compensator)
-    if (mechanism, compensator) == ("probe-drogue", "impulse_ledger")
-    else pytest.param(mechanism, compensator, marks=pytest.mark.slow)
-    for mechanism in MECHANISMS
-    for compensator in SIX_AXIS_COMPENSATORS
-]
+CASES = [(mechanism, compensator) for mechanism in MECHANISMS for compensator in SIX_AXIS_COMPENSATORS]
 
 
 @functools.cache
@@ -81,6 +75,7 @@ def exchange(mechanism, compensator, runs, delivered=lambda way, packet: [packet
     return rig, task, answers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, compensator", CASES)
 def test_six_axis_rehearsal_gives_final_twists_and_errors_of_simulate(name, compensator):
     mechanism = load_any(name).mechanism

@@ -178,6 +178,7 @@ def test_bundle_reports_limits_that_stop_its_own_nominal_run(loaded):
     assert again.stop is None and again.passing is None and again.ended[0] is None
 
 
+@pytest.mark.slow
 def test_export_reports_the_limit_that_stopped_a_run_and_a_sufficient_value(loaded, tmp_path):
     path = tmp_path / "gains.json"
     result = export(_saved(path, loaded), tmp_path / "bundle", limits={"force_limit": 5.0})

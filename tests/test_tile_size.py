@@ -127,6 +127,7 @@ def test_evaluation_in_one_tile_equals_evaluation_in_many(monkeypatch, name, com
         assert_same_outcomes(many, model.evaluate(loop, gains, scenarios))
 
 
+@pytest.mark.slow
 def test_solver_with_all_problems_in_one_tile_reaches_same_gains(monkeypatch):
     """The task has transparency probes, whose lanes are also divided into tiles on a processor."""
     task = build_task(load_any("rig-300kg").mechanism, "phase_lead", 10, 0, probed=True)

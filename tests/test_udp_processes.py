@@ -100,6 +100,7 @@ def test_rig_command_with_injected_faults_ends_safely(jaxhil, tmp_path):
     assert result["commanded"]["not_finite"] == result["commanded"]["beyond_limits"] == 0
 
 
+@pytest.mark.slow
 def test_rig_verdict_is_bad_if_controller_trips_without_injected_fault(jaxhil, tmp_path):
     limits = {"force_limit": 5.0, "retreat_velocity": 0.01, "deceleration": 1.0}
     path = gain_file(tmp_path, limits=limits)
