@@ -15,6 +15,8 @@ int driver_init_with(
     jaxhil_controller *controller, const double *gains, const double *limits, const double *constants
 );
 size_t driver_exported(double *parameters);
+uint32_t driver_faults(const jaxhil_controller *controller);
+int driver_contact_status(const jaxhil_controller *controller);
 void driver_run(jaxhil_controller *controller, size_t count, const double *rows, double *results);
 double driver_ticks(jaxhil_controller *controller, size_t count, const double *rows);
 
@@ -48,6 +50,14 @@ size_t driver_exported(double *parameters) {
     memcpy(parameters, &jaxhil_exported_constants, sizeof jaxhil_exported_constants);
     return (sizeof jaxhil_exported_gains + sizeof jaxhil_exported_limits + sizeof jaxhil_exported_constants) /
            sizeof *parameters;
+}
+
+uint32_t driver_faults(const jaxhil_controller *controller) {
+    return controller->faults;
+}
+
+int driver_contact_status(const jaxhil_controller *controller) {
+    return jaxhil_last_contact(controller).status;
 }
 
 static double event(jaxhil_controller *controller, const double *row) {

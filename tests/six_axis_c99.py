@@ -8,6 +8,7 @@ import functools
 import shutil
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from c99_cases import (
@@ -25,9 +26,11 @@ from c99_cases import (
 from six_axis_documents import LIMITS, six_axis_document
 from six_axis_records import random_readings
 
+import jaxhil.rig.six_axes
 from jaxhil.rig.law_status import STATUSES
 from jaxhil.rig.six_axes import Controller6
 from tuning.bundle.c99 import generate_c99
+from tuning.bundle.single_file import build_runtime_source
 
 DRIVER = Path(__file__).with_name("c99_driver_six_axes.c")
 SIX = ("x", "y", "z", "rx", "ry", "rz")
@@ -60,6 +63,70 @@ class SixAxisBatch:
         results = np.empty((len(rows), len(RESULT)))
         self.library.driver_run(self.state, ctypes.c_size_t(len(rows)), pointer(rows), pointer(results))
         return results
+
+
+class ControllerInC:
+    """Compiled controller of one gain document, with the methods of `Controller6` that a loop calls."""
+
+    def __init__(self, document, folder):
+        sources = write_sources(folder, document)
+        self._library = ctypes.CDLL(
+            str(compiled(sources, DRIVER.name, "driver.so", "-O2", "-shared", "-fPIC"))
+        )
+        self._library.driver_size.restype = ctypes.c_size_t
+        self._library.driver_faults.restype = ctypes.c_uint32
+        for name in ("tare", "reset", "tripped"):
+            getattr(self._library, f"jaxhil_{name}").restype = ctypes.c_bool
+        self._state = (ctypes.c_double * (self._library.driver_size() // 8 + 1))()
+        self.control_period = document["control_period"]
+        assert self._library.driver_init(self._state)
+
+    @property
+    def tripped(self):
+        return self._library.jaxhil_tripped(self._state)
+
+    @property
+    def status(self):
+        return "tripped" if self.tripped else "ok"
+
+    @property
+    def faults(self):
+        return self._library.driver_faults(self._state)
+
+    @property
+    def last_contact(self):
+        number = self._library.driver_contact_status(self._state)
+        return SimpleNamespace(status=next(name for name, n in STATUS_NUMBERS.items() if n == number))
+
+    def step(self, wrench, pose_desired, twist_desired, pose_measured, time=None):
+        time = None if time is None else ctypes.byref(ctypes.c_double(time))
+        vectors = wrench, pose_desired, twist_desired, pose_measured
+        return self._vector(self._library.jaxhil_step, vectors, time)
+
+    def pose_command(self, *vectors):
+        return self._vector(self._library.jaxhil_pose_command, vectors)
+
+    def tare(self, wrench):
+        return self._library.jaxhil_tare(self._state, pointer(np.array(wrench, float)))
+
+    def reset(self):
+        return self._library.jaxhil_reset(self._state)
+
+    def next_contact(self):
+        self._library.jaxhil_next_contact(self._state)
+
+    def _vector(self, function, vectors, *more):
+        arguments, result = [np.array(vector, float) for vector in vectors], np.empty(6)
+        function(self._state, *map(pointer, arguments), *more, pointer(result))
+        return result.tolist()
+
+
+def controller_of_bundle(document):
+    """Return a controller of the bundle's single Python file."""
+    namespace = {"__name__": "jaxhil_runtime"}
+    source = build_runtime_source(document["compensator"], jaxhil.rig.six_axes, "SIX_AXIS_COMPENSATORS")
+    exec(compile(source, "jaxhil_runtime.py", "exec"), namespace)
+    return namespace["Controller6"].from_dict(document)
 
 
 def pointer(values):

@@ -153,7 +153,7 @@ class Axis:
         return np.array([state[0], state[1], (self.flow @ state)[1]])
 
 
-def on_the_rig(case, ticks, controller=None):
+def on_the_rig(case, ticks, controller=None, leads=0.0):
     """Return the states of the numerical model's bodies after the given number of ticks.
 
     A controller's `step(wrench, pose, twist, measured)` changes the wrench, and its
@@ -163,7 +163,7 @@ def on_the_rig(case, ticks, controller=None):
     bodies, period = case["start"], case["period"]
     at, rates = command(case, bodies)
     if controller is not None:
-        at = at + controller.leads * rates
+        at = at + leads * rates
     axes = [
         Axis(*numbers, period, x, rate)
         for *numbers, x, rate in zip(case["frequency"], case["ratio"], at, rates, strict=True)

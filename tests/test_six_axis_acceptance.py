@@ -4,8 +4,6 @@ The rig is plain NumPy: its numerical model, motion simulator, contact and force
 package. The final twist of a contact must equal that of `simulate`.
 """
 
-import ctypes
-
 import c99_cases
 import jax
 import jax.numpy as jnp
@@ -13,17 +11,15 @@ import numpy as np
 import pytest
 from gain_documents import sign
 from scipy.spatial.transform import Rotation
-from six_axis_c99 import DRIVER, compiled, pointer, write_sources
+from six_axis_c99 import ControllerInC, controller_of_bundle
 from six_axis_documents import six_axis_document
 from six_axis_oracle import on_the_rig, relative
 
-import jaxhil.rig.six_axes
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load_any
 from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.sixdof.building import build_scenarios
 from jaxhil.sixdof.loop import model_motion, run
-from tuning.bundle.single_file import build_runtime_source
 from tuning.verification.six_axis_replay import six_axis_loop
 
 TICKS = 240  # duration of a run of probe-drogue until its contact is over
@@ -73,40 +69,6 @@ def case_of(mechanism, scenario):
     }
 
 
-class InPython:
-    """Controller in the bundle's single Python file."""
-
-    def __init__(self, document, leads):
-        namespace = {"__name__": "jaxhil_runtime"}
-        source = build_runtime_source(document["compensator"], jaxhil.rig.six_axes, "SIX_AXIS_COMPENSATORS")
-        exec(compile(source, "jaxhil_runtime.py", "exec"), namespace)
-        self.controller, self.leads = namespace["Controller6"].from_dict(document), leads
-        self.step, self.pose_command = self.controller.step, self.controller.pose_command
-
-
-class InC:
-    """Controller in C."""
-
-    def __init__(self, document, leads, folder):
-        library = compiled(
-            write_sources(folder, document), DRIVER.name, "driver.so", "-O2", "-shared", "-fPIC"
-        )
-        self.library, self.leads = ctypes.CDLL(str(library)), leads
-        self.library.driver_size.restype = ctypes.c_size_t
-        self.state = (ctypes.c_double * (self.library.driver_size() // 8 + 1))()
-        assert self.library.driver_init(self.state)
-
-    def step(self, *vectors):
-        arguments, result = [np.array(vector, float) for vector in vectors], np.empty(6)
-        self.library.jaxhil_step(self.state, *map(pointer, arguments), None, pointer(result))
-        return result.tolist()
-
-    def pose_command(self, *vectors):
-        arguments, result = [np.array(vector, float) for vector in vectors], np.empty(6)
-        self.library.jaxhil_pose_command(self.state, *map(pointer, arguments), pointer(result))
-        return result.tolist()
-
-
 @pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 @pytest.mark.parametrize("name", ["impulse_ledger", pytest.param("phase_lead", marks=pytest.mark.slow)])
 def test_exported_controller_on_independent_rig_gives_simulated_final_twist(name, tmp_path):
@@ -123,8 +85,11 @@ def test_exported_controller_on_independent_rig_gives_simulated_final_twist(name
         before = np.asarray(ticks.signals.twist_desired)[0, :, 0]
         assert np.linalg.norm((simulated - before)[:3]) > 0.01  # there was a contact
         case, document = case_of(mechanism, scenario), sign(six_axis_document(name, **gains))
-        for controller in (InPython(document, leads), InC(document, leads, tmp_path / str(offset[0]))):
-            *_, v, w, _, _ = relative(case, on_the_rig(case, TICKS, controller))
+        for controller in (
+            controller_of_bundle(document),
+            ControllerInC(document, tmp_path / str(offset[0])),
+        ):
+            *_, v, w, _, _ = relative(case, on_the_rig(case, TICKS, controller, leads))
             for part, expected in ((v, simulated[:3]), (w, simulated[3:])):
                 error = np.max(np.abs(part - expected)) / np.max(np.abs(expected))
                 print(name, offset, type(controller).__name__, error)

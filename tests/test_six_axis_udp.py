@@ -2,15 +2,18 @@
 
 import copy
 import functools
+import itertools
 import math
 from random import Random
 
+import c99_cases
 import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from six_axis_c99 import ControllerInC, controller_of_bundle
 from six_axis_documents import LIMITS, six_axis_document
 
 from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS
@@ -42,7 +45,13 @@ from tuning.rig.udp_task import MISSED_TICK, ControllerTask
 
 STATE_TOLERANCE = 1e-8  # of the largest (angular) velocity
 MECHANISMS = ("probe-drogue", "ring-capture", "hydraulic-hexapod", "petals", "claw-two-arms")
-CASES = [(mechanism, compensator) for mechanism in MECHANISMS for compensator in SIX_AXIS_COMPENSATORS]
+# Controllers of a gain document; the last two are those of a bundle. A folder is for the C sources.
+CONTROLLERS = {
+    "package": lambda document, folder: Controller6.from_dict(document),
+    "python_file": lambda document, folder: controller_of_bundle(document),
+    "c": ControllerInC,
+}
+CASES = list(itertools.product(MECHANISMS, SIX_AXIS_COMPENSATORS, CONTROLLERS))
 
 
 @functools.cache
@@ -51,13 +60,29 @@ def simulated_rig(mechanism):
     return SixAxisRig(load_any(mechanism).mechanism)
 
 
-def exchange(mechanism, compensator, runs, delivered=lambda way, packet: [packet], limits=None, ticks=20_000):
+@functools.cache
+def simulated_run(mechanism, compensator, phase=None):
+    """Return the run of `simulate`; None is the nominal phase."""
+    changes = {} if phase is None else {"approach.phase": phase}
+    return simulate_six_axes(load_any(mechanism, changes).mechanism, compensator)
+
+
+def exchange(
+    mechanism,
+    compensator,
+    runs,
+    delivered=lambda way, packet: [packet],
+    limits=None,
+    ticks=20_000,
+    build=Controller6.from_dict,
+):
     """Exchange packets until this many runs have ended; return rig, controller's task and answers.
 
     `delivered(way, packet)` returns the packets that arrive when `packet` is sent "there" or "back".
+    `build(document)` returns the controller.
     """
     document = six_axis_document(compensator, mechanism, limits)
-    controller = Controller6.from_dict(document)
+    controller = build(document)
     rig = RigTask(copy.copy(simulated_rig(mechanism)), controller.control_period)
     task = ControllerTask(controller, SixAxisModelInLoop(controller, document["mechanism"]))
     answers = []
@@ -76,22 +101,27 @@ def exchange(mechanism, compensator, runs, delivered=lambda way, packet: [packet
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name, compensator", CASES)
-def test_six_axis_rehearsal_gives_final_twists_and_errors_of_simulate(name, compensator):
+@pytest.mark.parametrize("name, compensator, controller", CASES)
+def test_six_axis_rehearsal_gives_final_twists_and_errors_of_simulate(
+    name, compensator, controller, tmp_path
+):
+    if controller == "c" and c99_cases.COMPILER is None:
+        pytest.skip("no C compiler (cc) on this machine")
     mechanism = load_any(name).mechanism
-    rig, task, _ = exchange(name, compensator, 2)
+    rig, task, _ = exchange(
+        name, compensator, 2, build=lambda document: CONTROLLERS[controller](document, tmp_path)
+    )
     assert task.status == "ok" and task.interpolated == task.stale == 0
     first, second = simulated_rig(name).evaluate(rig.contacts)[:2]
-    phase = Random(1).random()
-    for result, overrides in ((first, {}), (second, {"approach.phase": phase})):
-        expected = simulate_six_axes(load_any(name, overrides).mechanism, compensator)
+    for result, phase in ((first, None), (second, Random(1).random())):
+        expected = simulated_run(name, compensator, phase)
         episode = expected.episodes[0]
         assert result["status"] == episode.status and result["touches"] == episode.touches
         assert result["ticks"] == round(expected.final.time / mechanism.rig.control_period)
         for part in (slice(0, 3), slice(3, 6)):
             wanted = np.array(expected.final.twist[part])
             error = np.max(np.abs(np.array(result["final_twist"][part]) - wanted)) / np.max(np.abs(wanted))
-            print(name, compensator, error)
+            print(name, compensator, controller, error)
             assert error <= STATE_TOLERANCE
         assert result["twist_error"] == pytest.approx(episode.twist_error, abs=1e-7)
         assert result["energy_error"] == pytest.approx(episode.energy_error, abs=1e-6)

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxhil.laws.impulse_ledger.six_axes.reading.rig import MAX_RECALL
+from jaxhil.laws.impulse_ledger.six_axes.constants import MAX_RECALL
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.rig.six_axes.registry import ModelConstants
 from jaxhil.simulation.jax_environment import jax_context

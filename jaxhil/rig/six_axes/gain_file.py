@@ -26,6 +26,7 @@ from jaxhil.rig.six_axes.vectors import AXES, product
 MATRICES = ("mass_matrix", "inverse_mass", "tool_correction")
 MATRIX_ENTRIES = -1e9, 1e9  # lowest and highest entry, in SI units
 INVERSE_TOLERANCE = 1e-6  # maximum entry of M M^-1 - 1, divided by the scale of its row and column
+SYMMETRY_TOLERANCE = 1e-9  # maximum difference of mirrored entries, divided by the scale of row and column
 
 
 class SixAxisGainFile(NamedTuple):
@@ -75,7 +76,14 @@ def _constants(document: Mapping[str, Any], source: str) -> ModelConstants:
     )
     check_within(delay, *TIMES, "constants.longest_delay", source)
     constants = ModelConstants(mass, inverse, correction, delay)
+    if not _is_positive_definite(mass):
+        allowed = "a symmetric, positive definite matrix"
+        raise make_gain_file_error(source, "constants.mass_matrix", "another matrix", allowed)
     _check_inverse(constants, source)
+    # With the tool's mass matrix M_t, this product is the inverse of M - M_t.
+    if not _is_positive_definite([product(inverse, [row[i] for row in correction]) for i in range(AXES)]):
+        allowed = "the matrix of a tool that is lighter than constants.mass_matrix"
+        raise make_gain_file_error(source, "constants.tool_correction", "another matrix", allowed)
     return constants
 
 
@@ -92,16 +100,28 @@ def _matrix(entries: Mapping[str, Any], name: str, source: str) -> list[list[flo
     return matrix
 
 
+def _is_positive_definite(matrix: list[list[float]]) -> bool:
+    """Return whether a matrix is symmetric and positive definite, by Cholesky's factorisation."""
+    factor = [[0.0] * AXES for _ in range(AXES)]
+    for i in range(AXES):
+        for j in range(i + 1):
+            difference = abs(matrix[i][j] - matrix[j][i])
+            if not difference <= SYMMETRY_TOLERANCE * (abs(matrix[i][i]) * abs(matrix[j][j])) ** 0.5:
+                return False
+            rest = matrix[i][j] - sum(factor[i][k] * factor[j][k] for k in range(j))
+            if i == j and not rest > 0.0:
+                return False
+            factor[i][j] = rest**0.5 if i == j else rest / factor[j][j]
+    return True
+
+
 def _check_inverse(constants: ModelConstants, source: str) -> None:
-    """Raise GainFileError unless `inverse_mass` is the inverse of M and M has a positive diagonal."""
+    """Raise GainFileError unless `inverse_mass` is the inverse of M."""
     mass, inverse = constants.mass_matrix, constants.inverse_mass
     for i in range(AXES):
-        if not (mass[i][i] > 0.0 and inverse[i][i] > 0.0):
-            found = format_value(mass[i][i])
-            raise make_gain_file_error(source, "constants.mass_matrix", found, "a positive diagonal")
         column = product(mass, [row[i] for row in inverse])
         for j in range(AXES):
             error = abs(column[j] - (1.0 if i == j else 0.0))
-            if not error <= INVERSE_TOLERANCE * max(1.0, (mass[j][j] * inverse[i][i]) ** 0.5):
+            if not error <= INVERSE_TOLERANCE * max(1.0, (mass[j][j] * abs(inverse[i][i])) ** 0.5):
                 allowed = "the inverse of constants.mass_matrix"
                 raise make_gain_file_error(source, "constants.inverse_mass", "another matrix", allowed)

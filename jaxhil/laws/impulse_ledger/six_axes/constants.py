@@ -28,3 +28,5 @@ MIN_STIFFNESS = 100.0  # 1/s^2; lower bound of the stiffness in the limit of the
 LONG_AGO = 1e9  # ticks; at the beginning of a run, the last contact counts as this long ago
 FEW_READINGS = 5.0  # minimum number of readings of the tangent model; with fewer the status is `unsure`
 LATE = 0.8  # [1]; limit on D divided by the contact's duration; beyond it the status is `too_short`
+SAMPLES = 512  # length of the rig's delay line [ticks], a power of two
+MAX_RECALL = SAMPLES - 2.0  # ticks; maximum delay, because interpolation needs one older sample

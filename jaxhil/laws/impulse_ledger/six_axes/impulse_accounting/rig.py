@@ -5,13 +5,14 @@ from math import sqrt
 from jaxhil.laws.impulse_ledger.six_axes.constants import (
     AHEAD,
     HIGHEST,
+    MAX_RECALL,
     MIN_SHARE,
     MIN_SPEED,
     MIN_STIFFNESS,
     MIN_TWIST,
     TURNED,
 )
-from jaxhil.laws.impulse_ledger.six_axes.reading.rig import MAX_RECALL, ModelRows, SixAxisReader
+from jaxhil.laws.impulse_ledger.six_axes.reading.rig import ModelRows, SixAxisReader
 from jaxhil.laws.impulse_ledger.six_axes.tangent_model.rig import TangentModel
 from jaxhil.rig.six_axes.registry import ModelConstants
 from jaxhil.rig.six_axes.vectors import AXES, Matrix, Vector, add_multiple, dot, multiply, product, subtract

@@ -7,9 +7,11 @@ from jaxhil.laws.impulse_ledger.six_axes.constants import (
     LONG_AGO,
     MAX_FLIGHT,
     MAX_MEAN,
+    MAX_RECALL,
     MIN_RATE,
     ONSET_SIGMAS,
     RECENT,
+    SAMPLES,
 )
 from jaxhil.rig.six_axes.registry import ModelConstants
 from jaxhil.rig.six_axes.vectors import (
@@ -24,9 +26,7 @@ from jaxhil.rig.six_axes.vectors import (
 )
 from jaxhil.rig.types import Count, Gains, Index, Positive
 
-SAMPLES = 512  # length of the delay line [ticks], a power of two
 MASK = SAMPLES - 1
-MAX_RECALL = SAMPLES - 2.0  # ticks; maximum delay, because interpolation needs one older sample
 ROWS = 4 * AXES  # columns: filtered pose of the hardware; pose, twist and impulse of the model
 MODEL_ROWS = 3 * AXES
 ModelRows = Annotated[list[float], MODEL_ROWS]
