@@ -119,6 +119,10 @@ def browser(tmp_path_factory):
     browser.close()
 
 
+# Verdicts of JSON documents by exit code.
+VERDICTS = {0: ("good", "unknown"), 1: ("bad",), 2: ("unusable input",), 130: ("interrupted",)}
+
+
 class Ran(NamedTuple):
     """Exit code, standard output and standard error of a command."""
 
@@ -128,7 +132,12 @@ class Ran(NamedTuple):
 
     @property
     def document(self):
-        return json.loads(self.out, parse_constant=pytest.fail)
+        """Return the JSON document on standard output, and check its schema and verdict."""
+        document = json.loads(self.out, parse_constant=pytest.fail)
+        if "$schema" not in document:  # a JSON Schema is no result
+            assert document["schema"].startswith("jaxhil/"), document["schema"]
+            assert document["verdict"] in VERDICTS[self.code], (document["verdict"], self.code)
+        return document
 
 
 @pytest.fixture

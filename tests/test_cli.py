@@ -279,7 +279,7 @@ def test_tune_rejects_folder_without_mechanism_files(jaxhil, tmp_path):
 def test_verify_command_accepts_tuned_gains(jaxhil, tuned):
     ran = jaxhil("verify", tuned, "--json", "--scenarios", "2")
     assert ran.code == 0
-    assert ran.document["verdict"] is True
+    assert ran.document["verdict"] == "good"
     assert len(ran.document["replay"]) == 2
     assert "Good" in jaxhil("verify", tuned / "gains.json", "--scenarios", "2").out
 
@@ -291,7 +291,7 @@ def test_verify_command_detects_modified_gain_file(jaxhil, tuned, tmp_path):
     path.write_text(json.dumps(document))
     ran = jaxhil("verify", path, "--json")
     assert ran.code == 1
-    assert ran.document["verdict"] is False
+    assert ran.document["verdict"] == "bad"
     assert "sha256" in ran.document["reasons"][0]
     path.write_text("{")
     assert jaxhil("verify", path).code == 1

@@ -12,6 +12,7 @@ import msgspec
 import pytest
 from conftest import Ran
 
+import tuning.cli.commands
 from jaxhil.mechanism.file import builtin_names, load, six_axis_names, suite_names
 from jaxhil.mechanism.json_schema import build_json_schema
 from jaxhil.simulation import jax_environment
@@ -20,6 +21,9 @@ from tuning.cli.commands.tune import is_better, make_folder_name
 from tuning.cli.options import DEFAULT_PLOT
 from tuning.cli.parser import complete_bare_options
 from tuning.gains.tune import ErrorMetrics
+
+ERROR_KEYS = ["schema", "command", "verdict", "problems"]
+COMMANDS = Path(tuning.cli.commands.__file__).parent
 
 
 def refused(ran, *words):
@@ -70,6 +74,45 @@ def test_cli_exits_with_code_130_on_interrupt(jaxhil, monkeypatch):
 )
 def test_cli_reports_unusable_input_with_one_line_message(jaxhil, arguments, words):
     refused(jaxhil(*arguments), *words)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "init nowhere",
+        "simulate nowhere.toml",
+        "identify nowhere.csv",
+        "identify --guess nowhere.csv",
+        "identify --design nowhere.toml",
+        "identify --check nowhere.csv nowhere.toml",
+        "monitor nowhere.toml nowhere.csv",
+        "tune nowhere.toml",
+        "sweep nowhere.json",
+        "replay nowhere 3",
+        "export nowhere.json",
+        "verify nowhere.json",
+        "rig nowhere.json",
+        "compare nowhere.toml",
+        "map nowhere.toml --x a --y b",
+        "report nowhere",
+        "mechanisms --nowhere",
+    ],
+)
+def test_json_of_every_command_states_an_error_in_the_same_form(jaxhil, monkeypatch, tmp_path, words):
+    monkeypatch.chdir(tmp_path)
+    ran = jaxhil(*words.split(), "--json")
+    document = ran.document
+    assert ran.code == 2 and document["schema"] == "jaxhil/error/1"
+    assert document["command"] == words.split()[0] and list(document) == ERROR_KEYS
+    (problem,) = document["problems"]
+    assert ran.err == f"jaxhil: {problem}\n" or problem.startswith("wrong arguments")
+
+
+def test_json_names_every_command_in_its_test():
+    marks = test_json_of_every_command_states_an_error_in_the_same_form.pytestmark
+    tested = {words.split()[0] for words in marks[0].args[1]}
+    modules = [path for path in COMMANDS.glob("*.py") if "_" not in path.stem]
+    assert tested == {path.stem for path in modules if "\ndef run(options" in path.read_text()}
 
 
 def test_simulate_reports_plot_that_cannot_be_written(jaxhil, tmp_path):

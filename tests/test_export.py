@@ -306,7 +306,7 @@ def test_verify_command_rejects_corrupt_bundle_without_running_it(jaxhil, tmp_pa
     trap = f"\nopen({str(tmp_path / 'ran')!r}, 'w')\n".encode()
     (folder / name).write_bytes(content + trap)
     ran = jaxhil("verify", folder, "--json")
-    assert ran.code == 1 and not ran.document["verdict"] and ran.document["self_test"] == []
+    assert ran.code == 1 and ran.document["verdict"] == "bad" and ran.document["self_test"] == []
     assert any(reason.startswith(f"{name}: ") for reason in ran.document["reasons"])
     assert f"Bad: {name}: " in jaxhil("verify", folder).out
     assert not (tmp_path / "ran").exists()

@@ -5,6 +5,7 @@ input is unusable or the output cannot be written; 130 if the command is interru
 one line, without a traceback.
 """
 
+import contextlib
 import gc
 import io
 import os
@@ -28,6 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The command must not fail because the terminal's encoding lacks a character.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    words = sys.argv[1:] if arguments is None else arguments
     try:
         if sys.stdout is None:
             # The next opened file would get the descriptor of standard output, and the printed text with it.
@@ -37,32 +39,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
         from tuning.cli.parser import parse
 
-        code = parse(arguments)()
+        code = parse(words)()
         sys.stdout.flush()
         return code
+    except SystemExit as stop:
+        # The parser has printed its message for wrong arguments on standard error.
+        if stop.code == EXIT_UNUSABLE_INPUT:
+            _print_error_document(words, "wrong arguments: standard error names them", EXIT_UNUSABLE_INPUT)
+        raise
     except InputError as error:
         # If the error has a text that names the command's option, that text is printed.
-        return _print_error(getattr(error, "option", str(error)), EXIT_UNUSABLE_INPUT)
+        return _report_error(words, getattr(error, "option", str(error)), EXIT_UNUSABLE_INPUT)
     except KeyboardInterrupt:
-        return _print_error("interrupted", EXIT_INTERRUPTED)
+        return _report_error(words, "interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
         # Only commands without a verdict get here, for example a list or the help.
         _discard_output()
         return EXIT_GOOD
     except OSError as error:
         where = f"{to_one_line(os.fspath(error.filename))}: " if isinstance(error.filename, str) else ""
-        return _print_error(f"{where}{to_one_line(error.strerror or str(error), 200)}", EXIT_UNUSABLE_INPUT)
+        reason = to_one_line(error.strerror or str(error), 200)
+        return _report_error(words, f"{where}{reason}", EXIT_UNUSABLE_INPUT)
     except Exception as error:
         if os.environ.get(TRACEBACK_VARIABLE):
             raise
         from jaxhil.simulation import jax_startup
 
         if (problem := jax_startup.find_startup_error()) is not None:
-            return _print_error(str(problem), EXIT_UNUSABLE_INPUT)
+            return _report_error(words, str(problem), EXIT_UNUSABLE_INPUT)
         reason = to_one_line(f"{type(error).__name__}: {error}", 200)
-        return _print_error(
-            f"internal error: {reason} (set {TRACEBACK_VARIABLE}=1 for a traceback)", EXIT_UNUSABLE_INPUT
-        )
+        problem = f"internal error: {reason} (set {TRACEBACK_VARIABLE}=1 for a traceback)"
+        return _report_error(words, problem, EXIT_UNUSABLE_INPUT)
 
 
 def command() -> None:
@@ -89,13 +96,25 @@ def _open_closed_streams() -> None:
             setattr(sys, name, open(number, mode, encoding="utf-8"))
 
 
-def _print_error(text: str, code: int) -> int:
-    """Print an error message on standard error, ignoring a broken stream, and return `code`."""
+def _report_error(words: Sequence[str], text: str, code: int) -> int:
+    """Print an error message on standard error and, with `--json`, as a document; return `code`."""
     try:
         print(f"jaxhil: {text}", file=sys.stderr, flush=True)
     except OSError:
         _discard_output()
+    _print_error_document(words, text, code)
     return code
+
+
+def _print_error_document(words: Sequence[str], text: str, code: int) -> None:
+    """Print an error as a JSON document on standard output if the arguments contain `--json`."""
+    if "--json" not in words or sys.stdout is None:
+        return
+    from tuning import terminal
+
+    verdict = terminal.INTERRUPTED if code == EXIT_INTERRUPTED else terminal.UNUSABLE_INPUT
+    with contextlib.suppress(InputError):  # standard output cannot be written
+        terminal.emit_json_error(words[0], verdict, [text])
 
 
 def _discard_output() -> None:

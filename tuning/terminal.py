@@ -21,6 +21,8 @@ from rich.text import Text
 from jaxhil.errors import InputError, to_one_line
 
 DEFAULT_WIDTH = 110  # characters; width of lines if the output is not a terminal
+# Verdicts in JSON documents for exit codes 2 and 130.
+UNUSABLE_INPUT, INTERRUPTED = "unusable input", "interrupted"
 PROGRESS_INTERVAL = 10.0  # s; time between progress lines if the output is not a terminal
 MAX_SILENCE = 20.0  # s; after this time without a line, the progress is printed again
 MIN_SHARE_FOR_RATE = 0.05  # finished share of the work above which the rate is accurate enough to be shown
@@ -47,7 +49,22 @@ def suggest(*words: str) -> None:
     emit_line(f"Next: jaxhil {shlex.join(words)}")
 
 
-def emit_json(document: Mapping[str, Any]) -> None:
+def emit_json(command: str, document: Mapping[str, Any]) -> None:
+    """Print the result of a command as JSON on standard output.
+
+    Unless the document has its own, its schema is `jaxhil/COMMAND/1`, and its verdict is "good".
+    """
+    defaults = {"schema": f"jaxhil/{command}/1", "verdict": "good"}
+    print_json({**{key: value for key, value in defaults.items() if key not in document}, **document})
+
+
+def emit_json_error(command: str, verdict: str, problems: Sequence[str]) -> None:
+    """Print the JSON document of a command without a result: a verdict and one-line messages."""
+    schema = {"schema": "jaxhil/error/1", "command": command}
+    print_json({**schema, "verdict": verdict, "problems": list(problems)})
+
+
+def print_json(document: Mapping[str, Any]) -> None:
     """Print a document as JSON on standard output, in the form of `format_json`."""
     with _convert_output_errors():
         print(format_json(document), end="", flush=True)

@@ -23,6 +23,8 @@ from tuning.api.arguments import ArgumentError
 from tuning.api.options import add_options
 from tuning.api.sweep_options import SweepOptions
 
+SCHEMA = "jaxhil/sweep-result/1"
+
 if TYPE_CHECKING:
     import pyarrow
 
@@ -284,6 +286,7 @@ def _build_document(
     else:
         good = probability.high <= options.acceptable
     return {
+        "schema": SCHEMA,
         "store": str(store.folder),
         "sweep_sha256": manifest.sha256,
         "gains_sha256": manifest.gains_sha256,

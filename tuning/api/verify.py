@@ -37,7 +37,7 @@ class Verification:
     @property
     def good(self) -> bool:
         """Return whether the runtime's commands agree with the simulated ones, and all files are intact."""
-        return self.document["verdict"]
+        return self.document["verdict"] == "good"
 
     @property
     def reasons(self) -> list[str]:
@@ -120,7 +120,7 @@ def _verify_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: 
             stages.begin("running the bundle's self-test")
             document["self_test"], reasons = run_selftest(checked, os.path.basename(os.path.abspath(folder)))
     if reasons:
-        return {**document, "verdict": False, "reasons": reasons}
+        return {**document, "verdict": "bad", "reasons": reasons}
     return _verify_gains(checked, {**document, "file": str(folder / "gains.json")}, scenarios, seed, progress)
 
 
@@ -132,7 +132,7 @@ def _verify_gains(gains: Any, document: dict[str, Any], scenarios: int, seed: in
         try:
             loaded = arguments.load_gains(gains, any_axes=True)
         except InputError as error:
-            return {**document, "verdict": False, "reasons": [str(error)]}
+            return {**document, "verdict": "bad", "reasons": [str(error)]}
         axes = loaded.document.get("axes", 1)
         arguments.check_has_runtime(loaded.compensator, axes)
         if axes == 6:
@@ -141,7 +141,9 @@ def _verify_gains(gains: Any, document: dict[str, Any], scenarios: int, seed: in
             from tuning.verification.runtime_replay import verify as compare
         with terminal.show_stages(3, progress) as stages:
             result = compare(loaded, scenarios, seed, stages.begin)
-        return {**document, "mechanism": loaded.mechanism.name, **msgspec.to_builtins(result)}
+        verdict = "good" if result.verdict else "bad"
+        content = {"mechanism": loaded.mechanism.name, **msgspec.to_builtins(result)}
+        return {**document, **content, "verdict": verdict}
 
 
 def _is_folder(path: Path) -> bool:

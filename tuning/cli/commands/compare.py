@@ -55,7 +55,10 @@ def run(options: Compare) -> int:
             interrupted = True
     ordered = {name: [results[name][law] for law in laws if law in results[name]] for name in names}
     finished_names = [name for name in names if ordered[name]]
+    verdict = "bad" if problems else "good"
     document = {
+        "schema": "jaxhil/compare/1",
+        "verdict": terminal.INTERRUPTED if interrupted else verdict,
         **{key: getattr(options, key) for key in ("limit", "seed", "scenarios", "judged")},
         "axes": 6 if has_six_axes else 1,
         "tuned": not options.untuned,
@@ -75,7 +78,7 @@ def run(options: Compare) -> int:
     if finished_names and not interrupted:
         _draw(options, finished_names, ordered)
     if options.json:
-        terminal.emit_json(document)
+        terminal.emit_json("compare", document)
     else:
         _print(options, finished_names, ordered, document)
         _suggest_next(options, [result for name in finished_names[:1] for result in ordered[name]])

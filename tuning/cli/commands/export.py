@@ -28,7 +28,7 @@ def run(options: Export) -> int:
         **{field.name: getattr(options, field.name) for field in fields(ExportOptions)},
     )
     if options.json:
-        terminal.emit_json(result.document)
+        terminal.emit_json("export", result.document)
     else:
         _print(result.document, result.sizes)
         if result.document["bundle"]:

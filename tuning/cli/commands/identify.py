@@ -83,7 +83,7 @@ def run(options: IdentifyOptions) -> int:
     warn_about_checkpoints(checkpoints)
     terminal.warn([*campaign.notes, *result.notes])
     if options.json:
-        terminal.emit_json(document)
+        terminal.emit_json("identify", document)
     else:
         _print(document, None if result.mechanism is None else folder)
         if result.mechanism is not None:
@@ -144,7 +144,7 @@ def _print_draft_mapping(options: IdentifyOptions, logs: list[Path]) -> int:
 
     text = draft_mapping(logs, TextFormat() if options.map is None else load_text_format(options.map))
     if options.json:
-        terminal.emit_json({"mapping": text})
+        terminal.emit_json("identify", {"mapping": text})
     else:
         print(text, end="", flush=True)
     return 0
@@ -176,7 +176,7 @@ def _check_mechanism(options: IdentifyOptions, logs: list[Path]) -> int:
     document = _build_document(options, campaign, mechanism, result)
     terminal.warn(campaign.notes)
     if options.json:
-        terminal.emit_json(document)
+        terminal.emit_json("identify", document)
     else:
         runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
         terminal.emit(

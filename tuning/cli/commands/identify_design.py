@@ -62,7 +62,7 @@ def run(options: IdentifyOptions) -> int:
     with report_write_errors(folder / DOCUMENT_FILE):
         write_atomically(folder / DOCUMENT_FILE, terminal.format_json(document).encode("ascii"))
     if options.json:
-        terminal.emit_json(document)
+        terminal.emit_json("identify", document)
     else:
         _print(document, folder)
     return 0
@@ -82,6 +82,7 @@ def _build_document(options: IdentifyOptions, name: str, design: ExcitationDesig
     numbers = zip(design.keys, design.values, design.std, effects, strict=True)
     content = {
         "schema": SCHEMA,
+        "verdict": "good",  # a design has no requirement
         "mechanism": to_one_line(name),
         "predicted": [
             {"key": key, "value": value, "std": std, "effect": effect, "unit": get_unit(key)}

@@ -28,7 +28,7 @@ def run(options: InitOptions) -> int:
     names = [*builtin_names(), *suite_names(), *six_axis_names()]
     if options.list:
         if options.json:
-            terminal.emit_json({"names": names})
+            terminal.emit_json("init", {"names": names})
         else:
             terminal.emit(*names)
         return 0
@@ -45,7 +45,7 @@ def run(options: InitOptions) -> int:
     checks.prepare_output_folder(path.parent)
     checks.write_mechanism_file("--output", path, text)
     if options.json:
-        terminal.emit_json({"file": str(path), "name": name, "from": source})
+        terminal.emit_json("init", {"file": str(path), "name": name, "from": source})
     else:
         law = " --compensator phase_lead" if source in six_axis_names() else ""
         next_command = f"jaxhil tune {shlex.quote(label)}{law}"

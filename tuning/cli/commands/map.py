@@ -32,7 +32,7 @@ def run(options: Map) -> int:
     )
     mechanism_summary.report_summary(mechanism, None if options.json else terminal.emit_line)
     if options.json:
-        terminal.emit_json(stability_map.document)
+        terminal.emit_json("map", stability_map.document)
     else:
         terminal.emit(*_describe_map(stability_map.document))
         terminal.emit_line(f"Wrote {to_one_line(str(target / DOCUMENT_FILE))} and {PLOT}")

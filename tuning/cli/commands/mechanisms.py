@@ -23,7 +23,7 @@ from tuning.cli.options import MechanismsOptions
 def run(options: MechanismsOptions) -> int:
     """Print the lists of mechanisms, or the JSON Schema of mechanism files; return exit code 0."""
     if options.schema:
-        terminal.emit_json(build_json_schema())
+        terminal.print_json(build_json_schema())
         return 0
     titles = {"Built-in mechanisms": builtin_names(), "Standard suites": suite_names()}
     tables = {
@@ -33,7 +33,8 @@ def run(options: MechanismsOptions) -> int:
     six_axes = [_six_axis_entry(name) for name in six_axis_names()]
     if options.json:
         mechanisms, suites = tables.values()
-        terminal.emit_json({"mechanisms": mechanisms, "suites": suites, "six_axes": six_axes})
+        lists = {"mechanisms": mechanisms, "suites": suites, "six_axes": six_axes}
+        terminal.emit_json("mechanisms", lists)
         return 0
     headings = ["name", "law", "contacts", "mass [kg]", "contact frequencies [Hz]"]
     for title, entries in tables.items():

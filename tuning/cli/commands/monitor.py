@@ -33,6 +33,7 @@ def run(options: MonitorOptions) -> int:
         "schema": SCHEMA,
         "mechanism": loaded.label,
         "mechanism_sha256": loaded.sha256,
+        "verdict": "bad" if result.state == "bad" else "good",
         "state": result.state,
         "reason": result.verdict,
         "alarm": _count_from_one(result.alarm),
@@ -47,7 +48,7 @@ def run(options: MonitorOptions) -> int:
     document = {**plain, "sha256": digest(plain)}
     terminal.warn(document["notes"])
     if options.json:
-        terminal.emit_json(document)
+        terminal.emit_json("monitor", document)
     else:
         _print(document)
     return 1 if result.state == "bad" else 0

@@ -52,7 +52,7 @@ def run(options: ReplayOptions) -> int:
         save_figure(scenario_plot(result.sweep, options.index, title), resolve_output_path(options.plot))
         terminal.note(f"wrote {options.plot}")
     if options.json:
-        terminal.emit_json(document)
+        terminal.emit_json("replay", document)
     else:
         _print(document)
     return 0 if document["verdict"] == "good" else 1

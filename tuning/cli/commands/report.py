@@ -27,9 +27,8 @@ def run(options: ReportOptions) -> int:
     page = report(options.results, progress=True)
     page.save(target)
     if options.json:
-        terminal.emit_json(
-            {"report": str(target), "verdict": page.verdict, "requirements": page.requirements}
-        )
+        content = {"report": str(target), "verdict": page.verdict, "requirements": page.requirements}
+        terminal.emit_json("report", content)
     else:
         rows = [tuple(requirement.values()) for requirement in page.requirements]
         headings = ["quantity", "required", "result", "margin", "verdict"]

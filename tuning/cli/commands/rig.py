@@ -21,7 +21,7 @@ MAX_TABLE_ROWS = 12  # largest number of contacts in the printed table
 def run(options: RigOptions) -> int:
     """Run an empty loop, which only exchanges packets, then the controller, and print the result.
 
-    Return exit code 0 if the verdict is good, else 1. After an interrupted run, raise KeyboardInterrupt.
+    Return exit code 0 if the verdict is good, 130 after an interrupted run, else 1.
     """
     arguments.check_limit(options.limit)
     arguments.check_integers(0, seed=options.seed)
@@ -78,11 +78,13 @@ def run(options: RigOptions) -> int:
         save_figure(latency_plot(session, title, period), resolve_output_path(options.plot))
         terminal.note(f"wrote {options.plot}")
     if options.json:
-        terminal.emit_json(result)
+        verdict = {"verdict": terminal.INTERRUPTED} if session.interrupted else {}
+        terminal.emit_json("rig", {**result, **verdict})
     else:
         _print(result)
     if session.interrupted:
-        raise KeyboardInterrupt
+        terminal.note("jaxhil: interrupted")
+        return 130
     return 0 if result["verdict"] == "good" else 1
 
 

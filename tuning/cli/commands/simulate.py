@@ -75,6 +75,7 @@ def run(options: SimulateOptions) -> int:
     contacts = [_contact_entry(contact) for contact in result.contacts]
     if options.json:
         terminal.emit_json(
+            "simulate",
             {
                 "mechanism": mechanism.name,
                 "compensator": result.compensator,
@@ -87,7 +88,7 @@ def run(options: SimulateOptions) -> int:
                 "bounds": CONTACT_BOUNDS,
                 "reasons": reasons,
                 "verdict": "bad" if reasons else "good",
-            }
+            },
         )
     else:
         _print(options, limit, result, contacts, reasons)

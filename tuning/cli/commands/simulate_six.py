@@ -69,7 +69,7 @@ def run(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
     _write(options, result)
     _write_one_axis_file(options, mechanism, result.episodes[0])
     if options.json:
-        terminal.emit_json(_build_document(limit, result, good))
+        terminal.emit_json("simulate", _build_document(limit, result, good))
     else:
         terminal.emit_line(result.summary.line(mechanism.name))
         _print(options, limit, result, good)
@@ -89,8 +89,10 @@ def _run_ideal_contact(options: SimulateOptions, mechanism: SixAxisMechanism) ->
     _write_one_axis_file(options, mechanism, episode)
     if options.json:
         episodes = [episode._asdict()] if episode.reference_touches else []
+        final = {"reference_final": result.final._asdict(), "status": result.status}
+        verdict = {"verdict": "good" if episode.reference_touches else "bad"}
         document = {"mechanism": mechanism.name, "axes": 6, "episodes": episodes}
-        terminal.emit_json(document | {"reference_final": result.final._asdict(), "status": result.status})
+        terminal.emit_json("simulate", document | final | verdict)
     else:
         headings = ["m_n [kg]", "approach [mm/s]", "e*", "peak [N]", "peak [N m]", "in touch [ms]", "touches"]
         row = [

@@ -56,8 +56,11 @@ def run(options: Tune) -> int:
         except _TuningInterrupted as interruption:
             entries, interrupted = interruption.entries, True
         warn_about_checkpoints(checkpoints)
-    if options.json:
+    if options.json and problems and not entries and not interrupted:
+        terminal.emit_json_error("tune", terminal.UNUSABLE_INPUT, problems)
+    elif options.json:
         terminal.emit_json(
+            "tune",
             {
                 "compensator": options.compensator,
                 "limit": entries[0]["limit"] if entries else options.limit,
@@ -65,7 +68,7 @@ def run(options: Tune) -> int:
                 "problems": problems,
                 "interrupted": interrupted,
                 "verdict": _verdict(entries, problems, interrupted),
-            }
+            },
         )
     elif entries:
         terminal.suggest("sweep", entries[0]["gain_file"])
@@ -356,7 +359,7 @@ def _draw(result, options: Tune, limit: float, folder: Path) -> list[str]:
 def _verdict(entries, problems, interrupted) -> str:
     """Return "good" if the gains of every mechanism are good, else "bad", or why there is no verdict."""
     if interrupted:
-        return "interrupted"
+        return terminal.INTERRUPTED
     if problems:
-        return "unusable input"
+        return terminal.UNUSABLE_INPUT
     return "good" if all(entry["verdict"] == "good" for entry in entries) else "bad"

@@ -19,7 +19,7 @@ def run(options: Verify) -> int:
     )
     document = result.document
     if options.json:
-        terminal.emit_json(document)
+        terminal.emit_json("verify", document)
     else:
         _print(document)
         if result.good and Path(options.path).is_dir():
@@ -61,6 +61,7 @@ def _six_axis_tables(document: dict[str, Any]) -> list[Any]:
 def _print(document: dict[str, Any]) -> None:
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_SHORT_TEXT
 
+    result_is_good = document["verdict"] == "good"
     tables: list[Any] = list(document.get("self_test", ()))
     if "signature" in document:
         tables.append(f"Signature: {document['signature']}.")
@@ -98,12 +99,12 @@ def _print(document: dict[str, Any]) -> None:
                 texts=(5, 6),
             ),
         ]
-    if document["verdict"] and document.get("axes") == 6:
+    if result_is_good and document.get("axes") == 6:
         lines = [
             f"Good: commands agree to {document['replay_limit']:.0e} of their range, the final twist to "
             f"{document['closed_loop_limit']:.0e}."
         ]
-    elif document["verdict"]:
+    elif result_is_good:
         lines = [
             f"Good: commands agree to {document['replay_limit']:.0e} of their range, restitutions to "
             f"{document['closed_loop_limit']:.0e}; real contact: {CONTACT_BOUNDS_SHORT_TEXT}."
