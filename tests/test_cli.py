@@ -127,9 +127,12 @@ def test_tune_command_prints_tables_or_json_if_requested(jaxhil, table, tmp_path
     assert json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())["sha256"] == again["sha256"]
 
 
-def test_commands_end_with_next_command(jaxhil, table):
+def test_commands_end_with_next_command(jaxhil, table, tmp_path):
     tuned, _, out, _ = table
-    assert out.splitlines()[-1] == f"Next: jaxhil sweep {tuned / 'gains.json'}"
+    assert out.splitlines()[-1] == "Next: jaxhil compare rig-300kg"  # the gains are not good
+    for arguments, words in ((["mechanisms"], "init NAME"), (["init", "-o", tmp_path / "a"], "simulate ")):
+        assert jaxhil(*arguments).out.splitlines()[-1].startswith(f"Next: jaxhil {words}")
+    assert jaxhil("verify", tuned / "gains.json").out.splitlines()[-1].startswith("Next: jaxhil export")
     change = ("--set", "rig.force_sensor.delay=0.003")
     for arguments, words in (
         (("rig-300kg", *change), "tune rig-300kg --set rig.force_sensor.delay=0.003"),

@@ -13,7 +13,7 @@ FIGURES = [12.34, 20.15, 200.2, 0.1041, 0.5123, 0.9252, 1.443, 4.125]
 
 @pytest.mark.parametrize("width", [30, 60, 80, 110, 300])
 def test_terminal_table_shows_every_digit(monkeypatch, capsys, width):
-    monkeypatch.setattr(terminal, "DEFAULT_WIDTH", width)
+    monkeypatch.setenv("COLUMNS", str(width))
     heads = ["law", *(f"figure {number} %" for number in range(len(FIGURES)))]
     terminal.emit(
         terminal.build_table(
@@ -26,7 +26,7 @@ def test_terminal_table_shows_every_digit(monkeypatch, capsys, width):
 
 
 def test_terminal_table_wraps_long_texts_between_words(monkeypatch, capsys):
-    monkeypatch.setattr(terminal, "DEFAULT_WIDTH", 60)
+    monkeypatch.setenv("COLUMNS", "60")
     text = "force delay, noise of the force sensor and dead zone, equivalent mass, roughly the surface"
     terminal.emit(
         terminal.build_table("costs", ["law", "known beforehand", "us"], [[LAW, text, 1.25]], (0, 1))
@@ -34,6 +34,13 @@ def test_terminal_table_wraps_long_texts_between_words(monkeypatch, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 60
     assert set(" ".join(lines).split()) >= {LAW, *text.split(), "1.25"}
+
+
+def test_piped_output_is_as_wide_as_columns(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "40")
+    terminal.emit("word " * 20)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3 and max(map(len, lines)) <= 40
 
 
 def test_json_output_has_numbers_for_numpy_scalars_and_null_for_nonfinite_values():

@@ -5,10 +5,11 @@ import math
 import os
 import shlex
 import sys
+import textwrap
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any
 
 import rich.progress
@@ -20,7 +21,7 @@ from rich.text import Text
 
 from jaxhil.errors import InputError, to_one_line
 
-DEFAULT_WIDTH = 110  # characters; width of lines if the output is not a terminal
+DEFAULT_WIDTH = 110  # characters; width of lines if no stream is a terminal
 # Verdicts in JSON documents for exit codes 2 and 130.
 UNUSABLE_INPUT, INTERRUPTED = "unusable input", "interrupted"
 PROGRESS_INTERVAL = 10.0  # s; time between progress lines if the output is not a terminal
@@ -301,8 +302,8 @@ def _show_bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[r
 def _table_width(table: Table, console: Console) -> int:
     """Return the smallest width of a table, at least the terminal's, that breaks no number and no word.
 
-    If the terminal is too narrow, put each word of a heading on a line of its own. The terminal wraps the
-    lines that are still too long.
+    If the terminal is too narrow, break headings to the width of their column's cells. The terminal wraps
+    the lines that are still too long.
     """
 
     def full_width() -> int:
@@ -312,8 +313,9 @@ def _table_width(table: Table, console: Console) -> int:
         return console.width
     table.padding, broken = 0, 0
     for column in table.columns:
-        column.header = "\n".join(str(column.header).split())
         cells = [str(cell) for cell in column.cells]
+        longest = max(map(len, (*cells, *str(column.header).split())), default=1)
+        column.header = "\n".join(textwrap.wrap(str(column.header), max(longest, 1)))
         if not column.no_wrap:
             words = [word for text in (*cells, column.header) for word in text.split()]
             broken += max(map(len, cells), default=0) - max(map(len, words), default=0)
@@ -336,8 +338,18 @@ def _make_console(stream) -> Console:
     # Names come from files and must not be interpreted as markup.
     console = _Console(file=stream, markup=False, emoji=False, highlight=False)
     if not console.is_terminal:
-        console.width = DEFAULT_WIDTH
+        console.width = _width_without_terminal()
     return console
+
+
+def _width_without_terminal() -> int:
+    """Return the width of piped output: `COLUMNS`, or that of the terminal behind another stream."""
+    if (columns := os.environ.get("COLUMNS", "")).isdigit() and int(columns) > 0:
+        return int(columns)
+    for descriptor in range(3):
+        with suppress(OSError):
+            return os.get_terminal_size(descriptor).columns or DEFAULT_WIDTH
+    return DEFAULT_WIDTH
 
 
 @contextmanager

@@ -32,12 +32,13 @@ DEFAULT_REPLAY_PLOT = "jaxhil-out/replay.png"
 
 @dataclass(frozen=True)
 class InitOptions:
-    """Write a mechanism file as a template, with the meaning, unit, range and default of every key.
+    """Write a mechanism file to start from.
 
     Example: jaxhil init rig-300kg --output my-rig.toml
 
-    A file with six axes is a copy of the built-in file with its comments. An existing file is never
-    overwritten.
+    A file with one axis states the meaning, unit, range and default of every key. A file with six axes is a
+    copy of the built-in file with its comments; the guide's page on six axes lists its keys. An existing file
+    is never overwritten.
     """
 
     name: Annotated[

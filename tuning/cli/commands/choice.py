@@ -12,8 +12,8 @@ from tuning.cli.options import SimulateOptions
 from tuning.cli.options_report import Map
 
 
-def suggest_next(options: SimulateOptions, compensator: str) -> None:
-    """Print the command after a simulation: a sweep of the gain file, or the tuning of the compensator."""
+def suggest_next(options: SimulateOptions | Map, compensator: str) -> None:
+    """Print the command after a simulation or map: a sweep of the gains, or a tuning of the compensator."""
     if options.gains is not None:
         terminal.suggest("sweep", options.gains)
         return

@@ -183,6 +183,10 @@ def _check_mechanism(options: IdentifyOptions, logs: list[Path]) -> int:
             _check_table(document, f"What {mechanism.name} does not explain in runs: {runs}"),
             f"{document['reason']}.",
         )
+        if result.good:
+            terminal.suggest("tune", path)
+        else:
+            terminal.suggest("identify", *map(str, logs), "--prior", path)
     return 0 if result.good else 1
 
 

@@ -1,7 +1,6 @@
 """Command `jaxhil init`: writes a new mechanism file to start from."""
 
 import json
-import shlex
 from pathlib import Path
 
 import msgspec
@@ -31,6 +30,7 @@ def run(options: InitOptions) -> int:
             terminal.emit_json("init", {"names": names})
         else:
             terminal.emit(*names)
+            terminal.note("Next: jaxhil init NAME")
         return 0
     source, output = options.name or DEFAULT_MECHANISM, options.output
     if source.endswith(SUFFIX):  # the argument is the file, not a built-in name
@@ -47,9 +47,8 @@ def run(options: InitOptions) -> int:
     if options.json:
         terminal.emit_json("init", {"file": str(path), "name": name, "from": source})
     else:
-        law = " --compensator phase_lead" if source in six_axis_names() else ""
-        next_command = f"jaxhil tune {shlex.quote(label)}{law}"
-        terminal.emit(f"{label}: written, with the values of {source}. Change it, then: {next_command}")
+        terminal.emit_line(f"{label}: written, with the values of {source}: change them first")
+        terminal.suggest("simulate", str(path))
     return 0
 
 

@@ -12,7 +12,11 @@ from tuning.api import mechanism_summary
 from tuning.api.map import DOCUMENT_FILE, PLOT, MapOptions, map
 from tuning.api.options import check_options
 from tuning.cli.commands import checks
-from tuning.cli.commands.choice import load_any_named_mechanism, select_any_compensator
+from tuning.cli.commands.choice import (
+    load_any_named_mechanism,
+    select_any_compensator,
+    suggest_next,
+)
 from tuning.cli.options_report import Map
 from tuning.plots.stability_map import describe_missing_error
 
@@ -36,6 +40,8 @@ def run(options: Map) -> int:
     else:
         terminal.emit(*_describe_map(stability_map.document))
         terminal.emit_line(f"Wrote {to_one_line(str(target / DOCUMENT_FILE))} and {PLOT}")
+        is_untunable = compensator == "none" and stability_map.document["axes"] == 6
+        suggest_next(options, "phase_lead" if is_untunable else compensator)
     return 0
 
 

@@ -36,7 +36,7 @@ def run(options: MechanismsOptions) -> int:
         lists = {"mechanisms": mechanisms, "suites": suites, "six_axes": six_axes}
         terminal.emit_json("mechanisms", lists)
         return 0
-    headings = ["name", "law", "contacts", "mass [kg]", "contact frequencies [Hz]"]
+    headings = ["name", "contact law", "contacts", "mass [kg]", "contact frequencies [Hz]"]
     for title, entries in tables.items():
         terminal.emit(
             terminal.build_table(
@@ -48,13 +48,12 @@ def run(options: MechanismsOptions) -> int:
     terminal.emit(
         terminal.build_table(
             "Built-in mechanisms of six axes",
-            ["name", "masses [kg]", "pairs of shapes", "laws"], rows, texts=(0, 1, 3),
+            ["name", "masses [kg]", "pairs of shapes", "contact laws"], rows, texts=(0, 1, 3),
         ),
         *(f"{entry['name']}: {entry['source']}\n" for entry in six_axes),
     )  # fmt: skip
-    terminal.emit(
-        f"The files are in {builtin_path(DEFAULT_MECHANISM).parent}; `jaxhil init NAME` copies one."
-    )
+    terminal.emit_line(f"The files are in {builtin_path(DEFAULT_MECHANISM).parent}.")
+    terminal.suggest("init", "NAME")
     return 0
 
 

@@ -51,6 +51,10 @@ def run(options: MonitorOptions) -> int:
         terminal.emit_json("monitor", document)
     else:
         _print(document)
+        if result.state == "bad":
+            terminal.suggest("identify", "LOGS", "--prior", options.mechanism)
+        else:
+            terminal.suggest("monitor", options.mechanism, "LATER_LOGS")
     return 1 if result.state == "bad" else 0
 
 

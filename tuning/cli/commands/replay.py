@@ -55,6 +55,10 @@ def run(options: ReplayOptions) -> int:
         terminal.emit_json("replay", document)
     else:
         _print(document)
+        if options.plot is None:
+            terminal.suggest("replay", options.store, str(options.index), "--plot")
+        else:
+            terminal.suggest("report", options.store)
     return 0 if document["verdict"] == "good" else 1
 
 

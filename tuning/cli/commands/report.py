@@ -35,4 +35,5 @@ def run(options: ReportOptions) -> int:
         tables = [terminal.build_table("Requirements", headings, rows, texts=range(5))] if rows else []
         terminal.emit(*tables, f"Verdict: {page.verdict}.")
         terminal.emit_line(f"Wrote {to_one_line(str(target))}, {len(page.html) / 1e6:.2g} MB")
+        terminal.emit_line("Next: open this page in a browser")
     return 1 if page.verdict == "bad" else 0

@@ -82,6 +82,10 @@ def run(options: RigOptions) -> int:
         terminal.emit_json("rig", {**result, **verdict})
     else:
         _print(result)
+        if result["verdict"] == "good":
+            terminal.suggest("report", options.path)
+        elif options.plot is None:
+            terminal.suggest("rig", options.path, "--plot")
     if session.interrupted:
         terminal.note("jaxhil: interrupted")
         return 130

@@ -71,7 +71,7 @@ def run(options: Tune) -> int:
             },
         )
     elif entries:
-        terminal.suggest("sweep", entries[0]["gain_file"])
+        _suggest_next(options, entries)
     if interrupted:
         finished = f"{len(entries)} of {len(loaded)} mechanisms finished and saved"
         terminal.note(f"jaxhil: interrupted, {finished}; to continue, repeat the command with --resume")
@@ -84,6 +84,17 @@ def run(options: Tune) -> int:
                 terminal.note(f"jaxhil: {problem}")
         return 2
     return 0 if all(entry["verdict"] == "good" for entry in entries) else 1
+
+
+def _suggest_next(options: Tune, entries: list[dict[str, Any]]) -> None:
+    """Print the next command: a sweep of the first good gains or, without any, a comparison."""
+    good = [entry["gain_file"] for entry in entries if entry["verdict"] == "good"]
+    if good:
+        terminal.suggest("sweep", good[0])
+        return
+    changes = [("--set", change) for change in options.overrides]
+    changes += [("--unset", change) for change in options.unset]
+    terminal.suggest("compare", *options.files[:1], *(word for change in changes for word in change))
 
 
 def _check_output(output: Path, mechanisms: list[AnyMechanism]) -> None:

@@ -26,6 +26,8 @@ def run(options: Verify) -> int:
             terminal.suggest("rig", options.path)
         elif result.good:
             terminal.suggest("export", options.path, "-o", "bundle")
+        elif Path(options.path).is_dir():
+            terminal.suggest("export", "GAINS", "-o", options.path)
     return 0 if result.good else 1
 
 

@@ -99,7 +99,8 @@ def _has_contact(force: np.ndarray) -> bool:
 
 
 def _format_channels(guesses: Mapping[str, ChannelGuess]) -> list[str]:
-    lines = ["# A draft: check every line. Values are sign * (scale * number + offset), in the unit.", ""]
+    lines = ["# A draft: check every line. Values are sign * (scale * number + offset), in the unit."]
+    lines += ["# Next: jaxhil identify LOGS --map FILE, with this draft in FILE.", ""]
     lines += [f'schema = "{SCHEMA}"', "", "[channels]"]
     if "time" not in guesses:
         lines.append("time = { rate = 1000.0 }  # Hz; no column name indicates time stamps")
