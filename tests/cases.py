@@ -80,7 +80,7 @@ def form(case: Case) -> tuple[Any, ...]:
         simulator = "transfer_function", 4
     return (
         *(case.compensator, CONTACT_LAWS[contact.law], len(contact.depths), np.isfinite(contact.clearance)),
-        *(simulator, rig.integrator, rig.command_hold, rig.command_latency),
+        *(simulator, rig.integrator, rig.command_hold, rig.command_latency, rig.force_sensor.dead_zone_kind),
     )
 
 
@@ -234,6 +234,10 @@ CASES: dict[str, Case] = {
         mechanism({**LIST, "damping": [300.0]}, contacts=2, contact_plane=4.3e-5), "response_error"
     ),
     "dead zone": Case(mechanism(LIST, contacts=2, force_sensor={"dead_zone": 4.0}), "response_error"),
+    "cut dead zone": Case(
+        mechanism(LIST, contacts=2, force_sensor={"dead_zone": 4.0, "dead_zone_kind": "cut"}),
+        "response_error",
+    ),
     "quantum": Case(
         mechanism(LIST, force_sensor={"quantum": 0.5}, position_sensor={"quantum": 1e-7}), "response_error"
     ),

@@ -323,7 +323,11 @@ class _Run:
         force += self.sensor.get("bias", 0.0)
         force += 0.0 if self.force_noise is None else self.force_noise[n]
         force = _quantise(force, self.sensor.get("quantum", 0.0))
-        force = np.sign(force) * max(0.0, abs(force) - self.sensor.get("dead_zone", 0.0))
+        beyond = abs(force) - self.sensor.get("dead_zone", 0.0)
+        if self.sensor.get("dead_zone_kind") == "cut":
+            force = force if beyond > 0.0 else 0.0
+        else:
+            force = np.sign(force) * max(0.0, beyond)
         limit = self.sensor.get("range", inf)
         return float(min(max(force, -limit), limit))
 

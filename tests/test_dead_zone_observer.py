@@ -77,3 +77,23 @@ def test_dead_zone_observer_filter_has_gain_near_1_below_15_hz(overrides):
         assert abs(cosine + 1j * sine) >= 0.9 and mean == pytest.approx(2.0, rel=1e-6)
     lag = 1 / (2 * math.pi * gains["observer_bandwidth"])
     assert lag <= max(parsed.rig.force_sensor.delay, period / 2) * (1 + 1e-12)
+
+
+@pytest.mark.slow
+def test_observer_of_cut_dead_zone_restores_restitution():
+    """A cut dead zone changes the restitution itself; an observer of the other kind does not restore it."""
+    sensor = {"dead_zone": DEAD_ZONE, "dead_zone_kind": "cut"}
+    cut = validated(mechanism({}, IDEAL, DELAY, period=PERIOD, force_sensor=sensor))
+    gains = nominal_gains(cut, "dead_zone_observer")
+    assert gains["observer_saturation"] == 0.0 and GAINS["observer_saturation"] == 1.0
+    # For eight phases: no dead zone, the observer, no observer, and the observer of a continuous dead zone.
+    zone, limit = np.repeat(
+        [[1e-9, DEAD_ZONE, DEAD_ZONE, DEAD_ZONE], [0.0, DEAD_ZONE, 0.0, DEAD_ZONE]], 8, axis=1
+    )
+    gains |= {"observer_limit": limit, "observer_saturation": np.repeat([0.0, 0.0, 0.0, 1.0], 8)}
+    scenario = spread(cut, 32, phase=np.tile(np.arange(8) / 8, 4), force_sensor__dead_zone=zone)
+    result = first_contact(cut, scenario, "dead_zone_observer", gains)
+    without, *others = result["restitution"].reshape(4, 8).mean(axis=1)
+    observed, alone, other = np.abs(np.array(others) - without)
+    print(without, others)
+    assert observed < 0.2 * alone and alone < other

@@ -45,8 +45,21 @@ def test_dead_zone_is_estimated_from_noise_at_rest():
     assert cut.silent and cut.dead_zone is None
 
 
-@pytest.mark.parametrize("is_cut", [True, False])
-def test_identify_reports_dead_zone_that_sensor_does_not_subtract_as_defect(monkeypatch, tmp_path, is_cut):
+DATA_FINDING = "no reading lies between 0 and 3 N, as with a dead zone that is not subtracted"
+FILE_FINDING = "a cut dead zone of 3 N, which `identify` does not model"
+
+
+@pytest.mark.parametrize(
+    ("is_cut", "kind", "expected"),
+    [
+        (True, "continuous", [DATA_FINDING]),
+        pytest.param(True, "cut", [FILE_FINDING, DATA_FINDING], marks=pytest.mark.slow),
+        (False, "continuous", []),
+    ],
+)
+def test_identify_reports_dead_zone_that_sensor_does_not_subtract_as_defect(
+    monkeypatch, is_cut, kind, expected
+):
     campaign = ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0)
     runs = []
     for run in campaign.runs:
@@ -55,13 +68,13 @@ def test_identify_reports_dead_zone_that_sensor_does_not_subtract_as_defect(monk
         runs.append(replace(run, force_measured=np.where(np.abs(force) > 3.0, force - less, 0.0)))
     campaign = replace(campaign, runs=tuple(runs))
     prior: dict[str, Any] = to_plain_data(ambiguous.prior("plain"))
-    prior["rig"]["force_sensor"]["dead_zone"] = 3.0
+    prior["rig"]["force_sensor"] |= {"dead_zone": 3.0, "dead_zone_kind": kind}
     result = identify(campaign, from_plain_data(prior, "prior"))
     findings = [line.finding for line in result.lines if line.name == "dead zone of the force sensor"]
-    assert findings == (
-        ["no reading lies between 0 and 3 N, as with a dead zone that is not subtracted"] if is_cut else []
-    )
+    assert findings == expected
     assert not (is_cut and result.good)
+    assert result.mechanism is not None
+    assert (result.mechanism["rig"]["force_sensor"].get("dead_zone_kind") == "cut") == (kind == "cut")
 
 
 def test_contact_motion_is_evaluated_at_the_times_of_force_readings():

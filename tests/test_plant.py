@@ -24,7 +24,7 @@ AGAINST_THE_ORACLE = (
     *("zoh hold and integrator", "transfer function with latency", "third order with latency"),
     *("first order", "ideal with transport delay", "ideal with zoh hold", "hunt-crossley", "damped layers"),
     *("response error, gains off nominal", "late position", "dead zone", "quantum", "range"),
-    *("velocity limit", "damped, lag", "rattling, lag", "rattling against layers"),
+    *("cut dead zone", "velocity limit", "damped, lag", "rattling, lag", "rattling against layers"),
     *("rattling behind a long transport delay", "damped hardening", "depth-damped", "elastoplastic"),
     *("preloaded", "more friction than preload"),
     *("depth-damped, linear spring, lag", "elastoplastic, lag", "rattling, elastoplastic"),

@@ -55,7 +55,7 @@ WORK_ACCURACY = {
 # Each of these cases has its own program; their features have separate tests.
 SELDOM = ("rattling, elastoplastic", "rattling against layers", "depth-damped", "layers", "damped layers")
 SELDOM += ("transfer function with latency", "third order with latency", "position lead", "first order")
-SELDOM += ("hardening", "damped hardening", "elastoplastic", "rattling, lag")
+SELDOM += ("hardening", "damped hardening", "elastoplastic", "rattling, lag", "cut dead zone")
 slow_if_seldom = [
     pytest.param(name, marks=pytest.mark.slow if name.startswith(SELDOM) else ()) for name in CASES
 ]

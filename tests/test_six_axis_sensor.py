@@ -129,6 +129,8 @@ def test_six_axis_sensor_applies_crosstalk_then_bias_then_quantisation():
     quantum, dead_zone, limit = zero.copy(), zero.copy(), np.full(6, np.inf)
     quantum[1], dead_zone[5], limit[2] = 4.0, 0.5, 100.0
     errors = SampleErrors(*(jnp.asarray(part) for part in (mixing, zero + 0.25, quantum, dead_zone, limit)))
-    result = sample(wrench(), errors, jnp.asarray(zero + 0.125))
     expected = [40 + 1.2 + 0.375, -16.0, 100.0, 3.375, 8 + 0.3 + 0.375, -2 + 0.375 + 0.5]
-    close(result, expected, rtol=1e-12)
+    close(sample(wrench(), errors, jnp.asarray(zero + 0.125)), expected, rtol=1e-12)
+    # A cut dead zone leaves larger readings unchanged.
+    cut = sample(wrench(), errors, jnp.asarray(zero + 0.125), cuts_dead_zone=True)
+    close(cut, [*expected[:5], -2 + 0.375], rtol=1e-12)

@@ -9,9 +9,11 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, Struct, field
 
 from jaxhil.mechanism.structs import (
+    DEAD_ZONE_KINDS,
     MAX_LATENCY,
     CommandHold,
     CubicCoefficients,
+    DeadZoneKind,
     Denominator,
     Integrator,
     Numerator,
@@ -191,6 +193,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     dead_zone: Annotated[
         list[LoadMagnitude], six_axis_metadata("magnitude below which the reading is 0", LOAD_NAMES)
     ] = field(default_factory=zeros(6))
+    dead_zone_kind: Annotated[DeadZoneKind, key_metadata(DEAD_ZONE_KINDS)] = "continuous"
     range: Annotated[
         list[LoadLimit], six_axis_metadata("magnitude at which a reading saturates", LOAD_NAMES)
     ] = field(default_factory=lambda: [math.inf] * 6)

@@ -56,7 +56,10 @@ ContactLawName = Annotated[str, Meta(description="contact law", extra={"one_of":
 SimulatorModel = Literal["ideal", "first_order", "second_order", "third_order", "transfer_function"]
 Integrator = Literal["semi_implicit_euler", "zoh", "explicit_euler"]
 CommandHold = Literal["linear", "zoh"]
+DeadZoneKind = Literal["continuous", "cut"]
 Distribution = Literal["uniform", "loguniform", "normal"]
+
+DEAD_ZONE_KINDS = "larger readings: reduced by the dead zone, or unchanged (cut)"
 
 # Types of the entries of lists. A number must be finite unless its metadata contains `infinite`.
 Stiffness = Annotated[float, key_metadata("slope of the force", "N/m", gt=0.0)]
@@ -221,6 +224,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     noise_std: Annotated[float, key_metadata("standard deviation of white noise", "N", ge=0.0)] = 0.0
     quantum: Annotated[float, key_metadata("resolution: readings are multiples of this", "N", ge=0.0)] = 0.0
     dead_zone: Annotated[float, key_metadata("magnitude below which the reading is 0", "N", ge=0.0)] = 0.0
+    dead_zone_kind: Annotated[DeadZoneKind, key_metadata(DEAD_ZONE_KINDS)] = "continuous"
     bias: Annotated[float, key_metadata("bias added to every reading", "N")] = 0.0
     range: Annotated[
         float, key_metadata("magnitude at which a reading saturates", "N", gt=0.0, infinite=True)

@@ -45,6 +45,8 @@ class Loop(eqx.Module):
     has_position_noise: bool = eqx.field(static=True)  # whether the position sensor has noise
     # whether a sensor quantises its readings or has a dead zone or a range
     has_sample_effects: bool = eqx.field(static=True)
+    # whether the dead zone leaves larger readings unchanged, instead of reducing them by its half-width
+    cuts_dead_zone: bool = eqx.field(static=True)
     # whether the motion simulator has a velocity limit or an acceleration limit
     has_limits: bool = eqx.field(static=True)
     # order of the lowest time derivative of the mechanism's position that jumps at the ticks, at most 3

@@ -74,6 +74,7 @@ def build_loop(
             or np.any(np.isfinite(force.range))
             or np.any(position.quantum > 0)
         ),
+        cuts_dead_zone=rig.force_sensor.dead_zone_kind == "cut" and bool(np.any(force.dead_zone > 0)),
         has_limits=bool(
             np.any(np.isfinite(simulator.velocity_limit)) or np.any(np.isfinite(simulator.acceleration_limit))
         ),

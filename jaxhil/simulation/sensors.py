@@ -10,6 +10,7 @@ contacts. Results for different gains can be compared because of these common ra
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt32
@@ -89,13 +90,55 @@ def lag_decay(duration: Array, time_constant: Array) -> Array:
 
 
 def sample_force(
-    force: Float[Array, "*batch"], quantum: Array, dead_zone: Array, range_: Array
+    force: Float[Array, "*batch"],
+    quantum: Array,
+    dead_zone: Array,
+    range_: Array,
+    step: Array | None = None,
 ) -> Float[Array, "*batch"]:
-    """Apply quantisation, dead zone and range of the force sensor, in this order, to a force [N]."""
+    """Apply quantisation, dead zone and range of the force sensor, in this order, to a force [N].
+
+    Args:
+        force: Force [N].
+        quantum: Quantisation step [N]; 0 without quantisation.
+        dead_zone: Half-width of the dead zone [N].
+        range_: Largest reading [N].
+        step: Change of the force since the last tick [N] if the dead zone cuts (`cut_dead_zone`). None if it
+            is continuous, and is also subtracted from larger forces.
+    """
     force = quantise(force, quantum)
-    beyond = jnp.abs(force) - dead_zone
-    force = jnp.where(dead_zone > 0, jnp.sign(force) * jnp.where(beyond > 0, beyond, 0), force)
+    if step is None:
+        beyond = jnp.abs(force) - dead_zone
+        force = jnp.where(dead_zone > 0, jnp.sign(force) * jnp.where(beyond > 0, beyond, 0), force)
+    else:
+        force = cut_dead_zone(force, dead_zone, step)
     return jnp.where(force > range_, range_, jnp.where(force < -range_, -range_, force))
+
+
+@jax.custom_jvp
+def cut_dead_zone(force: Float[Array, "*batch"], dead_zone: Array, step: Array) -> Float[Array, "*batch"]:
+    """Replace forces [N] up to `dead_zone` [N] by 0; larger forces remain unchanged.
+
+    The reading jumps on the tick after the force crosses the dead zone's edge. Which tick this is depends on
+    the phase of the contact in the control period. The derivative is that of the mean over all phases, during
+    which the force covers its last `step` [N] uniformly. A `step` of 0 leaves out the jumps.
+    """
+    return jnp.where(jnp.abs(force) > dead_zone, force, 0)
+
+
+@cut_dead_zone.defjvp
+def _differentiate_cut(primals, tangents):
+    force, dead_zone, step = primals
+    force_slope, dead_zone_slope, _ = tangents
+    slope = jnp.where(jnp.abs(force) > dead_zone, force_slope, 0)
+    for side in (1, -1):
+        edge = side * dead_zone
+        crosses = (force > edge) != (force - step > edge)
+        # A force that is larger by 1 N crosses the edge earlier, or later, by 1/|step| ticks. In this time,
+        # the reading is larger by the dead zone.
+        gain = jnp.where(crosses, dead_zone / jnp.where(crosses, jnp.abs(step), 1), 0)
+        slope = slope + gain * (force_slope - side * dead_zone_slope)
+    return cut_dead_zone(*primals), slope
 
 
 def quantise(value: Array, quantum: Array) -> Array:

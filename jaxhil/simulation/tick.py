@@ -146,13 +146,15 @@ def sense(
     plant_signals = jax.tree.map(
         lambda ring: _delayed_sample(ring, now, age, delays.real), rings.plant_signals
     )
-    sensor = scenario.force_sensor
+    sensor, step = scenario.force_sensor, None
+    if loop.cuts_dead_zone:
+        step = force - _delayed_sample(force_ring, now, age, delays.force.intervals + 1)
     if loop.has_force_bias:
         force = force + sensor.bias
     if noise.force is not None:
         force = force + noise.force
     if loop.has_sample_effects:
-        force = sample_force(force, sensor.quantum, sensor.dead_zone, sensor.range)
+        force = sample_force(force, sensor.quantum, sensor.dead_zone, sensor.range, step)
 
     position = _delayed_position(rig, state, now, age)
     if noise.position is not None:

@@ -83,6 +83,8 @@ def make_loop(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario)
         hold=rig.command_hold,
         latency=rig.command_latency,
         side=rig.force_sensor.side,
+        cuts_dead_zone=rig.force_sensor.dead_zone_kind == "cut"
+        and bool(np.any(np.asarray(sensor.errors.dead_zone) > 0)),
         has_noise=bool(np.any(np.asarray(sensor.noise_std) > 0)),
         has_pose_errors=any(
             bool(np.any(np.asarray(values) > 0))

@@ -33,6 +33,8 @@ class Loop(eqx.Module):
     has_lag: bool = eqx.field(static=True, default=True)  # whether the force sensor has a lag
     # whether the force sensor has a quantum, a dead zone or a range
     has_sample_effects: bool = eqx.field(static=True, default=True)
+    # whether the dead zone leaves larger readings unchanged, instead of reducing them by its half-width
+    cuts_dead_zone: bool = eqx.field(static=True, default=False)
     has_pose_errors: bool = eqx.field(static=True, default=False)  # whether the pose has noise or a quantum
     # whether the pose is measured even if neither the sensor's tool nor the compensator needs it
     measures_pose: bool = eqx.field(static=True, default=False)

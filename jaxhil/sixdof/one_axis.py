@@ -179,6 +179,7 @@ def _convert_force_sensor(mechanism: SixAxisMechanism, normal: np.ndarray) -> di
         "bias": float(np.dot(normal, sensor.bias[:3])),
         "range": min(sensor.range[:3]),
         **{key: along(getattr(sensor, key)) for key in ("noise_std", "quantum", "dead_zone")},
+        "dead_zone_kind": sensor.dead_zone_kind,
     }
 
 

@@ -67,7 +67,7 @@ def _measured_wrench(
         raw = read_moving(contact, load, motion.pose)
     lagged = raw if last.lag is None else _lagged_reading(rig, state.tick, raw, *last.lag)
     noise = sensor.noise_std * _noise(rig, state.tick, 0) if loop.has_noise else None
-    reading = sample(lagged, sensor.errors, noise, loop.has_sample_effects)
+    reading = sample(lagged, sensor.errors, noise, loop.has_sample_effects, loop.cuts_dead_zone)
     unbiased: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
     if motion.acceleration is None:
         wrench = undo_fixed(unbiased, sensor.mounting)

@@ -130,11 +130,16 @@ def undo_fixed(reading: Wrench, mounting: Pose | None) -> Wrench:
 
 
 def sample(
-    reading: Wrench, errors: SampleErrors, noise: Float[Array, "6 *batch"] | None, has_effects: bool = True
+    reading: Wrench,
+    errors: SampleErrors,
+    noise: Float[Array, "6 *batch"] | None,
+    has_effects: bool = True,
+    cuts_dead_zone: bool = False,
 ) -> Wrench:
     """Add cross-talk, bias and `noise` [N, N m] to a reading.
 
-    If `has_effects` is true, apply quantum, dead zone and range too.
+    If `has_effects` is true, apply quantum, dead zone and range too. With `cuts_dead_zone`, the dead zone
+    leaves larger values unchanged.
     """
     # Each component is a separate array: from a stack, the compiler would compute the components repeatedly.
     components, structure = jax.tree.flatten(reading)
@@ -148,7 +153,8 @@ def sample(
                 mixed = mixed + errors.crosstalk[row, column] * component
         if not has_effects:
             return mixed
-        return sample_force(mixed, errors.quantum[row], errors.dead_zone[row], errors.range[row])
+        step = jnp.zeros_like(mixed) if cuts_dead_zone else None
+        return sample_force(mixed, errors.quantum[row], errors.dead_zone[row], errors.range[row], step)
 
     return structure.unflatten([channel(row) for row in range(6)])
 

@@ -34,7 +34,7 @@ _OPTIONAL_FLAGS = (
     "has_sample_effects",
     "has_limits",
 )
-_DISTINGUISHING_PROPERTIES = ("integrator", "hold", "latency", "is_two_sided")
+_DISTINGUISHING_PROPERTIES = ("integrator", "hold", "latency", "is_two_sided", "cuts_dead_zone")
 
 
 @dataclass(frozen=True)

@@ -75,11 +75,16 @@ def make_mechanism(
         rig["simulator"] = {**simulator, "delay": max(simulator["delay"], 0.0)}
     for section in ("force_sensor", "position_sensor"):
         sensor = {**rig.get(section, {})}
+        prefix = f"rig.{section}."
+        estimated = {key[len(prefix) :]: value for key, value in values.items() if key.startswith(prefix)}
+        if sensor.get("dead_zone_kind") == "cut":
+            estimated.pop("dead_zone", None)  # the estimate is that of a continuous dead zone
+        elif section == "force_sensor" and contact is not None:
+            sensor.pop("dead_zone", None)
         if section == "force_sensor" and contact is not None:
             # The estimated delay includes a sensor lag that the contacts do not determine.
-            sensor = {k: v for k, v in sensor.items() if k not in ("time_constant", "dead_zone")}
-        prefix = f"rig.{section}."
-        sensor |= {key[len(prefix) :]: value for key, value in values.items() if key.startswith(prefix)}
+            sensor.pop("time_constant", None)
+        sensor |= estimated
         rig[section] = {**sensor, "delay": max(sensor.get("delay", 0.0), 0.0)}
     if "rig.contact_plane" in values:
         rig["contact_plane"] = values["rig.contact_plane"]

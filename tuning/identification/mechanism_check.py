@@ -74,12 +74,12 @@ def check_against_mechanism(
     frequency = (
         ASSUMED_CONTACT_FREQUENCY if contact is None else contacts.estimate_contact_frequency(contact, mass)
     )
-    lines = []
+    lines = validation.check_sensor_effects(mechanism.rig.force_sensor)
     if motion is not None:
         fitted = fitted or free_motion.fit_free_motion(free, campaign.timing)
         assert fitted is not None
         motion = replace(motion, other_hold_gain=max(motion.other_hold_gain, fitted.other_hold_gain))
-        lines = [
+        lines += [
             *validation.check_motion_model(motion, frequency),
             validation.check_delay_sign(fitted, frequency),
         ]

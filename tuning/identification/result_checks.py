@@ -91,9 +91,9 @@ def _check_fits(
     written: Mechanism | None,
 ) -> list[validation.CheckResult]:
     """Return the checks of the fits to free motion and contact, at the contact frequency [Hz]."""
-    lines = []
+    lines = [] if written is None else validation.check_sensor_effects(written.rig.force_sensor)
     if motion is not None:
-        lines = [
+        lines += [
             *validation.check_motion_model(motion, frequency),
             validation.check_delay_sign(motion, frequency),
         ]

@@ -127,7 +127,9 @@ class RigHardware:
         if sensor.noise_std > 0.0:
             force += sensor.noise_std * noise.gauss(0.0, 1.0)
         force = _quantise(force, sensor.quantum)
-        if sensor.dead_zone > 0.0:
+        if sensor.dead_zone_kind == "cut":
+            force = force if abs(force) > sensor.dead_zone else 0.0
+        elif sensor.dead_zone > 0.0:
             force = math.copysign(max(0.0, abs(force) - sensor.dead_zone), force)
         force = min(max(force, -sensor.range), sensor.range)
         position = self._positions[(self._tick - 1 - self._position_intervals) & last]

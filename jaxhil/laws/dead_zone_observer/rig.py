@@ -1,10 +1,10 @@
 """Phase lead with an observer of the force that the force sensor's dead zone removes.
 
-A dead zone of half-width dz [N] subtracts clip(F, -dz, dz) from the force F. The observer estimates this
-difference as clip(k_n d, -dz, dz), where k_n is the gain `observer_stiffness` and d the measured penetration,
-delayed like the force. A first-order low-pass filter smooths the estimate, and the phase lead acts on the sum
-of measured force and estimate. The method follows Li et al. 2026, whose disturbance observer has a gain near
-1 below 15 Hz.
+A dead zone of half-width dz [N] removes the force F up to dz. From larger forces, a continuous dead zone
+removes dz, and a cut one nothing. The observer estimates the removed force from k_n d, where k_n is the gain
+`observer_stiffness` and d the measured penetration, delayed like the force. A first-order low-pass filter
+smooths the estimate, and the phase lead acts on the sum of measured force and estimate. The method follows
+Li et al. 2026, who cut small forces and whose disturbance observer has a gain near 1 below 15 Hz.
 """
 
 from collections.abc import Mapping
@@ -19,14 +19,15 @@ from jaxhil.rig.surfaces import deflection
 
 @register("dead_zone_observer")
 class DeadZoneObserver(Compensator):
-    """Compensator F_c = lead(F + w), w = Q u, u = clip(k_n d, -limit, limit), Q = 1/(1 + s/(2 pi f)).
+    """Compensator F_c = lead(F + w), w = Q u, Q = 1/(1 + s/(2 pi f)).
 
+    u is k_n d up to the limit; beyond it, u is the limit times `observer_saturation` (1: continuous, 0: cut).
     Q is realised by Tustin's rule: w = ((2 - c) w_prev + c (u + u_prev)) / (2 + c), c = 2 pi f T.
     """
 
     __slots__ = (
-        "_alignment", "_clearance", "_corner", "_denominator", "_lead", "_limit", "_observed", "_of_observed",
-        "_started", "_stiffness", "_withheld",
+        "_alignment", "_beyond", "_clearance", "_corner", "_denominator", "_lead", "_limit", "_observed",
+        "_of_observed", "_started", "_stiffness", "_withheld",
     )  # fmt: skip
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {
@@ -35,6 +36,7 @@ class DeadZoneObserver(Compensator):
         "observer_stiffness": GainSpecification("N/m", *STIFFNESSES),
         "observer_bandwidth": GainSpecification("Hz", 0.1, 1e5),
         "observer_limit": GainSpecification("N", *FORCES),
+        "observer_saturation": GainSpecification("1", 0.0, 1.0),
         "identification_delay": GainSpecification("s", *TIMES),
     }
 
@@ -44,6 +46,7 @@ class DeadZoneObserver(Compensator):
         self._clearance = clearance
         self._stiffness = gains["observer_stiffness"]
         self._limit = gains["observer_limit"]
+        self._beyond = gains["observer_saturation"] * gains["observer_limit"]
         corner = 2.0 * pi * gains["observer_bandwidth"] * period
         self._corner = corner
         self._of_observed = 2.0 - corner
@@ -59,8 +62,8 @@ class DeadZoneObserver(Compensator):
             alignment.start(position_measured, velocity_desired)
             self._started = True
         force = self._stiffness * deflection(alignment.step(position_measured), self._clearance)
-        limit = self._limit
-        withheld = limit if force > limit else -limit if force < -limit else force
+        limit, beyond = self._limit, self._beyond
+        withheld = beyond if force > limit else -beyond if force < -limit else force
         observed = (
             self._of_observed * self._observed + self._corner * (withheld + self._withheld)
         ) / self._denominator

@@ -1,20 +1,22 @@
 """Phase lead with an observer of the force that the force sensor's dead zone removes.
 
-    F_c = lead(F + Q(s) clip(k_n d, -dz, dz)),     Q(s) = 1/(1 + s/(2 pi f))
+    F_c = lead(F + Q(s) u(k_n d)),     Q(s) = 1/(1 + s/(2 pi f))
 
 F is the measured force, dz the half-width of the dead zone, d the measured penetration, delayed like F, and
-k_n the nominal stiffness. Li et al. 2026 combine a phase lead with a disturbance observer (|Q| near 1 below
-15 Hz) but state no details. A general disturbance observer adds Q (F_n - F), where F_n is the force of a
-nominal model. This observer uses the known effect of a dead zone, which subtracts clip(F, -dz, dz) from the
-force F; the nominal model k_n d replaces F in this expression. If k_n is wrong, the observer has an error
-only for |F| < dz; for larger forces it adds exactly dz.
+k_n the nominal stiffness. u(F) is the force that the dead zone removes: clip(F, -dz, dz) for a continuous
+one; F for |F| <= dz and 0 otherwise for a cut one. Li et al. 2026 combine a hybrid Smith predictor with a
+disturbance observer (|Q| near 1 below 15 Hz) for a cut dead zone. A general disturbance observer adds
+Q (F_n - F), where F_n is the force of a nominal model. This observer uses the known effect of a dead zone;
+the nominal model k_n d replaces F in u. If k_n is wrong, the observer has an error only for |F| < dz, and
+with a cut dead zone between |F| = dz and |k_n d| = dz.
 
 Q is discretised by Tustin's rule. |Q| >= 0.9 up to 15 Hz needs f >= 15 Hz/sqrt(1/0.81 - 1) = 31 Hz. Q lags by
 1/(2 pi f). To compensate for this lag, the delay of d (`identification_delay`) is shorter than the force
 delay tau_f by the same time; this requires f >= 1/(2 pi tau_f).
 
-A dead zone moves the surface of a linear contact by dz/k. The restitution does not change, but the hardware
-moves deeper into the mechanism, and its force is larger by dz. The observer corrects this.
+A continuous dead zone moves the surface of a linear contact by dz/k. The restitution does not change, but the
+hardware moves deeper into the mechanism, and its force is larger by dz. A cut dead zone removes unequal works
+from compression and from expansion, so that the restitution changes too. The observer corrects both.
 """
 
 import math
@@ -70,6 +72,10 @@ def _nominal_alignment(mechanism: Mechanism) -> float:
     return max(force_delay(mechanism) - 1 / (2 * math.pi * _nominal_bandwidth(mechanism)), 0.0)
 
 
+def _is_continuous(mechanism: Mechanism) -> bool:
+    return mechanism.rig.force_sensor.dead_zone_kind == "continuous"
+
+
 class DeadZoneObserverState(NamedTuple):
     """State of the dead-zone observer after a tick."""
 
@@ -92,7 +98,7 @@ class PreparedObserver(NamedTuple):
 
 
 class DeadZoneObserver(Compensator):
-    """Compensator F_c = lead(F + Q clip(k_n d, -dz, dz)); see the module's docstring."""
+    """Compensator F_c = lead(F + Q u(k_n d)); see the module's docstring."""
 
     name: ClassVar[str] = "dead_zone_observer"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, STIFFNESS, DEAD_ZONE)
@@ -110,7 +116,12 @@ class DeadZoneObserver(Compensator):
         rig_gain(
             "observer_limit", lambda m: 0.0,
             lambda m: 2 * m.rig.force_sensor.dead_zone + peak_force(m),
-            lambda m: m.rig.force_sensor.dead_zone, neutral=0.0,
+            lambda m: m.rig.force_sensor.dead_zone, neutral=0.0, tuned=_is_continuous,
+        ),
+        # Force that is added beyond the limit, divided by the limit.
+        rig_gain(
+            "observer_saturation", lambda m: 0.0, lambda m: 1.0, lambda m: float(_is_continuous(m)),
+            tuned=lambda m: False,
         ),
         rig_gain(
             "identification_delay", lambda m: 0.0, lambda m: 2 * force_delay(m) + 0.02,
@@ -147,7 +158,8 @@ class DeadZoneObserver(Compensator):
         aligned, line = read_delayed(prepared.delay, state.line, signals, tick)
         force = gains["observer_stiffness"] * deflection(aligned, prepared.clearance)
         most = gains["observer_limit"]
-        withheld = jnp.where(force > most, most, jnp.where(force < -most, -most, force))
+        beyond = gains["observer_saturation"] * most
+        withheld = jnp.where(force > most, beyond, jnp.where(force < -most, -beyond, force))
         observed = prepared.pole * state.observed + prepared.share * (withheld + state.withheld)
         command, lead_state = apply_lead_filter(prepared.lead, state.lead, signals.force_measured + observed)
         return command, DeadZoneObserverState(lead_state, withheld, observed, line)

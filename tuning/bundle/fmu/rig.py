@@ -139,6 +139,7 @@ def rig_constants(mechanism: Mechanism) -> str:
         "RIG_LAYERS": len(stiffness[0]),
         "RIG_LAW": f"LAW_{contact.law.upper()}",
         "RIG_TENSION": int(bool(getattr(contact, "tension", False))),
+        "RIG_DEAD_ZONE_CUTS": int(force.dead_zone_kind == "cut"),
         "RIG_INTEGRATOR": f"INTEGRATOR_{rig.integrator.upper()}",
     }
     numbers = {

@@ -92,7 +92,11 @@ def predict_readings(
     columns = [_compute_force_columns(law, table, x - rig.contact_plane, v) for x, v in moved]
     force, elastic, rate, touching = _apply_sensor_lag(columns, period, sensor.time_constant)
     force = force + sensor.bias
-    force = np.sign(force) * np.maximum(np.abs(force) - sensor.dead_zone, 0.0)
+    beyond = np.abs(force) - sensor.dead_zone
+    if sensor.dead_zone_kind == "cut":
+        force = np.where(beyond > 0.0, force, 0.0)
+    else:
+        force = np.sign(force) * np.maximum(beyond, 0.0)
     position, velocity = motion.at_row_times().at(rig.position_sensor.delay)
     return PredictedReadings(
         force, elastic, rate, touching, moved[0][0] - rig.contact_plane, position, velocity

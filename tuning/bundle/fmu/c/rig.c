@@ -188,7 +188,9 @@ static void set_outputs(fmu_state *state) {
     double force = rig->forces[ring_index(rig->tick - 1 - RIG_FORCE_INTERVALS)] + RIG_FORCE_BIAS;
     double position = rig->positions[ring_index(rig->tick - 1 - RIG_POSITION_INTERVALS)];
     force = quantise(force + draw_noise(rig, values[V_FORCE_NOISE]), RIG_FORCE_QUANTUM);
-    if (RIG_DEAD_ZONE > 0.0) {
+    if (RIG_DEAD_ZONE_CUTS) {
+        force = fabs(force) > RIG_DEAD_ZONE ? force : 0.0;
+    } else if (RIG_DEAD_ZONE > 0.0) {
         force = copysign(fmax(0.0, fabs(force) - RIG_DEAD_ZONE), force);
     }
     values[V_FORCE_MEASURED] = fmin(fmax(force, -RIG_FORCE_RANGE), RIG_FORCE_RANGE);
