@@ -151,7 +151,7 @@ class _Run:
             raise ValueError("the start must lie inside the gap")
         start = self._lead(self.x, self.v, 0.0)
         self.motion = Motion(rig, T, start, velocity, self.position_delay)
-        self.ideal_zoh = self.motion.matrices is None and self.motion.hold == "zoh"
+        self.ideal_zoh = self.motion.is_ideal and self.motion.hold == "zoh"
         if self.ideal_zoh and self.law.damped():
             raise ValueError("ideal simulator with zoh hold has no velocity: refuse damped laws")
 

@@ -25,7 +25,7 @@ def delay_in_ticks(delay, period):
 def simulator_matrices(simulator) -> Any:
     """Return (A, B, C) of G(s), or None for the ideal simulator; states are scaled by the fastest pole."""
     model = simulator["model"]
-    if model == "ideal":
+    if model in ("ideal", "moving_average"):
         return None
     if model == "first_order":
         numerator, denominator = [1.0], [simulator["time_constant"], 1.0]
@@ -82,6 +82,9 @@ class Motion:
             raise ValueError("command_latency is 0 or 1, command_hold linear or zoh")
         self.delay = delay_in_ticks(simulator.get("delay", 0.0), period)
         self.matrices = simulator_matrices(simulator)
+        self.window = delay_in_ticks(simulator.get("window", 0.0), period)
+        self.kink = self.window % 1.0  # at this fraction of an interval the window's start passes a tick
+        self.is_ideal = self.matrices is None and not self.window
         self.position = position
         self.commands: list[float] = [position]
         self.first = -ceil(self.delay + history) - 3
@@ -119,6 +122,8 @@ class Motion:
     def _solve(self, j):
         end = self._command(j + 1 - self.latency)
         start = self._command(j - self.latency) if self.hold == "linear" else end
+        if self.window:
+            return [self._average(j, 0), self._average(j, 1)]
         if self.matrices is None:
             return [np.array([start, end - start])]
         ramp, polynomials = (end - start) / self.substeps, []
@@ -127,6 +132,29 @@ class Motion:
             polynomials.append(self.series @ drive)
             self.state = self.transition @ drive
         return polynomials
+
+    def _average(self, j, part):
+        """Return the polynomial of the mean of u over the window before (part 0) or after the kink."""
+        whole = int(self.window - self.kink + 0.5)
+        oldest = j - whole - 1 + part  # interval in which the window starts
+        left = 1.0 - self.kink if part == 0 else -self.kink  # its start in that interval, at theta = 0
+        first, last = self._line(oldest), self._line(j)
+        # Integral over the oldest interval from left + theta to 1, and over interval j from 0 to theta.
+        shifted = np.array([first[0] + first[1] * left, first[1]])
+        total = np.array([first[0] + first[1] / 2 - first[0] * left - first[1] * left**2 / 2, 0.0, 0.0])
+        total[1:] += np.array([last[0], last[1] / 2]) - np.array([shifted[0], shifted[1] / 2])
+        for k in range(oldest + 1, j):
+            middle = self._line(k)
+            total[0] += middle[0] + middle[1] / 2
+        if oldest == j:  # the window is shorter than the interval: both integrals overlap
+            total[0] -= last[0] + last[1] / 2
+        return total / self.window
+
+    def _line(self, j):
+        """Return u in interval j as coefficients (u at its start, increase)."""
+        end = self._command(j + 1 - self.latency)
+        start = self._command(j - self.latency) if self.hold == "linear" else end
+        return np.array([start, end - start])
 
     def locate_left(self, time):
         """Return (j, i, theta), theta in (0, 1], of the substep that ends at or contains the time."""
@@ -137,6 +165,8 @@ class Motion:
 
     def at_left(self, time):
         j, i, theta = self.locate_left(time)
+        if self.window:
+            i = int(theta > self.kink + TIME_TOLERANCE)
         return polynomial(self.segment(j, i))(theta)
 
     def segments_between(self, start, end):
@@ -149,7 +179,11 @@ class Motion:
             if theta_b <= TIME_TOLERANCE:
                 return
             j = q // self.substeps
-            if theta_b > theta_a:
+            if self.window:
+                for part, low, high in ((0, 0.0, self.kink), (1, self.kink, 1.0)):
+                    if min(theta_b, high) > max(theta_a, low):
+                        yield self.segment(j, part), origin, max(theta_a, low), min(theta_b, high)
+            elif theta_b > theta_a:
                 yield self.segment(j, q - j * self.substeps), origin, theta_a, theta_b
             q += 1
 

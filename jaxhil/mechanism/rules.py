@@ -50,6 +50,7 @@ KEYS_OF_MODELS = {
     "second_order": ("natural_frequency", "damping_ratio"),
     "third_order": ("coefficients",),
     "transfer_function": ("numerator", "denominator"),
+    "moving_average": ("window",),
 }
 _ALL_MODEL_KEYS = sorted({key for keys in KEYS_OF_MODELS.values() for key in keys})
 
@@ -342,4 +343,6 @@ def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> f
         *_, slope, value = simulator.denominator or []
         *_, lead, gain = 0.0, *(simulator.numerator or [])
         return slope / value - lead / gain
+    if simulator.model == "moving_average":
+        return extreme(path + "window", 1) / 2
     return 0.0

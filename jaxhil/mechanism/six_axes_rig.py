@@ -41,7 +41,7 @@ __all__ = [
 MOTION_NAMES = ("translation", "rotation")
 LOAD_NAMES = ("force", "torque")
 # Keys of a motion simulator that have one value for each axis.
-PER_AXIS_KEYS = ("natural_frequency", "damping_ratio", "time_constant", "delay")
+PER_AXIS_KEYS = ("natural_frequency", "damping_ratio", "time_constant", "window", "delay")
 
 # Types of the entries of lists.
 Metre = Annotated[float, key_metadata("component", "m")]
@@ -62,6 +62,7 @@ CrosstalkRow = Annotated[
 Hertz = Annotated[float, key_metadata("frequency of one axis", "Hz", gt=0.0)]
 Ratio = Annotated[float, key_metadata("ratio of one axis", "1", gt=0.0)]
 Second = Annotated[float, key_metadata("time of one axis", "s", ge=0.0, le=1.0)]
+Window = Annotated[float, key_metadata("window of one axis", "s", gt=0.0, le=1.0)]
 Share = Annotated[float, key_metadata("share of one coordinate", "1", ge=0.0, le=1.0)]
 Load = Annotated[float, key_metadata("load of one channel", "N, N m")]
 LoadMagnitude = Annotated[float, key_metadata("load of one channel", "N, N m", ge=0.0)]
@@ -98,6 +99,7 @@ class TargetRobot(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     ) = None
     damping_ratio: Annotated[list[Ratio], six_axis_metadata("damping ratio of second_order")] | None = None
     time_constant: Annotated[list[Second], six_axis_metadata("time constant of first_order")] | None = None
+    window: Annotated[list[Window], six_axis_metadata("window of moving_average")] | None = None
     delay: Annotated[list[Second], six_axis_metadata("transport delay of the motion")] | None = None
 
 
@@ -118,6 +120,7 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     coefficients: CubicCoefficients | None = None
     numerator: Numerator | None = None
     denominator: Denominator | None = None
+    window: Annotated[list[Window], six_axis_metadata("window of moving_average")] | None = None
     delay: Annotated[list[Second], six_axis_metadata("transport delay of the motion")] = field(
         default_factory=zeros(6)
     )

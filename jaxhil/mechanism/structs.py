@@ -53,7 +53,9 @@ NO_METADATA: Mapping[str, Any] = {}
 
 # The type refers to the registry itself, because `jaxhil.register` adds laws later.
 ContactLawName = Annotated[str, Meta(description="contact law", extra={"one_of": CONTACT_LAWS})]
-SimulatorModel = Literal["ideal", "first_order", "second_order", "third_order", "transfer_function"]
+SimulatorModel = Literal[
+    "ideal", "first_order", "second_order", "third_order", "transfer_function", "moving_average"
+]
 Integrator = Literal["semi_implicit_euler", "zoh", "explicit_euler"]
 CommandHold = Literal["linear", "zoh"]
 DeadZoneKind = Literal["continuous", "cut"]
@@ -205,6 +207,10 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     coefficients: CubicCoefficients | None = None
     numerator: Numerator | None = None
     denominator: Denominator | None = None
+    window: (
+        Annotated[float, key_metadata("time over which moving_average takes the mean", "s", gt=0.0, le=1.0)]
+        | None
+    ) = None
     delay: Annotated[float, key_metadata("transport delay of the motion", "s", ge=0.0, le=1.0)] = 0.0
     velocity_limit: Annotated[
         float, key_metadata("velocity limit of the position command", "m/s", gt=0.0, infinite=True)

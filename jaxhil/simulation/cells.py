@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxhil.simulation.motion_simulator import SimulatorState, generator_rows, matrix_exponential
+from jaxhil.simulation.moving_average import DEGREE, motion_rows, split_window
 
 # rad per control period; for faster poles of the motion simulator, the matrix exponential loses accuracy.
 MAX_POLE = 64.0
@@ -145,6 +146,8 @@ def build_cells(
     control_period: Float[Array, "*batch"],
     fraction: Float[Array, "*batch"],
     time_constant: Float[Array, "*batch"],
+    window: Float[Array, "*batch"] | None = None,
+    hold: str = "linear",
 ) -> Cells:
     """Compute positions and matrices of the cells of a sampling interval.
 
@@ -155,12 +158,20 @@ def build_cells(
         control_period: Control period [s].
         fraction: Time from the interval's start to the force sample [periods].
         time_constant: Lag of the force sensor [s].
+        window: Window of a moving average [s]; None for a transfer function.
+        hold: Hold of the position command; only a moving average needs it.
     """
     lag = bound_time_constant(time_constant, control_period) / control_period
     first, second = _divide_part(counts, fraction, lag), _divide_part(counts, 1 - fraction, lag)
+    if window is not None:
+        kink = split_window(window, control_period).fraction
+        first, second = _divide_at(first, fraction - kink), _divide_at(second, 1 - kink)
     begin = jnp.concatenate([fraction - first.before[:-1], 1 - second.before[:-1]])
     length = jnp.concatenate([first.length, second.length])
     rest = jnp.concatenate([first.before[1:], second.before[1:]])
+    if window is not None:
+        states, series = _moving_average(begin, length, window, control_period, hold)
+        return Cells(begin, length, rest, states, series)
     order = denominator.shape[0] - 1
     if order == 0:
         states = jnp.zeros((0, len(begin), 2, *control_period.shape), control_period.dtype)
@@ -220,6 +231,27 @@ def _divide_part(counts, whole, lag):
     before = jnp.stack([window + time for time in before_window] + inside)
     lengths = [(whole - window) / max(counts.plain, 1)] * counts.plain
     return _CellEdges(before, jnp.stack(lengths + [window / max(counts.window, 1)] * counts.window))
+
+
+def _divide_at(edges, before):
+    """Add an edge at the time `before` the end of the part [periods], or at the nearer end of the part."""
+    kink = jnp.clip(before, edges.before[-1], edges.before[0])
+    edges = -jnp.sort(-jnp.concatenate([edges.before, kink[None]]), axis=0)
+    return _CellEdges(edges, edges[:-1] - edges[1:])
+
+
+def _moving_average(begin, length, window, control_period, hold):
+    """Return `states` and `series` of the cells of a moving average, whose motion is a parabola in each cell.
+
+    Here the state at a cell's start consists of the three coefficients of the parabola.
+    """
+    # Rounding may place the start of a cell on either side of the kink, but not its middle.
+    is_before = begin + length / 2 < split_window(window, control_period).fraction
+    position, rate, bend = motion_rows(window, control_period, begin, is_before, hold)
+    states = jnp.moveaxis(jnp.stack([position, rate, bend / 2]), 1, 2)
+    series = jnp.eye(DEGREE + 1, DEGREE + 3, dtype=begin.dtype)
+    series = series.reshape(*series.shape, *[1] * control_period.ndim)
+    return states, jnp.broadcast_to(series, (*series.shape[:2], *control_period.shape))
 
 
 def _series(generator, output, degree):

@@ -27,6 +27,7 @@ from jaxhil.simulation.motion_simulator import (
     split_delay,
     steady_state,
 )
+from jaxhil.simulation.moving_average import discretise_moving_average
 from jaxhil.simulation.probe import initial_first_contact
 from jaxhil.simulation.scenario import Scenario
 
@@ -144,18 +145,18 @@ def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -
             period,
             delays.force.fraction,
             time_constant,
+            simulator.window,
+            loop.hold,
         )
+    fractions = delays.force.fraction, delays.position.fraction if measured else None
+    ends = loop.follows_intervals and not loop.has_cells
+    if simulator.window is None:
+        rows = discretise(simulator.numerator, simulator.denominator, period, *fractions, loop.hold, ends)
+    else:
+        rows = discretise_moving_average(simulator.window, period, *fractions, loop.hold, ends)
     return RigConstants(
         scenario=scenario,
-        propagation=discretise(
-            simulator.numerator,
-            simulator.denominator,
-            period,
-            delays.force.fraction,
-            delays.position.fraction if measured else None,
-            loop.hold,
-            ends=loop.follows_intervals and not loop.has_cells,
-        ),
+        propagation=rows,
         cells=cells,
         delays=delays,
         constants=KnownConstants(period, scenario.clearance),
@@ -220,6 +221,7 @@ def start_uniform_motion(
             stride,
             steady_state(rig.propagation, drive, stride),
             commands[0] if loop.has_limits else None,
+            None if rig.propagation.window is None else (commands[-1], stride),
         ),
         sensed=state.sensed._replace(
             last=no_contact(position),

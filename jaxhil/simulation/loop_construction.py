@@ -12,6 +12,7 @@ from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.cells import MAX_POLE, NO_CELLS, CellCounts, count_cells, fastest_pole
 from jaxhil.simulation.loop import Loop
+from jaxhil.simulation.moving_average import DEGREE
 from jaxhil.simulation.scenario import Scenario
 
 MIN_RING_LENGTH = 16  # samples; minimum length of a delay line
@@ -57,6 +58,7 @@ def build_loop(
         periods = float(np.max(delay / scenarios.control_period))
         return max(MIN_RING_LENGTH, 1 << int(np.ceil(np.log2(periods + 4))))
 
+    past = sensed if simulator.window is None else np.maximum(sensed, simulator.window)
     is_two_sided = bool(np.any(np.isfinite(scenarios.clearance)))
     return Loop(
         law=find_contact_law(mechanism.contact.law).simulation_law,
@@ -78,10 +80,10 @@ def build_loop(
         has_limits=bool(
             np.any(np.isfinite(simulator.velocity_limit)) or np.any(np.isfinite(simulator.acceleration_limit))
         ),
-        discontinuity_order=_find_discontinuity_order(simulator.numerator, rig.command_hold),
+        discontinuity_order=_find_discontinuity_order(simulator, rig.command_hold),
         cells=_choose_cell_counts(mechanism, scenarios, exact),
         is_two_sided=is_two_sided,
-        ring=samples(sensed),
+        ring=samples(past),
         controller_ring=samples(max(aligned, default=0.0)),
         energies=energies,
         probed=scenarios.probe is not None,
@@ -95,13 +97,20 @@ def _choose_cell_counts(mechanism: Mechanism, scenarios: Scenario, exact: bool) 
     The numbers suffice for the fastest pole, shortest lag and longest control period of all scenarios.
     """
     period = float(np.max(scenarios.control_period))
+    window = scenarios.simulator.window
     fastest = float(np.max(fastest_pole(scenarios.simulator.denominator))) * period
     lags = np.asarray(scenarios.force_sensor.time_constant) / period
     law, lagging = find_contact_law(mechanism.contact.law), bool(np.any(lags > 0))
-    pole, contact = MAX_SAMPLED_RATES_WITH_MEMORY if law.has_memory or lagging else MAX_SAMPLED_RATES
+    has_memory = law.has_memory or lagging
+    pole, contact = MAX_SAMPLED_RATES_WITH_MEMORY if has_memory else MAX_SAMPLED_RATES
+    if window is not None:
+        # The motion has a kink within every interval, at which a lag or a dent would become inaccurate.
+        fastest = np.inf if has_memory else period / float(np.min(window))
     slow = fastest <= pole and _max_contact_frequency(mechanism, scenarios) * period <= contact
     if slow and (law.is_locally_parabolic or not lagging) and not exact:
         return NO_CELLS
+    if window is not None:
+        return count_cells(0.0, lags)._replace(degree=DEGREE)
     return count_cells(min(fastest, MAX_POLE), lags)
 
 
@@ -123,10 +132,14 @@ def _max_contact_frequency(mechanism: Mechanism, scenarios: Scenario) -> float:
         return float(max(frequency, DAMPER_WEIGHT * np.max(damping / mass)))
 
 
-def _find_discontinuity_order(numerator, hold: str) -> int:
+def _find_discontinuity_order(simulator, hold: str) -> int:
     """Return the order of the lowest derivative of the position that jumps at the ticks, at most 3.
 
     The order is the relative degree of the motion simulator, plus 1 if the position command does not jump.
+    A moving average has the relative degree 1.
     """
+    numerator = simulator.numerator
+    if simulator.window is not None:
+        return 1 + (hold == "linear")
     proper = [i + 1 for i in range(len(numerator)) if np.any(numerator[i] != 0)]
     return min((proper[0] if proper else 0) + (hold == "linear"), 3)

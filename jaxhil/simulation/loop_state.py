@@ -17,6 +17,9 @@ class PlantState(NamedTuple):
     state: tuple[Array, ...]  # state of the motion simulator
     # unlimited position command for tick n [m]; None without limits
     unlimited_command: Float[Array, "*batch"] | None
+    # drive command at the end of the last interval before the run [m], and its increase per period; None
+    # unless the motion simulator is a moving average
+    first_command: tuple[Array, Array] | None
 
     @property
     def sent(self) -> Float[Array, "*batch"]:
@@ -39,6 +42,8 @@ class Rings(NamedTuple):
     position: Float[Array, "samples *batch"] | None
     # sampling intervals in which the contact is not yet computed; None with one surface
     interval: SamplingInterval | None
+    # drive command at the end of each interval [m]; None unless the motion simulator is a moving average
+    command: Float[Array, "samples *batch"] | None
 
 
 class SensorState(NamedTuple):

@@ -36,6 +36,13 @@ class SplitDelay(NamedTuple):
     fraction: Float[Array, "*batch"]
 
 
+class SplitWindow(NamedTuple):
+    """Window of a moving average, divided into whole control periods and a fraction."""
+
+    intervals: Int[Array, "*batch"]  # whole number of control periods in the window
+    fraction: Float[Array, "*batch"]  # remaining fraction of a control period, in [0, 1)
+
+
 class Propagation(NamedTuple):
     """Discretised motion simulator as row vectors.
 
@@ -55,6 +62,7 @@ class Propagation(NamedTuple):
     steady_command: Float[Array, "order *batch"]  # steady state per unit of the command
     # steady state under a ramp command that increases by 1 in each control period
     steady_velocity: Float[Array, "order *batch"]
+    window: SplitWindow | None = None  # window of a moving average; None for a transfer function
 
 
 def split_delay(delay: Float[Array, "*batch"], control_period: Float[Array, "*batch"]) -> SplitDelay:

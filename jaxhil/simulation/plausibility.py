@@ -29,6 +29,7 @@ MAX_RUN_TICKS = 1e9  # maximum number of ticks of a run; ticks are counted in 32
 PLAUSIBLE_FREQUENCIES = 0.05, 50.0  # Hz; lowest and highest plausible contact frequency
 MIN_FREQUENCY_RATIO = 1e-4  # [1]; lowest plausible contact frequency as a fraction of the control rate
 MAX_PLAUSIBLE_BANDWIDTH = 50.0  # Hz; highest plausible natural frequency of a motion simulator
+MOVING_AVERAGE_BANDWIDTH = 0.442946  # [1]; x with sin(pi x)/(pi x) = 1/sqrt(2): bandwidth times window
 MAX_FREQUENCY_RATIO = 0.1  # [1]; highest plausible contact frequency as a fraction of the control rate
 MAX_PLAUSIBLE_VELOCITY = 1.0  # m/s; highest plausible approach velocity
 MAX_LISTED_FREQUENCIES = 4  # a summary lists at most this number of contact frequencies, or only their range
@@ -175,6 +176,8 @@ def compute_bandwidth(simulator: MotionSimulatorBatch) -> float:
 
     The bandwidth is infinite for an ideal motion simulator, and NaN if it cannot be computed.
     """
+    if simulator.window is not None:
+        return MOVING_AVERAGE_BANDWIDTH / float(simulator.window[0])
     numerator, denominator = (np.asarray(part, float)[:, 0] for part in simulator[:2])
     order = len(denominator) - 1
     if order == 0:

@@ -95,10 +95,14 @@ def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool
         position=zeros,
         velocity=zeros,
         plant=PlantState(
-            (zeros,) * (loop.latency + 1), zeros, (zeros,) * order, zeros if loop.has_limits else None
+            (zeros,) * (loop.latency + 1),
+            zeros,
+            (zeros,) * order,
+            zeros if loop.has_limits else None,
+            None if rig.propagation.window is None else (zeros, zeros),
         ),
         sensed=SensorState(
-            rings=_build_rings(loop, ring, measured, order),
+            rings=_build_rings(loop, ring, measured, order, rig.propagation.window is not None),
             last=no_contact(like),
             contact_time=zeros if loop.has_cells else None,
             lagged=zeros,
@@ -230,7 +234,7 @@ def _replace_changing_parts(run, parts):
     return run._replace(state=state, tracker=tracker, tick=now)
 
 
-def _build_rings(loop, ring, measured, order):
+def _build_rings(loop, ring, measured, order, averages):
     """Return the initial delay lines of the signals that the loop uses; `ring` is an array of zeros."""
     interval = None
     if loop.is_two_sided:
@@ -245,7 +249,8 @@ def _build_rings(loop, ring, measured, order):
         contact_time=ring if loop.has_cells else None,
     )
     reading = ring if loop.has_lag else None
-    return Rings(plant_signals, reading, ring if measured else None, interval)
+    position, command = (ring if is_used else None for is_used in (measured, averages))
+    return Rings(plant_signals, reading, position, interval, command)
 
 
 def _finished_lanes(rig, run):

@@ -26,13 +26,18 @@ MAX_CONTACT_DURATION = 10.0  # s; a longer contact is ended with the status "tim
 
 
 class MotionSimulatorBatch(NamedTuple):
-    """Parameters of the motion simulator num(s)/den(s) e^(-s delay), with s in rad/s."""
+    """Parameters of the motion simulator G(s) e^(-s delay), with s in rad/s.
+
+    G(s) is num(s)/den(s) or, with a window, the moving average (1 - e^(-s window))/(s window).
+    """
 
     numerator: Float[Array, "order *batch"]  # coefficients of num(s), descending powers
     denominator: Float[Array, "order_plus_1 *batch"]  # coefficients of den(s), descending powers
     delay: Float[Array, "*batch"]  # transport delay [s]
     velocity_limit: Float[Array, "*batch"]  # velocity limit [m/s]; infinite if there is none
     acceleration_limit: Float[Array, "*batch"]  # acceleration limit [m/s^2]; infinite if there is none
+    # window of a moving average [s]; None for a transfer function. With a window, num and den have order 0.
+    window: Float[Array, "*batch"] | None = None
 
 
 class ForceSensorBatch(NamedTuple):
@@ -196,12 +201,12 @@ def _build_mass(mechanism, table) -> Any:
 
 
 def _build_motion_simulator(simulator, table) -> MotionSimulatorBatch:
-    """Return the motion simulator as a transfer function, of order 0 if the model is `ideal`."""
+    """Return the motion simulator; the transfer function of `ideal` and `moving_average` has order 0."""
     path = "rig.simulator."
     ones = table.constant(1.0)
     numerator: Any
     denominator: Any
-    if simulator.model == "ideal":
+    if simulator.model in ("ideal", "moving_average"):
         numerator, denominator = np.zeros((0, len(ones))), ones[None]
     elif simulator.model == "first_order":
         time_constant = table.scalar(path + "time_constant")
@@ -227,4 +232,5 @@ def _build_motion_simulator(simulator, table) -> MotionSimulatorBatch:
         table.scalar(path + "delay"),
         table.scalar(path + "velocity_limit"),
         table.scalar(path + "acceleration_limit"),
+        table.scalar(path + "window") if simulator.model == "moving_average" else None,
     )

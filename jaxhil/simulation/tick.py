@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxhil.laws.shared.ring_buffer import depend_on, look_back, write_samples
+from jaxhil.laws.shared.ring_buffer import depend_on, look_back, write_sample, write_samples
 from jaxhil.laws.simulation_base import Gains, Signals
 from jaxhil.simulation.cells import MIN_LAG, IntervalInputs, power_series
 from jaxhil.simulation.contact_force import (
@@ -37,6 +37,7 @@ from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.loop_state import LoopState, PlantState, Rings
 from jaxhil.simulation.metrics import Metrics
 from jaxhil.simulation.motion_simulator import advance_state, apply_row, read_measured_position
+from jaxhil.simulation.moving_average import UniformCommand, read_leaving_commands
 from jaxhil.simulation.probe import Probe
 from jaxhil.simulation.probed_tick import apply_probe
 from jaxhil.simulation.rate_limits import limit_command
@@ -95,6 +96,8 @@ class ActuationResult(NamedTuple):
     interval: SamplingInterval  # sampling interval in which the contact is computed at this tick
     # delay line of intervals in which the contact is not yet computed; None with one surface
     pending: SamplingInterval | None
+    # delay line of drive commands; None unless the motion simulator is a moving average
+    commands: Float[Array, "samples *batch"] | None
 
 
 def tick(
@@ -197,7 +200,12 @@ def actuate(
     commands = (command, *state.plant.commands)
     end = commands[loop.latency]
     start = commands[loop.latency + 1] if loop.hold == "linear" else end
-    rows, simulator = rig.propagation, state.plant.state
+    rows, simulator, past = rig.propagation, state.plant.state, state.sensed.rings.command
+    first = state.plant.first_command
+    if past is not None and rows.window is not None and first is not None:
+        past = write_sample(past, now, end)
+        before_run = UniformCommand(*first, now - state.onset_tick)
+        simulator = read_leaving_commands(past, now, rows.window, simulator, before_run)
     inputs = IntervalInputs(simulator, start, end, rig.scenario.contact_plane) if loop.has_cells else None
     interval = _interval_motion(rows, simulator, start, end, rig.scenario.contact_plane)._replace(
         interval_inputs=inputs
@@ -206,13 +214,19 @@ def actuate(
     if pending is not None:
         pending = write_samples(pending, now, interval)
         interval = _current_interval(rig, pending, now, now - state.onset_tick)
-    simulator = advance_state(rows.transition, simulator, start, end)
+    next_state = advance_state(rows.transition, simulator, start, end)
     return ActuationResult(
-        plant=PlantState(commands[: loop.latency + 1], step, simulator, unlimited_command),
+        plant=state.plant._replace(
+            commands=commands[: loop.latency + 1],
+            step=step,
+            state=next_state,
+            unlimited_command=unlimited_command,
+        ),
         controller=controller,
-        position=read_measured_position(rows, state.plant.state, start, end),
+        position=read_measured_position(rows, simulator, start, end),
         interval=interval,
         pending=pending,
+        commands=past,
     )
 
 
@@ -298,14 +312,14 @@ def update_state(
     dependence on `before` makes XLA read before it writes.
     """
     plant_signals = jax.tree.map(depend_on, contact.plant_signals, before)
-    samples = Rings(plant_signals, contact.reading, actuated.position, None)
-    rings = write_samples(state.sensed.rings._replace(interval=None), now, samples)
+    samples = Rings(plant_signals, contact.reading, actuated.position, None, None)
+    rings = write_samples(state.sensed.rings._replace(interval=None, command=None), now, samples)
     return state._replace(
         position=model.position,
         velocity=model.velocity,
         plant=actuated.plant,
         sensed=state.sensed._replace(
-            rings=rings._replace(interval=actuated.pending),
+            rings=rings._replace(interval=actuated.pending, command=actuated.commands),
             last=contact.last,
             contact_time=contact.contact_time,
             lagged=contact.lagged,

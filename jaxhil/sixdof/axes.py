@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxhil.laws.shared.ring_buffer import write_sample
 from jaxhil.simulation.motion_simulator import (
     Propagation,
     SplitDelay,
@@ -25,6 +26,12 @@ from jaxhil.simulation.motion_simulator import (
     read_measured_position,
     split_delay,
     steady_state,
+)
+from jaxhil.simulation.moving_average import (
+    discretise_moving_average,
+    motion_rows,
+    read_leaving_commands,
+    split_window,
 )
 from jaxhil.simulation.scenario import MotionSimulatorBatch
 
@@ -60,6 +67,8 @@ class Hardware(NamedTuple):
     commands: tuple[Array, ...]  # commands c(n), c(n-1), ... to the drives, (axes, *batch) each
     state: tuple[Array, ...]  # states of the axes' transfer functions
     ring: Float[Array, "rows *batch"]  # delay line of the samples, (intervals x quantities x axes, *batch)
+    # delay line of the commands at the end of each interval; None unless the axes are moving averages
+    past: Float[Array, "intervals axes *batch"] | None = None
 
 
 def build_axes(
@@ -81,13 +90,27 @@ def build_axes(
         split_delay(simulator.delay + delay[None], period) for delay in (force_delay, position_delay)
     )
     instant = position.fraction if measured else None
+    if simulator.window is not None:
+        return _build_averages(simulator.window, period, force, position, instant, hold, has_tool)
     exact = discretise(simulator.numerator, simulator.denominator, period, force.fraction, instant, hold)
     acceleration = rate_row(exact.velocity, simulator.denominator, period) if has_tool else None
     return Axes(exact, acceleration, force, position)
 
 
+def _build_averages(window, period, force, position, instant, hold, has_tool) -> Axes:
+    """Discretise axes that are moving averages."""
+    exact = discretise_moving_average(window, period, force.fraction, instant, hold)
+    acceleration = None
+    if has_tool:
+        is_before = force.fraction <= split_window(window, period).fraction
+        acceleration = motion_rows(window, period, force.fraction, is_before, hold)[2] / period[None] ** 2
+    return Axes(exact, acceleration, force, position)
+
+
 def static_lags(simulator: MotionSimulatorBatch) -> np.ndarray:
     """Return the low-frequency lag -G'(0) [s] of each axis, (axes, *batch), without the transport delay."""
+    if simulator.window is not None:
+        return np.asarray(simulator.window) / 2
     numerator, denominator = (np.asarray(part) for part in (simulator.numerator, simulator.denominator))
     if len(denominator) == 1:
         return np.zeros(simulator.delay.shape)
@@ -125,7 +148,10 @@ def start_uniform_motion(
     back = jnp.arange(1 - ring, 1, dtype=jnp.int32).astype(stride.dtype).reshape(-1, 1, *[1] * stride.ndim)
     newest, growth = (jnp.stack(jax.tree.leaves(samples))[None] for samples in (newest, growth))
     return Hardware(
-        commands, steady_state(rows, drive, stride), (newest + back * growth).reshape(-1, *period.shape)
+        commands,
+        steady_state(rows, drive, stride),
+        (newest + back * growth).reshape(-1, *period.shape),
+        None if rows.window is None else commands[-1][None] + back[:, 0] * stride[None],
     )
 
 
@@ -152,14 +178,17 @@ def actuate(
     commands = (command, *hardware.commands)
     end = commands[latency]
     start = commands[latency + 1] if hold == "linear" else end
-    exact, state, ring = axes.propagation, hardware.state, hardware.ring
+    exact, state, ring, past = axes.propagation, hardware.state, hardware.ring, hardware.past
+    if past is not None and exact.window is not None:
+        past = write_sample(past, tick, end)
+        state = read_leaving_commands(past, tick, exact.window, state)
     rows = _samples(axes, exact.position, exact.velocity, axes.acceleration, exact.measured_position)
     kinds = jax.tree.leaves(rows)
     last = ring.size // (len(kinds) * command.size) - 1
     for kind, row in enumerate(kinds):
         index = ((tick & last) * len(kinds) + kind) * len(command)
         ring = lax.dynamic_update_slice_in_dim(ring, apply_row(row, state, start, end), index, 0)
-    return Hardware(commands[: latency + 1], advance_state(exact.transition, state, start, end), ring)
+    return Hardware(commands[: latency + 1], advance_state(exact.transition, state, start, end), ring, past)
 
 
 def _samples(axes: Axes, position: Any, rate: Any, acceleration: Any, measured: Any) -> Samples:

@@ -154,7 +154,7 @@ def _kinematics(mechanism: SixAxisMechanism, numbers: DrawnValues) -> Kinematics
 
 
 def _simulator(mechanism: SixAxisMechanism, numbers: DrawnValues) -> MotionSimulatorBatch:
-    """Return the transfer function, delay and limits of every axis; the model "ideal" has order 0."""
+    """Return the motion simulator of every axis; "ideal" and "moving_average" have order 0."""
     path, model = "rig.simulator.", mechanism.rig.simulator.model
 
     def of(key: str) -> Any:
@@ -172,7 +172,7 @@ def _simulator(mechanism: SixAxisMechanism, numbers: DrawnValues) -> MotionSimul
     ones, stack = 0 * delay + 1, numbers.np.stack
     numerator: Any
     denominator: Any
-    if model == "ideal":
+    if model in ("ideal", "moving_average"):
         numerator, denominator = np.zeros((0, *ones.shape)), ones[None]
     elif model == "first_order":
         numerator, denominator = ones[None], stack([of("time_constant"), ones])
@@ -192,7 +192,8 @@ def _simulator(mechanism: SixAxisMechanism, numbers: DrawnValues) -> MotionSimul
         missing = len(denominator) - 1 - len(numerator)
         numerator = numbers.np.concatenate([np.zeros((missing, *ones.shape)), numerator])
     limit: Any = np.full(ones.shape, np.inf)
-    return MotionSimulatorBatch(numerator, denominator, delay, limit, limit)
+    window = of("window") if model == "moving_average" else None
+    return MotionSimulatorBatch(numerator, denominator, delay, limit, limit, window)
 
 
 def _sensor(mechanism: SixAxisMechanism, numbers: DrawnValues) -> sensor.Sensor:

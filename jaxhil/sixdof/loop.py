@@ -48,7 +48,9 @@ def build_loop(scenario: Scenario, **static: Any) -> Loop:
     sensor, period = scenario.sensor, np.asarray(scenario.control_period)
     errors = sensor.errors
     slowest = np.maximum(sensor.delay, sensor.position_delay)[None] + np.asarray(scenario.simulator.delay)
-    intervals = int(np.max(slowest / period[None])) + 2
+    window = scenario.simulator.window
+    longest = slowest if window is None else np.maximum(slowest, np.asarray(window))
+    intervals = int(np.max(longest / period[None])) + 2
     law = SIX_AXIS_COMPENSATORS[static.get("compensator", "none")]
     # A compensator may estimate the delay of the whole loop, with an error of up to 100 %.
     whole = int(np.max((slowest + static_lags(scenario.simulator)) / period[None]))

@@ -161,6 +161,8 @@ def _convert_simulator(mechanism: SixAxisMechanism, shares: np.ndarray) -> dict[
         model_lag = result["damping_ratio"] / (math.pi * result["natural_frequency"])
     elif simulator.time_constant is not None:
         result["time_constant"] = mean(simulator.time_constant)
+    elif simulator.window is not None:
+        result["window"] = mean(simulator.window)
     delay = mean(simulator.delay)
     result["delay"] = delay if abs(lag - model_lag) < EQUAL_LAGS else max(0.0, delay + lag - model_lag)
     return result

@@ -138,6 +138,7 @@ def _group_one_axis(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Co
         key = (
             *(getattr(loop, name) for name in _DISTINGUISHING_PROPERTIES),
             len(batch.simulator.denominator),
+            batch.simulator.window is None,
             _needs_simulated_speeds(mechanisms[index]),
         )
         groups.setdefault(key, []).append(index)

@@ -90,6 +90,7 @@ def compute_traits(mechanism: Mechanism) -> MechanismTraits:
         simulator_delay=float(simulator.delay[0])
         + slopes[0]
         - slopes[1]
+        + (0.0 if simulator.window is None else float(simulator.window[0]) / 2)
         + command_delay * rig.control_period,
         control_period=rig.control_period,
         damping_ratio=law.damping_ratio(damping, mass, velocity, math.sqrt(slowest * fastest)),

@@ -18,8 +18,14 @@ REAL_POLE_TOLERANCE = 1e-9
 
 
 def make_motion_model(mechanism: Mechanism) -> MotionModel:
-    """Return the model from commanded to measured position, with the delay of the position sensor."""
+    """Return the model from commanded to measured position, with the delay of the position sensor.
+
+    Raise `InputError` for a moving average.
+    """
     simulator, delay = mechanism.rig.simulator, mechanism.rig.simulator.delay
+    if simulator.model == "moving_average":
+        expected = "another model: logs are not compared with a moving average"
+        raise InputError(f"{mechanism.name}: rig.simulator.model: found moving_average, expected {expected}")
     numerator, denominator = _get_transfer_function(simulator)
     poles = np.roots(denominator)
     real = np.abs(poles.imag) <= REAL_POLE_TOLERANCE * np.abs(poles)

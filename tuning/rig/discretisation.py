@@ -38,6 +38,7 @@ class DiscreteSimulator(NamedTuple):
     # In uniform motion, the state is steady_command * command + steady_step * command increment per period.
     steady_command: ResponseRow  # [1/m]
     steady_step: ResponseRow  # [1/m]
+    window_intervals: int | None = None  # whole periods in the window of a moving average; None for G(s)
 
 
 def split_delay(delay: float, period: float) -> tuple[int, float]:

@@ -24,6 +24,7 @@ from tuning.rig.discretisation import (
     evaluate_row,
     split_delay,
 )
+from tuning.rig.moving_average import discretise_moving_average
 from tuning.rig.sensor_lag import MotionState, apply_sensor_lag, deepest_penetration
 
 # Motion of the mechanism when the force sensor samples, at the sampling interval's start and at its end.
@@ -52,9 +53,14 @@ def compute_plant_constants(mechanism: Mechanism) -> PlantConstants:
     contact_delay = simulator.delay / period + force_fraction
     contact_intervals = math.ceil(contact_delay - DELAY_ROUNDING_TOLERANCE) - 1
     force_intervals -= contact_intervals
-    longest = max(force_intervals, position_intervals, contact_intervals)
+    instants = period, rig.command_hold, force_fraction, position_fraction
+    if simulator.window is None:
+        rows = discretise_simulator(simulator, *instants)
+    else:
+        rows = discretise_moving_average(simulator.window, *instants)
+    longest = max(force_intervals, position_intervals, contact_intervals, rows.window_intervals or 0)
     return PlantConstants(
-        rows=discretise_simulator(simulator, period, rig.command_hold, force_fraction, position_fraction),
+        rows=rows,
         sample_time=force_fraction * period,
         contact_intervals=contact_intervals,
         force_intervals=force_intervals,
@@ -115,6 +121,8 @@ class RigHardware:
         self._intervals: list[SamplingInterval | None] = [None] * size
         # The last element of the ring buffer is interval -1, the newest interval before the run.
         self._positions = [first + (index - size + 1) * stride for index in range(size)]
+        # Commands of the drives at the ends of the intervals; only a moving average reads them.
+        self._drives = [self._commands[-1] + (index - size + 1) * stride for index in range(size)]
         self._tick = 0
         self._lag = self.force = 0.0
         self._in_contact, self._deepest = False, 0.0
@@ -146,6 +154,10 @@ class RigHardware:
         start = commands[self._latency] if self._hold == "linear" else end
         self._commands = [command, *commands[: self._latency]]
         rows, state, tick, last = self._rows, self._state, self._tick, self._size - 1
+        if rows.window_intervals is not None:
+            self._drives[tick & last] = end
+            oldest = tick - rows.window_intervals - 2
+            state[1:] = [self._drives[(oldest + later) & last] for later in range(3)]
 
         def motion(motion_rows: MotionRows) -> MotionState:
             position = evaluate_row(motion_rows.position, state, start, end) - self._plane

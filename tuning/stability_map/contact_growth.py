@@ -76,11 +76,13 @@ class Growth(NamedTuple):
 
 
 def explain_nonlinearity(mechanism: Mechanism, compensator: str) -> str | None:
-    """Return the reason why the loop in contact is not linear, or None if it is linear."""
+    """Return the reason why the growth is not computed, such as a nonlinear loop; None if it is."""
     if compensator not in LINEAR_COMPENSATORS:
         return f"{compensator} is not linear"
     if not find_contact_law(mechanism.contact.law).is_linear:
         return f"the contact law {mechanism.contact.law} is not linear"
+    if mechanism.rig.simulator.model == "moving_average":
+        return "the motion simulator is a moving average"
     return None
 
 

@@ -118,6 +118,8 @@ def _lags(simulator: Simulator, robot: Simulator | TargetRobot) -> list[float]:
         *_, slope, value = simulator.denominator or []
         *_, lead, gain = 0.0, *(simulator.numerator or [])
         lag = [slope / value - lead / gain] * 6
+    elif simulator.model == "moving_average":
+        lag = [window / 2 for window in of("window")]
     return [axis_lag + delay for axis_lag, delay in zip(lag, of("delay"), strict=True)]
 
 
@@ -137,4 +139,6 @@ def _inverse_series(simulator) -> tuple[float, float]:
         first = (low[1] - low[0] / num[0] * num[1]) / num[0]
         second = (low[2] - low[0] / num[0] * num[2] - first * num[1]) / num[0]
         return first, second
+    if simulator.model == "moving_average":
+        return simulator.window / 2, simulator.window**2 / 12
     return 0.0, 0.0

@@ -132,6 +132,7 @@ def rig_constants(mechanism: Mechanism) -> str:
         "RIG_LATENCY": rig.command_latency,
         "RIG_LINEAR_HOLD": int(rig.command_hold == "linear"),
         "RIG_RING": plant.ring_size,
+        "RIG_WINDOW_INTERVALS": -1 if plant.rows.window_intervals is None else plant.rows.window_intervals,
         "RIG_CONTACT_INTERVALS": plant.contact_intervals,
         "RIG_FORCE_INTERVALS": plant.force_intervals,
         "RIG_POSITION_INTERVALS": plant.position_intervals,

@@ -85,6 +85,7 @@ static void begin_run(fmu_state *state, double velocity) {
         rig->forces[n] = 0.0;
         rig->intervals[n].is_used = false;
         rig->positions[n] = first + (n - RIG_RING + 1) * stride;
+        rig->drives[n] = rig->commands[RIG_LATENCY] + (n - RIG_RING + 1) * stride;
     }
     rig->tick = 0;
     rig->lag = rig->force = rig->deepest = 0.0;
@@ -165,6 +166,12 @@ static void move_hardware(fmu_model *rig, double command) {
         rig->commands[n] = rig->commands[n - 1];
     }
     rig->commands[0] = command;
+    rig->drives[ring_index(rig->tick)] = end;
+#if RIG_WINDOW_INTERVALS >= 0
+    for (int n = 0; n < 3; n++) { /* the commands between which the window's start moves */
+        rig->simulator[1 + n] = rig->drives[ring_index(rig->tick - RIG_WINDOW_INTERVALS - 2 + n)];
+    }
+#endif
     interval->is_used = true;
     interval->start = motion(rig_start, rig->simulator, start, end);
     interval->sample = motion(rig_sample, rig->simulator, start, end);

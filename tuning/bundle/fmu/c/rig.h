@@ -18,6 +18,7 @@ typedef struct {
     double requested, step, shortfall;       /* of the rate limits [m] */
     double simulator[RIG_ORDER];             /* state of the motion simulator */
     double forces[RIG_RING], positions[RIG_RING];
+    double drives[RIG_RING]; /* commands of the drives at the ends of the intervals, for a moving average */
     sampling_interval intervals[RIG_RING];
     int64_t tick;
     double lag, force, deepest; /* output of the sensor's lag [N], contact force [N], penetration [m] */
