@@ -140,7 +140,9 @@ def test_cli_exits_with_code_2_on_wrong_usage(jaxhil, arguments):
     assert ran.code == 2 and ran.out == "" and ran.err != ""
 
 
-@pytest.mark.parametrize("command", ["init", "simulate", "tune", "export", "verify", "rig", "mechanisms"])
+@pytest.mark.parametrize(
+    "command", ["init", "simulate", "tune", "export", "verify", "shadow", "rig", "mechanisms"]
+)
 def test_cli_help_shows_an_example(jaxhil, command):
     ran = jaxhil(command, "--help")
     assert ran.code == 0

@@ -14,7 +14,7 @@ from tuning.api.options import AllowedValues, add_options, check_options, number
 from tuning.api.tune_options import TuneOptions
 from tuning.cli.options import Compare, Sweep, Tune
 from tuning.cli.options_report import Map
-from tuning.cli.options_rig import Export, Verify
+from tuning.cli.options_rig import Export, Shadow, Verify
 
 COMMANDS = {
     tuning.tune: Tune,
@@ -23,6 +23,7 @@ COMMANDS = {
     tuning.map: Map,
     tuning.export: Export,
     tuning.verify: Verify,
+    tuning.shadow: Shadow,
 }
 
 

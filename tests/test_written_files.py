@@ -154,6 +154,7 @@ def test_gains_of_different_mechanism_with_same_name_are_replaced_with_warning(j
         ("sweep",),
         ("export",),
         ("verify",),
+        ("shadow",),
         ("rig",),
         ("identify", "--prior", "rig-300kg"),
         ("identify", "none.csv", "--map"),

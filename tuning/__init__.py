@@ -1,8 +1,8 @@
 """Functions to tune, evaluate and export compensators, and the command line `jaxhil`.
 
-The functions `tune`, `sweep`, `compare`, `map`, `export`, `verify` and `report` do the work of the commands
-with these names. Each function is imported when it is first used, so that `import tuning` does not import
-jax.
+The functions `tune`, `sweep`, `compare`, `map`, `export`, `verify`, `shadow` and `report` do the work of the
+commands with these names. Each function is imported when it is first used, so that `import tuning` does not
+import jax.
 """
 
 from importlib import import_module
@@ -13,11 +13,12 @@ if TYPE_CHECKING:
     from tuning.api.export import export
     from tuning.api.map import map
     from tuning.api.report import report
+    from tuning.api.shadow import shadow
     from tuning.api.sweep import sweep
     from tuning.api.tune import tune
     from tuning.api.verify import verify
 
-__all__ = ["compare", "export", "map", "report", "sweep", "tune", "verify"]
+__all__ = ["compare", "export", "map", "report", "shadow", "sweep", "tune", "verify"]
 
 
 def __getattr__(name: str) -> Any:

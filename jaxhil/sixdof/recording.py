@@ -1,5 +1,6 @@
 """Recording of all ticks of a six-axis run and of the ideal contact, as NumPy arrays."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -30,7 +31,8 @@ class RunRecord(NamedTuple):
     """Signals of the rig and of the ideal contact at all ticks of a run, in SI units.
 
     Coordinates (p, theta), twists (v, w) and wrenches (force, moment about the origin) are in target frame T.
-    Signals of the hardware are those at the force sensor's sampling instant. The motion of a body consists of
+    Signals of the hardware are those at the force sensor's sampling instant. The measured signals are the
+    controller's inputs, with the sensors' delays and errors. The motion of a body consists of
     position, attitude (w, x, y, z), velocity and angular velocity, in the axes of the file's table [start].
 
     Attributes:
@@ -43,6 +45,8 @@ class RunRecord(NamedTuple):
         twist_ideal: Twist in the ideal contact, (ticks, 6).
         wrench: Wrench of the real contact, (ticks, 6).
         command: Wrench command, which acts on the numerical model, (ticks, 6).
+        wrench_measured: Reading of the force sensor, (ticks, 6).
+        pose_measured: Reading of the motion simulator's position sensor, as coordinates, (ticks, 6).
         wrench_ideal: Wrench of the ideal contact, (ticks, 6).
         target: Motion of the numerical model's target, (ticks, 13).
         chaser: Motion of the numerical model's chaser, (ticks, 13).
@@ -64,6 +68,8 @@ class RunRecord(NamedTuple):
     twist_ideal: np.ndarray
     wrench: np.ndarray
     command: np.ndarray
+    wrench_measured: np.ndarray
+    pose_measured: np.ndarray
     wrench_ideal: np.ndarray
     target: np.ndarray
     chaser: np.ndarray
@@ -81,9 +87,9 @@ WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 MOTION = ("x", "y", "z", "qw", "qx", "qy", "qz", *TWIST)
 # For each field of `RunRecord`, the suffixes of its columns in the CSV file.
 COLUMNS: Mapping[str, tuple[str, ...]] = {
-    **dict.fromkeys(("desired", "actual", "ideal"), COORDINATES),
+    **dict.fromkeys(("desired", "actual", "ideal", "pose_measured"), COORDINATES),
     **dict.fromkeys(("twist_desired", "twist_actual", "twist_ideal"), TWIST),
-    **dict.fromkeys(("wrench", "command", "wrench_ideal"), WRENCH),
+    **dict.fromkeys(("wrench", "command", "wrench_measured", "wrench_ideal"), WRENCH),
     **dict.fromkeys(("target", "chaser"), MOTION),
 }
 
@@ -157,6 +163,7 @@ def motion(bodies: Pair, states: States) -> tuple[Any, ...]:
 @partial(jax.jit, static_argnums=(0, 1))
 def _run(loop: Loop, ticks: int, gains: dict[str, Any], scenario: Scenario) -> dict[str, Any]:
     """Simulate a run and the ideal contact; return the arrays of `RunRecord`, (ticks, ..., lanes)."""
+    loop = dataclasses.replace(loop, measures_pose=True)
     _, seen = run(loop, gains, scenario, ticks)
     contact_model, period = (
         IdealContactModel(scenario.bodies, scenario.groups, scenario.latches),
@@ -175,6 +182,8 @@ def _run(loop: Loop, ticks: int, gains: dict[str, Any], scenario: Scenario) -> d
         "chaser": chaser,
         "wrench": _stacked(seen.contact, 1),
         "command": _stacked(seen.command, 1),
+        "wrench_measured": _stacked(seen.signals.wrench, 1),
+        "pose_measured": seen.signals.pose_measured,
         "wrench_ideal": _stacked(free.wrench, 1),
     }
     nothing = {name: jnp.zeros((ticks, 0, *more, *period.shape)) for name, more in _OF_CANDIDATES.items()}

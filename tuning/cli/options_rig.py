@@ -1,4 +1,4 @@
-"""Options of the commands `export`, `verify` and `rig`, read by tyro."""
+"""Options of the commands `export`, `verify`, `shadow` and `rig`, read by tyro."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -7,9 +7,12 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from tuning.api.export import ExportOptions
 from tuning.api.options import Json, OptionalLimit, Timings, folder_option, number_option, text_option
+from tuning.api.shadow import ShadowOptions
 from tuning.api.verify import VerifyOptions
+from tuning.cli.options_identify import ColumnMap
 
 DEFAULT_RIG_PLOT = "jaxhil-out/rig.png"
+DEFAULT_SHADOW_PLOT = "jaxhil-out/shadow.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +67,37 @@ class Verify(VerifyOptions):
         Positional[str],
         arg(metavar="BUNDLE_OR_GAINS", help="Bundle, or gain file, or folder of a gain file."),
     ]
+    json: Json = False
+    timings: Timings = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shadow(ShadowOptions):
+    """Show what the controller would have commanded on the readings in a rig's logs; nothing is sent.
+
+    Example: jaxhil shadow jaxhil-out/bundle day1/contact_*.csv --map logs.toml --plot
+
+    The controller gets the readings tick by tick, with the time stamps of the log, and its commands are
+    compared with the logged ones. The exit code is 1 if the controller would have tripped.
+    """
+
+    path: Annotated[
+        Positional[str],
+        arg(metavar="BUNDLE_OR_GAINS", help="Bundle, or gain file, or folder of a gain file."),
+    ]
+    logs: Annotated[
+        Positional[tuple[str, ...]],
+        text_option("LOG [LOG ...]", "Logs of contacts, in any format that jaxhil identify reads."),
+    ] = ()
+    map: ColumnMap = None
+    plot: Annotated[
+        str | None,
+        arg(
+            metavar="[FILE]",
+            help="Write a plot of the commands (.png, .pdf or .svg); without a name to "
+            f"{DEFAULT_SHADOW_PLOT}.",
+        ),
+    ] = None
     json: Json = False
     timings: Timings = False
 

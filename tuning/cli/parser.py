@@ -28,7 +28,7 @@ from tuning.cli.options import (
 )
 from tuning.cli.options_identify import IdentifyOptions, MonitorOptions
 from tuning.cli.options_report import Map, ReportOptions
-from tuning.cli.options_rig import DEFAULT_RIG_PLOT, Export, RigOptions, Verify
+from tuning.cli.options_rig import DEFAULT_RIG_PLOT, DEFAULT_SHADOW_PLOT, Export, RigOptions, Shadow, Verify
 from tuning.cli.timings import report_timings
 
 DESCRIPTION = """Gains that keep hardware-in-the-loop docking tests from diverging.
@@ -48,6 +48,7 @@ Command = (
     | Annotated[ReplayOptions, subcommand("replay")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Verify, subcommand("verify")]
+    | Annotated[Shadow, subcommand("shadow")]
     | Annotated[RigOptions, subcommand("rig")]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Map, subcommand("map")]
@@ -84,7 +85,7 @@ def _print_version() -> int:
 def complete_bare_options(arguments: list[str]) -> list[str]:
     """Insert the default value after each `--plot`, `--drivers` or `--rare` that has no value."""
     completed = []
-    default_plots = {"replay": DEFAULT_REPLAY_PLOT, "rig": DEFAULT_RIG_PLOT}
+    default_plots = {"replay": DEFAULT_REPLAY_PLOT, "rig": DEFAULT_RIG_PLOT, "shadow": DEFAULT_SHADOW_PLOT}
     plot = default_plots.get(arguments[0], DEFAULT_PLOT) if arguments else DEFAULT_PLOT
     for index, word in enumerate(arguments):
         completed.append(word)

@@ -64,17 +64,12 @@ def read_campaign(
     mapping = mapping or make_simulation_mapping()
     if not logs:
         raise InputError("logs: found none, expected one or more files")
-    timing, mass = _make_timing(mapping, prior), find_equivalent_mass(mapping, prior)
+    timing, mass = make_timing(mapping, prior), find_equivalent_mass(mapping, prior)
     if mass is None:
         raise InputError(
             "bodies.equivalent_mass: found nothing, expected a number > 0 kg in the mapping or in a prior"
         )
-    for path in logs:
-        if not any(entry.names(path) for entry in mapping.runs):
-            patterns = ", ".join(format_value(pattern) for entry in mapping.runs for pattern in entry.files)
-            raise InputError(
-                f"{to_one_line(str(path))}: found a name that no [[runs]] entry matches, expected {patterns}"
-            )
+    check_names(logs, mapping.runs)
     runs: list[LoggedRun] = []
     notes: dict[str, list[str]] = {}  # for each note, the names of the logs that it concerns
     clocks = []
@@ -92,6 +87,16 @@ def read_campaign(
     timing = replace(timing, clock=max(clocks, key=lambda reading_clock: reading_clock.jitter))
     sources = {path.name: _hash_log(path) for path in logs}
     return Campaign(tuple(runs), timing, mass, sources, _merge_notes(notes), integrator)
+
+
+def check_names(logs: Sequence[Path], entries: Sequence[RunFiles]) -> None:
+    """Raise `InputError` if no `[[runs]]` entry matches the name of a log."""
+    for path in logs:
+        if not any(entry.names(path) for entry in entries):
+            patterns = ", ".join(format_value(pattern) for entry in entries for pattern in entry.files)
+            raise InputError(
+                f"{to_one_line(str(path))}: found a name that no [[runs]] entry matches, expected {patterns}"
+            )
 
 
 def _merge_notes(notes: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
@@ -127,7 +132,7 @@ class _RunsOfFile:
         log = open_log(path, mapping.text)
         columns, stamps, self._begin, notes = read_channels(log, mapping, timing.control_period)
         self.notes += notes
-        used = _select_rows(stamps, entry, timing.control_period)
+        used = select_rows(stamps, entry, timing.control_period)
         if stamps is not None:
             self._begin += float(stamps[used][0]) if len(stamps[used]) else 0.0
         stamps, columns = None if stamps is None else stamps[used], {n: c[used] for n, c in columns.items()}
@@ -140,7 +145,7 @@ class _RunsOfFile:
             self.ticks = clock.number_rows(rows, period)
         else:
             self.ticks = clock.assign_ticks(stamps, period, self.label)
-        modes = _classify_rows(columns.pop("mode", None), mapping, entry.kind, self.label)
+        modes = classify_rows(columns.pop("mode", None), mapping, entry.kind, self.label)
         channels = {name: columns.get(name) for name in (*NUMERIC_CHANNELS, FORCE_LATE_CHANNEL)}
         for name, values in channels.items():
             if values is not None:
@@ -277,7 +282,12 @@ class _RunsOfFile:
         )
 
 
-def _make_timing(mapping: LogMapping, prior: Mechanism | None) -> CampaignTiming:
+def make_timing(mapping: LogMapping, prior: Mechanism | None) -> CampaignTiming:
+    """Return the timing of the logs, from the mapping or, where the mapping omits it, from the prior.
+
+    Raises:
+        InputError: If neither states the control period, or if the rate of the rows does not fit it.
+    """
     spec, rig = mapping.timing, None if prior is None else prior.rig
     period = spec.control_period or (rig and rig.control_period)
     if period is None and mapping.channels.time.rate is not None:
@@ -301,14 +311,15 @@ def _make_timing(mapping: LogMapping, prior: Mechanism | None) -> CampaignTiming
     return CampaignTiming(period, hold, latency, spec.row, None, computing_delay, has_two_clocks)
 
 
-def _select_rows(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:
+def select_rows(stamps: np.ndarray | None, entry: RunFiles, period: float) -> slice:
+    """Return the rows of a log from the time `begin` to the time `end` of its `[[runs]]` entry."""
     if stamps is None:
         return slice(round(entry.begin / period), None if entry.end is None else round(entry.end / period))
     first = int(np.searchsorted(stamps, entry.begin)) if entry.begin else 0
     return slice(first, None if entry.end is None else int(np.searchsorted(stamps, entry.end)))
 
 
-def _classify_rows(
+def classify_rows(
     values: np.ndarray | None, mapping: LogMapping, kind: RunKind, label: str
 ) -> np.ndarray | None:
     """Return, for each row, the index of its kind of experiment into `KINDS`; None without a mode channel."""

@@ -59,7 +59,7 @@ def read_channels(
     if clocks is None:
         time = channels.time.column
         resampling.check_lengths(log.label, columns | ({"time": read[time]} if time else {}), wanted)
-        stamps, begin = _read_row_stamps(log, read, mapping)
+        stamps, begin = read_row_stamps(log, read, mapping)
         clocks = None if stamps is None else resampling.split_sparse_rows(columns, stamps)
         if clocks is None:
             rows, more = _select_tick_rows(log, mapping, columns[MASTER], stamps, period)
@@ -212,7 +212,7 @@ def _read_mapped_stamps(
     return {name: scaled[column] if column else None for name, column in columns.items()}
 
 
-def _read_row_stamps(
+def read_row_stamps(
     log: OpenLog, read: ColumnsByName, mapping: LogMapping
 ) -> tuple[np.ndarray | None, float]:
     """Return the time stamps of the rows relative to the first one, and the first one [s].

@@ -145,7 +145,7 @@ def load_mapping(path: str | os.PathLike[str]) -> LogMapping:
         InputError: If the file is missing or invalid.
     """
     label = to_one_line(os.fspath(path)) or "''"
-    return parse_mapping(_read_toml(path, label), label)
+    return parse_mapping(read_mapping_file(path, label), label)
 
 
 def load_text_format(path: str | os.PathLike[str]) -> TextFormat:
@@ -155,7 +155,7 @@ def load_text_format(path: str | os.PathLike[str]) -> TextFormat:
         InputError: If the file is missing, or if the table is invalid.
     """
     label = to_one_line(os.fspath(path)) or "''"
-    raw = {"text": {}} | _read_toml(path, label)
+    raw = {"text": {}} | read_mapping_file(path, label)
     try:
         return to_struct(_TextTable, {"text": raw["text"]}).text
     except KeyProblem as problem:
@@ -169,7 +169,7 @@ def parse_mapping(raw: Mapping[str, Any], label: str) -> LogMapping:
         InputError: If the table is invalid.
     """
     try:
-        mapping = to_struct(LogMapping, _expand_shorthand(raw))
+        mapping = to_struct(LogMapping, expand_shorthand(raw))
         _check_mapping(mapping)
     except KeyProblem as problem:
         raise InputError(f"{label}: {problem}") from None
@@ -201,7 +201,7 @@ def get_si_conversion(channel: Channel, name: str, stated: str | None = None) ->
     return channel.sign * unit * channel.scale, channel.sign * unit * channel.offset
 
 
-def _read_toml(path: str | os.PathLike[str], label: str) -> dict[str, Any]:
+def read_mapping_file(path: str | os.PathLike[str], label: str) -> dict[str, Any]:
     try:
         data = read_bytes(Path(path), label, "a mapping")
     except FileNotFoundError:
@@ -209,7 +209,7 @@ def _read_toml(path: str | os.PathLike[str], label: str) -> dict[str, Any]:
     return parse_toml(data, label, "a mapping")
 
 
-def _expand_shorthand(raw: Mapping[str, Any]) -> dict[str, Any]:
+def expand_shorthand(raw: Mapping[str, Any]) -> dict[str, Any]:
     """Expand shorthand in the tables: a column name becomes a table, a single pattern becomes a list."""
     tables = dict(raw)
     if isinstance(channels := tables.get("channels"), Mapping):

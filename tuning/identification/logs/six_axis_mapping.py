@@ -1,0 +1,158 @@
+"""Mapping file `jaxhil/log/1` of six-axis logs: six columns for each wrench, pose and twist.
+
+    schema = "jaxhil/log/1"
+    [channels]
+    time = "t"
+    wrench_measured = ["fx", "fy", "fz", "mx", "my", "mz"]      # or a table: columns, units, sign
+    pose_measured = { columns = ["x", "y", "z", "rx", "ry", "rz"], units = ["mm", "deg"] }
+    ...
+
+The tables `[timing]`, `[text]` and `[[runs]]` are those of one axis (`mapping`). All columns have the time
+stamps of the rows. Wrenches are about the origin of target frame T, poses and twists are those of chaser
+frame C relative to T, all in T axes, as in the files of `jaxhil simulate --log`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, Struct
+
+from jaxhil.errors import InputError, format_value, to_one_line
+from jaxhil.mechanism.conversion import KeyProblem, suggest_names, to_struct
+from jaxhil.mechanism.structs import key_metadata
+from tuning.identification.logs.mapping import (
+    SCHEMA,
+    Channel,
+    ColumnName,
+    RunFiles,
+    TextFormat,
+    TimeChannel,
+    TimingSection,
+    expand_shorthand,
+    parse_mapping,
+    read_mapping_file,
+)
+from tuning.identification.logs.units import FORCE_UNITS, LENGTH_UNITS, SPEED_UNITS
+
+# Suffixes of the columns that `jaxhil simulate --log` writes.
+COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
+TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
+WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
+
+ANGLE_UNITS = {"rad": 1.0, "mrad": 1e-3, "deg": 0.017453292519943295}
+ANGULAR_SPEED_UNITS = {f"{unit}/s": factor for unit, factor in ANGLE_UNITS.items()}
+TORQUE_UNITS = {"N m": 1.0, "N mm": 1e-3, "kN m": 1e3}
+# Allowed units of the first and of the last three columns of a channel, with the SI units first.
+VECTOR_UNITS = {
+    "wrench_measured": (FORCE_UNITS, TORQUE_UNITS),
+    "wrench_command": (FORCE_UNITS, TORQUE_UNITS),
+    "pose_desired": (LENGTH_UNITS, ANGLE_UNITS),
+    "pose_measured": (LENGTH_UNITS, ANGLE_UNITS),
+    "twist_desired": (SPEED_UNITS, ANGULAR_SPEED_UNITS),
+}
+
+
+class VectorChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Six columns of a log, and their conversion to SI units."""
+
+    columns: Annotated[
+        list[ColumnName], Meta(min_length=6, max_length=6)
+    ]  # three translations, three rotations
+    units: Annotated[list[str], Meta(min_length=2, max_length=2)] | None = (
+        None  # of both halves; SI by default
+    )
+    sign: Annotated[int, key_metadata("of all six columns", "", ge=-1, le=1)] = 1
+
+
+class SixAxisChannels(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Table `[channels]` of a six-axis log."""
+
+    time: TimeChannel
+    wrench_measured: VectorChannel
+    pose_desired: VectorChannel
+    pose_measured: VectorChannel
+    twist_desired: VectorChannel
+    wrench_command: VectorChannel
+    contact_index: Channel | None = None
+
+
+class SixAxisLogMapping(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Content of a mapping file for six-axis logs."""
+
+    schema: Literal["jaxhil/log/1"]
+    channels: SixAxisChannels
+    timing: TimingSection = TimingSection()
+    text: TextFormat = TextFormat()
+    runs: Annotated[list[RunFiles], Meta(min_length=1, max_length=1000)]
+
+
+def load_six_axis_mapping(path: str | os.PathLike[str]) -> SixAxisLogMapping:
+    """Load a mapping of six-axis logs from a TOML file.
+
+    Raises:
+        InputError: If the file is missing or invalid.
+    """
+    label = to_one_line(os.fspath(path)) or "''"
+    return parse_six_axis_mapping(read_mapping_file(path, label), label)
+
+
+def parse_six_axis_mapping(raw: Mapping[str, Any], label: str) -> SixAxisLogMapping:
+    """Convert parsed TOML tables to a mapping; `label` is the name of the mapping in messages.
+
+    Raises:
+        InputError: If the table is invalid.
+    """
+    tables = expand_shorthand(raw)
+    if isinstance(channels := tables.get("channels"), Mapping):
+        tables["channels"] = {
+            name: {"columns": list(entry)} if _is_list(entry) else entry for name, entry in channels.items()
+        }
+    try:
+        mapping = to_struct(SixAxisLogMapping, tables)
+        _check_units(mapping.channels)
+    except KeyProblem as problem:
+        raise InputError(f"{label}: {problem}") from None
+    # The checks of the time stamps and of the runs are those of one axis.
+    placeholder = dict.fromkeys(("position_desired", "position_measured"), "x")
+    checked = {"time": tables["channels"]["time"], **placeholder}
+    parse_mapping({"schema": SCHEMA, "channels": checked, "runs": tables["runs"]}, label)
+    return mapping
+
+
+def make_six_axis_simulation_mapping() -> SixAxisLogMapping:
+    """Return the mapping of six-axis logs that `jaxhil simulate --log` writes."""
+    channels = {
+        "time": "time",
+        "wrench_measured": [f"wrench_measured_{suffix}" for suffix in WRENCH],
+        "pose_desired": [f"desired_{suffix}" for suffix in COORDINATES],
+        "pose_measured": [f"pose_measured_{suffix}" for suffix in COORDINATES],
+        "twist_desired": [f"twist_desired_{suffix}" for suffix in TWIST],
+        "wrench_command": [f"command_{suffix}" for suffix in WRENCH],
+    }
+    runs = [{"files": "*", "kind": "contact"}]
+    return parse_six_axis_mapping({"schema": SCHEMA, "channels": channels, "runs": runs}, "own logs")
+
+
+def get_factors(channel: VectorChannel, name: str) -> list[float]:
+    """Return the factors that convert the six columns of the channel `name` to SI units."""
+    tables = VECTOR_UNITS[name]
+    units = channel.units or [next(iter(table)) for table in tables]
+    return [channel.sign * table[unit] for table, unit in zip(tables, units, strict=True) for _ in range(3)]
+
+
+def _is_list(entry: Any) -> bool:
+    return isinstance(entry, Sequence) and not isinstance(entry, str)
+
+
+def _check_units(channels: SixAxisChannels) -> None:
+    for name, tables in VECTOR_UNITS.items():
+        channel: VectorChannel = getattr(channels, name)
+        if channel.sign == 0:
+            raise KeyProblem(("channels", name, "sign"), "0", "1 or -1")
+        for index, (unit, table) in enumerate(zip(channel.units or (), tables, strict=False)):
+            if unit not in table:
+                expected = f"one of {', '.join(table)}{suggest_names(unit, table)}"
+                raise KeyProblem(("channels", name, "units", index), format_value(unit), expected)

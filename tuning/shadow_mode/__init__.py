@@ -1,0 +1,1 @@
+"""Shadow mode: what a controller would have commanded on the readings in a rig's logs."""
