@@ -61,6 +61,7 @@ def test_bundle_is_complete_and_its_vectors_agree_with_simulation(built):
     assert {name.partition("/")[0] for name in built.files} == {
         *("gains.json", "vectors.csv", "summary.html", "jaxhil_runtime.py", "selftest.py", "ros2.yaml"),
         *("udp_controller.py", "udp_protocol.py", "udp_task.py", "numerical_model_six_axes.py"),
+        "flight_recorder.py",
         *("gains.mat", "gains.csv", "c99", "README.md", "manifest.json"),
     }
     readme, summary = (built.files[name].decode() for name in ("README.md", "summary.html"))

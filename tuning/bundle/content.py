@@ -9,6 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jaxhil.rig
 from jaxhil.errors import InputError
 from tuning.bundle import selftest
 from tuning.bundle.controller_kind import kind_of
@@ -18,12 +19,14 @@ TUNING_FOLDER = Path(__file__).parents[1]
 # Files that are copied unchanged into a bundle.
 SELFTEST = "bundle/selftest.py"
 UDP_FILES = ("rig/udp_controller.py", "rig/udp_protocol.py", "rig/udp_task.py")
+FLIGHT_RECORDER = Path(jaxhil.rig.__file__).with_name("flight_recorder.py")
 
 
 def code_files(compensator: str, axes: int = 1) -> dict[str, bytes]:
     """Return the Python files that every bundle of a compensator contains.
 
-    These are the runtime, the self-test, and the program that runs the controller as a process.
+    These are the runtime, the flight recorder, the self-test, and the program that runs the controller as a
+    process.
 
     Args:
         compensator: name of the compensator.
@@ -40,7 +43,8 @@ def code_files(compensator: str, axes: int = 1) -> dict[str, bytes]:
 
     kind = kind_of({"axes": axes})
     names = (SELFTEST, *UDP_FILES, kind.numerical_model)
-    copied = {Path(name).name: (TUNING_FOLDER / name).read_bytes() for name in names}
+    paths = [FLIGHT_RECORDER, *(TUNING_FOLDER / name for name in names)]
+    copied = {path.name: path.read_bytes() for path in paths}
     runtime = build_runtime_source(compensator, kind.package, kind.table)
     return {"jaxhil_runtime.py": runtime.encode(), **copied}
 

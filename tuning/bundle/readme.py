@@ -20,6 +20,7 @@ SIX_AXIS_TEMPLATE = Path(__file__).parent / "bundle_readme_six_axes.md"
 FILE_DESCRIPTIONS = {
     "gains.json": "gains, limits for the rig, and the mechanism and uncertainty of the tuning",
     "jaxhil_runtime.py": "controller in Python, which needs no further packages",
+    "flight_recorder.py": "log of readings and commands, which `jaxhil shadow` and `identify` read",
     "vectors.csv": "test vectors: recorded and damaged ticks, with the controller's commands",
     "selftest.py": "program that checks all files and replays the test vectors",
     "summary.html": "summary on one page: gains, limits, errors, range of validity",
