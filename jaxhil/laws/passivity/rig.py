@@ -9,34 +9,41 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 
 @register("passivity")
 class Passivity(Compensator):
-    """Compensator F_c = F, or F_c = -E_before/(T v_d) if E = E_before + T F v_d would be negative.
+    """Compensator F_c = F, or F_c = -E/(T v_d) if E + T F v_d would be negative.
 
-    E is the energy that the numerical model has given to the contact, v_d the velocity of the numerical
-    model, and T the control period. The second force makes E = 0; it corresponds to a virtual damping
-    alpha = -E/(T v_d^2). Because E_before >= 0, the divisor T v_d is then not 0, and F_c is between 0 and F.
+    E is the energy that the numerical model has given to the contact until this tick, v_d the velocity of the
+    numerical model, and T the control period. Each period contributes T F_c times the mean of its first and
+    last v_d, which is the energy that the model loses, whatever its mass and integrator. The second force
+    returns the energy to 0; it corresponds to a virtual damping alpha. It is never larger than F.
     """
 
-    __slots__ = ("_energy", "_period")
+    __slots__ = ("_command", "_energy", "_period", "_velocity")
 
     gains: ClassVar[Mapping[str, GainSpecification]] = {}
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
         self._period = period
         self._energy = 0.0
+        self._command = 0.0
+        self._velocity = 0.0
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """Return the measured force [N], reduced if the contact would return more energy than it absorbed."""
-        travel = self._period * velocity_desired
-        before = self._energy
-        energy = before + force_measured * travel
-        if energy < 0.0:
-            self._energy = 0.0
-            return -before / travel
+        energy = self._energy + self._command * (0.5 * self._period * (self._velocity + velocity_desired))
         # Do not store an infinite or NaN energy, because it would never become finite again.
-        if energy < inf:
+        if -inf < energy < inf:
             self._energy = energy
-        return force_measured
+        travel = self._period * velocity_desired
+        command = force_measured
+        if self._energy + force_measured * travel < 0.0:
+            limit = abs(force_measured)
+            command = 0.0 if travel == 0.0 else min(max(-self._energy / travel, -limit), limit)
+        self._command = command
+        self._velocity = velocity_desired
+        return command
 
     def reset(self) -> None:
         """Set the observed energy to 0."""
         self._energy = 0.0
+        self._command = 0.0
+        self._velocity = 0.0
