@@ -90,6 +90,7 @@ def test_cli_reports_unusable_input_with_one_line_message(jaxhil, arguments, wor
         "sweep nowhere.json",
         "replay nowhere 3",
         "export nowhere.json",
+        "shadow nowhere.json nowhere.csv",
         "verify nowhere.json",
         "rig nowhere.json",
         "compare nowhere.toml",

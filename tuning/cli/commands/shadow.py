@@ -27,7 +27,7 @@ def run(options: Shadow) -> int:
         terminal.note(f"wrote {options.plot}")
     terminal.warn(document["notes"])
     if options.json:
-        terminal.emit_json(document)
+        terminal.emit_json("shadow", document)
     else:
         _print(document)
     return 0 if result.good else 1
