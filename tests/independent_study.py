@@ -1,17 +1,11 @@
-"""Study of `jaxhil identify` on campaigns of the independent generator.
-
-`python tests/independent_study.py FOLDER FIRST COUNT [KIND ...]` runs it for COUNT seeds of each kind.
-"""
+"""Outcome of `jaxhil identify` on a campaign of the independent generator."""
 
 import contextlib
 import io
 import json
-import shutil
-import sys
 import time
-from collections import Counter
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
+from unittest.mock import patch
 
 import numpy as np
 from independent_logs import KINDS, write_campaign
@@ -38,7 +32,8 @@ class Outcome:
     difference: float  # e - e* of the file minus e - e* of the true rig
     named: bool  # the message names the defect or, for a clean kind, a check
     trouble: str  # an internal error
-    seconds: float  # duration of identify
+    seconds: float  # processor time of identify without plots
+    covered: dict[str, bool]  # whether each interval includes the true value, by key
 
     @property
     def wrong(self):
@@ -79,16 +74,17 @@ def errors_of(file, campaign):
 def evaluate_identification(kind, seed, folder):
     """Write a campaign, identify it and return the outcome."""
     campaign = write_campaign(kind, seed, folder)
-    begin, result = time.perf_counter(), folder / "identified"
-    code, out, err = run_command(*campaign.arguments, "-o", result)
-    seconds, check = time.perf_counter() - begin, ""
+    begin, result = time.process_time(), folder / "identified"
+    with patch("tuning.plots.identification.draw_identification", lambda *_: {}):
+        code, out, err = run_command(*campaign.arguments, "-o", result)
+    seconds, check, covered = time.process_time() - begin, "", {}
     e = error = difference = np.nan
     # Without a file, the report on standard output says why.
     verdict, message = VERDICTS.get(code, str(code)), " ".join((out + err).split())
     text = message
     if (result / "mechanism.toml").exists():
         document = json.loads((result / "identification.json").read_text())
-        message = document["reason"]
+        covered, message = check_intervals(campaign.rig, document), document["reason"]
         large = [
             c
             for c in document["checks"]
@@ -115,46 +111,28 @@ def evaluate_identification(kind, seed, folder):
     words = KINDS[kind].defect
     named = any(word in text for word in words) if words else len(text) > 0
     trouble = err if "internal error" in err or "Traceback" in err else ""
-    return Outcome(
-        kind, seed, verdict, message, check, e, float(error), float(difference), named, trouble, seconds
-    )
+    return Outcome(kind, seed, verdict, message, check, e, float(error), float(difference), named, trouble,
+                   seconds, covered)  # fmt: skip
 
 
-def summary(kind, outcomes):
-    """Return a line about all outcomes of a kind."""
-    verdicts = Counter(outcome.verdict for outcome in outcomes)
-    good = [outcome for outcome in outcomes if outcome.verdict == "good"]
-    wrong = sum(outcome.wrong for outcome in good)
-    differ = sum(outcome.check not in ("", outcome.verdict) for outcome in outcomes)
-    unnamed = sum(not outcome.named for outcome in outcomes if outcome.verdict != "good")
-    error = max((abs(outcome.error) for outcome in good), default=0.0)
-    difference = max((abs(outcome.difference) for outcome in good), default=0.0)
-    return (
-        f"{kind:18} good {verdicts['good']:3} bad {verdicts['bad']:3} refused {verdicts['refused']:3}"
-        f"   good but wrong {wrong:3}   worst e {error:.4f} e-e* {difference:.4f}   check differs {differ:3}"
-        f"   defect not named {unnamed:3}   {np.median([outcome.seconds for outcome in outcomes]):.0f} s"
-    )
-
-
-def main(folder, first, count, *kinds):
-    """Run all kinds for each seed in turn; append outcomes to `outcomes.jsonl`."""
-    outcomes = {kind: [] for kind in kinds or KINDS}
-    for seed in range(int(first), int(first) + int(count)):
-        for kind in outcomes:
-            place = Path(folder) / f"{kind}_{seed}"
-            shutil.rmtree(place, ignore_errors=True)
-            outcome = evaluate_identification(kind, seed, place)
-            outcomes[kind].append(outcome)
-            with (Path(folder) / "outcomes.jsonl").open("a") as lines:
-                lines.write(json.dumps(asdict(outcome)) + "\n")
-            errors = f"{outcome.error:+.4f}, e - e* by {outcome.difference:+.4f}"
-            print(f"{kind} {seed}: {outcome.verdict}, check {outcome.check}, e off by {errors}", flush=True)
-            print(f"    {outcome.message} {outcome.trouble}", flush=True)
-            for log in [*place.glob("*.csv"), *place.glob("*.parquet")]:
-                log.unlink()
-    for kind, results in outcomes.items():
-        print(summary(kind, results))
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+def check_intervals(rig, document):
+    """Return, by key, whether the intervals of an identification include the true values of the rig."""
+    items = {item["key"]: item for item in (*document["estimates"], *document["combinations"])}
+    # Only the sum of the delays of motion and position sensor is determined.
+    share = items.get("rig.position_sensor.delay", {"value": 0.0})["value"]
+    age = rig.force_delay + share + (1 / (2 * np.pi * rig.cutoff) if rig.filter_order == 1 else 0.0)
+    lagging = "rig.force_sensor.time_constant" in items
+    true = {
+        "contact.stiffness.0": rig.stiffness,
+        "contact.damping.0": rig.damping,
+        "rig.contact_plane": rig.plane,
+        "rig.simulator.natural_frequency": rig.frequency,
+        "rig.simulator.damping_ratio": rig.ratio,
+        "rig.simulator.delay": rig.drive_delay - share,
+        "delay and lag of force" if lagging else "rig.force_sensor.delay": age,
+    }
+    return {
+        key: bool(items[key]["low"] <= value <= items[key]["high"])
+        for key, value in true.items()
+        if key in items and not items[key]["known"]
+    }

@@ -12,9 +12,9 @@ import campaign_rigs
 import campaigns
 import numpy as np
 import pytest
+from identify_study import evaluate_ambiguous_identification, summarise
 
 from jaxhil.mechanism.file import from_plain_data, load
-from jaxhil.simulation.gain_choice import choose_gains
 from tuning.identification import mechanism_models
 from tuning.identification.estimates import make_estimates
 from tuning.identification.identify import IdentificationOptions, identify
@@ -195,27 +195,11 @@ GOOD_BUT_WRONG = 0.01
 @pytest.mark.slow
 @pytest.mark.users_options
 @pytest.mark.parametrize("name", ambiguous.KINDS)
-def test_identified_files_with_good_verdict_are_accurate(monkeypatch, name):
-    kind = ambiguous.KINDS[name]
-    sensor, contact = kind.rig["force_sensor"], kind.contact
-    true = {f"contact.{key}.0": contact[key][0] for key in ("stiffness", "damping")}
-    age = sensor["delay"] + sensor.get("time_constant", 0.0)
-    mechanisms, good, inside = [], [], []
-    for seed in range(REPEATS):
-        campaign = ambiguous.campaign(monkeypatch, name, 80_000 + seed)
-        result = identify(campaign, ambiguous.prior(name), IdentificationOptions(seed=seed))
-        mechanisms.append(from_plain_data(result.mechanism, "identified"))
-        good.append(result.good)
-        assert check_against_mechanism(campaign, mechanisms[-1]).good == result.good
-        share = mechanisms[-1].rig.position_sensor.delay - kind.rig["position_sensor"].get("delay", 0.0)
-        covered = [item.low <= true[item.key] <= item.high for item in result.estimates if item.key in true]
-        estimate = delay_and_lag(result)
-        inside.append([*covered, estimate.low <= age + share <= estimate.high])
-    gains = choose_gains(ambiguous.truth(name), "response_error", None)[1]
-    off, good = np.abs(ambiguous.deviations(name, mechanisms, "response_error", gains)), np.array(good)
-    wrong = np.mean(np.any(off[good] >= 0.01, axis=1)) if good.any() else 0.0
-    shares = np.mean(inside, axis=0)
-    print(f"{name}: {good.mean():.2f} good, {wrong:.3f} of them wrong; rms off e, e - e*", end=" ")
-    print(np.sqrt(np.mean(off**2, axis=0)), "intervals of stiffness, damping, age cover", shares)
-    assert wrong <= GOOD_BUT_WRONG
-    assert np.all(shares >= 0.9)
+def test_identified_files_with_good_verdict_are_accurate(name):
+    outcomes = [evaluate_ambiguous_identification(name, 80_000 + seed) for seed in range(REPEATS)]
+    print(summarise(name, outcomes))
+    good = [outcome for outcome in outcomes if outcome.verdict == "good"]
+    assert sum(outcome.wrong for outcome in good) <= GOOD_BUT_WRONG * len(good)
+    assert all(outcome.check == outcome.verdict for outcome in outcomes)
+    for key in outcomes[0].covered:
+        assert np.mean([outcome.covered[key] for outcome in outcomes if key in outcome.covered]) >= 0.9, key

@@ -85,7 +85,7 @@ def test_lag_filter_weights_are_exact_for_contact_onset_within_a_period():
 def test_contact_fit_is_equal_with_and_without_noise_filter_for_white_noise():
     plain = problem("stiffnesses", kelvin_voigt(), speeds=(0.006, 0.012, 0.003))
     filtered = ContactProblem(plain.motion, plain.readings, plain.law, None)
-    filtered.is_unfiltered, filtered.needed_rows = False, np.arange(plain.readings.counts.size)
+    filtered.is_unfiltered = False
     filtered.entry = plain.readings.entry.ravel()
     for delay in (0.0031, 0.0037):
         direct, reference = plain.at(delay, 2e-4), filtered.at(delay, 2e-4)

@@ -83,9 +83,10 @@ REFUSED = {
     "time backwards": (
         lambda day: changed(day, TIME, lambda values: values[::-1]), "expected an increasing time",
     ),
-    "noise over all forces": (lambda day: changed(day, FORCE, noise(0.05)), "with a contact where there is"),
+    "noise over all forces": (lambda day: changed(day, FORCE, noise(0.05)), "with a contact"),
     "a force range of 5 N": (
-        lambda day: changed(day, FORCE, lambda values: np.clip(values, -5e-3, 5e-3)), "turns 350 kg round",
+        lambda day: changed(day, FORCE, lambda values: np.clip(values, -5e-3, 5e-3)),
+        "impulse that reverses 350 kg",
     ),
     "no force": (
         lambda day: {
@@ -126,9 +127,9 @@ BAD = {
         "does not explain",
     ),
     "two rigs": (add_late_run, "motion model"),
-    "free motion alone": (only("free"), "nor a prior tell contact.stiffness"),
-    "touches alone": (only("contact"), "nor a prior tell rig.simulator"),
-    "rest alone": (only("rest"), "nor a prior tell rig.simulator"),
+    "free motion alone": (only("free"), "do not determine contact.stiffness"),
+    "touches alone": (only("contact"), "do not determine rig.simulator"),
+    "rest alone": (only("rest"), "do not determine rig.simulator"),
 }  # fmt: skip
 
 

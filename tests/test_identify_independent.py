@@ -1,13 +1,13 @@
 """`jaxhil identify` on logs of a second simulator, which was written only from the user guide."""
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from identify_study import evaluate, summarise
 from independent_logs import KINDS, mechanism_file, write_campaign
 from independent_rig import Rig, drive, ideal_restitution, restitution, touch
-from independent_study import LIMIT, errors_of, evaluate_identification, summary
+from independent_study import LIMIT, errors_of, evaluate_identification
 
 CAMPAIGNS = 100  # number of campaigns of each kind in the study
 WRONG = 0.01  # share of campaigns that may get a good verdict for a wrong file
@@ -96,12 +96,9 @@ def test_identify_verdict_is_good_for_campaign_of_independent_simulator(tmp_path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_identify_on_independent_simulator_never_calls_inaccurate_file_good(kind, tmp_path):
-    outcomes = []
-    for seed in range(CAMPAIGNS):
-        outcomes.append(evaluate_identification(kind, seed, tmp_path / str(seed)))
-        shutil.rmtree(tmp_path / str(seed))
-    print(summary(kind, outcomes))
+def test_identify_on_independent_simulator_never_calls_inaccurate_file_good(kind):
+    outcomes = [evaluate(kind, seed) for seed in range(CAMPAIGNS)]
+    print(summarise(kind, outcomes))
     assert not [outcome for outcome in outcomes if outcome.trouble]
     wrong = [outcome for outcome in outcomes if outcome.verdict == "good" and outcome.wrong]
     assert len(wrong) <= WRONG * CAMPAIGNS, wrong

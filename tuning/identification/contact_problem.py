@@ -29,7 +29,7 @@ from tuning.identification.contact_regression import (
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
 from tuning.identification.nearby_rows import NearbyRows, Onsets
-from tuning.identification.packed_rows import PackedRows, pack_rows
+from tuning.identification.packed_rows import pack_rows
 from tuning.identification.sensor_filter import (
     compute_lag_weights,
     compute_onset_shares,
@@ -40,6 +40,7 @@ MAX_FORCE_DELAY = 0.02  # s, longest force delay in the search range of a fit
 COARSE_DELAY_STEP = 0.0005  # s, step between the delays of a first search
 STEP = 1e-7  # m, step of finite differences with respect to the surface position
 FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants after which a filter's response is below rounding errors
+Motion = list[tuple[np.ndarray, np.ndarray]]  # position [m] and velocity [m/s] at several times
 
 
 class ContactProblem:
@@ -65,13 +66,10 @@ class ContactProblem:
         self.min_delay = -COARSE_DELAY_STEP * float(np.floor(max(motion.delay, 0.0) / COARSE_DELAY_STEP))
         self.is_unfiltered = len(readings.whitening) == 1 and time_constant == 0.0
         self.used_rows = np.flatnonzero(readings.counts)
-        # Index of each row among the used rows, or -1 for an unused row. The additional last entry serves the
-        # row index -1.
-        self.used_indices = np.full(readings.counts.size + 1, -1)
-        self.used_indices[self.used_rows] = np.arange(len(self.used_rows))
-        # A filter also needs the rows that fits do not use.
-        self.needed_rows = self.used_rows if self.is_unfiltered else np.arange(readings.counts.size)
-        self.target = self.whiten(readings.force).ravel()[self.used_rows] / readings.std
+        # The additional last entry serves the row index -1.
+        self.is_used = np.append(readings.counts.ravel(), False)
+        self.whitened = self.whiten(readings.force).ravel() / readings.std
+        self.target = self.whitened[self.used_rows]
         self.damping_indices = [i for i, name in enumerate(self.names) if name.startswith("damping")]
         # A dead zone changes only the readings in contact; a bias changes all readings.
         self.has_dead_zone = bool(readings.threshold)
@@ -85,7 +83,6 @@ class ContactProblem:
         # Times at which the force is computed, in periods before a row. A lag integrates the force between
         # two rows, so it also needs the force in the middle.
         self.periods_before = (0.0,) if time_constant == 0.0 else (0.0, 0.5)
-        self._cached_motion: tuple[float, list[tuple[np.ndarray, np.ndarray]]] | None = None
         self._guess: np.ndarray | None = None
 
     @cached_property
@@ -99,8 +96,11 @@ class ContactProblem:
         """Apply the whitening filter along the rows of an array (..., rows, lanes)."""
         return _whiten(values.swapaxes(-1, -2), self.readings.whitening).swapaxes(-1, -2)
 
-    def changed(self, law: Law, time_constant: float) -> ContactProblem:
-        """Return the same problem with this contact law and this time constant of the sensor [s]."""
+    def changed(self, law: Law, time_constant: float, delay: float | None = None) -> ContactProblem:
+        """Return the same problem with this contact law and this time constant of the sensor [s].
+
+        `delay` [s] is the approximate delay of the later fits, if it is known.
+        """
         return ContactProblem(self.motion, self.readings, law, self.plane, time_constant)
 
     def at(self, delay: float, plane: float, pseudo: PseudoRows | None = None) -> CoefficientFit:
@@ -134,10 +134,10 @@ class ContactProblem:
         Returns:
             The rows near contact, flags of the rows in contact, and the fit for each surface position.
         """
-        moved = self._get_motion(delay)
-        near = [self._find_nearby_rows(*motion, self.needed_rows, planes) for motion in moved]
+        moved = self.motion_at(delay)
+        near = self._find_nearby_rows(moved, planes, self.is_unfiltered)
         flags = [self._flag_rows_in_contact(rows, self._guess) for rows in near]
-        onsets = self._find_onsets(near[0], [x for x, _ in moved], planes)
+        onsets = self._find_onsets(near[0], moved, planes)
         fit = self._solve(near, flags, onsets, pseudo)
         for _ in range(2):
             again = [self._flag_rows_in_contact(rows, fit.coefficients) for rows in near]
@@ -158,28 +158,46 @@ class ContactProblem:
             CoefficientFit(*values) for values in zip(coefficients, covariance, misfit, evidence, strict=True)
         ]
 
-    def _get_motion(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position [m] and velocity [m/s] in `needed_rows`, at each of the times `periods_before`."""
-        if self._cached_motion is None or self._cached_motion[0] != delay:
-            moved, rows = self.motion_at(delay), self.needed_rows
-            self._cached_motion = delay, [(x.ravel()[rows], v.ravel()[rows]) for x, v in moved]
-        return self._cached_motion[1]
-
-    def motion_at(self, delay: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    def motion_at(self, delay: float) -> Motion:
         """Return position [m] and velocity [m/s] in all rows, at each of the times `periods_before`."""
-        return [self.motion.at(delay + part * self.motion.period) for part in self.periods_before]
+        moved = [self.motion.at(delay + part * self.motion.period) for part in self.periods_before]
+        return [(position.ravel(), rate.ravel()) for position, rate in moved]
 
     def onsets_between(self, delay: float, low: float, high: float) -> np.ndarray:
         """Return the surface positions [m] from `low` to `high` at which a row enters or leaves contact."""
-        position, rate = self._get_motion(delay)[0]
-        return np.unique(position[(rate > 0.0) & (position > low) & (position < high)])
+        position, rate = self.motion_at(delay)[0]
+        inside = (rate > 0.0) & (position > low) & (position < high)
+        # A filter also needs the rows that fits do not use.
+        return np.unique(position[inside & self.is_used[:-1] if self.is_unfiltered else inside])
 
-    def _find_nearby_rows(self, position, rate, where, planes: np.ndarray) -> NearbyRows:
-        """Return the rows that are in contact for at least one of the surface positions `planes` [m]."""
+    def _find_nearby_rows(self, moved: Motion, planes: np.ndarray, only_used: bool) -> list[NearbyRows]:
+        """Return the rows near contact at each of the times `periods_before`.
+
+        They include all rows that are in contact for at least one of the surface positions `planes` [m]. If
+        the readings are filtered, they also include later rows, which depend on them through the filters.
+
+        Args:
+            moved: Position [m] and velocity [m/s] in all rows, at each of the times `periods_before`.
+            planes: Surface positions [m].
+            only_used: Whether to omit the rows that fits do not use, which is possible without filters.
+        """
         # Finite differences also need the rows that would be in contact with a slightly nearer surface.
-        rows = np.flatnonzero(position > planes.min() - (STEP if self.time_constant else 0.0))
-        depth, rate = np.maximum(position[rows] - planes[:, None], 0.0), rate[rows]
-        return NearbyRows(rows, depth, rate, self._tabulate(depth, rate, where[rows]))
+        lowest = planes.min() - (STEP if self.time_constant else 0.0)
+        inside = np.any([position > lowest for position, _ in moved], axis=0)
+        if self.is_unfiltered:
+            rows = np.flatnonzero(inside & self.is_used[:-1] if only_used else inside)
+        else:
+            rows = pack_rows(inside.reshape(self.readings.force.shape), self.memory)
+        gathered = [(position[rows], rate[rows]) for position, rate in moved]
+        if not self.is_unfiltered:
+            for position, _ in gathered:
+                position[rows < 0] = -np.inf
+        return [self._move_surface(rows, *motion, planes) for motion in gathered]
+
+    def _move_surface(self, rows, position, rate, planes: np.ndarray) -> NearbyRows:
+        """Return the given rows for the surface positions `planes` [m]."""
+        depth = np.maximum(position - planes[:, None], 0.0)
+        return NearbyRows(rows, position, depth, rate, self._tabulate(depth, rate, rows))
 
     def _tabulate(self, depth: np.ndarray, rate: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return the law's regressors in the given rows, shape (surface positions, coefficients, rows)."""
@@ -204,78 +222,65 @@ class ContactProblem:
         sound = 2 * pushing.sum(axis=1) > inside.sum(axis=1)
         return np.where(sound[:, None], pushing, inside)
 
-    def _find_onsets(
-        self, near: NearbyRows, positions: list[np.ndarray], planes: np.ndarray
-    ) -> Onsets | None:
-        """Find the onsets of contact between two rows; return None if the sensor has no lag.
-
-        `positions` contains the positions [m] at all rows and half a period before all rows.
-        """
+    def _find_onsets(self, near: NearbyRows, moved: Motion, planes: np.ndarray) -> Onsets | None:
+        """Find the onsets of contact between two rows; return None if the sensor has no lag."""
         if self.time_constant == 0.0:
             return None
-        now, half = positions
+        (now, _), (half, _) = moved
         before = near.rows - self.readings.force.shape[1]
-        last = np.where(before >= 0, now[np.maximum(before, 0)], now[near.rows])
-        left = compute_onset_shares(last, half[near.rows], now[near.rows], planes[:, None])
-        plane, row = np.nonzero(left)
-        columns = self._tabulate(np.zeros((1, len(row))), near.rate[row], self.needed_rows[near.rows[row]])[0]
+        last = np.where(before >= 0, now[before], near.position)
+        plane, row = np.nonzero((last <= planes[:, None]) & (near.position > planes[:, None]))
+        left = compute_onset_shares(last[row], half[near.rows[row]], near.position[row], planes[plane])
+        columns = self._tabulate(np.zeros((1, len(row))), near.rate[row], near.rows[row])[0]
         rate = self.motion.period / self.time_constant
-        return Onsets(plane, row, columns, *compute_onset_weights(rate, left[plane, row]))
+        return Onsets(plane, row, columns, *compute_onset_weights(rate, left))
 
-    def _pack_nearby_rows(self, near: list[NearbyRows]) -> PackedRows:
-        """Return the rows near contact and the later rows that depend on them through the filters."""
-        return pack_rows([part.rows for part in near], self.readings.force.shape, self.memory)
-
-    def _filter(self, near, tables: list[np.ndarray], onsets, first, where: PackedRows, whitening):
-        """Apply the lag of the sensor and the whitening filter to the regressors of the law.
+    def _filter(self, tables: list[np.ndarray], onsets: Onsets | None, first, whitening) -> np.ndarray:
+        """Apply the lag of the sensor and the whitening filter to values in the rows near contact.
 
         Args:
-            near: Rows near contact, at each of the times `periods_before`.
-            tables: Values of the regressors in these rows, at each of the times `periods_before`.
+            tables: Values in these rows at each of the times `periods_before`, each (surface positions,
+                regressors, rows); 0 out of contact.
             onsets: Onsets of contact, or None if the sensor has no lag.
-            first: Values of the regressors just after the onsets, shape (regressors, onsets), or None.
-            where: Rows of the result.
+            first: Values just after the onsets, shape (regressors, onsets), or None.
             whitening: Coefficients of the whitening filter.
         """
-        full, places = [], [where.places(part.rows) for part in near]
-        for columns, columns_in_table in zip(tables, places, strict=True):
-            table = np.zeros((*columns.shape[:2], len(where.rows)))
-            table[:, :, columns_in_table] = columns
-            full.append(table)
-        if onsets is None or not len(where.rows):
-            return _whiten(full[0], whitening)
+        if onsets is None or not tables[0].size:
+            return _whiten(tables[0], whitening)
         pole, (now, half, last) = compute_lag_weights(self.motion.period / self.time_constant)
-        drive = now * full[0] + half * full[1]
-        drive[:, :, 1:] += last * full[0][:, :, :-1]
+        drive = now * tables[0] + half * tables[1]
+        drive[:, :, 1:] += last * tables[0][:, :, :-1]
         then = tables[0][onsets.plane, :, onsets.row].T
-        drive[onsets.plane, :, places[0][onsets.row]] = (onsets.after * first + onsets.end * then).T
+        drive[onsets.plane, :, onsets.row] = (onsets.after * first + onsets.end * then).T
         lagged: Any = lfilter(whitening, [1.0, -pole], drive)
         return lagged
 
-    def inside(self, delay: float, planes: np.ndarray) -> np.ndarray:
-        """Return the design matrix of lanes that are always in contact.
+    def inside(self, delay: float, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return design matrix and readings of lanes that are always in contact, in the order of the lanes.
 
-        Its shape is (surface positions, coefficients, used rows).
+        The design has the shape (surface positions, coefficients, used rows), the readings (used rows,).
         """
-        tables, shape = [], self.readings.force.shape
-        rows = np.arange(self.readings.force.size).reshape(shape).T.ravel()
-        for position, rate in self.motion_at(delay):
-            depth = position.T.ravel() - planes[:, None]
-            columns = self._tabulate(depth, rate.T.ravel(), rows) / self.readings.std
-            tables.append(columns.reshape(*columns.shape[:2], shape[1], shape[0]))
-        drive = tables[0]
+        length, lanes = self.readings.force.shape
+        rows = np.arange(length * lanes).reshape(length, lanes).T.ravel()
+        tables = [
+            self._tabulate(position[rows] - planes[:, None], rate[rows], rows)
+            for position, rate in self.motion_at(delay)
+        ]
+        tables = [table.reshape(*table.shape[:2], lanes, length) for table in tables]
         if self.time_constant:
-            pole, (now, half, last) = compute_lag_weights(self.motion.period / self.time_constant)
-            drive = now * tables[0] + half * tables[1]
+            pole, weights = compute_lag_weights(self.motion.period / self.time_constant)
+            now, half, last = np.array(weights) / self.readings.std
+            drive = now * tables[0]
             drive[..., 1:] += last * tables[0][..., :-1]
+            drive += np.multiply(half, tables[1], out=tables[1])
             drive = np.asarray(lfilter(self.readings.whitening, [1.0, -pole], drive))
         else:
-            drive = _whiten(drive, self.readings.whitening)
-        used = drive.swapaxes(2, 3).reshape(*drive.shape[:2], -1)[:, :, self.used_rows]
-        bias = np.full(
-            (len(planes), 1, used.shape[2]), float(np.sum(self.readings.whitening)) / self.readings.std
-        )
-        return np.concatenate([used, bias], axis=1)
+            drive = _whiten(tables[0] / self.readings.std, self.readings.whitening)
+        used = self.is_used[rows]
+        design = np.empty((len(planes), drive.shape[1] + 1, len(self.used_rows)))
+        np.compress(used, drive.reshape(*drive.shape[:2], -1), axis=2, out=design[:, :-1])
+        design[:, -1] = float(np.sum(self.readings.whitening)) / self.readings.std
+        return design, self.whitened[rows[used]]
 
     def _build_design(
         self, near: list[NearbyRows], flags: list[np.ndarray], onsets: Onsets | None
@@ -284,25 +289,30 @@ class ContactProblem:
 
         Both are divided by the standard deviation of the noise.
         """
-        std, tables, first = self.readings.std, [], None
-        for rows_near, flag in zip(near, flags, strict=True):
-            # The last column belongs to the bias. It is 1 in all rows or, if there is a dead zone, only in
-            # rows in contact.
-            table = np.empty((len(flag), rows_near.columns.shape[1] + 1, len(rows_near.rows)))
-            np.multiply(rows_near.columns, flag[:, None] / std, out=table[:, :-1])
-            table[:, -1] = flag / std if self.has_dead_zone else 1.0 / std
-            tables.append(table)
-        if onsets is not None:
-            ones = np.ones((1, len(onsets.row)))
-            first = np.vstack([onsets.columns, ones]) * flags[0][onsets.plane, onsets.row] / std
+        std, rows, first = self.readings.std, near[0].rows, None
+        # The last column belongs to the bias. It is 1 in all rows or, with a dead zone, only in rows in
+        # contact.
         if self.is_unfiltered:
-            return tables[0], self.target[near[0].rows]
-        where = self._pack_nearby_rows(near)
-        used = self.used_indices[where.rows]
-        design = self._filter(near, tables, onsets, first, where, self.readings.whitening)[:, :, used >= 0]
+            design = np.empty((len(flags[0]), near[0].columns.shape[1] + 1, len(rows)))
+            np.multiply(near[0].columns, flags[0][:, None] / std, out=design[:, :-1])
+            design[:, -1] = flags[0] / std if self.has_dead_zone else 1.0 / std
+            return design, self.whitened[rows]
+        tables = [part.columns * (flag[:, None] / std) for part, flag in zip(near, flags, strict=True)]
+        if self.has_dead_zone:
+            tables = [
+                np.concatenate([table, flag[:, None] / std], axis=1)
+                for table, flag in zip(tables, flags, strict=True)
+            ]
+        if onsets is not None:
+            first = np.vstack([onsets.columns, np.ones((int(self.has_dead_zone), len(onsets.row)))])
+            first *= flags[0][onsets.plane, onsets.row] / std
+        used = self.is_used[rows]
+        design = np.compress(used, self._filter(tables, onsets, first, self.readings.whitening), axis=2)
         if not self.has_dead_zone:
-            design[:, -1] = self.bias_alone
-        return design, self.target[used[used >= 0]]
+            design = np.concatenate(
+                [design, np.full((len(design), 1, design.shape[2]), self.bias_alone)], axis=1
+            )
+        return design, self.whitened[rows[used]]
 
     def _solve(self, near, flags, onsets, pseudo: PseudoRows | None) -> LeastSquaresFit:
         """Fit the coefficients at each surface position, for the rows in contact that `flags` marks."""
@@ -324,37 +334,37 @@ class ContactProblem:
         The result is divided by the standard deviation of the noise.
         """
         scale = 2.0 * STEP * self.readings.std
+        planes, now = plane + STEP * np.array([1.0, -1.0]), near[0]
         if self.time_constant:
-            shifted = self._all_rows_near_contact(
-                self._get_motion(delay), plane + STEP * np.array([1.0, -1.0]), coefficients
-            )
-            where = self._pack_nearby_rows(near)
-            high, low = self._predict(*shifted, coefficients, where, self.readings.whitening)
-            return (high - low)[self.used_indices[where.rows] >= 0] / scale
-        now = near[0]
-        rows = self.needed_rows[now.rows]
+            shifted = [self._move_surface(now.rows, part.position, part.rate, planes) for part in near]
+            repeated = np.repeat(coefficients[None], 2, axis=0)
+            flags = [self._flag_rows_in_contact(part, repeated) for part in shifted]
+            onsets = self._find_onsets(shifted[0], self.motion_at(delay), planes)
+            high, low = self._predict(shifted, flags, onsets, coefficients, self.readings.whitening)
+            return (high - low)[self.is_used[now.rows]] / scale
         up, down = (
-            compute_force(coefficients, self._tabulate(np.maximum(now.depth + d, 0.0), now.rate, rows))
+            compute_force(coefficients, self._tabulate(np.maximum(now.depth + d, 0.0), now.rate, now.rows))
             for d in (STEP, -STEP)
         )
         table = ((down - up) * flag / scale)[:, None]
         if self.is_unfiltered:
             return table[0, 0]
-        where = self._pack_nearby_rows(near)
-        table = self._filter(near, [table], None, None, where, self.readings.whitening)
-        return table[0, 0, self.used_indices[where.rows] >= 0]
+        table = self._filter([table], None, None, self.readings.whitening)
+        return table[0, 0, self.is_used[now.rows]]
 
     def force(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """Return the predicted force readings [N], including the bias, shape (rows, lanes)."""
-        moved = [(position.ravel(), rate.ravel()) for position, rate in self.motion_at(delay)]
-        near, flags, onsets = self._all_rows_near_contact(moved, np.array([plane]), coefficients)
-        where = self._pack_nearby_rows(near)
-        force, real = np.zeros(self.readings.force.shape), where.rows >= 0
-        values = self._predict(near, flags, onsets, coefficients, where, (1.0,))[0]
-        force.ravel()[where.rows[real]] = values[real]
+        moved, planes = self.motion_at(delay), np.array([plane])
+        near = self._find_nearby_rows(moved, planes, False)
+        flags = [self._flag_rows_in_contact(part, coefficients[None]) for part in near]
+        onsets = self._find_onsets(near[0], moved, planes)
+        force, rows = np.zeros(self.readings.force.size), near[0].rows
+        values = self._predict(near, flags, onsets, coefficients, (1.0,))[0]
+        force[rows[rows >= 0]] = values[rows >= 0]
+        force = force.reshape(self.readings.force.shape)
         return force if self.has_dead_zone else force + coefficients[-1]
 
-    def _predict(self, near, flags, onsets, coefficients, where: PackedRows, whitening) -> np.ndarray:
+    def _predict(self, near, flags, onsets, coefficients, whitening) -> np.ndarray:
         """Return the whitened predicted readings [N] without a constant bias, (surface positions, rows)."""
         offset, first = self.has_dead_zone * coefficients[-1], None
         tables = [
@@ -363,31 +373,17 @@ class ContactProblem:
         ]
         if onsets is not None:
             first = (coefficients[:-1] @ onsets.columns + offset) * flags[0][onsets.plane, onsets.row]
-        return self._filter(near, tables, onsets, first, where, whitening)[:, 0]
+        return self._filter(tables, onsets, first, whitening)[:, 0]
 
     def touching(self, delay: float, plane: float, coefficients: np.ndarray) -> np.ndarray:
         """Return flags of the rows that are in contact according to the model, shape (rows, lanes)."""
         position, rate = self.motion.at(delay)
         moved = [(position.ravel(), rate.ravel())]
-        (near,), (flag,), _ = self._all_rows_near_contact(moved, np.array([plane]), coefficients)
-        flags = np.zeros(self.readings.force.shape, bool)
-        flags.ravel()[near.rows] = flag[0]
-        return flags
-
-    def _all_rows_near_contact(self, moved, planes: np.ndarray, coefficients: np.ndarray):
-        """Search all rows; return the rows near contact, flags of those in contact, and the onsets.
-
-        Args:
-            moved: Position [m] and velocity [m/s] in all rows, at each of the times `periods_before`.
-            planes: Surface positions [m].
-            coefficients: Coefficients of the law.
-        """
-        all_rows = np.arange(moved[0][0].size)
-        near = [self._find_nearby_rows(position, rate, all_rows, planes) for position, rate in moved]
-        repeated = np.repeat(coefficients[None], len(planes), axis=0)
-        flags = [self._flag_rows_in_contact(part, repeated) for part in near]
-        onsets = self._find_onsets(near[0], [x for x, _ in moved], planes) if len(moved) > 1 else None
-        return near, flags, onsets
+        (near,) = self._find_nearby_rows(moved, np.array([plane]), False)
+        (flag,) = self._flag_rows_in_contact(near, coefficients[None])
+        flags = np.zeros(self.readings.force.size, bool)
+        flags[near.rows[near.rows >= 0]] = flag[near.rows >= 0]
+        return flags.reshape(self.readings.force.shape)
 
 
 def _whiten(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:

@@ -12,6 +12,7 @@ that lead to the same sum of squared residuals as all rows (Golub and Van Loan, 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import BarycentricInterpolator
@@ -27,6 +28,7 @@ MIN_DEEP_LANES = 6  # minimum number of deep lanes for which pseudo-rows save ti
 LANES_FOR_LAW_CHOICE = 8  # number of deep lanes that suffice to fit the shape of a contact law
 MIN_DEPTH_SHARE = 0.1  # minimum ratio of the smallest depth of a deep lane to its median depth
 DELAY_RANGE = 0.002  # s, range of delays that one table covers
+DELAY_TOLERANCE = 1e-9  # s; a search near a delay ends at the limits of the range, up to rounding errors
 DELAY_NODES = 8  # number of delays at which the interpolation is exact
 # numbers of surface positions at which the interpolation is exact: first for a linear force, then for others
 SURFACE_NODES = 2, 4
@@ -97,9 +99,13 @@ class SummarisedProblem(ContactProblem):
         self.tables: list[_DesignTable] = []
         self.planes = SURFACE_NODES
 
-    def changed(self, law: Law, time_constant: float) -> ContactProblem:
-        """Return the same problem with this contact law and this time constant of the sensor [s]."""
-        delay = self.delay + self.time_constant - time_constant
+    def changed(self, law: Law, time_constant: float, delay: float | None = None) -> ContactProblem:
+        """Return the same problem with this contact law and this time constant of the sensor [s].
+
+        `delay` [s] is the approximate delay of the later fits, if it is known.
+        """
+        if delay is None:
+            delay = self.delay + self.time_constant - time_constant
         return SummarisedProblem(super().changed(law, time_constant), self.deep, delay)
 
     def at(self, delay: float, plane: float, pseudo: PseudoRows | None = None) -> CoefficientFit:
@@ -179,19 +185,27 @@ class _DesignTable:
     factor: np.ndarray
     check: np.ndarray  # (rows, regressors), regressors of the law between the nodes, to test the accuracy
 
+    @cached_property
+    def by_delay(self) -> BarycentricInterpolator:
+        return _interpolator(self.delays)
+
+    @cached_property
+    def by_surface(self) -> BarycentricInterpolator:
+        return _interpolator(self.planes)
+
     def covers(self, delay: float, planes: np.ndarray) -> bool:
         """Return whether a delay [s] and all surface positions [m] lie within the range of the table."""
         low, high = self.limit
-        return self.ends[0] <= delay <= self.ends[1] and low <= planes.min() and planes.max() < high
+        distance = max(self.ends[0] - delay, delay - self.ends[1])
+        return distance <= DELAY_TOLERANCE and low <= planes.min() and planes.max() < high
 
     def rows(self, delay: float, planes: np.ndarray) -> PseudoRows:
         """Interpolate the pseudo-rows at a delay [s] and at surface positions [m]."""
-        by_delay = _interpolator(self.delays)(delay)
+        by_delay = self.by_delay(delay)
         nodes = self.factor[:, :-2].reshape(len(self.factor), len(self.delays), len(self.planes), -1)
         columns = np.einsum("rdpc,d->rpc", nodes, by_delay)
-        by_surface = _interpolator(self.planes)
-        design = np.einsum("rnc,pn->pcr", columns, by_surface(planes))
-        by_plane = np.einsum("rnc,pn->pcr", columns, by_surface.derivative(planes))
+        design = np.einsum("rnc,pn->pcr", columns, self.by_surface(planes))
+        by_plane = np.einsum("rnc,pn->pcr", columns, self.by_surface.derivative(planes))
         bias = np.broadcast_to(self.factor[:, -2], (len(planes), 1, len(self.factor)))
         return PseudoRows(
             np.concatenate([design, bias], axis=1),
@@ -236,11 +250,11 @@ def _factorise_columns(
     total, count = 0.0, 0
     delay, plane = _point_between_nodes(delays, planes)
     for block in blocks:
-        designs = [block.inside(node, planes) for node in delays]
-        check = block.inside(delay, np.array([plane]))[0, :-1]
-        columns = [design[:, :-1].reshape(-1, design.shape[2]) for design in designs]
-        table = np.concatenate([*columns, designs[0][:1, -1], block.target[None], check])
-        total, count = total + table @ table.T, len(check)
+        designs = [block.inside(node, planes)[0] for node in delays]
+        check, target = block.inside(delay, np.array([plane]))
+        columns = [design[:, :-1].reshape(-1, len(target)) for design in designs]
+        table = np.concatenate([*columns, check[0, -1:], target[None], check[0, :-1]])
+        total, count = total + table @ table.T, check.shape[1] - 1
     size = np.sqrt(np.maximum(np.diag(total), 1e-300))
     values, vectors = np.linalg.eigh(total / np.outer(size, size))
     real = values > MIN_SINGULAR_VALUE**2 * values[-1]

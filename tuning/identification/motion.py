@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from tuning.identification.rational import MotionModel
 from tuning.identification.records import CampaignTiming, LoggedRun
 
 TICK_TOLERANCE = 1e-9  # periods; a time this close to a tick is treated as the tick
+MAX_CACHED_BYTES = 3.2e7  # maximum size of the motions that are cached, because fits repeat the same delays
 
 
 class MotionResponse:
@@ -65,16 +67,30 @@ class MotionResponse:
         # Interval k of `start` and `end` begins at tick k + latency - history and lasts one period.
         self.offset = self.history - latency
         self.states = self._advance(timing.command_hold)
+        self._cache: dict[float, tuple[np.ndarray, np.ndarray]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state of a copy, which has an empty cache."""
+        return {**vars(self), "_cache": {}}
 
     def at(self, delay: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the position [m] and velocity [m/s] that a sensor with a delay of `delay` [s] measures.
 
-        Both have the shape (rows, lanes).
+        Both are read-only and have the shape (rows, lanes).
         """
+        if delay in self._cache:
+            return self._cache[delay]
         if self.late is None:
-            return self._at(delay, slice(None))
-        lanes = [self._at(delay + late, slice(i, i + 1)) for i, late in enumerate(self.late)]
-        return np.hstack([x for x, _ in lanes]), np.hstack([v for _, v in lanes])
+            position, velocity = self._at(delay, slice(None))
+        else:
+            lanes = [self._at(delay + late, slice(i, i + 1)) for i, late in enumerate(self.late)]
+            position, velocity = np.hstack([x for x, _ in lanes]), np.hstack([v for _, v in lanes])
+        position.flags.writeable = velocity.flags.writeable = False
+        if (len(self._cache) + 1) * 2 * position.nbytes > MAX_CACHED_BYTES and self._cache:
+            del self._cache[next(iter(self._cache))]
+        if 2 * position.nbytes <= MAX_CACHED_BYTES:
+            self._cache[delay] = position, velocity
+        return position, velocity
 
     def _at(self, delay: float, lanes: slice) -> tuple[np.ndarray, np.ndarray]:
         lag = (self.delay + delay) / self.period + self.shift
@@ -84,7 +100,7 @@ class MotionResponse:
         if first < 0:
             raise ValueError(f"delay: found {delay:g} s, expected at most `longest`")
         taken = slice(first, first + self.rows)
-        start, end, states = self.start[taken, lanes], self.end[taken, lanes], self.states[taken, :, lanes]
+        start, end, states = self.start[taken, lanes], self.end[taken, lanes], self.states[:, taken, lanes]
         state, from_start, from_end = self._after(fraction)
         position = np.concatenate([self.C @ state, [self.C @ from_start, self.C @ from_end]])
         rate = np.concatenate(
@@ -95,11 +111,8 @@ class MotionResponse:
         else:
             rate[-2] += (self.C @ self.B) * (1.0 - fraction)
             rate[-1] += (self.C @ self.B) * fraction
-        x, v = (
-            np.einsum("i,nil->nl", row[: self.order], states) + row[-2] * start + row[-1] * end
-            for row in (position, rate / self.period)
-        )
-        return x, v
+        terms = (*states, start, end)
+        return _sum_weighted(position, terms), _sum_weighted(rate / self.period, terms)
 
     def at_row_times(self) -> MotionResponse:
         """Return the motion at the times of the rows, which may differ from those of the force readings."""
@@ -132,7 +145,7 @@ class MotionResponse:
                 step = 0.0
             before = x[0] + step * np.arange(-self.history, 0)
             lanes.append(np.concatenate([before, x, np.full(self.rows - len(x) + ahead, x[-1])]))
-        return np.array(lanes).T
+        return np.ascontiguousarray(np.array(lanes).T)
 
     def _after(self, fraction: float):
         """Return the three matrices that advance the state by a fraction of a period.
@@ -146,12 +159,12 @@ class MotionResponse:
         return full[:, :n], full[:, n] - full[:, n + 1], full[:, n + 1]
 
     def _advance(self, hold: str) -> np.ndarray:
-        """Return the states at the start of every interval, shape (intervals + 1, order, lanes)."""
+        """Return the states at the start of every interval, shape (order, intervals + 1, lanes)."""
         state, from_start, from_end = self._after(1.0)
         lanes = self.end.shape[1]
         states = np.empty((len(self.end) + 1, self.order, lanes))
         if not self.order:
-            return states
+            return states.swapaxes(0, 1)
         drive = from_start[:, None] * self.start[:, None] + from_end[:, None] * self.end[:, None]
         closed = np.eye(self.order) - state
         from_both = from_start + from_end
@@ -164,7 +177,16 @@ class MotionResponse:
         states[0] = np.linalg.solve(closed, np.outer(from_both, now) + np.outer(ahead, step) - beta)
         for n in range(len(self.end)):
             states[n + 1] = state @ states[n] + drive[n]
-        return states
+        return np.ascontiguousarray(states.swapaxes(0, 1))
+
+
+def _sum_weighted(weights: np.ndarray, terms: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the weighted sum of arrays of the same shape."""
+    total = weights[0] * terms[0]
+    product = np.empty_like(total)
+    for weight, term in zip(weights[1:], terms[1:], strict=True):
+        total += np.multiply(weight, term, out=product)
+    return total
 
 
 def _make_companion_form(numerator: np.ndarray, denominator: np.ndarray, period: float):
@@ -191,9 +213,10 @@ def compute_matrix_exponential(matrix: np.ndarray) -> np.ndarray:
     For hundreds of small matrices, it is faster than SciPy's routine, which must choose a method first.
     """
     halvings = max(6, int(np.ceil(np.log2(np.abs(matrix).sum(axis=0).max(initial=1.0)))))
-    scaled, total = matrix / 2.0**halvings, np.eye(len(matrix))
+    identity = np.eye(len(matrix))
+    scaled, total = matrix / 2.0**halvings, identity
     for term in range(13, 0, -1):
-        total = np.eye(len(matrix)) + scaled @ total / term
+        total = identity + scaled @ total / term
     for _ in range(halvings):
         total = total @ total
     return total

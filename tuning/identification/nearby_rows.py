@@ -6,9 +6,10 @@ import numpy as np
 
 
 class NearbyRows(NamedTuple):
-    """Rows that are in contact for at least one of several surface positions."""
+    """Rows near contact for several surface positions, at one time."""
 
-    rows: np.ndarray  # (rows,), indices of the rows
+    rows: np.ndarray  # (rows,), flat indices into an array (rows, lanes); -1 after the end of a lane
+    position: np.ndarray  # m, (rows,), position of the mechanism
     depth: np.ndarray  # m, (surface positions, rows), penetration; 0 out of contact
     rate: np.ndarray  # m/s, (rows,), rate of the penetration
     columns: np.ndarray  # (surface positions, coefficients, rows), regressors of the law, without the bias

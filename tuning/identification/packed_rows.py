@@ -6,43 +6,23 @@ the filters decay. The filtered values of a lane therefore do not depend on othe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
-
 import numpy as np
 
 
-class PackedRows(NamedTuple):
-    """Rows of several lanes in a single sequence, one lane after the other."""
-
-    rows: np.ndarray  # flat index into an array (rows, lanes) for each element; -1 after the end of a lane
-    starts: np.ndarray  # (lanes,), index in the sequence that row 0 of each lane has, or would have
-
-    def places(self, rows: np.ndarray) -> np.ndarray:
-        """Convert flat indices into an array (rows, lanes) to indices in the sequence."""
-        row, lane = np.divmod(rows, len(self.starts))
-        return self.starts[lane] + row
-
-
-def pack_rows(near: Sequence[np.ndarray], shape: tuple[int, int], memory: int) -> PackedRows:
-    """Build the sequence of rows near contact.
+def pack_rows(inside: np.ndarray, memory: int) -> np.ndarray:
+    """Build the sequence of rows near contact, one lane after the other.
 
     Args:
-        near: Arrays of rows near contact; each contains sorted flat indices into an array (rows, lanes).
-        shape: Numbers of rows and lanes.
+        inside: Flags of the rows in contact, shape (rows, lanes).
         memory: Number of rows until the response of the filters has decayed.
+
+    Returns:
+        Flat index into an array (rows, lanes) for each element, or -1 after the end of a lane.
     """
-    length, lanes = shape
-    first, last = np.full(lanes, length), np.full(lanes, -1)
-    for rows in near:
-        row, lane = np.divmod(rows, lanes)
-        # If an index occurs several times, NumPy keeps the value that was assigned last.
-        lasting, beginning = last.copy(), first.copy()
-        lasting[lane], beginning[lane[::-1]] = row, row[::-1]
-        first, last = np.minimum(first, beginning), np.maximum(last, lasting)
-    counts = np.where(last >= 0, last - first + 1 + memory, 0)
-    begins = np.cumsum(counts) - counts
-    starts = begins - first
+    length, lanes = inside.shape
+    by_lane = np.ascontiguousarray(inside.T)
+    first, last = np.argmax(by_lane, axis=1), length - 1 - np.argmax(by_lane[:, ::-1], axis=1)
+    counts = np.where(by_lane.any(axis=1), last - first + 1 + memory, 0)
     lane = np.repeat(np.arange(lanes), counts)
-    row = np.arange(len(lane)) - starts[lane]
-    return PackedRows(np.where(row < length, row * lanes + lane, -1), starts)
+    row = np.arange(len(lane)) - (np.cumsum(counts) - counts - first)[lane]
+    return np.where(row < length, row * lanes + lane, -1)

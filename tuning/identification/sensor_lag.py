@@ -66,7 +66,7 @@ def estimate_sensor_lag(problem: ContactProblem, posterior: Posterior, seed: int
     def at(value: float) -> tuple[ContactProblem, CoarseFit]:
         if value not in fits:
             start = (max(delay - value, problem.min_delay), plane, inner.misfit)
-            lagging = problem.changed(problem.law, value)
+            lagging = problem.changed(problem.law, value, start[0])
             fits[value] = lagging, search_coarsely(lagging, start, 2)
         return fits[value]
 
