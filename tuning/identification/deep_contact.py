@@ -93,7 +93,7 @@ class SummarisedProblem(ContactProblem):
         self.deep, self.delay = deep, delay
         lanes = np.flatnonzero(~deep)
         self.others = ContactProblem(
-            motion.of(lanes), readings.select_lanes(lanes), law, problem.plane, problem.time_constant
+            motion.of(lanes, 0, 0.0), readings.select_lanes(lanes), law, problem.plane, problem.time_constant
         )
         self.blocks = _split_into_blocks(problem, np.flatnonzero(deep))
         self.tables: list[_DesignTable] = []
@@ -229,7 +229,7 @@ def _split_into_blocks(problem: ContactProblem, lanes: np.ndarray) -> list[Conta
     parts = np.array_split(lanes, -(-len(lanes) // LANES_PER_BLOCK))
     return [
         ContactProblem(
-            problem.motion.of(part, begin),
+            problem.motion.of(part, begin, 0.0),
             problem.readings.select_lanes(part, begin),
             problem.law,
             problem.plane,

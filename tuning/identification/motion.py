@@ -20,7 +20,8 @@ from tuning.identification.rational import MotionModel
 from tuning.identification.records import CampaignTiming, LoggedRun
 
 TICK_TOLERANCE = 1e-9  # periods; a time this close to a tick is treated as the tick
-MAX_CACHED_BYTES = 3.2e7  # maximum size of the motions that are cached, because fits repeat the same delays
+# Maximum size of the cached motions (fits of several laws repeat the same delays), and minimum number.
+MAX_CACHED_BYTES, MIN_CACHED_MOTIONS = 3.2e7, 2
 
 
 class MotionResponse:
@@ -67,6 +68,7 @@ class MotionResponse:
         # Interval k of `start` and `end` begins at tick k + latency - history and lasts one period.
         self.offset = self.history - latency
         self.states = self._advance(timing.command_hold)
+        self.max_cached_bytes = MAX_CACHED_BYTES
         self._cache: dict[float, tuple[np.ndarray, np.ndarray]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -86,10 +88,10 @@ class MotionResponse:
             lanes = [self._at(delay + late, slice(i, i + 1)) for i, late in enumerate(self.late)]
             position, velocity = np.hstack([x for x, _ in lanes]), np.hstack([v for _, v in lanes])
         position.flags.writeable = velocity.flags.writeable = False
-        if (len(self._cache) + 1) * 2 * position.nbytes > MAX_CACHED_BYTES and self._cache:
+        size = 2 * position.nbytes * (len(self._cache) + 1)
+        if len(self._cache) >= MIN_CACHED_MOTIONS and size > self.max_cached_bytes:
             del self._cache[next(iter(self._cache))]
-        if 2 * position.nbytes <= MAX_CACHED_BYTES:
-            self._cache[delay] = position, velocity
+        self._cache[delay] = position, velocity
         return position, velocity
 
     def _at(self, delay: float, lanes: slice) -> tuple[np.ndarray, np.ndarray]:
@@ -120,9 +122,12 @@ class MotionResponse:
         rows.late = None
         return rows
 
-    def of(self, lanes: np.ndarray, begin: int = 0) -> MotionResponse:
+    def of(
+        self, lanes: np.ndarray, begin: int = 0, max_cached_bytes: float = MAX_CACHED_BYTES
+    ) -> MotionResponse:
         """Return the motion of the given lanes, which may repeat, from row `begin` on."""
         result = copy(self)
+        result.max_cached_bytes = max_cached_bytes
         result.offset, result.rows = self.offset + begin, self.rows - begin
         result.start, result.end = self.start[:, lanes], self.end[:, lanes]
         result.states = self.states[:, :, lanes]
