@@ -106,6 +106,9 @@ class ControllerInC:
     def pose_command(self, *vectors):
         return self._vector(self._library.jaxhil_pose_command, vectors)
 
+    def from_sensor(self, *vectors):
+        return self._vector(self._library.jaxhil_from_sensor, vectors)
+
     def tare(self, wrench):
         return self._library.jaxhil_tare(self._state, pointer(np.array(wrench, float)))
 

@@ -156,8 +156,9 @@ class Axis:
 def on_the_rig(case, ticks, controller=None, leads=0.0):
     """Return the states of the numerical model's bodies after the given number of ticks.
 
-    A controller's `step(wrench, pose, twist, measured)` changes the wrench, and its
-    `pose_command(pose, twist)` the command; `leads` are the times by which it leads the coordinates before
+    A controller's `from_sensor(reading, measured)` converts the sensor's reading, its
+    `step(wrench, pose, twist, measured)` changes the wrench, and its `pose_command(pose, twist)` changes the
+    command. `leads` are the times by which the controller leads the coordinates before
     the first tick.
     """
     bodies, period = case["start"], case["period"]
@@ -178,11 +179,15 @@ def on_the_rig(case, ticks, controller=None, leads=0.0):
         theta, slopes = x[3:], jacobian(x[3:])
         rotation, w = Rotation.from_rotvec(theta).as_matrix(), slopes @ rate[3:]
         force, moment = wrench(case, x[:3], rotation, rate[:3], w)
+        measured, *_ = seen(tick * period, case["position_delay"])
         if case["tool"] is not None:
-            measured, *_ = seen(tick * period, case["position_delay"])
-            force, moment = sensor_reading(case, x, rotation, w, rate, bend, force, moment, measured)
+            reading = sensor_reading(case, x, rotation, w, rate, bend, force, moment)
+            if controller is None:
+                force, moment = without_tool(case, reading, measured)
+            else:
+                converted = controller.from_sensor(np.concatenate(reading).tolist(), measured.tolist())
+                force, moment = converted[:3], converted[3:]
         if controller is not None:
-            measured, *_ = seen(tick * period, case["position_delay"])
             result = controller.step(
                 [*force, *moment], *coordinates_and_twist(case, bodies), measured.tolist()
             )
@@ -202,8 +207,8 @@ def coordinates_and_twist(case, bodies):
     return command(case, bodies)[0].tolist(), [*v.tolist(), *w.tolist()]
 
 
-def sensor_reading(case, x, rotation, w, rate, bend, force, moment, measured):
-    """Return the reading of a sensor that carries the tool, after tool compensation."""
+def sensor_reading(case, x, rotation, w, rate, bend, force, moment):
+    """Return the reading of a sensor that carries the tool, in C axes and about C's origin."""
     mass, centre, inertia = case["tool"]
     step = 1e-6
     ahead, behind = (
@@ -215,7 +220,11 @@ def sensor_reading(case, x, rotation, w, rate, bend, force, moment, measured):
     pull = mass * (case["gravity"] - acceleration)
     j = rotation @ inertia @ rotation.T
     at_flange = moment - np.cross(x[:3], force) + np.cross(arm, pull) - j @ alpha - np.cross(w, j @ w)
-    reading = rotation.T @ (force + pull), rotation.T @ at_flange
+    return rotation.T @ (force + pull), rotation.T @ at_flange
+
+
+def without_tool(case, reading, measured):
+    """Return the wrench of a reading after tool compensation, about T's origin and in T axes."""
     attitude = Rotation.from_rotvec(measured[3:]).as_matrix()
     mass, centre = case["assumed"]
     weight = mass * case["gravity"]

@@ -35,7 +35,8 @@ class Records(NamedTuple):
     def on_the_rig(self, lane: int) -> ModelConstants:
         known = self.constants
         matrices = (known.mass_matrix, known.inverse_mass, known.tool_correction)
-        return ModelConstants(*(matrix[..., lane].tolist() for matrix in matrices), self.longest_delay)
+        lists = (matrix[..., lane].tolist() for matrix in matrices)
+        return ModelConstants(*lists, self.longest_delay, 1.0, [0.0] * 6)
 
 
 def recorded(mechanism, compensator, lanes, seed=1, changes=None):

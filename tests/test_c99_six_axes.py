@@ -6,10 +6,12 @@ import subprocess
 import c99_cases
 import numpy as np
 import pytest
+from c99_cases import same_bits
 from gain_documents import sign
 from six_axis_c99 import (
     DRIVER,
     RESULT,
+    ControllerInC,
     assert_same,
     built,
     drawn_rows,
@@ -24,6 +26,7 @@ from six_axis_records import recorded
 
 from jaxhil.laws import built_in_compensators
 from jaxhil.mechanism.file import load_any
+from jaxhil.rig import Controller6
 from jaxhil.rig.faults import UNUSABLE, fault_names
 from jaxhil.rig.six_axes.faults import SIX_AXIS_FAULTS
 from jaxhil.rig.six_axes.limits import SIX_AXIS_LIMITS
@@ -71,9 +74,12 @@ def test_unusable_constants_are_rejected():
     made.library.driver_exported(pointer(parameters))
     first = 1 + len(document["gains"])
     second = first + len(SIX_AXIS_LIMITS)
-    parts = np.split(parameters[: second + 109], [first, second])
+    parts = np.split(parameters[: second + 116], [first, second])
     assert made.library.driver_init_with(made.state, *(pointer(part) for part in parts))
-    for index, value in ((0, np.nan), (40, np.inf), (80, 1e10), (108, -1.0), (108, 0.6), (0, -1.0)):
+    for index, value in (
+        *((0, np.nan), (40, np.inf), (80, 1e10), (108, -1.0), (108, 0.6), (0, -1.0)),
+        *((109, 0.0), (112, np.nan)),
+    ):
         changed = parts[2].copy()
         changed[index] = value
         assert not made.library.driver_init_with(
@@ -87,6 +93,15 @@ def test_unusable_constants_are_rejected():
     limits[list(SIX_AXIS_LIMITS).index("command_lowest_x")] = 0.5
     constants = pointer(parts[2].copy())
     assert not made.library.driver_init_with(made.state, pointer(parts[0].copy()), pointer(limits), constants)
+
+
+def test_c_sensor_conversion_equals_python_conversion_exactly(tmp_path):
+    document, rng = six_axis_document(limits=LIMITS), np.random.default_rng(3)
+    controllers = Controller6.from_dict(document), ControllerInC(document, tmp_path)
+    for size in (0.0, 1e-9, 0.03, 1.0, 4.0, 1e300, np.nan):
+        reading, pose = 100 * rng.standard_normal(6), size * rng.standard_normal(6)
+        values = [controller.from_sensor(reading, pose) for controller in controllers]
+        assert same_bits(*map(np.array, values)).all()
 
 
 @pytest.mark.parametrize("wide", [False, True], ids=["limited", "wide"])

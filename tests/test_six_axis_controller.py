@@ -11,6 +11,7 @@ import pytest
 from gain_documents import sign
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from six_axis_documents import LIMITS, six_axis_document
 from six_axis_ranges import NOISE, POSE_NOISE
 from six_axis_records import recorded
@@ -124,6 +125,8 @@ def test_changing_an_output_list_does_not_change_the_controller():
         (lambda d: d["constants"]["tool_correction"][0].__setitem__(5, 1.0), "tool_correction"),
         (lambda d: d["constants"].update(more=1), "an extra key 'more'"),
         (lambda d: d["constants"].update(longest_delay=5.0), "constants.longest_delay"),
+        (lambda d: d["constants"].update(sensor_sign=0.5), "constants.sensor_sign"),
+        (lambda d: d["constants"]["tool_load"].pop(), "constants.tool_load"),
         (lambda d: d["limits"].update(stroke={"value": 1.0, "unit": "m"}), "an unknown limit"),
         (lambda d: d["limits"]["force_range"].update(unit="N m"), "limits.force_range.unit"),
         (lambda d: d["limits"]["command_lowest_x"].update(value=0.41), "is not below"),
@@ -200,6 +203,29 @@ def test_delay_longer_than_delay_line_is_rejected():
     document["gains"]["identification_delay"]["upper"] = 1.0
     with pytest.raises(GainFileError, match="periods"):
         Controller6.from_dict(sign(document))
+
+
+# Force sensor
+
+
+def test_sensor_reading_becomes_wrench_about_target():
+    """Compare a reading of a known contact and tool with the contact's wrench, with SciPy's rotations."""
+    rng, tool = np.random.default_rng(4), load_any("probe-drogue").mechanism.rig.force_sensor.tool
+    weight, rig = tool.mass * np.array([0.0, 0.0, -9.80665]), controller()
+    for angle in (0.0, 1e-9, 0.03, 1.0, 3.0):
+        pose, force, moment = rng.normal(size=6), *(100 * rng.normal(size=(2, 3)))
+        pose[3:] *= angle / np.linalg.norm(pose[3:])
+        turn = Rotation.from_rotvec(pose[3:])
+        at_chaser = moment - np.cross(pose[:3], force) + np.cross(turn.apply(tool.com), weight)
+        reading = np.concatenate(turn.inv().apply([force + weight, at_chaser]))
+        wrench = rig.from_sensor(reading, pose)
+        np.testing.assert_allclose(wrench, [*force, *moment], rtol=0, atol=1e-10)
+    assert all(map(math.isnan, rig.from_sensor([1.0] * 5, pose)))
+
+
+def test_sensor_on_fixed_side_reads_the_reaction():
+    rig = Controller6.from_dict(six_axis_document("none", "ring-capture"))
+    assert rig.from_sensor([1.0, -2.0, 3.0, -4.0, 5.0, -6.0], START) == [-1.0, 2.0, -3.0, 4.0, -5.0, 6.0]
 
 
 # Guards

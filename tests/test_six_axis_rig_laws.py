@@ -158,7 +158,7 @@ def random_constants(rng):
     tool = np.diag([12.0, 12.0, 12.0, 0.3, 0.3, 0.3]) * rng.uniform(0, 1)
     correction = np.linalg.inv(np.eye(6) - tool @ np.linalg.inv(mass))
     matrices = (mass.tolist(), np.linalg.inv(mass).tolist(), correction.tolist())
-    return ModelConstants(*matrices, (RING - 2) * 1e-3)
+    return ModelConstants(*matrices, (RING - 2) * 1e-3, 1.0, [0.0] * 6)
 
 
 @pytest.mark.parametrize("runs", [4, pytest.param(200, marks=pytest.mark.slow)])

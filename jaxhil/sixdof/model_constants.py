@@ -11,6 +11,7 @@ from jaxhil.rig.six_axes.registry import ModelConstants
 from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.sixdof.building import build_scenarios, make_loop
 from jaxhil.sixdof.controller_record import known_constants
+from jaxhil.sixdof.vectors import components
 
 
 def model_constants(mechanism: SixAxisMechanism) -> dict[str, Any]:
@@ -24,5 +25,10 @@ def model_constants(mechanism: SixAxisMechanism) -> dict[str, Any]:
         np.asarray(matrix)[..., 0].tolist()
         for matrix in (constants.mass_matrix, constants.inverse_mass, constants.tool_correction)
     )
+    sign, tool = (1.0, scenario.sensor.assumed_tool) if loop.side == "moving" else (-1.0, None)
+    load = np.zeros(6)
+    if tool is not None:
+        weight = tool.mass[None] * components(scenario.sensor.assumed_gravity)
+        load = np.concatenate([weight, components(tool.centre)])[:, 0]
     delay = min(loop.controller_ring - 2.0, MAX_RECALL) * mechanism.rig.control_period
-    return ModelConstants(mass, inverse, correction, delay)._asdict()
+    return ModelConstants(mass, inverse, correction, delay, sign, load.tolist())._asdict()

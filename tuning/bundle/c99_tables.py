@@ -127,6 +127,7 @@ def constants_check() -> str:
     return (
         "static bool jaxhil_constants_fit(const jaxhil_constants *constants) {\n"
         "    bool fit = constants->longest_delay >= 0.0 && isfinite(constants->longest_delay);\n"
+        "    fit = fit && fabs(constants->sensor_sign) == 1.0;\n"
         "    for (int i = 0; i < 6; i++) {\n"
         "        for (int j = 0; j < 6; j++) {\n"
         + "".join(
@@ -135,6 +136,7 @@ def constants_check() -> str:
             for name in ("mass_matrix", "inverse_mass", "tool_correction")
         )
         + "        }\n"
+        f"        fit = fit && constants->tool_load[i] >= {lowest} && constants->tool_load[i] <= {highest};\n"
         "        fit = fit && constants->mass_matrix[i][i] > 0.0 && constants->inverse_mass[i][i] > 0.0;\n"
         "    }\n"
         "    return fit;\n"
@@ -164,11 +166,17 @@ def _model_constants(constants: Any) -> str:
     for name, value in constants._asdict().items():
         if isinstance(value, float):
             lines.append(f"    {format_double(value)}, /* {name} */\n")
-            continue
-        rows = (", ".join(format_double(entry) for entry in row) for row in value)
-        joined = ",\n".join(f"        {{{row}}}" for row in rows)
-        lines.append(f"    /* {name} */\n    {{\n{joined}\n    }},\n")
+        elif isinstance(value[0], float):
+            lines.append(f"    {{{_row(value)}}}, /* {name} */\n")
+        else:
+            joined = ",\n".join(f"        {{{_row(row)}}}" for row in value)
+            lines.append(f"    /* {name} */\n    {{\n{joined}\n    }},\n")
     return f"static const jaxhil_constants jaxhil_exported_constants = {{\n{''.join(lines)}}};\n"
+
+
+def _row(values: Sequence[float]) -> str:
+    """Return C literals, separated by commas."""
+    return ", ".join(format_double(value) for value in values)
 
 
 def _initialisers(values: Mapping[str, float], units: Mapping[str, str]) -> str:

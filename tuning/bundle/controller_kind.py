@@ -82,6 +82,7 @@ SIX_AXES = ControllerKind(
     order=SIX_AXIS_ORDER,
     faults=SIX_AXIS_FAULTS,
     methods={
+        "_convert": "from_sensor",
         "_take": "tare",
         "_step": "step",
         "_pose_command": "pose_command",

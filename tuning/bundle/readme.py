@@ -51,6 +51,7 @@ def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
         period=repr(document["control_period"]),
         digest=document["sha256"],
         content="\n".join(("| file | content |", "|---|---|", *table_rows)),
+        side="moving" if document.get("constants", {}).get("sensor_sign") == 1.0 else "fixed",
         statuses=status_table(),
         faults=fault_table(kind.faults),
         outermost=f"forces to {FORCES[1]:g} N, positions to {POSITIONS[1]:g} m either way, position commands "

@@ -21,6 +21,7 @@ from jaxhil.rig.six_axes.gain_file import SixAxisGainFile, check_six_axis_docume
 from jaxhil.rig.six_axes.inputs import SixAxisInputGuard, WrenchTare
 from jaxhil.rig.six_axes.outputs import PoseGuard, WrenchGuard
 from jaxhil.rig.six_axes.registry import SIX_AXIS_COMPENSATORS, ModelConstants, SixAxisCompensator
+from jaxhil.rig.six_axes.sensor import SensorReader
 from jaxhil.rig.six_axes.vectors import AXES, Vector, coordinate_rates, is_finite
 from jaxhil.rig.six_axes.watchdog import SixAxisWatchdog
 from jaxhil.rig.types import Limits, Positive
@@ -39,8 +40,8 @@ class Controller6(ControllerBase):
     """
 
     __slots__ = (
-        "_clock", "_command", "_detail", "_forces", "_inputs", "_law", "_period", "_poses", "_sent",
-        "_stopped", "_tare", "_watchdog", "cause", "faults", "seen",
+        "_clock", "_command", "_detail", "_forces", "_inputs", "_law", "_period", "_poses", "_sensor",
+        "_sent", "_stopped", "_tare", "_watchdog", "cause", "faults", "seen",
     )  # fmt: skip
     fault_table = SIX_AXIS_FAULTS
     _check = staticmethod(check_six_axis_document)
@@ -65,6 +66,7 @@ class Controller6(ControllerBase):
         """Create the checks of tick times, inputs, contacts and outputs, and reset the controller."""
         self._period = period
         self._clock = Clock(limits, period)
+        self._sensor = SensorReader(constants)
         self._tare = WrenchTare(limits)
         self._inputs = SixAxisInputGuard(limits)
         self._watchdog = SixAxisWatchdog(limits, constants, period, self._law.status != UNSTATED)
@@ -106,6 +108,29 @@ class Controller6(ControllerBase):
         """Return momentum error, energy gain and unpaid impulse of the last audited contact [1]."""
         watchdog = self._watchdog
         return watchdog.momentum_error, watchdog.energy_gain, watchdog.unpaid_impulse
+
+    def from_sensor(self, reading: Sequence[float], pose: Sequence[float]) -> Vector:
+        """Convert a reading of the force sensor to the wrench that `step` and `tare` expect.
+
+        A sensor on the moving side (section 5 of notebooks/guide/six_axes.md) has the axes and origin of C;
+        the result does not contain the weight of its tool. A sensor on the fixed side has those of T.
+
+        Args:
+            reading: reading of the sensor, about the origin of its frame [N, N m].
+            pose: measured pose of C relative to T [m, rad].
+
+        Returns:
+            Wrench on the chaser about T's origin, in T axes [N, N m]; NaN if an argument is not six numbers.
+        """
+        return self._convert(as_vector(reading), as_vector(pose))
+
+    def _convert(self, reading: Vector, pose: Vector) -> Vector:
+        """Convert a reading of the force sensor to the wrench that `step` and `tare` expect.
+
+        The reading [N, N m] is about the origin of the sensor's frame; the pose [m, rad] is the measured pose
+        of C relative to T.
+        """
+        return self._sensor.convert(reading, pose)
 
     def tare(self, wrench: Sequence[float]) -> bool:
         """Add one wrench reading out of contact to the tare; return True when the tare has ended.

@@ -71,11 +71,15 @@ def _constants(document: Mapping[str, Any], source: str) -> ModelConstants:
             allowed = ", ".join(ModelConstants._fields)
             raise make_gain_file_error(source, "constants", f"an extra key {format_value(name)}", allowed)
     mass, inverse, correction = (_matrix(entries, name, source) for name in MATRICES)
-    delay = read_number(
-        read_entry(entries, "longest_delay", source, "constants."), "constants.longest_delay", source
+    delay, sign = (
+        read_number(read_entry(entries, name, source, "constants."), f"constants.{name}", source)
+        for name in ("longest_delay", "sensor_sign")
     )
     check_within(delay, *TIMES, "constants.longest_delay", source)
-    constants = ModelConstants(mass, inverse, correction, delay)
+    if abs(sign) != 1.0:
+        raise make_gain_file_error(source, "constants.sensor_sign", format_value(sign), "1 or -1")
+    load = _vector(read_entry(entries, "tool_load", source, "constants."), "constants.tool_load", source)
+    constants = ModelConstants(mass, inverse, correction, delay, sign, load)
     if not _is_positive_definite(mass):
         allowed = "a symmetric, positive definite matrix"
         raise make_gain_file_error(source, "constants.mass_matrix", "another matrix", allowed)
@@ -93,11 +97,17 @@ def _matrix(entries: Mapping[str, Any], name: str, source: str) -> list[list[flo
     is_square = isinstance(rows, (list, tuple)) and len(rows) == AXES
     if not is_square or not all(isinstance(row, (list, tuple)) and len(row) == AXES for row in rows):
         raise make_gain_file_error(source, key, format_value(rows), f"{AXES} rows of {AXES} numbers")
-    matrix = [[read_number(entry, key, source) for entry in row] for row in rows]
-    for row in matrix:
-        for entry in row:
-            check_within(entry, *MATRIX_ENTRIES, key, source)
-    return matrix
+    return [_vector(row, key, source) for row in rows]
+
+
+def _vector(entries: Any, key: str, source: str) -> list[float]:
+    """Check and return a list of six numbers."""
+    if not isinstance(entries, (list, tuple)) or len(entries) != AXES:
+        raise make_gain_file_error(source, key, format_value(entries), f"{AXES} numbers")
+    vector = [read_number(entry, key, source) for entry in entries]
+    for entry in vector:
+        check_within(entry, *MATRIX_ENTRIES, key, source)
+    return vector
 
 
 def _is_positive_definite(matrix: list[list[float]]) -> bool:

@@ -21,6 +21,9 @@ class ModelConstants(NamedTuple):
     # (1 - M_t M^-1)^-1, converts a reading to the contact's wrench, about C's origin; identity without a tool
     tool_correction: Matrix
     longest_delay: float  # upper bound of the loop's delay [s]
+    sensor_sign: float  # 1 for a force sensor that carries the tool, -1 for one on the target's side
+    # weight of the tool on the force sensor, in T axes [N], and its centre of mass, in C axes [m]; or zeros
+    tool_load: Vector
 
 
 class SixAxisCompensator(Protocol):

@@ -4,7 +4,7 @@ All are in the axes of target frame T (notebooks/guide/six_axes.md, section 1). 
 their terms. C is the frame of the chaser's docking interface.
 """
 
-from math import isfinite, sqrt
+from math import factorial, isfinite, sqrt
 from typing import Annotated
 
 AXES = 6
@@ -16,8 +16,13 @@ COTANGENT = (
     3617 / 10670622842880000, 43867 / 5109094217170944000, 174611 / 802857662698291200000,
 )  # fmt: skip
 LAST_TERM = len(COTANGENT) - 1
+# sin t/t and (1 - cos t)/t^2 as power series of t^2
+SINE = tuple((-1) ** k / factorial(2 * k + 1) for k in range(15))
+COSINE = tuple((-1) ** k / factorial(2 * k + 2) for k in range(15))
+LAST_SINE_TERM = len(SINE) - 1
 MAX_SQUARED_ANGLE = 10.0  # rad^2; larger arguments of the series are clamped; rotation vectors end at pi^2
 
+Triple = Annotated[list[float], 3]
 Vector = Annotated[list[float], AXES]
 Matrix = Annotated[list[list[float]], AXES, AXES]
 
@@ -67,6 +72,36 @@ def wrench_at_target(wrench: Vector, pose: Vector) -> Vector:
     fx, fy, fz, mx, my, mz = wrench
     x, y, z = pose[:3]
     return [fx, fy, fz, mx + (y * fz - z * fy), my + (z * fx - x * fz), mz + (x * fy - y * fx)]
+
+
+def cross(left: Triple, right: Triple) -> Triple:
+    """Return the vector product."""
+    a, b, c = left
+    x, y, z = right
+    return [b * z - c * y, c * x - a * z, a * y - b * x]
+
+
+def rotate(pose: Vector, vector: Triple) -> Triple:
+    """Convert a vector from C axes to T axes; `pose` is that of C relative to T.
+
+    R v = v + sin t/t theta x v + (1 - cos t)/t^2 theta x (theta x v), t = |theta|.
+    """
+    _, _, _, a, b, c = pose
+    square = a * a + b * b + c * c
+    if not square < MAX_SQUARED_ANGLE:
+        square = MAX_SQUARED_ANGLE
+    sine, cosine = SINE[LAST_SINE_TERM], COSINE[LAST_SINE_TERM]
+    for index in range(LAST_SINE_TERM - 1, -1, -1):
+        sine = SINE[index] + square * sine
+        cosine = COSINE[index] + square * cosine
+    axis = pose[3:]
+    once = cross(axis, vector)
+    x, y, z = cross(axis, once)
+    return [
+        vector[0] + sine * once[0] + cosine * x,
+        vector[1] + sine * once[1] + cosine * y,
+        vector[2] + sine * once[2] + cosine * z,
+    ]
 
 
 def coordinate_rates(pose: Vector, twist: Vector) -> Vector:
