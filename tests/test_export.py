@@ -371,7 +371,7 @@ def test_each_export_format_writes_its_own_files():
         "ros2": {"ros2.yaml"},
         "matlab": {"gains.mat"},
         "csv": {"gains.csv"},
-        "c99": {f"c99/{file}" for file in C_FILES},
+        "c99": {f"c99/{file}" for file in (*C_FILES, *LOOP_FILES)},
         "fmu": {"fmi3/jaxhil_controller.fmu", "fmi3/jaxhil_rig.fmu"},
         "fmu2": {"fmi2/jaxhil_controller.fmu", "fmi2/jaxhil_rig.fmu"},
     }.items():
@@ -380,3 +380,4 @@ def test_each_export_format_writes_its_own_files():
 
 
 C_FILES = ("jaxhil_controller.h", "jaxhil_controller.c", "jaxhil_gains.h", "test_vectors.c")
+LOOP_FILES = ("rt_loop.h", "rt_loop.c", "rt_plant_udp.c")

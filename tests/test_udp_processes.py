@@ -144,6 +144,7 @@ def test_interrupted_rig_command_reports_measurements_so_far(tmp_path):
         (("GAINS", "--drops", "1"), "--drops: found 1, expected a probability"),
         (("GAINS", "--jitter", "-1"), "--jitter: found -1"),
         (("GAINS", "--delay", "nan"), "--delay: found nan"),
+        (("GAINS", "--connect", "0"), "--connect: found 0, expected an integer >= 1"),
         (("GAINS", "--duration", "0"), "--duration: found 0, expected 0.001 to 2000 s"),
         (("BROKEN",), "sha256"),
     ],

@@ -98,7 +98,7 @@ class FlightRecorder:
             position_measured: position reading [m]; six axes: pose [m, rad].
             time: time of the tick [s]; None for the tick's number times the period.
             command: command that `step` has returned [N]; six axes: wrench [N, N m].
-            faults: bits of the tick's faults.
+            faults: bits of the tick's faults, and of the faults that tripped the controller.
         """
         stamp = self._count * self._period if time is None else time
         values = (force_measured, position_desired, velocity_desired, position_measured, command)
@@ -136,10 +136,11 @@ class FlightRecorder:
                 *values, contact, faults = self._rows[start : start + self._width]
                 file.write(",".join([*map(repr, values), f"{contact:.0f}", f"{faults:.0f}"]) + "\n")
         with log.with_suffix(".toml").open("x", encoding="utf-8", newline="\n") as file:
-            file.write(self.mapping(log.name))
+            # A literal string has no escapes, and file patterns treat brackets as sets.
+            file.write(self.mapping("".join("?" if letter in "'[]*" else letter for letter in log.name)))
 
-    def mapping(self, name: str) -> str:
-        """Return the mapping of the log with this file name, in TOML."""
+    def mapping(self, pattern: str) -> str:
+        """Return the mapping of the logs whose names match a pattern, in TOML."""
         lines = ['schema = "jaxhil/log/1"', "", "[channels]", 'time = "time"']
         for channel, prefix, suffixes in CHANNELS[self._axes]:
             columns = [f'"{prefix}{suffix}"' for suffix in suffixes]
@@ -147,6 +148,4 @@ class FlightRecorder:
         lines += ['contact_index = "contact"', "", "[timing]", f"control_period = {self._period!r}", ""]
         if self._mass is not None:
             lines += ["[bodies]", f"equivalent_mass = {self._mass!r}", ""]
-        # A literal string has no escapes, and file patterns treat brackets as sets.
-        pattern = "".join("?" if character in "'[]*" else character for character in name)
         return "\n".join([*lines, "[[runs]]", f"files = '{pattern}'", 'kind = "contact"', ""])

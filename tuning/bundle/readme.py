@@ -29,7 +29,7 @@ FILE_DESCRIPTIONS = {
     "udp_task.py": "computation of this process's answers",
     "numerical_model.py": "numerical model of the docking for this process",
     "numerical_model_six_axes.py": "numerical model of the docking for this process",
-    "c99": "controller in C99, its gains, and its test program",
+    "c99": "controller in C99, its gains, its test program and, for one axis, a real-time loop",
     "fmi3": "FMUs of FMI 3.0 with sources: the controller and, for one axis, the simulated rig",
     "fmi2": "FMUs of FMI 2.0 with sources: the controller and, for one axis, the simulated rig",
     "ros2.yaml": "gains as ROS 2 parameters",

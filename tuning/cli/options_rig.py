@@ -135,6 +135,14 @@ class RigOptions:
     realtime: Annotated[
         FlagCreatePairsOff[bool], text_option(None, "Request real-time priority for both processes.")
     ] = False
+    connect: Annotated[
+        int | None,
+        text_option(
+            "PORT",
+            "UDP port on this computer of a running controller, such as the bundle's rt_loop; by default the "
+            "bundle's Python controller is started.",
+        ),
+    ] = None
     seed: Annotated[int, number_option("Seed of sensor noise, contact phases and injected faults.")] = 0
     plot: Annotated[
         str | None,

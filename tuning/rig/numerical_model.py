@@ -16,12 +16,13 @@ class NumericalModel:
     Attributes:
         start: default position [m] and velocity v [m/s] at the start of a run. The motion reaches a surface
             after 0.02 s + `approach.phase` T at the earliest (T: control period).
+        mass: equivalent mass of the bodies [kg].
         position: relative position of the bodies [m].
         velocity: relative velocity [m/s].
         acceleration: relative acceleration in the last period [m/s^2].
     """
 
-    __slots__ = ("_integrator", "_mass", "_period", "acceleration", "position", "start", "velocity")
+    __slots__ = ("_integrator", "_period", "acceleration", "mass", "position", "start", "velocity")
 
     def __init__(self, mechanism: dict[str, Any]) -> None:
         bodies, rig, approach = mechanism["bodies"], mechanism["rig"], mechanism["approach"]
@@ -29,7 +30,7 @@ class NumericalModel:
         if mass is None:
             chaser, target = bodies["chaser_mass"], bodies["target_mass"]
             mass = chaser * (target / (chaser + target))
-        self._mass, self._period = float(mass), float(rig["control_period"])
+        self.mass, self._period = float(mass), float(rig["control_period"])
         self._integrator = rig.get("integrator", "semi_implicit_euler")
         velocity = float(approach["velocity"])
         phase = float(approach.get("phase", 1.0 / 3.0))
@@ -44,7 +45,7 @@ class NumericalModel:
     def integrate(self, force: float) -> None:
         """Integrate the motion for one control period, with the force command F_c [N]."""
         period, velocity = self._period, self.velocity
-        acceleration = -force / self._mass
+        acceleration = -force / self.mass
         self.velocity = velocity + period * acceleration
         self.acceleration = acceleration
         if self._integrator == "zoh":

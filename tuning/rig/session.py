@@ -9,6 +9,7 @@ controller's process. After the session, it determines the cause of each missed 
 - in all other cases the machine: the computer ran another process or virtual machine.
 """
 
+import copy
 import json
 import math
 import os
@@ -53,6 +54,18 @@ END_TIMEOUT = 120.0  # longest time until the controller's process ends, includi
 SILENCE_TIMEOUT = 2.0  # time without a packet after which the controller's process ends the session [s]
 
 SOURCE_FOLDER = Path(__file__).parent
+# Record of a controller that this process has not started: it contains no times of ticks.
+RECORD_OF_OTHER_PROGRAM: dict[str, Any] = {
+    "ended": "stopped",
+    "ignored": 0,
+    "status": "unknown",
+    "stale": 0,
+    "made_up": 0,
+    "doubts": {},
+    "jax": False,
+    "ticks": {"sequence": [], "wall": [], "cpu": []},
+    "replayed": {"sequence": [], "cpu": []},
+}
 
 
 class Quantiles(NamedTuple):
@@ -119,6 +132,8 @@ class SessionSettings(NamedTuple):
     injection: Injection  # network faults that are injected into the run
     seed: int  # seed of all random numbers
     priority: bool = False  # whether to request a real-time priority for both processes
+    # UDP port of a running controller, such as the bundle's `rt_loop`; None to start `udp_controller.py`
+    port: int | None = None
 
 
 def run_session(
@@ -143,7 +158,7 @@ def run_session(
     period, empty, run, interrupted = setup.mechanism.rig.control_period, None, None, False
     task = RigTask(rig, period, setup.stroke, resets=not setup.injection.any)
     try:
-        if setup.empty_duration >= period:
+        if setup.port is None and setup.empty_duration >= period:
             say(f"empty loop at {1 / period:g} Hz, {setup.empty_duration:g} s")
             faultless = Injection()
             empty, interrupted = _run_controller_loop(
@@ -180,11 +195,11 @@ def _run_controller_loop(
     options = ["--empty"] * isinstance(task, EmptyTask) + ["--realtime"] * setup.priority
     options += ["--gains", str(setup.gains.resolve()), "--record", str(record), "--ticks", str(ticks)]
     options += ["--silence", str(max(SILENCE_TIMEOUT, 100 * period))]
-    process, interrupted = start_controller(setup.folder, options), False
-    timing = PacketTimes(ticks)
+    process = None if setup.port is not None else start_controller(setup.folder, options)
+    timing, interrupted = PacketTimes(ticks), False
     try:
-        port = read_listening_port(process)
-        network = Network(("127.0.0.1", port), injection, setup.seed, ticks, answered_packet_number)
+        port = setup.port if process is None else read_listening_port(process)
+        network = Network(("127.0.0.1", int(port or 0)), injection, setup.seed, ticks, answered_packet_number)
         session = open_session(network, axes)
         try:
             with real_time_priority(setup.priority):
@@ -197,20 +212,23 @@ def _run_controller_loop(
                 stop = build_empty_reading(axes, STOP, MAX_PACKET_NUMBER)
                 network.send_without_faults(encode_reading(stop, session))
             network.close()
-        process.wait(END_TIMEOUT)
-        document = json.loads(record.read_text(encoding="utf-8"))
+        document = RECORD_OF_OTHER_PROGRAM
+        if process is not None:
+            process.wait(END_TIMEOUT)
+            document = json.loads(record.read_text(encoding="utf-8"))
     except (OSError, subprocess.TimeoutExpired, json.JSONDecodeError) as error:
         reason = to_one_line(str(error), 200)
         raise InputError(
             f"udp_controller.py: the controller's process exited without writing its record ({reason})"
         ) from None
     finally:
-        if process.poll() is None:
-            process.kill()
-            process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
-    return build_loop_report(timing, network, document, period), interrupted
+        if process is not None:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+    return build_loop_report(timing, network, copy.deepcopy(document), period), interrupted
 
 
 @contextmanager

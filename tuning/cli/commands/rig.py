@@ -26,6 +26,8 @@ def run(options: RigOptions) -> int:
     arguments.check_limit(options.limit)
     arguments.check_integers(0, seed=options.seed)
     _check_injection(options)
+    if options.connect is not None:
+        arguments.check_integers(1, 65535, connect=options.connect)
     if options.plot is not None:
         checks.check_plot(options.plot)
     gains = arguments.find_gain_file(options.path)
@@ -65,6 +67,7 @@ def run(options: RigOptions) -> int:
             injection=Injection(options.drops, options.jitter, options.delay),
             seed=options.seed,
             priority=options.realtime,
+            port=options.connect,
         )
         rig = build_simulated_rig(mechanism, options.seed)
         session = run_session(setup, rig, scratch, terminal.note, _LoopProgress(period).tell)

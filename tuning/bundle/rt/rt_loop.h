@@ -1,0 +1,43 @@
+/* Interface between the real-time loop (rt_loop.c) and the plant: sensors and drives with one axis. */
+#ifndef RT_LOOP_H
+#define RT_LOOP_H
+
+#include <signal.h>
+#include <stdbool.h>
+#include <stdint.h>
+
+@constants@
+
+enum { PREPARE = 1, TICK = 2, STOP = 3, RESET = 4 };         /* events, as in udp_protocol.py */
+enum { READY = 1, TRIPPED = 2, TARING = 4 };                 /* bits of `commands.flags` */
+
+typedef struct {
+    int event;             /* PREPARE: the drives wait for the run with this number; TICK: a run goes on */
+    uint32_t run, tick;    /* number of the run, number of the tick in the run */
+    double time;           /* of the tick, from a steady clock [s] */
+    double force, position;                   /* readings [N], [m] */
+    double start_position, start_velocity;    /* of the model at tick 0 [m], [m/s]; NaN for the default */
+    double shift; /* added to the next deadline, to follow the clock of the plant [s]; 0 without one */
+} readings;
+
+typedef struct {
+    unsigned flags;
+    double position, rate;                    /* commands to the drives [m], [m/s] */
+    double model_position, model_velocity;    /* of the model at this tick */
+    double force;                             /* force on the model [N] */
+    uint32_t faults, cause;                   /* bits of the tick's faults, and of those that tripped */
+} commands;
+
+typedef struct {
+    bool (*open)(void *plant);                          /* wait until the plant is ready; false: give up */
+    bool (*read)(void *plant, readings *now);           /* false: there are no readings in this period */
+    bool (*write)(void *plant, const commands *answer); /* false: the plant has not taken the commands */
+    void (*close)(void *plant);                         /* the drives are at rest, or the plant is lost */
+    void *plant;
+} plant_io;
+
+extern const plant_io rt_plant;                                 /* the plant of this program */
+bool rt_plant_option(const char *name, const char *value);      /* whether this is an option of the plant */
+extern volatile sig_atomic_t stop_requested;                    /* not 0 after SIGTERM or SIGINT */
+
+#endif

@@ -1,0 +1,193 @@
+/* Example of a plant: exchange of UDP packets with `jaxhil rig --connect PORT`.
+ *
+ * This is version 3 of the protocol in udp_protocol.py, for little-endian processors. Replace this file with
+ * the four functions of your hardware.
+ */
+#define _POSIX_C_SOURCE 200809L
+#include <arpa/inet.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/select.h>
+#include <sys/socket.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "rt_loop.h"
+
+typedef struct {
+    int socket;
+    struct sockaddr_in peer;
+    bool has_peer, is_open;
+    uint64_t session;
+    uint32_t sequence, run, tick;
+    unsigned char packet[512], answer[176];
+} udp_plant;
+
+static udp_plant the_plant;
+
+static double get_double(const unsigned char *from) {
+    double value;
+    memcpy(&value, from, sizeof value);
+    return value;
+}
+
+static uint32_t get_uint32(const unsigned char *from) {
+    uint32_t value;
+    memcpy(&value, from, sizeof value);
+    return value;
+}
+
+static double seconds_now(void) {
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
+/* Answer a request for a session, or store the readings of a packet of the session; return whether it has any. */
+static bool take_packet(udp_plant *udp, size_t size, const struct sockaddr_in *sender, readings *now) {
+    unsigned char *const packet = udp->packet;
+    const bool is_peer = udp->has_peer && sender->sin_port == udp->peer.sin_port &&
+                         sender->sin_addr.s_addr == udp->peer.sin_addr.s_addr;
+    if (size == 24 && memcmp(packet, "JHas\3", 5) == 0 && (is_peer || !udp->is_open)) {
+        memcpy(packet, "JHop\3\1", 6);
+        memcpy(packet + 16, &udp->session, 8);
+        udp->peer = *sender;
+        udp->has_peer = true;
+        sendto(udp->socket, packet, 24, 0, (const struct sockaddr *)sender, sizeof *sender);
+        return false;
+    }
+    if (!is_peer || size != 72 || memcmp(packet, "JHrd\3", 5) != 0 || packet[6] != 1 ||
+        memcmp(packet + 8, &udp->session, 8) != 0) {
+        return false;
+    }
+    const uint32_t sequence = get_uint32(packet + 16);
+    if (udp->is_open && packet[5] != STOP && (int32_t)(sequence - udp->sequence) <= 0) {
+        return false; /* an old packet */
+    }
+    udp->is_open = true;
+    udp->sequence = sequence;
+    now->event = packet[5];
+    now->run = udp->run = get_uint32(packet + 20);
+    now->tick = udp->tick = get_uint32(packet + 24);
+    now->time = get_double(packet + 32);
+    now->force = get_double(packet + 40);
+    now->position = get_double(packet + 48);
+    now->start_position = get_double(packet + 56);
+    now->start_velocity = get_double(packet + 64);
+    return true;
+}
+
+/* Wait up to `wait` us for readings; return the newest ones. */
+static bool udp_receive(udp_plant *udp, readings *now, long wait) {
+    bool has_readings = false;
+    for (;;) {
+        struct sockaddr_in sender;
+        socklen_t length = sizeof sender;
+        const ssize_t size = recvfrom(udp->socket, udp->packet, sizeof udp->packet, MSG_DONTWAIT,
+                                      (struct sockaddr *)&sender, &length);
+        if (size >= 0) {
+            has_readings = take_packet(udp, (size_t)size, &sender, now) || has_readings;
+            if (has_readings && now->event == STOP) {
+                return true;
+            }
+        } else if (has_readings || wait == 0) {
+            return has_readings;
+        } else {
+            struct timeval timeout = {wait / 1000000, wait % 1000000};
+            fd_set ready;
+            FD_ZERO(&ready);
+            FD_SET(udp->socket, &ready);
+            select(udp->socket + 1, &ready, NULL, NULL, &timeout);
+            wait = 0;
+        }
+    }
+}
+
+static bool udp_open(void *plant) {
+    udp_plant *const udp = (udp_plant *)plant;
+    struct sockaddr_in address = udp->peer; /* with the port of the option --port */
+    socklen_t length = sizeof address;
+    struct timespec now;
+    readings first;
+    address.sin_family = AF_INET;
+    address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    clock_gettime(CLOCK_REALTIME, &now);
+    udp->session = (uint64_t)now.tv_sec * 1000000000u + (uint64_t)now.tv_nsec;
+    udp->socket = socket(AF_INET, SOCK_DGRAM, 0);
+    if (udp->socket < 0 || bind(udp->socket, (struct sockaddr *)&address, sizeof address) != 0 ||
+        getsockname(udp->socket, (struct sockaddr *)&address, &length) != 0) {
+        perror("rt_loop: UDP socket");
+        return false;
+    }
+    printf("port %d\n", ntohs(address.sin_port));
+    fflush(stdout);
+    for (int number = 0; number < 300 && !stop_requested; number++) {
+        if (udp_receive(udp, &first, 100000)) {
+            return true; /* the loop begins in phase with the first packet; its tick is repeated by the rig */
+        }
+    }
+    return false;
+}
+
+/* Wait up to half a period. Shift the loop so that it wakes up shortly before the packet of the rig arrives. */
+static bool udp_read(void *plant, readings *now) {
+    now->shift = -PERIOD / 50.0;
+    if (udp_receive((udp_plant *)plant, now, 0)) {
+        return true;
+    }
+    const double begin = seconds_now();
+    const bool has_readings = udp_receive((udp_plant *)plant, now, (long)(5e5 * PERIOD));
+    now->shift = has_readings ? (seconds_now() - begin - PERIOD / 20.0) / 8.0 : 0.0;
+    return has_readings;
+}
+
+/* Write "tripped: " and the names of the faults, at most 95 characters. */
+static void describe_trip(uint32_t cause, char *text) {
+    static const struct {
+        uint32_t bit;
+        const char *name;
+    } faults[] = {FAULT_NAMES};
+    size_t length = 8;
+    memcpy(text, "tripped:", 8);
+    for (size_t n = 0; n < sizeof faults / sizeof faults[0]; n++) {
+        const size_t size = strlen(faults[n].name);
+        if ((cause & faults[n].bit) && length + size < 95) {
+            text[length] = ' ';
+            memcpy(text + length + 1, faults[n].name, size);
+            length += size + 1;
+        }
+    }
+}
+
+static bool udp_write(void *plant, const commands *answer) {
+    udp_plant *const udp = (udp_plant *)plant;
+    const uint64_t faults = answer->faults;
+    unsigned char *const packet = udp->answer;
+    memset(packet, 0, sizeof udp->answer);
+    memcpy(packet, "JHan\3", 5);
+    packet[5] = (unsigned char)answer->flags;
+    packet[6] = 1;
+    memcpy(packet + 8, &udp->session, 8);
+    memcpy(packet + 16, &udp->sequence, 4);
+    memcpy(packet + 20, &udp->run, 4);
+    memcpy(packet + 24, &udp->tick, 4);
+    const double values[5] = {answer->position, answer->rate, answer->model_position, answer->model_velocity,
+                              answer->force};
+    memcpy(packet + 32, values, sizeof values);
+    memcpy(packet + 72, &faults, 8);
+    if (answer->flags & TRIPPED) {
+        describe_trip(answer->cause, (char *)packet + 80);
+    }
+    return sendto(udp->socket, packet, sizeof udp->answer, 0, (const struct sockaddr *)&udp->peer,
+                  sizeof udp->peer) == (ssize_t)sizeof udp->answer;
+}
+
+static void udp_close(void *plant) { close(((udp_plant *)plant)->socket); }
+
+bool rt_plant_option(const char *name, const char *value) {
+    the_plant.peer.sin_port = htons((uint16_t)strtol(value, NULL, 10));
+    return strcmp(name, "--port") == 0;
+}
+
+const plant_io rt_plant = {udp_open, udp_read, udp_write, udp_close, &the_plant};
