@@ -23,6 +23,7 @@ from tuning.gains.multistart_solver import StartResult
 from tuning.gains.pareto import ParetoFront, ParetoPoint
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tune import TuneResult, compute_error_metrics
+from tuning.plots.one_contact import describe_contact, plot_one_contact
 from tuning.plots.tuning_results import errors_plot, front_plot, loss_plot
 
 LANES = 40
@@ -164,7 +165,7 @@ def test_contact_plot_shows_contacts_side_by_side_with_units():
     force, _, position, _ = figure.axes
     assert "[N]" in force.get_ylabel() and "[mm]" in position.get_ylabel() and "[ms]" in position.get_xlabel()
     # The approach speed is stated for curves on which it differs visibly.
-    assert force.get_title() == "contact 1, entered at 5 mm/s\n(before: 7 mm/s)"
+    assert force.get_title() == "contact 1, approach at 5 mm/s\n(before: 7 mm/s)"
     assert len(figure.legends) == 1
     assert "the first 4 of 6 contacts" in plot_contacts(pieces(6), "title").get_suptitle()
 
@@ -231,3 +232,21 @@ def test_all_plots_use_the_same_colours_and_have_units(path):
                 assert re.fullmatch(r"0\.\d+|white|none", text), text
             elif keyword.arg in ("xlabel", "ylabel"):
                 assert re.search(r"\[.+\]", text) or text in counted, text
+
+
+def test_one_contact_plot_states_restitution_of_each_curve():
+    time = np.array([-0.1, 0.0, 0.1, 0.2, 0.3, 0.4])
+    fast = 1e-3 * np.array([-1.0, 0.0, 1.0, -0.0, -1.5, -3.0])
+    slow = 1e-3 * np.array([-1.0, 0.0, 1.0, 0.1, -0.8, -1.7])
+    curves = {
+        name: Curve(0.01, time, np.zeros(6), position, None, None)
+        for name, position in (("ideal", slow), ("before", fast), ("tuned", slow))
+    }
+    motion = RunMotion("contact 1", (0.0,), curves)
+    figure = plot_one_contact(motion, "rig")
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    assert {"ideal contact: e = 0.90", "before, no compensation: e = 1.50", "after tuning: e = 0.90"} <= {
+        *texts
+    }
+    assert "1.50 times as fast" in describe_contact(motion)
+    assert describe_contact(motion._replace(surfaces=(0.0, -0.01))) is None

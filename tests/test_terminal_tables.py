@@ -20,8 +20,9 @@ def test_terminal_table_shows_every_digit(monkeypatch, capsys, width):
             "suite-damped: each compensator, and a title that is long", heads, [[LAW, *FIGURES]]
         )
     )
-    title, *_, line, _ = capsys.readouterr().out.splitlines()
-    assert title == "suite-damped: each compensator, and a title that is long"
+    *title, _, _, _, line, _ = capsys.readouterr().out.splitlines()
+    words = "suite-damped: each compensator, and a title that is long".split()
+    assert " ".join(title).split()[: len(words)] == words
     assert line.split() == [LAW, *(f"{figure:.4g}" for figure in FIGURES)]
 
 

@@ -35,6 +35,8 @@ def emit(*things: RenderableType, wrap: bool = True) -> None:
         for thing in things:
             console = _make_console(sys.stdout)
             if isinstance(thing, Table):
+                console.print(thing.title or "")  # the table itself would cut a title that is wider
+                thing.title = None
                 console.width = _table_width(thing, console)
             console.print(thing, soft_wrap=not wrap)
         sys.stdout.flush()
@@ -94,9 +96,7 @@ def build_table(
     title: str, headings: Sequence[str], rows: Sequence[Sequence[Any]], texts: Sequence[int] = (0,)
 ) -> Table:
     """Return a table; `texts` holds the indices of the columns that contain text instead of numbers."""
-    # The title is on one line even if the table is narrower.
-    heading = Text(title, style="bold", no_wrap=True, overflow="ignore")
-    result = Table(title=heading, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    result = Table(title=Text(title, style="bold"), box=box.SIMPLE_HEAD, pad_edge=False)
     for number, heading in enumerate(headings):
         is_text = number in texts
         result.add_column(

@@ -45,6 +45,8 @@ CURVE_LABELS = {
     "tuned": "tuned",
     "rig": "on the rig",
 }
+# Widths of a legend entry at the font size of `legend_below` [inches].
+LEGEND_KEY_WIDTH, LEGEND_LETTER_WIDTH = 0.65, 0.075
 MAX_PANELS = 4  # maximum number of contacts in one plot, side by side
 
 
@@ -133,9 +135,10 @@ def finish_axes(axes: Axes, legend: Any) -> None:
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int | None = None) -> None:
-    """Draw the legend of `axes` at the bottom of the figure, by default in one row."""
+    """Draw the legend of `axes` at the bottom of the figure, in one row or, if that is too wide, in two."""
     handles, labels = axes.get_legend_handles_labels()
-    columns = columns or len(labels)
+    needed = sum(LEGEND_KEY_WIDTH + LEGEND_LETTER_WIDTH * len(label) for label in labels)
+    columns = columns or (len(labels) if needed < figure.get_figwidth() else -(-len(labels) // 2))
     figure.legend(handles, labels, loc="lower center", ncols=columns, fontsize=9, frameon=False)
 
 
@@ -162,7 +165,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
 def _panel_title(motion: RunMotion) -> str:
     """Return the title of a contact's panel: name, approach speed, and the speeds of curves that differ."""
     speed = motion.curves["ideal"].velocity
-    text = f"{motion.name}, entered at {1e3 * speed:.3g} mm/s"
+    text = f"{motion.name}, approach at {1e3 * speed:.3g} mm/s"
     for name, curve in motion.curves.items():
         if abs(curve.velocity - speed) > 0.005 * speed:
             text += f"\n({name}: {1e3 * curve.velocity:.3g} mm/s)"

@@ -16,6 +16,8 @@ from tuning.plots.bundle_summary import ERROR_STATISTICS, summary_png
 # Prefixes of those limits that are fitted coefficients of the watchdog's expected restitution.
 FITTED_LIMIT_PREFIXES = ("expected_", "softness_", "speed_", "loss_", "reference_")
 
+RIG_UNITS = {"m": "mm", "m/s": "mm/s", "s": "ms"}  # units of limits in tables, 1000 times smaller
+
 PAGE_STYLE = """
 @page { size: A4; margin: 11mm 12mm; }
 * { box-sizing: border-box; }
@@ -127,7 +129,7 @@ def _error_table(document: Mapping[str, Any], key: str, title: str) -> Iterator[
             "fresh scenarios",
             *ERROR_STATISTICS.values(),
             "mean",
-            "peak force / reference",
+            "peak command / ideal peak force",
             "not ended",
         )
         yield from _html_table(title, heads, rows)
@@ -174,7 +176,7 @@ def _limit_table(document: Mapping[str, Any]) -> Iterator[str]:
         yield "<h2>Limits</h2><p>None in the gain file: the controller's widest limits hold.</p>"
         return
     rows = [
-        (name, _format_number(limit.value, 5), limit.unit)
+        (name, *describe_limit(limit.value, limit.unit))
         for name, limit in limits.items()
         if is_user_limit(name)
     ]
@@ -213,6 +215,13 @@ def _active_limits(document: Mapping[str, Any]) -> dict[str, GainOrLimit]:
     """Return the limits that have a value in the gain document."""
     entries = limit_entries(document)
     return {name: entry for name, entry in entries.items() if document["limits"][name]["value"] is not None}
+
+
+def describe_limit(value: float | None, unit: str) -> tuple[str, str]:
+    """Return a limit as text and its unit, with lengths in mm, speeds in mm/s and times in ms."""
+    if unit not in RIG_UNITS:
+        return _format_number(value), unit
+    return _format_number(None if value is None else 1e3 * value), RIG_UNITS[unit]
 
 
 def is_user_limit(limit: str) -> bool:

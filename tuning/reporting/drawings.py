@@ -18,6 +18,7 @@ from jaxhil.sixdof.run import simulate_six_axes
 from tuning.identification.monitor.metrics import METRICS
 from tuning.plots.identification import plot_estimates
 from tuning.plots.monitor import monitor_plot
+from tuning.plots.one_contact import describe_contact, plot_one_contact
 from tuning.plots.parts import as_svg
 from tuning.plots.scenarios import linked_scenarios
 from tuning.plots.six_axes import six_axes_plot
@@ -60,17 +61,21 @@ class ScenarioPlot(NamedTuple):
     drawing: SvgPlot
 
 
-def draw_nominal_run(subject: LoadedGains) -> SvgPlot:
-    """Draw the nominal run with the gains `subject`, with the literature's gains, and uncompensated."""
+def draw_nominal_run(subject: LoadedGains) -> tuple[SvgPlot | None, SvgPlot]:
+    """Draw one contact, if its e is defined, and the nominal run, with and without compensation."""
     if isinstance(subject.mechanism, SixAxisMechanism):
-        return _draw_six_axis_run(subject)
+        return None, _draw_six_axis_run(subject)
     law = subject.compensator
     laws = {"before": ("none", {}), "literature": (law, literature_gains(subject.mechanism, law))}
     if law == "none":
         laws = {}
     motion = compute_nominal_motion(subject.mechanism, {**laws, "tuned": (law, subject.gains)})
     figure = plot_contacts(motion, f"{subject.mechanism.name}, nominal run: {law}", sensors="tuned")
-    return SvgPlot(as_svg(figure), "Force and position over time of every contact", "The nominal run.")
+    run = SvgPlot(as_svg(figure), "Force and position over time of every contact", "The nominal run.")
+    if (result := describe_contact(motion[0])) is None:
+        return None, run
+    contact = as_svg(plot_one_contact(motion[0], subject.mechanism.name))
+    return SvgPlot(contact, result, "Position of the numerical model in the first nominal contact."), run
 
 
 def _draw_six_axis_run(subject: LoadedGains) -> SvgPlot:

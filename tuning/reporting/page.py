@@ -28,12 +28,13 @@ def build_page(results: Results, say: Callable[[str], None] = lambda _: None) ->
     """Build the HTML page of the results, encoded as UTF-8; `say` is called with the name of each plot."""
     requirements = verdict_sections.collect_requirements(results)
     verdict = verdict_sections.combine_verdicts(requirements)
+    summary, runs = study_sections.run_sections(results, say)
     sections: list[Section | None] = [
         verdict_sections.assumption_section(results),
         rig_sections.identification_section(results),
         rig_sections.monitoring_section(results),
         verdict_sections.gain_section(results),
-        study_sections.run_section(results, say),
+        runs,
         study_sections.error_section(results),
         study_sections.sensitivity_section(results),
         study_sections.comparison_section(results),
@@ -50,6 +51,7 @@ def build_page(results: Results, say: Callable[[str], None] = lambda _: None) ->
         verdict=verdict,
         headline=HEADLINES[verdict],
         requirements=requirements,
+        summary=summary,
         sections=[section for section in sections if section is not None],
         style=Markup(_read_text(STYLE)),
         script=Markup(script),

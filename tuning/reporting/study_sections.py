@@ -38,14 +38,20 @@ def count_plots(results: Results) -> int:
     return (results.subject is not None) + scenarios + (results.map is not None)
 
 
-def run_section(results: Results, say: Callable[[str], None]) -> Section | None:
-    """Return the report's section with plots of the nominal run and of some scenarios of the sweep."""
+def run_sections(results: Results, say: Callable[[str], None]) -> tuple[Section | None, Section | None]:
+    """Return the report's section with one contact, and the section with the nominal run and scenarios."""
     if results.subject is None:
-        return None
+        return None, None
     say("the nominal run")
-    drawings, traces, texts = [draw_nominal_run(results.subject)], [], []
+    contact, run = draw_nominal_run(results.subject)
+    summary = None
+    if contact is not None:
+        summary = Section(
+            "summary", "In short", list(_describe_results(results, contact.says)), (), [contact]
+        )
+    drawings, traces, texts = [run], [], []
     if results.axes == 6:
-        return Section("runs", "The nominal run", texts, [], drawings, traces)
+        return summary, Section("runs", "The nominal run", texts, [], drawings, traces)
     if results.store is not None and results.sweep is not None:
         say("scenarios of the sweep")
         points, traces = draw_sweep(results.store, results.sweep.worst, say)
@@ -53,7 +59,22 @@ def run_section(results: Results, say: Callable[[str], None]) -> Section | None:
         texts.append(
             "Scenarios of the sweep: the worst ones, and some between the smallest and the largest error."
         )
-    return Section("runs", "The nominal run and the worst scenarios", texts, [], drawings, traces)
+    title = "The nominal run" + (" and the worst scenarios" if traces else "")
+    return summary, Section("runs", title, texts, [], drawings, traces)
+
+
+def _describe_results(results: Results, contact: str) -> Iterator[str]:
+    """Yield sentences for readers without the theory: one contact and, if there is a sweep, its failures."""
+    yield contact
+    yield (
+        "e, the restitution, is the rebound speed divided by the approach speed. Delays of the rig change e; "
+        "the compensator must restore the ideal contact's e."
+    )
+    if (sweep := results.sweep) is not None:
+        share = 100 * sweep.failure_probability.value
+        limit = "" if sweep.limit is None else f": an error of e above {sweep.limit:g}, or a contact that"
+        limit += " does not end well" if limit else ""
+        yield f"Of {sweep.scenarios} random scenarios, {sweep.failed} ({share:.2g} %) fail{limit}."
 
 
 def error_section(results: Results) -> Section | None:

@@ -13,7 +13,7 @@ from jaxhil.mechanism.six_axes import numeric_keys_of
 from jaxhil.mechanism.structs import Mechanism, Uncertainty, numeric_keys, value_at
 from jaxhil.mechanism.uncertainty import PHASE_KEY
 from jaxhil.simulation.contact_plot import CURVE_LABELS
-from tuning.bundle.summary import describe_alarm_rates, is_user_limit
+from tuning.bundle.summary import describe_alarm_rates, describe_limit, is_user_limit
 from tuning.bundle.writers import gain_entries, limit_entries
 from tuning.reporting.drawings import ScenarioPlot, SvgPlot
 from tuning.reporting.result_files import Results
@@ -126,7 +126,7 @@ def gain_section(results: Results) -> Section | None:
     ]
     tables = [ReportTable(("gain", "value", "unit", "bounds"), rows)] if rows else []
     limits = [
-        (name, format_number(limit.value, 5), limit.unit)
+        (name, *describe_limit(limit.value, limit.unit))
         for name, limit in limit_entries(document).items()
         if is_user_limit(name)
     ]

@@ -57,17 +57,28 @@ def _parse_limits(settings: tuple[str, ...]) -> dict[str, float | None]:
 
 
 def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
-    from tuning.bundle.summary import ERROR_TABLES, describe_alarm_rates, describe_sweep, is_user_limit
+    from tuning.bundle.summary import (
+        ERROR_TABLES,
+        describe_alarm_rates,
+        describe_limit,
+        describe_sweep,
+        is_user_limit,
+    )
 
     tables = []
     if document["limits"]:
         rows = [
-            (name, terminal.format_number(limit["value"], 6), limit["unit"])
+            (name, *describe_limit(limit["value"], limit["unit"]))
             for name, limit in document["limits"].items()
             if is_user_limit(name)
         ]
         tables.append(
-            terminal.build_table("Limits for the rig", ["limit", "value", "unit"], rows, texts=(0, 2))
+            terminal.build_table(
+                "Limits for the rig (gains.json and --set use SI units)",
+                ["limit", "value", "unit"],
+                rows,
+                texts=(0, 2),
+            )
         )
     lines = [
         f"{'draw ' + str(number) if number else 'The nominal run'}, {end}: later ticks are not compared."

@@ -244,7 +244,7 @@ def _six_axis_row(contact: dict[str, Any]) -> tuple[Any, ...]:
 
 # Headings of the columns between number and status, and function that returns their entries, by axes.
 _CONTACT_TABLES = {
-    1: (["entry", "e", "e*", "error", "peak force [N]", "duration [ms]"], _one_axis_row),
+    1: (["in file", "e", "e*", "error", "peak force [N]", "duration [ms]"], _one_axis_row),
     6: (
         ["run", "energy error", "twist error", "peak [N]", "peak [N m]", "in touch [ms]", "touches"],
         _six_axis_row,

@@ -23,7 +23,7 @@ from tuning.cli.options import Tune
 if TYPE_CHECKING:
     from tuning.caches.checkpoints import Checkpoints
 
-PLOTS = ("errors.png", "contact.png", "loss.png", "pareto.png")
+PLOTS = ("one_contact.png", "errors.png", "contact.png", "loss.png", "pareto.png")
 OVERVIEW_FILE = "overview.png"
 MAX_PLOTTED_MECHANISMS = 4  # if there are more, all share an overview plot
 
@@ -348,6 +348,7 @@ def _draw(result, options: Tune, limit: float, folder: Path) -> list[str]:
     from jaxhil.simulation.contact_plot import plot_contacts, save_figure
     from jaxhil.simulation.motion_curves import compute_nominal_motion
     from tuning.gains.tune import remove_compensation
+    from tuning.plots.one_contact import describe_contact, plot_one_contact
     from tuning.plots.tuning_results import errors_plot, loss_plot, six_axis_errors_plot
 
     name, compensator = result.mechanism.name, options.compensator
@@ -358,6 +359,8 @@ def _draw(result, options: Tune, limit: float, folder: Path) -> list[str]:
             "errors.png": errors_plot(result, limit),
             "contact.png": plot_contacts(motion, f"{name}: nominal run, {compensator}"),
         }
+        if describe_contact(motion[0]) is not None:
+            figures["one_contact.png"] = plot_one_contact(motion[0], name)
     else:
         figures = {"errors.png": six_axis_errors_plot(result, limit)}
     if result.starts:

@@ -7,6 +7,9 @@ from tuning import terminal
 from tuning.api.tune_verdict import describe_verdict
 from tuning.cli.options import Tune
 
+# Names of the stages in `TuneResult.timings`, for readers.
+STAGE_NAMES = {"judge": "evaluate", "certify": "search globally"}
+
 
 def print_overview(options: Tune, results: list[Any], entries: list[dict[str, Any]], drawn: bool) -> None:
     """Print a table with one row per mechanism: errors, best start and verdict."""
@@ -56,7 +59,8 @@ def print_result(options: Tune, result: Any, entry: dict[str, Any]) -> None:
         closing.append(
             f"The mechanism has no sensor noise; to add noise: --set rig.force_sensor.noise_std={noise}"
         )
-    closing.append("took: " + ", ".join(f"{stage} {time:.1f} s" for stage, time in result.timings.items()))
+    stages = [(STAGE_NAMES.get(stage, stage), time) for stage, time in result.timings.items()]
+    closing.append("took: " + ", ".join(f"{stage} {time:.1f} s" for stage, time in stages))
     terminal.emit(
         *tables, *_describe_confidence(result), *closing, describe_verdict(result, entry["limit"]), ""
     )
@@ -73,12 +77,12 @@ def _error_table(options: Tune, result: Any, better: bool) -> Any:
         metrics = metrics_by_gains[key]
         if key == "tuned" and not better:
             label = "tuned (NOT better than the literature's)"
-        shares = f"{100 * metrics.diverging:.0f} %", f"{metrics.peak_ratio:.3f}", f"{metrics.chatter:.3f}"
-        rows.append((label, *_cells(metrics), *shares, metrics.failed))
+        peaks = f"{metrics.peak_ratio:.3f}", f"{metrics.chatter:.3f}"
+        rows.append((label, *_cells(metrics), *peaks, metrics.failed))
     count = int(result.outcomes["tuned"].is_scheduled.sum())
     return terminal.build_table(
         f"{result.mechanism.name}: errors e - e* of {count} contacts in {options.validation} fresh scenarios",
-        ["gains", "rms", "99th pct", "max", "mean", "e > e*", "peak ratio", "chatter", "not ended"],
+        ["gains", "rms", "99th pct", "max", "mean", "peak ratio", "chatter", "not ended"],
         rows,
     )
 
@@ -115,19 +119,26 @@ def _gain_tables(options: Tune, result: Any) -> list[Any]:
     mechanism = result.mechanism
     rows = [
         (
-            *(gain.name, gain.unit, float(gain.lower(mechanism)), float(gain.upper(mechanism))),
-            result.literature[gain.name],
-            result.gains[gain.name] if gain.tuned(mechanism) else "(not tuned)",
-            *([f"{100 * share:.1f} %" for share in result.tolerances.get(gain.name, ())] or ["", ""]),
+            *(gain.name, gain.unit),
+            *(_format_compactly(float(bound(mechanism))) for bound in (gain.lower, gain.upper)),
+            _format_compactly(result.literature[gain.name]),
+            _format_compactly(result.gains[gain.name], 4) if gain.tuned(mechanism) else "fixed",
+            *([f"{100 * share:.1f}" for share in result.tolerances.get(gain.name, ())] or ["", ""]),
         )
         for gain in get_compensator(options.compensator, axes_of(mechanism)).gains
     ]
-    headings = ["gain", "unit", "lower", "upper", "literature", "tuned", "free alone", "together"]
+    headings = ["gain", "unit", "lower", "upper", "by rule", "tuned", "alone [%]", "together [%]"]
     return (
         [terminal.build_table(f"Gains of {options.compensator}", headings, rows, texts=(0, 1))]
         if rows
         else []
     )
+
+
+def _format_compactly(value: float, digits: int = 3) -> str:
+    """Return a number as text with `digits` significant digits and a short exponent, such as 1.2e6."""
+    mantissa, _, exponent = f"{value:.{digits}g}".partition("e")
+    return f"{mantissa}e{int(exponent)}" if exponent else mantissa
 
 
 def _describe_aim(limit: float, result: Any) -> list[str]:
@@ -150,8 +161,8 @@ def _describe_confidence(result: Any) -> list[str]:
     lines = []
     if result.tolerances:
         lines.append(
-            "Free: the change of a gain, as a share of its range, that raises the loss by 1 %: alone, or "
-            "together with the other gains readjusted."
+            "Tolerance of a gain: its change, in percent of its range, that raises the objective by 1 %: "
+            "alone, or together with the other gains readjusted."
         )
     errors = sorted(start.rms for start in result.starts if math.isfinite(start.rms))
     if result.settings.probed and len(errors) > 1:
