@@ -94,7 +94,7 @@ class CallLowering(ListLowering):
         hinted = type_of_annotation(hints.get(name, ...), self.program.bindings)
         if hinted is None:
             found = f"{name} of {type_.of.__name__}, which has no known type"
-            raise self.refuse(node, found, "an assignment in `__init__`, or an annotation in the class")
+            raise self.reject(node, found, "an assignment in `__init__`, or an annotation in the class")
         fields = self.program.fields.setdefault(type_.of, {})
         # A record has all its fields, in order, because its initialisers name none.
         for other in getattr(type_.of, "_fields", ()):

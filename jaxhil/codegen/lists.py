@@ -234,7 +234,7 @@ class ListLowering(ExpressionLowering):
             key = eval(code, {"__builtins__": {}}, texts)
             lowest = self.program.lowest[value.type.of][key]
         except Exception:
-            raise self.refuse(node, f"{ast.unparse(node)}", "the name of a gain or limit") from None
+            raise self.reject(node, f"{ast.unparse(node)}", "the name of a gain or limit") from None
         return CExpression(f"{value.text}->{key}", FLOAT, sign=sign_of(lowest) if lowest >= 0.0 else 0)
 
     def _slice(self, node: Any, value: CExpression, part: ast.Slice) -> CExpression:

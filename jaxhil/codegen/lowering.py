@@ -54,13 +54,13 @@ class ExpressionLowering:
         self.effects: list[Locations] = []  # locations that the code so far has changed
         self.compared: list[ast.AST] = []  # sums that are only operands of comparisons
 
-    def refuse(self, node: ast.AST, found: str, expected: str) -> SubsetError:
+    def reject(self, node: ast.AST, found: str, expected: str) -> SubsetError:
         line = getattr(node, "lineno", self.function.node.lineno)
         return SubsetError(self.function.file, line, found, expected)
 
     def require(self, condition: Any, node: ast.AST, found: str, expected: str) -> None:
         if not condition:
-            raise self.refuse(node, found, expected)
+            raise self.reject(node, found, expected)
 
     def emit(self, *lines: str) -> None:
         self.lines += lines
@@ -123,7 +123,7 @@ class ExpressionLowering:
         """Lower an expression, with the facts about its value."""
         lower = getattr(self, f"lower_{type(node).__name__.lower()}", None)
         if lower is None:
-            raise self.refuse(node, type(node).__name__, "an expression of numbers, lists and attributes")
+            raise self.reject(node, type(node).__name__, "an expression of numbers, lists and attributes")
         value = lower(node)
         fact = self.facts.get(value.text)
         return value._replace(sign=value.sign | fact.sign, span=fact.span or value.span) if fact else value
@@ -326,7 +326,7 @@ class ExpressionLowering:
             return constant((kind == getattr(comparator, "id", "")) == is_same)
         parameter = self.names.get(getattr(node.left, "id", ""))
         if parameter is None or parameter.length != "optional" or getattr(comparator, "value", 0) is not None:
-            raise self.refuse(node, "`is`", "`is None` of a parameter `float | None`")
+            raise self.reject(node, "`is`", "`is None` of a parameter `float | None`")
         text = f"{parameter.text.lstrip('*')} {'==' if is_same else '!='} NULL"
         return CExpression(text, BOOL, Rank.EQUALITY)
 

@@ -107,7 +107,7 @@ class CProgram:
         """Return the C function for a Python function with parameter types; lower it on the first call."""
         key = (function, owner, *((n, t.length, t.of) for n, t in types.items() if t.kind == "list"))
         if key in self.under_way and caller is not None:
-            raise caller.refuse(caller.function.node, f"{function.__name__} calling itself", "a loop")
+            raise caller.reject(caller.function.node, f"{function.__name__} calling itself", "a loop")
         if key not in self.functions:
             result = CFunction(function, owner, types)
             self.under_way.append(key)

@@ -238,7 +238,7 @@ class BodyLowering(CallLowering):
 
     def share(self, node: Any, target: Locations, value: CExpression) -> None:
         """Record a list that an attribute shares with a second name; such a list must not change in place."""
-        error = self.refuse(node, "a list that is shared and changed in place", "a copy of it, `list(...)`")
+        error = self.reject(node, "a list that is shared and changed in place", "a copy of it, `list(...)`")
         for key in value.reads:
             if key[0] == "parameter":
                 self.function.retained[key[1]] = target

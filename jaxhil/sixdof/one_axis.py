@@ -90,27 +90,27 @@ def convert_to_one_axis(mechanism: SixAxisMechanism, episode: Episode | IdealEpi
 def _check_has_equivalent(mechanism: SixAxisMechanism, episode: Episode | IdealEpisode) -> None:
     """Raise `InputError` if the contact has no equivalent with one axis."""
 
-    def refuse(key: str, found: str, expected: str) -> None:
+    def reject(key: str, found: str, expected: str) -> None:
         raise InputError(f"{mechanism.name}: {key}: found {found}, expected for a one-axis file: {expected}")
 
     if mechanism.approach is None:
-        refuse("start", "explicit states", "[approach]")
+        reject("start", "explicit states", "[approach]")
     for name in mechanism.latch:
-        refuse(f"latch.{name}", "a latch", "no latch, because a latch holds all six axes")
+        reject(f"latch.{name}", "a latch", "no latch, because a latch holds all six axes")
     for name, contact in mechanism.contact.items():
         if contact.friction is not None and contact.friction.coefficient > 0:
             found, key = f"{contact.friction.coefficient:g}", f"contact.{name}.friction.coefficient"
-            refuse(key, found, "0, because friction couples the axes")
+            reject(key, found, "0, because friction couples the axes")
     touches = episode.reference_touches
     if touches != 1:
         expected = "one, because each touch has its own normal"
-        refuse("contact", f"{touches} touches in the ideal contact", expected)
+        reject("contact", f"{touches} touches in the ideal contact", expected)
     simulator = mechanism.rig.simulator
     robot = simulator.target_robot
     lists = [[getattr(simulator, key), robot and getattr(robot, key)] for key in PER_AXIS_KEYS]
     values = [[entry for part in parts if part for entry in part] for parts in lists]
     if simulator.space != "task" and any(np.ptp(entries or [0.0]) > 0 for entries in values):
-        refuse("rig.simulator", "axes with different dynamics", "equal axes of legs or robots")
+        reject("rig.simulator", "axes with different dynamics", "equal axes of legs or robots")
 
 
 def _find_touch(

@@ -76,7 +76,7 @@ def build_mechanism_table(name: str, results: Sequence[CompensatorMetrics]) -> T
             )
     tuned = ", then tuned, except those with settings" * _has_tuned_gains(results)
     title = f"{name}: each compensator with the literature's gains{tuned}"
-    return _set_compact_style(terminal.build_table(title, ["law", *headings.values()], rows))
+    return _set_compact_style(terminal.build_table(title, ["compensator", *headings.values()], rows))
 
 
 def build_leaderboard(names: Sequence[str], results: Mapping[str, Sequence[CompensatorMetrics]]) -> Table:

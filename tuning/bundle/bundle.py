@@ -69,7 +69,7 @@ def build_bundle(
         Files of the bundle, and the comparison of its test vectors with the simulation.
 
     Raises:
-        InputError: If the runtime refuses the limits, or the compensator does not support a format.
+        InputError: If the runtime rejects the limits, or the compensator does not support a format.
     """
     from jaxhil.simulation.gain_file import check_document
 

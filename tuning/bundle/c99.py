@@ -172,7 +172,7 @@ def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> 
         Text of each file by its name.
 
     Raises:
-        GainFileError: If the runtime refuses the document.
+        GainFileError: If the runtime rejects the document.
         InputError: If the compensator contains Python code that cannot be translated to C. The message names
             file and line.
     """

@@ -165,7 +165,7 @@ def _read_json(path: Path, where: str) -> dict[str, Any]:
     if len(content) > MAX_DOCUMENT_BYTES:
         raise InputError(f"{where}: found more than {MAX_DOCUMENT_BYTES} bytes, expected {ALLOWED_RESULTS}")
     try:
-        document = json.loads(content, parse_constant=_refuse_constant)
+        document = json.loads(content, parse_constant=_reject_constant)
     except (ValueError, RecursionError):
         raise InputError(f"{where}: found no JSON, expected {ALLOWED_RESULTS}") from None
     if not isinstance(document, dict):
@@ -173,7 +173,7 @@ def _read_json(path: Path, where: str) -> dict[str, Any]:
     return document
 
 
-def _refuse_constant(name: str) -> None:
+def _reject_constant(name: str) -> None:
     """Raise ValueError for NaN or infinity in a file, because standard JSON does not allow them."""
     raise ValueError(name)
 

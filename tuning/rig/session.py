@@ -235,7 +235,7 @@ def _run_controller_loop(
 def real_time_priority(wanted: bool) -> Iterator[None]:
     """Context manager: run this thread with real-time priority if `wanted` is true.
 
-    Raise OSError if the operating system refuses the priority.
+    Raise OSError if the operating system denies the priority.
     """
     if not wanted:
         yield

@@ -265,7 +265,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Serve one session; return the exit code.
 
     The exit code is 0 if the rig stopped the session, 2 if the gain file is invalid or the real-time priority
-    is refused, and 1 if the rig was silent or the user interrupted the session.
+    is rejected, and 1 if the rig was silent or the user interrupted the session.
     """
     options = parse(arguments)
     limit = math.inf
@@ -332,7 +332,7 @@ def load_task(path: str) -> ControllerTask:
 
 
 def request_real_time_priority() -> None:
-    """Request a real-time priority for this thread; raise OSError if the operating system refuses it."""
+    """Request a real-time priority for this thread; raise OSError if the operating system denies it."""
     if not hasattr(os, "sched_setscheduler"):
         raise OSError("this system has no real-time priorities")
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME_PRIORITY))

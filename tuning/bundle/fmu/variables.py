@@ -29,7 +29,7 @@ class Variable(NamedTuple):
     description: str
     unit: str = "1"  # "1" if dimensionless
     start: float = 0.0  # value before the first step
-    lowest: float = -math.inf  # lower bound; for a parameter, the FMU refuses values beyond it
+    lowest: float = -math.inf  # lower bound; for a parameter, the FMU rejects values beyond it
     highest: float = math.inf  # upper bound
 
     @property

@@ -172,22 +172,19 @@ def _explain_columns(document: Mapping[str, Any]) -> list[str]:
     """Return sentences that explain the columns of the tables."""
     from jaxhil.simulation.contact_bounds import MAX_DURATION_RATIO, MAX_PEAK_FORCE_RATIO, MIN_DURATION_RATIO
 
-    failures = [
-        f"fail: scenarios with an error above {100 * document['limit']:g} %, with a",
-        f"contact that does not end, or with a real contact above {MAX_PEAK_FORCE_RATIO:g} times the ideal "
-        f"peak force or outside {MIN_DURATION_RATIO:g} to {MAX_DURATION_RATIO:g} times the ideal duration.",
-    ]
+    failures = (
+        f"fail: scenarios with an error above {100 * document['limit']:g} %, with a contact that does not "
+        f"end, or with a real contact above {MAX_PEAK_FORCE_RATIO:g} times the ideal peak force or outside "
+        f"{MIN_DURATION_RATIO:g} to {MAX_DURATION_RATIO:g} times the ideal duration."
+    )
     if document["axes"] == 6:
         return [
-            f"E: energy error. V: twist error. {failures[0]}",
-            failures[1],
-            "peak: largest force on the numerical model divided by the ideal peak force, 99th percentile.",
-            "not ended: number of contacts that did not end.",
+            f"E: energy error. V: twist error. {failures} peak: largest force on the numerical model divided "
+            "by the ideal peak force, 99th percentile. not ended: number of contacts that did not end."
         ]
     return [
-        f"rms, p99, worst: |e - e*|. {failures[0]}",
-        failures[1],
-        f"early, late: transparency to {document['transparency']} (1: perfect, 0: none).",
-        "slope: of e against e* for damping perturbations. peak: peak command divided by the ideal peak",
-        "force, 99th percentile. path: trajectory error of x_d. noise: amplification of the sensor noise.",
+        f"rms, p99, worst: |e - e*|. {failures}",
+        f"early, late: transparency to {document['transparency']} (1: perfect, 0: none). slope: of e against "
+        "e* for damping perturbations. peak: peak command divided by the ideal peak force, 99th percentile. "
+        "path: trajectory error of x_d. noise: amplification of the sensor noise.",
     ]

@@ -72,7 +72,7 @@ def run(options: IdentifyOptions) -> int:
         stages.turn_to("reading the logs")
         campaign = _select_stage(read_logs(logs, options.map, prior), options.stage)
         if prior is None:
-            _refuse_other_logs(folder / DOCUMENT_FILE, earlier, campaign)
+            _reject_other_logs(folder / DOCUMENT_FILE, earlier, campaign)
         result = identify(campaign, prior, settings, stages.turn_to)
         document = _build_document(options, campaign, prior, result)
         if result.mechanism is not None:
@@ -121,7 +121,7 @@ def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], fo
         write_atomically(folder / MECHANISM_FILE, to_toml(mechanism, f"{verdict}\n{SPREAD_COMMENT}").encode())
 
 
-def _refuse_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) -> None:
+def _reject_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) -> None:
     """Raise `InputError` if the folder contains results of other logs, which would be overwritten.
 
     Without a prior, all mechanisms have the same default name, so that a comparison of names is not enough.
