@@ -39,7 +39,7 @@ from tuning.identification.sensor_filter import (
 MAX_FORCE_DELAY = 0.02  # s, longest force delay in the search range of a fit
 COARSE_DELAY_STEP = 0.0005  # s, step between the delays of a first search
 STEP = 1e-7  # m, step of finite differences with respect to the surface position
-FILTER_MEMORY_TIME_CONSTANTS = 40.0  # time constants after which a filter's response is below rounding errors
+FILTER_MEMORY_TIME_CONSTANTS = 25.0  # time constants after which the response of a filter is below 1e-10
 Motion = list[tuple[np.ndarray, np.ndarray]]  # position [m] and velocity [m/s] at several times
 
 
