@@ -157,4 +157,4 @@ def _find_contact_entries(fit: ContactFit) -> np.ndarray:
 def _describe_problem(problem: ContactProblem) -> Any:
     """Return the data that define the problem, except its readings."""
     law = problem.law
-    return law.name, law.names, law.pulls, law.shape, problem.plane, vars(problem.motion)
+    return law.name, law.names, law.pulls, law.shape, problem.plane, problem.motion.__getstate__()
