@@ -15,8 +15,7 @@ BARS = {
     "probe-drogue": (0.05, 0.012, 0.05),
     "ring-capture": (0.05, 0.08, np.inf),
     "hydraulic-hexapod": (0.04, 0.02, np.inf),
-    # In a few draws the rig has a different sequence of touches, with twist errors up to 0.30.
-    "petals": (np.inf, 0.03, np.inf),
+    "petals": (np.inf, 0.03, 0.15),
     "claw-two-arms": (np.inf, 0.05, 0.35),
 }
 SEARCH = {"scenarios": 32, "starts": 2, "steps": 12, "validation": 511}
@@ -27,6 +26,16 @@ def test_nominal_ledger_errors_are_small_with_wide_ranges():
     check_good(metrics)
     assert rms(metrics["energy_error"]) < 0.05
     assert rms(metrics["twist_error"]) < 0.012 and np.max(metrics["twist_error"]) < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["petals", "claw-two-arms"])
+def test_nominal_ledger_errors_are_small_if_several_surfaces_touch(name):
+    [metrics] = evaluated(load_wide(name), "impulse_ledger", lanes=511, seed=0x5EED)
+    check_good(metrics)
+    energy, twist = metrics["energy_error"], metrics["twist_error"]
+    print(name, rms(energy), np.max(np.abs(energy)), rms(twist), np.max(twist))
+    assert rms(twist) <= BARS[name][1] and np.max(twist) <= BARS[name][2]
 
 
 @pytest.mark.slow

@@ -5,10 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import QUICK
-from six_axis_ranges import POSE_NOISE, with_ranges
+from six_axis_ranges import POSE_NOISE, load_wide, with_ranges
 
 from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS, literature_gains
-from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import Tangent, compute_force_change
+from jaxhil.laws.impulse_ledger.six_axes.tangent_model.rig import TangentModel
+from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import (
+    Estimate,
+    Tangent,
+    compute_force_change,
+    turn,
+)
 from jaxhil.mechanism.file import load_any
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.jax_environment import jax_context
@@ -27,10 +33,10 @@ BARS = {
 }
 
 
-def evaluated(mechanism, compensator, *changes, lanes=LANES, scenario=None):
+def evaluated(mechanism, compensator, *changes, lanes=LANES, scenario=None, seed=1):
     """Return the metrics of all contacts of a run, for each change of the literature's gains."""
     with jax_context():
-        scenarios = build_scenarios(mechanism, draw(mechanism, lanes, 1), seed=1)
+        scenarios = build_scenarios(mechanism, draw(mechanism, lanes, seed), seed=seed)
         if scenario is not None:
             scenarios = scenario(scenarios)
         loop = make_loop(mechanism, compensator, scenarios)
@@ -107,6 +113,50 @@ def test_elastic_force_of_the_tangent_model_changes_in_the_direction_of_the_dept
         )
     assert np.all(force * np.sign(changes) >= 0) and np.max(force) > 0 > np.min(force)
     np.testing.assert_allclose(line, stiffness * changes, atol=1e-15)
+
+
+def test_turn_of_the_direction_keeps_slope_and_force_of_the_tangent_model():
+    """Learn F = 500 x/s^2 + 2e4 x|x|/(m s^2) up to 20 mm, where the slope is 1300/s^2, then turn."""
+    gains = {"stiffness_spread": 1e3, "damping_spread": 3.0, "force_spread": 1.0, "curvature_spread": 1e3}
+    model, speed, force, noise = TangentModel(gains | {"forgetting": 1.0}, 1e-3), 0.3, 7.0, 1e-6
+    for depth in np.linspace(1e-4, 0.02, 200):
+        model.learn(depth, 0.0, 500 * depth + 2e4 * depth**2, noise, speed)
+    with jax_context():
+        old = Estimate(jnp.array(model._mean), jnp.array(model._covariance))
+        prior = jnp.diag(jnp.square(jnp.array([1e3, 3.0, 1.0, 1e3])))
+        turned = turn(
+            old, Estimate(jnp.zeros(4), prior), jnp.asarray(0.02 / speed), jnp.asarray(force / speed)
+        )
+        np.testing.assert_allclose(turned.covariance, prior)
+    model.turn(0.02, force, speed)
+    np.testing.assert_allclose(turned.mean, model._mean, rtol=1e-12)
+    np.testing.assert_allclose(np.sqrt(np.diag(model._covariance)), [1e3, 3.0, 1.0, 1e3])
+    np.testing.assert_allclose(model._mean, [1300.0, 0.0, force / speed, 0.0], rtol=0.01, atol=0.5)
+    model.settle(0.0, speed)
+    model.bridge(force, 0.0, 0.0, 0.0, 1e-4)
+    assert model.force == pytest.approx(force, rel=1e-3)
+
+
+# Lanes of 511 fresh scenarios in which the direction turns at a large force, and the largest twist error.
+TURNING = {"petals": ([410, 484], 0.15), "claw-two-arms": ([124, 262], 0.35)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TURNING)
+def test_twist_errors_are_small_if_another_surface_takes_over(name):
+    lanes, largest = TURNING[name]
+
+    def chosen(scenarios):
+        def pick(leaf):
+            is_drawn = jnp.ndim(leaf) > 0 and jnp.shape(leaf)[-1] == 511
+            return jnp.asarray(leaf)[..., np.array(lanes)] if is_drawn else leaf
+
+        return jax.tree.map(pick, scenarios)
+
+    [metrics] = evaluated(load_wide(name), LAW, lanes=511, scenario=chosen, seed=0x5EED)
+    check_good(metrics)
+    print(name, metrics["twist_error"])
+    assert np.max(metrics["twist_error"]) < largest
 
 
 def test_six_axis_impulse_ledger_gains_follow_from_mechanism_file():

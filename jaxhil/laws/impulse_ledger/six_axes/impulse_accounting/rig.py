@@ -168,7 +168,7 @@ class Ledger:
         return self._size(self._unpaid) / self._size(self._impulse)
 
     def _turn(self, reader: SixAxisReader, begins: bool) -> None:
-        """Update the contact's direction; restart the tangent model if the direction has turned.
+        """Update the contact's direction and the depth; adapt the tangent model if the direction has turned.
 
         A pulling force, for example of a latch, does not reverse the direction.
         """
@@ -182,13 +182,16 @@ class Ledger:
             ]
             self._direction = multiply(1.0 / self._size(self._mixed), self._mixed)
         direction = self._direction
-        # If the direction turns, the contact is at a different surface.
         turns = begins
-        if reader.loud and not begins:
-            turns = dot(self._modelled, product(self._inverse, direction)) < TURNED
+        if begins:
+            self.tangent.restart()
+        elif reader.loud and dot(self._modelled, product(self._inverse, direction)) < TURNED:
+            # If the direction turns, the contact is at a different surface.
+            turns = True
+            force = dot(reader.wrench, product(self._inverse, direction))
+            self.tangent.turn(self._path, force, self._speed)
         if turns:
             self._modelled = list(direction)
-            self.tangent.restart()
             self._path = 0.0
         else:
             self._path -= dot(direction, reader.moved)

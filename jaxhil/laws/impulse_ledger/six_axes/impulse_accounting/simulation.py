@@ -19,6 +19,7 @@ from jaxhil.laws.impulse_ledger.six_axes.tangent_model.simulation import (
     bridge,
     compute_force_change,
     learn,
+    turn,
 )
 from jaxhil.laws.six_axis_base import Six, SixAxisSignals
 
@@ -86,13 +87,14 @@ def follow(
     desired, twist, impulse = recalled[:6], recalled[6:12], recalled[12:]
     old = contact_now._replace(impulse=jnp.where(begins[None], impulse, contact_now.impulse))
     direction, mixed = _direction(prepared, old, reading, begins)
-    # If the direction turns, the contact is at a different surface: restart the tangent model.
+    # If the direction turns, the contact is at a different surface.
     along = dot(old.modelled, product(inverse_mass, direction))
     turns = begins | (is_contact & (along < fixed.TURNED))
     modelled = jnp.where(turns[None], direction, old.modelled)
-    estimate = select_lanes(turns, prepared.prior, estimate)
-    path = jnp.where(turns, 0, old.path - dot(direction, reading.pose_change))
     force = dot(reading.wrench, product(inverse_mass, direction))
+    turned = turn(estimate, prepared.prior, old.path / old.speed, force / old.speed)
+    estimate = select_lanes(begins, prepared.prior, select_lanes(turns, turned, estimate))
+    path = jnp.where(turns, 0, old.path - dot(direction, reading.pose_change))
     estimate, tangent = _update_estimate(prepared, old, reading, estimate, (direction, path, force))
 
     # Advance the reference, which is at the time t - D (equation c of README.md).

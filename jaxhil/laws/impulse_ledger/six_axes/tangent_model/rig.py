@@ -64,6 +64,22 @@ class TangentModel:
         self.impulse = 0.0
         self.force = 0.0
 
+    def turn(self, path: float, force: float, speed: float) -> None:
+        """Adapt the estimate to a turn of the direction: the depth restarts at 0, the force continues.
+
+        The slope at the last depth and the damping remain the best guess; their covariance is that of the
+        prior.
+
+        Args:
+            path: depth at the last reading [m].
+            force: force per unit mass along the new direction [m/s^2].
+            speed: approach speed [m/s].
+        """
+        stiffness, damping, _, curvature = self._mean
+        slope = max(stiffness + 2.0 * curvature * abs(path / speed) / BEND, 0.0)
+        self.restart()
+        self._mean = [slope, damping, force / speed, 0.0]
+
     def learn(self, path: float, rate: float, force: float, variance: float, speed: float) -> None:
         """Update the estimate with a reading, by recursive least squares with forgetting.
 

@@ -52,6 +52,17 @@ def begin_estimate(spreads: tuple[Array, ...]) -> Estimate:
     return Estimate(jnp.zeros_like(variances), identity * variances[None])
 
 
+def turn(old: Estimate, prior: Estimate, path: Array, force: Array) -> Estimate:
+    """Return the estimate after a turn of the direction: the depth restarts at 0, the force continues.
+
+    The slope at the last depth `path` [s] and the damping remain the best guess; their covariance is that of
+    the prior. Depth and `force` [1/s] are divided by the approach speed.
+    """
+    slope = jnp.maximum(old.mean[0] + 2 * old.mean[3] * jnp.abs(path) / BEND, 0)
+    mean = jnp.stack([slope, old.mean[1], force, jnp.zeros_like(force)])
+    return Estimate(mean, prior.covariance)
+
+
 def learn(
     old: Estimate, prior: Estimate, path: Array, rate: Array, force: Array, variance: Array, growth: Array
 ) -> Estimate:
