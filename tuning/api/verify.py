@@ -1,7 +1,8 @@
 """Function `tuning.verify`, which checks that the rig's controller code reproduces the simulated controller.
 
 For a bundle, three checks are made: all files are compared with a new export, the bundle's self-test runs in
-an isolated interpreter, and the gain file is verified.
+an isolated interpreter, and the gain file is verified. If the bundle has FMUs of controller and rig, the loop
+is also closed through them.
 """
 
 import os
@@ -121,7 +122,32 @@ def _verify_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: 
             document["self_test"], reasons = run_selftest(checked, os.path.basename(os.path.abspath(folder)))
     if reasons:
         return {**document, "verdict": "bad", "reasons": reasons}
-    return _verify_gains(checked, {**document, "file": str(folder / "gains.json")}, scenarios, seed, progress)
+    document = _verify_gains(
+        checked, {**document, "file": str(folder / "gains.json")}, scenarios, seed, progress
+    )
+    return _add_fmu_loop(document, checked.files, checked, progress)
+
+
+def _add_fmu_loop(document: dict[str, Any], files: Any, gains: Any, progress: bool) -> dict[str, Any]:
+    """Close the loop through the FMUs of a bundle that has both; add the result to the document."""
+    if not any(name.endswith("jaxhil_rig.fmu") for name in files):
+        return document
+    import msgspec
+
+    from tuning.bundle.fmu.closed_loop import compare_fmu_loop
+
+    with jax_context(), terminal.show_stages(1, progress) as stages:
+        stages.begin("running the nominal contacts with the FMUs")
+        loop = compare_fmu_loop(files, arguments.load_gains(gains))
+    if loop is None:
+        return document
+    reasons = [*document["reasons"], *loop.reasons]
+    return {
+        **document,
+        "fmu_loop": msgspec.to_builtins(loop),
+        "verdict": "bad" if loop.reasons else document["verdict"],
+        "reasons": reasons,
+    }
 
 
 def _verify_gains(gains: Any, document: dict[str, Any], scenarios: int, seed: int, progress: bool):

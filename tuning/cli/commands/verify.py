@@ -60,6 +60,25 @@ def _six_axis_tables(document: dict[str, Any]) -> list[Any]:
     ]
 
 
+def _fmu_table(loop: dict[str, Any]) -> Any:
+    """Return the table of the nominal contacts in the loop of both FMUs."""
+    return terminal.build_table(
+        f"Nominal contacts with the FMUs of FMI {loop['fmi']}, rig.command_latency = "
+        f"{loop['command_latency']}",
+        ["contact", "e", "e simulated", "status"],
+        [
+            (
+                number,
+                terminal.format_number(contact["restitution"], 9),
+                terminal.format_number(contact["simulated_restitution"], 9),
+                contact["status"],
+            )
+            for number, contact in enumerate(loop["contacts"], start=1)
+        ],
+        texts=(3,),
+    )
+
+
 def _print(document: dict[str, Any]) -> None:
     from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_SHORT_TEXT
 
@@ -101,6 +120,8 @@ def _print(document: dict[str, Any]) -> None:
                 texts=(5, 6),
             ),
         ]
+    if "fmu_loop" in document:
+        tables.append(_fmu_table(document["fmu_loop"]))
     if result_is_good and document.get("axes") == 6:
         lines = [
             f"Good: commands agree to {document['replay_limit']:.0e} of their range, the final twist to "
