@@ -56,7 +56,8 @@ def simulate(
     list of sequences: one per run). With `first_force_zero`, tick 0 commands F_c = 0 for any reading. With
     `index_waits_for_exit` and a clearance, the next stiffness applies only after x_a has left the surface. A
     damped contact separates at F = 0 while x_a is still beyond the surface, where a stiffer contact law would
-    push again and count as another contact.
+    push again and count as another contact. `jitter` is the deviation of the force's delay [s] at every tick;
+    `lost` and `missed` contain the ticks whose reading is lost, and that the controller misses.
     """
     compensator = NoCompensator() if compensator is None else compensator
     approach = mechanism["approach"]
@@ -113,6 +114,9 @@ class _Run:
         first_force_zero=True,
         index_waits_for_exit=True,
         time_limit=10.0,
+        jitter=None,
+        lost=(),
+        missed=(),
     ):
         bodies, rig, approach = mechanism["bodies"], mechanism["rig"], mechanism["approach"]
         self.period = T = rig["control_period"]
@@ -135,7 +139,9 @@ class _Run:
         self.lag_state = 0.0
         std, bias = sensor.get("noise_std", 0.0), sensor.get("bias", 0.0)
         self.noisy = std != 0.0 or bias != 0.0 or self.force_noise is not None
-        self.quiet_ticks = self.force_delay + 20.0 * self.lag / T + 2.0
+        self.jitter, self.lost, self.missed = jitter, lost, missed
+        self.reading = self.command = 0.0
+        self.quiet_ticks = self.force_delay + 20.0 * self.lag / T + 2.0 + sensor.get("jitter", 0.0) / T
         position_sensor = rig.get("position_sensor", {})
         self.position_quantum = position_sensor.get("quantum", 0.0)
         self.position_delay = delay_in_ticks(position_sensor.get("delay", 0.0), T)
@@ -193,7 +199,7 @@ class _Run:
             elif n - contact.first >= patience or not isfinite(command):
                 contact.status = "timeout"
             contact.before = abs(self.v)
-            self._integrate(command)
+            self._integrate(command, n)
             if contact.status is None and not (isfinite(command) and isfinite(self.x)):
                 contact.status = "timeout"
             n += 1
@@ -206,7 +212,10 @@ class _Run:
         if not self.index_waits_for_exit or self.law.side(actual) == 0:
             self.law_index = self.index
         force, position = self._read_force(n), self._read_position(n)
-        command = float(self.compensator.step(force, self.x, self.v, position))
+        if n and n in self.missed:
+            command = self.command
+        else:
+            command = float(self.compensator.step(force, self.x, self.v, position))
         if n == 0 and self.first_force_zero:
             command = 0.0
         self.log.append((n, self.x, self.v, actual, self._true_force(n), force, position, command))
@@ -263,7 +272,12 @@ class _Run:
             "status": contact.status,
         }
 
-    def _integrate(self, command):
+    def _integrate(self, command, n):
+        self.command = command
+        if n and n in self.missed:
+            self.motion.append(self.motion.commands[-1])
+            self.shortfalls.append(self.shortfalls[-1])
+            return
         T, a = self.period, -command / self.mass
         if self.integrator == "semi_implicit_euler":
             self.v += T * a
@@ -319,7 +333,8 @@ class _Run:
         if self.lag > 0.0:
             force = self._lagged(n)
         else:
-            force = self._true_force(n - self.force_delay)
+            late = 0.0 if self.jitter is None else self.jitter[n] / self.period
+            force = self._true_force(n - self.force_delay - late)
         force += self.sensor.get("bias", 0.0)
         force += 0.0 if self.force_noise is None else self.force_noise[n]
         force = _quantise(force, self.sensor.get("quantum", 0.0))
@@ -329,7 +344,9 @@ class _Run:
         else:
             force = np.sign(force) * max(0.0, beyond)
         limit = self.sensor.get("range", inf)
-        return float(min(max(force, -limit), limit))
+        if not (n and n in self.lost):
+            self.reading = float(min(max(force, -limit), limit))
+        return self.reading
 
     def _lagged(self, n):
         """Return the output of the lag at t_n: lag y' = F(t - tau_f) - y, exact over the last period."""

@@ -219,6 +219,8 @@ def test_normal_draws_are_truncated_to_allowed_values(path, nominal, std):
         raw["contact"] |= {"damping": [0.0], **of_one_law[path]}
     if path == "rig.simulator.time_constant":
         raw["rig"]["simulator"] = {"model": "first_order"}
+    if path == "rig.force_sensor.jitter":
+        raw["rig"]["force_sensor"] = {"delay": 1.0}
     if path == "rig.simulator.window":
         raw["rig"]["simulator"] = {"model": "moving_average"}
     node = raw

@@ -78,7 +78,14 @@ def check_mechanism_rules(mechanism: Mechanism) -> None:
         ]
     )
     check_correlation(mechanism)
-    run_checks([lambda: _check_velocity_limit(mechanism, spans), lambda: _check_gap(mechanism, spans)])
+    run_checks(
+        [
+            lambda: _check_velocity_limit(mechanism, spans),
+            lambda: _check_gap(mechanism, spans),
+            lambda: _check_jitter(mechanism, spans),
+            lambda: _check_missed_ticks(mechanism),
+        ]
+    )
 
 
 def resolve_damping_ratio(mechanism: Mechanism) -> Mechanism:
@@ -307,6 +314,39 @@ def _check_velocity_limit(mechanism: Mechanism, spans: Mapping[str, Span]) -> No
 def format_allowed_velocity_limit(approach: float) -> str:
     """Describe the allowed velocity limits for an `approach` speed [m/s], for a message."""
     return f"a number >= {approach:g} m/s, the approach speed: slower drives cannot follow the approach"
+
+
+def _check_jitter(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
+    """Raise `KeyProblem` if a force sensor with jitter has effects that jitter does not support."""
+    path, extreme = "rig.force_sensor.jitter", _build_extreme_function(mechanism, spans)
+    if not _is_used(mechanism, path):
+        return
+    key, found = tuple(path.split(".")), format_value(extreme(path, 1))
+    shortest = extreme("rig.force_sensor.delay", 0)
+    if not extreme(path, 1) <= shortest:
+        raise KeyProblem(key, found, f"at most {shortest:g} s, the least rig.force_sensor.delay")
+    reasons = {
+        "a time_constant": _is_used(mechanism, "rig.force_sensor.time_constant"),
+        f"the contact law {mechanism.contact.law}": find_contact_law(mechanism.contact.law).has_memory,
+        "a clearance": math.isfinite(mechanism.contact.clearance),
+    }
+    for reason in (reason for reason, is_true in reasons.items() if is_true):
+        raise KeyProblem(key, found, f"0, because {reason} excludes jitter")
+
+
+def _check_missed_ticks(mechanism: Mechanism) -> None:
+    """Raise `KeyProblem` if ticks are missed between two surfaces."""
+    path = "rig.missed_tick_probability"
+    if _is_used(mechanism, path) and math.isfinite(mechanism.contact.clearance):
+        found = format_value(mechanism.rig.missed_tick_probability)
+        raise KeyProblem(
+            tuple(path.split(".")), found, "0, because a clearance does not support missed ticks"
+        )
+
+
+def _is_used(mechanism: Mechanism, path: str) -> bool:
+    """Return whether a number is not 0, or uncertain."""
+    return bool(value_at(mechanism, path)) or path in mechanism.uncertainty
 
 
 def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:

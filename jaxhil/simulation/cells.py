@@ -175,16 +175,43 @@ def build_cells(
     order = denominator.shape[0] - 1
     if order == 0:
         states = jnp.zeros((0, len(begin), 2, *control_period.shape), control_period.dtype)
-        ones, zeros = jnp.ones_like(control_period), jnp.zeros_like(control_period)
-        lines = [jnp.stack([ones, zeros]), jnp.stack([zeros, ones])]
-        lines += [jnp.zeros_like(lines[0])] * (counts.degree - 1)
-        return Cells(begin, length, rest, states, jnp.stack(lines))
+        return Cells(begin, length, rest, states, _line_series(control_period, counts.degree))
     generator, output = generator_rows(numerator, denominator, control_period)
     rows = matrix_exponential(generator[:, :, None] * begin[None, None], begin)
     rows = rows.at[:, order].add(-rows[:, order + 1])
     return Cells(
         begin, length, rest, jnp.moveaxis(rows[:order], 2, 1), _series(generator, output, counts.degree)
     )
+
+
+def build_series(
+    numerator: Float[Array, "order *batch"],
+    denominator: Float[Array, "order_plus_1 *batch"],
+    control_period: Float[Array, "*batch"],
+    degree: int,
+) -> Float[Array, "powers columns *batch"]:
+    """Return the matrix from (state, command, increase of the command in a period) to a power series.
+
+    The series gives the position as a function of the time since the instant of the state [periods].
+    """
+    if denominator.shape[0] > 1:
+        return _series(*generator_rows(numerator, denominator, control_period), degree)
+    return _line_series(control_period, degree)
+
+
+def horner_series(
+    series: Float[Array, "powers columns *batch"], drive: tuple[Array, ...], s: Float[Array, "*batch"]
+) -> tuple[Array, Array]:
+    """Return position [m] and velocity [m per period] at the time `s` [periods] of a series.
+
+    `drive` contains the state, the command, and the increase of the command in a period.
+    """
+    coefficients = [sum(row[i] * value for i, value in enumerate(drive)) for row in series]
+    position = rate = 0 * s
+    for power in range(len(coefficients) - 1, -1, -1):
+        rate = position + s * rate
+        position = coefficients[power] + s * position
+    return position, rate
 
 
 @jax.numpy_rank_promotion("allow")
@@ -252,6 +279,13 @@ def _moving_average(begin, length, window, control_period, hold):
     series = jnp.eye(DEGREE + 1, DEGREE + 3, dtype=begin.dtype)
     series = series.reshape(*series.shape, *[1] * control_period.ndim)
     return states, jnp.broadcast_to(series, (*series.shape[:2], *control_period.shape))
+
+
+def _line_series(control_period, degree):
+    """Return the rows of `_series` for an ideal motion simulator."""
+    ones, zeros = jnp.ones_like(control_period), jnp.zeros_like(control_period)
+    lines = [jnp.stack([ones, zeros]), jnp.stack([zeros, ones])]
+    return jnp.stack(lines + [jnp.zeros_like(lines[0])] * (degree - 1))
 
 
 def _series(generator, output, degree):

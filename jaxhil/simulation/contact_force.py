@@ -18,7 +18,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxhil.contact.laws import ContactLaw, ContactParameters, compute_two_sided_force, deflection
+from jaxhil.laws.shared.ring_buffer import look_back
 from jaxhil.simulation.cells import IntervalInputs
+from jaxhil.simulation.motion_simulator import apply_row
 from jaxhil.simulation.sensors import apply_lag, lag_decay
 
 NEWTON_STEPS = 3  # number of Newton steps from the root of the secant
@@ -147,6 +149,29 @@ def no_contact(like: Array) -> ContactSample:
     """Return the sample of a mechanism without contact, with the batch shape of `like`."""
     zeros = jnp.zeros_like(like)
     return ContactSample(zeros - 1, zeros, zeros, zeros + 1)
+
+
+def compute_interval_motion(rows, state, start, end, plane):
+    """Return the mechanism's motion in the current interval, relative to the surface at `plane` [m]."""
+
+    def motion(position, velocity):
+        return MotionSample(
+            apply_row(position, state, start, end) - plane, apply_row(velocity, state, start, end)
+        )
+
+    sample = motion(rows.position, rows.velocity)
+    if rows.start is None:
+        return SamplingInterval(sample, None, None, None)
+    return SamplingInterval(sample, motion(*rows.start), motion(*rows.end), None)
+
+
+def read_current_interval(rig, pending, now, age):
+    """Return the motion in the current sampling interval, from the delay line of motions.
+
+    Before the start of the run, all entries are 0: the mechanism is at rest at the surface, without a force.
+    """
+    intervals = rig.delays.contact
+    return jax.tree.map(lambda ring: look_back(ring, now, intervals, age >= intervals), pending)
 
 
 def compute_work_between(before: ContactSample, now: ContactSample) -> tuple[Array, Array]:

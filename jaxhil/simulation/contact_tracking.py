@@ -73,7 +73,10 @@ def build_end_conditions(scenario: Scenario) -> ContactEndConditions:
     when the force command has decayed, but at most 0.1 s later.
     """
     sensor, period = scenario.force_sensor, scenario.control_period
-    force_free_ticks = jnp.floor((sensor.delay + 20 * sensor.time_constant) / period + (2 + 1e-9)) + 1
+    delay = sensor.delay + 20 * sensor.time_constant
+    if scenario.timing is not None and scenario.timing.jitter is not None:
+        delay = delay + scenario.timing.jitter
+    force_free_ticks = jnp.floor(delay / period + (2 + 1e-9)) + 1
     return ContactEndConditions(
         force_free_ticks=force_free_ticks,
         max_force_free_ticks=force_free_ticks + jnp.ceil(MAX_DECAY_WAIT / period),

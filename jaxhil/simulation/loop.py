@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxhil.contact.laws import ContactLaw
 from jaxhil.laws.simulation_base import Compensator, Gains, KnownConstants
-from jaxhil.simulation.cells import CellCounts, Cells, build_cells
+from jaxhil.simulation.cells import CellCounts, Cells, build_cells, build_series
 from jaxhil.simulation.contact_force import no_contact
 from jaxhil.simulation.loop_state import LoopState, PlantState
 from jaxhil.simulation.motion_simulator import (
@@ -30,6 +30,7 @@ from jaxhil.simulation.motion_simulator import (
 from jaxhil.simulation.moving_average import discretise_moving_average
 from jaxhil.simulation.probe import initial_first_contact
 from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.timing import SERIES_DEGREE, HeldValues
 
 
 class Loop(eqx.Module):
@@ -59,6 +60,7 @@ class Loop(eqx.Module):
     energies: bool = eqx.field(static=True)  # whether the work of the contact force is recorded
     probed: bool = eqx.field(static=True)  # whether the scenarios have a `Probe`
     chatter: bool = eqx.field(static=True)  # whether the total variation of the force command is recorded
+    has_timing: bool = eqx.field(static=True, default=False)  # whether the rig has timing effects
 
     @property
     def reads_always(self) -> bool:
@@ -70,12 +72,13 @@ class Loop(eqx.Module):
         """Return whether the approach to a contact is uniform motion without any event, and can be skipped.
 
         This requires that readings have no noise, bias or quantisation, that the motion simulator has no
-        limits, and that the compensator does nothing before the contact. It also requires that the scenarios
-        have no `Probe`, whose time starts at the numerical model's first touch.
+        limits, that there are no timing effects, and that the compensator does nothing before the contact.
+        It also requires that the scenarios have no `Probe`, whose time starts at the numerical model's first
+        touch.
         """
         uneven = self.reads_always or self.has_position_noise or self.has_sample_effects or self.has_limits
         waits = vars(type(self.compensator)).get("waits_for_contact", False)
-        return waits and not (uneven or self.probed)
+        return waits and not (uneven or self.probed or self.has_timing)
 
     @property
     def first_tick(self) -> int:
@@ -123,6 +126,8 @@ class RigConstants(NamedTuple):
     delays: Delays  # delays of the loop [sampling intervals]
     constants: KnownConstants  # rig data that the compensator knows
     inverse_mass: Float[Array, "*batch"]  # reciprocal of the equivalent mass [1/kg]
+    # power series of the motion in a sampling interval (`build_series`); None without jitter
+    series: Float[Array, "powers columns *batch"] | None = None
 
 
 def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -> RigConstants:
@@ -154,6 +159,9 @@ def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -
         rows = discretise(simulator.numerator, simulator.denominator, period, *fractions, loop.hold, ends)
     else:
         rows = discretise_moving_average(simulator.window, period, *fractions, loop.hold, ends)
+    series = None
+    if scenario.timing is not None and scenario.timing.jitter is not None:
+        series = build_series(simulator.numerator, simulator.denominator, period, SERIES_DEGREE)
     return RigConstants(
         scenario=scenario,
         propagation=rows,
@@ -161,6 +169,7 @@ def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -
         delays=delays,
         constants=KnownConstants(period, scenario.clearance),
         inverse_mass=1 / scenario.equivalent_mass,
+        series=series,
     )
 
 
@@ -233,4 +242,5 @@ def start_uniform_motion(
         onset_velocity=velocity,
         onset_tick=jnp.broadcast_to(tick, position.shape),
         first_contact=initial_first_contact(position) if loop.probed else None,
+        held=None if state.held is None else HeldValues(0 * position, 0 * position),
     )

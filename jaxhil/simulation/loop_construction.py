@@ -50,7 +50,9 @@ def build_loop(
     rig, force, position = mechanism.rig, scenarios.force_sensor, scenarios.position_sensor
     simulator = scenarios.simulator
     law = COMPENSATORS[compensator]
-    sensed = np.maximum(force.delay, position.delay) + simulator.delay
+    sensed, timing = np.maximum(force.delay, position.delay) + simulator.delay, scenarios.timing
+    if timing is not None and timing.jitter is not None:
+        sensed = sensed + timing.jitter
     aligned = [g.upper(mechanism) for g in law.gains if g.name == "identification_delay"]
 
     def samples(delay) -> int:
@@ -88,6 +90,7 @@ def build_loop(
         energies=energies,
         probed=scenarios.probe is not None,
         chatter=chatter,
+        has_timing=timing is not None,
     )
 
 

@@ -5,8 +5,10 @@ from typing import Any, NamedTuple
 from jaxtyping import Array, Float, Int
 
 from jaxhil.contact.laws import ContactParameters
+from jaxhil.simulation.cells import IntervalInputs
 from jaxhil.simulation.contact_force import ContactSample, PlantSignals, SamplingInterval
 from jaxhil.simulation.probe import FirstContact
+from jaxhil.simulation.timing import HeldValues
 
 
 class PlantState(NamedTuple):
@@ -44,6 +46,7 @@ class Rings(NamedTuple):
     interval: SamplingInterval | None
     # drive command at the end of each interval [m]; None unless the motion simulator is a moving average
     command: Float[Array, "samples *batch"] | None
+    inputs: IntervalInputs | None  # inputs of the motion in each sampling interval; None without jitter
 
 
 class SensorState(NamedTuple):
@@ -71,3 +74,4 @@ class LoopState(NamedTuple):
     onset_velocity: Float[Array, "*batch"]  # velocity of the uniform motion at the start of the run [m/s]
     onset_tick: Int[Array, "*batch"]  # number of the first tick of the run
     first_contact: FirstContact | None  # first touch of the hardware; None without a probe
+    held: HeldValues | None  # values of the last tick; None without timing effects

@@ -22,6 +22,7 @@ from jaxhil.simulation.free_flight import APPROACH_TIME
 from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.simulation.outcome import parameters_by_slot
 from jaxhil.simulation.scenario import MAX_CONTACT_DURATION, MotionSimulatorBatch, Scenario, build_scenarios
+from jaxhil.simulation.timing import MAX_SERIES_POLE
 
 MAX_CONTACT_TICKS = 1e7  # maximum number of ticks of a contact, including its approach
 MAX_RUN_TICKS = 1e9  # maximum number of ticks of a run; ticks are counted in 32 bits
@@ -32,6 +33,7 @@ MAX_PLAUSIBLE_BANDWIDTH = 50.0  # Hz; highest plausible natural frequency of a m
 MOVING_AVERAGE_BANDWIDTH = 0.442946  # [1]; x with sin(pi x)/(pi x) = 1/sqrt(2): bandwidth times window
 MAX_FREQUENCY_RATIO = 0.1  # [1]; highest plausible contact frequency as a fraction of the control rate
 MAX_PLAUSIBLE_VELOCITY = 1.0  # m/s; highest plausible approach velocity
+FAST_SIMULATOR = f"at most {MAX_POLE:g} / control_period; for a faster simulator use model = 'ideal'"
 MAX_LISTED_FREQUENCIES = 4  # a summary lists at most this number of contact frequencies, or only their range
 
 _TAIL_PROBABILITY = 1e-9  # [1]; probability of the values that are ignored at each end of a distribution
@@ -133,6 +135,9 @@ def check_run(mechanism: Mechanism, label: str | None = None, drawn: bool = Fals
     name = label or mechanism.name
     lanes = build_scenarios(mechanism, _extreme_draws(mechanism, _POLE_KEYS) if drawn else None)
     check_poles(name, lanes.simulator.denominator, lanes.control_period)
+    if lanes.timing is not None and lanes.timing.jitter is not None:
+        allowed = "at most 1 / control_period for rig.force_sensor.jitter"
+        check_poles(name, lanes.simulator.denominator, lanes.control_period, MAX_SERIES_POLE, allowed)
     _check_velocity_limit(
         name, build_scenarios(mechanism, _extreme_draws(mechanism, _SPEED_KEYS) if drawn else None)
     )
@@ -152,23 +157,26 @@ def _check_velocity_limit(name: str, scenarios: Scenario) -> None:
         )
 
 
-def check_poles(name: str, denominator: Any, control_period: Any) -> None:
-    """Raise `InputError` if a pole of the motion simulator exceeds `MAX_POLE` [rad per control period].
+def check_poles(
+    name: str, denominator: Any, control_period: Any, limit: float = MAX_POLE, expected: str = FAST_SIMULATOR
+) -> None:
+    """Raise `InputError` if a pole of the motion simulator exceeds a limit.
 
     Args:
         name: Name of the mechanism in the message.
         denominator: Denominators of the transfer functions, descending powers of s, (order + 1, lanes).
         control_period: Control periods [s], (lanes,).
+        limit: Largest magnitude of a pole [rad per control period].
+        expected: Text of the message that states the limit.
     """
     for lane, period in enumerate(control_period):
         coefficients = np.asarray(denominator)[:, lane]
         with np.errstate(all="ignore"):
             monic = coefficients / coefficients[0] * period ** np.arange(len(coefficients))
         fastest = np.max(np.abs(np.roots(monic)), initial=0.0) if np.all(np.isfinite(monic)) else math.inf
-        if fastest > MAX_POLE:
-            allowed = f"at most {MAX_POLE:g} / control_period; for a faster simulator use model = 'ideal'"
+        if fastest > limit:
             pole = f"a pole of {fastest / period:.3g} rad/s at a control period of {period:g} s"
-            raise InputError(f"{name}: rig.simulator: found {pole}, expected {allowed}")
+            raise InputError(f"{name}: rig.simulator: found {pole}, expected {expected}")
 
 
 def compute_bandwidth(simulator: MotionSimulatorBatch) -> float:

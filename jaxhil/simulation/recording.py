@@ -47,12 +47,18 @@ class LaneRecord(NamedTuple):
 
 
 def nominal_and_draws(mechanism: Mechanism, number: int, seed: int) -> Scenario:
-    """Return `number` scenarios: the nominal scenario first, then draws of the uncertain parameters."""
+    """Return `number` scenarios: the nominal scenario first, then draws of the uncertain parameters.
+
+    The scenarios have no missed ticks.
+    """
     draws = {}
     for path, drawn in draw(mechanism, number - 1, seed).items():
         nominal = np.broadcast_to(np.asarray(value_at(mechanism, path), float), drawn.shape[1:])
         draws[path] = np.concatenate([nominal[None], drawn])
-    return build_scenarios(mechanism, draws, seed=seed)
+    scenarios = build_scenarios(mechanism, draws, seed=seed)
+    # The rig's controller is compared tick by tick: it must run at every tick.
+    timing = scenarios.timing
+    return scenarios if timing is None else scenarios._replace(timing=timing._replace(missed=None))
 
 
 def record_lanes(loaded: LoadedGains, batch: Scenario) -> tuple[Metrics, list[LaneRecord]]:

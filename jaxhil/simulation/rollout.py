@@ -23,6 +23,7 @@ from jaxhil.simulation.probe import initial_first_contact
 from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.sensors import SensorNoise, draw_noise
 from jaxhil.simulation.tick import RunState, SegmentConstants, Tick, tick
+from jaxhil.simulation.timing import HeldValues, TimingDraws, draw_timing
 
 
 def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
@@ -102,7 +103,7 @@ def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool
             None if rig.propagation.window is None else (zeros, zeros),
         ),
         sensed=SensorState(
-            rings=_build_rings(loop, ring, measured, order, rig.propagation.window is not None),
+            rings=_build_rings(loop, rig, ring, measured, order),
             last=no_contact(like),
             contact_time=zeros if loop.has_cells else None,
             lagged=zeros,
@@ -114,6 +115,7 @@ def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool
         onset_velocity=zeros,
         onset_tick=index,
         first_contact=initial_first_contact(zeros) if loop.probed else None,
+        held=None if scenario.timing is None else HeldValues(zeros, zeros),
     )
     # Delay lines are read up to their whole length back. With this number of the first tick, no index is
     # negative.
@@ -139,7 +141,7 @@ def run_segment(
     prepared = prepare_segment(loop, rig, gains, run)
 
     def body(carry, noise):
-        now, seen = tick(loop, rig, prepared, _replace_changing_parts(run, carry), noise)
+        now, seen = tick(loop, rig, prepared, _replace_changing_parts(run, carry), *noise)
         return _changing_parts(now), seen if record else None
 
     length = segment_length(loop)
@@ -159,11 +161,14 @@ def prepare_segment(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) 
     )
 
 
-def draw_segment_noise(loop: Loop, rig: RigConstants, run: RunState, ticks: int) -> SensorNoise:
-    """Return the sensors' noise at the ticks of the next segment, (ticks, *batch)."""
+def draw_segment_noise(
+    loop: Loop, rig: RigConstants, run: RunState, ticks: int
+) -> tuple[SensorNoise, TimingDraws | None]:
+    """Return the sensors' noise and the timing effects at the ticks of the next segment, (ticks, *batch)."""
     ahead = jnp.arange(ticks, dtype=jnp.int32).reshape(-1, *[1] * run.index.ndim)
     age = run.tick + ahead - run.state.onset_tick[None]
-    return draw_noise(loop.has_force_noise, loop.has_position_noise, rig.scenario, run.index, age)
+    noise = draw_noise(loop.has_force_noise, loop.has_position_noise, rig.scenario, run.index, age)
+    return noise, draw_timing(rig.scenario, run.index, age)
 
 
 def begin_next_contacts(
@@ -234,7 +239,7 @@ def _replace_changing_parts(run, parts):
     return run._replace(state=state, tracker=tracker, tick=now)
 
 
-def _build_rings(loop, ring, measured, order, averages):
+def _build_rings(loop, rig, ring, measured, order):
     """Return the initial delay lines of the signals that the loop uses; `ring` is an array of zeros."""
     interval = None
     if loop.is_two_sided:
@@ -249,8 +254,10 @@ def _build_rings(loop, ring, measured, order, averages):
         contact_time=ring if loop.has_cells else None,
     )
     reading = ring if loop.has_lag else None
-    position, command = (ring if is_used else None for is_used in (measured, averages))
-    return Rings(plant_signals, reading, position, interval, command)
+    position = ring if measured else None
+    command = None if rig.propagation.window is None else ring
+    inputs = None if rig.series is None else IntervalInputs((ring,) * order, ring, ring, ring)
+    return Rings(plant_signals, reading, position, interval, command, inputs)
 
 
 def _finished_lanes(rig, run):

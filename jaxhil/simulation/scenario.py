@@ -60,6 +60,14 @@ class PositionSensorBatch(NamedTuple):
     quantum: Float[Array, "*batch"]  # quantisation step [m]; 0 without quantisation
 
 
+class TimingBatch(NamedTuple):
+    """Timing effects of the rig; None for an effect that no scenario of the batch has."""
+
+    jitter: Float[Array, "*batch"] | None  # largest deviation of the force reading's delay [s]
+    loss: Float[Array, "*batch"] | None  # probability that a frame of the force sensor is lost
+    missed: Float[Array, "*batch"] | None  # probability that the controller misses a tick
+
+
 class Scenario(NamedTuple):
     """Batch of scenarios; each element of the batch (lane) is one series of contacts."""
 
@@ -81,6 +89,7 @@ class Scenario(NamedTuple):
     probe: Probe | None = None  # push and reference trajectory for each contact; None without a probe
     # metrics of ideal contacts computed in advance; NaN for the other contacts; None if there are none
     reference: IdealContact | None = None
+    timing: TimingBatch | None = None  # timing effects; None if there are none
 
 
 def count_contact_slots(contacts: int) -> int:
@@ -132,6 +141,7 @@ def build_scenarios(
         ),
         time_limit=table.constant(MAX_CONTACT_DURATION),
         key=key,
+        timing=_build_timing(mechanism, table),
     )
 
 
@@ -159,6 +169,11 @@ class _MechanismNumbers:
     def constant(self, value: float) -> Any:
         """Return an array (lanes,) with the same value in every lane."""
         return self.np.broadcast_to(self.np.asarray(value, float), (self.number,))
+
+    def optional(self, path: str) -> Any:
+        """Return a parameter, as an array (lanes,); None if it is 0 in every draw."""
+        is_used = path in self._draws or path in self._mechanism.uncertainty
+        return self.scalar(path) if is_used or value_at(self._mechanism, path) else None
 
     def entries(self, path: str) -> Any:
         """Return a parameter that is a list, as an array (entries, ..., lanes)."""
@@ -198,6 +213,13 @@ def _build_mass(mechanism, table) -> Any:
         return table.scalar("bodies.equivalent_mass")
     chaser, target = table.scalar("bodies.chaser_mass"), table.scalar("bodies.target_mass")
     return chaser * target / (chaser + target)
+
+
+def _build_timing(mechanism, table) -> TimingBatch | None:
+    """Return the timing effects that the mechanism has; None if it has none."""
+    paths = "rig.force_sensor.jitter", "rig.force_sensor.loss_probability", "rig.missed_tick_probability"
+    timing = TimingBatch(*map(table.optional, paths))
+    return None if all(effect is None for effect in timing) else timing
 
 
 def _build_motion_simulator(simulator, table) -> MotionSimulatorBatch:

@@ -154,11 +154,25 @@ def white_noise(
     dtype: Any,
 ) -> Float[Array, "ticks *batch"]:
     """Return standard normal samples, independent for different (key, contact, count)."""
+    # erf_inv is infinite at -1 and 1.
+    return 2**0.5 * lax.erf_inv(_odd_multiples(key, contact, count, dtype) - 1)
+
+
+def uniform_noise(
+    key: UInt32[Array, "2 *batch"],
+    contact: Int[Array, "*batch"],
+    count: Int[Array, "ticks *batch"],
+    dtype: Any,
+) -> Float[Array, "ticks *batch"]:
+    """Return uniform samples between 0 and 1, independent for different (key, contact, count)."""
+    return _odd_multiples(key, contact, count, dtype) / 2
+
+
+def _odd_multiples(key, contact, count, dtype):
+    """Return random odd multiples of a power of two, which lie strictly between 0 and 2."""
     bits, _ = threefry(key[0][None], key[1][None], contact[None].astype("uint32"), count.astype("uint32"))
-    # erf_inv is infinite at -1 and 1. Odd multiples of a power of two lie strictly between these values.
     digits = min(32, jnp.finfo(dtype).nmant)
-    share = (2 * (bits >> (32 - digits)).astype(dtype) + 1) * 2**-digits - 1
-    return 2**0.5 * lax.erf_inv(share)
+    return (2 * (bits >> (32 - digits)).astype(dtype) + 1) * 2**-digits
 
 
 def threefry(key_0: Array, key_1: Array, count_0: Array, count_1: Array) -> tuple[Array, Array]:

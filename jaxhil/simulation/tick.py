@@ -16,19 +16,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxhil.lanes import select_lanes
 from jaxhil.laws.shared.ring_buffer import depend_on, look_back, write_sample, write_samples
 from jaxhil.laws.simulation_base import Gains, Signals
 from jaxhil.simulation.cells import MIN_LAG, IntervalInputs, power_series
 from jaxhil.simulation.contact_force import (
     IntervalContact,
-    MotionSample,
     PlantSignals,
     SamplingInterval,
     Surfaces,
     apply_sensor_lag,
+    compute_interval_motion,
     compute_work_along,
     compute_work_between,
     largest_force,
+    read_current_interval,
 )
 from jaxhil.simulation.contact_in_cells import ContactSurfaces, compute_jump_work, contact_in_cells
 from jaxhil.simulation.contact_tracking import ContactEndConditions, ContactTracker, record_contact
@@ -36,12 +38,13 @@ from jaxhil.simulation.integrators import INTEGRATORS
 from jaxhil.simulation.loop import Loop, RigConstants
 from jaxhil.simulation.loop_state import LoopState, PlantState, Rings
 from jaxhil.simulation.metrics import Metrics
-from jaxhil.simulation.motion_simulator import advance_state, apply_row, read_measured_position
+from jaxhil.simulation.motion_simulator import advance_state, read_measured_position
 from jaxhil.simulation.moving_average import UniformCommand, read_leaving_commands
 from jaxhil.simulation.probe import Probe
 from jaxhil.simulation.probed_tick import apply_probe
 from jaxhil.simulation.rate_limits import limit_command
 from jaxhil.simulation.sensors import SensorNoise, quantise, sample_force
+from jaxhil.simulation.timing import HeldValues, TimingDraws, hold_compensator, read_force
 
 
 class RunState(NamedTuple):
@@ -98,17 +101,28 @@ class ActuationResult(NamedTuple):
     pending: SamplingInterval | None
     # delay line of drive commands; None unless the motion simulator is a moving average
     commands: Float[Array, "samples *batch"] | None
+    inputs: IntervalInputs | None  # inputs of the motion in the current interval; None without jitter
 
 
 def tick(
-    loop: Loop, rig: RigConstants, prepared: SegmentConstants, run: RunState, noise: SensorNoise
+    loop: Loop,
+    rig: RigConstants,
+    prepared: SegmentConstants,
+    run: RunState,
+    noise: SensorNoise,
+    timing: TimingDraws | None = None,
 ) -> tuple[RunState, Tick]:
     """Simulate one control period; return the next state and the record of the tick."""
     state, now = run.state, run.tick
-    signals, plant_signals = sense(loop, rig, state, now, noise)
+    missed = None if timing is None else timing.is_missed
+    signals, plant_signals = sense(loop, rig, state, now, noise, timing)
     force, controller = compensate(loop, prepared, state, signals, now)
+    if missed is not None and state.held is not None:
+        force = jnp.where(missed, state.held.command, force)
     model = integrate(loop, rig, state, force)
-    actuated = actuate(loop, rig, prepared.gains, state, now, model, controller)
+    if missed is not None:
+        model = select_lanes(missed, model._replace(position=state.position, velocity=state.velocity), model)
+    actuated = actuate(loop, rig, prepared.gains, state, now, model, controller, missed)
     contact = compute_contact(loop, rig, state, actuated.interval)
     tracker = record_contact(
         loop, prepared.rules, run.tracker, signals, plant_signals, force, state.plant.shortfall
@@ -125,6 +139,8 @@ def tick(
             tracker,
         )
     state = update_state(state, now, plant_signals, model, actuated, contact)
+    if state.held is not None:
+        state = state._replace(held=HeldValues(signals.force_measured, force))
     record = Tick(
         signals,
         force,
@@ -138,26 +154,39 @@ def tick(
 
 
 def sense(
-    loop: Loop, rig: RigConstants, state: LoopState, now: Array, noise: SensorNoise
+    loop: Loop,
+    rig: RigConstants,
+    state: LoopState,
+    now: Array,
+    noise: SensorNoise,
+    timing: TimingDraws | None = None,
 ) -> tuple[Signals, PlantSignals]:
     """Stage 1: return the sensor readings at tick `now`, and the real forces in the last interval."""
     scenario, sensed = rig.scenario, state.sensed
     age = now - state.onset_tick
     rings, delays = sensed.rings, rig.delays
-    force_ring = rings.plant_signals.force if rings.reading is None else rings.reading
-    force = _delayed_sample(force_ring, now, age, delays.force.intervals)
+    if timing is not None and timing.jitter is not None:
+        surfaces = Surfaces(loop.law, state.parameters, state.law, None)
+        force = read_force(rig, rings.inputs, surfaces, now, age, timing.jitter, loop.hold)
+        step = jnp.zeros_like(force)  # jitter already spreads the instants of the jumps
+    else:
+        force_ring = rings.plant_signals.force if rings.reading is None else rings.reading
+        force = _delayed_sample(force_ring, now, age, delays.force.intervals)
+        step = force - _delayed_sample(force_ring, now, age, delays.force.intervals + 1)
     plant_signals = jax.tree.map(
         lambda ring: _delayed_sample(ring, now, age, delays.real), rings.plant_signals
     )
-    sensor, step = scenario.force_sensor, None
-    if loop.cuts_dead_zone:
-        step = force - _delayed_sample(force_ring, now, age, delays.force.intervals + 1)
+    sensor = scenario.force_sensor
     if loop.has_force_bias:
         force = force + sensor.bias
     if noise.force is not None:
         force = force + noise.force
     if loop.has_sample_effects:
-        force = sample_force(force, sensor.quantum, sensor.dead_zone, sensor.range, step)
+        force = sample_force(
+            force, sensor.quantum, sensor.dead_zone, sensor.range, step if loop.cuts_dead_zone else None
+        )
+    if timing is not None and timing.is_lost is not None and state.held is not None:
+        force = jnp.where(timing.is_lost, state.held.reading, force)
 
     position = _delayed_position(rig, state, now, age)
     if noise.position is not None:
@@ -193,9 +222,17 @@ def actuate(
     now: Array,
     model: ModelState,
     controller: Any,
+    missed: Array | None = None,
 ) -> ActuationResult:
-    """Stage 4: apply limits, latency, hold and motion simulator to the position command."""
+    """Stage 4: apply limits, latency, hold and motion simulator to the position command.
+
+    In lanes that `missed` the tick, the drives receive the last command again, and the compensator keeps its
+    state.
+    """
     command, controller = loop.compensator.position_command(gains, controller, *model)
+    if missed is not None:
+        command = jnp.where(missed, state.plant.sent, command)
+        controller = hold_compensator(missed, state.controller, controller, loop.controller_ring)
     command, step, unlimited_command = _apply_limits(rig, state.plant, command)
     commands = (command, *state.plant.commands)
     end = commands[loop.latency]
@@ -206,14 +243,14 @@ def actuate(
         past = write_sample(past, now, end)
         before_run = UniformCommand(*first, now - state.onset_tick)
         simulator = read_leaving_commands(past, now, rows.window, simulator, before_run)
-    inputs = IntervalInputs(simulator, start, end, rig.scenario.contact_plane) if loop.has_cells else None
-    interval = _interval_motion(rows, simulator, start, end, rig.scenario.contact_plane)._replace(
-        interval_inputs=inputs
+    inputs = IntervalInputs(simulator, start, end, rig.scenario.contact_plane)
+    interval = compute_interval_motion(rows, simulator, start, end, rig.scenario.contact_plane)._replace(
+        interval_inputs=inputs if loop.has_cells else None
     )
     pending = state.sensed.rings.interval
     if pending is not None:
         pending = write_samples(pending, now, interval)
-        interval = _current_interval(rig, pending, now, now - state.onset_tick)
+        interval = read_current_interval(rig, pending, now, now - state.onset_tick)
     next_state = advance_state(rows.transition, simulator, start, end)
     return ActuationResult(
         plant=state.plant._replace(
@@ -227,6 +264,7 @@ def actuate(
         interval=interval,
         pending=pending,
         commands=past,
+        inputs=None if rig.series is None else inputs,
     )
 
 
@@ -312,7 +350,7 @@ def update_state(
     dependence on `before` makes XLA read before it writes.
     """
     plant_signals = jax.tree.map(depend_on, contact.plant_signals, before)
-    samples = Rings(plant_signals, contact.reading, actuated.position, None, None)
+    samples = Rings(plant_signals, contact.reading, actuated.position, None, None, actuated.inputs)
     rings = write_samples(state.sensed.rings._replace(interval=None, command=None), now, samples)
     return state._replace(
         position=model.position,
@@ -357,26 +395,3 @@ def _apply_limits(rig, plant, command):
         simulator.velocity_limit, simulator.acceleration_limit,
     )  # fmt: skip
     return limited, step, command
-
-
-def _interval_motion(rows, state, start, end, plane):
-    """Return the mechanism's motion in the current interval, relative to the surface at `plane` [m]."""
-
-    def motion(position, velocity):
-        return MotionSample(
-            apply_row(position, state, start, end) - plane, apply_row(velocity, state, start, end)
-        )
-
-    sample = motion(rows.position, rows.velocity)
-    if rows.start is None:
-        return SamplingInterval(sample, None, None, None)
-    return SamplingInterval(sample, motion(*rows.start), motion(*rows.end), None)
-
-
-def _current_interval(rig, pending, now, age):
-    """Return the motion in the current sampling interval, from the delay line of motions.
-
-    Before the start of the run, all entries are 0: the mechanism is at rest at the surface, without a force.
-    """
-    intervals = rig.delays.contact
-    return jax.tree.map(lambda ring: look_back(ring, now, intervals, age >= intervals), pending)

@@ -138,7 +138,7 @@ def _group_one_axis(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Co
         key = (
             *(getattr(loop, name) for name in _DISTINGUISHING_PROPERTIES),
             len(batch.simulator.denominator),
-            batch.simulator.window is None,
+            jax.tree.structure((batch.simulator.window, batch.timing)),
             _needs_simulated_speeds(mechanisms[index]),
         )
         groups.setdefault(key, []).append(index)

@@ -41,7 +41,7 @@ class ContactDetector:
     def __init__(self, mechanism: Mechanism) -> None:
         rig, sensor = mechanism.rig, mechanism.rig.force_sensor
         self._period, self._clearance = rig.control_period, mechanism.contact.clearance
-        lag = (sensor.delay + 20 * sensor.time_constant) / self._period
+        lag = (sensor.delay + sensor.jitter + 20 * sensor.time_constant) / self._period
         min_ticks = math.floor(lag + 2 + 1e-9) + 1
         max_ticks = min_ticks + math.ceil(MAX_FADING_TIME / self._period)
         self._min_ticks_without_force, self._max_ticks_without_force = min_ticks, max_ticks

@@ -17,6 +17,7 @@ from jaxhil.mechanism.structs import Simulator
 
 # Coefficients of (state, command at the sampling interval's start, command at its end).
 ResponseRow = tuple[float, ...]
+SERIES_DEGREE = 16  # degree of the power series of the motion in an interval
 DELAY_ROUNDING_TOLERANCE = 1e-9  # [periods]; a delay this close to a whole number of periods is rounded to it
 
 
@@ -127,6 +128,31 @@ def transfer_function(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
     frequency = 2 * math.pi * (simulator.natural_frequency or math.nan)
     damping = simulator.damping_ratio or math.nan
     return np.array([frequency**2]), np.array([1.0, 2 * damping * frequency, frequency**2])
+
+
+def series_rows(simulator: Simulator, period: float) -> tuple[ResponseRow, ...]:
+    """Return rows that give the position as a power series in the time since an interval's start [periods].
+
+    The rows are multiplied by (state, command at the interval's start, its increase in the interval). The
+    series is accurate to rounding for poles up to 1 rad per period.
+    """
+    numerator, denominator = transfer_function(simulator)
+    order = len(denominator) - 1
+    generator, row = np.zeros((order + 2, order + 2)), np.zeros(order + 2)
+    generator[order, order + 1] = 1.0
+    if order:
+        powers = period ** np.arange(order + 1.0)
+        generator[:order, :order] = np.eye(order, k=1)
+        generator[order - 1, :order] = -(denominator[::-1] / denominator[0])[:order] * powers[:0:-1]
+        generator[order - 1, order] = 1.0
+        row[: len(numerator)] = numerator[::-1] / denominator[0]
+        row[:order] *= powers[:0:-1]
+    else:
+        row[0] = 1.0
+    rows = [row]
+    for power in range(1, SERIES_DEGREE + 1):
+        rows.append(rows[-1] @ generator / power)
+    return tuple(map(_as_row, rows))
 
 
 def evaluate_row(row: ResponseRow, state: list[float], start: float, end: float) -> float:

@@ -30,15 +30,7 @@ def discretise_moving_average(
     kink = width - whole
 
     def motion(fraction: float, is_before: bool) -> MotionRows:
-        """Return the rows of an instant `is_before` or after the window's start passes a tick."""
-        early, late = (fraction, 0.0) if is_before else (kink, fraction - kink)
-        entering, leaving = _line_integral(0.0, fraction, hold), _line_integral(1.0 - kink, early, hold)
-        second = _line_integral(0.0, late, hold)
-        position = (1.0, *_weights(entering, leaving, second, width))
-        rates = _line_value(1.0 - kink + early, hold), _line_value(late, hold)
-        leaving, second = (rates[0], (0.0, 0.0)) if is_before else ((0.0, 0.0), rates[1])
-        velocity = (0.0, *_weights(_line_value(fraction, hold), leaving, second, width * period))
-        return MotionRows(position, velocity)
+        return average_rows(window, period, hold, fraction, is_before)
 
     def sampled(fraction: float) -> MotionRows:
         return motion(fraction, fraction <= kink + DELAY_ROUNDING_TOLERANCE)
@@ -55,6 +47,20 @@ def discretise_moving_average(
         steady_step=_steady_step(whole, kink, hold),
         window_intervals=whole,
     )
+
+
+def average_rows(window: float, period: float, hold: str, fraction: float, is_before: bool) -> MotionRows:
+    """Return the rows at a fraction of an interval, `is_before` or after the window's start passes a tick."""
+    width = window / period
+    kink = width - math.floor(width + DELAY_ROUNDING_TOLERANCE)
+    early, late = (fraction, 0.0) if is_before else (kink, fraction - kink)
+    entering, leaving = _line_integral(0.0, fraction, hold), _line_integral(1.0 - kink, early, hold)
+    second = _line_integral(0.0, late, hold)
+    position = (1.0, *_weights(entering, leaving, second, width))
+    rates = _line_value(1.0 - kink + early, hold), _line_value(late, hold)
+    leaving, second = (rates[0], (0.0, 0.0)) if is_before else ((0.0, 0.0), rates[1])
+    velocity = (0.0, *_weights(_line_value(fraction, hold), leaving, second, width * period))
+    return MotionRows(position, velocity)
 
 
 def _line_value(fraction: float, hold: str) -> tuple[float, float]:

@@ -26,6 +26,7 @@ from tuning.rig.discretisation import (
 )
 from tuning.rig.moving_average import discretise_moving_average
 from tuning.rig.sensor_lag import MotionState, apply_sensor_lag, deepest_penetration
+from tuning.rig.timing import TimingEffects
 
 # Motion of the mechanism when the force sensor samples, at the sampling interval's start and at its end.
 SamplingInterval = tuple[MotionState, MotionState | None, MotionState | None]
@@ -58,7 +59,8 @@ def compute_plant_constants(mechanism: Mechanism) -> PlantConstants:
         rows = discretise_simulator(simulator, *instants)
     else:
         rows = discretise_moving_average(simulator.window, *instants)
-    longest = max(force_intervals, position_intervals, contact_intervals, rows.window_intervals or 0)
+    longest, _ = split_delay(simulator.delay + rig.force_sensor.delay + rig.force_sensor.jitter, period)
+    longest = max(longest, force_intervals, position_intervals, contact_intervals, rows.window_intervals or 0)
     return PlantConstants(
         rows=rows,
         sample_time=force_fraction * period,
@@ -91,6 +93,7 @@ class RigHardware:
         self._contact_intervals = constants.contact_intervals
         self._force_intervals = constants.force_intervals
         self._position_intervals = constants.position_intervals
+        self._timing = TimingEffects(mechanism, seed)
         self.begin(-1.0, 0.0, -1.0, 0)
 
     def begin(self, position: float, velocity: float, command: float, number: int) -> None:
@@ -124,6 +127,7 @@ class RigHardware:
         # Commands of the drives at the ends of the intervals; only a moving average reads them.
         self._drives = [self._commands[-1] + (index - size + 1) * stride for index in range(size)]
         self._tick = 0
+        self._timing.begin(size)
         self._lag = self.force = 0.0
         self._in_contact, self._deepest = False, 0.0
 
@@ -131,7 +135,10 @@ class RigHardware:
         """Return the measured force [N] and position [m] just before this tick's command acts."""
         last = self._size - 1
         sensor, noise = self._force_sensor, self._noise
-        force = self._forces[(self._tick - 1 - self._force_intervals) & last] + sensor.bias
+        force = self._timing.late_force(self._tick, self._law)
+        if force is None:
+            force = self._forces[(self._tick - 1 - self._force_intervals) & last]
+        force += sensor.bias
         if sensor.noise_std > 0.0:
             force += sensor.noise_std * noise.gauss(0.0, 1.0)
         force = _quantise(force, sensor.quantum)
@@ -139,7 +146,7 @@ class RigHardware:
             force = force if abs(force) > sensor.dead_zone else 0.0
         elif sensor.dead_zone > 0.0:
             force = math.copysign(max(0.0, abs(force) - sensor.dead_zone), force)
-        force = min(max(force, -sensor.range), sensor.range)
+        force = self._timing.hold_lost(self._tick, min(max(force, -sensor.range), sensor.range))
         position = self._positions[(self._tick - 1 - self._position_intervals) & last]
         if self._position_sensor.noise_std > 0.0:
             position += self._position_sensor.noise_std * noise.gauss(0.0, 1.0)
@@ -168,6 +175,7 @@ class RigHardware:
         else:
             interval = motion(rows.sample), None, None
         self._intervals[tick & last] = interval
+        self._timing.store(tick, state, start, end)
         self._positions[tick & last] = evaluate_row(rows.measured, state, start, end)
         self._state = [evaluate_row(row, state, start, end) for row in rows.transition]
         contact_interval = self._intervals[(tick - self._contact_intervals) & last]

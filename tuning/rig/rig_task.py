@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, Protocol
 
+from jaxhil.errors import InputError, format_value
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from tuning.rig.udp_protocol import (
@@ -60,6 +61,10 @@ def build_simulated_rig(mechanism: AnyMechanism, seed: int = 0) -> SimulatedRig:
         seed: seed of the sensor noise and of the phases.
     """
     if isinstance(mechanism, Mechanism):
+        if mechanism.rig.missed_tick_probability:
+            found = format_value(mechanism.rig.missed_tick_probability)
+            expected = "0 for a rehearsal; lost packets (--drops) make the controller miss ticks"
+            raise InputError(f"rig.missed_tick_probability: found {found}, expected {expected}")
         from tuning.rig.one_axis_rig import OneAxisRig
 
         return OneAxisRig(mechanism, seed)

@@ -107,6 +107,8 @@ def _reason_none_applies(mechanism: Mechanism, compensator: str, scenarios: Scen
         return f"the contact law is {mechanism.contact.law}"
     if mechanism.rig.simulator.model != "ideal":
         return f"the motion simulator is {mechanism.rig.simulator.model}"
+    if scenarios.timing is not None:
+        return "the timing varies from tick to tick"
     if np.any(np.asarray(scenarios.force_sensor.time_constant) > 0):
         return "the force sensor has a lag"
     if np.any(np.isfinite(np.asarray(scenarios.clearance))):

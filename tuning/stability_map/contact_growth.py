@@ -28,7 +28,7 @@ from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.simulation_base import Compensator, Gains, KnownConstants, Signals
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.integrators import INTEGRATORS
-from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 LINEAR_COMPENSATORS = (
     "none", "phase_lead", "multi_parameter_lead", "virtual_contact", "position_lead", "smith_predictor",
@@ -83,6 +83,8 @@ def explain_nonlinearity(mechanism: Mechanism, compensator: str) -> str | None:
         return f"the contact law {mechanism.contact.law} is not linear"
     if mechanism.rig.simulator.model == "moving_average":
         return "the motion simulator is a moving average"
+    if build_scenarios(mechanism).timing is not None:
+        return "the timing varies from tick to tick"
     return None
 
 

@@ -33,6 +33,7 @@ from jaxhil.simulation.tick import (
     sense,
     update_state,
 )
+from jaxhil.simulation.timing import HeldValues
 from tuning.verification.stops import ControllerStop, RecordingController
 
 
@@ -133,8 +134,8 @@ def _compile_loop(loop: Loop) -> _LoopProgram:
 
 
 def _sense(loop: Loop, rig: RigConstants, run: RunState) -> tuple[Signals, PlantSignals]:
-    noise = jax.tree.map(lambda leaf: leaf[0], draw_segment_noise(loop, rig, run, 1))
-    return sense(loop, rig, run.state, run.tick, noise)
+    noise, timing = jax.tree.map(lambda leaf: leaf[0], draw_segment_noise(loop, rig, run, 1))
+    return sense(loop, rig, run.state, run.tick, noise, timing)
 
 
 def _integrate(loop: Loop, rig: RigConstants, run: RunState, command: Array) -> ModelState:
@@ -159,6 +160,8 @@ def _advance(
     rules, shortfall = build_end_conditions(rig.scenario), state.plant.shortfall
     tracker = record_contact(loop, rules, run.tracker, signals, plant_signals, command, shortfall)
     state = update_state(state, now, plant_signals, model, actuated, contact)
+    if state.held is not None:
+        state = state._replace(held=HeldValues(signals.force_measured, command))
     return run._replace(state=state, tracker=tracker, tick=now + 1)
 
 

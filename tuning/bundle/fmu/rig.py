@@ -52,12 +52,21 @@ def rig_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
         fmi: version of FMI, 2 or 3.
 
     Raises:
-        InputError: If the contact law is not a built-in one.
+        InputError: If the contact law is not a built-in one, or the rig has timing effects.
     """
     mechanism = _without_extra_periods(document)
     if mechanism.contact.law not in LAWS:
         found = f"found {format_value(mechanism.contact.law)}, expected one of {', '.join(LAWS)}"
         raise InputError(f"fmu: contact.law: {found}; use `--format c99` to export without the rig")
+    sensor = mechanism.rig.force_sensor
+    for key, value in {
+        "force_sensor.jitter": sensor.jitter,
+        "force_sensor.loss_probability": sensor.loss_probability,
+        "missed_tick_probability": mechanism.rig.missed_tick_probability,
+    }.items():
+        if value:
+            found = f"found {value:g}, expected 0; use `--format c99` to export without the rig"
+            raise InputError(f"fmu: rig.{key}: {found}")
     return build_fmu(
         identifier=IDENTIFIER,
         name=f"{IDENTIFIER}: {mechanism.name}",

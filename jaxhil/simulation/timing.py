@@ -1,0 +1,131 @@
+"""Timing effects of the rig: delays that vary from tick to tick, lost frames, and missed ticks.
+
+The delay of the force reading at a tick deviates from its nominal value by at most the jitter, uniformly. The
+reading is the real force at exactly this earlier time, from the exact motion between the samples. If a frame
+of the force sensor is lost, the controller reads the last frame again. At a missed tick the controller does
+not run: the numerical model rests, and the drives receive the last position command once more.
+
+The effects at a tick depend only on the key of the scenario, the index of the contact, and the number of
+ticks since the run began, as the noise of the sensors does. No effect occurs at the first tick of a run.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxhil.lanes import select_lanes
+from jaxhil.laws.shared.ring_buffer import look_back
+from jaxhil.simulation.cells import IntervalInputs, horner_series
+from jaxhil.simulation.contact_force import MotionSample, Surfaces
+from jaxhil.simulation.motion_simulator import apply_row, split_delay
+from jaxhil.simulation.moving_average import TOLERANCE, motion_rows
+from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.sensors import uniform_noise
+
+TIMING_STREAM = 0x40000000  # offset of the contact's index, which separates these numbers from the noise
+SERIES_DEGREE = 16  # degree of the power series of the motion in an interval, accurate to rounding up to
+MAX_SERIES_POLE = 1.0  # this pole of the motion simulator [rad per control period]
+
+
+class TimingDraws(NamedTuple):
+    """Timing effects at several ticks, (ticks, *batch), or at one tick, (*batch); None for absent effects."""
+
+    jitter: Float[Array, "..."] | None  # deviation of the force reading's delay [s]
+    is_lost: Bool[Array, "..."] | None  # whether the frame of the force sensor is lost
+    is_missed: Bool[Array, "..."] | None  # whether the controller misses the tick
+
+
+class HeldValues(NamedTuple):
+    """Values of the last tick, which lost frames and missed ticks repeat."""
+
+    reading: Float[Array, "*batch"]  # force reading [N]
+    command: Float[Array, "*batch"]  # force command [N]
+
+
+def draw_timing(
+    scenario: Scenario, contact: Int[Array, "*batch"], age: Int[Array, "ticks *batch"]
+) -> TimingDraws | None:
+    """Return the timing effects of scenarios; None if they have none.
+
+    Args:
+        scenario: Scenarios.
+        contact: Index of the current contact.
+        age: Number of ticks since the run began.
+    """
+    timing = scenario.timing
+    if timing is None:
+        return None
+
+    def share(stream):
+        dtype = scenario.velocity.dtype
+        return uniform_noise(scenario.key, contact + TIMING_STREAM, 4 * age + stream, dtype)
+
+    def occurs(stream, probability):
+        return None if probability is None else (share(stream) < probability[None]) & (age > 0)
+
+    jitter = None if timing.jitter is None else timing.jitter[None] * (2 * share(0) - 1)
+    return TimingDraws(jitter, occurs(1, timing.loss), occurs(2, timing.missed))
+
+
+def hold_compensator(missed: Bool[Array, "*batch"], before: Any, after: Any, ring: int) -> Any:
+    """Return the compensator's next state: the last one in lanes that missed the tick.
+
+    Args:
+        missed: Lanes that missed the tick.
+        before: State before the tick.
+        after: State after the tick.
+        ring: Length of the compensator's delay lines [samples].
+    """
+
+    def unchanged(leaf):
+        # The position in a delay line follows from the number of the tick, which is common to all lanes. The
+        # samples move on with this number.
+        is_ring = leaf.ndim == missed.ndim + 1 and leaf.shape[0] == ring
+        return jnp.roll(leaf, 1, axis=0) if is_ring else leaf
+
+    return jax.lax.cond(
+        jnp.any(missed),
+        lambda: select_lanes(missed, jax.tree.map(unchanged, before), after),
+        lambda: after,
+    )
+
+
+def read_force(
+    rig: Any,
+    ring: IntervalInputs,
+    surfaces: Surfaces,
+    now: Int[Array, ""],
+    age: Int[Array, "*batch"],
+    jitter: Float[Array, "*batch"],
+    hold: str,
+) -> Float[Array, "*batch"]:
+    """Return the real force [N] at tick `now` minus the delays and the jitter; 0 before the run.
+
+    Args:
+        rig: Constants of the run.
+        ring: Delay line of the inputs of the sampling intervals.
+        surfaces: Contact law of the current contact, without memory.
+        now: Number of the tick.
+        age: Number of ticks since the run began.
+        jitter: Deviation of the delay [s].
+        hold: Hold of the position command.
+    """
+    scenario, period = rig.scenario, rig.constants.control_period
+    simulator = scenario.simulator
+    # A drawn jitter may exceed the drawn delay.
+    delay = split_delay(simulator.delay + jnp.maximum(scenario.force_sensor.delay + jitter, 0), period)
+    is_available = age > delay.intervals
+    inputs = jax.tree.map(lambda leaf: look_back(leaf, now - 1, delay.intervals, is_available), ring)
+    if simulator.window is None:
+        drive = (*inputs.state, inputs.start, inputs.end - inputs.start)
+        position, rate = horner_series(rig.series, drive, delay.fraction)
+        if hold == "zoh" and not inputs.state:
+            rate = 0 * rate
+    else:
+        is_before = delay.fraction <= rig.propagation.window.fraction + TOLERANCE
+        rows = motion_rows(simulator.window, period, delay.fraction, is_before, hold)
+        position, rate = (apply_row(row, inputs.state, inputs.start, inputs.end) for row in rows[:2])
+    motion = MotionSample(position - scenario.contact_plane, rate / period)
+    return jnp.where(is_available, surfaces.force(motion)[0], 0)
