@@ -57,7 +57,7 @@ def mechanism(
     period: float = PERIOD,
     velocity: float = VELOCITY,
     phase: float = 1 / 3,
-    force_sensor: Mapping[str, float] | None = None,
+    force_sensor: Mapping[str, Any] | None = None,
     **rig: Any,
 ) -> dict[str, Any]:
     """Return a mechanism file as plain data: 350 kg at 5 mm/s, Kelvin-Voigt contact by default."""

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyder
 from oracle_contact import SMOOTH_NODES, SMOOTH_WEIGHTS, Law, Piece, Work, cut
 from oracle_motion import TIME_TOLERANCE, Motion, delay_in_ticks
+from scipy import signal
 
 FORGOTTEN = 50.0  # time constants after which a lagging reading no longer depends on a past force
 
@@ -137,6 +138,10 @@ class _Run:
         self.force_delay = delay_in_ticks(sensor.get("delay", 0.0), T)
         self.lag = sensor.get("time_constant", 0.0)
         self.lag_state = 0.0
+        self.filter_poles, self.filter_gains = _filter_modes(sensor.get("filter"))
+        if len(self.filter_poles):
+            self.lag = -1.0 / max(self.filter_poles.real)
+            self.lag_state = 0.0 * self.filter_poles
         std, bias = sensor.get("noise_std", 0.0), sensor.get("bias", 0.0)
         self.noisy = std != 0.0 or bias != 0.0 or self.force_noise is not None
         self.jitter, self.lost, self.missed = jitter, lost, missed
@@ -369,14 +374,35 @@ class _Run:
             for early, late in pairwise(edges):
                 ago = early + (late - early) * SMOOTH_NODES
                 forces = piece.force((end - ago / rate - piece.origin) / piece.length)
-                total += float(np.sum(forces * np.exp(-ago) * SMOOTH_WEIGHTS) * (early - late))
-        self.lag_state = float(np.exp(-rate)) * self.lag_state + total
+                if len(self.filter_poles):
+                    responses = np.exp(np.outer(self.filter_poles, ago * self.lag)) * self.lag
+                else:
+                    responses = np.exp(-ago)
+                total += (responses @ (forces * SMOOTH_WEIGHTS)) * (early - late)
+        if len(self.filter_poles):
+            self.lag_state = np.exp(self.filter_poles * self.period) * self.lag_state + total
+            return float((self.filter_gains @ self.lag_state).real)
+        self.lag_state = float(np.exp(-rate)) * self.lag_state + float(total)
         return self.lag_state
 
     def _read_position(self, n):
         position = self.motion.at_left(n - self.position_delay)
         position += 0.0 if self.position_noise is None else self.position_noise[n]
         return float(_quantise(position, self.position_quantum))
+
+
+def _filter_modes(stated):
+    """Return poles [1/s] and residues [1/s] of the sensor's filter; empty arrays without a filter."""
+    if stated is None:
+        return np.zeros(0), np.zeros(0)
+    design = (
+        signal.buttap(stated["order"])
+        if stated["kind"] == "butterworth"
+        else signal.besselap(stated["order"], norm="mag")
+    )
+    scale = 2.0 * np.pi * stated["cutoff"]
+    residues, poles, _ = signal.residue(design[2], np.poly(design[1]))
+    return poles * scale, residues * scale
 
 
 def _equivalent_mass(bodies):

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import continuous
@@ -202,12 +203,14 @@ def test_guide_examples_run(path, tmp_path):
     assert path.name == "README.md" or ran.stdout.endswith(shown)
 
 
-def test_delays_of_butterworth_filters_in_data_sheet_table_are_group_delays_at_low_frequency():
+@pytest.mark.parametrize("kind", ["butterworth", "bessel"])
+def test_delays_of_filters_are_group_delays_at_low_frequency(kind):
     from scipy import signal
 
-    page = (GUIDE / "first_ten_minutes.md").read_text()
-    factors = re.search(r"plus (0\.\d+) / f, (0\.\d+) / f or (0\.\d+) / f", page).groups()
-    for order, factor in zip((2, 3, 4), factors, strict=True):
-        numerator, denominator = signal.butter(order, 2 * np.pi, analog=True)
+    page = (GUIDE / "model.md").read_text()
+    (row,) = re.findall(rf"delay of a {kind.title()} filter, times f \|(.*)\|", page)
+    for order, factor in enumerate(row.split("|"), 1):
+        design = signal.butter if kind == "butterworth" else partial(signal.bessel, norm="mag")
+        numerator, denominator = design(order, 2 * np.pi, analog=True)
         _, response = signal.freqs(numerator, denominator, [2 * np.pi * 1e-3])
         assert -np.angle(response[0]) / (2 * np.pi * 1e-3) == pytest.approx(float(factor), abs=5e-4)

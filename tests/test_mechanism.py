@@ -27,6 +27,9 @@ REQUIRED = [
     "rig.simulator.model",
     "rig.simulator.natural_frequency",
     "rig.simulator.damping_ratio",
+    "rig.force_sensor.filter.kind",
+    "rig.force_sensor.filter.order",
+    "rig.force_sensor.filter.cutoff",
 ]
 POSITIVE = [
     "bodies.equivalent_mass",
@@ -39,6 +42,7 @@ POSITIVE = [
     "rig.simulator.velocity_limit",
     "rig.simulator.acceleration_limit",
     "rig.force_sensor.range",
+    "rig.force_sensor.filter.cutoff",
 ]
 MAY_BE_INFINITE = [
     "contact.clearance",

@@ -84,7 +84,8 @@ def test_mechanism_key_descriptions_state_unit_range_and_contact_laws():
     keys = {f"{table.path}.{key.name}": key for table in describe_tables() for key in table.keys}
     numbers = {path for path in keys if '"' not in path and keys[path].unit is not None}
     # Integer keys, and keys that stand for others.
-    others = {"approach.contacts", "rig.command_latency", "correlation.matrix", "contact.damping_ratio"}
+    others = {"approach.contacts", "rig.command_latency", "rig.force_sensor.filter.order"}
+    others |= {"correlation.matrix", "contact.damping_ratio"}
     assert numbers - others == set(numeric_keys())
     assert all(keys[path].unit == numeric_keys()[path].unit for path in numbers - others)
     assert keys["approach.contacts"].allowed == f"an integer from 1 to {MAX_CONTACTS}"

@@ -4,8 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lanes import IDEAL, SECOND_ORDER, mechanism, nominal_gains, run_record, run_rollout, validated
+from scipy import signal
 from scipy.integrate import quad
 
+from jaxhil.mechanism.sensor_filter import find_modes
 from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.probe import Probe, Push
 from jaxhil.simulation.scenario import build_scenarios
@@ -28,6 +30,26 @@ def test_lagged_reading_of_probe_push_equals_convolution_with_sensor_lag(lag):
             max(0.04, min(time, 0.06)),
         )
         assert float(PUSH.lagged(jnp.array(time), jnp.array(lag))) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_filtered_reading_of_probe_push_equals_convolution_with_impulse_response():
+    modes, cutoff = find_modes("bessel", 3), 250.0
+    prototype = signal.besselap(3, norm="mag")
+    residues, poles, _ = signal.residue(prototype[2], np.poly(prototype[1]))
+    for time in TIMES:
+        expected, _ = quad(
+            lambda s, time=time: (
+                3.0
+                * np.sin(np.pi * (s - 0.04) / 0.02)
+                * cutoff
+                * (residues @ np.exp(poles * cutoff * (time - s))).real
+            ),
+            0.04,
+            max(0.04, min(time, 0.06)),
+        )
+        reading = PUSH.filtered(jnp.array(time), modes, jnp.array(cutoff))
+        assert float(reading) == pytest.approx(expected, abs=1e-9)
 
 
 def test_sensor_without_lag_reads_the_probe_push():

@@ -223,6 +223,8 @@ def test_normal_draws_are_truncated_to_allowed_values(path, nominal, std):
         raw["rig"]["force_sensor"] = {"delay": 1.0}
     if path == "rig.simulator.window":
         raw["rig"]["simulator"] = {"model": "moving_average"}
+    if path.startswith("rig.force_sensor.filter"):
+        raw["rig"]["force_sensor"] = {"filter": {"kind": "bessel", "order": 2}}
     node = raw
     *tables, key = path.split(".")
     for table in tables:

@@ -66,6 +66,7 @@ def check_mechanism_rules(mechanism: Mechanism) -> None:
             lambda: _check_bodies(mechanism),
             lambda: check_contact_law(("contact",), contact, uncertainty, CONTACT_KEYS.values()),
             lambda: check_simulator_model(mechanism.rig.simulator),
+            lambda: check_sensor_filter(mechanism.rig.force_sensor, uncertainty),
         ]
     )
     run_checks(
@@ -260,6 +261,18 @@ def check_simulator_model(simulator: Any) -> None:
         _check_transfer_function(simulator.numerator or [], simulator.denominator or [])
 
 
+def check_sensor_filter(sensor: Any, uncertain: Collection[str]) -> None:
+    """Raise `KeyProblem` if a force sensor has both a filter and a time constant."""
+    path = ("rig", "force_sensor", "time_constant")
+    if sensor.filter is None:
+        return
+    expected = "nothing (rig.force_sensor.filter replaces the lag)"
+    if sensor.time_constant != 0.0:
+        raise KeyProblem(path, format_value(sensor.time_constant), expected)
+    if ".".join(path) in uncertain:
+        raise KeyProblem(("uncertainty", ".".join(path)), "a time constant", expected)
+
+
 def _check_transfer_function(numerator: list[float], denominator: list[float]) -> None:
     """Raise `KeyProblem` unless G(s) is strictly proper and stable, with G(0) = 1."""
     path = ("rig", "simulator")
@@ -327,6 +340,7 @@ def _check_jitter(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
         raise KeyProblem(key, found, f"at most {shortest:g} s, the least rig.force_sensor.delay")
     reasons = {
         "a time_constant": _is_used(mechanism, "rig.force_sensor.time_constant"),
+        "a filter": mechanism.rig.force_sensor.filter is not None,
         f"the contact law {mechanism.contact.law}": find_contact_law(mechanism.contact.law).has_memory,
         "a clearance": math.isfinite(mechanism.contact.clearance),
     }

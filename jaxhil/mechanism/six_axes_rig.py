@@ -17,6 +17,7 @@ from jaxhil.mechanism.structs import (
     Denominator,
     Integrator,
     Numerator,
+    SensorFilter,
     SimulatorModel,
     key_metadata,
 )
@@ -200,6 +201,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     range: Annotated[
         list[LoadLimit], six_axis_metadata("magnitude at which a reading saturates", LOAD_NAMES)
     ] = field(default_factory=lambda: [math.inf] * 6)
+    filter: Annotated[SensorFilter, key_metadata("low-pass filter of all channels")] | None = None
     tool: Annotated[Tool, key_metadata("tool that a moving sensor carries")] | None = None
     gravity: Annotated[list[Acceleration], vector_metadata("gravity for a moving sensor, in T axes")] = field(
         default_factory=zeros(3)

@@ -7,7 +7,7 @@ and contact laws are in `jaxhil.mechanism.six_axes_contacts`.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from jaxhil.errors import format_value
 from jaxhil.mechanism.conversion import KeyPath, KeyProblem
 from jaxhil.mechanism.correlation import check_correlation
-from jaxhil.mechanism.rules import KEYS_OF_MODELS, check_simulator_model, check_texts
+from jaxhil.mechanism.rules import KEYS_OF_MODELS, check_sensor_filter, check_simulator_model, check_texts
 from jaxhil.mechanism.six_axes import Contact, Latch, RigidBody, SixAxisMechanism, Start
 from jaxhil.mechanism.six_axes_contacts import check_contact, check_latch
 from jaxhil.mechanism.six_axes_rig import PER_AXIS_KEYS, Inertia, Rig, Simulator
@@ -54,7 +54,7 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
     check_simulator_model(mechanism.rig.simulator)
     _check_space(mechanism.rig.simulator)
     _check_hold(mechanism)
-    _check_sensor(mechanism.rig)
+    _check_sensor(mechanism.rig, mechanism.uncertainty)
     for path in mechanism.uncertainty:
         _check_uncertainty(mechanism, path)
     check_correlation(mechanism)
@@ -215,9 +215,10 @@ def _check_hold(mechanism: SixAxisMechanism) -> None:
         raise KeyProblem(("rig", "command_hold"), format_value(rig.command_hold), expected)
 
 
-def _check_sensor(rig: Rig) -> None:
-    """Raise `KeyProblem` if the crosstalk of the force sensor, its tool or gravity is invalid."""
+def _check_sensor(rig: Rig, uncertain: Collection[str]) -> None:
+    """Raise `KeyProblem` if the crosstalk of the force sensor, its filter, tool or gravity is invalid."""
     sensor, path = rig.force_sensor, ("rig", "force_sensor")
+    check_sensor_filter(sensor, uncertain)
     mixing = np.eye(6) + np.asarray(sensor.crosstalk)
     if not np.linalg.cond(mixing) < 100:
         found = "channels that are nearly identical"

@@ -34,6 +34,7 @@ __all__ = [
     "PositionSensor",
     "Range",
     "Rig",
+    "SensorFilter",
     "Simulator",
     "Uncertainty",
     "is_computable",
@@ -59,6 +60,8 @@ SimulatorModel = Literal[
 Integrator = Literal["semi_implicit_euler", "zoh", "explicit_euler"]
 CommandHold = Literal["linear", "zoh"]
 DeadZoneKind = Literal["continuous", "cut"]
+FilterKind = Literal["butterworth", "bessel"]
+MAX_FILTER_ORDER = 4
 Distribution = Literal["uniform", "loguniform", "normal"]
 
 DEAD_ZONE_KINDS = "larger readings: reduced by the dead zone, or unchanged (cut)"
@@ -220,6 +223,14 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ] = math.inf
 
 
+class SensorFilter(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Low-pass filter of the force sensor, instead of a time constant; optional."""
+
+    kind: Annotated[FilterKind, key_metadata("kind of filter")]
+    order: Annotated[int, key_metadata("order of the filter", "1", ge=1, le=MAX_FILTER_ORDER)]
+    cutoff: Annotated[float, key_metadata("frequency at which the gain is -3 dB", "Hz", gt=0.0)]
+
+
 class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Force sensor. Its effects, in order: delay, lag, noise and bias, rounding, dead zone, saturation."""
 
@@ -242,6 +253,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     range: Annotated[
         float, key_metadata("magnitude at which a reading saturates", "N", gt=0.0, infinite=True)
     ] = math.inf
+    filter: Annotated[SensorFilter, key_metadata("low-pass filter of the reading")] | None = None
 
 
 class PositionSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxhil.contact.laws import ContactLaw, ContactParameters, compute_two_sided_force
+from jaxhil.mechanism.sensor_filter import FilterModes
 from jaxhil.simulation.cells import Cells, bound_time_constant
 from jaxhil.simulation.monotone_sections import (
     SHORT_CELL_DEGREE,
@@ -64,7 +65,7 @@ class CellContact(NamedTuple):
     """Real contact in a sampling interval: sensor lag, work, peak force, duration, state of the law."""
 
     reading: Float[Array, "*batch"]  # output of the force sensor's lag at the sampling instant [N]
-    lagged: Float[Array, "*batch"]  # output of the force sensor's lag at the interval's end [N]
+    lagged: Array  # state of the force sensor's lag or filter at the interval's end [N]
     work: tuple[Array, Array]  # work done on the mechanism and work returned by it [J]
     peak: Float[Array, "*batch"]  # largest |force| [N]
     contact_time: tuple[Array, Array]  # duration of contact, before and after the sampling instant [periods]
@@ -88,8 +89,9 @@ def contact_in_cells(
     cells: Cells,
     series: Float[Array, "powers cells *batch"],
     period: Float[Array, "*batch"],
-    lagged: Float[Array, "*batch"],
+    lagged: Array,
     time_constant: Float[Array, "*batch"] | None,
+    sensor_filter: tuple[FilterModes, Array] | None = None,
 ) -> CellContact:
     """Compute the real contact in a sampling interval.
 
@@ -99,10 +101,11 @@ def contact_in_cells(
         cells: Cells of the interval.
         series: Power series of the position [m] in each cell, from `power_series`.
         period: Control period [s].
-        lagged: Output of the force sensor's lag at the interval's start [N].
+        lagged: State of the force sensor's lag or filter at the interval's start [N].
         time_constant: Time constant of the force sensor's lag [s]; None for a sensor without lag.
+        sensor_filter: Modes and cutoff frequency [rad/s] of the force sensor's filter; None without a filter.
     """
-    rates = _sensor_rates(cells, period, time_constant)
+    rates = _sensor_rates(cells, period, time_constant, sensor_filter)
 
     # Each branch returns distinct arrays: without optimisation, XLA confuses results that share an array.
     def touches(state):
@@ -116,8 +119,9 @@ def contact_in_cells(
 
     def free(state):
         """Return results of 0 and the initial law states if no lane is in contact."""
-        fresh = touch.law.init(jnp.zeros_like(lagged))
-        numbers = jnp.zeros((_RESULT_COUNT, *lagged.shape), lagged.dtype)
+        fresh = touch.law.init(jnp.zeros_like(period))
+        count = _RESULT_COUNT if sensor_filter is None else _RESULT_COUNT - 2 + 2 * len(lagged)
+        numbers = jnp.zeros((count, *period.shape), lagged.dtype)
         return numbers, jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), fresh)
 
     # In most intervals no lane is in contact.
@@ -150,8 +154,9 @@ def compute_jump_work(
 class _SurfaceContribution(NamedTuple):
     """Results of the contact at one surface in a sampling interval."""
 
-    # contribution to the lag's output at the sampling instant and at the interval's end [N]
-    readings: tuple[Array, Array]
+    # contribution to the lag's output, or to each component of the filter's state, at the sampling instant
+    # and at the interval's end [N]
+    readings: tuple[Array, ...]
     work: tuple[Array, Array]  # work done on the mechanism and work returned by it [J]
     peak: Array  # largest |force| [N]
     contact_time: tuple[Array, Array]  # duration of contact, before and after the sampling instant [periods]
@@ -200,25 +205,57 @@ class _SensorRates(NamedTuple):
     part_durations: tuple[Array, Array]
     rate: Array  # control period, divided by the lag's time constant [1]
     remaining: Array  # time from a cell's end to the end of its part [periods]
+    modes: FilterModes | None  # modes of a filter, whose rates are relative to `rate`; None for a lag
 
 
-def _sensor_rates(cells, period, time_constant) -> _SensorRates | None:
-    """Return the decay of the force sensor's lag; None for a sensor without lag."""
+def _sensor_rates(cells, period, time_constant, sensor_filter=None) -> _SensorRates | None:
+    """Return the decay of the force sensor's lag or filter; None for a sensor without either."""
     if time_constant is None:
         return None
-    rate = period / bound_time_constant(time_constant, period)
+    modes = None
+    if sensor_filter is None:
+        rate = period / bound_time_constant(time_constant, period)
+    else:
+        modes, cutoff = sensor_filter
+        rate = cutoff * period
     half = cells.length.shape[0] // 2
     first = cells.remaining[0] + cells.length[0]
     second = cells.remaining[half] + cells.length[half]
-    return _SensorRates((first * rate, second * rate), rate, cells.remaining)
+    return _SensorRates((first * rate, second * rate), rate, cells.remaining, modes)
 
 
 def _decay_reading(lagged, rates, readings):
     """Return the output [N] of the force sensor's lag at the sample and at the interval's end."""
     if rates is None:
         return lagged, lagged
+    if rates.modes is not None:
+        return _decay_modes(lagged, rates, readings)
     sample = lagged * jnp.exp(-rates.part_durations[0]) + readings[0]
     return sample, sample * jnp.exp(-rates.part_durations[1]) + readings[1]
+
+
+def _decay_modes(state, rates, readings):
+    """Return the output [N] of the filter at the sample, and its state at the interval's end."""
+    half, states = len(readings) // 2, []
+    for duration, added in zip(rates.part_durations, (readings[:half], readings[half:]), strict=True):
+        decayed = []
+        for rate, real, imaginary in zip(rates.modes.rates, state[::2], state[1::2], strict=True):
+            c, s = _decay_factors(rate, duration)
+            decayed += [real * c - imaginary * s, real * s + imaginary * c]
+        state = [old + new for old, new in zip(decayed, added, strict=True)]
+        states.append(state)
+    sample, end = states
+    terms = [
+        weight.real * real - weight.imag * imaginary
+        for weight, real, imaginary in zip(rates.modes.weights, sample[::2], sample[1::2], strict=True)
+    ]
+    return sum(terms[1:], terms[0]), jnp.stack(end)
+
+
+def _decay_factors(rate: complex, duration: Array) -> tuple[Array, Array]:
+    """Return real and imaginary part of exp(-rate duration)."""
+    decay = jnp.exp(-rate.real * duration)
+    return decay * jnp.cos(rate.imag * duration), -decay * jnp.sin(rate.imag * duration)
 
 
 def _may_touch(touch, cells, series):
@@ -300,8 +337,23 @@ def _lag_contributions(rates, path, impulses, arguments):
         zeros = jnp.zeros(path.length.shape[1:], path.length.dtype)
         return zeros, zeros
     age = rates.remaining + (1 - arguments) * path.length
+    if rates.modes is not None:
+        return _mode_contributions(rates, impulses, age * rates.rate)
     remaining = jnp.sum(impulses * jnp.exp(-age * rates.rate) * rates.rate, axis=(0, 1, 2))
     return _sum_by_part(remaining)
+
+
+def _mode_contributions(rates, impulses, age):
+    """Return the response of each mode of a filter [N] to impulses [N periods] of the given age [rad].
+
+    The results are real and imaginary part of each mode at the sampling instant, then at the interval's end.
+    """
+    parts = []
+    for rate in rates.modes.rates:
+        c, s = _decay_factors(rate, age)
+        for factor in (rate.real * c - rate.imag * s, rate.real * s + rate.imag * c):
+            parts.append(_sum_by_part(jnp.sum(impulses * factor * rates.rate, axis=(0, 1, 2))))
+    return (*(before for before, _ in parts), *(after for _, after in parts))
 
 
 def _sum_by_part(values):

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxhil.contact.laws import ContactLaw
 from jaxhil.laws.simulation_base import Compensator, Gains, KnownConstants
+from jaxhil.mechanism.sensor_filter import FilterModes
 from jaxhil.simulation.cells import CellCounts, Cells, build_cells, build_series
 from jaxhil.simulation.contact_force import no_contact
 from jaxhil.simulation.loop_state import LoopState, PlantState
@@ -41,7 +42,9 @@ class Loop(eqx.Module):
     integrator: str = eqx.field(static=True)  # integrator of the numerical model, a key of `INTEGRATORS`
     hold: str = eqx.field(static=True)  # hold of the position command: "linear" or "zoh" (zero-order hold)
     latency: int = eqx.field(static=True)  # delay of the position command, 0 or 1 [control periods]
-    has_lag: bool = eqx.field(static=True)  # whether the force sensor has a first-order lag
+    has_lag: bool = eqx.field(static=True)  # whether the force sensor has a lag or a filter
+    # low-pass filter of the force sensor: its modes; None without a filter
+    sensor_filter: FilterModes | None = eqx.field(static=True)
     has_force_bias: bool = eqx.field(static=True)  # whether the force sensor has a bias
     has_force_noise: bool = eqx.field(static=True)  # whether the force sensor has noise
     has_position_noise: bool = eqx.field(static=True)  # whether the position sensor has noise
@@ -173,6 +176,14 @@ def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -
     )
 
 
+def no_lagged_force(loop: Loop, like: Array) -> Array:
+    """Return the state of the sensor's lag or filter before a run, for a batch with the shape of `like`."""
+    if loop.sensor_filter is None:
+        return jnp.zeros_like(like)
+    # Real and imaginary part of each mode.
+    return jnp.zeros((2 * len(loop.sensor_filter.rates), *like.shape), like.dtype)
+
+
 def split_delays(scenario: Scenario, is_two_sided: bool) -> Delays:
     """Convert the delays of the scenarios to sampling intervals."""
     period, simulator = scenario.control_period, scenario.simulator
@@ -235,7 +246,7 @@ def start_uniform_motion(
         sensed=state.sensed._replace(
             last=no_contact(position),
             contact_time=jnp.zeros_like(position) if loop.has_cells else None,
-            lagged=jnp.zeros_like(position),
+            lagged=no_lagged_force(loop, position),
             first_position=first_position,
         ),
         law=loop.law.init(position),

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.laws.compensators import COMPENSATORS
+from jaxhil.mechanism.sensor_filter import find_modes
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.cells import MAX_POLE, NO_CELLS, CellCounts, count_cells, fastest_pole
 from jaxhil.simulation.loop import Loop
@@ -48,7 +49,7 @@ def build_loop(
             several times faster is used for slow motion, where its accuracy is sufficient.
     """
     rig, force, position = mechanism.rig, scenarios.force_sensor, scenarios.position_sensor
-    simulator = scenarios.simulator
+    simulator, sensor_filter = scenarios.simulator, rig.force_sensor.filter
     law = COMPENSATORS[compensator]
     sensed, timing = np.maximum(force.delay, position.delay) + simulator.delay, scenarios.timing
     if timing is not None and timing.jitter is not None:
@@ -69,6 +70,7 @@ def build_loop(
         hold=rig.command_hold,
         latency=rig.command_latency,
         has_lag=bool(np.any(force.time_constant > 0)),
+        sensor_filter=None if sensor_filter is None else find_modes(sensor_filter.kind, sensor_filter.order),
         has_force_bias=bool(np.any(force.bias != 0)),
         has_force_noise=bool(np.any(force.noise_std > 0)),
         has_position_noise=bool(np.any(position.noise_std > 0)),
@@ -110,6 +112,8 @@ def _choose_cell_counts(mechanism: Mechanism, scenarios: Scenario, exact: bool) 
         # The motion has a kink within every interval, at which a lag or a dent would become inaccurate.
         fastest = np.inf if has_memory else period / float(np.min(window))
     slow = fastest <= pole and _max_contact_frequency(mechanism, scenarios) * period <= contact
+    if mechanism.rig.force_sensor.filter is not None:
+        exact = True
     if slow and (law.is_locally_parabolic or not lagging) and not exact:
         return NO_CELLS
     if window is not None:

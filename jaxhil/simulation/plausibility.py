@@ -13,6 +13,7 @@ import numpy as np
 from jaxhil.contact.ideal_contact import IdealContact
 from jaxhil.contact.laws import ContactLaw, ContactParameters, find_contact_law
 from jaxhil.errors import InputError
+from jaxhil.laws.shared.nominal_values import force_delay
 from jaxhil.mechanism.rules import format_allowed_velocity_limit
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import compute_quantiles, count_dimensions
@@ -394,7 +395,7 @@ def _format_frequency(contact: ContactSummary) -> str:
 def _check_delays(mechanism: Mechanism, shortest: ContactSummary) -> list[str]:
     """Return one warning if a delay exceeds the duration of the shortest contact, else an empty list."""
     rig = mechanism.rig
-    force = rig.force_sensor.delay + rig.force_sensor.time_constant
+    force = force_delay(mechanism)
     allowed = f"less than {shortest.duration:.3g} s, the duration of contact {shortest.number}"
     for key, sensor_delay, suffix in (
         ("simulator", 0.0, ""),

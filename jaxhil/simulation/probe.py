@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxhil.lanes import safe_sqrt
+from jaxhil.mechanism.sensor_filter import FilterModes
 
 
 class Push(NamedTuple):
@@ -58,6 +59,30 @@ class Push(NamedTuple):
         decay = jnp.exp(-jnp.where(since > self.width, since - self.width, 0) / lag)
         reading = self.size / (1 + late**2) * jnp.where(begun, swing * decay, 0)
         return jnp.where(lags, reading, self.force(time))
+
+    def filtered(
+        self, time: Float[Array, "*batch"], modes: FilterModes, cutoff: Float[Array, "*batch"]
+    ) -> Float[Array, "*batch"]:
+        """Return the push [N] as a sensor with a low-pass filter reads it.
+
+        Every mode of the filter responds like a first-order lag (`lagged`) with a complex time constant.
+
+        Args:
+            time: Time since the hardware's first touch [s].
+            modes: Modes of the filter for the cutoff 1 rad/s.
+            cutoff: Cutoff frequency of the filter [rad/s].
+        """
+        since = time - self.centre + self.width / 2
+        begun = since > 0
+        within = jnp.clip(jnp.where(begun, since, 0), 0, self.width)
+        after = jnp.where(since > self.width, since - self.width, 0)
+        rate, total = jnp.pi / self.width, jnp.zeros_like(time)
+        for weight, mode in zip(modes.weights, modes.rates, strict=True):
+            decay = mode * cutoff
+            late = rate / decay
+            swing = jnp.sin(rate * within) - late * jnp.cos(rate * within) + late * jnp.exp(-within * decay)
+            total = total + jnp.real(weight / (1 + late**2) * swing * jnp.exp(-after * decay))
+        return self.size * jnp.where(begun, total, 0)
 
 
 class Probe(NamedTuple):

@@ -5,6 +5,7 @@ from jaxtyping import Array
 
 from jaxhil.contact.laws import deflection
 from jaxhil.laws.simulation_base import KnownConstants, Signals
+from jaxhil.mechanism.sensor_filter import FilterModes
 from jaxhil.simulation.contact_force import IntervalContact, MotionSample
 from jaxhil.simulation.contact_tracking import ContactTracker
 from jaxhil.simulation.loop import RigConstants
@@ -21,6 +22,7 @@ def apply_probe(
     sample: MotionSample,
     contact: IntervalContact,
     tracker: ContactTracker,
+    sensor_filter: FilterModes | None = None,
 ) -> tuple[LoopState, IntervalContact, ContactTracker]:
     """Add the effects of the probe to the state, the contact and the contact's record.
 
@@ -33,8 +35,11 @@ def apply_probe(
         sample: Motion of the hardware at the instant at which the force is sampled.
         contact: Real contact in the sampling interval.
         tracker: Record of the current contact.
+        sensor_filter: Modes of the force sensor's filter; None without a filter.
     """
-    first_contact, contact = apply_push(rig, probe, state.first_contact, signals.age, sample, contact)
+    first_contact, contact = apply_push(
+        rig, probe, state.first_contact, signals.age, sample, contact, sensor_filter
+    )
     tracker = update_model_deviation(rig.constants, probe, has_ended, signals, tracker)
     return state._replace(first_contact=first_contact), contact, tracker
 
@@ -46,6 +51,7 @@ def apply_push(
     age: Array,
     sample: MotionSample,
     contact: IntervalContact,
+    sensor_filter: FilterModes | None = None,
 ) -> tuple[FirstContact, IntervalContact]:
     """Add the push to the force on the hardware and to the reading of the force sensor."""
     assert first_contact is not None
@@ -57,7 +63,10 @@ def apply_push(
     since = jnp.where(first.made, now - first.time, -1e9) * period
     force = contact.plant_signals.force + first.side * probe.push.force(since)
     reading = contact.reading
-    if reading is not None:
+    if reading is not None and sensor_filter is not None:
+        cutoff = scenario.force_sensor.cutoff
+        reading = reading + first.side * probe.push.filtered(since, sensor_filter, cutoff)
+    elif reading is not None:
         reading = reading + first.side * probe.push.lagged(since, scenario.force_sensor.time_constant)
     return first, contact._replace(plant_signals=contact.plant_signals._replace(force=force), reading=reading)
 

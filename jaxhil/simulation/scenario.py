@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int, UInt32
 from jaxhil.contact.ideal_contact import IdealContact
 from jaxhil.contact.keys import ContactKey
 from jaxhil.contact.laws import CONTACT_KEYS, ContactParameters, find_contact_law
+from jaxhil.mechanism.sensor_filter import find_modes
 from jaxhil.mechanism.structs import Mechanism, value_at
 from jaxhil.simulation.probe import Probe
 
@@ -50,6 +51,9 @@ class ForceSensorBatch(NamedTuple):
     dead_zone: Float[Array, "*batch"]  # half-width of the dead zone [N]; 0 without dead zone
     bias: Float[Array, "*batch"]  # bias [N]
     range: Float[Array, "*batch"]  # largest |reading| [N]; infinite if unlimited
+    # cutoff frequency of the low-pass filter [rad/s], (*batch); None without a filter. With a filter,
+    # `time_constant` is that of the filter's slowest mode.
+    cutoff: Any = None
 
 
 class PositionSensorBatch(NamedTuple):
@@ -133,9 +137,7 @@ def build_scenarios(
         control_period=table.scalar("rig.control_period"),
         contact_plane=table.scalar("rig.contact_plane"),
         simulator=_build_motion_simulator(rig.simulator, table),
-        force_sensor=ForceSensorBatch(
-            *(table.scalar(f"rig.force_sensor.{name}") for name in ForceSensorBatch._fields)
-        ),
+        force_sensor=_build_force_sensor(rig.force_sensor, table),
         position_sensor=PositionSensorBatch(
             *(table.scalar(f"rig.position_sensor.{name}") for name in PositionSensorBatch._fields)
         ),
@@ -220,6 +222,17 @@ def _build_timing(mechanism, table) -> TimingBatch | None:
     paths = "rig.force_sensor.jitter", "rig.force_sensor.loss_probability", "rig.missed_tick_probability"
     timing = TimingBatch(*map(table.optional, paths))
     return None if all(effect is None for effect in timing) else timing
+
+
+def _build_force_sensor(sensor, table) -> ForceSensorBatch:
+    """Return the force sensor; with a filter, its cutoff and the time constant of its slowest mode."""
+    path, names = "rig.force_sensor.", ForceSensorBatch._fields[:-1]
+    batch = ForceSensorBatch(*(table.scalar(path + name) for name in names))
+    if sensor.filter is None:
+        return batch
+    cutoff = 2 * np.pi * table.scalar(path + "filter.cutoff")
+    slowest = find_modes(sensor.filter.kind, sensor.filter.order).slowest
+    return batch._replace(time_constant=1 / (slowest * cutoff), cutoff=cutoff)
 
 
 def _build_motion_simulator(simulator, table) -> MotionSimulatorBatch:

@@ -84,6 +84,19 @@ def apply_lag(
     return reading * lag_decay(free, time_constant)
 
 
+def follow_ramp(mode: Array, before: Array, now: Array, span: Array) -> Array:
+    """Return the next output [N] of a filter's mode, y' = r (F - y), whose input is linear.
+
+    Args:
+        mode: Output at the start, complex [N].
+        before: Input at the start [N].
+        now: Input at the end [N].
+        span: Duration times the mode's rate r, complex [1].
+    """
+    decay = jnp.exp(-span)
+    return mode * decay + now - before * decay - (now - before) * (1 - decay) / span
+
+
 def lag_decay(duration: Array, time_constant: Array) -> Array:
     """Return the factor [1] by which the output of a lag decays in `duration` [s] without force."""
     return jnp.exp(-duration / _bound_above_zero(time_constant))

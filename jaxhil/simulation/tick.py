@@ -137,6 +137,7 @@ def tick(
             actuated.interval.sample,
             contact,
             tracker,
+            loop.sensor_filter,
         )
     state = update_state(state, now, plant_signals, model, actuated, contact)
     if state.held is not None:
@@ -316,6 +317,7 @@ def _compute_contact_in_cells(
         period,
         state.sensed.lagged,
         scenario.force_sensor.time_constant if loop.has_lag else None,
+        None if loop.sensor_filter is None else (loop.sensor_filter, scenario.force_sensor.cutoff),
     )
     surfaces = Surfaces(loop.law, state.parameters, result.at_sample, clearance)
     force, _ = surfaces.force(interval.sample)
@@ -326,7 +328,9 @@ def _compute_contact_in_cells(
         before = state.sensed.last.position(clearance)
         work = compute_jump_work(touch, state.law, before, interval.sample.position)
     reading = None
-    if loop.has_lag:
+    if loop.sensor_filter is not None:
+        reading = result.reading
+    elif loop.has_lag:
         # Cells cannot resolve a lag of 0, which one lane may have while other lanes of the batch have a lag.
         lag = scenario.force_sensor.time_constant
         reading = jnp.where(lag > MIN_LAG * period, result.reading, force)

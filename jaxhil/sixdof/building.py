@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhil.mechanism.sensor_filter import find_modes
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.six_axes_rig import Tool
 from jaxhil.simulation.scenario import MotionSimulatorBatch
@@ -76,13 +77,14 @@ def build_scenarios(
 
 def make_loop(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -> Loop:
     """Return the loop that runs a mechanism's scenarios with a compensator."""
-    rig, sensor = mechanism.rig, scenario.sensor
+    rig, sensor, stated = mechanism.rig, scenario.sensor, mechanism.rig.force_sensor.filter
     return build_loop(
         scenario,
         integrator=rig.integrator,
         hold=rig.command_hold,
         latency=rig.command_latency,
         side=rig.force_sensor.side,
+        sensor_filter=None if stated is None else find_modes(stated.kind, stated.order),
         cuts_dead_zone=rig.force_sensor.dead_zone_kind == "cut"
         and bool(np.any(np.asarray(sensor.errors.dead_zone) > 0)),
         has_noise=bool(np.any(np.asarray(sensor.noise_std) > 0)),
@@ -200,7 +202,10 @@ def _sensor(mechanism: SixAxisMechanism, numbers: DrawnValues) -> sensor.Sensor:
     """Build the force sensor and the controller's assumptions about the sensor."""
     path = "rig.force_sensor."
     nothing: Any = np.zeros((6, numbers.number))
-    tool = _tool(mechanism, numbers)
+    tool, stated, cutoff, slowest = _tool(mechanism, numbers), mechanism.rig.force_sensor.filter, None, 1.0
+    if stated is not None:
+        cutoff = 2 * np.pi * numbers(path + "filter.cutoff")
+        slowest = find_modes(stated.kind, stated.order).slowest
     errors = sensor.SampleErrors(
         None if numbers.is_zero(path + "crosstalk") else np.eye(6)[:, :, None] + numbers(path + "crosstalk"),
         *(numbers(path + key) for key in ("bias", "quantum", "dead_zone", "range")),
@@ -208,7 +213,8 @@ def _sensor(mechanism: SixAxisMechanism, numbers: DrawnValues) -> sensor.Sensor:
     gravity = numbers.vector(numbers(path + "gravity"))
     return sensor.Sensor(
         delay=numbers(path + "delay"),
-        time_constant=numbers(path + "time_constant"),
+        time_constant=numbers(path + "time_constant") if cutoff is None else 1 / (slowest * cutoff),
+        cutoff=cutoff,
         errors=errors,
         noise_std=numbers(path + "noise_std"),
         mounting=None,

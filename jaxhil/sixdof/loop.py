@@ -39,7 +39,7 @@ from jaxhil.sixdof.relative import (
     relative,
 )
 from jaxhil.sixdof.scenario import Scenario
-from jaxhil.sixdof.sensing import sense
+from jaxhil.sixdof.sensing import sense, start_filter
 from jaxhil.sixdof.vectors import vector
 
 
@@ -139,7 +139,7 @@ def begin(
         memories=tuple(group.init() for group in rig.groups),
         latch_states=tuple(init_latch(latch, pose) for latch in rig.latches),
         controller=NumericalController(
-            (nothing, nothing) if loop.has_lag else None,
+            (nothing, start_filter(loop.sensor_filter, nothing)) if loop.has_lag else None,
             law.init(rig.prepared, rig.constants, start, loop.controller_ring),
         ),
         tick=jnp.array(0, jnp.int32),

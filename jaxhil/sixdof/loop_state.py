@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Int, UInt32
 
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.laws.six_axis_base import SixAxisConstants, SixAxisSignals
+from jaxhil.mechanism.sensor_filter import FilterModes
 from jaxhil.sixdof.axes import Axes, Hardware
 from jaxhil.sixdof.forces import ContactGroup, Forces, Memory
 from jaxhil.sixdof.kinematics import Kinematics, RigidMotion
@@ -30,7 +31,9 @@ class Loop(eqx.Module):
     ring: int = eqx.field(static=True)
     side: str = eqx.field(static=True, default="fixed")  # side of the force sensor, one of `SIDES`
     has_noise: bool = eqx.field(static=True, default=False)  # whether the force sensor has noise
-    has_lag: bool = eqx.field(static=True, default=True)  # whether the force sensor has a lag
+    has_lag: bool = eqx.field(static=True, default=True)  # whether the force sensor has a lag or a filter
+    # low-pass filter of the force sensor: its modes; None without a filter
+    sensor_filter: FilterModes | None = eqx.field(static=True, default=None)
     # whether the force sensor has a quantum, a dead zone or a range
     has_sample_effects: bool = eqx.field(static=True, default=True)
     # whether the dead zone leaves larger readings unchanged, instead of reducing them by its half-width
@@ -66,8 +69,8 @@ class RigConstants(NamedTuple):
 class NumericalController(NamedTuple):
     """States of the force sensor's lag and of the compensator."""
 
-    # last input and last output of the lag; None without a lag
-    lag: tuple[Wrench, Wrench] | None
+    # last input and last output of the lag, or of each mode of the filter; None without either
+    lag: tuple[Wrench, Any] | None
     law: Any  # state of the compensator
 
 
@@ -106,5 +109,5 @@ class Sensed(NamedTuple):
     forces: tuple[Forces, ...]  # contact forces of each group at the sampling instant
     memories: tuple[Memory, ...]  # next states of the contact laws
     latch_states: tuple[LatchState, ...]  # next states of the latches
-    lag: tuple[Wrench, Wrench] | None  # next state of the force sensor's lag
+    lag: tuple[Wrench, Any] | None  # next state of the force sensor's lag or filter
     signals: SixAxisSignals  # inputs of the compensator

@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from jaxhil.laws.shared.nominal_values import axis_lags
+from jaxhil.laws.shared.nominal_values import axis_lags, force_delay
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.sixdof.units import unit_warnings
 
@@ -58,7 +58,7 @@ def summarise_six_axes(
     `tangential_mass` is the effective mass along the surface, `duration` the duration of the contact.
     """
     rig = mechanism.rig
-    delay = rig.force_sensor.delay + rig.force_sensor.time_constant + max(axis_lags(mechanism))
+    delay = force_delay(mechanism) + max(axis_lags(mechanism))
     frequency = 1 / (2 * duration) if duration > 0 else math.nan
     warnings = list(unit_warnings(mechanism))
     rate = 1 / rig.control_period

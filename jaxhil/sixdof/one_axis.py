@@ -11,6 +11,7 @@ import math
 from typing import Any, NamedTuple
 
 import jax
+import msgspec
 import numpy as np
 
 from jaxhil.errors import InputError
@@ -182,6 +183,7 @@ def _convert_force_sensor(mechanism: SixAxisMechanism, normal: np.ndarray) -> di
         "range": min(sensor.range[:3]),
         **{key: along(getattr(sensor, key)) for key in ("noise_std", "quantum", "dead_zone")},
         "dead_zone_kind": sensor.dead_zone_kind,
+        **({} if sensor.filter is None else {"filter": msgspec.to_builtins(sensor.filter)}),
     }
 
 

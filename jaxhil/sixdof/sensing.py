@@ -1,11 +1,15 @@
 """Sensors of the six-axis rig: real contact at a tick, and the readings of wrench and pose."""
 
+from functools import partial
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxhil.laws.six_axis_base import SixAxisSignals
-from jaxhil.simulation.sensors import apply_lag, quantise, white_noise
+from jaxhil.mechanism.sensor_filter import FilterModes
+from jaxhil.simulation.sensors import apply_lag, follow_ramp, quantise, white_noise
 from jaxhil.sixdof.axes import AxisMotion, read_samples
 from jaxhil.sixdof.forces import contact_wrench
 from jaxhil.sixdof.kinematics import RigidMotion, to_rigid_motion
@@ -40,6 +44,15 @@ def sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
     return Sensed(motion, contact, forces, memories, tuple(latched), lag, signals)
 
 
+def start_filter(modes: FilterModes | None, nothing: Wrench) -> Any:
+    """Return the state of the force sensor's lag or filter before the first tick: its input is `nothing`."""
+    if modes is None:
+        return nothing
+    dtype = jnp.result_type(nothing.force.x, jnp.complex64)
+    mode = jax.tree.map(lambda channel: channel.astype(dtype), nothing)
+    return (mode,) * len(modes.rates)
+
+
 def _measured_pose(loop: Loop, rig: RigConstants, state: RunState, measured: Array) -> Array:
     """Convert the measured axis positions to measured coordinates, including noise and rounding."""
     still = AxisMotion(measured, jnp.zeros_like(measured), None)
@@ -57,17 +70,18 @@ def _measured_wrench(
     contact: Wrench,
     motion: RigidMotion,
     measured: Array | None,
-) -> tuple[Wrench, tuple[Wrench, Wrench] | None]:
-    """Return the measured wrench about T's origin, and the next state of the sensor's lag."""
+) -> tuple[Wrench, tuple[Wrench, Any] | None]:
+    """Return the measured wrench about T's origin, and the next state of the sensor's lag or filter."""
     sensor, last = rig.sensor, state.controller
     if motion.acceleration is None:
         raw = read_fixed(contact, sensor.mounting)
     else:
         load = tool_load(sensor.tool, motion.pose, motion.twist, motion.acceleration, sensor.gravity)
         raw = read_moving(contact, load, motion.pose)
-    lagged = raw if last.lag is None else _lagged_reading(rig, state.tick, raw, *last.lag)
+    lagged = raw if last.lag is None else _advance_filter(loop, rig, state.tick, raw, *last.lag)
+    reading = _read_filter(loop.sensor_filter, lagged)
     noise = sensor.noise_std * _noise(rig, state.tick, 0) if loop.has_noise else None
-    reading = sample(lagged, sensor.errors, noise, loop.has_sample_effects, loop.cuts_dead_zone)
+    reading = sample(reading, sensor.errors, noise, loop.has_sample_effects, loop.cuts_dead_zone)
     unbiased: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
     if motion.acceleration is None:
         wrench = undo_fixed(unbiased, sensor.mounting)
@@ -79,8 +93,8 @@ def _measured_wrench(
     return wrench, None if last.lag is None else (raw, lagged)
 
 
-def _lagged_reading(rig: RigConstants, now: Array, raw: Wrench, last: Wrench, lagged: Wrench) -> Wrench:
-    """Return the output of the force sensor's lag; its input is interpolated linearly between ticks."""
+def _advance_filter(loop: Loop, rig: RigConstants, now: Array, raw: Wrench, last: Wrench, state: Any) -> Any:
+    """Return the next state of the force sensor's lag or filter; its input is linear between ticks."""
     first, zero = now == 0, jnp.zeros_like(rig.period)
 
     def lagged_channel(now: Array, before: Array, lagged: Array) -> Array:
@@ -88,8 +102,30 @@ def _lagged_reading(rig: RigConstants, now: Array, raw: Wrench, last: Wrench, la
         middle = (before + now) / 2
         return apply_lag(lagged, zero, rig.period, zero, [before, middle, now], rig.sensor.time_constant)
 
-    reading: Wrench = jax.tree.map(lagged_channel, raw, last, lagged)
-    return reading
+    if loop.sensor_filter is None:
+        reading: Wrench = jax.tree.map(lagged_channel, raw, last, state)
+        return reading
+
+    def filtered_channel(rate: complex, now: Array, before: Array, mode: Array) -> Array:
+        before, mode = jnp.where(first, now, before), jnp.where(first, now, mode)
+        return follow_ramp(mode, before, now, rate * rig.sensor.cutoff * rig.period)
+
+    return tuple(
+        jax.tree.map(partial(filtered_channel, rate), raw, last, mode)
+        for rate, mode in zip(loop.sensor_filter.rates, state, strict=True)
+    )
+
+
+def _read_filter(modes: FilterModes | None, state: Any) -> Wrench:
+    """Return the output of the force sensor's lag or filter."""
+    if modes is None:
+        return state
+
+    def channel(*parts: Array) -> Array:
+        terms = [jnp.real(weight * part) for weight, part in zip(modes.weights, parts, strict=True)]
+        return sum(terms[1:], terms[0])
+
+    return jax.tree.map(channel, *state)
 
 
 def _wrench(channels: Array) -> Wrench:

@@ -6,7 +6,7 @@ also reads the tool's weight and inertial force, which depend on the tool's orie
 lag of the sensor are part of `jaxhil.sixdof.loop`.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -53,6 +53,9 @@ class Sensor(NamedTuple):
     position_delay: Float[Array, "*batch"]  # delay of the pose sensor [s]
     position_noise_std: Float[Array, "6 *batch"]  # standard deviation of the pose's noise [m, rad]
     position_quantum: Float[Array, "6 *batch"]  # resolution of the pose's coordinates [m, rad]
+    # cutoff frequency of the low-pass filter of all channels [rad/s], (*batch); None without a filter. With a
+    # filter, `time_constant` is that of the filter's slowest mode.
+    cutoff: Any = None
 
 
 def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity: Vector) -> Wrench:

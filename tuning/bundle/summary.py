@@ -9,6 +9,8 @@ from html import escape
 from typing import Any
 
 from jaxhil.errors import to_one_line
+from jaxhil.mechanism.sensor_filter import low_frequency_delay
+from jaxhil.mechanism.structs import SensorFilter
 from jaxhil.simulation.contact_plot import CURVE_LABELS
 from tuning.bundle.writers import GainOrLimit, gain_entries, limit_entries
 from tuning.plots.bundle_summary import ERROR_STATISTICS, summary_png
@@ -90,8 +92,18 @@ def describe_mechanism(mechanism: Mapping[str, Any], axes: int = 1) -> str:
         f"{contact['law'].replace('_', ' ')} contact of stiffness {stiffness} (SI units); motion simulator "
         f"{rig['simulator']['model'].replace('_', ' ')}, delay "
         f"{_format_number(1e3 * rig['simulator'].get('delay', 0.0))} ms; force sensor delay "
-        f"{_format_number(1e3 * rig['force_sensor'].get('delay', 0.0))} ms."
+        f"{_format_number(1e3 * rig['force_sensor'].get('delay', 0.0))} ms{_describe_filter(rig)}."
     )
+
+
+def _describe_filter(rig: Mapping[str, Any]) -> str:
+    """Return the force sensor's filter in words, with its delay at low frequencies; empty without one."""
+    stated = rig["force_sensor"].get("filter")
+    if stated is None:
+        return ""
+    delay = _format_number(1e3 * low_frequency_delay(SensorFilter(**stated)))
+    name = f"{stated['kind']} filter of order {stated['order']} at {_format_number(stated['cutoff'])} Hz"
+    return f", {name} (another {delay} ms)"
 
 
 def _describe_six_axes(mechanism: Mapping[str, Any]) -> str:
@@ -109,7 +121,7 @@ def _describe_six_axes(mechanism: Mapping[str, Any]) -> str:
         f"{_format_number(mechanism['chaser']['mass'])} kg{speed}; contacts {contacts or 'none'}; motion "
         f"simulator {rig['simulator']['model'].replace('_', ' ')}, delays {delays} ms; force sensor on the "
         f"{rig['force_sensor'].get('side', 'fixed')} side, delay "
-        f"{_format_number(1e3 * rig['force_sensor'].get('delay', 0.0))} ms."
+        f"{_format_number(1e3 * rig['force_sensor'].get('delay', 0.0))} ms{_describe_filter(rig)}."
     )
 
 

@@ -34,7 +34,14 @@ _OPTIONAL_FLAGS = (
     "has_sample_effects",
     "has_limits",
 )
-_DISTINGUISHING_PROPERTIES = ("integrator", "hold", "latency", "is_two_sided", "cuts_dead_zone")
+_DISTINGUISHING_PROPERTIES = (
+    "integrator",
+    "hold",
+    "latency",
+    "is_two_sided",
+    "cuts_dead_zone",
+    "sensor_filter",
+)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.laws.compensators import COMPENSATORS, literature_gains
+from jaxhil.laws.shared.nominal_values import force_delay as nominal_force_delay
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.scenario import build_scenarios
@@ -73,7 +74,7 @@ def compute_traits(mechanism: Mechanism) -> MechanismTraits:
     nominal = build_scenarios(mechanism)
     frequency = validity_envelope(mechanism, nominal)["contact_frequency"]
     slowest, fastest = (2 * math.pi * frequency[end] for end in ("low", "high"))
-    simulator, sensor, rig = nominal.simulator, nominal.force_sensor, mechanism.rig
+    simulator, rig = nominal.simulator, mechanism.rig
     # In uniform motion, the output of num(s)/den(s) lags by den'(0)/den(0) - num'(0)/num(0).
     slopes = [
         float(polynomial[-2, 0] / polynomial[-1, 0]) if len(polynomial) > 1 else 0.0
@@ -86,7 +87,7 @@ def compute_traits(mechanism: Mechanism) -> MechanismTraits:
     return MechanismTraits(
         slowest=slowest,
         fastest=fastest,
-        force_delay=float(sensor.delay[0] + sensor.time_constant[0]),
+        force_delay=nominal_force_delay(mechanism),
         simulator_delay=float(simulator.delay[0])
         + slopes[0]
         - slopes[1]

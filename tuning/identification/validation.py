@@ -285,10 +285,16 @@ def _check_cutting_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list
 
 def check_sensor_effects(sensor: ForceSensor) -> list[CheckResult]:
     """Return a failed check if a file's force sensor has an effect that `identify` does not model."""
-    if sensor.dead_zone_kind != "cut" or sensor.dead_zone == 0.0:
-        return []
-    finding = f"a cut dead zone of {sensor.dead_zone:g} N, which `identify` does not model"
-    return [CheckResult("dead zone of the force sensor", finding, True, 1.0)]
+    lines = []
+    if sensor.dead_zone_kind == "cut" and sensor.dead_zone > 0.0:
+        finding = f"a cut dead zone of {sensor.dead_zone:g} N, which `identify` does not model"
+        lines.append(CheckResult("dead zone of the force sensor", finding, True, 1.0))
+    if sensor.filter is not None:
+        finding = (
+            f"a {sensor.filter.kind} filter of order {sensor.filter.order}, which `identify` does not model"
+        )
+        lines.append(CheckResult("filter of the force sensor", finding, True, 1.0))
+    return lines
 
 
 def estimate_restitution_errors(

@@ -7,6 +7,7 @@ to batches, but is too slow for a real-time loop.
 import math
 from typing import NamedTuple
 
+from jaxhil.mechanism.sensor_filter import settling_constant
 from jaxhil.mechanism.structs import Mechanism
 
 FADED_COMMAND_RATIO = 1e-6  # force command, divided by its peak, below which it has decayed [1]
@@ -41,7 +42,7 @@ class ContactDetector:
     def __init__(self, mechanism: Mechanism) -> None:
         rig, sensor = mechanism.rig, mechanism.rig.force_sensor
         self._period, self._clearance = rig.control_period, mechanism.contact.clearance
-        lag = (sensor.delay + sensor.jitter + 20 * sensor.time_constant) / self._period
+        lag = (sensor.delay + sensor.jitter + 20 * settling_constant(sensor)) / self._period
         min_ticks = math.floor(lag + 2 + 1e-9) + 1
         max_ticks = min_ticks + math.ceil(MAX_FADING_TIME / self._period)
         self._min_ticks_without_force, self._max_ticks_without_force = min_ticks, max_ticks

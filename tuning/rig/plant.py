@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from jaxhil.contact.float_law import FloatLaw
 from jaxhil.contact.laws import find_contact_law
+from jaxhil.mechanism.sensor_filter import find_modes
 from jaxhil.mechanism.structs import Contact, Mechanism
 from tuning.rig.discretisation import (
     DELAY_ROUNDING_TOLERANCE,
@@ -25,7 +26,7 @@ from tuning.rig.discretisation import (
     split_delay,
 )
 from tuning.rig.moving_average import discretise_moving_average
-from tuning.rig.sensor_lag import MotionState, apply_sensor_lag, deepest_penetration
+from tuning.rig.sensor_lag import MotionState, apply_sensor_filter, apply_sensor_lag, deepest_penetration
 from tuning.rig.timing import TimingEffects
 
 # Motion of the mechanism when the force sensor samples, at the sampling interval's start and at its end.
@@ -90,6 +91,11 @@ class RigHardware:
         self._limits = simulator.velocity_limit, simulator.acceleration_limit
         self._has_rate_limits = math.isfinite(min(self._limits))
         self._rows, self._size = constants.rows, constants.ring_size
+        stated, self._rates, self._weights = rig.force_sensor.filter, [], ()
+        if stated is not None:
+            modes = find_modes(stated.kind, stated.order)
+            self._rates = [2.0 * math.pi * stated.cutoff * rate for rate in modes.rates]
+            self._weights = modes.weights
         self._contact_intervals = constants.contact_intervals
         self._force_intervals = constants.force_intervals
         self._position_intervals = constants.position_intervals
@@ -129,6 +135,7 @@ class RigHardware:
         self._tick = 0
         self._timing.begin(size)
         self._lag = self.force = 0.0
+        self._modes = [0j] * len(self._rates)
         self._in_contact, self._deepest = False, 0.0
 
     def read(self) -> tuple[float, float]:
@@ -170,7 +177,7 @@ class RigHardware:
             position = evaluate_row(motion_rows.position, state, start, end) - self._plane
             return MotionState(position, evaluate_row(motion_rows.velocity, state, start, end))
 
-        if self._force_sensor.time_constant > 0.0 or self._law.loaded_law is not None:
+        if self._force_sensor.time_constant > 0.0 or self._rates or self._law.loaded_law is not None:
             interval = motion(rows.sample), motion(rows.start), motion(rows.end)
         else:
             interval = motion(rows.sample), None, None
@@ -210,6 +217,9 @@ class RigHardware:
         else:
             self._in_contact, self.force = False, 0.0
         time_constant = self._force_sensor.time_constant
+        if self._rates and start is not None and end is not None:
+            segments = (start, sample, self._sample_time, deepest), (sample, end, rest, at_sample)
+            return self._filter(clearance, *segments)
         if start is None or end is None or time_constant == 0.0:
             return self.force
         reading = apply_sensor_lag(
@@ -219,6 +229,20 @@ class RigHardware:
             reading, self._law, clearance, sample, end, rest, time_constant, at_sample
         )
         return reading
+
+    def _filter(self, clearance: float, *segments: tuple[MotionState, MotionState, float, float]) -> float:
+        """Advance the force sensor's filter by two segments; return its output [N] between the segments.
+
+        A segment has its motion at both ends, its duration [s] and the deepest penetration before it [m].
+        """
+        outputs = []
+        for start, end, duration, deepest in segments:
+            self._modes = apply_sensor_filter(
+                self._modes, self._law, clearance, start, end, duration, self._rates, deepest
+            )
+            pairs = zip(self._weights, self._modes, strict=True)
+            outputs.append(sum((weight * mode).real for weight, mode in pairs))
+        return outputs[0]
 
     def _deepest_until(self, deepest: float, start: MotionState, end: MotionState, duration: float) -> float:
         """Return the deepest penetration [m] of the contact until `end`; 0 if it has ended by then."""

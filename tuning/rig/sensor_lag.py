@@ -1,16 +1,18 @@
-"""Response of a force sensor with a first-order lag, T_s y' = F - y, during segments of smooth motion.
+"""Response of a force sensor with a lag, T_s y' = F - y, or a filter, during segments of smooth motion.
 
 Within a segment, a cubic Hermite polynomial through the exact positions and velocities at both ends
 interpolates the motion. The contact starts and ends at roots of this polynomial. In between, parabolas
 interpolate the force, and the response of the lag to each parabola is exact.
 """
 
+import cmath
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from jaxhil.contact.float_law import FloatLaw
 
+Number = TypeVar("Number", float, complex)
 FORCE_PARABOLAS = 2  # number of parabolas that interpolate the force in one segment
 MAX_ROOT_STEPS = 50  # largest number of iterations of the root finder
 ROOT_TOLERANCE = 1e-13  # largest error of a root [fraction of the segment]
@@ -47,16 +49,63 @@ def apply_sensor_lag(
         time_constant: time constant T_s of the lag [s].
         deepest: deepest penetration before the segment [m], for contact laws with memory.
     """
+    forces = _find_forces(law, clearance, start, end, duration, deepest)
+    return _respond(reading, forces, duration, time_constant)
+
+
+def apply_sensor_filter(
+    modes: list[complex],
+    law: FloatLaw,
+    clearance: float,
+    start: MotionState,
+    end: MotionState,
+    duration: float,
+    rates: list[complex],
+    deepest: float = 0.0,
+) -> list[complex]:
+    """Return the outputs of a filter's modes [N] at the end of a segment of motion.
+
+    Every mode is a first-order lag with a complex rate (`jaxhil.mechanism.sensor_filter`).
+
+    Args:
+        modes: outputs of the modes at the start of the segment [N].
+        law: contact law.
+        clearance: distance between the two surfaces [m]; infinite for one surface.
+        start: motion at the start of the segment.
+        end: motion at the end of the segment.
+        duration: duration of the segment [s].
+        rates: rate of each mode [1/s].
+        deepest: deepest penetration before the segment [m], for contact laws with memory.
+    """
+    forces = _find_forces(law, clearance, start, end, duration, deepest)
+    return [_respond(mode, forces, duration, 1.0 / rate) for mode, rate in zip(modes, rates, strict=True)]
+
+
+def _find_forces(
+    law: FloatLaw,
+    clearance: float,
+    start: MotionState,
+    end: MotionState,
+    duration: float,
+    deepest: float,
+) -> tuple[float, float, list[float]]:
+    """Return start, end and nodes of the force in a segment (`_ContactInterval`); no nodes without force."""
+    side, surface = _reached_surface(start.position, end.position, clearance)
+    if duration <= 0.0 or side == 0.0:
+        return 1.0, 0.0, []
+    return _ContactInterval(_CubicPath(start, end, duration), side, surface, law, deepest).forces()
+
+
+def _respond(
+    reading: Number, interval: tuple[float, float, list[float]], duration: float, time_constant: Number
+) -> Number:
+    """Return the output of a lag [N] at the end of a segment, from its output at the start."""
     if duration <= 0.0:
         return reading
-    side, surface = _reached_surface(start.position, end.position, clearance)
-    if side == 0.0:
-        return reading * math.exp(-duration / time_constant)
-    interval = _ContactInterval(_CubicPath(start, end, duration), side, surface, law, deepest)
-    first, last, forces = interval.forces()
+    first, last, forces = interval
     if not first < last:
-        return reading * math.exp(-duration / time_constant)
-    reading *= math.exp(-first * duration / time_constant)
+        return reading * _exp(-duration / time_constant)
+    reading *= _exp(-first * duration / time_constant)
     span = (last - first) * duration / FORCE_PARABOLAS / time_constant
     decay, mean_decay, parabola_response = _parabola_weights(span)
     for i in range(0, 2 * FORCE_PARABOLAS, 2):
@@ -64,7 +113,7 @@ def apply_sensor_lag(
         bend = middle - (begin + finish) / 2
         reading = reading * decay + finish - begin * decay - (finish - begin) * mean_decay
         reading += bend * parabola_response
-    return reading * math.exp(-(1.0 - last) * duration / time_constant)
+    return reading * _exp(-(1.0 - last) * duration / time_constant)
 
 
 def deepest_penetration(start: MotionState, end: MotionState, duration: float, clearance: float) -> float:
@@ -211,16 +260,28 @@ def _find_root(function: Callable[[float], float], at_0: float, at_1: float) -> 
     return s
 
 
-def _parabola_weights(span: float) -> tuple[float, float, float]:
+def _parabola_weights(span: Number) -> tuple[Number, Number, Number]:
     """Return three coefficients of the lag's exact response to a parabola that lasts `span` time constants.
 
     The first is the decay exp(-span) of the initial value. The second is the mean of exp(-t) for t from 0 to
     span. The third is the response at t = span to the input 4 (t/span) (1 - t/span).
     """
-    decay = math.exp(-span)
-    if span < MIN_CLOSED_FORM_DURATION:
-        mean = -math.expm1(-span) / span if span > 0.0 else 1.0
+    decay = _exp(-span)
+    if abs(span) < MIN_CLOSED_FORM_DURATION:
         parabola_response = 4 * span * (1 / 6 - span * (1 / 12 - span * (1 / 40 - span / 180)))
-        return decay, mean, parabola_response
-    mean = -math.expm1(-span) / span
+        return decay, _mean_decay(span), parabola_response
+    mean = _mean_decay(span)
     return decay, mean, 4 * (mean - 2 * (mean - decay) / span)
+
+
+def _mean_decay(span: Number) -> Number:
+    """Return the mean of exp(-t) for t from 0 to span."""
+    if isinstance(span, complex):
+        if abs(span) < MIN_CLOSED_FORM_DURATION:
+            return 1 - span * (1 / 2 - span * (1 / 6 - span * (1 / 24 - span * (1 / 120 - span / 720))))
+        return (1 - cmath.exp(-span)) / span
+    return -math.expm1(-span) / span if span > 0.0 else 1.0
+
+
+def _exp(exponent: Any) -> Any:
+    return cmath.exp(exponent) if isinstance(exponent, complex) else math.exp(exponent)

@@ -2,8 +2,8 @@
 
 For a linear contact law and a linear compensator, the loop in contact is a linear map from tick to tick. The
 state of the map consists of the numerical model, the delayed commands, the motion simulator, the force
-sensor's lag, the delayed readings, and the compensator's filters. The motion between ticks is solved exactly,
-and the matrix of the map is the derivative of one control period with respect to the state.
+sensor's lag or filter, the delayed readings, and the compensator's filters. The motion between ticks is
+solved exactly, and the matrix of the map is the derivative of one control period with respect to the state.
 
 The spectral radius is the largest magnitude of the eigenvalues of this matrix. If it exceeds 1, the
 oscillation grows. For the eigenvalue z with this magnitude, the growth rate is ln|z|/T per second, where T is
@@ -26,6 +26,7 @@ from jax.flatten_util import ravel_pytree
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.simulation_base import Compensator, Gains, KnownConstants, Signals
+from jaxhil.mechanism.sensor_filter import FilterModes, find_modes
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.integrators import INTEGRATORS
 from jaxhil.simulation.scenario import Scenario, build_scenarios
@@ -48,8 +49,14 @@ class ProgramParameters(NamedTuple):
     integrator: str
     hold: str  # hold of the command, "zoh" or "linear"
     latency: int  # latency of the command [control periods]
-    has_lag: bool  # whether the force sensor has a lag
+    # modes of the force sensor's lag or filter; None for a sensor without either
+    modes: FilterModes | None
     delays: int  # number of past force readings in the state, enough for the longest delay
+
+    @property
+    def filter_size(self) -> int:
+        """Return the number of states of the force sensor's lag or filter."""
+        return 0 if self.modes is None else 2 * len(self.modes.rates)
 
 
 class LoopParameters(NamedTuple):
@@ -62,7 +69,7 @@ class LoopParameters(NamedTuple):
     numerator: Any  # motion simulator's numerator, coefficients of descending powers of s, (order,)
     denominator: Any  # motion simulator's denominator, descending powers of s, (order + 1,)
     delay: Any  # delay of motion simulator plus force sensor [s]
-    lag: Any  # time constant of the force sensor [s]
+    cutoff: Any  # cutoff frequency of the force sensor's lag or filter [rad/s]
 
 
 class Growth(NamedTuple):
@@ -167,15 +174,22 @@ def _program_parameters(mechanism: Mechanism, compensator: str, scenarios: Scena
     rig = mechanism.rig
     delay = np.asarray(scenarios.simulator.delay) + np.asarray(scenarios.force_sensor.delay)
     longest = int(np.max(np.floor(delay / np.asarray(scenarios.control_period) + 1e-9)))
-    lagging = bool(np.any(np.asarray(scenarios.force_sensor.time_constant) > 0))
+    stated, modes = rig.force_sensor.filter, None
+    if stated is not None:
+        modes = find_modes(stated.kind, stated.order)
+    elif np.any(np.asarray(scenarios.force_sensor.time_constant) > 0):
+        modes = find_modes("butterworth", 1)
     return ProgramParameters(
-        compensator, rig.integrator, rig.command_hold, rig.command_latency, lagging, longest + 1
+        compensator, rig.integrator, rig.command_hold, rig.command_latency, modes, longest + 1
     )
 
 
 def _lane_parameters(scenarios: Scenario, slot: int) -> LoopParameters:
     """Return the physical parameters of every lane in contact `slot` of the schedule."""
     sensor, simulator = scenarios.force_sensor, scenarios.simulator
+    cutoff = sensor.cutoff
+    if cutoff is None:
+        cutoff = 1.0 / np.maximum(sensor.time_constant, MIN_LAG * np.asarray(scenarios.control_period))
     numbers = LoopParameters(
         mass=scenarios.equivalent_mass,
         period=scenarios.control_period,
@@ -184,7 +198,7 @@ def _lane_parameters(scenarios: Scenario, slot: int) -> LoopParameters:
         numerator=np.moveaxis(np.asarray(simulator.numerator), 0, -1),
         denominator=np.moveaxis(np.asarray(simulator.denominator), 0, -1),
         delay=sensor.delay + simulator.delay,
-        lag=sensor.time_constant,
+        cutoff=cutoff,
     )
     return jax.tree.map(np.asarray, numbers)
 
@@ -196,7 +210,7 @@ def _per_lane(gains: Mapping[str, Any], number: int) -> dict[str, np.ndarray]:
 
 def _matrix_size(shape: ProgramParameters, lanes: LoopParameters) -> int:
     """Return the approximate number of rows of the matrix of one control period."""
-    return 2 + shape.latency + 1 + lanes.numerator.shape[-1] + shape.has_lag + shape.delays + 4
+    return 2 + shape.latency + 1 + lanes.numerator.shape[-1] + shape.filter_size + shape.delays + 4
 
 
 @partial(jax.jit, static_argnums=0)
@@ -218,7 +232,7 @@ def _period_matrix(shape: ProgramParameters, lane: LoopParameters, gains: Gains)
     """Return the matrix that maps the state of the loop from one tick to the next, (size, size)."""
     law = COMPENSATORS[shape.compensator]
     constants = KnownConstants(lane.period, jnp.full_like(lane.period, jnp.inf))
-    plant = jnp.zeros(lane.numerator.shape[0] + shape.has_lag)
+    plant = jnp.zeros(lane.numerator.shape[0] + shape.filter_size)
     start = (
         jnp.full_like(lane.period, LINEARISATION_DEPTH),
         jnp.zeros_like(lane.period),
@@ -274,7 +288,7 @@ def _plant_transition(shape: ProgramParameters, lane: LoopParameters) -> tuple[j
     1978). Time is in control periods, and the command is linear within a period.
     """
     order, period = lane.numerator.shape[0], lane.period
-    size = order + shape.has_lag
+    size = order + shape.filter_size
     command, slope = size, size + 1
     generator = jnp.zeros((size + 2, size + 2)).at[command, slope].set(1.0)
     position = jnp.zeros(size + 2)
@@ -290,10 +304,16 @@ def _plant_transition(shape: ProgramParameters, lane: LoopParameters) -> tuple[j
     if order:
         generator = generator.at[order - 1, command].set(1.0)
     force = lane.stiffness * position + lane.damping / period * (position @ generator)
-    if shape.has_lag:
-        ratio = 1.0 / jnp.maximum(lane.lag / period, MIN_LAG)
-        generator = generator.at[order].set(ratio * force).at[order, order].add(-ratio)
-        force = jnp.zeros(size + 2).at[order].set(1.0)
+    if shape.modes is not None:
+        force, inputs = jnp.zeros(size + 2), force
+        for mode, (rate, weight) in enumerate(zip(*shape.modes, strict=True)):
+            # Real part u and imaginary part v of a mode, (u + j v)' = rate cutoff (force - u - j v).
+            u = order + 2 * mode
+            v, turn, decay = u + 1, rate.imag * lane.cutoff * period, rate.real * lane.cutoff * period
+            generator = generator.at[u].set(decay * inputs).at[v].set(turn * inputs)
+            generator = generator.at[u, u].add(-decay).at[u, v].add(turn)
+            generator = generator.at[v, u].add(-turn).at[v, v].add(-decay)
+            force = force.at[u].set(weight.real).at[v].set(-weight.imag)
     # A reading has the value just before a tick, so that its time within the period is in (0, 1].
     time = 1.0 - (lane.delay / period - jnp.floor(lane.delay / period + 1e-9))
     to_end, to_reading = (_matrix_exponential(generator * t) for t in (jnp.ones_like(time), time))

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxhil.errors import InputError
+from jaxhil.laws.shared.nominal_values import force_delay
 from jaxhil.mechanism.uncertainty import draw_extremes
 from jaxhil.rig.law_status import UNSTATED
 from jaxhil.rig.limits import LIMITS
@@ -148,7 +149,7 @@ def build_audit_rules(loaded: LoadedGains) -> tuple[AuditRules, float]:
     """
     mechanism = loaded.mechanism
     rig = mechanism.rig
-    force, position, period = rig.force_sensor, rig.position_sensor, rig.control_period
+    position, period = rig.position_sensor, rig.control_period
     drawn = _find_largest_draws(loaded)
     # Time that the simulated loop waits for the force to decay, with the largest delays of all draws.
     wait = drawn["force_delay"] + 20 * drawn["force_lag"] + 2 * period
@@ -158,7 +159,7 @@ def build_audit_rules(loaded: LoadedGains) -> tuple[AuditRules, float]:
         period=period,
         clearance=mechanism.contact.clearance,
         mass=mass,
-        alignment=max(0.0, force.delay + force.time_constant - position.delay),
+        alignment=max(0.0, force_delay(mechanism) - position.delay),
         settling=LIMIT_MARGIN * wait,
         fading=noise,
         has_status=_has_status(loaded),

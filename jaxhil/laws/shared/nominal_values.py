@@ -8,6 +8,7 @@ values that a compensator needs.
 import math
 
 from jaxhil.contact.laws import find_contact_law
+from jaxhil.mechanism.sensor_filter import low_frequency_delay
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.six_axes_rig import Simulator, TargetRobot
 from jaxhil.mechanism.structs import Mechanism
@@ -23,9 +24,9 @@ EQUIVALENT_MASS = "equivalent mass"
 
 
 def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
-    """Return the nominal delay [s] of the force measurement: transport delay plus first-order lag."""
+    """Return the nominal delay [s] of the force measurement: transport delay plus lag or filter."""
     sensor = mechanism.rig.force_sensor
-    return sensor.delay + sensor.time_constant
+    return sensor.delay + sensor.time_constant + low_frequency_delay(sensor.filter)
 
 
 def simulator_inverse(mechanism: Mechanism) -> tuple[float, float]:

@@ -52,7 +52,7 @@ def rig_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
         fmi: version of FMI, 2 or 3.
 
     Raises:
-        InputError: If the contact law is not a built-in one, or the rig has timing effects.
+        InputError: If the contact law is not a built-in one, or if the rig has a filter or timing effects.
     """
     mechanism = _without_extra_periods(document)
     if mechanism.contact.law not in LAWS:
@@ -67,6 +67,11 @@ def rig_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
         if value:
             found = f"found {value:g}, expected 0; use `--format c99` to export without the rig"
             raise InputError(f"fmu: rig.{key}: {found}")
+    if sensor.filter is not None:
+        found = "found a filter, expected none"
+        raise InputError(
+            f"fmu: rig.force_sensor.filter: {found}; use `--format c99` to export without the rig"
+        )
     return build_fmu(
         identifier=IDENTIFIER,
         name=f"{IDENTIFIER}: {mechanism.name}",

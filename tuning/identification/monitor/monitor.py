@@ -124,6 +124,10 @@ def monitor_contacts(campaign: Campaign, mechanism: Mechanism) -> MonitorResult:
         raise InputError("logs: found no contact, expected a run of kind contact or tap")
     numbers, correlation = list_uncertain_parameters(mechanism)
     sensor = mechanism.rig.force_sensor
+    if sensor.filter is not None:
+        raise InputError(
+            "rig.force_sensor.filter: found a filter, expected none: monitor does not predict it"
+        )
     prediction = MetricFilter(correlation, float(np.hypot(sensor.noise_std, sensor.quantum)))
     monitor = _MonitorState(prediction)
     for run, features in zip(runs, _compute_run_metrics(runs, mechanism, campaign, numbers), strict=True):
