@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 
@@ -30,3 +31,8 @@ def safe_sqrt(square: Float[Array, "..."]) -> Float[Array, "..."]:
     positive = square > 0
     # JAX also differentiates the branch that is not selected: with sqrt(0) this would give 0 times infinity.
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
+
+
+def as_complex(value: Array) -> Array:
+    """Return real values as complex ones; strict promotion of types does not mix both."""
+    return lax.complex(value, jnp.zeros_like(value))

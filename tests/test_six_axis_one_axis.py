@@ -125,3 +125,26 @@ def test_simulate_writes_a_one_axis_file_that_loads(jaxhil, tmp_path):
     assert mechanism.contact.law == "hunt_crossley" and mechanism.contact.stiffness == [3e6]
     ran = jaxhil("simulate", "probe-drogue", "--reference", "--one-axis", tmp_path / "two.toml")
     assert ran.code == 2 and "friction.coefficient: found 0.15, expected for a one-axis file: 0" in ran.err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        {"dead_zone": [0.0, 0.0, 8.0, 0.0, 0.0, 0.0], "dead_zone_kind": "cut"},
+        {"filter": {"kind": "bessel", "order": 4, "cutoff": 40.0}},
+    ],
+)
+def test_cut_dead_zone_and_filter_of_a_central_contact_act_as_with_one_axis(sensor):
+    ball = OFF_CENTRE["contact"]["ball"]
+    central = ball | {"chaser": ball["chaser"] | {"centre": [0.0, 0.0, 0.0]}}
+    changes = {
+        "contact": OFF_CENTRE["contact"] | {"ball": central},
+        "rig.force_sensor": {"delay": 0.004, **sensor},
+        "rig.position_sensor": {},
+    }
+    mechanism = package.load("probe-drogue", OFF_CENTRE | changes)
+    [episode] = package.simulate(mechanism, "none").episodes
+    converted, _ = convert_to_one_axis(mechanism, episode)
+    [contact] = package.simulate(converted, "none").contacts
+    assert contact.restitution == pytest.approx(episode.restitution, rel=1e-4)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxhil.lanes import safe_sqrt
+from jaxhil.lanes import as_complex, safe_sqrt
 from jaxhil.mechanism.sensor_filter import FilterModes
 
 
@@ -74,11 +74,11 @@ class Push(NamedTuple):
         """
         since = time - self.centre + self.width / 2
         begun = since > 0
-        within = jnp.clip(jnp.where(begun, since, 0), 0, self.width)
-        after = jnp.where(since > self.width, since - self.width, 0)
-        rate, total = jnp.pi / self.width, jnp.zeros_like(time)
+        within = as_complex(jnp.clip(jnp.where(begun, since, 0), 0, self.width))
+        after = as_complex(jnp.where(since > self.width, since - self.width, 0))
+        rate, total = as_complex(jnp.pi / self.width), jnp.zeros_like(time)
         for weight, mode in zip(modes.weights, modes.rates, strict=True):
-            decay = mode * cutoff
+            decay = mode * as_complex(cutoff)
             late = rate / decay
             swing = jnp.sin(rate * within) - late * jnp.cos(rate * within) + late * jnp.exp(-within * decay)
             total = total + jnp.real(weight / (1 + late**2) * swing * jnp.exp(-after * decay))

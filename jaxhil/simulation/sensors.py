@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt32
 
+from jaxhil.lanes import as_complex
 from jaxhil.simulation.scenario import Scenario
 
 THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))  # bits; rotation constants of Threefry-2x32
@@ -93,7 +94,7 @@ def follow_ramp(mode: Array, before: Array, now: Array, span: Array) -> Array:
         now: Input at the end [N].
         span: Duration times the mode's rate r, complex [1].
     """
-    decay = jnp.exp(-span)
+    decay, before, now = jnp.exp(-span), as_complex(before), as_complex(now)
     return mode * decay + now - before * decay - (now - before) * (1 - decay) / span
 
 

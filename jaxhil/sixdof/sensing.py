@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxhil.lanes import as_complex
 from jaxhil.laws.six_axis_base import SixAxisSignals
 from jaxhil.mechanism.sensor_filter import FilterModes
 from jaxhil.simulation.sensors import apply_lag, follow_ramp, quantise, white_noise
@@ -48,9 +49,7 @@ def start_filter(modes: FilterModes | None, nothing: Wrench) -> Any:
     """Return the state of the force sensor's lag or filter before the first tick: its input is `nothing`."""
     if modes is None:
         return nothing
-    dtype = jnp.result_type(nothing.force.x, jnp.complex64)
-    mode = jax.tree.map(lambda channel: channel.astype(dtype), nothing)
-    return (mode,) * len(modes.rates)
+    return (jax.tree.map(as_complex, nothing),) * len(modes.rates)
 
 
 def _measured_pose(loop: Loop, rig: RigConstants, state: RunState, measured: Array) -> Array:
@@ -107,8 +106,8 @@ def _advance_filter(loop: Loop, rig: RigConstants, now: Array, raw: Wrench, last
         return reading
 
     def filtered_channel(rate: complex, now: Array, before: Array, mode: Array) -> Array:
-        before, mode = jnp.where(first, now, before), jnp.where(first, now, mode)
-        return follow_ramp(mode, before, now, rate * rig.sensor.cutoff * rig.period)
+        before, mode = jnp.where(first, now, before), jnp.where(first, as_complex(now), mode)
+        return follow_ramp(mode, before, now, rate * as_complex(rig.sensor.cutoff * rig.period))
 
     return tuple(
         jax.tree.map(partial(filtered_channel, rate), raw, last, mode)
