@@ -16,7 +16,7 @@ import tuning
 
 SCRIPT = Path(__file__).parent / "interface_script.py"
 SMALL = {"scenarios": 4, "starts": 1, "steps": 2, "validation": 16}
-TINY = ["--scenarios", "4", "--starts", "1", "--steps", "2", "--validation", "16"]
+TINY = ["--scenarios", "4", "--starts", "1", "--steps", "2", "--evaluated", "16"]
 
 
 @pytest.fixture(scope="module")

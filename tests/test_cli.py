@@ -11,7 +11,7 @@ from jaxhil.mechanism.file import builtin_path
 from tuning.__main__ import main
 from tuning.gain_file import write_gain_file
 
-TINY = ["--scenarios", "4", "--starts", "2", "--steps", "2", "--validation", "16"]
+TINY = ["--scenarios", "4", "--starts", "2", "--steps", "2", "--evaluated", "16"]
 CONTACT_KEYS = {
     *("restitution", "reference_restitution", "error", "peak_force", "duration", "approach_velocity"),
 }

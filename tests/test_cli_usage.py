@@ -19,7 +19,7 @@ from jaxhil.simulation import jax_environment
 from tuning.api.sweep_options import DEFAULT_SOBOL_SCENARIOS
 from tuning.cli.commands.tune import is_better, make_folder_name
 from tuning.cli.options import DEFAULT_PLOT
-from tuning.cli.parser import complete_bare_options
+from tuning.cli.parser import complete_bare_options, replace_old_names
 from tuning.gains.tune import ErrorMetrics
 
 ERROR_KEYS = ["schema", "command", "verdict", "problems"]
@@ -295,3 +295,11 @@ def test_cache_folder_is_none_if_folder_cannot_be_created(monkeypatch, tmp_path)
     monkeypatch.setenv("JAXHIL_CACHE", str(tmp_path / "new"))
     assert jax_environment.cache_folder() == tmp_path / "new"
     assert (tmp_path / "new").is_dir()
+
+
+def test_old_names_of_options_are_replaced_with_a_warning(capsys):
+    old = ["tune", "--validation=8", "--pareto-against", "honesty", "--certify", "honesty"]
+    new = ["tune", "--evaluated=8", "--pareto-against", "transparency", "--global-search", "honesty"]
+    assert replace_old_names(old) == new
+    assert capsys.readouterr().err.count("warning: ") == 3
+    assert replace_old_names(new) == new and capsys.readouterr().err == ""

@@ -32,7 +32,16 @@ HEEDING = (
     "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
     "from tuning.__main__ import main; sys.exit(main())"
 )
-SMALL = ["rig-300kg", "--set", "approach.contacts=1", "--compensators", "none", "passivity", "--judged", "8"]
+SMALL = [
+    "rig-300kg",
+    "--set",
+    "approach.contacts=1",
+    "--compensators",
+    "none",
+    "passivity",
+    "--evaluated",
+    "8",
+]
 
 
 def run(arguments, folder, **options):
@@ -144,7 +153,7 @@ def test_compare_reports_positive_computing_time_per_tick():
         (["--compensators", "magic"], "--compensators: found 'magic', expected none, dead_zone_observer"),
         (["no-such-file"], "no-such-file"),
         (["varying", "varying"], "name: found varying, expected a name that differs from that of varying"),
-        (["--judged", "1"], "--judged: found 1, expected an integer >= 2"),
+        (["--evaluated", "1"], "--evaluated: found 1, expected an integer >= 2"),
         (["--scenarios", "0"], "--scenarios: found 0, expected an integer >= 1"),
         (["--limit", "nan"], "--limit: found nan, expected a number >= 0"),
     ],

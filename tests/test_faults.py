@@ -38,7 +38,7 @@ class Command(NamedTuple):
     logged: bool = False  # whether the command reads the log of a run
 
 
-TUNED = ["--compensator", "phase_lead", "--scenarios", 2, "--starts", 1, "--steps", 1, "--validation", 4]
+TUNED = ["--compensator", "phase_lead", "--scenarios", 2, "--starts", 1, "--steps", 1, "--evaluated", 4]
 
 
 NOISE = ["--set", "rig.force_sensor.noise_std=0.5", "--set", "rig.position_sensor.noise_std=5e-6"]
@@ -63,7 +63,7 @@ def _identify(out: Path, gains: Path) -> list[Any]:
 
 
 def _compare(out: Path, gains: Path) -> list[Any]:
-    few = ["--scenarios", 2, "--judged", 4, "--untuned", "--compensators", "phase_lead"]
+    few = ["--scenarios", 2, "--evaluated", 4, "--untuned", "--compensators", "phase_lead"]
     return ["compare", "rig-300kg", *few, "--json", "-o", out]
 
 

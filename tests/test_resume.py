@@ -28,7 +28,7 @@ from tuning.statistics.intervals import IntervalEstimate
 HERE = Path(__file__).parent
 FILES = 5  # more mechanisms than have separate plots
 TINY = ["--compensator", "phase_lead", "--scenarios", "4", "--starts", "2", "--steps", "2"]
-TINY += ["--validation", "16", "--limit", "inf", "--json"]
+TINY += ["--evaluated", "16", "--limit", "inf", "--json"]
 SETTINGS = TuneSettings(scenarios=4, starts=2, steps=2, validation=16)
 
 

@@ -118,8 +118,8 @@ def test_six_axis_map_equals_single_runs():
 @pytest.mark.slow
 def test_six_axis_compare_tunes_and_evaluates_on_equal_draws(jaxhil, tmp_path):
     ran = jaxhil(
-        "compare", FILE, "--compensators", "none", "phase_lead", "--scenarios", 8, "--judged", 16, "--json",
-        "-o", tmp_path,
+        "compare", FILE, "--compensators", "none", "phase_lead", "--scenarios", 8, "--evaluated", 16,
+        "--json", "-o", tmp_path,
     )  # fmt: skip
     assert ran.code == 0, ran.err
     document = json.loads(ran.out)

@@ -59,7 +59,7 @@ def test_default_error_limit_depends_on_number_of_axes():
 def test_six_axis_pareto_accepts_only_the_command_peak_as_cost():
     mechanism = load_any("petals").mechanism
     TuneOptions(compensator="phase_lead", pareto=3).check_mechanism(mechanism)
-    for against in ("noise", "honesty"):
+    for against in ("noise", "transparency"):
         with pytest.raises(InputError, match=f"pareto_against: found {against}, expected peak, the only"):
             options = TuneOptions(compensator="phase_lead", pareto=3, pareto_against=against)
             options.check_mechanism(mechanism)

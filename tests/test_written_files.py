@@ -9,7 +9,17 @@ from sweep_cases import case
 from jaxhil.mechanism.file import builtin_path
 from tuning.gain_file import write_gain_file
 
-COMPARE = ("compare", "rig-300kg", "--untuned", "--compensators", "none", "--scenarios", "1", "--judged", "2")
+COMPARE = (
+    "compare",
+    "rig-300kg",
+    "--untuned",
+    "--compensators",
+    "none",
+    "--scenarios",
+    "1",
+    "--evaluated",
+    "2",
+)
 
 
 @pytest.fixture
@@ -81,7 +91,7 @@ TUNE = (
     "2",
     "--steps",
     "2",
-    "--validation",
+    "--evaluated",
     "16",
 )
 

@@ -103,7 +103,7 @@ def test_rollouts_with_derivatives_compile_within_time_limit(compensator, no_com
 
 @pytest.mark.parametrize("compensator", [name for name, law in COMPENSATORS.items() if law.gains])
 def test_programs_of_tuning_compile_within_time_limit(compensator, tmp_path, capsys):
-    few = "--starts", "1", "--steps", "1", "--validation", "15", "--compensator", compensator
+    few = "--starts", "1", "--steps", "1", "--evaluated", "15", "--compensator", compensator
     took, timings = run(("tune", "varying", *few), tmp_path, tmp_path / "programs")
     parts = {part: float(seconds) for part, seconds in re.findall(r"(\w+) ([\d.]+) s", timings)}
     with capsys.disabled():

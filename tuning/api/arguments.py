@@ -33,6 +33,10 @@ SIX_AXIS_COMPENSATOR_NAMES = built_in_compensators(6)
 DEFAULT_LIMIT, SIX_AXIS_DEFAULT_LIMIT = 0.01, 0.05
 
 
+# Options of the command line whose names differ from those of the arguments in Python.
+OPTION_NAMES = {"judged": "evaluated", "validation": "evaluated"}
+
+
 class ArgumentError(InputError):
     """Error for an unusable argument, with the message "name: found X, expected Y".
 
@@ -51,7 +55,7 @@ class ArgumentError(InputError):
         """
         text = f"{f': {entry}' if entry else ''}: found {found}, expected {allowed}"
         super().__init__(name + text)
-        self.option = f"--{name.replace('_', '-')}{text}"
+        self.option = f"--{OPTION_NAMES.get(name, name).replace('_', '-')}{text}"
 
 
 def convert_os_errors(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

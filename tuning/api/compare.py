@@ -88,7 +88,9 @@ class CompareOptions:
         text_option(None, "Do not tune: evaluate the literature's gains and the compensators' settings."),
     ] = False
     scenarios: Annotated[int, number_option("Scenarios to tune on."), AllowedValues(1)] = 32
-    judged: Annotated[int, number_option("Fresh scenarios for the evaluation."), AllowedValues(2)] = 256
+    judged: Annotated[
+        int, number_option("Fresh scenarios for the evaluation.", name="evaluated"), AllowedValues(2)
+    ] = 256
     limit: OptionalLimit = None
     seed: Annotated[int, number_option("Seed of scenarios, starts and resampling."), SeedRange] = 0
     scheduler: Scheduler = None

@@ -35,9 +35,9 @@ class AllowedValues:
     words: str = ""
 
 
-def number_option(meaning: str):
+def number_option(meaning: str, **more: Any):
     """Return tyro's description of an option whose value is a number."""
-    return arg(metavar="NUMBER", help=meaning)
+    return arg(metavar="NUMBER", help=meaning, **more)
 
 
 def folder_option(meaning: str):

@@ -67,7 +67,9 @@ class TuneOptions:
         ),
     ] = ()
     steps: Annotated[int, number_option("Largest number of solver steps from each start."), CountRange] = 25
-    validation: Annotated[int, number_option("Fresh scenarios for the evaluation."), CountRange] = 511
+    validation: Annotated[
+        int, number_option("Fresh scenarios for the evaluation.", name="evaluated"), CountRange
+    ] = 511
     objective: Annotated[
         ObjectiveOption,
         arg(
@@ -109,7 +111,6 @@ class TuneOptions:
             "NUMBER",
             "Weight of the errors in runs of the same scenarios with a push on the hardware or more damping; "
             "by default 1 for impulse_ledger, 0 for others.",
-            aliases=("--honesty-weight",),
         ),
     ] = None
     pareto: Annotated[
@@ -120,15 +121,14 @@ class TuneOptions:
         str | None,
         text_option(
             "NAME",
-            "Cost that --pareto trades off against the error: noise, peak (of the command) or honesty "
-            "(transparency); by default noise, or peak for impulse_ledger.",
+            "Cost that --pareto trades off against the error: noise, peak (of the command) or transparency; "
+            "by default noise, or peak for impulse_ledger.",
         ),
     ] = None
     global_search: Annotated[
         bool,
         arg(
             name="global-search",
-            aliases=("--certify",),
             metavar="",
             help="Also search the full range of all gains for better gains, with 50 times the evaluations.",
         ),
@@ -187,7 +187,7 @@ class TuneOptions:
             global_search=self.global_search,
             setting=self.setting,
             quiet=self.wants_quiet,
-            evaluate_transparency=self.pareto_against == "honesty",
+            evaluate_transparency=self.pareto_against == "transparency",
         )
 
     @property

@@ -31,6 +31,17 @@ from tuning.cli.options_report import Map, ReportOptions
 from tuning.cli.options_rig import DEFAULT_RIG_PLOT, DEFAULT_SHADOW_PLOT, Export, RigOptions, Shadow, Verify
 from tuning.cli.timings import report_timings
 
+# Old names of options, which are read for one release, and their new names.
+RENAMED_OPTIONS = {
+    "--judged": "--evaluated",
+    "--validation": "--evaluated",
+    "--honesty-weight": "--transparency-weight",
+    "--certify": "--global-search",
+    "--no-certify": "--no-global-search",
+}
+
+RENAMED_VALUES = {("--pareto-against", "honesty"): "transparency"}  # likewise, by option and old value
+
 DESCRIPTION = """Gains that keep hardware-in-the-loop docking tests from diverging.
 
 To begin: jaxhil init mine.toml, then jaxhil tune mine.toml. Help for a command: jaxhil COMMAND --help.
@@ -66,7 +77,7 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
         Command,  # pyright: ignore[reportArgumentType]
         prog="jaxhil",
         description=DESCRIPTION,
-        args=complete_bare_options(words),
+        args=replace_old_names(complete_bare_options(words)),
     )
 
     def run() -> int:
@@ -95,6 +106,25 @@ def complete_bare_options(arguments: list[str]) -> list[str]:
         elif word in ("--drivers", "--rare") and not _is_number(following):
             completed.append(str(DEFAULT_SOBOL_SCENARIOS) if word == "--drivers" else "0")
     return completed
+
+
+def replace_old_names(arguments: Sequence[str]) -> list[str]:
+    """Replace the old names of options and values by the new ones; print a warning for each."""
+    replaced, option = [], ""
+    for word in arguments:
+        old, equals, value = word.partition("=")
+        new = RENAMED_VALUES.get((option, word)) or RENAMED_OPTIONS.get(old, old)
+        if new != old:
+            _warn(f"{old} is now {new}; the old name will be removed in the next release")
+        replaced.append(new + equals + value)
+        option = word
+    return replaced
+
+
+def _warn(text: str) -> None:
+    from tuning import terminal  # imports much that --help does not need
+
+    terminal.warn([text])
 
 
 def _is_number(word: str) -> bool:

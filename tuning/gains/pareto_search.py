@@ -48,7 +48,7 @@ PEAK_CRITERION = ParetoCriterion(
     "peak", "command_weight", "peak_p99", "peak command / ideal peak force (99th percentile)", 0.1
 )
 TRANSPARENCY_CRITERION = ParetoCriterion(
-    "honesty", "transparency_weight", "honesty_error", "error with pushes or other damping (rms)", 1e-3
+    "transparency", "transparency_weight", "honesty_error", "error with pushes or other damping (rms)", 1e-3
 )
 PARETO_CRITERIA = {axis.name: axis for axis in (NOISE_CRITERION, PEAK_CRITERION, TRANSPARENCY_CRITERION)}
 

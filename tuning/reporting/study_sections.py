@@ -235,7 +235,7 @@ def _repeat_commands(results: Results) -> Iterator[str]:
     name = subject.mechanism.name if subject is not None else "MECHANISM"
     if (compared := results.comparison) is not None:
         names = [entry.mechanism for entry in compared.mechanisms]
-        options = {"scenarios": compared.scenarios, "judged": compared.judged, "seed": compared.seed,
+        options = {"scenarios": compared.scenarios, "evaluated": compared.judged, "seed": compared.seed,
                    "limit": compared.limit}  # fmt: skip
         laws = list(dict.fromkeys(law.law for entry in compared.mechanisms for law in entry.laws))
         untuned = [] if compared.tuned else ["--untuned"]

@@ -78,7 +78,7 @@ def print_front(options: Tune, result: Any, front: Any, entry: dict[str, Any]) -
         texts = {
             "noise": f"Least noise within {limit:g}: point {number}, sensor noise x {cost:.4g}",
             "peak": f"Least peak command within {limit:g}: point {number}, peak x {cost:.4g}",
-            "honesty": f"Best transparency within {limit:g}: point {number}, error {cost:.2g}",
+            "transparency": f"Best transparency within {limit:g}: point {number}, error {cost:.2g}",
         }
         lines.append(f"{texts[axis.name]}, rms {rms:.2g}.")
     else:
