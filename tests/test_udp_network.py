@@ -127,6 +127,13 @@ def test_ideal_restitutions_use_entries_of_mechanism_lists_in_turn():
     assert ideal_restitutions(mechanism, []) == []
 
 
+def test_rehearsal_at_a_tenth_of_the_rate_sends_a_packet_every_ten_periods(varying):
+    mechanism = varying[0]
+    setup = SessionSettings(SOURCE_FOLDER, SOURCE_FOLDER, mechanism, ((-1,), (1,)), 1.0, 0.0, Injection(), 0)
+    assert setup.tick_interval == mechanism.rig.control_period
+    assert setup._replace(rate=0.1).tick_interval == 10 * mechanism.rig.control_period
+
+
 def test_contacts_without_commands_due_to_a_stall_are_not_evaluated(varying):
     causes = np.full(100, NOT_MISSED)
     causes[20:40], causes[60] = CAUSE_MACHINE, CAUSE_CONTROLLER

@@ -54,9 +54,49 @@ def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
         side="moving" if document.get("constants", {}).get("sensor_sign") == 1.0 else "fixed",
         statuses=status_table(),
         faults=fault_table(kind.faults),
+        **({"model": describe_numerical_model(document["mechanism"])} if kind is ONE_AXIS else {}),
         outermost=f"forces to {FORCES[1]:g} N, positions to {POSITIONS[1]:g} m either way, position commands "
         f"that change by up to {SPEEDS[1]:g} m/s",
     )
+
+
+# Change of the position in one period T for each integrator, after the change of the velocity.
+POSITION_CHANGES = {
+    "semi_implicit_euler": "T * velocity",
+    "explicit_euler": "T * velocity - T * T * acceleration",
+    "zoh": "T * velocity - T * T * acceleration / 2",
+}
+HOLDS = {
+    "linear": "the drives interpolate linearly from each command to the next",
+    "zoh": "the drives hold each command",
+}
+
+
+def describe_numerical_model(mechanism: Mapping[str, Any]) -> str:
+    """Return the README's text on the numerical model: mass, sign, integrator in code, hold and latency."""
+    bodies, rig = mechanism["bodies"], mechanism["rig"]
+    mass = bodies.get("equivalent_mass")
+    if mass is None:
+        chaser, target = bodies["chaser_mass"], bodies["target_mass"]
+        mass = chaser * (target / (chaser + target))
+    integrator = rig.get("integrator", "semi_implicit_euler")
+    change, latency = POSITION_CHANGES[integrator], rig.get("command_latency", 0)
+    steps = (
+        "acceleration = -force / M",
+        "velocity = velocity + T * acceleration",
+        f"position = position + {change}",
+    )
+    python = [f"    {step}" for step in steps]
+    c99 = [f"    {step};" for step in steps]
+    return "\n".join((
+        f"The gains were tuned with this model: equivalent mass M = {mass:.9g} kg, control period "
+        f"T = {rig['control_period']!r} s, integrator `{integrator}`.",
+        "Position and velocity are positive towards contact, and a compressing force is positive: it acts as",
+        "`-force`. In every tick, between `step` and `position_command`, in Python",
+        "", *python, "", "and in C", "", *c99, "",
+        f"Command hold `{rig.get('command_hold', 'linear')}`: {HOLDS[rig.get('command_hold', 'linear')]}. "
+        f"Command latency: {latency} periods from a command to its effect.",
+    ))  # fmt: skip
 
 
 def status_table() -> str:

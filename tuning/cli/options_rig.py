@@ -117,7 +117,11 @@ class RigOptions:
         Positional[str],
         arg(metavar="BUNDLE_OR_GAINS", help="Bundle, or gain file, or folder of a gain file."),
     ]
-    duration: Annotated[float, arg(metavar="SECONDS", help="Duration of the run.")] = 10.0
+    duration: Annotated[float, arg(metavar="SECONDS", help="Duration of the run, in simulated time.")] = 10.0
+    rate: Annotated[
+        float,
+        arg(metavar="NUMBER", help="Simulated time divided by real time: below 1, the run is slower."),
+    ] = 1.0
     drops: Annotated[
         float,
         arg(metavar="PROBABILITY", help="Injected fault: probability that a packet is lost, per direction."),

@@ -42,7 +42,7 @@ def plot_one_contact(motion: RunMotion, name: str) -> Figure:
         name: name of the mechanism.
     """
     figure = create_figure((9, 4.8), f"{name}, {motion.name}: before and after tuning", above=0.85)
-    figure.text(0.5, 0.895, describe_contact(motion), ha="center", fontsize=10)
+    figure.text(0.5, 0.895, describe_contact(motion) or "", ha="center", fontsize=10)
     axes = figure.subplots()
     shown = {key: motion.curves[key] for key in SHOWN_NAMES}
     duration = max(_find_last_touch(curve) for curve in shown.values())

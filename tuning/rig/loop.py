@@ -106,7 +106,7 @@ def run_loop(
         task: work of the rig in each tick.
         network: connection to the controller's process.
         session: number of the session.
-        period: control period [s].
+        period: real time from one tick to the next [s].
         timing: record of the packet times, which this function fills.
         tell: callback, called once a second with the number of completed ticks.
     """

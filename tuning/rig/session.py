@@ -134,6 +134,12 @@ class SessionSettings(NamedTuple):
     priority: bool = False  # whether to request a real-time priority for both processes
     # UDP port of a running controller, such as the bundle's `rt_loop`; None to start `udp_controller.py`
     port: int | None = None
+    rate: float = 1.0  # simulated time divided by real time; below 1, the rehearsal is slower [1]
+
+    @property
+    def tick_interval(self) -> float:
+        """Return the real time from one tick to the next [s]."""
+        return self.mechanism.rig.control_period / self.rate
 
 
 def run_session(
@@ -159,13 +165,13 @@ def run_session(
     task = RigTask(rig, period, setup.stroke, resets=not setup.injection.any)
     try:
         if setup.port is None and setup.empty_duration >= period:
-            say(f"empty loop at {1 / period:g} Hz, {setup.empty_duration:g} s")
+            say(f"empty loop at {1 / setup.tick_interval:g} Hz, {setup.empty_duration:g} s")
             faultless = Injection()
             empty, interrupted = _run_controller_loop(
                 setup, EmptyTask(rig.axes), rig.axes, setup.empty_duration, faultless, scratch, progress
             )
         if not interrupted:
-            say(f"{setup.mechanism.name} at {1 / period:g} Hz, {setup.duration:g} s")
+            say(f"{setup.mechanism.name} at {1 / setup.tick_interval:g} Hz, {setup.duration:g} s")
             run, interrupted = _run_controller_loop(
                 setup, task, rig.axes, setup.duration, setup.injection, scratch, progress
             )
@@ -190,11 +196,11 @@ def _run_controller_loop(
 
     Return the report of the loop, and whether the user interrupted it.
     """
-    period = setup.mechanism.rig.control_period
-    ticks, record = max(1, round(duration / period)), scratch / f"{type(task).__name__}.json"
+    ticks = max(1, round(duration / setup.mechanism.rig.control_period))
+    record, interval = scratch / f"{type(task).__name__}.json", setup.tick_interval
     options = ["--empty"] * isinstance(task, EmptyTask) + ["--realtime"] * setup.priority
     options += ["--gains", str(setup.gains.resolve()), "--record", str(record), "--ticks", str(ticks)]
-    options += ["--silence", str(max(SILENCE_TIMEOUT, 100 * period))]
+    options += ["--silence", str(max(SILENCE_TIMEOUT, 100 * interval))]
     process = None if setup.port is not None else start_controller(setup.folder, options)
     timing, interrupted = PacketTimes(ticks), False
     try:
@@ -203,7 +209,7 @@ def _run_controller_loop(
         session = open_session(network, axes)
         try:
             with real_time_priority(setup.priority):
-                run_loop(task, network, session, period, timing, lambda done: progress(done, ticks))
+                run_loop(task, network, session, interval, timing, lambda done: progress(done, ticks))
         except KeyboardInterrupt:
             interrupted = True
         finally:
@@ -228,7 +234,7 @@ def _run_controller_loop(
                 process.wait()
             if process.stdout is not None:
                 process.stdout.close()
-    return build_loop_report(timing, network, copy.deepcopy(document), period), interrupted
+    return build_loop_report(timing, network, copy.deepcopy(document), interval), interrupted
 
 
 @contextmanager

@@ -57,6 +57,7 @@ def evaluate_session(
         "axes": rig.axes,
         "compensator": compensator,
         "control_period": setup.mechanism.rig.control_period,
+        "rate": setup.rate,
         "duration": setup.duration,
         "seed": setup.seed,
         "realtime": setup.priority,

@@ -15,6 +15,7 @@ from tuning.cli.options_rig import RigOptions
 MAX_EMPTY_LOOP_DURATION = 30.0  # s; longest duration of the empty loop, which only exchanges packets
 EMPTY_LOOP_SHARE = 0.2  # duration of the empty loop, divided by the run's duration
 MAX_TICKS = 2_000_000  # largest number of ticks in a run
+MINIMUM_RATE = 1e-3  # [1]; at lower rates, a run of 10 s would take more than 3 hours
 MAX_TABLE_ROWS = 12  # largest number of contacts in the printed table
 
 
@@ -68,6 +69,7 @@ def run(options: RigOptions) -> int:
             seed=options.seed,
             priority=options.realtime,
             port=options.connect,
+            rate=options.rate,
         )
         rig = build_simulated_rig(mechanism, options.seed)
         session = run_session(setup, rig, scratch, terminal.note, _LoopProgress(period).tell)
@@ -161,7 +163,9 @@ class _LoopProgress:
 
 
 def _check_injection(options: RigOptions) -> None:
-    """Raise `InputError` if a probability or delay of the injected faults is not allowed."""
+    """Raise `InputError` if the rate, or a probability or delay of the injected faults, is not allowed."""
+    if not MINIMUM_RATE <= options.rate <= 1.0:
+        raise InputError(f"--rate: found {options.rate:g}, expected {MINIMUM_RATE:g} to 1")
     if not 0.0 <= options.drops < 1.0:
         raise InputError(f"--drops: found {options.drops:g}, expected a probability >= 0 and < 1")
     for name in ("jitter", "delay"):
@@ -178,7 +182,7 @@ def _print(document: dict[str, Any]) -> None:
 
 def _build_tables(document: dict[str, Any], loops: dict[str, Any]) -> list[Any]:
     """Return the tables of missed ticks, computing times and contacts, for each loop that was run."""
-    rate = f"{1 / document['control_period']:g} Hz over UDP"
+    rate = f"{document['rate'] / document['control_period']:g} Hz over UDP"
     ticks = terminal.build_table(
         f"{document['mechanism']}, {document['compensator']}, {rate}: ticks",
         ["loop", "ticks", "missed", "controller's fault", "injected", "the machine's"],
