@@ -16,6 +16,7 @@ import tuning
 from jaxhil.errors import InputError
 from jaxhil.rig import Controller
 from jaxhil.rig.six_axes import Controller6
+from jaxhil.simulation.gain_file import check_document
 from jaxhil.sixdof.recording import COORDINATES, TWIST, WRENCH
 
 HEAD = 'schema = "jaxhil/log/1"\n[channels]\n'
@@ -289,6 +290,24 @@ def test_shadow_of_simulated_logs_of_other_compensators(tmp_path, mechanism, com
     run.to_csv(tmp_path / "run.csv")
     document = tuning.shadow(Result(bundles.document(mechanism, compensator)), tmp_path / "run.csv").document
     assert max(shares(document)) < 1e-12 and document["verdict"] == "good" and document["findings"] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("rig.force_sensor.noise_std=0.5", "rig.position_sensor.noise_std=1e-6"),
+        ("contact.clearance=0.02", "approach.contacts=4"),
+        ("rig.integrator='zoh'", "rig.command_latency=2"),
+    ],
+)
+def test_shadow_of_simulated_logs_of_other_rigs(tmp_path, overrides):
+    document = bundles.document("rig-300kg", "response_error", overrides)
+    values = {name: entry["value"] for name, entry in document["gains"].items()}
+    run = package.simulate(check_document(document).mechanism, "response_error", values)
+    run.to_csv(tmp_path / "run.csv")
+    result = tuning.shadow(Result(document), tmp_path / "run.csv").document
+    assert max(shares(result)) < 1e-12 and result["verdict"] == "good" and result["findings"] == []
 
 
 @pytest.mark.slow

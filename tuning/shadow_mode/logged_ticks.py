@@ -6,6 +6,7 @@ The readers, the mapping and the assignment of rows to ticks are those of `jaxhi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,8 +15,15 @@ from typing import Any
 import numpy as np
 
 from jaxhil.errors import InputError, format_value
+from jaxhil.mechanism.structs import Mechanism
 from tuning.identification.logs import clock
-from tuning.identification.logs.campaign import check_names, classify_rows, make_timing, select_rows
+from tuning.identification.logs.campaign import (
+    check_names,
+    classify_rows,
+    find_restarts,
+    make_timing,
+    select_rows,
+)
 from tuning.identification.logs.channels import read_channels, read_row_stamps
 from tuning.identification.logs.contact_detection import detect_contacts
 from tuning.identification.logs.mapping import KINDS, LogMapping, RunFiles, get_si_conversion
@@ -90,7 +98,7 @@ def read_logged_ticks(
             f"timing.control_period: found {timing.control_period:g} s, expected {period:g} s as in the gains"
         )
     read = [
-        _read_log(path, entry, mapping, replace(timing, control_period=period))
+        _read_log(path, entry, mapping, replace(timing, control_period=period), _is_two_sided(mechanism))
         for entry in mapping.runs
         for path in logs
         if entry.names(path) and (entry.kind == "contact" or getattr(mapping.channels, "mode", None))
@@ -102,8 +110,13 @@ def read_logged_ticks(
 
 
 def _read_log(
-    path: Path, entry: RunFiles, mapping: LogMapping | SixAxisLogMapping, timing: CampaignTiming
+    path: Path,
+    entry: RunFiles,
+    mapping: LogMapping | SixAxisLogMapping,
+    timing: CampaignTiming,
+    is_two_sided: bool,
 ) -> LoggedTicks:
+    """Read one log; with two surfaces (`is_two_sided`), a run may have several contacts."""
     log = open_log(path, mapping.text)
     period = timing.control_period
     if isinstance(mapping, LogMapping):
@@ -124,8 +137,11 @@ def _read_log(
     index, chosen = more.get("contact_index"), np.flatnonzero(used)
     if index is not None:
         index = index.astype(np.int64)[chosen]
-    force = vectors["force"][chosen]
-    starts = [np.flatnonzero(np.diff(chosen) > 1) + 1, _find_starts(force, index, period)]
+    if index is not None and is_two_sided:
+        runs = find_restarts(vectors["position_desired"][chosen, 0], index)
+    else:
+        runs = _find_starts(vectors["force"][chosen], index, period)
+    starts = [np.flatnonzero(np.diff(chosen) > 1) + 1, runs]
     ticks = LoggedTicks(
         label=log.label,
         period=period,
@@ -137,6 +153,11 @@ def _read_log(
         notes=tuple(notes),
     )
     return _align(ticks, timing)
+
+
+def _is_two_sided(mechanism: Any) -> bool:
+    """Return whether the mechanism of one axis has two surfaces."""
+    return isinstance(mechanism, Mechanism) and math.isfinite(mechanism.contact.clearance)
 
 
 def _read_one_axis(log: OpenLog, mapping: LogMapping, period: float):

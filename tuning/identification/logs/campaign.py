@@ -160,7 +160,7 @@ class _RunsOfFile:
         """Divide the log into runs: at gaps, at changes of the mode, at restarts, and between contacts."""
         tick, x = self.ticks.tick, channels["position_desired"]
         assert x is not None
-        cuts = _find_restarts(x, channels["contact_index"])
+        cuts = find_restarts(x, channels["contact_index"])
         if modes is not None:
             cuts = np.union1d(cuts, np.flatnonzero(modes[1:] != modes[:-1]) + 1)
         runs: list[LoggedRun] = []
@@ -339,7 +339,7 @@ def classify_rows(
     return np.array(kinds)[inverse]
 
 
-def _find_restarts(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
+def find_restarts(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
     """Return the rows at which the motion jumps to the start of the next contact, as in simulated logs."""
     if index is None:
         return np.empty(0, int)
