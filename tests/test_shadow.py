@@ -277,7 +277,7 @@ def test_shadow_mode_refuses_unusable_logs_with_one_line(jaxhil, tmp_path, mappi
     (tmp_path / "gains.json").write_text(json.dumps(gains().document))
     ran = jaxhil("shadow", tmp_path, log, "--map", tmp_path / "map.toml")
     assert ran.code == 2 and ran.out == "" and words in ran.err.splitlines()[-1]
-    assert jaxhil("shadow", tmp_path).err == "jaxhil: --logs: found none, expected one or more files\n"
+    assert jaxhil("shadow", tmp_path).err == "jaxhil: logs: found none, expected one or more files\n"
 
 
 @pytest.mark.slow

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import FlagCreatePairsOff
 
 from jaxhil.errors import InputError, format_value, to_one_line
-from jaxhil.files import report_write_errors
+from jaxhil.files import report_write_errors, resolve_output_path
 from jaxhil.simulation.jax_environment import jax_context
 from tuning import terminal
 from tuning.api import arguments
-from tuning.api.arguments import ArgumentError
 from tuning.api.options import add_options, check_options, text_option
 
 if TYPE_CHECKING:
@@ -52,7 +51,7 @@ class ShadowResult:
         title = f"{self.document['mechanism']}, {self.document['compensator']}: commands in shadow mode"
         target = arguments.check_path("path", path)
         with report_write_errors(target):
-            save_figure(shadow_plot(self.comparison, title), target)
+            save_figure(shadow_plot(self.comparison, title), resolve_output_path(target))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +137,7 @@ def shadow(
 def _list_logs(logs: Any) -> list[Path]:
     listed, _ = arguments.as_list(logs, (str, os.PathLike))
     if not listed:
-        raise ArgumentError("logs", "none", "one or more files")
+        raise InputError("logs: found none, expected one or more files")
     return [arguments.check_path("logs", log) for log in listed]
 
 

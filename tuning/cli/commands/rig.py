@@ -1,5 +1,6 @@
 """Command `jaxhil rig`: runs the controller against a simulated rig in real time over UDP."""
 
+import math
 import sys
 import tempfile
 from pathlib import Path
@@ -201,7 +202,7 @@ def _build_tables(document: dict[str, Any], loops: dict[str, Any]) -> list[Any]:
         "Times [µs]: median, 99.9th percentile, maximum",
         ["", "loop", "median", "99.9 %", "maximum"],
         [
-            (label, name, *(f"{1e6 * value:.1f}" for value in loop[key].values()))
+            (label, name, *(_format_microseconds(value) for value in loop[key].values()))
             for key, label in _TIME_LABELS.items()
             for name, loop in loops.items()
         ],
@@ -219,6 +220,11 @@ def _build_tables(document: dict[str, Any], loops: dict[str, Any]) -> list[Any]:
         texts=(len(headings) + 1,),
     )
     return [ticks, times, *([contacts] if rows else [])]
+
+
+def _format_microseconds(time: float) -> str:
+    """Return a time in microseconds; a dash if it was not measured."""
+    return "-" if math.isnan(time) else f"{1e6 * time:.1f}"
 
 
 def _one_axis_row(contact: dict[str, Any]) -> tuple[Any, ...]:
