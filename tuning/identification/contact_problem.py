@@ -141,10 +141,19 @@ class ContactProblem:
         fit = self._solve(near, flags, onsets, pseudo)
         for _ in range(2):
             again = [self._flag_rows_in_contact(rows, fit.coefficients) for rows in near]
-            if all(np.array_equal(new, old) for new, old in zip(again, flags, strict=True)):
-                break
+            pairs = zip(again, flags, strict=True)
+            changed = np.any([(new != old).any(axis=1) for new, old in pairs], axis=0)
             flags = again
-            fit = self._solve(near, flags, onsets, pseudo)
+            if not changed.any():
+                break
+            if changed.all() or onsets is not None:
+                fit = self._solve(near, flags, onsets, pseudo)
+                continue
+            # The other surface positions have the same rows in contact, and so the same fit.
+            part = near[0]._replace(depth=near[0].depth[changed], columns=near[0].columns[changed])
+            rows = pseudo and pseudo._replace(design=pseudo.design[changed])
+            for values, change in zip(fit, self._solve([part], [flags[0][changed]], None, rows), strict=True):
+                values[changed] = change
         self._guess = fit.coefficients[len(planes) // 2]
         return near, flags, fit
 
@@ -290,8 +299,7 @@ class ContactProblem:
         Both are divided by the standard deviation of the noise.
         """
         std, rows, first = self.readings.std, near[0].rows, None
-        # The last column belongs to the bias. It is 1 in all rows or, with a dead zone, only in rows in
-        # contact.
+        # The last column belongs to the bias: 1 in all rows or, with a dead zone, only in rows in contact.
         if self.is_unfiltered:
             design = np.empty((len(flags[0]), near[0].columns.shape[1] + 1, len(rows)))
             np.multiply(near[0].columns, flags[0][:, None] / std, out=design[:, :-1])
@@ -309,9 +317,8 @@ class ContactProblem:
         used = self.is_used[rows]
         design = np.compress(used, self._filter(tables, onsets, first, self.readings.whitening), axis=2)
         if not self.has_dead_zone:
-            design = np.concatenate(
-                [design, np.full((len(design), 1, design.shape[2]), self.bias_alone)], axis=1
-            )
+            bias = np.full((len(design), 1, design.shape[2]), self.bias_alone)
+            design = np.concatenate([design, bias], axis=1)
         return design, self.whitened[rows[used]]
 
     def _solve(self, near, flags, onsets, pseudo: PseudoRows | None) -> LeastSquaresFit:
