@@ -11,9 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from jaxhil.files import write_atomically
-from jaxhil.simulation.contact_plot import BLUE, create_figure
+from jaxhil.simulation.contact_plot import BLUE, VERMILION, create_figure
 from jaxhil.sixdof.recording import RunRecord
 from tuning.plots.outlines import Polyline, outlines, rotation_matrix
 from tuning.plots.six_axes import AXIS_NAMES, VIEWS, find_shown_ticks, find_time_origin, quaternion_of
@@ -33,7 +34,7 @@ def animate(recorded: RunRecord, title: str, path: str | Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     ticks_shown = find_shown_ticks(recorded)
     ticks = np.unique(np.linspace(ticks_shown.start, ticks_shown.stop - 1, FRAME_COUNT).astype(int))
-    figure = create_figure((7.6, 8), title, above=0.9, below=0.6)
+    figure = create_figure((7.6, 8), title, above=0.9, below=0.85)
     FigureCanvasAgg(figure)
     figure.subplots_adjust(hspace=0.28, wspace=0.28)
     moving = _draw_scene(figure, recorded)
@@ -45,8 +46,9 @@ def animate(recorded: RunRecord, title: str, path: str | Path) -> None:
         with writer.saving(figure, str(film), 64):
             for tick in ticks:
                 clock.set_text(f"{1e3 * (recorded.time[tick] - recorded.time[origin]):.0f} ms {since}")
-                for lines, chaser, poses, view in moving:
+                for lines, path, chaser, poses, view in moving:
                     lines.set_segments(_project_outline(chaser, poses[tick], view))
+                    path.set_data(*(1e3 * poses[ticks_shown.start : tick + 1, list(view)].T))
                 writer.grab_frame()
         write_atomically(target, film.read_bytes())
 
@@ -58,11 +60,11 @@ def _select_writer(target: Path) -> AbstractMovieWriter:
 
 def _draw_scene(
     figure: Figure, recorded: RunRecord
-) -> list[tuple[LineCollection, list[Polyline], np.ndarray, Any]]:
+) -> list[tuple[LineCollection, Line2D, list[Polyline], np.ndarray, Any]]:
     """Draw the target in four subplots: two views of the ideal contact, and two of the contact on the rig.
 
-    Return for each subplot the data to draw the chaser in one frame of the animation: its lines, its outline
-    in frame C (the chaser's docking interface), its pose at each tick, and the view.
+    Return for each subplot the data to draw the chaser in one frame of the animation: its lines, the path of
+    its docking interface C, its outline in frame C, its pose at each tick, and the view.
     """
     target, chaser = outlines(recorded.groups)
     middle, half = _shown_region(recorded)
@@ -76,7 +78,11 @@ def _draw_scene(
             axes.add_collection(lines)
             _format_axes(axes, middle[list(view)], half, view)
             axes.set_title(COLUMN_TITLES[column], fontsize=10)
-            moving.append((lines, chaser, poses, view))
+            [path] = axes.plot([], [], color=VERMILION, linewidth=2.0)
+            moving.append((lines, path, chaser, poses, view))
+    handles = [Line2D([], [], color=colour, linewidth=2.0) for colour in ("0.55", BLUE, VERMILION)]
+    labels = ["target", "chaser", "path of the chaser's interface C"]
+    figure.legend(handles, labels, loc="lower center", ncols=3, fontsize=9, frameon=False)
     return moving
 
 

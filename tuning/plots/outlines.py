@@ -16,6 +16,7 @@ Polyline = np.ndarray  # (points, 3) [m]
 
 CIRCLE_ANGLES = np.linspace(0, 2 * np.pi, 49)  # rad; angles of the points of a circle
 MERIDIAN_COUNT = 24  # number of meridians drawn on a surface of revolution
+DRAWN_CONE_SIZE = 3.0  # smallest drawn radius of a cone without a mouth, divided by its bottom radius [1]
 POINT_MARK_SIZE = 0.02  # half size of the cross that marks a point, divided by the size of the mechanism
 
 
@@ -52,7 +53,7 @@ def _shape_pairs(candidates: Candidates) -> list[tuple[Shape, Shape]]:
 
 
 def _corners(shape: Any) -> np.ndarray:
-    """Return points (n, 3) [m] that span a shape; no points (0, 3) for a plane or an infinite cone."""
+    """Return points (n, 3) [m] that span a shape; no points (0, 3) for a plane."""
     if isinstance(shape, (Ball, Cavity)):
         reach = 0.0 if isinstance(shape, Cavity) else float(shape.radius)
         return _as_point(shape.centre)[None] + reach * np.eye(3)
@@ -60,6 +61,8 @@ def _corners(shape: Any) -> np.ndarray:
         return np.stack([_as_point(shape.start), _as_point(shape.end)])
     if isinstance(shape, Shell):
         return np.array([[float(shape.mouth_radius), 0.0, 0.0]])
+    if isinstance(shape, Drogue):
+        return np.array([[DRAWN_CONE_SIZE * float(shape.bottom_radius), 0.0, 0.0]])
     if isinstance(shape, Box):
         return _as_point(shape.centre)[None] + _as_point(shape.half_lengths)
     return np.zeros((0, 3))
