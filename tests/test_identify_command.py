@@ -94,7 +94,9 @@ def test_identify_command_verdict_is_bad_for_wrong_mapping_file(jaxhil, day, tmp
     ran = jaxhil(*command)
     assert ran.code == 1
     assert "Bad: the model does not explain this rig: command hold" in ran.out
-    assert re.search(r"prior +change", ran.out) and re.search(r"contact.stiffness.0 .* [+-][\d.]+ %", ran.out)
+    assert re.search(r"prior +change", ran.out) and re.search(
+        r"contact.stiffness\[0\] .* [+-][\d.]+ %", ran.out
+    )
     head = (tmp_path / "mechanism.toml").read_text().splitlines()[:3]
     assert head[0].startswith("# Bad: ") and head[1].startswith(
         "# [uncertainty] is the uncertainty of the estimate"

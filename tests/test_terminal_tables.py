@@ -57,3 +57,16 @@ def test_json_output_has_numbers_for_numpy_scalars_and_null_for_nonfinite_values
         "half": 0.5,
         "each": [1.0, None],
     }
+
+
+@pytest.mark.parametrize(
+    ("key", "shown"),
+    [
+        ("contact.stiffness.1", "contact.stiffness[1]"),
+        ("contact.stiffness_2", "contact.stiffness[1]"),
+        ("contact.stiffness_1_3", "contact.stiffness[0][2]"),
+        ("rig.force_sensor.delay", "rig.force_sensor.delay"),
+    ],
+)
+def test_entry_of_a_list_has_one_name_in_tables(key, shown):
+    assert terminal.format_key(key) == shown

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import shlex
 import sys
 import textwrap
@@ -22,6 +23,7 @@ from rich.text import Text
 from jaxhil.errors import InputError, to_one_line
 
 DEFAULT_WIDTH = 110  # characters; width of lines if no stream is a terminal
+COLUMN_INDEX = re.compile(r"_(\d+)(?=_\d+|$)")  # index from 1 at the end of a sweep's column name
 # Verdicts in JSON documents for exit codes 2 and 130.
 UNUSABLE_INPUT, INTERRUPTED = "unusable input", "interrupted"
 PROGRESS_INTERVAL = 10.0  # s; time between progress lines if the output is not a terminal
@@ -123,6 +125,12 @@ def format_ratio(value: float, ideal: float) -> str:
     """Return `value / ideal` as text with three decimals, or a dash if the ratio is not finite."""
     quotient = value / ideal if ideal else math.nan
     return f"{quotient:.3f}" if math.isfinite(quotient) and math.isfinite(ideal) else "-"
+
+
+def format_key(key: str) -> str:
+    """Return a dotted key with its list indices in brackets: `a.0` and the column `a_1` become `a[0]`."""
+    key = COLUMN_INDEX.sub(lambda match: f".{int(match[1]) - 1}", key)
+    return "".join(f"[{part}]" if part.isdigit() else f".{part}" for part in key.split("."))[1:]
 
 
 def to_json_data(value: Any) -> Any:

@@ -23,6 +23,7 @@ from tuning.identification.contact_fit import ContactFit
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.result import Identification
 from tuning.plots.parts import INTERVAL_SIGMAS, legend_above
+from tuning.terminal import format_key
 
 DOT_STYLE: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 2.5, "markeredgewidth": 0}
 PLOTTED_CONTACTS = 3  # number of contacts that are plotted over time
@@ -232,7 +233,10 @@ def plot_estimates(entries: Sequence[Mapping[str, Any]]) -> Figure:
         shares = [100.0 * (entry["prior"] / entry["value"] - 1.0) for _, entry in with_prior]
         style: dict[str, Any] = {"linestyle": "none", "marker": "D", "markersize": 5, "color": VERMILION}
         axes.plot(shares, [row for row, _ in with_prior], label="prior", **style)
-    names = [f"{entry['key']}\n{entry['value']:.4g} {entry['unit']}".removesuffix(" 1") for entry in plotted]
+    names = [
+        f"{format_key(entry['key'])}\n{entry['value']:.4g} {entry['unit']}".removesuffix(" 1")
+        for entry in plotted
+    ]
     # Matplotlib would read text between dollar signs as a formula.
     axes.set_yticks(range(len(plotted)), [name.replace("$", r"\$") for name in names])
     axes.tick_params(axis="y", labelsize=7)

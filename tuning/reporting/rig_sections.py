@@ -14,6 +14,7 @@ from tuning.reporting.verdict_sections import (
     is_identified,
     is_other_file_monitored,
 )
+from tuning.terminal import format_key
 
 MAX_TABLE_ROWS = 60  # largest number of contacts in the table; earlier contacts are omitted
 
@@ -25,7 +26,7 @@ def identification_section(results: Results) -> Section | None:
         return None
     rows = [
         (
-            estimate.key,
+            format_key(estimate.key),
             format_number(estimate.value, _significant_digits(estimate)),
             f"{format_number(estimate.low, _significant_digits(estimate))} to "
             f"{format_number(estimate.high, _significant_digits(estimate))}",

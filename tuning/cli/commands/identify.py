@@ -393,7 +393,7 @@ def _estimate_row(entry: dict[str, Any]) -> list[Any]:
         digits = min(max(1 + math.ceil(math.log10(abs(entry["value"]) / entry["std"])), 2), 9)
     change = entry["change"]
     return [
-        entry["key"],
+        terminal.format_key(entry["key"]),
         *(terminal.format_number(float(entry[name]), digits) for name in ("value", "low", "high")),
         entry["unit"],
         entry["prior"],

@@ -112,7 +112,8 @@ def _build_document(options: IdentifyOptions, name: str, design: ExcitationDesig
 
 def _print(document: dict[str, Any], folder: Path) -> None:
     rows = [
-        [entry[name] for name in ("key", "value", "std", "unit", "effect")] for entry in document["predicted"]
+        [terminal.format_key(entry["key"]), *(entry[name] for name in ("value", "std", "unit", "effect"))]
+        for entry in document["predicted"]
     ]
     headings = ["number", "value", "std", "unit", "effect on e"]
     items: list[Any] = [terminal.build_table("Predicted uncertainty after both runs", headings, rows, (0, 3))]

@@ -101,7 +101,10 @@ def _print(document: dict[str, Any]) -> None:
     inputs = terminal.build_table(
         f"{document['mechanism']}, compensation: {document['compensator']}, scenario {document['index']}",
         ["input", "drawn"],
-        [(name, terminal.format_number(value, 6)) for name, value in document["inputs"].items()],
+        [
+            (terminal.format_key(name), terminal.format_number(value, 6))
+            for name, value in document["inputs"].items()
+        ],
     )
     lines = [f"Outcome: {document['outcome']}."]
     if document["verdict"] == "good":

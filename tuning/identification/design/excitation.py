@@ -24,6 +24,7 @@ from tuning.identification import hold, mechanism_models
 from tuning.identification.design import powers, waveform
 from tuning.identification.design.press_force import LIMIT_SHARE, differentiate_force, find_preload
 from tuning.identification.mechanism_file import set_value
+from tuning.terminal import format_key
 
 MULTISINE_PERIOD = 5.0  # s
 MULTISINE_PERIODS = 12  # number of periods; the first period of the free run is not evaluated
@@ -187,7 +188,7 @@ def differentiate_error(
     for section in ("simulator", "force_sensor"):
         # The derivative with respect to a delay exists only for a delay above 0.
         document["rig"][section]["delay"] = max(document["rig"][section]["delay"], 1e-6)
-    names = [_with_bracketed_indices(key) for key in keys]
+    names = [format_key(key) for key in keys]
     for phase in CONTACT_PHASES:
         document["approach"]["phase"] = phase
         phased = from_plain_data(document, mechanism.name)
@@ -223,11 +224,6 @@ def _replace_damping(mechanism: Mechanism, damping: float) -> Mechanism:
     document = to_plain_data(mechanism)
     set_value(document, DAMPING_KEY, damping)
     return from_plain_data(document, mechanism.name)
-
-
-def _with_bracketed_indices(key: str) -> str:
-    """Return a dotted key with its list indices in brackets: `a.0` becomes `a[0]`."""
-    return "".join(f"[{part}]" if part.isdigit() else f".{part}" for part in key.split("."))[1:]
 
 
 class _MultisinePlan:
