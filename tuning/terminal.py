@@ -245,13 +245,13 @@ class Progress:
     def _format_rate(self) -> str:
         """Return the rate and the time left as text; at the beginning, the time elapsed."""
         if (rate := self.rate) is None or self._done < MIN_SHARE_FOR_RATE * self._total:
-            return f"{_format_duration(time.monotonic() - self._begun)} so far"
+            return f"{format_duration(time.monotonic() - self._begun)} so far"
         left = max(self._total - self._done, 0.0) / rate
         # If the whole work is a single unit, the rate is the percentage of it that is done per unit of time.
         scale, unit = (100.0, " %") if self._total == 1 else (1.0, f" {self._unit}")
         hourly = 3600 * scale * rate
         divisor, per = next((pair for pair in ((3600, "s"), (60, "min")) if hourly >= pair[0]), (1, "h"))
-        return f"{format_number(hourly / divisor, 3)}{unit}/{per}, {_format_duration(left)} left"
+        return f"{format_number(hourly / divisor, 3)}{unit}/{per}, {format_duration(left)} left"
 
 
 @contextmanager
@@ -330,7 +330,8 @@ def _table_width(table: Table, console: Console) -> int:
     return max(console.width, full_width() - max(broken, 0))
 
 
-def _format_duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
+    """Return a duration as text in hours, minutes and seconds."""
     rounded = round(seconds)
     return f"{rounded // 3600}:{rounded // 60 % 60:02d}:{rounded % 60:02d}"
 

@@ -1,7 +1,8 @@
 """Function `tuning.tune`, which tunes one compensator's gains for one or several mechanisms."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from jaxhil.mechanism.file import LoadedAnyMechanism, LoadedMechanism
@@ -9,6 +10,7 @@ from jaxhil.simulation.jax_environment import jax_context
 from tuning import terminal
 from tuning.api import arguments, mechanism_summary, tune_pareto
 from tuning.api.options import add_options
+from tuning.api.tune_duration import describe_expected_duration, record_duration
 from tuning.api.tune_options import TuneOptions
 from tuning.api.tuned_gains import TunedGains
 
@@ -82,6 +84,7 @@ def tune_each(
     options: TuneOptions,
     bar: terminal.Progress,
     checkpoints: "Checkpoints | None" = None,
+    announce: Callable[[str], None] = lambda text: None,
 ) -> Iterator[tuple[int, TunedGains]]:
     """Tune several mechanisms, and yield the index and the result of each as soon as it is finished.
 
@@ -90,6 +93,7 @@ def tune_each(
         options: options of the tuning.
         bar: progress display.
         checkpoints: results of finished work, which is not repeated; new results are added.
+        announce: is called before the search with a text on the time that it will take.
 
     Yields:
         Index into `loaded`, and tuned gains.
@@ -103,6 +107,8 @@ def tune_each(
     settings, earlier = options.settings(max(map(axes_of, mechanisms))), options.load_start_gains()
     number = len(loaded)
     work = SearchProgress(lambda text, share, before: bar.tell(text, share * number, before * number))
+    work.announce = lambda runs: announce(describe_expected_duration(mechanisms, options.compensator, runs))
+    begun = time.monotonic()
     results = tune_all(
         mechanisms,
         options.compensator,
@@ -122,3 +128,5 @@ def tune_each(
                 extra_periods=options.extra_periods,
             ),
         )
+    if options.scheduler is None:
+        record_duration(mechanisms, options.compensator, work.computed_runs, time.monotonic() - begun)

@@ -22,7 +22,13 @@ class SearchProgress:
         self.name = ""  # name of the current group of mechanisms
         self.runs_after_group = 0.0  # number of runs that remain after the current group
         self.journal: StepCheckpoints = NO_CHECKPOINTS.journal("", None)  # checkpoints of the group's steps
+        self.announce: Callable[[float], None] = lambda runs: None  # is called with the estimated runs
         self._text, self._kept, self._done, self._left = "", 0.0, 0.0, 0.0
+
+    @property
+    def computed_runs(self) -> float:
+        """Return the number of runs that were simulated, without results from the cache."""
+        return self._done
 
     def keep(self, text: str, runs: float) -> None:
         """Report that the current group, of about `runs` runs, was read from the cache."""

@@ -97,6 +97,7 @@ def tune_all(
         for begin in range(0, len(group), MAX_GROUP_SIZE)
     ]
     left = sum(estimate_group_runs([tasks[i] for i in members], settings) for members in indices)
+    work.announce(left)
     afterwards = work.runs_after_group
     for members_of_groups in (indices[:1], indices[1:]):
         sources = [source for source in (tuned, first_group) if source]

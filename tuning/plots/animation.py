@@ -46,9 +46,9 @@ def animate(recorded: RunRecord, title: str, path: str | Path) -> None:
         with writer.saving(figure, str(film), 64):
             for tick in ticks:
                 clock.set_text(f"{1e3 * (recorded.time[tick] - recorded.time[origin]):.0f} ms {since}")
-                for lines, path, chaser, poses, view in moving:
+                for lines, trail, chaser, poses, view in moving:
                     lines.set_segments(_project_outline(chaser, poses[tick], view))
-                    path.set_data(*(1e3 * poses[ticks_shown.start : tick + 1, list(view)].T))
+                    trail.set_data(*(1e3 * poses[ticks_shown.start : tick + 1, list(view)].T))
                 writer.grab_frame()
         write_atomically(target, film.read_bytes())
 
@@ -78,8 +78,8 @@ def _draw_scene(
             axes.add_collection(lines)
             _format_axes(axes, middle[list(view)], half, view)
             axes.set_title(COLUMN_TITLES[column], fontsize=10)
-            [path] = axes.plot([], [], color=VERMILION, linewidth=2.0)
-            moving.append((lines, path, chaser, poses, view))
+            [trail] = axes.plot([], [], color=VERMILION, linewidth=2.0)
+            moving.append((lines, trail, chaser, poses, view))
     handles = [Line2D([], [], color=colour, linewidth=2.0) for colour in ("0.55", BLUE, VERMILION)]
     labels = ["target", "chaser", "path of the chaser's interface C"]
     figure.legend(handles, labels, loc="lower center", ncols=3, fontsize=9, frameon=False)

@@ -206,7 +206,7 @@ def _tune_all(
                 first = loaded[0].mechanism
                 if isinstance(first, Mechanism):
                     meanwhile.submit(_prepare_drawing, first, options.compensator)
-            for index, result in tune_each(loaded, options, bar, checkpoints):
+            for index, result in tune_each(loaded, options, bar, checkpoints, terminal.note):
                 try:
                     entries[index] = _write_result(options, loaded[index], result, drawn, bar.say)
                 except InputError as error:
