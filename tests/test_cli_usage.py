@@ -116,6 +116,10 @@ def test_json_names_every_command_in_its_test():
     assert tested == {path.stem for path in modules if "\ndef run(options" in path.read_text()}
 
 
+def test_identify_reports_missing_log_before_missing_values(jaxhil):
+    refused(jaxhil("identify", "nowhere.csv"), "nowhere.csv: found no such file, expected a log")
+
+
 def test_simulate_reports_plot_that_cannot_be_written(jaxhil, tmp_path):
     (tmp_path / "taken").touch()
     ran = jaxhil("simulate", "rig-300kg", "--plot", tmp_path / "taken" / "plot.png")

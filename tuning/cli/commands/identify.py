@@ -221,6 +221,9 @@ def read_logs(logs: list[Path], mapping: str | None, prior: Mechanism | None) ->
     from tuning.identification.logs.campaign import read_campaign
     from tuning.identification.logs.mapping import load_mapping
 
+    for log in logs:
+        if not log.exists():
+            raise InputError(f"{to_one_line(str(log))}: found no such file, expected a log")
     if mapping is not None:
         return read_campaign(logs, load_mapping(mapping), prior)
     try:
