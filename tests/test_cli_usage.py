@@ -205,7 +205,9 @@ def test_init_command_writes_mechanism_file(jaxhil, monkeypatch, tmp_path, argum
     assert ran.code == 0
     mechanism = load(written).mechanism
     assert mechanism.name == ran.document["name"] == Path(written).stem
-    assert msgspec.structs.replace(mechanism, name=source) == load(source).mechanism
+    builtin = load(source).mechanism
+    assert msgspec.structs.replace(mechanism, name=source, source=builtin.source) == builtin
+    assert mechanism.source.startswith(f"the values of the built-in {source}, until you replace them")
     assert [path.name for path in (tmp_path / written).parent.iterdir()] == [Path(written).name]
 
 

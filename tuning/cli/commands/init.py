@@ -1,6 +1,7 @@
 """Command `jaxhil init`: writes a new mechanism file to start from."""
 
 import json
+import re
 from pathlib import Path
 
 import msgspec
@@ -54,10 +55,17 @@ def run(options: InitOptions) -> int:
 
 def _one_axis_text(source: str, name: str) -> str:
     """Return the file text of a built-in one-axis mechanism under a new name, with a comment for each key."""
-    return format_mechanism_file(msgspec.structs.replace(load(source).mechanism, name=name))
+    changes = {"name": name, "source": _describe_source(source)}
+    return format_mechanism_file(msgspec.structs.replace(load(source).mechanism, **changes))
 
 
 def _six_axis_text(source: str, name: str) -> str:
     # A mechanism's name is printable, so its JSON string is also valid TOML.
     named = f"name = {json.dumps(name, ensure_ascii=False)}"
-    return builtin_path(source).read_text(encoding="utf-8").replace(f'name = "{source}"', named, 1)
+    text = builtin_path(source).read_text(encoding="utf-8").replace(f'name = "{source}"', named, 1)
+    return re.sub(r'^source = ".*"$', f'source = "{_describe_source(source)}"', text, count=1, flags=re.M)
+
+
+def _describe_source(source: str) -> str:
+    """Return the text on the source of the numbers in a new file, which still are those of a built-in one."""
+    return f"the values of the built-in {source}, until you replace them and this text"
