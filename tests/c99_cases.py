@@ -40,7 +40,7 @@ TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY = map(f
 EVENTS = (TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY)
 PERIOD = 0.001
 CAPACITY = 64  # periods of delay, for random gains
-LINES = DelayLine.LONGEST  # periods of delay that the compiled compensators support
+LINES = DelayLine.MAX_DELAY_PERIODS  # periods of delay that the compiled compensators support
 SANITIZED = ("-fsanitize=undefined,address,float-cast-overflow", "-fno-sanitize-recover=all", "-g")
 SANE_LIMITS = {
     "force_range": 2000.0,

@@ -24,7 +24,7 @@ BIT_MARKS = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}
 HELPERS = {ast.FloorDiv: "floor_division", ast.Mod: "modulo", ast.Pow: "power"}
 LARGEST_INT = 2**53  # largest int of the subset; a double represents all smaller ints exactly
 MAX_SQUARABLE_INT = 94906265  # largest int whose square is at most LARGEST_INT
-SMALL = 2**10  # with this increment every millisecond, a counter needs 278 years to reach LARGEST_INT
+MAX_INCREMENT = 2**10  # with this increment every millisecond, a counter needs 278 years to reach LARGEST_INT
 # Sums of these nodes need no test if they are only compared: terms up to LARGEST_INT cannot overflow.
 TERMS = (ast.BinOp, ast.Add, ast.Sub, ast.Name, ast.Attribute, ast.Constant, ast.expr_context)
 # Sign of x if the comparison `x OP limit` is true, and if it is false, for the limit 0.
@@ -36,7 +36,7 @@ SIGNS = {"": 0, ">=": Sign.NONNEGATIVE, "!=": Sign.NONZERO, ">": Sign.POSITIVE}
 def is_small(value: CExpression) -> bool:
     """Return whether an int is so small that a counter with this increment cannot reach LARGEST_INT."""
     has_bound = value.type.is_index or bool(value.below) or value.type.c_int != "int64_t"
-    return has_bound or (value.span is not None and max(map(abs, value.span)) <= SMALL)
+    return has_bound or (value.span is not None and max(map(abs, value.span)) <= MAX_INCREMENT)
 
 
 class ExpressionLowering:

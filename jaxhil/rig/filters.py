@@ -82,18 +82,18 @@ class DelayLine:
     r = tau/T, q = floor(r + 1e-9), f = r - q, output (1 - f) x[n-q] + f x[n-q-1]
 
     T is the control period. Call `start` before the first `step`. The constructor raises ValueError if the
-    delay is longer than `LONGEST` periods.
+    delay is longer than `MAX_DELAY_PERIODS` periods.
     """
 
-    LONGEST = 100_000
+    MAX_DELAY_PERIODS = 100_000
 
     __slots__ = ("_fraction", "_head", "_period", "_remainder", "_samples", "_size", "_whole")
     _head: Annotated[Count, "index"]
 
     def __init__(self, delay: float, period: Positive) -> None:
         ratio = delay / period
-        if not 0.0 <= ratio <= self.LONGEST:
-            raise ValueError(f"a delay of {ratio!r} periods, expected 0 to {self.LONGEST}")
+        if not 0.0 <= ratio <= self.MAX_DELAY_PERIODS:
+            raise ValueError(f"a delay of {ratio!r} periods, expected 0 to {self.MAX_DELAY_PERIODS}")
         # The margin of 1e-9 gives the right integer if rounding makes the ratio slightly too small.
         self._whole = floor(ratio + 1e-9)
         self._fraction = ratio - self._whole

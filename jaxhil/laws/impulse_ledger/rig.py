@@ -41,10 +41,10 @@ MAX_LAG = 0.2  # s; upper bound of the lag D
 ONSET_PLACE = -0.5  # periods of travel; assumed depth of the hardware at the last reading of free flight
 MISFIT = 0.00315  # [1]; standard deviation of the contact model's relative error, averaged for `MISFIT_TIME`
 MISFIT_TIME = 0.001  # s
-SLOWEST = 1e-9  # [1]; minimum speed, divided by the approach speed; a lower speed is a rounding error
-SHALLOW = 0.001  # s; lower bound of the depth by which the secant stiffness is divided
+MIN_SCALED_SPEED = 1e-9  # [1]; speed / approach speed; a lower speed is a rounding error
+MIN_CONTACT_DEPTH = 0.001  # s; lower bound of the depth by which the secant stiffness is divided
 MIN_PEAK = 0.3  # 1/s; minimum of peak force / (mass x approach speed), for a contact at 0.05 Hz
-FEW_READINGS = 5  # readings in contact; with fewer readings the status is `unsure`
+MIN_CONTACT_READINGS = 5  # readings in contact; with fewer readings the status is `unsure`
 LATE = 0.8  # [1]; if the lag D is a larger share of the contact's duration, the status is `too_short`
 UNCERTAIN = 0.006  # [1]; if the reference speed has a larger standard deviation, the status is `noisy`
 MAX_GAIN = 0.01  # [1]; limit on the energy gain beyond the contact model, divided by M v^2
@@ -216,8 +216,8 @@ class ImpulseLedger(Compensator):
 
         self._peak = max(self._peak, reading)
         peak = self._peak
-        if rate > SLOWEST:
-            stiffness = dot(phi[:HINGES], model.mean[:HINGES]) / max(depth, SHALLOW)
+        if rate > MIN_SCALED_SPEED:
+            stiffness = dot(phi[:HINGES], model.mean[:HINGES]) / max(depth, MIN_CONTACT_DEPTH)
             stiffness -= sqrt(max(model.covariance[0][0], 0.0))
             peak = max(peak, sqrt(max(stiffness, 0.0)))
         unlimited = self._gain * (side * velocity_desired / speed - 0.5 * period * push - ahead)
@@ -239,7 +239,7 @@ class ImpulseLedger(Compensator):
         model, period, floor = self._model, self._period, self._floor
         model_error = MISFIT * reading
         variance = noise + floor * floor + model_error * model_error * (MISFIT_TIME / period)
-        learns = depth > period and (rate > SLOWEST or dot(phi, model.mean) > 0.0)
+        learns = depth > period and (rate > MIN_SCALED_SPEED or dot(phi, model.mean) > 0.0)
         if learns:
             model.learn(phi, reading, variance)
         if not depth > 0.0:
@@ -256,7 +256,7 @@ class ImpulseLedger(Compensator):
         `peak` [1/s] is the estimated scaled peak force, and `noise` [1/s^2] the noise variance of a reading.
         """
         reference, model = self._reference, self._model
-        if model.count < FEW_READINGS:
+        if model.count < MIN_CONTACT_READINGS:
             return UNSURE
         if self._lag * peak > LATE * pi:
             return TOO_SHORT

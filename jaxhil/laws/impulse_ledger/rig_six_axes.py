@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from math import pi, sqrt
 from typing import ClassVar
 
-from jaxhil.laws.impulse_ledger.six_axes.constants import FEW_READINGS, LATE
+from jaxhil.laws.impulse_ledger.six_axes.constants import LATE, MIN_CONTACT_READINGS
 from jaxhil.laws.impulse_ledger.six_axes.impulse_accounting.rig import Ledger
 from jaxhil.laws.impulse_ledger.six_axes.reading.rig import SixAxisReader
 from jaxhil.rig.bounds import DAMPINGS_BY_MASS, FORCES, STIFFNESSES_BY_MASS, TIMES
@@ -109,7 +109,7 @@ class ImpulseLedger(SixAxisCompensator):
     def _evaluate(self) -> int:
         """Return the status of the last command."""
         ledger = self._ledger
-        if ledger.tangent.readings < FEW_READINGS:
+        if ledger.tangent.readings < MIN_CONTACT_READINGS:
             return UNSURE
         if self.loop_delay * sqrt(ledger.tangent.stiffness) > LATE * pi:
             return TOO_SHORT

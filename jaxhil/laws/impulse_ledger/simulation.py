@@ -259,7 +259,7 @@ class ImpulseLedger(Compensator):
         noise = onset_detection.variance(flight, gains["force_noise"]) / (weight * weight)
         model_error = rig.MISFIT**2 * (rig.MISFIT_TIME / period) * reading**2
         variance = noise + gains["force_noise_floor"] ** 2 + model_error
-        learns = (depth > period) & ((rate > rig.SLOWEST) | (dot(phi, estimate.mean) > 0))
+        learns = (depth > period) & ((rate > rig.MIN_SCALED_SPEED) | (dot(phi, estimate.mean) > 0))
         estimate = contact_model.learn(estimate, phi, reading, variance, learns)
 
         onset = rig.ONSET_TICKS * period * contact_model.slope(estimate.mean, deepest)
@@ -277,10 +277,10 @@ class ImpulseLedger(Compensator):
         reference = reference_trajectory.advance(reference, theta, period, reading, phi)
         push, ahead = reference_trajectory.bridge(reference, theta, contact.lag + 0.5 * period)
 
-        secure = dot(phi[:HINGES], estimate.mean[:HINGES]) / jnp.maximum(depth, rig.SHALLOW)
+        secure = dot(phi[:HINGES], estimate.mean[:HINGES]) / jnp.maximum(depth, rig.MIN_CONTACT_DEPTH)
         predicted = safe_sqrt(secure - safe_sqrt(estimate.covariance[0, 0]))
         largest = jnp.maximum(contact.peak, reading)
-        peak = jnp.maximum(largest, jnp.where(rate > rig.SLOWEST, predicted, 0))
+        peak = jnp.maximum(largest, jnp.where(rate > rig.MIN_SCALED_SPEED, predicted, 0))
         desired = side * signals.velocity_desired / speed
         unlimited = gains["velocity_gain"] * (desired - 0.5 * period * push - ahead)
         limit = gains["correction_limit"] * peak

@@ -12,7 +12,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 
 from jaxhil.lanes import select_lanes
-from jaxhil.laws.impulse_ledger.six_axes.constants import LONG_AGO
+from jaxhil.laws.impulse_ledger.six_axes.constants import INITIAL_CONTACT_AGE
 from jaxhil.laws.impulse_ledger.six_axes.gains import GAINS
 from jaxhil.laws.impulse_ledger.six_axes.impulse_accounting.simulation import follow, onset
 from jaxhil.laws.impulse_ledger.six_axes.reading.simulation import read, record
@@ -72,7 +72,7 @@ class ImpulseLedger(SixAxisCompensator):
             first=zeros,
             aligned=zeros,
             impulse=zeros,
-            flight=FreeFlightState(zeros, zero, zeros, zeros, zero, zero + LONG_AGO),
+            flight=FreeFlightState(zeros, zero, zeros, zeros, zero, zero + INITIAL_CONTACT_AGE),
             in_contact=zero > 0,
             contact=SixAxisContact(zero, zero + 1, zeros, zeros, zeros, zeros, zero, zero, zero),
             estimate=prepared.prior,

@@ -34,7 +34,7 @@ from jaxhil.laws.six_axis_base import COORDINATES, SixAxisCompensator, lag_leads
 
 AXIS = 2  # index of the docking axis z
 USUAL_SPEED = 0.02  # m/s; approach speed if the mechanism file has none
-SHALLOW = 1e-3  # s; depth divided by approach speed, at which a first sample has weight 1/2 in k_hat
+FIRST_SAMPLE_DEPTH = 1e-3  # s; depth / approach speed at which a first sample has weight 1/2 in k_hat
 
 
 class ResponseErrorState(NamedTuple):
@@ -98,7 +98,7 @@ class ResponseError(SixAxisCompensator):
         LEAD_FILTER._replace(tuned=_never),
         rig_gain("response_error", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0, neutral=0.0),
         rig_gain("response_error_damping", lambda m: 0.0, lambda m: 2.0, lambda m: 1.0, neutral=0.0),
-        _covariance("stiffness_covariance", lambda m: 1 / (SHALLOW * approach_speed(m)) ** 2),
+        _covariance("stiffness_covariance", lambda m: 1 / (FIRST_SAMPLE_DEPTH * approach_speed(m)) ** 2),
         _covariance("damping_covariance", lambda m: 1 / approach_speed(m) ** 2),
         rig_gain("forgetting", lambda m: 0.8, lambda m: 1.0, lambda m: 0.98, tuned=_never),
         rig_gain(

@@ -2,7 +2,7 @@
 
     f(x, v, x_m) = preload + sum_j hinge_j max(0, x - kappa_j)
                    + (damping + depth_damping x/REACH) v - unloading (x_m - x)
-                   + friction v/sqrt(v^2 + SLOW^2)                              at x > 0, else 0
+                   + friction v/sqrt(v^2 + MIN_SLIDING_SPEED^2)                at x > 0, else 0
 
 f is the force, divided by mass and approach speed [1/s]. x is the depth and x_m the largest depth so far,
 divided by the approach speed [s]. v is the speed, divided by the approach speed [1]. The slope at a depth x
@@ -37,7 +37,7 @@ CONCLUDED = (*DISSIPATIVE, DELAY)  # indices of parameters that `conclude` const
 DELAY_PARAMETERS = (*CONCLUDED, 0, PRELOAD)  # indices of the parameters that `estimate_delay` uses
 WANDER = 0.03  # s; depth / approach speed in which the slope changes by one prior standard deviation
 REACH = 0.03  # s; depth / approach speed at which damping and an equal depth_damping have the same effect
-SLOW = 0.03  # [1]; speed, divided by the approach speed, below which friction changes sign smoothly
+MIN_SLIDING_SPEED = 0.03  # [1]; speed / approach speed below which friction changes sign smoothly
 # The prior variance of a parameter (except the delay) is a squared entry of `Spreads`, selected by
 # `SPREAD_INDICES`, times the parameter's entry of `FACTORS`.
 SPREAD_INDICES = (0, *[1] * (HINGES - 1), 2, 3, 4, 5, 6)
@@ -63,7 +63,7 @@ def features(depth: float, speed: float, deepest: float, delay_effect: float) ->
         return [0.0] * PARAMETERS
     phi = [depth - knot if depth > knot else 0.0 for knot in KNOTS]
     back = depth - deepest
-    turning = speed / sqrt(speed * speed + SLOW * SLOW)
+    turning = speed / sqrt(speed * speed + MIN_SLIDING_SPEED * MIN_SLIDING_SPEED)
     return [*phi, speed, depth * speed / REACH, back if back < 0.0 else 0.0, turning, 1.0, delay_effect]
 
 
@@ -80,7 +80,7 @@ def force(theta: Sequence[float], depth: float, speed: float, deepest: float) ->
     total += (theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH) * speed
     if back < 0.0:
         total += theta[UNLOADING] * back
-    return total + theta[FRICTION] * (speed / sqrt(speed * speed + SLOW * SLOW))
+    return total + theta[FRICTION] * (speed / sqrt(speed * speed + MIN_SLIDING_SPEED * MIN_SLIDING_SPEED))
 
 
 def slope(theta: Sequence[float], depth: float) -> float:

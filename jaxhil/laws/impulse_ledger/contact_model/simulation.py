@@ -44,7 +44,7 @@ def begin(mean: Array, variances: Array) -> ContactModelEstimate:
 def features(depth: Array, speed: Array, deepest: Array, delay_effect: Array) -> Array:
     """Return the regressor phi; the contact model's force is phi.theta. Out of contact, phi is 0."""
     hinges = [jnp.where(depth > knot, depth - knot, 0) for knot in rig.KNOTS]
-    turning = speed / jnp.sqrt(speed * speed + rig.SLOW * rig.SLOW)
+    turning = speed / jnp.sqrt(speed * speed + rig.MIN_SLIDING_SPEED * rig.MIN_SLIDING_SPEED)
     losses = [speed, depth * speed / rig.REACH, jnp.where(depth < deepest, depth - deepest, 0), turning]
     return jnp.where((depth > 0)[None], jnp.stack([*hinges, *losses, jnp.ones_like(depth), delay_effect]), 0)
 

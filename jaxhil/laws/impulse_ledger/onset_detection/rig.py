@@ -14,7 +14,7 @@ DRIFT = 2.0  # standard deviations; a reading increases S only if it exceeds the
 LEVEL = 8.0  # standard deviations; contact is detected if S exceeds this level
 SETTLING = 0.004  # s; no detection during this time after the start of a run
 MAX_MEAN = 2000.0  # readings; limits the memory of the bias, which may drift slowly
-FEW = 9.0  # readings in free flight; with fewer, sigma is the specified noise
+MIN_FLIGHT_READINGS = 9.0  # readings in free flight; with fewer, sigma is the specified noise
 
 
 class OnsetDetector:
@@ -42,7 +42,11 @@ class OnsetDetector:
     @property
     def variance(self) -> float:
         """Return the noise variance of a force reading [N^2]: the larger of specified and measured value."""
-        return max(self._noise_variance, self._square) if self._count > FEW else self._noise_variance
+        return (
+            max(self._noise_variance, self._square)
+            if self._count > MIN_FLIGHT_READINGS
+            else self._noise_variance
+        )
 
     def update(self, force: float, side: float, floor: float, settled: bool) -> None:
         """Update the cumulative sum with one force reading [N].

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxhil.laws.impulse_ledger.onset_detection.rig import DRIFT, FEW, MAX_MEAN
+from jaxhil.laws.impulse_ledger.onset_detection.rig import DRIFT, MAX_MEAN, MIN_FLIGHT_READINGS
 
 
 class FreeFlight(NamedTuple):
@@ -21,7 +21,9 @@ class FreeFlight(NamedTuple):
 def variance(flight: FreeFlight, noise: Array) -> Float[Array, "*batch"]:
     """Return the noise variance of a force reading [N^2]: the larger of specified and measured value."""
     specified = noise**2
-    return jnp.where((flight.count > FEW) & (flight.square > specified), flight.square, specified)
+    return jnp.where(
+        (flight.count > MIN_FLIGHT_READINGS) & (flight.square > specified), flight.square, specified
+    )
 
 
 def update(flight: FreeFlight, deviation: Array, settled: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:

@@ -32,8 +32,8 @@ from jaxhil.laws.impulse_ledger.contact_model.rig import (
 )
 
 STEPS = 12  # number of integration steps from the last reading to the present
-FASTEST = 2.0  # [1]; limit on the speed, divided by the approach speed; at most 1 without added energy
-FARTHEST = 10.0  # s; limit on the depth, divided by the approach speed: 3 times the depth at 0.05 Hz
+MAX_SCALED_SPEED = 2.0  # [1]; speed / approach speed; at most 1 without added energy
+MAX_SCALED_DEPTH = 10.0  # s; limit on the depth, divided by the approach speed: 3 times the depth at 0.05 Hz
 
 
 class ReferenceTrajectory:
@@ -69,8 +69,8 @@ class ReferenceTrajectory:
         changes = [new - old for new, old in zip(theta, self._theta, strict=True)]
         self._theta = theta
         if not self.released:
-            self.depth = within(self.depth + dot(self._depths, changes), FARTHEST)
-        self.speed = within(self.speed + dot(self._speeds, changes), FASTEST)
+            self.depth = within(self.depth + dot(self._depths, changes), MAX_SCALED_DEPTH)
+        self.speed = within(self.speed + dot(self._speeds, changes), MAX_SCALED_SPEED)
 
     def advance(self, period: float, reading: float, measured: Vector) -> None:
         """Advance the trajectory by one control period to the time of the next reading.
@@ -95,7 +95,7 @@ class ReferenceTrajectory:
             self._losses = [
                 loss + period * speed * rate for loss, rate in zip(self._losses, losses, strict=True)
             ]
-        self.speed = within(self.speed - 0.5 * period * (self.force + push), FASTEST)
+        self.speed = within(self.speed - 0.5 * period * (self.force + push), MAX_SCALED_SPEED)
         self.depth = depth
         self.force = push
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxhil.laws.impulse_ledger.contact_model.rig import DAMPING, DEPTH_DAMPING, REACH
 from jaxhil.laws.impulse_ledger.contact_model.simulation import dot, features, force, slope
-from jaxhil.laws.impulse_ledger.reference_trajectory.rig import FARTHEST, FASTEST, STEPS
+from jaxhil.laws.impulse_ledger.reference_trajectory.rig import MAX_SCALED_DEPTH, MAX_SCALED_SPEED, STEPS
 
 
 class ReferenceTrajectory(NamedTuple):
@@ -34,8 +34,8 @@ def begin(depth: Array, like: Array) -> ReferenceTrajectory:
 def correct(old: ReferenceTrajectory, changes: Array) -> ReferenceTrajectory:
     """Correct the trajectory to first order for the `changes` of the contact model's parameters."""
     moved = jnp.where(old.released, 0, dot(old.depths, changes))
-    speed = jnp.clip(old.speed + dot(old.speeds, changes), -FASTEST, FASTEST)
-    return old._replace(depth=jnp.clip(old.depth + moved, -FARTHEST, FARTHEST), speed=speed)
+    speed = jnp.clip(old.speed + dot(old.speeds, changes), -MAX_SCALED_SPEED, MAX_SCALED_SPEED)
+    return old._replace(depth=jnp.clip(old.depth + moved, -MAX_SCALED_DEPTH, MAX_SCALED_DEPTH), speed=speed)
 
 
 def advance(
@@ -59,7 +59,7 @@ def advance(
     rates = undelayed - measured + stiffness[None] * ahead + damping[None] * old.speeds
     speeds = old.speeds - jnp.where(moves, tick * rates, 0)
     depths = old.depths + jnp.where(moves, tick * speeds, 0)
-    speed = jnp.clip(old.speed - 0.5 * period * (old.force + push), -FASTEST, FASTEST)
+    speed = jnp.clip(old.speed - 0.5 * period * (old.force + push), -MAX_SCALED_SPEED, MAX_SCALED_SPEED)
     return ReferenceTrajectory(depth, speed, push, deepest, released, depths, speeds)
 
 

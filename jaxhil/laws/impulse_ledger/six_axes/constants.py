@@ -25,8 +25,8 @@ HIGHEST = 2.0  # [1]; limit on the predicted force, divided by the larger of exp
 # m/s^2; limit on the force per unit mass in the prediction: without it, a wrong estimate overflows to NaN
 MAX_PUSH = 1e6
 MIN_STIFFNESS = 100.0  # 1/s^2; lower bound of the stiffness in the limit of the correction
-LONG_AGO = 1e9  # ticks; at the beginning of a run, the last contact counts as this long ago
-FEW_READINGS = 5.0  # minimum number of readings of the tangent model; with fewer the status is `unsure`
+INITIAL_CONTACT_AGE = 1e9  # ticks; at the beginning of a run, the last contact counts as this long ago
+MIN_CONTACT_READINGS = 5.0  # readings of the tangent model; with fewer the status is `unsure`
 LATE = 0.8  # [1]; limit on D divided by the contact's duration; beyond it the status is `too_short`
 SAMPLES = 512  # length of the rig's delay line [ticks], a power of two
 MAX_RECALL = SAMPLES - 2.0  # ticks; maximum delay, because interpolation needs one older sample

@@ -4,7 +4,7 @@ from math import floor
 from typing import Annotated
 
 from jaxhil.laws.impulse_ledger.six_axes.constants import (
-    LONG_AGO,
+    INITIAL_CONTACT_AGE,
     MAX_FLIGHT,
     MAX_MEAN,
     MAX_RECALL,
@@ -102,7 +102,7 @@ class SixAxisReader:
         self._first = [0.0] * AXES
         self.lag = [0.0] * AXES
         self.twist = [0.0] * AXES
-        self.quiet = LONG_AGO
+        self.quiet = INITIAL_CONTACT_AGE
         self.tool = 0.0
         self.wrench = [0.0] * AXES
         self.pose = [0.0] * AXES
