@@ -42,6 +42,7 @@ FULL = {
             "dead_zone": 1.0,
             "bias": -1.0,
             "range": 1000.0,
+            "loss_probability": 0.01,
             "filter": {"kind": "bessel", "order": 3, "cutoff": 200.0},
         },
         "position_sensor": {"delay": 0.001, "noise_std": 1e-6, "quantum": 1e-6},
@@ -86,11 +87,14 @@ OF_OTHERS = {
     "contact.preload": 2.0,
     "contact.friction": 2.0,
     "rig.simulator.time_constant": 0.01,
+    "rig.simulator.window": 0.01,
     "rig.force_sensor.time_constant": 0.001,
     "rig.simulator.coefficients": [0.1, 0.1, 0.001],
     "rig.simulator.numerator": [1.0],
     "rig.simulator.denominator": [1.0, 1.0],
 }
+# Keys that exclude a filter or a clearance, which the full table has.
+EXCLUDED = ("rig.force_sensor.jitter", "rig.missed_tick_probability")
 
 
 def changed(changes=(), base=FULL):

@@ -224,6 +224,7 @@ def six_axis_mapping(**changes):
     return f'{HEAD}time = "time"\n' + "\n".join(lines) + f"\n{RUNS}"
 
 
+@pytest.mark.slow
 def test_shadow_mode_reads_six_axis_logs_in_other_units(tmp_path):
     document, columns = six_axis_log()
     (tmp_path / "map.toml").write_text(six_axis_mapping())
