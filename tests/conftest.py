@@ -21,6 +21,7 @@ os.environ["XLA_FLAGS"] = build_xla_flags(
     os.environ.get("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
 )
 os.environ["NPROC"] = build_jax_variables(os.environ)["NPROC"]
+os.environ["COLUMNS"] = "110"  # tables and texts have the same width in every terminal
 
 import hypothesis
 import jax

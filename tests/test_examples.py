@@ -18,6 +18,7 @@ EVERYDAY = [
     "jaxhil.rig.Controller.from_dict",
     "jaxhil.rig.digest",
     "jaxhil.rig_models.choose_rig_model",
+    "tuning.shadow",
     "tuning.sweep",
     "tuning.tune",
     "tuning.verify",

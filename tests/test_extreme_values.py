@@ -31,6 +31,10 @@ OTHERS = {
         ["rig.simulator={model='transfer_function', numerator=[1.0], denominator=[1e-3, 0.05, 1.0]}"],
     ),
 }
+# Overrides without which a key is invalid.
+COMPANIONS = {
+    "rig.force_sensor.filter.cutoff": ["rig.force_sensor.filter={kind='bessel', order=2, cutoff=200.0}"]
+}
 SAMPLE = 11  # the daily run takes every 11th value
 LONGEST = 120.0  # s; on a busy machine most of it is compilation
 
@@ -39,7 +43,7 @@ def overrides(others, key, value):
     """Yield overrides of the key itself, or of a list entry."""
     for path in (key, key + ENTRIES.get(key, "[0]")):
         certain = ["uncertainty={}"] if others else []
-        yield [*certain, *others, f"{path}={value}"]
+        yield [*certain, *others, *COMPANIONS.get(key, []), f"{path}={value}"]
 
 
 def check_simulate(command, name, changes):

@@ -167,7 +167,7 @@ def test_gains_of_different_mechanism_with_same_name_are_replaced_with_warning(j
         ("shadow",),
         ("rig",),
         ("identify", "--prior", "rig-300kg"),
-        ("identify", "none.csv", "--map"),
+        ("identify", "log.csv", "--map"),
         ("monitor", "rig-300kg"),
         ("report",),
     ],
@@ -176,6 +176,7 @@ def test_gains_of_different_mechanism_with_same_name_are_replaced_with_warning(j
 def test_input_from_a_pipe_or_device_is_refused(jaxhil, tmp_path, monkeypatch, command, kind):
     """Reading would block on a pipe and never end on a device."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "log.csv").write_text("t\n")
     path = tmp_path / "input.csv"
     if kind == "pipe":
         os.mkfifo(path)
