@@ -15,7 +15,7 @@ import pytest
 
 import jaxhil
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.mechanism.structs import value_at
+from jaxhil.mechanism.number_ranges import value_at
 from tuning.gain_file import build_document
 
 OFFERED = (

@@ -8,7 +8,7 @@ import pytest
 
 import jaxhil
 from jaxhil.mechanism.file import load
-from jaxhil.mechanism.structs import numeric_keys
+from jaxhil.mechanism.number_ranges import numeric_keys
 from jaxhil.simulation.plausibility import check_run, summarise_mechanism
 
 VALUES = "0 -0.0 1e-320 1e-300 1e-100 1e-9 1e9 1e100 1e300 1.7e308 nan inf".split()

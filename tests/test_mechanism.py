@@ -9,7 +9,8 @@ from mechanism_table import EXCLUDED, FULL, LAYERED, OF_OTHERS, changed, leaves,
 
 from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.mechanism.file import from_plain_data, to_plain_data
-from jaxhil.mechanism.structs import Bodies, Mechanism, numeric_keys, value_at
+from jaxhil.mechanism.number_ranges import numeric_keys, value_at
+from jaxhil.mechanism.structs import Bodies, Mechanism
 
 REQUIRED = [
     "schema",

@@ -25,7 +25,7 @@ from jaxhil.mechanism.file import (
     suite_names,
     to_plain_data,
 )
-from jaxhil.mechanism.structs import mechanism_type
+from jaxhil.mechanism.number_ranges import mechanism_type
 from jaxhil.mechanism.toml_table import MAX_BYTES
 
 TEXT = builtin_path("claw-350kg").read_text()

@@ -18,8 +18,8 @@ from mechanism_table import (
 )
 
 from jaxhil.mechanism.file import from_plain_data, to_plain_data
+from jaxhil.mechanism.number_ranges import value_at
 from jaxhil.mechanism.rules import is_hurwitz
-from jaxhil.mechanism.structs import value_at
 
 HARDENING = {"contact.law": "hardening", "contact.reference_depth": 2e-4}
 DEPTH_DAMPED = {"contact.law": "depth_damped", "contact.reference_depth": 2e-4}

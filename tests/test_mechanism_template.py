@@ -20,7 +20,8 @@ from jaxhil.mechanism.file import (
 )
 from jaxhil.mechanism.json_schema import build_json_schema
 from jaxhil.mechanism.keys import describe_tables
-from jaxhil.mechanism.structs import MAX_CONTACTS, key_metadata, numeric_keys
+from jaxhil.mechanism.number_ranges import numeric_keys
+from jaxhil.mechanism.structs import MAX_CONTACTS, key_metadata
 from jaxhil.mechanism.template import format_mechanism_file
 
 NAMES = [*builtin_names(), *suite_names()]

@@ -10,7 +10,7 @@ from mechanism_table import file_refusal
 import jaxhil
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import builtin_path, load, to_plain_data
-from jaxhil.mechanism.structs import numeric_keys
+from jaxhil.mechanism.number_ranges import numeric_keys
 
 TEXT = builtin_path("claw-350kg").read_text()
 

@@ -10,7 +10,8 @@ from scipy import stats
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import builtin_names, from_plain_data, load, to_plain_data
-from jaxhil.mechanism.structs import MAGNITUDE_LIMITS, numeric_keys
+from jaxhil.mechanism.number_ranges import numeric_keys
+from jaxhil.mechanism.structs import MAGNITUDE_LIMITS
 from jaxhil.mechanism.uncertainty import (
     PHASE_KEY,
     count_dimensions,

@@ -18,14 +18,8 @@ import msgspec
 from msgspec import inspect
 
 from jaxhil.errors import format_value, to_one_line
-from jaxhil.mechanism.structs import (
-    MAGNITUDE_LIMITS,
-    NO_METADATA,
-    Mechanism,
-    is_computable,
-    mechanism_type,
-    range_of,
-)
+from jaxhil.mechanism.number_ranges import is_computable, mechanism_type, range_of
+from jaxhil.mechanism.structs import MAGNITUDE_LIMITS, NO_METADATA, Mechanism
 
 __all__ = [
     "SCALAR_LIST_KEYS",

@@ -13,8 +13,9 @@ import msgspec
 
 from jaxhil.contact.laws import CONTACT_LAWS
 from jaxhil.mechanism.conversion import SCALAR_LIST_KEYS
+from jaxhil.mechanism.number_ranges import numeric_keys
 from jaxhil.mechanism.six_axes import SIX_AXIS_SCHEMA, SixAxisMechanism
-from jaxhil.mechanism.structs import Mechanism, numeric_keys
+from jaxhil.mechanism.structs import Mechanism
 
 __all__ = ["build_json_schema"]
 

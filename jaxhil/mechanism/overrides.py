@@ -21,8 +21,9 @@ from jaxhil.mechanism.conversion import (
     suggest_names,
 )
 from jaxhil.mechanism.correlation import remove_keys
+from jaxhil.mechanism.number_ranges import Range, mechanism_type, numeric_keys
 from jaxhil.mechanism.six_axes import is_six_axes, numeric_keys_with, six_axis_type
-from jaxhil.mechanism.structs import MAX_CONTACTS, Range, mechanism_type, numeric_keys
+from jaxhil.mechanism.structs import MAX_CONTACTS
 
 __all__ = ["apply_override", "parse_key", "parse_override"]
 

@@ -21,14 +21,8 @@ from jaxhil.contact.laws import CONTACT_KEYS, ContactLaw, find_contact_law, laws
 from jaxhil.errors import format_value
 from jaxhil.mechanism.conversion import KeyPath, KeyProblem, describe_allowed_at, run_checks
 from jaxhil.mechanism.correlation import check_correlation
-from jaxhil.mechanism.structs import (
-    DAMPING_RATIO_LAWS,
-    Contact,
-    Mechanism,
-    Simulator,
-    Uncertainty,
-    value_at,
-)
+from jaxhil.mechanism.number_ranges import value_at
+from jaxhil.mechanism.structs import DAMPING_RATIO_LAWS, Contact, Mechanism, Simulator, Uncertainty
 from jaxhil.mechanism.uncertainty_rules import Span, check_uncertainty
 
 __all__ = [

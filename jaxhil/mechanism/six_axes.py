@@ -18,6 +18,7 @@ from msgspec import Meta, Struct, defstruct, field
 
 from jaxhil.contact.keys import key_metadata
 from jaxhil.contact.laws import CONTACT_KEYS, laws_with_key
+from jaxhil.mechanism.number_ranges import Range, numeric_keys, ranges_of
 from jaxhil.mechanism.six_axes_rig import (
     Inertia,
     Length,
@@ -34,12 +35,9 @@ from jaxhil.mechanism.structs import (
     ContactLawName,
     Correlation,
     Mechanism,
-    Range,
     Slopes,
     Stiffness,
     Uncertainty,
-    numeric_keys,
-    ranges_of,
 )
 
 __all__ = [

@@ -28,8 +28,9 @@ from typing import Any
 import numpy as np
 
 from jaxhil.mechanism.correlation import correlate
+from jaxhil.mechanism.number_ranges import Range, value_at
 from jaxhil.mechanism.six_axes import AnyMechanism, numeric_keys_of
-from jaxhil.mechanism.structs import Mechanism, Range, Uncertainty, value_at
+from jaxhil.mechanism.structs import Mechanism, Uncertainty
 
 __all__ = [
     "PHASE_KEY",

@@ -8,8 +8,9 @@ import numpy as np
 
 from jaxhil.errors import format_value
 from jaxhil.mechanism.conversion import KeyProblem, add_magnitude_limits, suggest_names
+from jaxhil.mechanism.number_ranges import Range, is_computable, value_at
 from jaxhil.mechanism.six_axes import AnyMechanism, numeric_keys_of
-from jaxhil.mechanism.structs import Range, Uncertainty, is_computable, value_at
+from jaxhil.mechanism.structs import Uncertainty
 
 __all__ = ["Span", "check_uncertainty"]
 

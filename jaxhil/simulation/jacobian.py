@@ -20,8 +20,9 @@ from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.simulation_base import Compensator, Gains
 from jaxhil.mechanism.conversion import format_key_path, suggest_names
 from jaxhil.mechanism.loading import as_mechanism
+from jaxhil.mechanism.number_ranges import numeric_keys, value_at
 from jaxhil.mechanism.overrides import KeyProblem, parse_key
-from jaxhil.mechanism.structs import Mechanism, numeric_keys, value_at
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.gain_choice import choose_gains
 from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.simulation.loop import Loop

@@ -13,7 +13,6 @@ import numpy as np
 from jaxhil.contact.ideal_contact import IdealContact
 from jaxhil.contact.laws import ContactLaw, ContactParameters, find_contact_law
 from jaxhil.errors import InputError
-from jaxhil.laws.shared.nominal_values import force_delay
 from jaxhil.mechanism.rules import format_allowed_velocity_limit
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import compute_quantiles, count_dimensions
@@ -21,6 +20,7 @@ from jaxhil.simulation import cached_programs
 from jaxhil.simulation.cells import MAX_POLE
 from jaxhil.simulation.free_flight import APPROACH_TIME
 from jaxhil.simulation.jax_environment import jax_context
+from jaxhil.simulation.mechanism_warnings import ContactSummary, find_warnings
 from jaxhil.simulation.outcome import parameters_by_slot
 from jaxhil.simulation.scenario import MAX_CONTACT_DURATION, MotionSimulatorBatch, Scenario, build_scenarios
 from jaxhil.simulation.timing import MAX_SERIES_POLE
@@ -28,12 +28,7 @@ from jaxhil.simulation.timing import MAX_SERIES_POLE
 MAX_CONTACT_TICKS = 1e7  # maximum number of ticks of a contact, including its approach
 MAX_RUN_TICKS = 1e9  # maximum number of ticks of a run; ticks are counted in 32 bits
 
-PLAUSIBLE_FREQUENCIES = 0.05, 50.0  # Hz; lowest and highest plausible contact frequency
-MIN_FREQUENCY_RATIO = 1e-4  # [1]; lowest plausible contact frequency as a fraction of the control rate
-MAX_PLAUSIBLE_BANDWIDTH = 50.0  # Hz; highest plausible natural frequency of a motion simulator
 MOVING_AVERAGE_BANDWIDTH = 0.442946  # [1]; x with sin(pi x)/(pi x) = 1/sqrt(2): bandwidth times window
-MAX_FREQUENCY_RATIO = 0.1  # [1]; highest plausible contact frequency as a fraction of the control rate
-MAX_PLAUSIBLE_VELOCITY = 1.0  # m/s; highest plausible approach velocity
 FAST_SIMULATOR = f"at most {MAX_POLE:g} / control_period; for a faster simulator use model = 'ideal'"
 MAX_LISTED_FREQUENCIES = 4  # a summary lists at most this number of contact frequencies, or only their range
 
@@ -43,22 +38,6 @@ _TAIL_PROBABILITY = 1e-9  # [1]; probability of the values that are ignored at e
 _TICK_KEYS = ("bodies.", "approach.velocity", "contact.", "rig.contact_plane", "rig.control_period")
 _SPEED_KEYS = ("approach.velocity", "rig.simulator.velocity_limit")
 _POLE_KEYS = ("rig.simulator.", "rig.control_period")
-
-
-class ContactSummary(NamedTuple):
-    """Metrics of an ideal contact at the velocity of the first approach.
-
-    Attributes:
-        number: Number of the first scheduled contact with these metrics, from 1.
-        frequency: Contact frequency [Hz]: sqrt(stiffness/mass)/(2 pi) for a spring, else 1/(2 duration).
-        duration: Duration [s]; infinite if the bodies do not separate.
-        peak_force: Peak force [N].
-    """
-
-    number: int
-    frequency: float
-    duration: float
-    peak_force: float
 
 
 class MechanismSummary(NamedTuple):
@@ -118,7 +97,7 @@ def summarise_mechanism(mechanism: Mechanism) -> MechanismSummary:
         simulator_bandwidth=compute_bandwidth(scenarios.simulator),
         force_range=rig.force_sensor.range,
         duration=float(np.sum(_estimate_durations(scenarios, reference))),
-        warnings=tuple(_find_warnings(mechanism, contacts)),
+        warnings=tuple(find_warnings(mechanism, contacts)),
     )
 
 
@@ -321,91 +300,6 @@ def _extreme_draws(mechanism: Mechanism, prefixes: tuple[str, ...]) -> dict[str,
         for path, count in columns.items()
     ]
     return compute_quantiles(mechanism, np.concatenate(points, axis=1))
-
-
-def _find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) -> list[str]:
-    rig, contact, warnings = mechanism.rig, mechanism.contact, []
-    fastest = max(contacts, key=lambda item: item.frequency)
-    slowest = min(contacts, key=lambda item: item.frequency)
-    strongest = max(contacts, key=lambda item: item.peak_force)
-    lowest, highest = PLAUSIBLE_FREQUENCIES
-    limit = MAX_FREQUENCY_RATIO / rig.control_period
-    if fastest.frequency > limit:
-        warnings.append(
-            f"{_format_frequency(fastest)}, expected at most {limit:.4g} Hz, 1/10 of the control rate"
-        )
-    elif fastest.frequency > highest:
-        warnings.append(f"{_format_frequency(fastest)}, expected at most {highest:g} Hz")
-    lowest = max(lowest, MIN_FREQUENCY_RATIO / rig.control_period)
-    if slowest.frequency < lowest:
-        hint = "is the stiffness in N/mm, or a mass in g?"
-        warnings.append(f"{_format_frequency(slowest)}, expected at least {lowest:g} Hz ({hint})")
-    if mechanism.approach.velocity > MAX_PLAUSIBLE_VELOCITY:
-        velocity = f"{mechanism.approach.velocity:.4g} m/s"
-        warnings.append(
-            f"approach.velocity: found {velocity}, expected at most {MAX_PLAUSIBLE_VELOCITY:g} m/s (is it in "
-            "mm/s?)"
-        )
-    if strongest.peak_force > rig.force_sensor.range:
-        peak = f"{strongest.peak_force:.3g} N, the peak force of ideal contact {strongest.number}"
-        warnings.append(
-            f"rig.force_sensor.range: found {rig.force_sensor.range:.4g} N, expected more than {peak} (is it "
-            "in kN?)"
-        )
-    frequency = rig.simulator.natural_frequency
-    if frequency is not None and frequency > MAX_PLAUSIBLE_BANDWIDTH:
-        warnings.append(
-            f"rig.simulator.natural_frequency: found {frequency:.4g} Hz, expected at most "
-            f"{MAX_PLAUSIBLE_BANDWIDTH:g} Hz (is it in rad/s? then it is {frequency / (2 * math.pi):.3g} Hz)"
-        )
-    warnings += _check_sensors(mechanism, strongest)
-    if not find_contact_law(contact.law).is_damped and any(contact.damping):
-        largest = max(contact.damping)
-        warnings.append(
-            f"contact.damping: found {largest:.4g} N s/m, expected 0: law {contact.law} has no damping"
-        )
-    return warnings + _check_delays(mechanism, min(contacts, key=lambda item: item.duration))
-
-
-def _check_sensors(mechanism: Mechanism, strongest: ContactSummary) -> list[str]:
-    """Return a warning for every sensor error that is larger than the signal of all ideal contacts."""
-    frequency = strongest.frequency  # 0 if the contact does not end
-    depth = mechanism.approach.velocity / (2 * math.pi * frequency) if frequency else math.inf
-    limits = (
-        ("force_sensor", strongest.peak_force, "N", "the peak force", "mN"),
-        ("position_sensor", depth, "m", "about the depth", "um or mm"),
-    )
-    warnings = []
-    for sensor, limit, unit, meaning, smaller in limits:
-        for key in ("noise_std", "quantum", "dead_zone", "bias"):
-            value = getattr(getattr(mechanism.rig, sensor), key, 0.0)
-            if 0.0 < limit <= abs(value):
-                warnings.append(
-                    f"rig.{sensor}.{key}: found {value:.4g} {unit}, expected less than {limit:.3g} {unit}, "
-                    f"{meaning} of ideal contact {strongest.number} (is it in {smaller}?)"
-                )
-    return warnings
-
-
-def _format_frequency(contact: ContactSummary) -> str:
-    frequency = f"a contact frequency of {contact.frequency:.3g} Hz (contact {contact.number})"
-    return f"contact.stiffness: found {frequency}"
-
-
-def _check_delays(mechanism: Mechanism, shortest: ContactSummary) -> list[str]:
-    """Return one warning if a delay exceeds the duration of the shortest contact, else an empty list."""
-    rig = mechanism.rig
-    force = force_delay(mechanism)
-    allowed = f"less than {shortest.duration:.3g} s, the duration of contact {shortest.number}"
-    for key, sensor_delay, suffix in (
-        ("simulator", 0.0, ""),
-        ("force_sensor", force, " with its lag and the motion simulator's delay"),
-        ("position_sensor", rig.position_sensor.delay, " with the motion simulator's"),
-    ):
-        delay = rig.simulator.delay + sensor_delay
-        if delay > shortest.duration:
-            return [f"rig.{key}.delay: found {delay:.3g} s{suffix}, expected {allowed}"]
-    return []
 
 
 def _format_ratio(value: float, whole: float) -> str:

@@ -14,7 +14,8 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxhil.laws.simulation_base import Gains, Signals
-from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.number_ranges import value_at
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation import cached_programs
 from jaxhil.simulation.gain_file import LoadedGains

@@ -19,8 +19,9 @@ from jaxtyping import Array, Float, Int, UInt32
 from jaxhil.contact.ideal_contact import IdealContact
 from jaxhil.contact.keys import ContactKey
 from jaxhil.contact.laws import CONTACT_KEYS, ContactParameters, find_contact_law
+from jaxhil.mechanism.number_ranges import value_at
 from jaxhil.mechanism.sensor_filter import find_modes
-from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.probe import Probe
 
 MAX_CONTACT_DURATION = 10.0  # s; a longer contact is ended with the status "timeout"

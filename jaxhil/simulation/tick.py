@@ -165,27 +165,26 @@ def sense(
     """Stage 1: return the sensor readings at tick `now`, and the real forces in the last interval."""
     scenario, sensed = rig.scenario, state.sensed
     age = now - state.onset_tick
-    rings, delays = sensed.rings, rig.delays
+    rings, delays, sensor = sensed.rings, rig.delays, scenario.force_sensor
+    # With jitter, the derivative leaves out the jumps of a cut dead zone.
+    step = jnp.zeros_like(sensor.dead_zone) if loop.cuts_dead_zone else None
     if timing is not None and timing.jitter is not None:
         surfaces = Surfaces(loop.law, state.parameters, state.law, None)
         force = read_force(rig, rings.inputs, surfaces, now, age, timing.jitter, loop.hold)
-        step = jnp.zeros_like(force)  # jitter already spreads the instants of the jumps
     else:
         force_ring = rings.plant_signals.force if rings.reading is None else rings.reading
         force = _delayed_sample(force_ring, now, age, delays.force.intervals)
-        step = force - _delayed_sample(force_ring, now, age, delays.force.intervals + 1)
+        if loop.cuts_dead_zone:
+            step = force - _delayed_sample(force_ring, now, age, delays.force.intervals + 1)
     plant_signals = jax.tree.map(
         lambda ring: _delayed_sample(ring, now, age, delays.real), rings.plant_signals
     )
-    sensor = scenario.force_sensor
     if loop.has_force_bias:
         force = force + sensor.bias
     if noise.force is not None:
         force = force + noise.force
     if loop.has_sample_effects:
-        force = sample_force(
-            force, sensor.quantum, sensor.dead_zone, sensor.range, step if loop.cuts_dead_zone else None
-        )
+        force = sample_force(force, sensor.quantum, sensor.dead_zone, sensor.range, step)
     if timing is not None and timing.is_lost is not None and state.held is not None:
         force = jnp.where(timing.is_lost, state.held.reading, force)
 

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhil.mechanism.number_ranges import value_at
 from jaxhil.mechanism.six_axes import SixAxisMechanism
-from jaxhil.mechanism.structs import value_at
 from jaxhil.sixdof.rotations import Quaternion, exponential
 from jaxhil.sixdof.vectors import Matrix, Vector
 

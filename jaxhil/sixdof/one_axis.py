@@ -16,9 +16,10 @@ import numpy as np
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.file import from_plain_data, to_plain_data
+from jaxhil.mechanism.number_ranges import numeric_keys, value_at
 from jaxhil.mechanism.six_axes import KEYS_IN_SIX_AXES, SixAxisMechanism
 from jaxhil.mechanism.six_axes_rig import PER_AXIS_KEYS
-from jaxhil.mechanism.structs import SCHEMA, Mechanism, numeric_keys, value_at
+from jaxhil.mechanism.structs import SCHEMA, Mechanism
 from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.sixdof.building import APPROACH_DURATION, build_scenarios
 from jaxhil.sixdof.building_contacts import candidate_names

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxhil.contact.laws import find_contact_law
-from jaxhil.mechanism.structs import numeric_keys
+from jaxhil.mechanism.number_ranges import numeric_keys
 from tuning.identification.contact_fit import ContactFit
 from tuning.identification.result import ParameterEstimate
 

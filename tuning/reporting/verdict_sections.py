@@ -9,8 +9,9 @@ import numpy as np
 
 from jaxhil.errors import to_one_line
 from jaxhil.mechanism.file import AnyMechanism
+from jaxhil.mechanism.number_ranges import numeric_keys, value_at
 from jaxhil.mechanism.six_axes import numeric_keys_of
-from jaxhil.mechanism.structs import Mechanism, Uncertainty, numeric_keys, value_at
+from jaxhil.mechanism.structs import Mechanism, Uncertainty
 from jaxhil.mechanism.uncertainty import PHASE_KEY
 from jaxhil.simulation.contact_plot import CURVE_LABELS
 from tuning.bundle.summary import describe_alarm_rates, describe_limit, is_user_limit

@@ -14,9 +14,9 @@ from jaxhil.laws.simulation_base import Compensator
 from jaxhil.laws.six_axis_base import SixAxisCompensator
 from jaxhil.mechanism.conversion import format_key_path, suggest_names
 from jaxhil.mechanism.file import AnyMechanism, any_from_plain_data, to_plain_data
+from jaxhil.mechanism.number_ranges import value_at
 from jaxhil.mechanism.overrides import KeyProblem, parse_key
 from jaxhil.mechanism.six_axes import SixAxisMechanism, numeric_keys_of
-from jaxhil.mechanism.structs import value_at
 from jaxhil.mechanism.uncertainty import compute_quantiles, count_dimensions, draw_extremes
 from jaxhil.simulation.gain_file import resolve_gain_bounds
 from jaxhil.simulation.plausibility import check_run

@@ -13,8 +13,9 @@ import numpy as np
 
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.file import AnyMechanism
+from jaxhil.mechanism.number_ranges import value_at
 from jaxhil.mechanism.six_axes import numeric_keys_of
-from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import PHASE_KEY, count_dimensions
 from jaxhil.rig_models import choose_rig_model
 from jaxhil.simulation.contact_bounds import (

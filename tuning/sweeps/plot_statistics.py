@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxhil.mechanism.file import AnyMechanism
-from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.number_ranges import value_at
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import PHASE_KEY, compute_quantiles, count_dimensions
 from jaxhil.simulation.metrics import CONTACT_STATUS_NAMES, OK
 from tuning.statistics.quantiles import BIN_COUNT, BIN_EDGES, binned_estimate

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxhil.contact.laws import find_contact_law
-from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.number_ranges import value_at
+from jaxhil.mechanism.structs import Mechanism
 
 MAX_DAMPING_RATIO = 0.15  # largest additional damping ratio [1]; an elastic mechanism then has e* = 0.62
 

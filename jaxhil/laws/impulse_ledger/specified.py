@@ -4,7 +4,8 @@ import math
 
 from jaxhil.laws.impulse_ledger.rig import MAX_DELAY_SPREAD
 from jaxhil.laws.shared.nominal_values import typical_stiffness
-from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.number_ranges import value_at
+from jaxhil.mechanism.structs import Mechanism
 
 DELAY = "rig.force_sensor.delay"
 

@@ -9,8 +9,9 @@ from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.files import report_write_errors, write_atomically
 from jaxhil.mechanism.conversion import KeyProblem
 from jaxhil.mechanism.file import from_plain_data, load
+from jaxhil.mechanism.number_ranges import value_at
 from jaxhil.mechanism.overrides import parse_override
-from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.rig import digest
 from jaxhil.simulation.source_fingerprint import dependency_versions
 from tuning import terminal

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from jaxhil.mechanism.structs import Mechanism, value_at
+from jaxhil.mechanism.number_ranges import value_at
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw
 
 UNCERTAINTY_DRAWS = 4096  # number of draws that determine standard deviations and correlations
