@@ -34,5 +34,5 @@ def safe_sqrt(square: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def as_complex(value: Array) -> Array:
-    """Return real values as complex ones; strict promotion of types does not mix both."""
+    """Return real values as complex ones, because JAX's strict type promotion does not mix both."""
     return lax.complex(value, jnp.zeros_like(value))

@@ -12,7 +12,7 @@ NAMES = (
     "contact",
 )
 STIFFNESS = 124355.0  # N/m, of `rig-300kg`
-HARDWARE_LAG, FORCE_LAG = 12, 4  # periods of the position behind the command, and of the force behind it
+HARDWARE_LAG, FORCE_LAG = 12, 4  # periods: position behind the command, force behind the position
 
 
 def record_contacts(make_controller, mechanism, contacts=2, force_lag=FORCE_LAG, ticks=260):

@@ -1,4 +1,4 @@
-"""Low-pass filter of the force sensor: poles, exact response, derivative, rehearsal, refusals."""
+"""Low-pass filter of the force sensor: poles, exact response, derivative, rehearsal, rejections."""
 
 import numpy as np
 import pytest

@@ -45,7 +45,8 @@ from tuning.rig.udp_task import MISSED_TICK, ControllerTask
 
 STATE_TOLERANCE = 1e-8  # of the largest (angular) velocity
 MECHANISMS = ("probe-drogue", "ring-capture", "hydraulic-hexapod", "petals", "claw-two-arms")
-# Controllers of a gain document; the last two are those of a bundle. A folder is for the C sources.
+# Functions that make a controller from a gain document and a folder for C sources; a bundle contains the
+# last two controllers.
 CONTROLLERS = {
     "package": lambda document, folder: Controller6.from_dict(document),
     "python_file": lambda document, folder: controller_of_bundle(document),

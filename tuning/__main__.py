@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit as stop:
         # The parser has printed its message for wrong arguments on standard error.
         if stop.code == EXIT_UNUSABLE_INPUT:
-            _print_error_document(words, "wrong arguments: standard error names them", EXIT_UNUSABLE_INPUT)
+            _print_error_document(words, "wrong arguments: see standard error", EXIT_UNUSABLE_INPUT)
         raise
     except InputError as error:
         # If the error has a text that names the command's option, that text is printed.

@@ -37,7 +37,7 @@ def emit(*things: RenderableType, wrap: bool = True) -> None:
         for thing in things:
             console = _make_console(sys.stdout)
             if isinstance(thing, Table):
-                console.print(thing.title or "")  # the table itself would cut a title that is wider
+                console.print(thing.title or "")  # the table would cut a title that is wider than itself
                 thing.title = None
                 console.width = _table_width(thing, console)
             console.print(thing, soft_wrap=not wrap)
@@ -57,7 +57,7 @@ def suggest(*words: str) -> None:
 def emit_json(command: str, document: Mapping[str, Any]) -> None:
     """Print the result of a command as JSON on standard output.
 
-    Unless the document has its own, its schema is `jaxhil/COMMAND/1`, and its verdict is "good".
+    If the document has no schema, add `jaxhil/COMMAND/1`; if it has no verdict, add "good".
     """
     defaults = {"schema": f"jaxhil/{command}/1", "verdict": "good"}
     print_json({**{key: value for key, value in defaults.items() if key not in document}, **document})

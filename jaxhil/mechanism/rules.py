@@ -343,17 +343,17 @@ def _check_jitter(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
 
 
 def _check_missed_ticks(mechanism: Mechanism) -> None:
-    """Raise `KeyProblem` if ticks are missed between two surfaces."""
+    """Raise `KeyProblem` if a mechanism with two surfaces has missed ticks."""
     path = "rig.missed_tick_probability"
     if _is_used(mechanism, path) and math.isfinite(mechanism.contact.clearance):
         found = format_value(mechanism.rig.missed_tick_probability)
         raise KeyProblem(
-            tuple(path.split(".")), found, "0, because a clearance does not support missed ticks"
+            tuple(path.split(".")), found, "0, because missed ticks are not supported with a clearance"
         )
 
 
 def _is_used(mechanism: Mechanism, path: str) -> bool:
-    """Return whether a number is not 0, or uncertain."""
+    """Return whether the number at `path` is uncertain or not 0."""
     return bool(value_at(mechanism, path)) or path in mechanism.uncertainty
 
 

@@ -74,10 +74,10 @@ def low_frequency_delay(sensor_filter: SensorFilter | None) -> float:
 
 def settling_constant(sensor: ForceSensor | SixAxisForceSensor) -> float:
     """Return the time constant [s] of a force sensor's lag, or of the slowest mode of its filter."""
-    stated = sensor.filter
-    if stated is None:
+    low_pass = sensor.filter
+    if low_pass is None:
         return sensor.time_constant
-    return 1 / (2 * math.pi * stated.cutoff * find_modes(stated.kind, stated.order).slowest)
+    return 1 / (2 * math.pi * low_pass.cutoff * find_modes(low_pass.kind, low_pass.order).slowest)
 
 
 def _butterworth_rates(order: int) -> list[complex]:

@@ -55,7 +55,7 @@ FilterKind = Literal["butterworth", "bessel"]
 MAX_FILTER_ORDER = 4
 Distribution = Literal["uniform", "loguniform", "normal"]
 
-DEAD_ZONE_KINDS = "larger readings: reduced by the dead zone, or unchanged (cut)"
+DEAD_ZONE_KINDS = "forces above the dead zone: reduced by it (continuous) or unchanged (cut)"
 
 # Types of the entries of lists. A number must be finite unless its metadata contains `infinite`.
 Stiffness = Annotated[float, key_metadata("slope of the force", "N/m", gt=0.0)]
@@ -202,7 +202,7 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     numerator: Numerator | None = None
     denominator: Denominator | None = None
     window: (
-        Annotated[float, key_metadata("time over which moving_average takes the mean", "s", gt=0.0, le=1.0)]
+        Annotated[float, key_metadata("time span over which moving_average averages", "s", gt=0.0, le=1.0)]
         | None
     ) = None
     delay: Annotated[float, key_metadata("transport delay of the motion", "s", ge=0.0, le=1.0)] = 0.0
@@ -227,7 +227,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
     delay: Annotated[float, key_metadata("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
     jitter: Annotated[
-        float, key_metadata("largest deviation of the delay, uniform from tick to tick", "s", ge=0.0, le=1.0)
+        float, key_metadata("largest deviation of the delay, uniform for each tick", "s", ge=0.0, le=1.0)
     ] = 0.0
     loss_probability: Annotated[
         float,

@@ -21,7 +21,7 @@ from pathlib import Path
 COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
 WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
-# For each number of axes, the channels of the mapping, with the prefix of their columns and the suffixes.
+# Channels of the mapping by number of axes: name, and prefix and suffixes of the columns.
 CHANNELS = {
     1: tuple(
         (name, name, ("",))
@@ -37,7 +37,7 @@ CHANNELS = {
         ("wrench_command", "command_", WRENCH),
     ),
 }  # fmt: skip
-DEFAULT_TICKS = 600_000  # number of ticks that are kept: ten minutes at 1 kHz
+DEFAULT_TICKS = 600_000  # number of ticks in memory: ten minutes at 1 kHz
 
 
 class FlightRecorder:
@@ -46,7 +46,7 @@ class FlightRecorder:
     Args:
         period: control period [s].
         axes: number of axes, 1 or 6.
-        ticks: number of ticks that are kept; a later tick replaces the oldest one.
+        ticks: number of ticks in memory; when it is full, a new tick replaces the oldest one.
         equivalent_mass: mass of a one-axis numerical model [kg] for the mapping, so that `identify` needs no
             prior; None to leave it out.
 
@@ -76,7 +76,7 @@ class FlightRecorder:
         self._count = self._contact = 0
 
     def __len__(self) -> int:
-        """Return the number of ticks that are kept."""
+        """Return the number of ticks in memory."""
         return min(self._count, self._ticks)
 
     def add(
@@ -96,7 +96,7 @@ class FlightRecorder:
             position_desired: position of the numerical model before the tick [m]; six axes: pose [m, rad].
             velocity_desired: velocity of the numerical model [m/s]; six axes: twist [m/s, rad/s].
             position_measured: position reading [m]; six axes: pose [m, rad].
-            time: time of the tick [s]; None for the tick's number times the period.
+            time: time of the tick [s]; if None, the number of the tick times the period.
             command: command that `step` has returned [N]; six axes: wrench [N, N m].
             faults: bits of the tick's faults, and of the faults that tripped the controller.
         """
@@ -106,12 +106,12 @@ class FlightRecorder:
             values = tuple(value for vector in values for value in vector)  # pyright: ignore
         start = self._count % self._ticks * self._width
         row = array("d", (stamp, *values, self._contact, faults))  # pyright: ignore
-        if len(row) == self._width:  # a vector of another length would move all later rows
+        if len(row) == self._width:  # a vector of another length would shift all later rows
             self._rows[start : start + self._width] = row
             self._count += 1
 
     def next_contact(self) -> None:
-        """Begin a new run: call this method when the controller's `next_contact` is called."""
+        """Begin a new run; call this method together with the controller's `next_contact`."""
         self._contact += 1
 
     def write(self, path: str | os.PathLike[str]) -> None:
@@ -136,7 +136,7 @@ class FlightRecorder:
                 *values, contact, faults = self._rows[start : start + self._width]
                 file.write(",".join([*map(repr, values), f"{contact:.0f}", f"{faults:.0f}"]) + "\n")
         with log.with_suffix(".toml").open("x", encoding="utf-8", newline="\n") as file:
-            # A literal string has no escapes, and file patterns treat brackets as sets.
+            # A literal string of TOML contains no quotes, and file patterns treat brackets as sets.
             file.write(self.mapping("".join("?" if letter in "'[]*" else letter for letter in log.name)))
 
     def mapping(self, pattern: str) -> str:

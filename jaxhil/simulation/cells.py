@@ -261,7 +261,7 @@ def _divide_part(counts, whole, lag):
 
 
 def _divide_at(edges, before):
-    """Add an edge at the time `before` the end of the part [periods], or at the nearer end of the part."""
+    """Add an edge at the time `before` [periods] before the part's end, clipped to the range of the edges."""
     kink = jnp.clip(before, edges.before[-1], edges.before[0])
     edges = -jnp.sort(-jnp.concatenate([edges.before, kink[None]]), axis=0)
     return _CellEdges(edges, edges[:-1] - edges[1:])

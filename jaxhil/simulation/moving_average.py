@@ -61,7 +61,7 @@ def discretise_moving_average(
         force_fraction: Fraction of the interval at which the force is sampled.
         position_fraction: Fraction of the interval at which the position is sampled; None if unused.
         hold: Hold of the position command, "linear" or "zoh" (zero-order hold).
-        ends: Whether to return the rows for the interval's start and end too.
+        ends: Whether to return the rows of the interval's start and end too.
     """
     split = split_window(window, control_period)
     fraction = split.fraction
@@ -71,7 +71,7 @@ def discretise_moving_average(
         position, velocity, _ = motion_rows(window, control_period, s, is_before, hold)
         return position, velocity / control_period[None]
 
-    # A reading at the instant at which the command of the window's start jumps has the value before the jump.
+    # If the command at the window's start jumps at the sampling instant, the reading is that before the jump.
     position, velocity = motion(force_fraction, force_fraction <= fraction + TOLERANCE)
     measured = None
     if position_fraction is not None:
@@ -101,7 +101,7 @@ def motion_rows(
         window: Length of the window [s].
         control_period: Control period [s].
         s: Fraction of the interval.
-        is_before: Whether the instant lies before the window's start passes a tick.
+        is_before: Whether the window's start has not yet passed a tick at this instant.
         hold: Hold of the command.
     """
     width, fraction = window / control_period, split_window(window, control_period).fraction
@@ -139,7 +139,7 @@ def read_leaving_commands(
     """Return the state with the commands between which the window's start moves in the current interval.
 
     Args:
-        ring: Delay line of the drive commands at the end of each interval [m], with that of this interval.
+        ring: Delay line of the drive commands at the end of each interval [m], including this interval.
         tick: Number of the tick.
         split: Window, divided into periods.
         state: State of the motion simulator.

@@ -117,8 +117,8 @@ def sample_force(
         quantum: Quantisation step [N]; 0 without quantisation.
         dead_zone: Half-width of the dead zone [N].
         range_: Largest reading [N].
-        step: Change of the force since the last tick [N] if the dead zone cuts (`cut_dead_zone`). None if it
-            is continuous, and is also subtracted from larger forces.
+        step: Change of the force since the last tick [N], for a cut dead zone (`cut_dead_zone`). None for a
+            continuous dead zone, which is also subtracted from larger forces.
     """
     force = quantise(force, quantum)
     if step is None:
@@ -133,9 +133,10 @@ def sample_force(
 def cut_dead_zone(force: Float[Array, "*batch"], dead_zone: Array, step: Array) -> Float[Array, "*batch"]:
     """Replace forces [N] up to `dead_zone` [N] by 0; larger forces remain unchanged.
 
-    The reading jumps on the tick after the force crosses the dead zone's edge. Which tick this is depends on
-    the phase of the contact in the control period. The derivative is that of the mean over all phases, during
-    which the force covers its last `step` [N] uniformly. A `step` of 0 leaves out the jumps.
+    The reading jumps at the first tick after the force crosses the edge of the dead zone. The phase of the
+    contact in the control period determines this tick. The derivative is that of the mean reading over all
+    phases: over the phases, the force is spread uniformly over its last change `step` [N]. A `step` of 0
+    leaves out the jumps.
     """
     return jnp.where(jnp.abs(force) > dead_zone, force, 0)
 
@@ -148,8 +149,8 @@ def _differentiate_cut(primals, tangents):
     for side in (1, -1):
         edge = side * dead_zone
         crosses = (force > edge) != (force - step > edge)
-        # A force that is larger by 1 N crosses the edge earlier, or later, by 1/|step| ticks. In this time,
-        # the reading is larger by the dead zone.
+        # A force that is larger by 1 N enters earlier, or leaves later, by 1/|step| ticks. During this
+        # time, the reading is larger by the dead zone.
         gain = jnp.where(crosses, dead_zone / jnp.where(crosses, jnp.abs(step), 1), 0)
         slope = slope + gain * (force_slope - side * dead_zone_slope)
     return cut_dead_zone(*primals), slope

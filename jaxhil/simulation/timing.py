@@ -3,10 +3,11 @@
 The delay of the force reading at a tick deviates from its nominal value by at most the jitter, uniformly. The
 reading is the real force at exactly this earlier time, from the exact motion between the samples. If a frame
 of the force sensor is lost, the controller reads the last frame again. At a missed tick the controller does
-not run: the numerical model rests, and the drives receive the last position command once more.
+not run: the numerical model keeps its position and velocity, and the drives receive the last position
+command again.
 
-The effects at a tick depend only on the key of the scenario, the index of the contact, and the number of
-ticks since the run began, as the noise of the sensors does. No effect occurs at the first tick of a run.
+Like the noise of the sensors, the effects at a tick depend only on the key of the scenario, the index of the
+contact, and the number of ticks since the run began. No effect occurs at the first tick of a run.
 """
 
 from typing import Any, NamedTuple
@@ -25,8 +26,9 @@ from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.sensors import uniform_noise
 
 TIMING_STREAM = 0x40000000  # offset of the contact's index, which separates these numbers from the noise
-SERIES_DEGREE = 16  # degree of the power series of the motion in an interval, accurate to rounding up to
-MAX_SERIES_POLE = 1.0  # this pole of the motion simulator [rad per control period]
+SERIES_DEGREE = 16  # degree of the power series of the motion in an interval
+# Largest pole of the motion simulator [rad per control period] for which the series is accurate to rounding.
+MAX_SERIES_POLE = 1.0
 
 
 class TimingDraws(NamedTuple):
@@ -80,8 +82,8 @@ def hold_compensator(missed: Bool[Array, "*batch"], before: Any, after: Any, rin
     """
 
     def unchanged(leaf):
-        # The position in a delay line follows from the number of the tick, which is common to all lanes. The
-        # samples move on with this number.
+        # The number of the tick, which is common to all lanes, determines the position in a delay line. The
+        # samples of a lane that keeps its state must therefore move on by one position.
         is_ring = leaf.ndim == missed.ndim + 1 and leaf.shape[0] == ring
         return jnp.roll(leaf, 1, axis=0) if is_ring else leaf
 

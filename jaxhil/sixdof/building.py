@@ -77,14 +77,14 @@ def build_scenarios(
 
 def make_loop(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -> Loop:
     """Return the loop that runs a mechanism's scenarios with a compensator."""
-    rig, sensor, stated = mechanism.rig, scenario.sensor, mechanism.rig.force_sensor.filter
+    rig, sensor, low_pass = mechanism.rig, scenario.sensor, mechanism.rig.force_sensor.filter
     return build_loop(
         scenario,
         integrator=rig.integrator,
         hold=rig.command_hold,
         latency=rig.command_latency,
         side=rig.force_sensor.side,
-        sensor_filter=None if stated is None else find_modes(stated.kind, stated.order),
+        sensor_filter=None if low_pass is None else find_modes(low_pass.kind, low_pass.order),
         cuts_dead_zone=rig.force_sensor.dead_zone_kind == "cut"
         and bool(np.any(np.asarray(sensor.errors.dead_zone) > 0)),
         has_noise=bool(np.any(np.asarray(sensor.noise_std) > 0)),
@@ -202,10 +202,10 @@ def _sensor(mechanism: SixAxisMechanism, numbers: DrawnValues) -> sensor.Sensor:
     """Build the force sensor and the controller's assumptions about the sensor."""
     path = "rig.force_sensor."
     nothing: Any = np.zeros((6, numbers.number))
-    tool, stated, cutoff, slowest = _tool(mechanism, numbers), mechanism.rig.force_sensor.filter, None, 1.0
-    if stated is not None:
+    tool, low_pass, cutoff, slowest = _tool(mechanism, numbers), mechanism.rig.force_sensor.filter, None, 1.0
+    if low_pass is not None:
         cutoff = 2 * np.pi * numbers(path + "filter.cutoff")
-        slowest = find_modes(stated.kind, stated.order).slowest
+        slowest = find_modes(low_pass.kind, low_pass.order).slowest
     errors = sensor.SampleErrors(
         None if numbers.is_zero(path + "crosstalk") else np.eye(6)[:, :, None] + numbers(path + "crosstalk"),
         *(numbers(path + key) for key in ("bias", "quantum", "dead_zone", "range")),

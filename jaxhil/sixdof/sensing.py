@@ -46,7 +46,7 @@ def sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
 
 
 def start_filter(modes: FilterModes | None, nothing: Wrench) -> Any:
-    """Return the state of the force sensor's lag or filter before the first tick: its input is `nothing`."""
+    """Return the state of the force sensor's lag or filter before the first tick, for the input `nothing`."""
     if modes is None:
         return nothing
     return (jax.tree.map(as_complex, nothing),) * len(modes.rates)

@@ -124,7 +124,7 @@ def shadow(
             ticks = read_logged_ticks(paths, mapping, loaded.mechanism)
         except InputError as error:
             hint = (
-                " (describe the columns in a mapping file and pass it as map, with --map)"
+                " (describe the columns in a mapping file; pass it with --map or as `map`)"
                 if map is None
                 else ""
             )
@@ -142,7 +142,7 @@ def _list_logs(logs: Any) -> list[Path]:
 
 
 def _prepare_controller(gains: Any, loaded: Any) -> Callable[[Sequence[str]], Any]:
-    """Return a function that makes a controller without some of its limits; check the code of a bundle."""
+    """Return a function that makes a controller without given limits; check the code of a bundle."""
     from tuning.bundle.checking import find_code_differences
     from tuning.bundle.controller_kind import kind_of
     from tuning.bundle.manifest import is_bundle
@@ -150,7 +150,7 @@ def _prepare_controller(gains: Any, loaded: Any) -> Callable[[Sequence[str]], An
     kind = kind_of(loaded.document)
     arguments.check_has_runtime(loaded.compensator, kind.axes)
     if isinstance(gains, (str, os.PathLike)) and is_bundle(folder := Path(gains)):
-        # The code of this package then has the same behaviour as the bundle's code.
+        # If the check passes, the code of this package behaves like the bundle's code.
         if reasons := find_code_differences(folder, loaded.compensator, kind.axes):
             raise InputError(f"{to_one_line(str(folder))}: {reasons[0]}: for details, run jaxhil verify")
     gain_file = kind.check_document(loaded.document)

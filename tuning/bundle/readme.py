@@ -60,7 +60,7 @@ def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
     )
 
 
-# Change of the position in one period T for each integrator, after the change of the velocity.
+# Change of the position in one period T for each integrator; `velocity` is that at the end of the period.
 POSITION_CHANGES = {
     "semi_implicit_euler": "T * velocity",
     "explicit_euler": "T * velocity - T * T * acceleration",

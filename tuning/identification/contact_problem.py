@@ -149,7 +149,7 @@ class ContactProblem:
             if changed.all() or onsets is not None:
                 fit = self._solve(near, flags, onsets, pseudo)
                 continue
-            # The other surface positions have the same rows in contact, and so the same fit.
+            # The rows in contact, and therefore the fits, of the other surface positions have not changed.
             part = near[0]._replace(depth=near[0].depth[changed], columns=near[0].columns[changed])
             rows = pseudo and pseudo._replace(design=pseudo.design[changed])
             for values, change in zip(fit, self._solve([part], [flags[0][changed]], None, rows), strict=True):

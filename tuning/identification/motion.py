@@ -20,7 +20,8 @@ from tuning.identification.rational import MotionModel
 from tuning.identification.records import CampaignTiming, LoggedRun
 
 TICK_TOLERANCE = 1e-9  # periods; a time this close to a tick is treated as the tick
-# Maximum size of the cached motions (fits of several laws repeat the same delays), and minimum number.
+# Maximum size of the cached motions [bytes], and their minimum number. Fits of several contact laws repeat
+# the same delays.
 MAX_CACHED_BYTES, MIN_CACHED_MOTIONS = 3.2e7, 2
 
 
@@ -72,7 +73,7 @@ class MotionResponse:
         self._cache: dict[float, tuple[np.ndarray, np.ndarray]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state of a copy, which has an empty cache."""
+        """Return the state for copies and digests, with an empty cache."""
         return {**vars(self), "_cache": {}}
 
     def at(self, delay: float) -> tuple[np.ndarray, np.ndarray]:

@@ -63,8 +63,9 @@ def _draw_scene(
 ) -> list[tuple[LineCollection, Line2D, list[Polyline], np.ndarray, Any]]:
     """Draw the target in four subplots: two views of the ideal contact, and two of the contact on the rig.
 
-    Return for each subplot the data to draw the chaser in one frame of the animation: its lines, the path of
-    its docking interface C, its outline in frame C, its pose at each tick, and the view.
+    Return for each subplot the data to draw the chaser in one frame of the animation. The data are the lines
+    of the chaser, the path of its docking interface C, its outline in frame C, its pose at each tick, and the
+    view.
     """
     target, chaser = outlines(recorded.groups)
     middle, half = _shown_region(recorded)

@@ -28,8 +28,9 @@ COMPUTED: dict[str, Any] = {"color": BLUE, "linewidth": 1.3}
 def shadow_plot(comparison: ShadowComparison, title: str) -> Figure:
     """Plot logged commands, the controller's commands and their differences against time.
 
-    Each column shows one contact, at most `MAX_PANELS`: those with trips, then those with the largest
-    differences, in the order of the logs. On six axes, the norms of force and moment are drawn.
+    Each column shows one contact. At most `MAX_PANELS` contacts are shown: first those with trips, then those
+    with the largest differences. The columns follow the order of the logs. On six axes, the norms of force
+    and moment are drawn.
     """
     runs = [
         (ticks, run) for ticks, runs in zip(comparison.logs, comparison.runs, strict=True) for run in runs

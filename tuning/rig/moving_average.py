@@ -1,8 +1,8 @@
 """Exact discretisation of a moving average: the position is the mean of the command during a window.
 
-With the window of N + f control periods, the window's start moves within two sampling intervals during one
-control period: first in the line from a to b, after the fraction f in the line from b to c. The state is the
-position at the start of the sampling interval, and a, b, c. The rows are those of
+The window has N + f control periods. During one control period, the start of the window moves through parts
+of two sampling intervals: first on the line from command a to b and, after the fraction f, on the line from b
+to c. The state is the position at the start of the sampling interval, and a, b, c. The rows are those of
 `tuning.rig.discretisation`.
 """
 
@@ -50,7 +50,7 @@ def discretise_moving_average(
 
 
 def average_rows(window: float, period: float, hold: str, fraction: float, is_before: bool) -> MotionRows:
-    """Return the rows at a fraction of an interval, `is_before` or after the window's start passes a tick."""
+    """Return the rows at a fraction of an interval, before or after the window's start passes a tick."""
     width = window / period
     kink = width - math.floor(width + DELAY_ROUNDING_TOLERANCE)
     early, late = (fraction, 0.0) if is_before else (kink, fraction - kink)
@@ -69,7 +69,7 @@ def _line_value(fraction: float, hold: str) -> tuple[float, float]:
 
 
 def _line_integral(start: float, length: float, hold: str) -> tuple[float, float]:
-    """Return the weights in the integral over a part of an interval: the length times the middle's value."""
+    """Return the weights of an interval's ends in the integral of the command over a part of the interval."""
     before, after = _line_value(start + length / 2.0, hold)
     return length * before, length * after
 

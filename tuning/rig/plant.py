@@ -91,10 +91,10 @@ class RigHardware:
         self._limits = simulator.velocity_limit, simulator.acceleration_limit
         self._has_rate_limits = math.isfinite(min(self._limits))
         self._rows, self._size = constants.rows, constants.ring_size
-        stated, self._rates, self._weights = rig.force_sensor.filter, [], ()
-        if stated is not None:
-            modes = find_modes(stated.kind, stated.order)
-            self._rates = [2.0 * math.pi * stated.cutoff * rate for rate in modes.rates]
+        low_pass, self._rates, self._weights = rig.force_sensor.filter, [], ()
+        if low_pass is not None:
+            modes = find_modes(low_pass.kind, low_pass.order)
+            self._rates = [2.0 * math.pi * low_pass.cutoff * rate for rate in modes.rates]
             self._weights = modes.weights
         self._contact_intervals = constants.contact_intervals
         self._force_intervals = constants.force_intervals
@@ -233,7 +233,7 @@ class RigHardware:
     def _filter(self, clearance: float, *segments: tuple[MotionState, MotionState, float, float]) -> float:
         """Advance the force sensor's filter by two segments; return its output [N] between the segments.
 
-        A segment has its motion at both ends, its duration [s] and the deepest penetration before it [m].
+        A segment contains the motion at both ends, the duration [s] and the deepest penetration before [m].
         """
         outputs = []
         for start, end, duration, deepest in segments:

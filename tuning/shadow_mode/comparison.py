@@ -28,14 +28,14 @@ class FaultEntry(msgspec.Struct, frozen=True):
 
     name: str
     ticks: int  # number of ticks with the fault
-    first: float  # instant of the first of them, from the log's first row [s]
+    first: float  # instant of the first such tick, from the log's first row [s]
 
 
 class Trip(msgspec.Struct, frozen=True):
     """Trip of the controller in a contact."""
 
     time: float  # instant, from the log's first row [s]
-    reason: str  # names of the faults that caused it
+    reason: str  # names of the faults that caused the trip
 
 
 class ShadowContact(msgspec.Struct, frozen=True):
@@ -75,7 +75,7 @@ def compare_with_logs(
     """Feed the readings of logs to a controller; compare its commands with the logged ones.
 
     Args:
-        make_controller: Function that returns a new controller without the limits with these names.
+        make_controller: Function that takes names of limits, and returns a new controller without them.
         logs: Readings and commands of each log.
         mechanism: Mechanism of the gain file.
         is_session: Whether all logs belong to one session, so that the controller keeps what it identifies.

@@ -14,10 +14,10 @@ from scipy.interpolate import CubicSpline
 from tuning.shadow_mode.logged_ticks import LoggedTicks
 from tuning.shadow_mode.replay import ReplayedRun, compare_commands, relative_difference
 
-SPEED_SPAN_ROWS = 8  # rows on either side of a row between which the model's change of velocity is computed
+SPEED_SPAN_ROWS = 8  # rows before and after a row, between which the model's velocity changes are computed
 MIN_FORCE_SHARE = 0.05  # minimum size of a force that is used, as a share of the largest one
-MAX_SIGN_AGREEMENT = -0.5  # maximum agreement of force and motion that shows a flipped sign, from -1 to 1
-MIN_DIFFERENCE = 1e-3  # minimum difference of commands, divided by their range, that is explained
+MAX_SIGN_AGREEMENT = -0.5  # below this agreement of force and motion (-1 to 1), the sign is flipped
+MIN_DIFFERENCE = 1e-3  # a smaller difference of commands, divided by their range, is not explained
 MAX_SHIFT = 20  # periods, largest shift of the commands in the search
 SHIFT_STEP = 0.05  # periods, resolution of the search
 MIN_SHIFT = 0.1  # periods, smallest shift that is reported
@@ -53,10 +53,10 @@ def describe_lost_rows(ticks: LoggedTicks) -> str | None:
 
 
 def describe_signs(ticks: LoggedTicks) -> list[str]:
-    """Return a line for a force reading, and one for a command, that accelerates the approach.
+    """Return one line for each channel, force reading or command, whose sign is flipped.
 
-    A force that pushes the bodies apart must change the velocity of the numerical model accordingly: its
-    impulse times the change of velocity is positive.
+    A force must change the velocity of the numerical model in its own direction: the product of the force on
+    the model and the model's change of velocity is positive.
     """
     names = ("force_measured", "force_command") if ticks.axes == 1 else ("wrench_measured", "wrench_command")
     lines = []
@@ -64,8 +64,8 @@ def describe_signs(ticks: LoggedTicks) -> list[str]:
         agreement = _agreement(ticks, values)
         if agreement is not None and agreement < MAX_SIGN_AGREEMENT:
             lines.append(
-                f"{name}: the sign is flipped: while it pushes, the numerical model accelerates the other "
-                "way (if this is the log's error, correct the channel's sign in the mapping)"
+                f"{name}: the sign is flipped: the numerical model accelerates against this force (if the "
+                "log is wrong, correct the sign of this channel in the mapping)"
             )
     return lines
 
@@ -96,27 +96,27 @@ def _agreement(ticks: LoggedTicks, force: np.ndarray) -> float | None:
 
 
 def describe_shift(ticks: LoggedTicks, runs: Sequence[ReplayedRun]) -> str | None:
-    """Return a line if the logged commands are the controller's commands at another time.
+    """Return a line if the logged commands are the controller's commands, shifted in time.
 
-    The shift minimises the rms difference in the rows with a force. The line is None if the shift explains
-    less than three quarters of the difference, or if a fifth of the commands remains unexplained.
+    The shift minimises the rms difference in the rows with a force. Return None if the shift explains less
+    than three quarters of the difference, or if more than a fifth of the commands remains unexplained.
     """
     if (
         max((relative_difference(*compare_commands(ticks, run)) for run in runs), default=0.0)
         < MIN_DIFFERENCE
     ):
         return None
-    pieces = [piece for run in runs for piece in [_get_fit_rows(ticks, run)] if piece is not None]
-    if not pieces:
+    fits = [fit for run in runs for fit in [_get_fit_rows(ticks, run)] if fit is not None]
+    if not fits:
         return None
     shifts = np.arange(-MAX_SHIFT, MAX_SHIFT + SHIFT_STEP / 2, SHIFT_STEP)
     squares = np.zeros(len(shifts))
-    for spline, rows, logged in pieces:
+    for spline, rows, logged in fits:
         for index, shift in enumerate(shifts):
             squares[index] += float(np.sum((logged - spline(rows - shift)) ** 2))
     best = int(np.argmin(squares))
     unshifted = float(np.interp(0.0, shifts, squares))
-    power = sum(float(np.sum(logged**2)) for *_, logged in pieces)
+    power = sum(float(np.sum(logged**2)) for *_, logged in fits)
     if (
         abs(shifts[best]) < MIN_SHIFT
         or squares[best] > MAX_REMAINING_SHARE**2 * unshifted
@@ -154,8 +154,9 @@ def _get_fit_rows(ticks: LoggedTicks, run: ReplayedRun) -> tuple[CubicSpline, np
 def describe_force_delay(ticks: LoggedTicks, mechanism: Any) -> str | None:
     """Return a line if the force reading is later, or earlier, than the mechanism of the gains states.
 
-    A force F = k d + b d' whose reading lags by a delay is k d + (b - k delay) d' for slow contacts. The line
-    therefore supposes the damping b of the mechanism. It is None on six axes and for other contact laws.
+    In slow contacts, a delayed reading of the force F = k d + b d' is k d + (b - k delay) d'. To find the
+    delay, the function assumes the damping b of the mechanism. Return None on six axes and for other contact
+    laws.
     """
     if ticks.axes > 1 or mechanism.contact.law not in ("linear", "kelvin_voigt"):
         return None

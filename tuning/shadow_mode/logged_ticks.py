@@ -62,7 +62,7 @@ class LoggedTicks:
 
     @property
     def instant(self) -> np.ndarray:
-        """Return the time of each row from the first row [s], from the ticks if there are no stamps."""
+        """Return the time of each row from the first row [s]; without time stamps, use the ticks."""
         return self.period * self.tick if self.time is None else self.time
 
     @property
@@ -129,7 +129,8 @@ def _read_log(
     if (modes := more.get("mode")) is not None and isinstance(mapping, LogMapping):
         used &= classify_rows(modes, mapping, entry.kind, log.label) == KINDS.index("contact")
     if np.count_nonzero(used) < MIN_ROWS:
-        raise InputError(f"{log.label}: found {np.count_nonzero(used)} rows of contact runs, expected more")
+        rows_found = f"found {np.count_nonzero(used)} rows of contact runs"
+        raise InputError(f"{log.label}: {rows_found}, expected {MIN_ROWS} or more")
     if stamps is None or mapping.timing.clock == "index":
         stamps, tick = None, np.arange(rows, dtype=np.int64)
     else:
@@ -165,7 +166,7 @@ def _read_one_axis(log: OpenLog, mapping: LogMapping, period: float):
     columns, stamps, _, notes = read_channels(log, mapping, period)
     for name in ("force_measured", "force_command"):
         if name not in columns:
-            raise InputError(f"{log.label}: {name}: found no such channel, needed by shadow mode")
+            raise InputError(f"{log.label}: {name}: found no such channel, expected one for shadow mode")
     if "velocity_desired" not in columns:
         x = columns["position_desired"]
         columns["velocity_desired"] = np.diff(x, prepend=2 * x[:1] - x[1:2]) / period
@@ -192,7 +193,7 @@ def _read_six_axes(log: OpenLog, mapping: SixAxisLogMapping):
     for name in names:
         if read[name].dtype == object or len(read[name]) != len(read[names[0]]):
             where = f"{log.label}: column {format_value(name)}"
-            raise InputError(f"{where}: found other rows or texts, expected a number in each row")
+            raise InputError(f"{where}: found missing values or texts, expected a number in each row")
     if any(value is not None for value in log.clocks(names, channels.time.column).values()):
         raise InputError(f"{log.label}: found separate time stamps of channels, expected those of the rows")
     vectors = {

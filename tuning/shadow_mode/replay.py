@@ -1,10 +1,10 @@
 """Replay of a log's readings through the rig's controller, and comparison with the logged commands.
 
-The controller gets the readings of each logged tick, with the log's time stamp, in the order of calls of the
-rig: a position command before a run, then `step` and `position_command` in every tick, and `next_contact`
+The controller gets the readings of each logged tick, with the time stamp of the log. The calls are those on
+the rig: a position command before a run, then `step` and `position_command` in every tick, and `next_contact`
 before each further run. After a trip, the comparison of the run ends, and the next run has a new controller.
 
-Two kinds of audits of the watchdog suppose that the numerical model moves under the controller's own
+Two kinds of audits of the watchdog assume that the numerical model moves under the controller's own
 commands. In shadow mode it moved under the logged commands. An audit is therefore left out if the logged
 commands differ too much from the controller's commands: see `AUDITS`.
 """
@@ -23,7 +23,7 @@ from jaxhil.rig.faults import CONTACT_TOO_LONG, ENERGY_BALANCE, RESTITUTION, fau
 from jaxhil.rig.six_axes.faults import ENERGY_GAIN, MOMENTUM, UNPAID_IMPULSE
 from tuning.shadow_mode.logged_ticks import LoggedTicks
 
-ENDED_SHARE = 0.05  # maximum share of a run's largest force in its last row if the contact has ended
+ENDED_SHARE = 0.05  # a contact has ended if the last force is at most this share of the run's largest one
 
 
 class Audit(NamedTuple):
@@ -117,7 +117,7 @@ def _replay_run(controller: Any, ticks: LoggedTicks, rows: slice) -> ReplayedRun
             break
         commands[row] = command
     if trip is None and _has_ended(ticks.force[rows]):
-        controller.next_contact()  # it audits the contact
+        controller.next_contact()  # this call audits the contact
         _count(seen, controller.faults, instant[-1])
         trip = (instant[-1], controller.status) if controller.tripped else None
     record = controller.last_contact
@@ -154,8 +154,9 @@ def _has_ended(force: np.ndarray) -> bool:
 def compare_commands(ticks: LoggedTicks, run: ReplayedRun) -> tuple[np.ndarray, np.ndarray]:
     """Return the controller's minus the logged commands (rows, axes), and the ranges of the logged commands.
 
-    Rows without both commands are NaN. The first row of a run is NaN if its logged command is 0: rigs with a
-    noisy sensor command no force in the first tick. Force and moment have separate ranges.
+    Rows in which a command is missing are NaN. The first row of a run is NaN if its logged command is 0,
+    because rigs with a noisy sensor command no force in the first tick. Force and moment have separate
+    ranges.
     """
     logged = ticks.command[run.rows]
     difference = run.commands - logged
@@ -185,7 +186,7 @@ def replay_logs(
     """Replay all logs without the audits that are not valid for them.
 
     Args:
-        make_controller: Function that returns a new controller without the limits with these names.
+        make_controller: Function that takes names of limits, and returns a new controller without them.
         logs: Readings of each log.
         is_session: Whether all logs belong to one session.
 
@@ -210,7 +211,7 @@ def replay_logs(
 
 
 def _is_invalid(audit: Audit, logs: Sequence[LoggedTicks], replays: Sequence[Sequence[ReplayedRun]]) -> bool:
-    """Return whether an audit tripped the controller in a run whose commands the controller did not give."""
+    """Return whether an audit tripped the controller in a run with lost rows or with other commands."""
     for ticks, runs in zip(logs, replays, strict=True):
         for run in runs:
             has_gaps = np.any((ticks.gaps >= run.rows.start) & (ticks.gaps < run.rows.stop))

@@ -83,7 +83,7 @@ class Growth(NamedTuple):
 
 
 def explain_nonlinearity(mechanism: Mechanism, compensator: str) -> str | None:
-    """Return the reason why the growth is not computed, such as a nonlinear loop; None if it is."""
+    """Return the reason why the growth is not computed, such as a nonlinear loop; else None."""
     if compensator not in LINEAR_COMPENSATORS:
         return f"{compensator} is not linear"
     if not find_contact_law(mechanism.contact.law).is_linear:
@@ -174,9 +174,9 @@ def _program_parameters(mechanism: Mechanism, compensator: str, scenarios: Scena
     rig = mechanism.rig
     delay = np.asarray(scenarios.simulator.delay) + np.asarray(scenarios.force_sensor.delay)
     longest = int(np.max(np.floor(delay / np.asarray(scenarios.control_period) + 1e-9)))
-    stated, modes = rig.force_sensor.filter, None
-    if stated is not None:
-        modes = find_modes(stated.kind, stated.order)
+    low_pass, modes = rig.force_sensor.filter, None
+    if low_pass is not None:
+        modes = find_modes(low_pass.kind, low_pass.order)
     elif np.any(np.asarray(scenarios.force_sensor.time_constant) > 0):
         modes = find_modes("butterworth", 1)
     return ProgramParameters(

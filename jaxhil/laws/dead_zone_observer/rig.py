@@ -1,10 +1,11 @@
 """Phase lead with an observer of the force that the force sensor's dead zone removes.
 
-A dead zone of half-width dz [N] removes the force F up to dz. From larger forces, a continuous dead zone
-removes dz, and a cut one nothing. The observer estimates the removed force from k_n d, where k_n is the gain
-`observer_stiffness` and d the measured penetration, delayed like the force. A first-order low-pass filter
-smooths the estimate, and the phase lead acts on the sum of measured force and estimate. The method follows
-Li et al. 2026, who cut small forces and whose disturbance observer has a gain near 1 below 15 Hz.
+A dead zone of half-width dz [N] removes the force F up to dz. A continuous dead zone also subtracts dz from
+larger forces; a cut dead zone leaves them unchanged. The observer estimates the removed force from k_n d.
+Here k_n is the gain `observer_stiffness`, and d is the measured penetration, delayed like the force. A
+first-order low-pass filter smooths the estimate, and the phase lead acts on the sum of measured force and
+estimate. The method follows Li et al. 2026: their dead zone is cut, and the gain of their disturbance
+observer is near 1 below 15 Hz.
 """
 
 from collections.abc import Mapping

@@ -2,21 +2,24 @@
 
     F_c = lead(F + Q(s) u(k_n d)),     Q(s) = 1/(1 + s/(2 pi f))
 
-F is the measured force, dz the half-width of the dead zone, d the measured penetration, delayed like F, and
-k_n the nominal stiffness. u(F) is the force that the dead zone removes: clip(F, -dz, dz) for a continuous
-one; F for |F| <= dz and 0 otherwise for a cut one. Li et al. 2026 combine a hybrid Smith predictor with a
-disturbance observer (|Q| near 1 below 15 Hz) for a cut dead zone. A general disturbance observer adds
-Q (F_n - F), where F_n is the force of a nominal model. This observer uses the known effect of a dead zone;
-the nominal model k_n d replaces F in u. If k_n is wrong, the observer has an error only for |F| < dz, and
-with a cut dead zone between |F| = dz and |k_n d| = dz.
+F is the measured force, dz the half-width of the dead zone, and k_n the nominal stiffness. d is the measured
+penetration, delayed like F. u(F) is the force that the dead zone removes. A continuous dead zone removes
+clip(F, -dz, dz). A cut dead zone removes F if |F| <= dz, else 0.
+
+Li et al. 2026 combine a hybrid Smith predictor with a disturbance observer (|Q| near 1 below 15 Hz) for a cut
+dead zone. A general disturbance observer adds Q (F_n - F), where F_n is the force of a nominal model. This
+observer uses the known effect of a dead zone; the nominal model k_n d replaces F in u. If k_n is wrong, the
+observer has an error only for |F| < dz. With a cut dead zone, it also has an error between |F| = dz and
+|k_n d| = dz.
 
 Q is discretised by Tustin's rule. |Q| >= 0.9 up to 15 Hz needs f >= 15 Hz/sqrt(1/0.81 - 1) = 31 Hz. Q lags by
 1/(2 pi f). To compensate for this lag, the delay of d (`identification_delay`) is shorter than the force
 delay tau_f by the same time; this requires f >= 1/(2 pi tau_f).
 
 A continuous dead zone moves the surface of a linear contact by dz/k. The restitution does not change, but the
-hardware moves deeper into the mechanism, and its force is larger by dz. A cut dead zone removes unequal works
-from compression and from expansion, so that the restitution changes too. The observer corrects both.
+hardware moves deeper into the mechanism, and the contact force is larger by dz. A cut dead zone removes
+different amounts of mechanical work during compression and expansion. The restitution therefore changes too.
+The observer corrects both kinds of dead zone.
 """
 
 import math

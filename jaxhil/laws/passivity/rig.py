@@ -12,9 +12,9 @@ class Passivity(Compensator):
     """Compensator F_c = F, or F_c = -E/(T v_d) if E + T F v_d would be negative.
 
     E is the energy that the numerical model has given to the contact until this tick, v_d the velocity of the
-    numerical model, and T the control period. Each period contributes T F_c times the mean of its first and
-    last v_d, which is the energy that the model loses, whatever its mass and integrator. The second force
-    returns the energy to 0; it corresponds to a virtual damping alpha. It is never larger than F.
+    numerical model, and T the control period. Each period adds T F_c times the mean of v_d at its start and
+    end. This is the energy that the model loses, for every mass and integrator. The second form of F_c
+    returns E to 0; it corresponds to a virtual damping alpha. Its magnitude never exceeds that of F.
     """
 
     __slots__ = ("_command", "_energy", "_period", "_velocity")

@@ -4,8 +4,8 @@
     if E(n) + T F v_d < 0:  F_c = F + alpha v_d,  alpha = -(E(n) + T F v_d)/(T v_d^2)
 
 E is the energy that the numerical model has given to the contact, v_d its velocity, and T the control period.
-The mean velocity of each period includes the energy T^2 F_c^2/(2 M) that the integrator of the model adds: E
-is exactly the energy that the model has lost, for each integrator and without knowledge of the mass M. The
+The mean velocity of each period includes the energy T^2 F_c^2/(2 M) that the integrator of the model adds. E
+is therefore exactly the energy that the model has lost, for every integrator. The mass M is not needed. The
 virtual damping alpha returns E to 0. Then F_c = -E/(T v_d), limited to the magnitude of F. The compensator
 needs no gain and no knowledge of the rig. One limitation remains: later contacts of the run can gain the
 energy that an earlier, damped contact has dissipated (notebooks/guide/model.md section 6, item 17).
@@ -20,7 +20,7 @@ from jaxhil.laws.simulation_base import Compensator, Gain, clear_lanes
 
 
 class ObservedEnergy(NamedTuple):
-    """Energy that the contact has received until a tick, and what the next period's energy depends on."""
+    """Energy that the contact has received until a tick, and the signals that the next update needs."""
 
     energy: Float[Array, "*batch"]  # energy E [J] until the last tick
     command: Float[Array, "*batch"]  # force command F_c of the last tick [N]

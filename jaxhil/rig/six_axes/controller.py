@@ -112,8 +112,9 @@ class Controller6(ControllerBase):
     def from_sensor(self, reading: Sequence[float], pose: Sequence[float]) -> Vector:
         """Convert a reading of the force sensor to the wrench that `step` and `tare` expect.
 
-        A sensor on the moving side (section 5 of notebooks/guide/six_axes.md) has the axes and origin of C;
-        the result does not contain the weight of its tool. A sensor on the fixed side has those of T.
+        A sensor on the moving side reads in the axes and about the origin of C; the weight of its tool is
+        subtracted. A sensor on the fixed side reads in the axes and about the origin of T (section 5 of
+        notebooks/guide/six_axes.md).
 
         Args:
             reading: reading of the sensor, about the origin of its frame [N, N m].

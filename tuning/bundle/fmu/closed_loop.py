@@ -41,7 +41,7 @@ class FmuLoop(msgspec.Struct, frozen=True):
 def compare_fmu_loop(files: Mapping[str, bytes], loaded: Any) -> FmuLoop | None:
     """Close the loop through the FMUs of a checked bundle; compare the nominal contacts with the simulation.
 
-    The libraries are compiled from the sources, which `check_bundle` has compared. The sequential master adds
+    The libraries are compiled from the sources, which `check_bundle` has verified. The sequential master adds
     one period. Noise and the controller's limits are left out, because the limits may stop this run.
 
     Args:

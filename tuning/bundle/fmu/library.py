@@ -50,7 +50,7 @@ class FmuInstance:
         with tempfile.TemporaryDirectory(prefix="jaxhil-fmu-") as folder:
             path = Path(folder) / "library.so"
             path.write_bytes(library)
-            self._library = ctypes.CDLL(str(path))  # stays loaded after the file is gone
+            self._library = ctypes.CDLL(str(path))  # stays loaded after the file is deleted
         token = root.attrib["instantiationToken" if self._fmi == 3 else "guid"].encode()
         self._instance = self._instantiate(token)
         if not self._instance:

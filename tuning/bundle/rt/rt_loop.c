@@ -28,7 +28,7 @@
 #include "rt_loop.h"
 
 #define START_GRACE 0.1   /* s; overruns before this time are not counted */
-#define LATE_SHARE 0.25   /* periods; the loop was woken too late if it wakes up later than this */
+#define LATE_SHARE 0.25   /* periods; if the loop wakes up later than this, it was woken too late */
 #define BUDGET_SHARE 0.8  /* periods; a tick that computes for longer is an overrun */
 #define SILENCE 2.0       /* s; the loop ends if there are no readings for this time */
 #define STOP_TIME 5.0     /* s; longest time until the drives are at rest */
@@ -172,8 +172,8 @@ static void tick(double force, double position, double time, bool is_first) {
     add_row(&row);
 }
 
-/* Execute the ticks whose readings are missing: with interpolated readings, or, if there are too many, not at
- * all: the last force acts on, and the controller detects the gap in the time. */
+/* Make up for ticks whose readings are missing. Execute a few ticks with interpolated readings. If more ticks
+ * are missing, only the model moves, under the last force, and the controller detects the gap in the time. */
 static void catch_up(const readings *now, uint32_t missed) {
     const double most = jaxhil_exported_limits.missed_in_a_row;
     if ((double)missed > (most < MAX_INTERPOLATED ? most : MAX_INTERPOLATED)) {
@@ -311,7 +311,7 @@ static void print_latency(const char *name, const uint32_t *histogram) {
     printf("\n");
 }
 
-/* Lock the memory, and request the processor and the priority; each is left out if it is not permitted. */
+/* Lock the memory, and request the processor and the priority; continue without what is not permitted. */
 static void request_real_time(long cpu, int priority) {
     if (mlockall(MCL_CURRENT | MCL_FUTURE) != 0) {
         fprintf(stderr, "rt_loop: note: memory is not locked: %s\n", strerror(errno));
@@ -365,7 +365,7 @@ int main(int count, char **arguments) {
     action.sa_handler = request_stop;
     sigaction(SIGTERM, &action, NULL);
     sigaction(SIGINT, &action, NULL);
-    pthread_t writer; /* it starts before the priority is raised, so that it does not inherit it */
+    pthread_t writer; /* starts before the priority is raised, and therefore does not inherit it */
     if (pthread_create(&writer, NULL, write_log, NULL) != 0) {
         return 2;
     }

@@ -17,7 +17,7 @@ typedef struct {
     double time;           /* of the tick, from a steady clock [s] */
     double force, position;                   /* readings [N], [m] */
     double start_position, start_velocity;    /* of the model at tick 0 [m], [m/s]; NaN for the default */
-    double shift; /* added to the next deadline, to follow the clock of the plant [s]; 0 without one */
+    double shift; /* added to the next deadline, to follow the clock of the plant [s]; or 0 */
 } readings;
 
 typedef struct {
@@ -25,14 +25,14 @@ typedef struct {
     double position, rate;                    /* commands to the drives [m], [m/s] */
     double model_position, model_velocity;    /* of the model at this tick */
     double force;                             /* force on the model [N] */
-    uint32_t faults, cause;                   /* bits of the tick's faults, and of those that tripped */
+    uint32_t faults, cause;                   /* bits of the faults: of the tick, of the trip */
 } commands;
 
 typedef struct {
     bool (*open)(void *plant);                          /* wait until the plant is ready; false: give up */
-    bool (*read)(void *plant, readings *now);           /* false: there are no readings in this period */
+    bool (*read)(void *plant, readings *now);           /* false: no readings in this period */
     bool (*write)(void *plant, const commands *answer); /* false: the plant has not taken the commands */
-    void (*close)(void *plant);                         /* the drives are at rest, or the plant is lost */
+    void (*close)(void *plant);                         /* called at rest, or if the plant is lost */
     void *plant;
 } plant_io;
 

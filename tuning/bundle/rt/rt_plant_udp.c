@@ -44,7 +44,7 @@ static double seconds_now(void) {
     return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
 }
 
-/* Answer a request for a session, or store the readings of a packet of the session; return whether it has any. */
+/* Answer a request for a session, or store the readings of a packet; return whether there are readings. */
 static bool take_packet(udp_plant *udp, size_t size, const struct sockaddr_in *sender, readings *now) {
     unsigned char *const packet = udp->packet;
     const bool is_peer = udp->has_peer && sender->sin_port == udp->peer.sin_port &&
@@ -124,7 +124,7 @@ static bool udp_open(void *plant) {
     fflush(stdout);
     for (int number = 0; number < 300 && !stop_requested; number++) {
         if (udp_receive(udp, &first, 100000)) {
-            return true; /* the loop begins in phase with the first packet; its tick is repeated by the rig */
+            return true; /* the loop begins in phase with the first packet; the rig repeats its tick */
         }
     }
     return false;

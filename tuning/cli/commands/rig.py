@@ -16,7 +16,7 @@ from tuning.cli.options_rig import RigOptions
 MAX_EMPTY_LOOP_DURATION = 30.0  # s; longest duration of the empty loop, which only exchanges packets
 EMPTY_LOOP_SHARE = 0.2  # duration of the empty loop, divided by the run's duration
 MAX_TICKS = 2_000_000  # largest number of ticks in a run
-MINIMUM_RATE = 1e-3  # [1]; at lower rates, a run of 10 s would take more than 3 hours
+MINIMUM_RATE = 1e-3  # [1]; at this rate, a run of 10 s takes almost 3 hours
 MAX_TABLE_ROWS = 12  # largest number of contacts in the printed table
 
 
