@@ -124,7 +124,7 @@ def check_bytes(suffix, content):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("examples", [20, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [10, pytest.param(1000, marks=pytest.mark.slow)])
 def test_log_file_of_any_bytes_is_read_or_refused_with_one_line(examples):
     @settings(deadline=None, max_examples=examples)
     @given(st.sampled_from(SUFFIXES), st.booleans(), st.binary(max_size=400))
@@ -135,7 +135,7 @@ def test_log_file_of_any_bytes_is_read_or_refused_with_one_line(examples):
 
 
 @pytest.mark.filterwarnings("ignore")
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=10)
 @given(st.data())
 def test_damaged_log_file_of_any_format_is_read_or_refused_with_one_line(valid_files, data):
     suffix, content = data.draw(st.sampled_from(valid_files))
