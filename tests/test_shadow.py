@@ -145,6 +145,16 @@ def test_shadow_mode_exits_with_1_if_the_controller_trips(jaxhil, tmp_path):
     assert ran.code == 1 and "Bad: contact 1 of" in ran.out and "at 0.0800 s" in ran.out
 
 
+@pytest.mark.parametrize("factor, is_limited", [(1.0, False), (0.8, True), (0.0, True)])
+def test_shadow_verdict_states_that_differences_do_not_count(jaxhil, tmp_path, factor, is_limited):
+    log = write_columns(tmp_path / "log.csv", changed(force_command=factor * recorded()["force_command"]))
+    (tmp_path / "gains.json").write_text(json.dumps(gains().document))
+    ran = jaxhil("shadow", tmp_path, log)
+    assert ran.code == 0 and "Good: the controller would not have tripped." in ran.out
+    assert ("This verdict is about trips only" in ran.out) == is_limited
+    assert ("has no such range" in ran.out) == (factor == 0.0)
+
+
 def test_shadow_mode_leaves_out_audits_of_motion_under_other_commands(tmp_path):
     limited = gains(restitution_margin=1e-9, equivalent_mass=300.0)
     log = write_columns(tmp_path / "log.csv", recorded())

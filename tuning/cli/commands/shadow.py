@@ -10,6 +10,7 @@ from tuning.cli.commands import checks
 from tuning.cli.options_rig import Shadow
 
 MAX_TABLE_ROWS = 12  # largest number of contacts in the printed table
+MAX_ROUNDING_SHARE = 1e-3  # [1]; difference, divided by the range, that rounded logs can explain
 METRICS = "largest", "rms", "range"
 
 
@@ -67,6 +68,8 @@ def _describe(document: dict[str, Any]) -> Iterator[str]:
     shares = [contact["share"] for contact in contacts if contact["share"] is not None]
     if shares:
         yield f"Largest difference: {max(shares):.2g} of the range of the logged commands."
+    if len(shares) < len(contacts):
+        yield "A contact with a constant logged command, or without rows to compare, has no such range."
     for contact in contacts[:MAX_TABLE_ROWS]:
         faults = ", ".join(
             f"{fault['name']} {fault['ticks']} times from {fault['first']:.4f} s"
@@ -77,6 +80,9 @@ def _describe(document: dict[str, Any]) -> Iterator[str]:
     yield from (f"{finding}." for finding in document["findings"])
     if document["verdict"] == "good":
         yield "Good: the controller would not have tripped."
+        agrees = len(shares) == len(contacts) and max(shares) <= MAX_ROUNDING_SHARE
+        if document["findings"] or not agrees:
+            yield "This verdict is about trips only, not about the differences and findings above."
     yield from (f"Bad: {reason}." for reason in document["reasons"])
 
 
