@@ -134,6 +134,14 @@ def test_mechanism_file_rejects_unsupported_timing_effect(change, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("key", ["rig.force_sensor.jitter", "rig.missed_tick_probability"])
+def test_message_about_an_uncertain_timing_effect_states_its_largest_value(key):
+    raw = case(contact={**LIST, "clearance": 0.01}).mechanism
+    uncertain = {key: {"distribution": "uniform", "low": 0.0, "high": 0.001}}
+    with pytest.raises(InputError, match=re.escape(f"{key}: found 0.001, expected 0, because")):
+        from_plain_data(raw | {"uncertainty": uncertain}, "case")
+
+
 def test_jitter_of_fast_motion_simulator_is_rejected_in_one_line():
     fast = {"model": "first_order", "time_constant": 0.001}
     with pytest.raises(InputError, match=re.escape("at most 1 / control_period for rig.force_sensor.jitter")):

@@ -78,7 +78,7 @@ def check_mechanism_rules(mechanism: Mechanism) -> None:
             lambda: _check_velocity_limit(mechanism, spans),
             lambda: _check_gap(mechanism, spans),
             lambda: _check_jitter(mechanism, spans),
-            lambda: _check_missed_ticks(mechanism),
+            lambda: _check_missed_ticks(mechanism, spans),
         ]
     )
 
@@ -342,11 +342,11 @@ def _check_jitter(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
         raise KeyProblem(key, found, f"0, because {reason} excludes jitter")
 
 
-def _check_missed_ticks(mechanism: Mechanism) -> None:
+def _check_missed_ticks(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
     """Raise `KeyProblem` if a mechanism with two surfaces has missed ticks."""
     path = "rig.missed_tick_probability"
     if _is_used(mechanism, path) and math.isfinite(mechanism.contact.clearance):
-        found = format_value(mechanism.rig.missed_tick_probability)
+        found = format_value(_build_extreme_function(mechanism, spans)(path, 1))
         raise KeyProblem(
             tuple(path.split(".")), found, "0, because missed ticks are not supported with a clearance"
         )
