@@ -79,6 +79,7 @@ def test_loop_in_c_stops_on_sigterm_with_the_drives_at_rest(folder):
 def test_loop_in_c_refuses_wrong_options(program, tmp_path):
     for arguments, words in (
         (["--lag", "x.csv"], "--lag: unknown option"),
+        (["--log"], "--log: found no value"),
         (["--log", "x.txt"], "expected a name that ends in .csv"),
         (["--log", str(tmp_path / "no" / "x.csv")], "cannot be created"),
     ):

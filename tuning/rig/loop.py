@@ -31,6 +31,7 @@ MAX_CATCH_UP_PERIODS = 10  # largest delay of the rig [periods] after which it s
 BUSY_WAIT_TIME = 100_000  # time before a tick [ns] in which the loop polls the clock; a sleep may be too long
 START_DELAY = 50_000_000  # time from the start of the loop to the first tick [ns]
 MAX_SILENCE = 2.0  # time without an answer after which the loop ends: the controller has ended or hangs [s]
+MAX_UNANSWERED_TICKS = 100  # at least this number of ticks without an answer, as for the controller's process
 TIME_AFTER_TRIP = 1.0  # time for which the rig continues after the controller has tripped [s]
 
 
@@ -99,8 +100,8 @@ def run_loop(
 ) -> None:
     """Execute ticks in real time until `timing` is full, or until 1 s after the controller has tripped.
 
-    The loop also ends if the controller's process sends no answer for `MAX_SILENCE`. After an interruption,
-    `timing` holds the ticks executed so far.
+    The loop also ends if the controller's process sends no answer for `MAX_SILENCE` and for
+    `MAX_UNANSWERED_TICKS`. After an interruption, `timing` holds the ticks executed so far.
 
     Args:
         task: work of the rig in each tick.
@@ -135,7 +136,7 @@ def run_loop(
             timing.ticks = number + 1
             if number % second == 0:
                 tell(number)
-            if number - timing.newest_answer > MAX_SILENCE / period:
+            if number - timing.newest_answer > max(MAX_SILENCE / period, MAX_UNANSWERED_TICKS):
                 break
             if task.tripped and last == total:
                 last = number + round(TIME_AFTER_TRIP / period)

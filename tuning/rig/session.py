@@ -141,6 +141,10 @@ class SessionSettings(NamedTuple):
         """Return the real time from one tick to the next [s]."""
         return self.mechanism.rig.control_period / self.rate
 
+    def count_ticks(self, duration: float) -> int:
+        """Return the number of ticks of a run with this duration [s] in simulated time."""
+        return max(1, round(duration / self.mechanism.rig.control_period))
+
 
 def run_session(
     setup: SessionSettings,
@@ -196,7 +200,7 @@ def _run_controller_loop(
 
     Return the report of the loop, and whether the user interrupted it.
     """
-    ticks = max(1, round(duration / setup.mechanism.rig.control_period))
+    ticks = setup.count_ticks(duration)
     record, interval = scratch / f"{type(task).__name__}.json", setup.tick_interval
     options = ["--empty"] * isinstance(task, EmptyTask) + ["--realtime"] * setup.priority
     options += ["--gains", str(setup.gains.resolve()), "--record", str(record), "--ticks", str(ticks)]
@@ -205,8 +209,9 @@ def _run_controller_loop(
     timing, interrupted = PacketTimes(ticks), False
     try:
         port = setup.port if process is None else read_listening_port(process)
+        name = "udp_controller.py" if process is not None else f"--connect {port}"
         network = Network(("127.0.0.1", int(port or 0)), injection, setup.seed, ticks, answered_packet_number)
-        session = open_session(network, axes)
+        session = open_session(network, axes, name)
         try:
             with real_time_priority(setup.priority):
                 run_loop(task, network, session, interval, timing, lambda done: progress(done, ticks))
@@ -282,7 +287,7 @@ def read_listening_port(process: subprocess.Popen) -> int:
     return int(line[1])
 
 
-def open_session(network: Network, axes: int) -> int:
+def open_session(network: Network, axes: int, name: str = "udp_controller.py") -> int:
     """Request a session until the controller's process answers; return the session's number.
 
     Raise InputError if there is no answer within `START_TIMEOUT`, or if the controller has another number of
@@ -299,13 +304,9 @@ def open_session(network: Network, axes: int) -> int:
         if opening.axes == axes:
             return opening.session
         network.close()
-        raise InputError(
-            f"udp_controller.py: axes of the controller: found {opening.axes}, expected {axes}, as the rig"
-        )
+        raise InputError(f"{name}: axes of the controller: found {opening.axes}, expected {axes}, as the rig")
     network.close()
-    raise InputError(
-        f"udp_controller.py: the process did not answer a request for a session within {START_TIMEOUT:g} s"
-    )
+    raise InputError(f"{name}: the process did not answer a request for a session within {START_TIMEOUT:g} s")
 
 
 def build_loop_report(

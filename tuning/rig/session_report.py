@@ -15,10 +15,15 @@ def is_stalled(contact: dict[str, Any], setup: SessionSettings, run: LoopReport 
     """Return whether the computer, and not the controller, delayed the commands during a contact.
 
     This is the case if a command was older than `MAX_COMMAND_AGE` periods and the controller did not cause
-    any missed tick of the contact. Such a contact says nothing about the controller. If faults are injected,
-    the result is always False.
+    any missed tick of the contact. Such a contact says nothing about the controller. The result is always
+    False if faults are injected, and for a running controller, whose missed ticks have unknown causes.
     """
-    if run is None or setup.injection.any or contact["oldest_command"] <= MAX_COMMAND_AGE:
+    if (
+        run is None
+        or setup.injection.any
+        or setup.port is not None
+        or contact["oldest_command"] <= MAX_COMMAND_AGE
+    ):
         return False
     first, last = contact["packets"]
     return not np.any(run.causes[first : last + 1] == CAUSE_CONTROLLER)
@@ -50,6 +55,9 @@ def evaluate_session(
         setup, rig, session, [contact["status"] for contact in contacts], errors, limit
     )
     good = f"the controller caused no missed tick, and every {_describe_error(rig)} is within {limit:g}."
+    if setup.port is not None and session.run is not None:
+        missed = f"{session.run.metrics.missed} of {session.run.metrics.ticks} ticks were missed"
+        good = f"every {_describe_error(rig)} is within {limit:g}; {missed}, with unknown causes."
     if session.tripped:
         good = "the injected faults caused the trip, and every command was finite and within its limits."
     return {
@@ -129,6 +137,15 @@ def _failure_reasons(
         if run.controller["ended"] not in ("stopped",):
             reasons.append(
                 f"the controller's process ended before the run (reason: {run.controller['ended']})."
+            )
+        ticks = setup.count_ticks(setup.duration)
+        if (
+            run.metrics.ticks < ticks
+            and setup.port is not None
+            and not (session.tripped or session.interrupted)
+        ):
+            reasons.append(
+                f"the controller stopped answering: the run ended at tick {run.metrics.ticks} of {ticks}."
             )
     wrong = [error for error in errors if not abs(error) <= limit]
     if wrong:

@@ -338,6 +338,10 @@ int main(int count, char **arguments) {
     const char *path = NULL;
     double seconds = 0.0;
     long cpu = -1, priority = 80;
+    if (count % 2 == 0) {
+        fprintf(stderr, "rt_loop: %s: found no value\n", arguments[count - 1]);
+        return 2;
+    }
     for (int n = 1; n + 1 < count; n += 2) {
         const char *const name = arguments[n], *const value = arguments[n + 1];
         if (strcmp(name, "--log") == 0) {

@@ -186,8 +186,11 @@ static bool udp_write(void *plant, const commands *answer) {
 static void udp_close(void *plant) { close(((udp_plant *)plant)->socket); }
 
 bool rt_plant_option(const char *name, const char *value) {
+    if (strcmp(name, "--port") != 0) {
+        return false;
+    }
     the_plant.peer.sin_port = htons((uint16_t)strtol(value, NULL, 10));
-    return strcmp(name, "--port") == 0;
+    return true;
 }
 
 const plant_io rt_plant = {udp_open, udp_read, udp_write, udp_close, &the_plant};
