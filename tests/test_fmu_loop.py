@@ -81,7 +81,11 @@ def test_verify_closes_the_loop_through_the_fmus_of_a_bundle(jaxhil, tmp_path):
     write_bundle(tmp_path / "bundle", made.files)
     document = tuning.verify(tmp_path / "bundle", scenarios=2).document
     loop = document["fmu_loop"]
-    assert document["verdict"] and (loop["fmi"], loop["command_latency"], loop["reasons"]) == (3, 1, ())
+    assert document["verdict"] == "good" and (loop["fmi"], loop["command_latency"], loop["reasons"]) == (
+        3,
+        1,
+        (),
+    )
     assert [contact["status"] for contact in loop["contacts"]] == ["ok"] * 3
     ran = jaxhil("verify", tmp_path / "bundle", "--scenarios", 2)
     assert ran.code == 0 and "Nominal contacts with the FMUs of FMI 3, rig.command_latency = 1" in ran.out

@@ -130,7 +130,8 @@ def _verify_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: 
 
 def _add_fmu_loop(document: dict[str, Any], files: Any, gains: Any, progress: bool) -> dict[str, Any]:
     """Close the loop through the FMUs of a bundle that has both; add the result to the document."""
-    if not any(name.endswith("jaxhil_rig.fmu") for name in files):
+    has_rig = any(name.endswith("jaxhil_rig.fmu") for name in files)
+    if not has_rig or "mechanism" not in document:  # the gain file could not be read
         return document
     import msgspec
 
@@ -140,7 +141,7 @@ def _add_fmu_loop(document: dict[str, Any], files: Any, gains: Any, progress: bo
         stages.begin("running the nominal contacts with the FMUs")
         loop = compare_fmu_loop(files, arguments.load_gains(gains))
     if loop is None:
-        return document
+        return {**document, "fmu_loop": None}
     reasons = [*document["reasons"], *loop.reasons]
     return {
         **document,

@@ -7,6 +7,11 @@ from tuning import terminal
 from tuning.api.verify import verify
 from tuning.cli.options_rig import Verify
 
+NO_FMU_LOOP = (
+    "The loop through the bundle's FMUs was not closed: it needs a C compiler, no force bias, and a command "
+    "latency to which the master can add a period."
+)
+
 
 def run(options: Verify) -> int:
     """Verify a bundle or a gain file, and print the result.
@@ -120,8 +125,11 @@ def _print(document: dict[str, Any]) -> None:
                 texts=(5, 6),
             ),
         ]
-    if "fmu_loop" in document:
+    notes = []
+    if document.get("fmu_loop"):
         tables.append(_fmu_table(document["fmu_loop"]))
+    elif "fmu_loop" in document:
+        notes = [NO_FMU_LOOP]
     if result_is_good and document.get("axes") == 6:
         lines = [
             f"Good: commands agree to {document['replay_limit']:.0e} of their range, the final twist to "
@@ -134,4 +142,4 @@ def _print(document: dict[str, Any]) -> None:
         ]
     else:
         lines = [f"Bad: {reason}" for reason in document["reasons"]]
-    terminal.emit(*tables, *lines)
+    terminal.emit(*tables, *notes, *lines)
