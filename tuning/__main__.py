@@ -114,7 +114,8 @@ def _print_error_document(words: Sequence[str], text: str, code: int) -> None:
 
     verdict = terminal.INTERRUPTED if code == EXIT_INTERRUPTED else terminal.UNUSABLE_INPUT
     with contextlib.suppress(InputError):  # standard output cannot be written
-        terminal.emit_json_error(words[0], verdict, [text])
+        command = next((word for word in words if not word.startswith("-")), "")
+        terminal.emit_json_error(command, verdict, [text])
 
 
 def _discard_output() -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff
 
-from jaxhil.errors import InputError, format_value, to_one_line
+from jaxhil.errors import InputError, format_value
 from jaxhil.files import report_write_errors, resolve_output_path
 from jaxhil.simulation.jax_environment import jax_context
 from tuning import terminal
@@ -143,16 +143,14 @@ def _list_logs(logs: Any) -> list[Path]:
 
 def _prepare_controller(gains: Any, loaded: Any) -> Callable[[Sequence[str]], Any]:
     """Return a function that makes a controller without given limits; check the code of a bundle."""
-    from tuning.bundle.checking import find_code_differences
+    from tuning.bundle.checking import check_bundle_code
     from tuning.bundle.controller_kind import kind_of
-    from tuning.bundle.manifest import is_bundle
 
     kind = kind_of(loaded.document)
     arguments.check_has_runtime(loaded.compensator, kind.axes)
-    if isinstance(gains, (str, os.PathLike)) and is_bundle(folder := Path(gains)):
+    if isinstance(gains, (str, os.PathLike)):
         # If the check passes, the code of this package behaves like the bundle's code.
-        if reasons := find_code_differences(folder, loaded.compensator, kind.axes):
-            raise InputError(f"{to_one_line(str(folder))}: {reasons[0]}: for details, run jaxhil verify")
+        check_bundle_code(Path(gains), loaded.compensator, kind.axes)
     gain_file = kind.check_document(loaded.document)
 
     def make_controller(unlimited: Sequence[str]) -> Any:

@@ -55,7 +55,9 @@ def _read_times() -> dict[str, float]:
         times = json.loads((Path(folder or ".") / RECORD_FILE).read_bytes())
     except (OSError, ValueError):
         return {}
-    return {name: value for name, value in times.items() if isinstance(value, float)} if folder else {}
+    if folder is None or not isinstance(times, dict):
+        return {}
+    return {name: value for name, value in times.items() if isinstance(value, float)}
 
 
 def _name(mechanism: AnyMechanism, compensator: str) -> str:

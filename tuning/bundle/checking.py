@@ -18,7 +18,7 @@ from jaxhil.errors import InputError, format_value, to_one_line
 from tuning.bundle import selftest
 from tuning.bundle.content import bundle_files, code_files, find_formats
 from tuning.bundle.fmu.archive import find_library
-from tuning.bundle.manifest import package_version
+from tuning.bundle.manifest import is_bundle, package_version
 
 SELFTEST_TIMEOUT = 600.0  # longest duration of the self-test [s]
 MAX_REASONS = 50  # largest number of reported reasons; a damaged file may have thousands
@@ -74,6 +74,13 @@ def find_code_differences(folder: Path, compensator: str, axes: int = 1) -> list
     reasons = [reason for reason in checked.reasons if selftest.PYTHON_CACHE not in reason]
     code = {name: content for name, content in checked.files.items() if name.endswith(".py")}
     return reasons or _find_export_differences(checked.files, code, lambda: code_files(compensator, axes))
+
+
+def check_bundle_code(folder: Path, compensator: str, axes: int) -> None:
+    """Raise `InputError` if the folder is a bundle that is damaged or contains code of another version."""
+    reasons = find_code_differences(folder, compensator, axes) if is_bundle(folder) else []
+    if reasons:
+        raise InputError(f"{to_one_line(str(folder))}: {reasons[0]}: for details, run jaxhil verify")
 
 
 def run_selftest(checked: BundleCheck, name: str) -> tuple[list[str], list[str]]:

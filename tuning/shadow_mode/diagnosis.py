@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from jaxhil.laws.shared.nominal_values import force_delay
 from tuning.shadow_mode.logged_ticks import LoggedTicks
 from tuning.shadow_mode.replay import ReplayedRun, compare_commands, relative_difference
 
@@ -167,8 +168,7 @@ def describe_force_delay(ticks: LoggedTicks, mechanism: Any) -> str | None:
     delays, errors = np.array(fits).T
     weights = 1.0 / np.maximum(errors, 1e-9) ** 2
     delay, error = float(np.average(delays, weights=weights)), float(np.sum(weights) ** -0.5)
-    sensors = mechanism.rig.force_sensor, mechanism.rig.position_sensor
-    expected = sensors[0].delay + sensors[0].time_constant - sensors[1].delay
+    expected = force_delay(mechanism) - mechanism.rig.position_sensor.delay
     change = delay - expected
     if abs(change) < max(MIN_DELAY_CHANGE, MIN_DELAY_SIGMAS * error):
         return None

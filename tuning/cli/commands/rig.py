@@ -35,6 +35,8 @@ def run(options: RigOptions) -> int:
     gains = arguments.find_gain_file(options.path)
     document, mechanism, stroke = load_checked_gains(gains)
     axes = document.get("axes", 1)
+    from tuning.bundle.checking import check_bundle_code
+
     check_bundle_code(Path(options.path), document["compensator"], axes)
     limit = arguments.choose_limit(options.limit, mechanism)
     period = mechanism.rig.control_period
@@ -96,16 +98,6 @@ def run(options: RigOptions) -> int:
         terminal.note("jaxhil: interrupted")
         return 130
     return 0 if result["verdict"] == "good" else 1
-
-
-def check_bundle_code(folder: Path, compensator: str, axes: int) -> None:
-    """Raise `InputError` if the folder is a bundle that is damaged or contains code of another version."""
-    from tuning.bundle.checking import find_code_differences
-    from tuning.bundle.manifest import is_bundle
-
-    reasons = find_code_differences(folder, compensator, axes) if is_bundle(folder) else []
-    if reasons:
-        raise InputError(f"{to_one_line(str(folder))}: {reasons[0]}: for details, run jaxhil verify")
 
 
 def write_controller_files(compensator: str, axes: int, scratch: Path) -> Path:
