@@ -14,12 +14,16 @@ import jaxhil
 import tuning
 from jaxhil import InputError
 from jaxhil.mechanism.file import from_plain_data, to_plain_data
+from jaxhil.mechanism.uncertainty import draw
+from jaxhil.simulation.loop_construction import build_loop
+from jaxhil.simulation.one_axis import evaluate
 from jaxhil.simulation.plausibility import check_run
 from jaxhil.simulation.scenario import build_scenarios
 from jaxhil.simulation.timing import draw_timing
 from tuning.bundle.fmu.rig import rig_fmu
 from tuning.rig.plant import RigHardware
 from tuning.rig.rig_task import build_simulated_rig
+from tuning.transparency.probes import build_probed_scenarios
 
 LIST = {"stiffness": [STIFFNESS, 0.5 * STIFFNESS], "damping": [500.0, 100.0]}
 AVERAGE = {"model": "moving_average", "window": 0.0144, "delay": 0.0021}
@@ -178,3 +182,15 @@ def test_gains_of_rig_with_timing_effects_are_verified():
     parsed = validated(case("response_error", sensor={**JITTER, **LOSS}, **MISSED).mechanism)
     result = tuning.tune(parsed, "phase_lead", scenarios=4, starts=1, validation=4)
     assert tuning.verify(result).good
+
+
+@pytest.mark.slow
+def test_reading_with_jitter_contains_the_push_of_a_probe():
+    """Without the push, a compensator would seem to ignore it."""
+    errors = []
+    for sensor in ({}, {"jitter": 1e-12}):
+        uncertainty = {"contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
+        parsed = validated({**case(sensor=sensor).mechanism, "uncertainty": uncertainty})
+        scenarios = build_probed_scenarios(parsed, draw(parsed, 4, 0)).scenarios
+        errors.append(np.asarray(evaluate(build_loop(parsed, "none", scenarios), {}, scenarios).error[0]))
+    np.testing.assert_allclose(errors[1], errors[0], rtol=0, atol=1e-9)

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.laws.shared.ring_buffer import look_back
 from jaxhil.simulation.motion_simulator import Propagation, SimulatorState, SplitWindow
@@ -64,32 +64,40 @@ def discretise_moving_average(
         ends: Whether to return the rows of the interval's start and end too.
     """
     split = split_window(window, control_period)
-    fraction = split.fraction
     zeros, ones = jnp.zeros_like(control_period), jnp.ones_like(control_period)
 
     def motion(s, is_before):
         position, velocity, _ = motion_rows(window, control_period, s, is_before, hold)
         return position, velocity / control_period[None]
 
-    # If the command at the window's start jumps at the sampling instant, the reading is that before the jump.
-    position, velocity = motion(force_fraction, force_fraction <= fraction + TOLERANCE)
-    measured = None
-    if position_fraction is not None:
-        measured, _ = motion(position_fraction, position_fraction <= fraction + TOLERANCE)
-    after, _ = motion(ones, ones <= fraction)
-    identity = jnp.eye(6, dtype=after.dtype).reshape(6, 6, *[1] * zeros.ndim)[1:4]
-    unchanged = jnp.broadcast_to(identity, (3, *after.shape))
+    def reading(s):
+        return motion(s, is_before_kink(window, control_period, s))
+
+    position, velocity = reading(force_fraction)
+    measured = None if position_fraction is None else reading(position_fraction)[0]
+    end = motion(ones, zeros > 0)
+    identity = jnp.eye(6, dtype=end[0].dtype).reshape(6, 6, *[1] * zeros.ndim)[1:4]
+    unchanged = jnp.broadcast_to(identity, (3, *end[0].shape))
     return Propagation(
-        transition=jnp.concatenate([after[None], unchanged]),
+        transition=jnp.concatenate([end[0][None], unchanged]),
         position=position,
         velocity=velocity,
         measured_position=measured,
-        start=motion(zeros, fraction > 0) if ends else None,
-        end=motion(ones, ones <= fraction) if ends else None,
+        start=motion(zeros, split.fraction > 0) if ends else None,
+        end=end if ends else None,
         steady_command=jnp.stack([ones] * 4),
         steady_velocity=_steady_velocity(split, window / control_period, hold),
         window=split,
     )
+
+
+def is_before_kink(window: Array, control_period: Array, s: Array) -> Bool[Array, "*batch"]:
+    """Return whether a reading at the fraction `s` of an interval has the motion before the kink.
+
+    The kink is at the instant at which the window's start passes a tick. A reading at this instant has the
+    value just before it.
+    """
+    return s <= split_window(window, control_period).fraction + TOLERANCE
 
 
 def motion_rows(

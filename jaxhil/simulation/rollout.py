@@ -285,11 +285,7 @@ def _restart(loop, gains, state, entered, begins, fresh):
     sensed = sensed_at_entry._replace(
         last=select_lanes(begins, sensed_at_entry.last, state.sensed.last),
         contact_time=select_lanes(begins, sensed_at_entry.contact_time, state.sensed.contact_time),
-        lagged=jnp.where(
-            begins if loop.sensor_filter is None else begins[None],
-            sensed_at_entry.lagged,
-            state.sensed.lagged,
-        ),
+        lagged=select_lanes(begins, sensed_at_entry.lagged, state.sensed.lagged),
         first_position=select_lanes(begins, sensed_at_entry.first_position, state.sensed.first_position),
     )
     return chosen._replace(

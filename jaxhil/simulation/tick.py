@@ -115,7 +115,7 @@ def tick(
     """Simulate one control period; return the next state and the record of the tick."""
     state, now = run.state, run.tick
     missed = None if timing is None else timing.is_missed
-    signals, plant_signals = sense(loop, rig, state, now, noise, timing)
+    signals, plant_signals = sense(loop, rig, state, now, noise, timing, prepared.probe)
     force, controller = compensate(loop, prepared, state, signals, now)
     if missed is not None and state.held is not None:
         force = jnp.where(missed, state.held.command, force)
@@ -161,6 +161,7 @@ def sense(
     now: Array,
     noise: SensorNoise,
     timing: TimingDraws | None = None,
+    probe: Probe | None = None,
 ) -> tuple[Signals, PlantSignals]:
     """Stage 1: return the sensor readings at tick `now`, and the real forces in the last interval."""
     scenario, sensed = rig.scenario, state.sensed
@@ -169,8 +170,7 @@ def sense(
     # With jitter, the derivative leaves out the jumps of a cut dead zone.
     step = jnp.zeros_like(sensor.dead_zone) if loop.cuts_dead_zone else None
     if timing is not None and timing.jitter is not None:
-        surfaces = Surfaces(loop.law, state.parameters, state.law, None)
-        force = read_force(rig, rings.inputs, surfaces, now, age, timing.jitter, loop.hold)
+        force = read_force(loop, rig, state, now, age, timing.jitter, probe)
     else:
         force_ring = rings.plant_signals.force if rings.reading is None else rings.reading
         force = _delayed_sample(force_ring, now, age, delays.force.intervals)

@@ -18,10 +18,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.lanes import select_lanes
 from jaxhil.laws.shared.ring_buffer import look_back
-from jaxhil.simulation.cells import IntervalInputs, horner_series
+from jaxhil.simulation.cells import horner_series
 from jaxhil.simulation.contact_force import MotionSample, Surfaces
 from jaxhil.simulation.motion_simulator import apply_row, split_delay
-from jaxhil.simulation.moving_average import TOLERANCE, motion_rows
+from jaxhil.simulation.moving_average import is_before_kink, motion_rows
+from jaxhil.simulation.probe import Probe
 from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.sensors import uniform_noise
 
@@ -95,39 +96,46 @@ def hold_compensator(missed: Bool[Array, "*batch"], before: Any, after: Any, rin
 
 
 def read_force(
+    loop: Any,
     rig: Any,
-    ring: IntervalInputs,
-    surfaces: Surfaces,
+    state: Any,
     now: Int[Array, ""],
     age: Int[Array, "*batch"],
     jitter: Float[Array, "*batch"],
-    hold: str,
+    probe: Probe | None,
 ) -> Float[Array, "*batch"]:
     """Return the real force [N] at tick `now` minus the delays and the jitter; 0 before the run.
 
     Args:
+        loop: Fixed properties of the loop; its contact law has no memory.
         rig: Constants of the run.
-        ring: Delay line of the inputs of the sampling intervals.
-        surfaces: Contact law of the current contact, without memory.
+        state: State of the loop before the tick.
         now: Number of the tick.
         age: Number of ticks since the run began.
         jitter: Deviation of the delay [s].
-        hold: Hold of the position command.
+        probe: Probe, whose push is added; None without a probe.
     """
     scenario, period = rig.scenario, rig.constants.control_period
-    simulator = scenario.simulator
+    simulator, first = scenario.simulator, state.first_contact
     # A drawn jitter may exceed the drawn delay.
     delay = split_delay(simulator.delay + jnp.maximum(scenario.force_sensor.delay + jitter, 0), period)
     is_available = age > delay.intervals
-    inputs = jax.tree.map(lambda leaf: look_back(leaf, now - 1, delay.intervals, is_available), ring)
+    inputs = jax.tree.map(
+        lambda leaf: look_back(leaf, now - 1, delay.intervals, is_available), state.sensed.rings.inputs
+    )
     if simulator.window is None:
         drive = (*inputs.state, inputs.start, inputs.end - inputs.start)
         position, rate = horner_series(rig.series, drive, delay.fraction)
-        if hold == "zoh" and not inputs.state:
-            rate = 0 * rate
     else:
-        is_before = delay.fraction <= rig.propagation.window.fraction + TOLERANCE
-        rows = motion_rows(simulator.window, period, delay.fraction, is_before, hold)
+        is_before = is_before_kink(simulator.window, period, delay.fraction)
+        rows = motion_rows(simulator.window, period, delay.fraction, is_before, loop.hold)
         position, rate = (apply_row(row, inputs.state, inputs.start, inputs.end) for row in rows[:2])
     motion = MotionSample(position - scenario.contact_plane, rate / period)
-    return jnp.where(is_available, surfaces.force(motion)[0], 0)
+    surfaces = Surfaces(loop.law, state.parameters, state.law, None)
+    force = jnp.where(is_available, surfaces.force(motion)[0], 0)
+    if probe is None:
+        return force
+    # The time of the first touch counts from the instants at which the force is sampled without jitter.
+    at = (age - 1 - delay.intervals).astype(period.dtype) + delay.fraction - rig.delays.force.fraction
+    since = jnp.where(first.made, at - first.time, -1e9) * period
+    return force + first.side * probe.push.force(since)

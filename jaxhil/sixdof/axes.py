@@ -29,9 +29,9 @@ from jaxhil.simulation.motion_simulator import (
 )
 from jaxhil.simulation.moving_average import (
     discretise_moving_average,
+    is_before_kink,
     motion_rows,
     read_leaving_commands,
-    split_window,
 )
 from jaxhil.simulation.scenario import MotionSimulatorBatch
 
@@ -102,7 +102,7 @@ def _build_averages(window, period, force, position, instant, hold, has_tool) ->
     exact = discretise_moving_average(window, period, force.fraction, instant, hold)
     acceleration = None
     if has_tool:
-        is_before = force.fraction <= split_window(window, period).fraction
+        is_before = is_before_kink(window, period, force.fraction)
         acceleration = motion_rows(window, period, force.fraction, is_before, hold)[2] / period[None] ** 2
     return Axes(exact, acceleration, force, position)
 
