@@ -27,6 +27,7 @@ class Simulated:
     contacts = ()
 
 
+@needs_compiler
 def test_fmu_loop_is_left_out_if_the_simulation_cannot_repeat_it(monkeypatch):
     gains = loaded(bundles.document())
     files = fmi3_files(gains.document)

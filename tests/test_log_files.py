@@ -135,17 +135,20 @@ def test_log_file_of_any_bytes_is_read_or_refused_with_one_line(examples):
 
 
 @pytest.mark.filterwarnings("ignore")
-@settings(deadline=None, max_examples=10)
-@given(st.data())
-def test_damaged_log_file_of_any_format_is_read_or_refused_with_one_line(valid_files, data):
-    suffix, content = data.draw(st.sampled_from(valid_files))
-    position = data.draw(st.integers(0, len(content) - 1))
-    if data.draw(st.booleans()):
-        check_bytes(suffix, content[:position])
-    else:
-        check_bytes(
-            suffix, content[:position] + bytes([data.draw(st.integers(0, 255))]) + content[position + 1 :]
-        )
+@pytest.mark.parametrize("examples", [10, pytest.param(400, marks=pytest.mark.slow)])
+def test_damaged_log_file_of_any_format_is_read_or_refused_with_one_line(valid_files, examples):
+    @settings(deadline=None, max_examples=examples)
+    @given(st.data())
+    def check(data):
+        suffix, content = data.draw(st.sampled_from(valid_files))
+        position = data.draw(st.integers(0, len(content) - 1))
+        if data.draw(st.booleans()):
+            check_bytes(suffix, content[:position])
+        else:
+            changed = bytes([data.draw(st.integers(0, 255))])
+            check_bytes(suffix, content[:position] + changed + content[position + 1 :])
+
+    check()
 
 
 @pytest.fixture(scope="module")

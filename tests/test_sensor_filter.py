@@ -31,9 +31,9 @@ def test_filter_modes_equal_the_analogue_prototype_of_scipy(kind, order):
     s = 1j * np.logspace(-2, 1.5, 15)
     response = 0.0 * s
     for rate, weight in zip(modes.rates, modes.weights, strict=True):
-        one = weight * rate / (s + rate)
+        mode = weight * rate / (s + rate)
         conjugate = np.conj(weight * rate) / (s + np.conj(rate))
-        response = response + (0.5 * (one + conjugate) if rate.imag else one)
+        response = response + (0.5 * (mode + conjugate) if rate.imag else mode)
     expected = prototype[2] / np.prod([s - pole for pole in prototype[1]], axis=0)
     np.testing.assert_allclose(response, expected, rtol=0, atol=1e-13)
     assert modes.delay == pytest.approx(-sum(1 / complex(pole) for pole in prototype[1]).real, rel=1e-12)

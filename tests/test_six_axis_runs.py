@@ -332,5 +332,5 @@ def test_init_command_copies_a_six_axis_builtin_with_new_name(jaxhil, tmp_path):
     path = tmp_path / "mine.toml"
     assert jaxhil("init", "petals", "-o", path).code == 0
     mine, builtin = load_any(path).mechanism, load_any("petals").mechanism
-    own = {"name": "mine", "source": mine.source}
-    assert to_plain_data(mine) == to_plain_data(builtin) | own and "built-in petals" in mine.source
+    changed = {"name": "mine", "source": mine.source}
+    assert to_plain_data(mine) == to_plain_data(builtin) | changed and "built-in petals" in mine.source

@@ -53,7 +53,8 @@ def test_rig_command_refuses_bundle_with_modified_controller(jaxhil, tmp_path):
         for other, content in signed({**made.files, name: made.files[name] + trap}, made.document).items():
             (folder / other).write_bytes(content)
         ran = jaxhil(*arguments)
-        assert ran.code == 2 and f"{name}: differs from what this version exports" in ran.err
+        assert (ran.code, ran.document["schema"]) == (2, "jaxhil/error/1")
+        assert f"{name}: differs from what this version exports" in ran.err
     assert not (tmp_path / "ran").exists()
 
 

@@ -365,8 +365,8 @@ def _print(document: dict[str, Any], folder: Path | None) -> None:
     items: list[Any] = [terminal.build_table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
     items.append(_check_table(document, "What the model does not explain"))
     items += [
-        f"The estimates of {pair['one']} and {pair['other']} are strongly correlated "
-        f"({pair['correlation']:.3f}): {pair['experiment']} would separate them."
+        f"The estimates of {terminal.format_key(pair['one'])} and {terminal.format_key(pair['other'])} are "
+        f"strongly correlated ({pair['correlation']:.3f}): {pair['experiment']} would separate them."
         for pair in document["confounded"]
     ]
     wrote = (
