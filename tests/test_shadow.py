@@ -123,6 +123,14 @@ def test_shadow_mode_reports_longer_delay_of_the_force_reading(tmp_path):
     assert "the delay of the force reading is 1.93 ms longer than in the mechanism" in line
 
 
+def test_shadow_mode_counts_the_delay_of_a_sensor_filter(tmp_path):
+    two_periods = "rig.force_sensor.filter={kind='bessel', order=1, cutoff=79.5775}"
+    document = sign(bundles.document("rig-300kg", "phase_lead", overrides=(two_periods,)))
+    log = write_columns(tmp_path / "log.csv", recorded(force_lag=shadow_logs.FORCE_LAG + 2))
+    findings = tuning.shadow(Result(document), log).document["findings"]
+    assert not [finding for finding in findings if "the delay of the force reading" in finding]
+
+
 def test_shadow_mode_accepts_rounded_logs_of_other_controllers(tmp_path):
     document = shadowed(tmp_path, recorded(), form=lambda value: f"{value:.6g}")
     assert max(shares(document)) < 1e-4 and document["findings"] == []
