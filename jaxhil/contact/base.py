@@ -51,7 +51,7 @@ class ContactLaw(abc.ABC):
     damped_law: ClassVar[str] = ""  # name of the same law with damping; empty: this law itself
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Make the subclass a frozen dataclass, so that a law can be a key of compiled programs."""
+        """Make the subclass a frozen dataclass, so that laws can be compared and hashed."""
         super().__init_subclass__(**kwargs)
         dataclass(frozen=True)(cls)
 
@@ -61,19 +61,22 @@ class ContactLaw(abc.ABC):
     def has_memory(self) -> bool:
         """Return whether the force depends on the deepest penetration so far.
 
-        If so, the simulation also updates the state of the law between samples. `step` must reset the
-        state at d <= 0. Between two calls, only the deepest point of the motion may affect the state.
+        If it does, the simulation also updates the law's state between samples. `step` must reset the state
+        at d <= 0. Between two calls of `step`, only the deepest point of the motion may affect the state.
         """
         return False
 
     @property
     def has_reversal_jump(self) -> bool:
-        """Return whether the force jumps when the motion reverses; its peak may lie between two samples."""
+        """Return whether the force jumps when the motion reverses.
+
+        If it does, the peak force may lie between two samples.
+        """
         return False
 
     @property
     def is_locally_parabolic(self) -> bool:
-        """Return whether a slow contact has a nearly parabolic force in each quarter of a control period.
+        """Return whether parabolas approximate the force of a slow contact, one in each quarter of a period.
 
         This is false if the slope changes at a given depth, if the force jumps when the motion reverses, or
         if the force near 0 is proportional to a power of the depth.
@@ -87,14 +90,14 @@ class ContactLaw(abc.ABC):
 
     @property
     def simulation_law(self) -> ContactLaw:
-        """Return the law to simulate instead of this law, so that laws with equal forces share a program."""
+        """Return an equivalent law to simulate, so that laws with equal forces share a compiled program."""
         return self
 
     def specialise(self, contact: Any, drawn: Callable[[str], bool]) -> ContactLaw:
-        """Return a faster law with the same force for a batch in which certain keys have only one value.
+        """Return a faster law with the same force, if certain keys have the same value in the whole batch.
 
         Args:
-            contact: the file's table `[contact]`.
+            contact: table `[contact]` of the mechanism file.
             drawn: function that returns whether the value of a key differs between batch elements.
         """
         return self.simulation_law
@@ -129,7 +132,7 @@ class ContactLaw(abc.ABC):
     def ideal_contact(self, parameters: Any, mass: Any, velocity: Any) -> IdealContact:
         """Return the ideal contact for an equivalent `mass` [kg] and an approach `velocity` [m/s].
 
-        By default the motion is integrated numerically (`jaxhil.contact.ideal_contact_motion`).
+        By default, this method integrates the motion numerically (`jaxhil.contact.ideal_contact_motion`).
         """
         from jaxhil.contact.ideal_contact import IdealContact
         from jaxhil.contact.ideal_contact_motion import integrate_contact
@@ -154,7 +157,8 @@ class ContactLaw(abc.ABC):
     def tangent_stiffness(self, parameters: Any, mass: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """Return the largest slope dF/dd [N/m] in each contact, an array (contacts, batch).
 
-        By default, the slope is `parameters.stiffness`; for a segmented law, this is the largest slope.
+        By default, this is `parameters.stiffness`. For a segmented law, `parameters.stiffness` must already
+        contain the largest slope of each contact.
         """
         return parameters.stiffness
 
@@ -165,7 +169,7 @@ class ContactLaw(abc.ABC):
     # Magnitudes of the contact, from a mechanism file
 
     def nominal_peak_force(self, contact: Any, stiffness: list[float], mass: float, velocity: float) -> float:
-        """Estimate the largest peak force [N] of a mechanism's contacts, by default as for a linear law."""
+        """Estimate the largest peak force [N] of a mechanism's contacts; by default for a linear spring."""
         return velocity * math.sqrt(max(stiffness) * mass)
 
     def damping_ratio(self, damping: float, mass: float, velocity: float, frequency: float) -> float:
@@ -180,7 +184,7 @@ class ContactLaw(abc.ABC):
     def perturb_damping(
         self, drawn: Callable[[str], np.ndarray], ratio: np.ndarray, mass: np.ndarray, velocity: np.ndarray
     ) -> tuple[str, np.ndarray]:
-        """Add to the contacts the energy loss of a linear oscillator with the damping ratio zeta.
+        """Increase the contacts' energy loss by that of a linear oscillator with the damping ratio zeta.
 
         Args:
             drawn: function that returns the random draws of a key, (draws, ...). For `stiffness` and
@@ -222,7 +226,15 @@ class ContactLaw(abc.ABC):
         return [stiffness, damping]
 
     def file_values(self, fitted: Mapping[str, np.ndarray], entry: int) -> dict[str, np.ndarray]:
-        """Convert the `fitted` coefficients of one contact to values of a mechanism file, by dotted key."""
+        """Convert the fitted coefficients of one contact to values of a mechanism file.
+
+        Args:
+            fitted: values of the coefficients, by their names in `regression`.
+            entry: index of the contact's entry in the lists `stiffness` and `damping`.
+
+        Returns:
+            Values by dotted key, such as "contact.stiffness.0".
+        """
         return {f"contact.stiffness.{entry}": fitted["stiffness"]}
 
     def _missing_method_error(self, method: str) -> InputError:

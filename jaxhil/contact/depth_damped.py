@@ -19,12 +19,12 @@ DEFAULT_REFERENCE_DEPTH = 1e-3  # m; reference depth d_0 for which identificatio
 class DepthDamped(PowerLaw):
     """Contact law F = max(0, k d^n + b d' d/d_0), with damping proportional to depth.
 
-    k is `stiffness` [N/m^n], n is `exponent` (1.5 for Hertz), b is `damping` [N s/m] at the depth d_0,
-    `reference_depth` [m]. The force does not jump at the onset. During the outward motion the surfaces
-    separate at a depth d > 0, where k d^(n-1) = b |d'|/d_0.
+    k is `stiffness` [N/m^n], n is `exponent` (1.5 for Hertz), d_0 is `reference_depth` [m], and b is
+    `damping` [N s/m], the damping constant at the depth d_0. The force does not jump at the onset. During the
+    outward motion, the surfaces separate at the depth d > 0 where k d^(n-1) = b |d'|/d_0.
 
-    The ideal contact is integrated numerically. It equals the ideal contact of Hunt and Crossley's law
-    without damping, and for n = 1 with chi = 2 b/(3 k d_0).
+    The ideal contact is integrated numerically. Without damping, or for n = 1, this law equals Hunt and
+    Crossley's law (`HuntCrossley`) with chi = 2 b/(3 k d_0).
     """
 
     name: ClassVar[str] = "depth_damped"
@@ -42,16 +42,17 @@ class DepthDamped(PowerLaw):
         return jnp.zeros_like(rate)
 
     def separation_function(self, parameters, state, penetration, rate):
-        """Return the unclamped F/d for d > 0, and its limit at d = 0 for d <= 0."""
+        """Return F/d before clamping at 0; for d <= 0, return the limit of F/d as d goes to 0."""
         touching = penetration > 0
         power = jnp.where(touching, penetration, 1) ** (parameters.exponent - 1)
         power = jnp.where(touching | (parameters.exponent == 1), power, 0)
         return parameters.stiffness * power + parameters.damping * rate / parameters.reference_depth
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add the b that damps the deepest point like Hunt and Crossley's law with chi = pi zeta/v.
+        """Add to `damping` the effect of Hunt and Crossley's damping constant chi = pi zeta/v.
 
-        zeta is the damping ratio `ratio`, and v the approach speed.
+        zeta is the damping ratio `ratio`, and v is the approach speed. The added force equals that of Hunt
+        and Crossley's law at the deepest penetration of the undamped contact.
         """
         stiffness, order = drawn("stiffness"), drawn("exponent")[:, None] + 1
         depth = (order * mass * velocity**2 / (2 * stiffness)) ** (1 / order)

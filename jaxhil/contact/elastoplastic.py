@@ -15,11 +15,11 @@ class Elastoplastic(ContactLaw):
 
     k is `stiffness` [N/m], r is `unloading_ratio` >= 1, and the state d_max [m] is the deepest penetration so
     far. Loading beyond d_max follows F = k d. Unloading and reloading below d_max follow the slope k_u; the
-    force is 0 for d <= d_max (1 - 1/r). The mechanism absorbs the energy k d_max^2/2 = M v^2/2 and returns
-    the fraction 1/r of it, so that the restitution is e = 1/sqrt(r). The law has no damping.
+    force is 0 for d <= d_max (1 - 1/r). The mechanism absorbs the energy k d_max^2/2 and returns the fraction
+    1/r of this energy, so that the restitution is e = 1/sqrt(r). The law has no damping.
 
-    d_max is reset when the mechanism leaves the surface (d <= 0), so that every contact starts undeformed. It
-    is not reset while F = 0 at d > 0.
+    d_max is reset to 0 when the mechanism leaves the surface (d <= 0), so that every contact starts
+    undeformed. Without contact force at a depth d > 0, d_max is not reset.
     """
 
     name: ClassVar[str] = "elastoplastic"
@@ -66,7 +66,10 @@ class Elastoplastic(ContactLaw):
         return parameters.stiffness * deepest - jnp.where(above > 0, slope, parameters.stiffness) * above
 
     def ideal_contact(self, parameters, mass, velocity):
-        """Return the ideal contact: a quarter period at sqrt(k/M) inward, then one at sqrt(k_u/M) outward."""
+        """Return the ideal contact, which consists of two quarter periods of harmonic oscillations.
+
+        The angular frequency is sqrt(k/M) during the inward motion and sqrt(k_u/M) during the outward motion.
+        """
         from jaxhil.contact.ideal_contact import IdealContact
 
         frequency = jnp.sqrt(parameters.stiffness / mass)
@@ -84,7 +87,10 @@ class Elastoplastic(ContactLaw):
         return parameters.stiffness * parameters.unloading_ratio
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Multiply r by exp(2 pi zeta) with zeta = `ratio`, because the restitution is 1/sqrt(r)."""
+        """Multiply the unloading ratio r by exp(2 pi zeta), where zeta is the damping ratio `ratio`.
+
+        This multiplies the restitution 1/sqrt(r) by exp(-pi zeta).
+        """
         return "unloading_ratio", drawn("unloading_ratio") * np.exp(2 * np.pi * ratio[:, 0])
 
     def as_float_law(self, contact, stiffness, damping):

@@ -16,12 +16,15 @@ class FloatLaw(NamedTuple):
     separation_function: ForceFunction
     # limit of the force [N] as d goes to 0 from above, a function of d' only
     onset_force: Callable[[float], float]
-    # only for a law with memory: returns the law after a deepest penetration [m]; 0: undeformed
+    # only for a law with memory: returns the law for a deepest penetration so far [m] (0 before contact)
     loaded_law: "Callable[[float], FloatLaw] | None" = None
 
 
 def clamp_force(spring: ForceFunction, onset_force: Callable[[float], float]) -> FloatLaw:
-    """Return the law with the force max(0, `spring`); `onset_force` is the limit of `spring` at d = 0."""
+    """Return a contact law whose force is `spring` [N], clamped at 0.
+
+    `onset_force` is the limit of `spring` as the penetration goes to 0, a function of the rate [m/s].
+    """
 
     def force(depth: float, rate: float) -> float:
         value = spring(depth, rate)

@@ -19,7 +19,8 @@ class Hardening(ContactLaw):
     spring's force is k at the surface and 4 k at the depth d_0.
 
     The ideal contact is integrated numerically. Without damping the restitution is 1, and the force is
-    largest at the deepest point, where k d^2/2 + k d^4/(4 d_0^2) = M v^2/2.
+    largest at the deepest point, where k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 for the equivalent mass M [kg] and
+    the approach speed v [m/s].
     """
 
     name: ClassVar[str] = "hardening"
@@ -42,7 +43,7 @@ class Hardening(ContactLaw):
         return parameters.stiffness * penetration * stiffening + parameters.damping * rate
 
     def undamped_peak_force(self, parameters, mass, velocity):
-        """Return the force [N] at the deepest point d, where M v^2/2 = k d^2/2 + k d^4/(4 d_0^2)."""
+        """Return the force [N] at the deepest point, where the spring stores all kinetic energy."""
         energy, unit = mass * velocity**2 / 2, parameters.reference_depth
         square = np.sqrt(1 + 4 * energy / (parameters.stiffness * unit**2)) - 1
         return parameters.stiffness * unit * np.sqrt(square) * (1 + square)
@@ -58,7 +59,7 @@ class Hardening(ContactLaw):
         return contact.reference_depth * max(forces)
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add 2 zeta sqrt(k M) to `damping`, where zeta is the damping ratio `ratio`."""
+        """Add 2 zeta sqrt(k M) to `damping`, where zeta is `ratio`, k `stiffness` and M `mass`."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
     def as_float_law(self, contact, stiffness, damping):
@@ -81,7 +82,7 @@ class Hardening(ContactLaw):
         return [stiffness, stiffness / contact.reference_depth**2, damping]
 
     def file_values(self, fitted, entry):
-        # The bounds keep the reference depth finite where the cubic coefficient is 0 or negative.
+        # The bounds keep the reference depth finite if the cubic coefficient is 0 or negative.
         ratio = fitted["stiffness"] / np.maximum(fitted["cubic"], 1e-12)
         depth = np.sqrt(np.maximum(ratio, 1e-12))
         return {**super().file_values(fitted, entry), "contact.reference_depth": depth}

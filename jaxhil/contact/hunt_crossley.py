@@ -11,14 +11,14 @@ from jaxhil.contact.regression import Regression, RegressionFamily
 
 
 class HuntCrossley(PowerLaw):
-    """Contact law F = max(0, k d^n (1 + (3/2) chi d')), n = 1.5 for Hertz (Hunt and Crossley 1975).
+    """Contact law F = max(0, k d^n (1 + (3/2) chi d')) (Hunt and Crossley 1975).
 
-    k is `stiffness` [N/m^n], n is `exponent`, and chi is `damping` [s/m].
+    k is `stiffness` [N/m^n], n is `exponent` (1.5 for Hertz), and chi is `damping` [s/m].
     """
 
     name: ClassVar[str] = "hunt_crossley"
     damping_unit: ClassVar[str] = "s/m"
-    FAST_EXPONENTS: ClassVar = (1.0, 1.5)  # exponents n that need no general power function, which is slow
+    FAST_EXPONENTS: ClassVar = (1.0, 1.5)  # exponents n for which d^n needs no power function, which is slow
 
     # n, if it is in `FAST_EXPONENTS` and equal for all batch elements; else None
     exponent: float | None = None
@@ -53,11 +53,17 @@ class HuntCrossley(PowerLaw):
         )
 
     def damping_ratio(self, damping, mass, velocity, frequency):
-        """Return zeta = chi v/pi: e is about 1 - chi v, and about 1 - pi zeta for a linear oscillator."""
+        """Return the damping ratio zeta = chi v/pi, where v is the approach speed.
+
+        The restitution is about 1 - chi v for this law, and about 1 - pi zeta for a linear oscillator.
+        """
         return damping * velocity / np.pi
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add pi zeta/v to chi with zeta = `ratio`, because the restitution is about 1 - chi v."""
+        """Add pi zeta/v to chi, where zeta is the damping ratio `ratio` and v the approach speed.
+
+        This reduces the restitution, which is about 1 - chi v, by about pi zeta.
+        """
         return "damping", drawn("damping") + np.pi * ratio / velocity * np.ones_like(drawn("stiffness"))
 
     def as_float_law(self, contact, stiffness, damping):
@@ -92,7 +98,10 @@ class HuntCrossley(PowerLaw):
 
 
 def _regression(exponent: float) -> Regression:
-    """Return the regression F = k d^n (1 + 1.5 chi d') with the unknown coefficients k and k chi."""
+    """Return the regression F = k d^n (1 + 1.5 chi d') with the unknown coefficients k and k chi.
+
+    `exponent` is n, and chi is the damping [s/m].
+    """
     return Regression(
         "hunt_crossley",
         lambda d, v: [d**exponent, 1.5 * v * d**exponent],

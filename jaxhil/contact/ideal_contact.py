@@ -66,7 +66,7 @@ def ideal_kelvin_voigt(
         jnp.where(sticks, jnp.inf, np.pi / (sine * frequency)),
     )
 
-    # F' = 0 at the phase 3 acos(xi) - pi of the oscillation, which exists for xi < 1/2 only.
+    # F is stationary at the phase 3 acos(xi) - pi of the oscillation, which exists for xi < 1/2 only.
     peaks_inside = damping_ratio < 0.5
     light = jnp.where(peaks_inside, damping_ratio, 0.25)
     sine = jnp.sqrt((1 - light) * (1 + light))
@@ -159,12 +159,15 @@ _ZETA = np.array(
     ]
 )
 _COTH_SERIES = 2 * (-1.0) ** (_SERIES_ORDERS + 1) * _ZETA / np.pi ** (2 * _SERIES_ORDERS)
-# Series of the first integral in terms of s, s coth(s) - 1 + log(sinh(s) / s).
+# Coefficients of s^(2k) in the first integral G = s coth(s) - 1 + log(sinh(s) / s).
 _POTENTIAL_SERIES = _COTH_SERIES * (1 + 1 / (2 * _SERIES_ORDERS))
 
 
 def _langevin(s):
-    """Return 1 - f(s) and L'(s) for s >= 0; f(s) = coth(s) - 1 / s is Langevin's function, L(s) = s f(s)."""
+    """Return 1 - f(s) and the derivative L'(s) of L(s) = s f(s) for s >= 0.
+
+    f(s) = coth(s) - 1 / s is Langevin's function.
+    """
     small = s < _MAX_SERIES_ARGUMENT
     square = jnp.where(small, s, 0.0) ** 2
     value, slope = jnp.zeros_like(s), jnp.zeros_like(s)
@@ -183,14 +186,18 @@ def _langevin(s):
 
 @jax.custom_jvp
 def _hunt_crossley_shape(onset, exponent):
-    """Return e, F_max D / (M v^2) and duration v / D, all dimensionless; D^(n+1) = (n + 1) M v^2 / k."""
+    """Return restitution, peak force and duration of a contact with Hunt and Crossley's law, dimensionless.
+
+    The unit of force is M v^2 / D and the unit of time D / v, where the length D satisfies
+    D^(n+1) = (n + 1) M v^2 / k. `onset` is q = 3 chi v / 2 (`ideal_hunt_crossley`).
+    """
     half_span, at_peak = _solve_half_span(onset), _solve_peak(onset, exponent)
     return _shape_at_roots(half_span, at_peak, onset, exponent)
 
 
 @_hunt_crossley_shape.defjvp
 def _hunt_crossley_shape_jvp(primals, tangents):
-    # All tangents are combinations of the two partial derivatives.
+    # The tangents are linear combinations of the partial derivatives with respect to `onset` and `exponent`.
     onset, exponent = primals
     root, at_peak = _solve_half_span(onset), _solve_peak(onset, exponent)
     root_slope = 1 + _langevin(root)[1]
@@ -211,7 +218,7 @@ def _shape_at_roots(half_span, at_peak, onset, exponent):
     """Return the results of `_hunt_crossley_shape` from the roots S = `half_span` and u = `at_peak`."""
     symmetry, _ = _langevin(half_span)
     exponent_ratio = exponent / (exponent + 1)
-    # The force is stationary in y / q^2 = `at_peak`, which needs no derivative.
+    # The peak force is stationary with respect to u = `at_peak`, so that u needs no derivative.
     y = onset**2 * at_peak
     potential = _scaled_potential(jnp.stack([onset, y]))
     depth_power = potential[0] - y * at_peak * potential[1]
@@ -233,7 +240,7 @@ def _solve_half_span(onset):
 
 
 def _solve_peak(onset, exponent):
-    """Return the root u = y / q^2 of G(q^2 u) / q^2 + n / (n + 1) u = G(q) / q^2 (`ideal_hunt_crossley`)."""
+    """Return u = y / q^2 at the peak force, where G(q) - G(y) = n y / (n + 1) (`ideal_hunt_crossley`)."""
     exponent_ratio = exponent / (exponent + 1)
     potential = _scaled_potential(onset)
 
@@ -299,7 +306,11 @@ def _duration_integral(half_span, exponent):
 
 
 def _gap_by_series(span, fraction):
-    """Return R of `_duration_integral`: (1 + r) sum_k g_k S^(2k-2) (1 + r^2 + ... + r^(2k-2)), r = s / S."""
+    """Return R of `_duration_integral` by a power series in S, for small S.
+
+    With r = s / S and the coefficients g_k of G (`_POTENTIAL_SERIES`),
+    R = (1 + r) sum_k g_k S^(2k-2) (1 + r^2 + ... + r^(2k-2)).
+    """
 
     def term(k, carry):
         total, power, partial_sum = carry

@@ -82,13 +82,16 @@ def integrate_contact(
         parameters: parameters of the law (`jaxhil.contact.laws.ContactParameters`).
         mass: equivalent mass M [kg].
         velocity: approach speed v [m/s].
-        push: p(t) [N], a function of the time since the first touch [s], (*batch), for
-            0 <= t <= `push_duration`. p may have kinks and jumps, but no detail shorter than
-            1/50 of `push_duration`.
+        push: function that returns p(t) [N] for a time t since the first touch [s], both (*batch). It is
+            used for 0 <= t <= `push_duration`. p may have kinks and jumps, but no detail shorter than 1/50
+            of `push_duration`.
         push_duration: end of the push [s]; later p = 0.
         times: requested times since the first touch [s], in any order. Before 0 and after the end the motion
             is assumed to be uniform.
         tolerance: limit on the relative error of each step, at least 32 times the rounding unit of the dtype.
+
+    Returns:
+        Restitution, peak force and duration of the contact, and the motion at `times`.
     """
     shape = jnp.broadcast_shapes(jnp.shape(mass), jnp.shape(velocity))
     mass, velocity = jnp.broadcast_to(mass, shape), jnp.broadcast_to(velocity, shape)
@@ -168,14 +171,14 @@ def _event_value(problem, state, time, depth, rate):
 
 
 def _contact_force(problem, state, depth, rate):
-    """Return the contact force [N]; at d <= 0, which a step may reach, its limit for d -> 0 from above."""
+    """Return the contact force [N]; at d <= 0, return the limit of the force for d -> 0 from above."""
     force, _ = problem.law.step(problem.parameters, state.memory, depth, rate)
     force = jnp.where(depth > 0, force, problem.law.onset_force(problem.parameters, rate))
     return jnp.where(state.phase < FREE, force, 0)
 
 
 def _try_step(problem, state, length):
-    """Return the motion after a step of `length` [s], and the errors of its depth [m] and rate [m/s]."""
+    """Return the motion after a step of `length` [s], and the estimated errors of depth and rate [m, m/s]."""
     pushes = state.time < problem.push_end
 
     def slope(offset, motion):
@@ -205,7 +208,7 @@ def _initial_state(problem):
 
 
 def _integrate_phases(problem, records):
-    """Integrate all contacts; return the final state, and the nodes or, if `records` is false, None."""
+    """Integrate all contacts. Return the final state and, if `records` is true, the nodes, else None."""
     like = problem.approach
     dtype, zeros = like.dtype, jnp.zeros_like(like)
     rounding = float(np.finfo(dtype).eps)
@@ -241,14 +244,14 @@ def _integrate_phases(problem, records):
         crosses = ~searching & is_accurate & (value <= 0)
         is_located = searching & ((search.tries >= MAX_EVENT_ITERATIONS) | (value == 0))
         is_accepted = active & (is_located | (~searching & is_accurate & ~crosses))
-        # A final Newton step gives the time of the event its derivative.
+        # A final Newton step makes the time of the event differentiable.
         slope = lax.stop_gradient(slope)
         correction = jnp.where(is_located & (slope < 0), -value / jnp.where(slope < 0, slope, -1), 0)
         after = _update_state(problem, state, step, trial, correction, is_located)
         growth = jnp.clip(0.9 * jnp.maximum(ratio, 1e-6) ** -0.2, 0.2, 5)
         at_start = event(state.time, state.depth, state.velocity)
         search = _update_search(search, step, step * growth, value, at_start, crosses, is_located)
-        # The motion of a batch element with values that are not finite ends here.
+        # If a batch element has values that are not finite, its motion ends here.
         after = after._replace(phase=jnp.where(jnp.isfinite(ratio), after.phase, ENDED))
         return select_lanes(is_accepted | ~jnp.isfinite(ratio), after, state), search, count + 1, nodes
 
@@ -261,7 +264,10 @@ def _integrate_phases(problem, records):
 
 
 def _propose_step(problem, state, search):
-    """Return the next step to try [s]: by regula falsi if an event is bracketed, else by error control."""
+    """Return the next step to try [s].
+
+    If an event is bracketed, the step comes from the false position method, else from the error control.
+    """
     rise = search.at_high - search.at_low
     middle = search.high - search.at_high * (search.high - search.low) / jnp.where(rise < 0, rise, -1)
     # A step does not cross the end of the push, and is at most 1/50 of the duration of the push.
@@ -272,7 +278,7 @@ def _propose_step(problem, state, search):
 
 
 def _fill_nodes(nodes, end, count):
-    """Set all nodes from index `count` on to the end of the motion."""
+    """Set the unused nodes, from index `count` on, to the state `end` at the end of the motion."""
     zeros = jnp.zeros_like(end.time)
     is_unused = jnp.arange(MAX_STEPS, dtype=count.dtype).reshape(-1, *[1] * zeros.ndim) >= count
     filling = end.time, end.depth, end.velocity, zeros, zeros
@@ -281,7 +287,7 @@ def _fill_nodes(nodes, end, count):
 
 
 def _update_search(search, step, proposed, value, at_start, crosses, is_located):
-    """Return the search for the event after one more step: started, narrowed, or finished."""
+    """Return the state of the search after one more step: the search starts, narrows its bracket, or ends."""
     searching = search.tries > 0
     before = value > 0
     # The Illinois rule halves the value at a bound that does not move for a second time.
@@ -303,7 +309,10 @@ def _update_search(search, step, proposed, value, at_start, crosses, is_located)
 
 
 def _update_state(problem, state, step, trial, correction, is_located):
-    """Return the state after a `step` and its `correction` [s]; a located event starts the next phase."""
+    """Return the state after a `step` [s] and its `correction` [s].
+
+    If the step ends at a located event, the next phase of the motion starts.
+    """
 
     def force_at(s):
         depth, rate = interpolate_step(s, step, state.depth, state.velocity, trial)
@@ -348,7 +357,7 @@ def _interpolate_nodes(nodes, end, approach, times):
     columns = _Nodes(*(leaf.reshape(leaf.shape[0], -1) for leaf in nodes))
     last = [leaf.reshape(1, -1) for leaf in (end.time, end.depth, end.velocity)]
     requested = times.reshape(times.shape[0], -1)
-    # The index has no derivative: the times of the nodes move with the parameters, their order does not.
+    # The index has no derivative: the parameters change the times of the nodes, but not their order.
     search = jax.vmap(lambda column, at: jnp.searchsorted(column, at, side="right"), 1, 1)
     index = jnp.clip(search(columns.time, requested) - 1, 0, MAX_STEPS - 2)
 

@@ -25,7 +25,7 @@ def solve_chained_oscillators(
     damping: Float[Array, "*batch"],
     velocity: Float[Array, "*batch"],
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """Return restitution, peak force [N] and duration [s] of the contact in `ideal_piecewise_linear`."""
+    """Return restitution, peak force [N] and duration [s]; for the arguments see `ideal_piecewise_linear`."""
     count = slopes.shape[0]
     zero = jnp.zeros_like(velocity)
     thicknesses = jnp.diff(depths, axis=0, prepend=zero[None])
@@ -129,8 +129,8 @@ def _traverse(decay, segment: _Segment, inward, state: _State) -> _State:
     forces = passage.spring[None] + stiffness[None] * distances + 2 * decay[None] * speeds
     distance, speed, end_force = distances[0], speeds[0], forces[0]
 
-    # The event is the zero of `residual`. One Newton step of value 0 gives the event's time its derivative.
-    # The culmination needs no such step, since F is stationary there.
+    # The event is the zero of `residual`. A Newton step whose value is 0 adds the derivative of the event's
+    # time. The culmination needs no such step, since F is stationary there.
     crosses = passage.crosses
     force_rate = stiffness * speed - 2 * decay * end_force
     residual = jnp.where(crosses, distance - passage.target, jnp.where(inward, speed, end_force))
@@ -160,9 +160,9 @@ def _traverse(decay, segment: _Segment, inward, state: _State) -> _State:
 
 
 def _compute_passage(decay, segment: _Segment, inward, state: _State, active) -> _SegmentPassage:
-    """Compute the motion of the `active` batch elements through a segment; its times have no derivative."""
+    """Compute the motion of the `active` batch elements through a segment, with times without derivatives."""
     stiffness, turns_here = segment.stiffness, state.segment == segment.number
-    # The outward motion enters a segment at its deeper end, but the turning segment at the turning point.
+    # The outward motion starts at the turning point, and enters each further segment at its deeper end.
     depth = jnp.where(inward, 0.0, jnp.where(turns_here, state.depth, segment.thickness))
     depth = jnp.where(active, depth, 0.0)
     velocity = jnp.where(active, state.velocity, 0.0)
@@ -194,7 +194,7 @@ def _compute_passage(decay, segment: _Segment, inward, state: _State, active) ->
 
 
 def _crossing_time(decay, stiffness, spring, velocity, target, start):
-    """Return the time [s], without derivative, to travel the distance `target`; 0 if `target` is 0.
+    """Return the time [s] to travel the distance `target` [m], without derivative; 0 if `target` is 0.
 
     `start` is 0 for the inward motion, and the time of separation for the outward motion. Since d is concave
     in time, Newton's method approaches the crossing from `start` without overshoot, until rounding stops it.
@@ -218,9 +218,10 @@ def _crossing_time(decay, stiffness, spring, velocity, target, start):
 
 
 def _first_zero(decay, stiffness, value, slope_share):
-    """Return the first zero of the solution of y'' + 2 a y' + k y = 0, y(0) >= 0, y'(0) = -(2 a y(0) + c).
+    """Return the time of the first zero of a damped oscillation y(t) [s].
 
-    The arguments are a, k, y(0) and c >= 0. With w^2 = k - a^2 the solution is
+    The oscillation satisfies y'' + 2 a y' + k y = 0 with y(0) >= 0 and y'(0) = -(2 a y(0) + c), c >= 0. The
+    arguments are a, k, y(0) and c. With w^2 = k - a^2 the solution is
     e^(-a t) (y(0) cos(w t) - (a y(0) + c) sin(w t) / w). Its zero is artanh(h y(0) / (a y(0) + c)) / h,
     h^2 = -w^2, for either sign of w^2. For k > a^2 the zero lies in the first quarter period.
     """
@@ -234,10 +235,10 @@ def _first_zero(decay, stiffness, value, slope_share):
 
 
 def _free_motion(decay, stiffness, spring, velocity, time):
-    """Return distance [m] and velocity [m/s] after `time` [s].
+    """Return distance [m] and velocity [m/s] after a `time` [s] of motion within one segment.
 
-    With the impulse response S and the initial spring force per mass, f = `spring`, the distance is
-    v S - f int S, and the velocity is v S' - f S.
+    S is the impulse response, f = `spring` the spring force per mass at the start, and v = `velocity` the
+    velocity at the start. The distance is v S minus f times the integral of S. The velocity is v S' - f S.
     """
     impulse, slope, integral = _impulse_response(decay, stiffness, time)
     return velocity * impulse - spring * integral, velocity * slope - spring * impulse
@@ -245,7 +246,7 @@ def _free_motion(decay, stiffness, spring, velocity, time):
 
 @jax.custom_jvp
 def _impulse_response(decay, stiffness, time):
-    """Return the impulse response S = e^(-a t) sin(w t) / w (w^2 = k - a^2), its rate S', and int S."""
+    """Return the impulse response S = e^(-a t) sin(w t) / w (w^2 = k - a^2), its rate S' and its integral."""
     over, rate = _characteristic_root(decay, stiffness)
     half = jnp.where(over, 0.0, rate * time) / 2
     sine = jnp.sin(half)

@@ -12,7 +12,7 @@ from jaxhil.contact.regression import Regression, RegressionFamily
 
 
 class KelvinVoigt(ContactLaw):
-    """Contact law F = k d + b d', clamped at 0 unless the key `tension` is true."""
+    """Contact law F = k d + b d' (k: `stiffness`, b: `damping`), clamped at 0 unless `tension` is true."""
 
     name: ClassVar[str] = "kelvin_voigt"
     keys: ClassVar = (ContactKey("tension", "whether {laws} may pull", default=False),)
@@ -46,7 +46,7 @@ class KelvinVoigt(ContactLaw):
         return np.sqrt(2 * (mass * velocity**2 / 2) * parameters.stiffness)
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add 2 zeta sqrt(k M) to `damping`, where zeta is the damping ratio `ratio`."""
+        """Add 2 zeta sqrt(k M) to `damping`, where zeta is `ratio`, k `stiffness` and M `mass`."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
     def as_float_law(self, contact, stiffness, damping):

@@ -16,7 +16,8 @@ def key_metadata(meaning: str, unit: str | None = None, **limits: Any) -> Meta:
     Args:
         meaning: description of the key, one line.
         unit: unit of a number ("1" if dimensionless); None for other types.
-        limits: allowed values, by msgspec's names (`ge`, `lt`, ...); `infinite`: whether to allow infinity.
+        limits: allowed values as keyword arguments with msgspec's names, such as ``ge=0.0``. With
+            ``infinite=True``, infinity is allowed too.
     """
     unit_entry = {} if unit is None else {"unit": unit}
     extra = {"infinite": limits.pop("infinite", False), **unit_entry}
@@ -35,8 +36,8 @@ class ContactKey(NamedTuple):
     limits: Mapping[str, float] = {}  # allowed values of the number or list entries, by msgspec's names
     default: Any = None  # None: the key is required for the laws that have it
     neutral: float = 0.0  # value in `ContactParameters` if the file has no value
-    name_in_six_axes: str = ""  # name in six-axis files, if it differs
-    meaning_in_six_axes: str = ""  # description in six-axis files, if the name differs
+    name_in_six_axes: str = ""  # name in six-axis files, if it differs from `name`
+    meaning_in_six_axes: str = ""  # description in six-axis files, if `name_in_six_axes` is not empty
 
     def in_six_axes(self) -> "ContactKey":
         """Return the key with its name and description in six-axis files."""
@@ -45,7 +46,7 @@ class ContactKey(NamedTuple):
         return self._replace(name=self.name_in_six_axes, meaning=self.meaning_in_six_axes)
 
     def struct_field(self, laws: str) -> tuple[str, Any, Any]:
-        """Return name, type and default for `msgspec.defstruct`; `laws` names the laws that use the key."""
+        """Return name, type and default for `msgspec.defstruct`; the description contains the text `laws`."""
         meaning = self.meaning.format(laws=laws)
         if isinstance(self.default, bool):
             return self.name, Annotated[bool, key_metadata(meaning)], self.default

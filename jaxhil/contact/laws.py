@@ -92,9 +92,10 @@ else:
 
 
 def deflection(position: Any, clearance: Any | None) -> Any:
-    """Return the signed deflection [m] of the mechanism: x for x > 0, x + c for x < -c, else 0.
+    """Return the signed deflection [m] of the mechanism at the position x [m].
 
-    The clearance c [m] may be infinite; None means that there is only one surface.
+    The deflection is x for x > 0, x + c for x < -c, and else 0. The clearance c [m] may be infinite; None
+    means that there is only one surface.
     """
     if clearance is None:
         return jnp.where(position > 0, position, 0)
@@ -105,8 +106,8 @@ def deflection(position: Any, clearance: Any | None) -> Any:
 def compute_two_sided_force(law, parameters, state, position, velocity, clearance):
     """Return the signed contact force [N] at one or two surfaces, and the next state of the law.
 
-    At the first surface the force is law(d, d') with d = x. A `clearance` c [m] other than None adds a second
-    surface, where the force is -law(d, d') with d = -c - x.
+    At the first surface, the penetration is d = x and the force is F(d, d'). A `clearance` c [m] other than
+    None adds a second surface, where the penetration is d = -c - x and the force is -F(d, d').
     """
     signed = deflection(position, clearance)
     if clearance is None:

@@ -54,7 +54,10 @@ class PiecewiseLinear(ContactLaw):
         )
 
     def undamped_peak_force(self, parameters, mass, velocity):
-        """Return the peak force [N]: the energy E that a segment stores raises F to sqrt(F^2 + 2 k E)."""
+        """Return the peak force [N], where the segments together store the kinetic energy.
+
+        A segment with the slope k that stores the energy E raises the force from F to sqrt(F^2 + 2 k E).
+        """
         stiffness, depths = parameters.stiffness, parameters.depths
         slots, segments = stiffness.shape[:2]
         energy = np.broadcast_to(mass * velocity**2 / 2, (slots, stiffness.shape[-1]))
@@ -69,7 +72,7 @@ class PiecewiseLinear(ContactLaw):
         return force
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add 2 zeta sqrt(k M) to `damping`, with the damping ratio zeta = `ratio` and the first slope k."""
+        """Add 2 zeta sqrt(k M) to `damping`, where zeta is `ratio`, k the first slope and M `mass`."""
         return "damping", drawn("damping") + 2 * ratio * np.sqrt(drawn("stiffness") * mass)
 
     def as_float_law(self, contact, stiffness, damping):
@@ -101,7 +104,7 @@ class PiecewiseLinear(ContactLaw):
 
 
 def _regression(depths: tuple[float, ...]) -> Regression:
-    """Return the regression F = sum_i k_i s_i(d) + b d' with the unknown coefficients k_1, k_2, ... and b."""
+    """Return the regression F = sum_i k_i s_i(d) + b d' with the unknown coefficients k_i and b."""
     bounds = np.array([0.0, *depths, np.inf])
 
     def overlaps(d, v):

@@ -15,7 +15,7 @@ class PowerLaw(ContactLaw):
     stiffness_unit: ClassVar[str] = "N/m^n"
 
     def undamped_peak_force(self, parameters, mass, velocity):
-        """Return k d^n at the deepest point d, where k d^(n + 1)/(n + 1) = M v^2/2."""
+        """Return the force k d^n [N] at the deepest point, where the spring stores all kinetic energy."""
         exponent, energy = parameters.exponent, mass * velocity**2 / 2
         depth = ((exponent + 1) * energy / parameters.stiffness) ** (1 / (exponent + 1))
         return parameters.stiffness * depth**exponent

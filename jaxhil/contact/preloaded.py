@@ -16,10 +16,11 @@ class Preloaded(ContactLaw):
     F_0 is `preload` [N], k is `stiffness` [N/m], and F_r is `friction` [N], Coulomb friction against the
     motion. The force jumps at the onset and when the motion reverses. The law has no damping.
 
-    The ideal contact oscillates about d = -s inward, s = (F_0 + F_r)/k, and about d = -r outward,
-    r = (F_0 - F_r)/k. The deepest point d_m satisfies (d_m + s)^2 = s^2 + (v/omega)^2. At the separation,
-    where d or F crosses 0, e v/omega = sqrt((d_m + r)^2 - max(r, 0)^2). If F_0 + k d_m <= F_r, friction holds
-    the mechanism at d_m, and e = 0.
+    The ideal contact with the equivalent mass M and the approach speed v is a harmonic oscillation with
+    omega = sqrt(k/M). The inward motion oscillates about d = -s, s = (F_0 + F_r)/k, and the outward motion
+    about d = -r, r = (F_0 - F_r)/k. The deepest point d_m satisfies (d_m + s)^2 = s^2 + (v/omega)^2. The
+    contact ends when d or F crosses 0, with the restitution e = (omega/v) sqrt((d_m + r)^2 - max(r, 0)^2).
+    If F_0 + k d_m <= F_r, friction holds the mechanism at d_m, and e = 0.
     """
 
     name: ClassVar[str] = "preloaded"
@@ -77,8 +78,8 @@ class Preloaded(ContactLaw):
     def perturb_damping(self, drawn, ratio, mass, velocity):
         """Add friction that dissipates the fraction 1 - exp(-2 pi zeta) of the kinetic energy.
 
-        zeta is the damping ratio `ratio`. The path of the friction is taken as twice the deepest penetration
-        without friction.
+        zeta is the damping ratio `ratio`. The length of the friction's path is estimated as twice the deepest
+        penetration of the contact without friction.
         """
         preload, friction, stiffness = drawn("preload"), drawn("friction"), drawn("stiffness")[:, 0]
         energy = (mass * velocity**2)[:, 0] / 2
