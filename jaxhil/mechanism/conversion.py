@@ -71,7 +71,7 @@ class KeyProblem(Exception):
 
 
 def raise_problems(problems: Sequence[KeyProblem]) -> None:
-    """Raise the first problem with all others as its attribute `further`; do nothing if there is none."""
+    """Raise the first problem, with all others in its attribute `further`. Do nothing if there are none."""
     if problems:
         first, *others = problems
         further = [problem for other in others for problem in (other, *other.further)]
@@ -110,7 +110,7 @@ def suggest_names(word: str, names: Iterable[str]) -> str:
 
 
 def format_entry_count(entries: Sequence[object]) -> str:
-    """Return the text "a list of N entries" with the number of `entries`."""
+    """Return the text "a list of N entries", where N is the length of `entries`."""
     return f"a list of {len(entries)} entr{'y' if len(entries) == 1 else 'ies'}"
 
 
@@ -134,7 +134,10 @@ def to_struct(kind: type[AnyStruct], raw: Mapping[str, Any]) -> AnyStruct:
 
 
 def find_member_type(kind: inspect.Type, part: str | int, path: KeyPath) -> inspect.Type:
-    """Return the type of the key or list index `part` of `kind`. Raise `KeyProblem` if there is none."""
+    """Return the type of the value at the key or list index `part` in a value of the type `kind`.
+
+    Raise `KeyProblem` if the type has no such key or index.
+    """
     match kind:
         case inspect.Metadata(type=inner, extra={"six": names}) if part in names:
             return find_member_type(inner, 0, path)
@@ -283,7 +286,7 @@ def _convert_struct(kind: inspect.StructType, value: Mapping[Any, Any], path: Ke
             except KeyProblem as problem:
                 problems.append(problem)
         elif entry.required and not has_unknown:
-            # A misspelt key also looks like a missing one.
+            # If there is an unknown key, it may be a misspelling of this key.
             problems.append(KeyProblem((*path, name), "nothing", describe_allowed(entry.type, NO_METADATA)))
     raise_problems(problems)
     return converted

@@ -9,8 +9,9 @@ where i and j number the keys of the table. u'_i is uniform as well; the quantil
 u'_i to a value. The numbers of a key that is not correlated with an earlier key stay exactly the same.
 
 Lists with a separate draw for each entry (``independent = true``) come last in the order of the keys. Entry i
-of such a list is correlated with entry i of every other such list (the last entry repeats), and with all keys
-that have a single draw. For given values of the keys with a single draw, different entries are independent.
+of such a list is correlated with all keys that have a single draw, and with entry i of every other such list
+(or with the last entry, if the other list is shorter). For given values of the keys with a single draw,
+entries with different indices are independent.
 """
 
 from __future__ import annotations
@@ -35,7 +36,11 @@ _MIN_UNIFORM, _MAX_UNIFORM = 2.0**-54, 1.0 - 2.0**-53
 
 
 def correlate(mechanism: AnyMechanism, uniform: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Apply the mechanism's correlation to the uniform random numbers (draws, columns) of every key."""
+    """Return the uniform random numbers of every key, correlated as the mechanism states.
+
+    `uniform` contains independent uniform random numbers, an array (draws, columns) for each key. The result
+    has the same form.
+    """
     table = mechanism.correlation
     if table is None:
         return dict(uniform)
@@ -58,7 +63,7 @@ def correlate(mechanism: AnyMechanism, uniform: Mapping[str, np.ndarray]) -> dic
 
 
 def find_correlated_groups(mechanism: AnyMechanism) -> list[tuple[str, ...]]:
-    """Return groups of the keys of ``[correlation]`` such that different groups are independent."""
+    """Group the keys of ``[correlation]`` so that keys in different groups are independent."""
     table = mechanism.correlation
     if table is None:
         return []
@@ -70,7 +75,7 @@ def find_correlated_groups(mechanism: AnyMechanism) -> list[tuple[str, ...]]:
 
 
 def fix_at_nominal(mechanism: Mechanism, keys: Collection[str]) -> Mechanism:
-    """Return the mechanism with the given keys fixed at their nominal values; other keys stay uncertain."""
+    """Return the mechanism with some keys fixed at their nominal values; other keys stay uncertain."""
     uncertainty = {key: entry for key, entry in mechanism.uncertainty.items() if key not in keys}
     table = mechanism.correlation
     reduced = table and remove_keys(table.keys, table.matrix, keys)

@@ -52,7 +52,7 @@ MAX_PROBLEMS = 20  # maximum number of invalid keys of a file in a message
 SUITE_PREFIX = "suite-"  # prefix of the names of the mechanisms for benchmarks
 
 _SIX_INFINITIES = [math.inf] * 6  # default of limits for six axes
-_file_hashes: dict[str, str] = {}  # SHA-256 of the files read, by the SHA-256 of the mechanism's content
+_file_hashes: dict[str, str] = {}  # SHA-256 of the file of each mechanism, by the SHA-256 of its content
 
 _BUILTIN_FOLDER = Path(__file__).parent / "builtin"
 _SIX_AXIS_FOLDER = _BUILTIN_FOLDER / "six_axes"
@@ -83,9 +83,12 @@ def load(
         path_or_name: path of a file, name of a built-in mechanism, or None for the default one.
         overrides: ``PATH=VALUE`` texts as for ``--set``, applied in order before validation. PATH is a dotted
             TOML key, possibly with an index (``contact.stiffness[1]``); VALUE is a TOML value, or a bare word
-            for a string. A table as VALUE replaces the whole table. Alternatively a mapping from PATH to the
-            value, in which None removes the key.
+            for a string. A table as VALUE replaces the whole table. Alternatively, a mapping from PATH to a
+            Python value, where the value None removes the key.
         unset: PATHs of keys to remove afterwards, as for ``--unset``.
+
+    Returns:
+        The mechanism, with hash and name of its file.
 
     Raises:
         InputError: if the file or a change is invalid, or the mechanism has six axes. The message has one
@@ -108,7 +111,7 @@ def load_any(
 
 
 def source_sha256(mechanism: AnyMechanism) -> str:
-    """Return the SHA-256 (hex) of the mechanism's file, or of the mechanism's content if there is no file."""
+    """Return the SHA-256 of the mechanism's file in hexadecimal; without a file, that of the content."""
     content = _content_sha256(mechanism)
     return _file_hashes.get(content, content)
 
@@ -146,7 +149,10 @@ def _check_one_axis(raw: Mapping[str, Any], label: str) -> None:
 def _convert_table(
     raw: Mapping[str, Any], label: str, overrides: Overrides, unset: Sequence[str], problems: int
 ) -> AnyMechanism:
-    """Change and convert a parsed table; an error message has one line for each of up to `problems` keys."""
+    """Apply the requested changes to a parsed table and convert the table to a mechanism.
+
+    Raise `InputError` if a key is invalid. The message has one line for each invalid key, at most `problems`.
+    """
     changed, label = raw, to_one_line(label)
     all_changes = _requested_changes(overrides, unset)
     for option, changes in all_changes.items():
@@ -266,7 +272,7 @@ def _find_problem(raw: Mapping[str, Any]) -> str:
 
 
 def _requested_changes(overrides: Overrides, unset: Sequence[str]) -> dict[str, list[Any]]:
-    """Return the requested changes by the option or argument that requests them, as named in messages."""
+    """Return the lists of changes to a mechanism, each under the name of the option that requests it."""
     is_mapping = isinstance(overrides, Mapping)
     return {
         "overrides" if is_mapping else "--set": list(overrides.items() if is_mapping else overrides),

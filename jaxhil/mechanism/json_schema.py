@@ -103,7 +103,10 @@ def _clean_schema(node: Any) -> Any:
 
 
 def _add_short_forms(node: dict[str, Any]) -> dict[str, Any]:
-    """Extend the schema of six numbers, or of a matrix, by the short forms with one or two numbers."""
+    """Let the schema of six numbers or of a matrix also accept their short forms.
+
+    The short form is one number or, for six numbers, also a table of two numbers.
+    """
     full = _clean_schema(
         {key: value for key, value in node.items() if key not in ("six", "square", "description")}
     )

@@ -25,7 +25,7 @@ class KeyDescription(NamedTuple):
 
     name: str
     meaning: str  # description
-    unit: str | None  # None: not a number; "1": dimensionless; "": the unit of another key
+    unit: str | None  # None: not a number; "1": dimensionless; "": unit depends on another key
     allowed: str  # the allowed values, in words
     required: bool
     default: Any  # None: no value by default
@@ -118,7 +118,7 @@ def _find_descriptions(kind: inspect.Type) -> Iterator[str]:
 
 
 def _unit(kind: inspect.Type, path: str, extra: Mapping[str, Any] | None = None) -> str | None:
-    """Return the unit of a number or a list of numbers, else None. Raise ValueError if it is missing."""
+    """Return the unit of a number or a list of numbers, else None. Raise ValueError if it has no unit."""
     match kind:
         case inspect.Metadata(type=inner, extra=metadata):
             return _unit(inner, path, metadata)

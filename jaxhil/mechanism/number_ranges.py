@@ -82,7 +82,7 @@ def ranges_of(kind: msgspec.inspect.Type, names: Mapping[str, Sequence[str]]) ->
             case msgspec.inspect.StructType(fields=fields):
                 for entry in fields:
                     if entry.name not in ("correlation", "damping_ratio") or path == "rig.simulator":
-                        # Correlations and damping ratios state values of other keys.
+                        # Correlations and damping ratios are skipped, because they only determine other keys.
                         visit(entry.type, f"{path}.{entry.encode_name}".lstrip("."))
             case msgspec.inspect.Metadata(type=inner):
                 visit(inner, path, kind.extra or NO_METADATA)

@@ -113,9 +113,9 @@ def _numeric_keys(raw: Mapping[str, Any]) -> dict[str, Range]:
 
 
 def _parse_path(text: str, key: str | None = None) -> tuple[KeyPath, int]:
-    """Return the path before ``=`` and the index of the character after ``=``.
+    """Parse the path at the start of `text`, and return it with the index of the character after ``=``.
 
-    Error messages show `key`, or `text` if `key` is None.
+    Error messages show `key` or, if `key` is None, `text`.
     """
     source, example = (text, _EXAMPLE) if key is None else (key, _EXAMPLE_KEY)
     path: list[str | int] = []

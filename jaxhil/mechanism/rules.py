@@ -84,7 +84,7 @@ def check_mechanism_rules(mechanism: Mechanism) -> None:
 
 
 def resolve_damping_ratio(mechanism: Mechanism) -> Mechanism:
-    """Return the mechanism with the damping that its key `contact.damping_ratio` states.
+    """Return the mechanism with `contact.damping` computed from its key `contact.damping_ratio`.
 
     The mechanism is returned unchanged if it has no such key, or if `check_mechanism_rules` will reject it.
     """
@@ -116,7 +116,7 @@ def _check_damping_ratio(contact: Contact) -> None:
 
 
 def _repeat_last(*lists: Sequence[Any]) -> list[tuple[Any, ...]]:
-    """Return a tuple of the lists' entries for each index; shorter lists repeat their last entry."""
+    """Combine lists to a list of tuples, as `zip` does; shorter lists repeat their last entry."""
     length = max(map(len, lists))
     return [tuple(entries[min(i, len(entries) - 1)] for entries in lists) for i in range(length)]
 
@@ -124,8 +124,9 @@ def _repeat_last(*lists: Sequence[Any]) -> list[tuple[Any, ...]]:
 def is_hurwitz(polynomial: Sequence[float]) -> bool:
     """Return whether all roots of a real polynomial (descending powers) have negative real parts.
 
-    This is true if and only if the first column of the Routh array, in exact rational arithmetic, has one
-    sign and no zero (Routh 1877; Gantmacher, The Theory of Matrices, vol. 2, ch. XV).
+    This is true if and only if all entries in the first column of the Routh array, computed in exact rational
+    arithmetic, are nonzero and have the same sign (Routh 1877; Gantmacher, The Theory of Matrices, vol. 2,
+    ch. XV).
     """
     coefficients = [Fraction(value) for value in polynomial]
     if coefficients[0] < 0:
@@ -286,7 +287,7 @@ def _check_transfer_function(numerator: list[float], denominator: list[float]) -
 
 def _check_hold(mechanism: Mechanism) -> None:
     """Raise `KeyProblem` if an ideal simulator with zero-order hold has a damped contact."""
-    # Such a simulator jumps at the ticks and has no velocity between the ticks.
+    # Such a simulator jumps at the ticks, where its velocity is not defined.
     rig, contact = mechanism.rig, mechanism.contact
     law, arguments = find_contact_law(contact.law), (("contact",), contact, mechanism.uncertainty)
     dissipates = (law.is_damped and is_damped(*arguments)) or is_damped(*arguments, "friction")
@@ -296,9 +297,10 @@ def _check_hold(mechanism: Mechanism) -> None:
 
 
 def _build_extreme_function(mechanism: Mechanism, spans: Mapping[str, Span]) -> Callable[[str, int], Any]:
-    """Return a function `extreme(path, end)`: a key's smallest (`end` = 0) or largest (1) possible draw.
+    """Return a function `extreme(path, end)` that returns a key's smallest or largest possible draw.
 
-    For a normal distribution, which may have no bounds, the function returns the nominal value.
+    `end` is 0 for the smallest draw and 1 for the largest. If the key is not uncertain, or has a normal
+    distribution, which may have no bounds, `extreme` returns the nominal value.
     """
 
     def extreme(path: str, end: int) -> Any:
@@ -324,7 +326,7 @@ def format_allowed_velocity_limit(approach: float) -> str:
 
 
 def _check_jitter(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    """Raise `KeyProblem` if a force sensor with jitter has effects that jitter does not support."""
+    """Raise `KeyProblem` if a force sensor has jitter in a mechanism that does not support jitter."""
     path, extreme = "rig.force_sensor.jitter", _build_extreme_function(mechanism, spans)
     if not _is_used(mechanism, path):
         return
@@ -359,8 +361,8 @@ def _is_used(mechanism: Mechanism, path: str) -> bool:
 
 def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
     """Raise `KeyProblem` unless the start of the approach lies between the two surfaces."""
-    # The model starts at min(plane, 0) - v (0.02 s + phase T). The hardware lags behind it by the motion
-    # simulator's delay and lag and by the command latency.
+    # The model starts at min(plane, 0) - v (0.02 s + phase T). The hardware lags behind the model by
+    # the motion simulator's delay and lag, and by the command latency.
     extreme = _build_extreme_function(mechanism, spans)
     clearance = float(extreme("contact.clearance", 0))
     period = extreme("rig.control_period", 1)

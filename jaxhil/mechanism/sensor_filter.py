@@ -1,8 +1,8 @@
 """Low-pass filter of the force sensor: poles, and parallel form of the transfer function.
 
 A Butterworth filter has a maximally flat gain, a Bessel filter a maximally flat group delay. The gain of both
-is -3 dB at the cutoff frequency. With distinct poles -r_m w_c, the filter is a sum of first-order lags with
-complex rates:
+is -3 dB at the cutoff frequency w_c. The poles -r_m w_c are distinct, so that the filter is a sum of
+first-order lags with complex rates r_m w_c and weights v_m:
 
     H(s) = prod r_m w_c/(s + r_m w_c) = sum v_m r_m w_c/(s + r_m w_c)
 """
@@ -29,18 +29,18 @@ class FilterModes(NamedTuple):
 
     @property
     def slowest(self) -> float:
-        """Return the slowest decay rate [1/s]."""
+        """Return the decay rate [1/s] of the slowest mode, for the cutoff 1 rad/s."""
         return min(rate.real for rate in self.rates)
 
     @property
     def delay(self) -> float:
-        """Return the group delay [s] at frequencies well below the cutoff."""
+        """Return the group delay [s] at low frequencies, for the cutoff 1 rad/s."""
         return sum((weight / rate).real for weight, rate in zip(self.weights, self.rates, strict=True))
 
 
 @functools.cache
 def find_modes(kind: str, order: int) -> FilterModes:
-    """Return the modes of a filter.
+    """Compute the parallel form of a Butterworth or Bessel filter with the cutoff 1 rad/s.
 
     Args:
         kind: "butterworth" or "bessel".
@@ -81,12 +81,12 @@ def settling_constant(sensor: ForceSensor | SixAxisForceSensor) -> float:
 
 
 def _butterworth_rates(order: int) -> list[complex]:
-    """Return the negative poles for the cutoff 1 rad/s: they lie on the unit circle."""
+    """Return the poles times -1, for the cutoff 1 rad/s. They are on the unit circle."""
     return [cmath.exp(1j * math.pi * (2 * k - order + 1) / (2 * order)) for k in range(order)]
 
 
 def _bessel_rates(order: int) -> list[complex]:
-    """Return the negative poles for the cutoff 1 rad/s: roots of the reverse Bessel polynomial, scaled."""
+    """Return the poles times -1, for the cutoff 1 rad/s: scaled roots of the reverse Bessel polynomial."""
     coefficients = np.array(
         [
             math.factorial(2 * order - k)

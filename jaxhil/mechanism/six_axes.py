@@ -217,7 +217,8 @@ class ContactOfAnyLaw(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     damping: Annotated[float, key_metadata(DAMPING_UNITS, "N s/m", ge=0.0)] = 0.0
 
 
-# Keys that only some contact laws have, as in six-axis files, by their names in one-axis files.
+# Keys that only some contact laws have, as they are in six-axis files. The dict's keys are the names in
+# one-axis files.
 KEYS_IN_SIX_AXES = {key.name: key.in_six_axes() for key in CONTACT_KEYS.values()}
 
 if TYPE_CHECKING:

@@ -55,7 +55,10 @@ def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> N
 
 
 def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
-    """Raise `KeyProblem` unless a latch has exactly one stiffness, and conditions for catching."""
+    """Raise `KeyProblem` unless a latch has exactly one key for its stiffness, and conditions for catching.
+
+    A latch that holds from the start on needs no conditions.
+    """
     path: KeyPath = ("latch", name)
     if latch.latched and mechanism.approach is not None:
         expected = "false, because an approach begins unlatched (use [start] instead)"

@@ -77,7 +77,10 @@ def vector_metadata(meaning: str) -> Meta:
 
 
 def six_axis_metadata(meaning: str, names: tuple[str, str] = MOTION_NAMES) -> Meta:
-    """Return the metadata of six numbers, which a file may shorten to one, or to one for each of `names`."""
+    """Return the msgspec metadata of a key with six numbers.
+
+    A file may also state one number for all six, or a table with one number for each of `names`.
+    """
     schema: Any = {"six": list(names)}
     return Meta(
         min_length=6, max_length=6, description=meaning, extra={"six": names}, extra_json_schema=schema

@@ -206,7 +206,7 @@ def _check_space(simulator: Simulator) -> None:
 
 def _check_hold(mechanism: SixAxisMechanism) -> None:
     """Raise `KeyProblem` if an ideal simulator with zero-order hold has damping or friction."""
-    # Such a simulator jumps at the ticks and has no velocity between the ticks.
+    # Such a simulator jumps at the ticks, where its velocity is not defined.
     rig = mechanism.rig
     dissipates = any(contact.damping or contact.friction or contact.dry_friction
                      for contact in mechanism.contact.values())  # fmt: skip
@@ -216,7 +216,7 @@ def _check_hold(mechanism: SixAxisMechanism) -> None:
 
 
 def _check_sensor(rig: Rig, uncertain: Collection[str]) -> None:
-    """Raise `KeyProblem` if the crosstalk of the force sensor, its filter, tool or gravity is invalid."""
+    """Raise `KeyProblem` if the force sensor's crosstalk, filter, tool or gravity is invalid."""
     sensor, path = rig.force_sensor, ("rig", "force_sensor")
     check_sensor_filter(sensor, uncertain)
     mixing = np.eye(6) + np.asarray(sensor.crosstalk)

@@ -39,7 +39,7 @@ __all__ = [
 SCHEMA = "jaxhil/mechanism/1"
 MAX_CONTACTS = 1000
 MAX_LATENCY = 4  # [periods]; maximum command latency, including the periods that a co-simulation adds
-# limits on nonzero numbers, so that a product of three neither overflows nor underflows
+# limits on the magnitude of nonzero numbers; a product of three such numbers neither overflows nor underflows
 MAGNITUDE_LIMITS = 1e-100, 1e100
 NO_METADATA: Mapping[str, Any] = {}
 

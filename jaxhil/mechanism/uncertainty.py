@@ -93,18 +93,21 @@ def draw_at_points(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.
 
 
 def compute_quantiles(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the quantiles of each key at points of the unit box: `draw_at_points` without correlation."""
+    """Convert points (number, dimensions) of the unit box to values of each key, without correlation."""
     return _compute_values(mechanism, _split_by_key(mechanism, points))
 
 
 def draw_extremes(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
-    """Return the smallest and the largest value of every uncertain key, (2, ...), without correlation."""
+    """Return the smallest and the largest draw of every uncertain key, an array (2, ...) for each key."""
     ends = np.array([[0.0], [_MAX_UNIFORM]])
     return compute_quantiles(mechanism, np.repeat(ends, sum(count_dimensions(mechanism).values()), axis=1))
 
 
 def count_dimensions(mechanism: AnyMechanism) -> dict[str, int]:
-    """Return how many random numbers a draw of each key needs; keys are sorted by path, phases are last."""
+    """Return the number of random numbers that one draw of each key needs.
+
+    The keys are in the order of the columns of points in the unit box: sorted by path, the phase last.
+    """
     columns = {}
     for path in sorted(set(mechanism.uncertainty) - {PHASE_KEY}):
         independent = mechanism.uncertainty[path].independent
@@ -117,7 +120,7 @@ def count_dimensions(mechanism: AnyMechanism) -> dict[str, int]:
 
 
 def _split_by_key(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
-    """Split points of the unit box into the columns of each key."""
+    """Split points (number, dimensions) of the unit box into an array (number, columns) for each key."""
     columns = count_dimensions(mechanism)
     bounds = np.cumsum(list(columns.values()))[:-1]
     return dict(zip(columns, np.split(points, bounds, axis=1), strict=True))
@@ -164,7 +167,7 @@ def _compute_key_values(
 ) -> np.ndarray:
     """Convert the uniform random numbers (number, columns) of one key to values of the key."""
     number = uniform.shape[0]
-    # The quantile at 0 would be outside an open range.
+    # The quantile at 0 is the lower bound, which an open range excludes.
     uniform = np.maximum(uniform, _MIN_UNIFORM)
     if per_contact:
         return _build_quantile_function(uncertainty, nominal, allowed)(uniform)
