@@ -33,7 +33,7 @@ class Gain(NamedTuple):
         logarithmic: whether tuning searches on a logarithmic scale.
         neutral: value that makes the gain ineffective, or None. If all gains are neutral, the force command
             is the measured force.
-        tuned: function that returns whether tuning changes the gain for a mechanism, instead of keeping it.
+        tuned: function that returns whether tuning may change the gain for a mechanism.
         begins: initial value for tuning, as a function of the mechanism; None for any value within the
             bounds. Tuning also starts from the nominal value.
     """
@@ -167,7 +167,7 @@ class Compensator(eqx.Module):
         return position, state
 
     def noise_amplification(self, gains: Gains, constants: KnownConstants) -> Float[Array, "*batch"]:
-        """Return the standard deviation of F_c in steady contact if F has unit white noise [1].
+        """Return the noise amplification [1]: the standard deviation of F_c for unit white noise on F.
 
         The default is 1, for F_c = F. The value is differentiable with respect to the gains.
         """

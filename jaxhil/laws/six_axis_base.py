@@ -46,14 +46,14 @@ class SixAxisConstants(NamedTuple):
 
     @property
     def of_channel(self) -> KnownConstants:
-        """Constants of the rig for a single-axis compensator that acts on one channel of the wrench."""
+        """Return the constants for a one-axis compensator that acts on one channel of the wrench."""
         return KnownConstants(self.control_period, jnp.full_like(self.control_period, jnp.inf))
 
 
 class SixAxisCompensator(eqx.Module):
     """Interface of a compensator in six axes.
 
-    `jaxhil.laws.simulation_base.Compensator` explains the class variables; `reads_pose` is whether the
+    `jaxhil.laws.simulation_base.Compensator` explains the class variables, except `reads_pose`: whether the
     compensator uses the measured pose.
     """
 

@@ -121,7 +121,7 @@ class DeadZoneObserver(Compensator):
             lambda m: 2 * m.rig.force_sensor.dead_zone + peak_force(m),
             lambda m: m.rig.force_sensor.dead_zone, neutral=0.0, tuned=_is_continuous,
         ),
-        # Force that is added beyond the limit, divided by the limit.
+        # Force that is added if k_n d is beyond the limit, divided by the limit.
         rig_gain(
             "observer_saturation", lambda m: 0.0, lambda m: 1.0, lambda m: float(_is_continuous(m)),
             tuned=lambda m: False,

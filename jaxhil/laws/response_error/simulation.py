@@ -52,12 +52,18 @@ from jaxhil.laws.simulation_base import Compensator, Gain, Gains, clear_lanes, r
 
 
 def _stiffness_covariance(mechanism) -> float:
-    """Return the initial covariance [1/m^2]: a first sample at 3 % of the peak depth has weight 1/2."""
+    """Return the initial covariance of the stiffness [1/m^2].
+
+    With it, a first sample at 3 % of the peak depth has the weight 1/2 in the estimate.
+    """
     return 1 / (0.03 * peak_force(mechanism) / typical_stiffness(mechanism)) ** 2
 
 
 def _damping_covariance(mechanism) -> float:
-    """Return the initial covariance [s^2/m^2]: a first sample at the approach speed has weight 1/2."""
+    """Return the initial covariance of the damping [s^2/m^2].
+
+    With it, a first sample at the approach speed has the weight 1/2 in the estimate.
+    """
     return 1 / mechanism.approach.velocity**2
 
 

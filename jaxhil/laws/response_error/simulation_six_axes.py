@@ -1,6 +1,7 @@
 """Response-error compensation of Qi et al. along the docking axis, with phase lead on all six channels.
 
-    F_c = lead(F),  in contact plus g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a) along the docking axis
+    F_c = lead(F)                                                 all channels, out of contact
+    F_c = lead(F) + g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a)   along the docking axis, in contact
 
 The literature states the method for one axis with a known surface (`simulation.py` in this folder). Here x is
 the travel along the docking axis. The surface is at the travel at which the force exceeds
@@ -81,7 +82,7 @@ def _never(mechanism: Any) -> bool:
 
 
 def _covariance(name: str, size: Any) -> Gain:
-    """Create the gain that sets an initial covariance; `size(mechanism)` is its nominal value."""
+    """Create the gain `name` that sets an initial covariance; `size(mechanism)` is its nominal value."""
     return rig_gain(
         name, lambda m: 1e-3 * size(m), lambda m: 1e1 * size(m), size, logarithmic=True, tuned=_never
     )

@@ -1,4 +1,4 @@
-"""Delay line of the measured position, with linear interpolation; assumes uniform motion before the run."""
+"""Delay line of the measured position, with linear interpolation, for uniform motion before the run."""
 
 from typing import NamedTuple
 
@@ -34,7 +34,7 @@ def split_delay(delay: Array, period: Array) -> DelayInPeriods:
 
 
 def empty_delay_line(ring: int, zeros: Float[Array, "*batch"]) -> DelayLine:
-    """Return a delay line with `ring` samples, a power of two; `read_delayed` reads only written samples."""
+    """Return a delay line with `ring` samples of 0; `ring` is a power of two."""
     return DelayLine(zeros, zeros, jnp.zeros((ring, *zeros.shape), zeros.dtype))
 
 

@@ -20,10 +20,10 @@ def look_back(
     is_available: Bool[Array, "*batch"] | bool = True,
     otherwise: Any = 0,
 ) -> Float[Array, "*batch"]:
-    """Return the sample written `ticks` before `tick`, or `otherwise` where `is_available` is false.
+    """Return the sample that was written `ticks` ticks before `tick`.
 
-    `ticks` must be less than `samples`. If `ticks` is equal on all lanes, the function reads one row of the
-    ring, which is much faster than a gather.
+    Where `is_available` is false, return `otherwise`. `ticks` must be less than the length of the ring. If
+    `ticks` is equal on all lanes, the function reads one row of the ring, which is much faster than a gather.
     """
     first, mask = ticks.reshape(-1)[0], ring.shape[0] - 1
 
@@ -66,7 +66,10 @@ def write_samples(rings: Any, tick: Int[Array, ""], values: Any) -> Any:
 
 
 def depend_on(value: Float[Array, "*batch"], *reads: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return `value` so that it depends on `reads` for the compiler; NaN where one of `reads` is NaN."""
+    """Return `value` in a form that makes the compiler compute `reads` before its use.
+
+    Where one of `reads` is NaN, the result is NaN.
+    """
     for read in reads:
         value = jnp.where(read == read, value, read)
     return value

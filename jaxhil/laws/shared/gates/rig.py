@@ -2,11 +2,13 @@
 
 
 def share_beyond(excess: float, excess_before: float, moved: float) -> float:
-    """Return the share [1] of the last period in which a reading exceeded a threshold, if it moved linearly.
+    """Return the share [1] of the last period during which a reading exceeded a threshold.
+
+    The reading is assumed to be linear in time between two ticks.
 
     Args:
-        excess: reading minus threshold, 0 if the reading does not exceed it; negative beyond a lower
-            threshold.
+        excess: reading minus threshold if the reading exceeds the threshold, else 0. It is negative for a
+            reading below a lower threshold.
         excess_before: excess on the previous tick.
         moved: change of the reading since the previous tick, in the unit of `excess`.
     """

@@ -2,8 +2,8 @@
 
 A reading is assumed to be linear between two ticks. `share_beyond` returns the share of a control period in
 which the reading exceeds a threshold. `gate` weights the shares of the last two periods with a triangle of
-two periods. It is 1 above the threshold, 0 below, and once differentiable with respect to the time of the
-crossing. If crossings are at least two periods apart, the gates of all ticks add up to the time above the
+two periods. The gate is 1 above the threshold, 0 below, and once differentiable with respect to the time of
+the crossing. If crossings are at least two periods apart, the gates of all ticks add up to the time above the
 threshold in periods, and the mean delay of the gate is one period. A gate that switches at the next tick
 would have an error of up to half a period, which would be a sawtooth function of every delay.
 """
@@ -15,11 +15,13 @@ from jaxtyping import Array, Float
 def share_beyond(
     excess: Float[Array, "*batch"], excess_before: Float[Array, "*batch"], moved: Float[Array, "*batch"]
 ) -> Float[Array, "*batch"]:
-    """Return the share [1] of the last period in which a reading exceeded a threshold, if it moved linearly.
+    """Return the share [1] of the last period during which a reading exceeded a threshold.
+
+    The reading is assumed to be linear in time between two ticks.
 
     Args:
-        excess: reading minus threshold, 0 if the reading does not exceed it; negative beyond a lower
-            threshold.
+        excess: reading minus threshold if the reading exceeds the threshold, else 0. It is negative for a
+            reading below a lower threshold.
         excess_before: excess on the previous tick.
         moved: change of the reading since the previous tick, in the unit of `excess`.
     """
@@ -32,8 +34,8 @@ def share_beyond(
 def gate(share: Float[Array, "*batch"], share_before: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Return the gate (s^2 + l^2)/2 + s l (2 - s - l) of the last period's share s and the previous share l.
 
-    If the reading crossed the threshold once, the gate is a triangle, integrated while the reading was above
-    the threshold. At the age u [periods], the triangle is u for u < 1 and 2 - u for 1 <= u < 2. After an
-    upward crossing the gate is s^2/2, then 1/2 + l - l^2/2; it increases with s and l.
+    If the reading crossed the threshold once, the gate is the integral of a weight over the time during which
+    the reading was above the threshold. At the age u [periods], the weight is u for u < 1 and 2 - u for
+    1 <= u < 2. On the first tick after an upward crossing the gate is s^2/2, on the second 1/2 + l - l^2/2.
     """
     return (share**2 + share_before**2) / 2 + share * share_before * (2 - share - share_before)
