@@ -113,9 +113,9 @@ class ControllerBase:
 
     @property
     def last_contact(self) -> ContactRecord:
-        """Return the compensator status of the last audited contact; the number is 0 before the first.
+        """Return the record of the last audited contact, with the compensator's status.
 
-        The record remains until the next audit, even after `reset`.
+        Before the first audit, the contact number in the record is 0. `reset` keeps the record.
         """
         return contact_record(self._last_count())
 

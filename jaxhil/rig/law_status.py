@@ -57,7 +57,7 @@ STATUS_NAMES = {status.number: status.name for status in STATUSES}
 
 
 class ContactCount(NamedTuple):
-    """Compensator status of one contact, with the number of ticks for each doubtful status."""
+    """Numbers of ticks with each compensator status in one contact, and the status of the contact."""
 
     number: int  # number of the contact; 0 before the first contact
     ticks: int  # number of ticks on which the compensator acted
@@ -70,7 +70,7 @@ class ContactCount(NamedTuple):
 
 
 class ContactRecord(NamedTuple):
-    """Compensator status of one contact, with the number of ticks for each doubtful status.
+    """Record of one contact for users: the compensator's status, and the ticks with each doubtful status.
 
     Attributes:
         number: number of the contact; 0 before the first contact.

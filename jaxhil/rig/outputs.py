@@ -105,7 +105,7 @@ class PositionGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the faults; until the output first reaches a command, a limited change does not trip."""
+        """Forget the faults. Until the output first reaches a command, limiting the output does not trip."""
         self._limited_ticks = 0
         self._engaged = False
         self._rate = 0.0
@@ -193,7 +193,11 @@ class PositionGuard:
         self.at_rest = rate == 0.0 and target_rate == 0.0
 
     def _stand(self, measured: float, position: float) -> None:
-        """Set the output to `measured`; if it is NaN, to `position` moved into the stroke, out of contact."""
+        """Set the output to the measured position or, without one, to a position out of contact.
+
+        If `measured` is NaN, use `position` if it is out of contact, else a position out of contact. Both are
+        moved into the stroke.
+        """
         self.has_output = True
         self.output = measured
         if isfinite(measured):

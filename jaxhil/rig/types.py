@@ -6,7 +6,7 @@ from typing import Annotated
 Positive = Annotated[float, "> 0"]
 NonNegative = Annotated[float, ">= 0"]
 Count = Annotated[int, ">= 0"]
-Index = Annotated[int, "index"]  # into a list; the Python code ensures its range, because C does not check it
+Index = Annotated[int, "index"]  # index into a list; Python keeps it in range, as C has no check
 Bits = Annotated[int, "uint32_t"]
 SmallInt = Annotated[int, "int"]
 Limits = Annotated[Mapping[str, float], "limits"]  # limit names and values

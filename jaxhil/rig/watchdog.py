@@ -281,7 +281,9 @@ class Expectation:
         ]
 
     def restitution(self, stiffness: float, damping: float, speed: float, mass: Positive) -> float:
-        """Return the expected restitution [1]; for a stiffness <= 0, use the largest p and the least z.
+        """Return the expected restitution [1] from the polynomial in p, w and z (see the module's docstring).
+
+        For a stiffness <= 0, use the largest p and the smallest z.
 
         Args:
             stiffness: identified stiffness [N/m].

@@ -100,12 +100,12 @@ class Controller6(ControllerBase):
 
     @property
     def unpaid_impulse(self) -> float:
-        """Return the impulse still owed after the last contact, divided by its impulse; 0 if unknown."""
+        """Return the uncorrected impulse error after a contact, divided by its impulse; 0 if unknown."""
         return self._law.unpaid_impulse
 
     @property
     def last_audit(self) -> tuple[float, float, float]:
-        """Return momentum error, energy gain and unpaid impulse of the last audited contact [1]."""
+        """Return momentum error, energy gain and uncorrected impulse error of the last audit [1]."""
         watchdog = self._watchdog
         return watchdog.momentum_error, watchdog.energy_gain, watchdog.unpaid_impulse
 
@@ -360,7 +360,10 @@ class Controller6(ControllerBase):
 
 
 def as_vector(values: Any) -> Vector:
-    """Convert six values to floats: NaN replaces any other object, and all values unless there are six."""
+    """Convert six values to floats; an object that is not a number becomes NaN.
+
+    If there are not six values, all results are NaN.
+    """
     try:
         vector = [value if type(value) is float else as_float(value) for value in values]
     except TypeError:

@@ -129,7 +129,7 @@ class PoseGuard:
         self._start = limits["start_distance"]
         self._start_angle = limits["start_angle"]
         spacing = max(self._retreat, 2.0 * self._retreat_distance / POINTS)
-        # The retreat covers the lever times an angle in the same time as the angle.
+        # At the retreat's speeds, a rotation by an angle takes as long as a translation by lever times angle.
         lever = self._retreat / self._retreat_turn if self._retreat_turn > 0.0 else 0.0
         self._path = CommandPath(spacing, self._retreat_turn, lever)
         self.output = [0.0] * AXES
@@ -137,7 +137,7 @@ class PoseGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the faults; until the output first reaches a command, a limited change does not trip."""
+        """Forget the faults. Until the output first reaches a command, limiting the output does not trip."""
         self._limited_ticks = 0.0
         self._engaged = False
         self._rate = [0.0] * AXES
@@ -225,7 +225,7 @@ class PoseGuard:
         if remaining > 0.0 and self._retreat > 0.0 and self._retreat_turn > 0.0:
             gain = min(self._braking / self._retreat, self._braking_turn / self._retreat_turn)
             slowing = sqrt(2.0 * self._braking * remaining) / self._retreat
-            # The last part has the speed that one period's braking can stop.
+            # The speed does not fall below the value from which one period's braking stops the motion.
             return min(self._share + gain, max(slowing, gain), 1.0)
         return 0.0
 
@@ -280,7 +280,7 @@ class PoseGuard:
         self._rate = [new - old for new, old in zip(self.output, before, strict=True)]
 
     def _stand(self, measured: Vector, pose: Vector) -> None:
-        """Set the output to `measured`; if it is not finite, to `pose` moved into the stroke."""
+        """Set the output to `measured`. If that is not finite, use `pose`, moved into the stroke."""
         self.has_output = True
         if is_finite(measured):
             self.output = list(measured)

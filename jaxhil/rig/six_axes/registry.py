@@ -17,7 +17,7 @@ class ModelConstants(NamedTuple):
     """Constants of the numerical model and the rig, which a six-axis gain file contains."""
 
     mass_matrix: Matrix  # relative mass matrix M at the docked pose, about C's origin [kg, kg m, kg m^2]
-    inverse_mass: Matrix  # its inverse
+    inverse_mass: Matrix  # inverse of M
     # (1 - M_t M^-1)^-1, converts a reading to the contact's wrench, about C's origin; identity without a tool
     tool_correction: Matrix
     longest_delay: float  # upper bound of the loop's delay [s]
@@ -50,7 +50,7 @@ class SixAxisCompensator(Protocol):
 
     @property
     def unpaid_impulse(self) -> float:
-        """Return the impulse still owed after the last contact, divided by its impulse; 0 if unknown."""
+        """Return the uncorrected impulse error after a contact, divided by its impulse; 0 if unknown."""
         return 0.0
 
     @property

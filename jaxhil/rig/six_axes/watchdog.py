@@ -10,7 +10,8 @@ wrench about the chaser's origin, and |W|^2 = W . M^-1 W. The audit checks four 
 - Momentum: |M (V - V_in) - T sum W_c| is at most `momentum_error` times the sum of |T sum W_c| and 0.05
   |M V_in|. Otherwise the model integrates a different wrench, or has a different mass.
 - Passivity: T sum W_c . V is at most `energy_gain` times the kinetic energy before contact, V_in . M V_in/2.
-- Impulse: what the compensator still owes is at most `unpaid_impulse` times the contact's impulse.
+- Impulse: the impulse error that the compensator has not corrected after the contact is at most
+  `unpaid_impulse` times the contact's impulse.
 - Status: the compensator reports that it identified the contact (`law_status`).
 """
 
@@ -46,7 +47,7 @@ class SixAxisWatchdog:
         record: compensator status of the last audited contact.
         momentum_error: momentum error of that contact, divided by its impulse [1]; 0 after `restart`.
         energy_gain: energy that it released, divided by the approach energy [1]; 0 after `restart`.
-        unpaid_impulse: impulse still owed, divided by the contact's impulse [1]; 0 after `restart`.
+        unpaid_impulse: uncorrected impulse error, divided by the contact's impulse [1]; 0 after `restart`.
     """
 
     __slots__ = (
@@ -118,7 +119,7 @@ class SixAxisWatchdog:
             previous: wrench W_c of the last tick [N, N m].
             status: the compensator's status at that wrench.
             lag: lag of the hardware behind the model [s]; 0 if the compensator does not know it.
-            unpaid: impulse still owed after the compensator's last contact, divided by its impulse [1].
+            unpaid: uncorrected impulse error after the last contact, divided by the contact's impulse [1].
             wrench: measured wrench of this tick [N, N m].
             pose: pose of the numerical model [m, rad].
             twist: twist of the numerical model [m/s, rad/s].
@@ -163,7 +164,7 @@ class SixAxisWatchdog:
         Args:
             previous: wrench W_c of the last tick [N, N m].
             status: the compensator's status at that wrench.
-            unpaid: impulse still owed after the compensator's last contact, divided by its impulse [1].
+            unpaid: uncorrected impulse error after the last contact, divided by the contact's impulse [1].
         """
         if not self._open:
             return 0
@@ -176,7 +177,7 @@ class SixAxisWatchdog:
         return self._audit()
 
     def detail(self, fatal: int) -> str:
-        """Describe these faults by the numbers of the last audit."""
+        """Describe the faults with the bits `fatal` by the numbers of the last audit."""
         numbers = {
             MOMENTUM: f"momentum error {self.momentum_error:.4g}",
             ENERGY_GAIN: f"energy released {self.energy_gain:.4g}",
