@@ -190,9 +190,10 @@ def build_series(
     control_period: Float[Array, "*batch"],
     degree: int,
 ) -> Float[Array, "powers columns *batch"]:
-    """Return the matrix from (state, command, increase of the command in a period) to a power series.
+    """Return the matrix from (state, command, increase of the command in a period) to series coefficients.
 
-    The series gives the position as a function of the time since the instant of the state [periods].
+    The power series gives the position [m] as a function of the time since the instant of the state
+    [periods].
     """
     if denominator.shape[0] > 1:
         return _series(*generator_rows(numerator, denominator, control_period), degree)
@@ -202,9 +203,10 @@ def build_series(
 def horner_series(
     series: Float[Array, "powers columns *batch"], drive: tuple[Array, ...], s: Float[Array, "*batch"]
 ) -> tuple[Array, Array]:
-    """Return position [m] and velocity [m per period] at the time `s` [periods] of a series.
+    """Evaluate a series of `build_series` at the time `s` [periods].
 
-    `drive` contains the state, the command, and the increase of the command in a period.
+    Return position [m] and velocity [m per period]. `drive` contains the state, the command, and the increase
+    of the command in a period.
     """
     coefficients = [sum(row[i] * value for i, value in enumerate(drive)) for row in series]
     position = rate = 0 * s
@@ -268,9 +270,9 @@ def _divide_at(edges, before):
 
 
 def _moving_average(begin, length, window, control_period, hold):
-    """Return `states` and `series` of the cells of a moving average, whose motion is a parabola in each cell.
+    """Return the fields `states` and `series` of `Cells` for a moving average.
 
-    Here the state at a cell's start consists of the three coefficients of the parabola.
+    The motion in each cell is a parabola. The state at a cell's start consists of its three coefficients.
     """
     # Rounding may place the start of a cell on either side of the kink, but not its middle.
     is_before = begin + length / 2 < split_window(window, control_period).fraction
@@ -282,7 +284,7 @@ def _moving_average(begin, length, window, control_period, hold):
 
 
 def _line_series(control_period, degree):
-    """Return the rows of `_series` for an ideal motion simulator."""
+    """Return the rows of `_series` for an ideal motion simulator, whose position is the command."""
     ones, zeros = jnp.ones_like(control_period), jnp.zeros_like(control_period)
     lines = [jnp.stack([ones, zeros]), jnp.stack([zeros, ones])]
     return jnp.stack(lines + [jnp.zeros_like(lines[0])] * (degree - 1))
@@ -309,5 +311,5 @@ def _series(generator, output, degree):
 
 
 def _power_of_two(number: float) -> int:
-    """Round a number up to a power of two; a relative excess of `CELL_LENGTH_TOLERANCE` is ignored."""
+    """Round a number up to a power of two, unless it exceeds a power by at most `CELL_LENGTH_TOLERANCE`."""
     return 1 << max(0, math.ceil(math.log2(max(number, 1.0) / (1 + CELL_LENGTH_TOLERANCE))))

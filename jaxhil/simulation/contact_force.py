@@ -109,7 +109,7 @@ class Surfaces(NamedTuple):
         return self._replace(state=state)
 
     def side(self, start: MotionSample, end: MotionSample) -> tuple[Array, Array]:
-        """Return side (1 or -1; 0 if none) and position [m] of the surface touched in a section of motion."""
+        """Return side (1 or -1; 0 without touch) and position [m] of the surface that the motion touches."""
         signed = deflection(start.position, self.clearance)
         side = jnp.sign(jnp.where(signed == 0, deflection(end.position, self.clearance), signed))
         return side, jnp.zeros_like(side) if self.clearance is None else jnp.where(
@@ -175,7 +175,7 @@ def read_current_interval(rig, pending, now, age):
 
 
 def compute_work_between(before: ContactSample, now: ContactSample) -> tuple[Array, Array]:
-    """Return the work [J] done on the mechanism and the work returned by it between two samples.
+    """Return the work done on the mechanism, and the work that it returns, between two samples [J].
 
     The result is exact if the force is linear in the penetration.
     """
@@ -191,9 +191,10 @@ def compute_work_between(before: ContactSample, now: ContactSample) -> tuple[Arr
 def compute_work_along(
     surfaces: Surfaces, start: MotionSample, end: MotionSample, duration: Array
 ) -> tuple[Array, Array]:
-    """Return the work [J] done on the mechanism and the work returned by it in a smooth section of motion.
+    """Return the work done on the mechanism, and the work that it returns, in a section of motion [J].
 
-    If the force pulls while the penetration decreases, its work is subtracted from the work returned.
+    If the force pulls while the penetration decreases, the work of the force is subtracted from the returned
+    work.
     """
     contact = _find_section_contact(surfaces, start, end, duration)
 
@@ -218,8 +219,8 @@ def largest_force(
 ) -> Float[Array, "*batch"]:
     """Return the largest |force| [N] within a sampling interval.
 
-    It is the largest value at both ends and at the vertex of a parabola through the forces at the ends and in
-    the middle.
+    The result is the largest of three forces: at both ends, and at the vertex of a parabola through the
+    forces at the ends and in the middle.
     """
 
     def magnitude(motion, s):
@@ -310,7 +311,7 @@ class _SectionContact(NamedTuple):
     side: Array  # side of the surface, 1 or -1
     begin: Array  # fraction of the section at which the contact begins
     end: Array  # fraction of the section at which the contact ends
-    # for the beginning and the end: whether it is within the section, at zero penetration
+    # whether the contact begins, and whether it ends, within the section at zero penetration
     at_surface: tuple[Array, Array]
 
 
@@ -347,7 +348,7 @@ def _find_section_contact(surfaces, start, end, duration):
 
 
 def _find_positive_interval(function, like):
-    """Return the subinterval of [0, 1] in which a function is positive; it may change sign at most once."""
+    """Return the subinterval of [0, 1] in which a function with at most one change of sign is positive."""
     zeros, ones = jnp.zeros_like(like), jnp.ones_like(like)
     at_0, at_1 = function(zeros), function(ones)
     rises, falls = (at_0 <= 0) & (at_1 > 0), (at_0 > 0) & (at_1 <= 0)

@@ -47,11 +47,11 @@ class QuadratureRule(NamedTuple):
 
 
 def _build_quadrature(number: int) -> QuadratureRule:
-    """Return a rule with `number` nodes; near its ends, the force may be any power of the penetration."""
+    """Return a rule with `number` nodes, which is accurate even for powers of the distance from its ends."""
     nodes, weights = np.polynomial.legendre.leggauss(number)
     unit = (nodes + 1) / 2
-    # The slope of the substitution p -> 3 p^2 - 2 p^3 is 0 at both ends, so that powers of the penetration
-    # become smooth functions.
+    # Near the ends, the force may be any power of the penetration. The substitution p -> 3 p^2 - 2 p^3, whose
+    # slope is 0 at both ends, converts these powers to smooth functions.
     return QuadratureRule(unit**2 * (3 - 2 * unit), weights * 3 * unit * (1 - unit))
 
 
@@ -109,7 +109,7 @@ def contact_in_cells(
 
     # Each branch returns distinct arrays: without optimisation, XLA confuses results that share an array.
     def touches(state):
-        """Return contact results and law states (at sample and end) if a lane may be in contact."""
+        """Compute the contact, and the states of the contact law at the sample and at the interval's end."""
         sections = split_at_reversals(build_cell_motion(series, cells.length))
         states, at_sample, at_end = _compute_law_states(touch, state, sections, period)
         parts = [
@@ -118,13 +118,13 @@ def contact_in_cells(
         return _sum_surfaces(parts), jax.tree.map(lambda *leaves: jnp.stack(leaves), at_sample, at_end)
 
     def free(state):
-        """Return results of 0 and the initial law states if no lane is in contact."""
+        """Return the results without any contact: zeros, and the initial states of the contact law."""
         fresh = touch.law.init(jnp.zeros_like(period))
         count = _RESULT_COUNT if sensor_filter is None else _RESULT_COUNT - 2 + 2 * len(lagged)
         numbers = jnp.zeros((count, *period.shape), lagged.dtype)
         return numbers, jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), fresh)
 
-    # In most intervals no lane is in contact.
+    # In most intervals no lane is in contact, so that the computation can be skipped.
     numbers, states = lax.cond(_may_touch(touch, cells, series), touches, free, state)
     *readings, done, returned, before, after, peak = numbers
     sample, end = _decay_reading(lagged, rates, readings)
@@ -139,7 +139,10 @@ def compute_jump_work(
     before: Float[Array, "*batch"],
     now: Float[Array, "*batch"],
 ) -> tuple[Array, Array]:
-    """Return the work [J] done on the mechanism and the work returned by it if the position jumps."""
+    """Return the work done on the mechanism, and the work that it returns, if the position jumps [J].
+
+    `before` and `now` are the positions before and after the jump [m].
+    """
     ones = jnp.ones_like(before)
     path = build_cell_motion(jnp.stack([before, now - before])[:, None], ones[None])
     sections = split_at(path, jnp.stack([0 * ones, ones])[:, None])
@@ -163,7 +166,10 @@ class _SurfaceContribution(NamedTuple):
 
 
 def _sum_surfaces(parts: list[_SurfaceContribution]) -> Array:
-    """Return an array (results, *batch): sums for all surfaces, and the largest peak force last."""
+    """Combine the contributions of all surfaces to an array (results, *batch).
+
+    The last result is the largest peak force; all others are sums.
+    """
     sums = [jnp.stack([*part.readings, *part.work, *part.contact_time]) for part in parts]
     peak = functools.reduce(jnp.maximum, [part.peak for part in parts])
     return jnp.concatenate([functools.reduce(jnp.add, sums), peak[None]])
@@ -344,9 +350,10 @@ def _lag_contributions(rates, path, impulses, arguments):
 
 
 def _mode_contributions(rates, impulses, age):
-    """Return the response of each mode of a filter [N] to impulses [N periods] of the given age [rad].
+    """Return the response of each mode of a filter [N] to impulses [N periods].
 
-    The results are real and imaginary part of each mode at the sampling instant, then at the interval's end.
+    `age` is the time since each impulse, multiplied by the filter's cutoff frequency [rad]. The results are
+    real and imaginary part of each mode at the sampling instant, then at the interval's end.
     """
     parts = []
     for rate in rates.modes.rates:
@@ -365,7 +372,8 @@ def _sum_by_part(values):
 def _find_largest_force(force, arguments, begin, width, magnitudes):
     """Return the largest |force| [N] in a span, from the values at the nodes (`magnitudes`).
 
-    It may lie between nodes: a parabola through the largest value and its two neighbours is included.
+    The largest force may lie between nodes. Therefore, the vertex of a parabola through the largest value and
+    its two neighbours is also considered.
     """
     middle = jnp.clip(jnp.argmax(magnitudes, axis=0), 1, len(arguments) - 2)[None]
 

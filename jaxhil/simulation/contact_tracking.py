@@ -121,7 +121,7 @@ def record_contact(
     """Stage 6: return the record of the current contact, updated with the current tick.
 
     Args:
-        loop: Loop.
+        loop: Structure of the loop.
         rules: Conditions for the end of a contact.
         tracker: Record up to the previous tick.
         signals: Inputs of the compensator.
@@ -228,7 +228,7 @@ def _peak_force(loop, tracker, plant_signals, force):
 
 
 def _largest_shortfall(tracker, shortfall, lasts):
-    """Update the position command's largest shortfall [m] where the contact `lasts`; None without limits."""
+    """Return the largest shortfall [m], updated in lanes whose contact `lasts`; None without limits."""
     if tracker.shortfall is None or shortfall is None:
         return tracker.shortfall
     return jnp.where(lasts, jnp.maximum(tracker.shortfall, shortfall), tracker.shortfall)

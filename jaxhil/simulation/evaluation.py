@@ -60,7 +60,7 @@ class RigModel(abc.ABC):
     errors: ClassVar[tuple[str, ...]]
     verdict_error: ClassVar[str]  # name of the error that tuning minimises and to which limits apply
     compiler_options: ClassVar[Mapping[str, int | str]] = ROLLOUT_OPTIONS  # compiler options for batches
-    derivative_options: ClassVar[Mapping[str, int | str]] = TICK_OPTIONS  # likewise with derivatives
+    derivative_options: ClassVar[Mapping[str, int | str]] = TICK_OPTIONS  # the same with derivatives
 
     @abc.abstractmethod
     def scenarios(
@@ -69,7 +69,7 @@ class RigModel(abc.ABC):
         """Return scenarios of a mechanism as NumPy arrays.
 
         Args:
-            mechanism: Mechanism file.
+            mechanism: Mechanism.
             draws: Values of uncertain parameters by dotted path, one per scenario; None for the nominal
                 scenario.
             seed: Seed of the sensors' noise.
@@ -149,7 +149,7 @@ class RigModel(abc.ABC):
     def select_verdict_error(self, outcome: Outcome) -> Outcome:
         """Return only those rows of an outcome that contain the verdict's error.
 
-        It is the error that tuning minimises and that is compared with the limits.
+        The verdict's error is the error that tuning minimises and that is compared with the limits.
         """
         return self.by_error(outcome)[self.verdict_error]
 
@@ -316,7 +316,7 @@ def unfold_tiles(batch: Batch, results: Any) -> Any:
     """Return results (devices, tiles, ..., lanes of a tile) of a batch as NumPy arrays (..., lanes)."""
 
     def unfold(leaf):
-        # One device at a time.
+        # The results are copied from one device at a time.
         devices, tiles, *slots, tile = leaf.shape
         rows = np.empty((*slots, devices, tiles, tile), leaf.dtype)
         for part in leaf.addressable_shards:
@@ -364,7 +364,7 @@ def _arrange_leaf(assignment: _TileAssignment, leaf: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.take(leaf, assignment.lane, axis=-1), (-3, -2), (0, 1))
 
 
-@lru_cache(maxsize=128)  # arrays; enough for a few batches of similar scenarios
+@lru_cache(maxsize=128)  # number of arrays, which is enough for a few batches of similar scenarios
 def _broadcast_to_lanes(content, dtype, slots, lanes):
     """Place a value common to all lanes on the devices; later batches reuse the array."""
     devices, tiles, tile = lanes

@@ -41,7 +41,7 @@ DIFFERENTIABLE_RESULTS = tuple(name for name in ContactResult._fields if name no
 _QUANTUM_KEYS = ("rig.force_sensor.quantum", "rig.position_sensor.quantum")
 # Keys whose value must not be 0: at 0 the rig does not have the effect, and the derivative is one-sided.
 _KEYS_WITH_CORNER_AT_0 = ("rig.force_sensor.time_constant", "rig.force_sensor.dead_zone")
-# Increment of the keys' values for the construction of the loop, which then contains effects of the value 0.
+# The loop is built for values that are larger by this increment, so that it includes effects of the value 0.
 _KEY_INCREMENT = 1e-9
 
 

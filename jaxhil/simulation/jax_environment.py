@@ -287,9 +287,9 @@ def count_usable_cores() -> int:
 def use_half_the_cores(half: int) -> Iterator[None]:
     """Restrict this thread to one half of the usable cores within this context; `half` (0 or 1) selects it.
 
-    This is for a thread that works while a program runs on all devices. The operating system usually
-    leaves a thread on its core. The thread then always delays the same device, and the other devices wait. If
-    successive tasks alternate between both halves of the cores, the delay is shared by all devices.
+    This context is for a thread that works while a program runs on all devices. The operating system usually
+    leaves a thread on its core. The thread then always delays the same device, and the other devices wait.
+    Successive tasks should therefore alternate between both halves of the cores.
     """
     usable = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
     cores = sorted(usable)[half::2]

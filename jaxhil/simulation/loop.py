@@ -212,7 +212,7 @@ def start_uniform_motion(
     samples from before the start of the run are never read.
 
     Args:
-        loop: Loop.
+        loop: Structure of the loop.
         rig: Constants of the run.
         gains: Gains of the compensator.
         state: State from which the compensator's state and the delay lines are taken.

@@ -109,7 +109,7 @@ def _choose_cell_counts(mechanism: Mechanism, scenarios: Scenario, exact: bool) 
     has_memory = law.has_memory or lagging
     pole, contact = MAX_SAMPLED_RATES_WITH_MEMORY if has_memory else MAX_SAMPLED_RATES
     if window is not None:
-        # The motion has a kink within every interval, at which a lag or a dent would become inaccurate.
+        # The motion has a kink within every interval, where a lag or a law with memory would be inaccurate.
         fastest = np.inf if has_memory else period / float(np.min(window))
     slow = fastest <= pole and _max_contact_frequency(mechanism, scenarios) * period <= contact
     if mechanism.rig.force_sensor.filter is not None:

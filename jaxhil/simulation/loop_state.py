@@ -25,12 +25,12 @@ class PlantState(NamedTuple):
 
     @property
     def sent(self) -> Float[Array, "*batch"]:
-        """Unlimited position command of the compensator for tick n [m]."""
+        """Return the compensator's unlimited position command for tick n [m]."""
         return self.commands[0] if self.unlimited_command is None else self.unlimited_command
 
     @property
     def shortfall(self) -> Float[Array, "*batch"] | None:
-        """Distance [m] between the limited and the unlimited position command; None without limits."""
+        """Return the distance [m] of the limited from the unlimited position command; None without limits."""
         return None if self.unlimited_command is None else abs(self.unlimited_command - self.commands[0])
 
 

@@ -34,8 +34,8 @@ class Metrics(NamedTuple):
 
     `excess_variation` measures the chatter of the force command F_c. It is V/2 - (max F_c - min F_c), where
     V = sum |F_c(n+1) - F_c(n)| is the total variation of F_c, which counts as 0 before and after the contact.
-    It is 0 for a command that rises to its maximum, falls to its minimum and returns to 0. Each further swing
-    adds its height.
+    The excess variation is 0 for a command that rises to its maximum, falls to its minimum and returns to 0.
+    Each further swing of the command adds the height of the swing.
 
     `position_shortfall` is the largest |c - c'| at any tick of the contact. Here c is the compensator's
     position command, and c' is the command after the velocity and acceleration limits. The shortfall is

@@ -114,11 +114,11 @@ def motion_rows(
     """
     width, fraction = window / control_period, split_window(window, control_period).fraction
     zeros, ones = jnp.zeros_like(s + width), jnp.ones_like(s + width)
-    early = jnp.where(is_before, s, fraction)  # time before and after the window's start passes a tick
+    early = jnp.where(is_before, s, fraction)  # time until the window's start passes a tick
     late = jnp.where(is_before, 0, s - fraction)
     late_share = jnp.where(is_before, 0, ones)
     if hold == "linear":
-        begin, stop = 1 - fraction, 1 - fraction + early  # on the line from a to b
+        begin, stop = 1 - fraction, 1 - fraction + early  # fractions of the line from a to b
         first = (stop**2 - begin**2) / 2
         entering = s - s**2 / 2, s**2 / 2
         leaving = early - first, first + late - late**2 / 2, late**2 / 2

@@ -35,12 +35,12 @@ class Outcome(NamedTuple):
 
     @property
     def peak_force_ratio(self) -> Any:
-        """Largest real contact force divided by the ideal contact's peak force [1]."""
+        """Return the largest real contact force, divided by the ideal contact's peak force [1]."""
         return self.metrics.peak_force / self.reference_peak_force
 
     @property
     def duration_ratio(self) -> Any:
-        """Duration of the real contact force divided by the ideal contact's duration [1]."""
+        """Return the duration of the real contact force, divided by the ideal contact's duration [1]."""
         return self.metrics.duration / self.reference_duration
 
 

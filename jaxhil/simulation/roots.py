@@ -21,7 +21,7 @@ RootFunction = Callable[[Any, Array], Array]  # maps (data, argument) to the fun
 
 
 def find_positive_part(function: RootFunction, data: Any, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the subinterval of [low, high] in which a function is positive; it may change sign only once."""
+    """Return the subinterval of [low, high] in which a function with at most one sign change is positive."""
     root, at_low, at_high = _find_root(function, data, low, high)
     begin = jnp.where(at_low > 0, low, jnp.where(at_high > 0, root, low))
     end = jnp.where(at_high > 0, high, jnp.where(at_low > 0, root, low))

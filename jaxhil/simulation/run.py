@@ -122,7 +122,7 @@ class Run:
 
     @cached_property
     def summary(self) -> MechanismSummary:
-        """Summary of the mechanism: mass, ideal contacts, rates, and warnings about implausible numbers."""
+        """Return the summary of the mechanism: mass, ideal contacts, rates, and implausible numbers."""
         return summarise_mechanism(self.mechanism)
 
     def reasons(self, limit: float = 0.01) -> list[str]:
@@ -140,7 +140,7 @@ class Run:
 
     @cached_property
     def ticks(self) -> Ticks:
-        """Signals at all ticks up to the end of the last contact, or to the first non-finite number."""
+        """Return the signals at all ticks until the last contact ends, or until a number is not finite."""
         with jax_context():
             scenarios = build_scenarios(self.mechanism, seed=self.seed)
             loaded = LoadedGains({}, self.compensator, self.gains, self.mechanism)
@@ -158,37 +158,37 @@ class Run:
 
     @property
     def time(self) -> np.ndarray:
-        """Time of every tick [s]."""
+        """Return the time of every tick [s]."""
         return self.ticks.time
 
     @property
     def force_measured(self) -> np.ndarray:
-        """Reading of the force sensor at every tick [N]."""
+        """Return the reading of the force sensor at every tick [N]."""
         return self.ticks.force_measured
 
     @property
     def force_command(self) -> np.ndarray:
-        """Force on the numerical model at every tick [N]."""
+        """Return the force on the numerical model at every tick [N]."""
         return self.ticks.force_command
 
     @property
     def position_desired(self) -> np.ndarray:
-        """Position of the numerical model at every tick [m]."""
+        """Return the position of the numerical model at every tick [m]."""
         return self.ticks.position_desired
 
     @property
     def velocity_desired(self) -> np.ndarray:
-        """Velocity of the numerical model at every tick [m/s]."""
+        """Return the velocity of the numerical model at every tick [m/s]."""
         return self.ticks.velocity_desired
 
     @property
     def position_measured(self) -> np.ndarray:
-        """Reading of the position sensor at every tick [m]."""
+        """Return the reading of the position sensor at every tick [m]."""
         return self.ticks.position_measured
 
     @property
     def contact(self) -> np.ndarray:
-        """Index of the current or next contact at every tick, from 0."""
+        """Return the index, from 0, of the current or next contact at every tick."""
         return self.ticks.contact
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:

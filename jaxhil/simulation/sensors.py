@@ -134,9 +134,9 @@ def cut_dead_zone(force: Float[Array, "*batch"], dead_zone: Array, step: Array) 
     """Replace forces [N] up to `dead_zone` [N] by 0; larger forces remain unchanged.
 
     The reading jumps at the first tick after the force crosses the edge of the dead zone. The phase of the
-    contact in the control period determines this tick. The derivative is that of the mean reading over all
-    phases: over the phases, the force is spread uniformly over its last change `step` [N]. A `step` of 0
-    leaves out the jumps.
+    contact in the control period determines this tick. The derivative is the derivative of the mean reading
+    over all phases. For this mean, the force is assumed to be uniformly distributed over its last change
+    `step` [N]. With a `step` of 0, the derivative does not include the jumps.
     """
     return jnp.where(jnp.abs(force) > dead_zone, force, 0)
 
@@ -149,8 +149,8 @@ def _differentiate_cut(primals, tangents):
     for side in (1, -1):
         edge = side * dead_zone
         crosses = (force > edge) != (force - step > edge)
-        # A force that is larger by 1 N enters earlier, or leaves later, by 1/|step| ticks. During this
-        # time, the reading is larger by the dead zone.
+        # If the force is larger by 1 N, it crosses the edge of the dead zone 1/|step| ticks earlier when it
+        # rises, or later when it falls. During this time, the reading is larger by the dead zone.
         gain = jnp.where(crosses, dead_zone / jnp.where(crosses, jnp.abs(step), 1), 0)
         slope = slope + gain * (force_slope - side * dead_zone_slope)
     return cut_dead_zone(*primals), slope

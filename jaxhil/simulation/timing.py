@@ -104,7 +104,9 @@ def read_force(
     jitter: Float[Array, "*batch"],
     probe: Probe | None,
 ) -> Float[Array, "*batch"]:
-    """Return the real force [N] at tick `now` minus the delays and the jitter; 0 before the run.
+    """Return the real force [N] that the sensor reads at tick `now`; 0 if it acts before the run.
+
+    This is the force at the instant that precedes the tick by the delays and the jitter.
 
     Args:
         loop: Fixed properties of the loop; its contact law has no memory.
