@@ -128,14 +128,14 @@ def _specified(numbers: DrawnValues, bodies: Pair) -> States:
 def _before_touch(
     numbers: DrawnValues, bodies: Pair, groups: tuple[ContactGroup, ...], before: Any
 ) -> States:
-    """Return the states at `before` seconds before the first touch that the table [approach] specifies."""
+    """Return the states of the bodies, `before` [s] before the first touch that [approach] specifies."""
     keys = ("offset", "attitude", "velocity", "angular_velocity")
     return _lowered(bodies, groups, *(numbers(f"approach.{key}") for key in keys), before)
 
 
 @jax.jit
 def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, before) -> States:
-    """Return the states at `before` seconds before a first touch with this offset and velocity."""
+    """Return the states of the bodies, `before` [s] before a first touch with this relative motion."""
     rotation = exponential(vector(attitude))
     height = find_touching_height(groups, offset[0], offset[1], rotation)
     pose = Pose(Vector(offset[0], offset[1], height), rotation)

@@ -35,12 +35,12 @@ class Candidates(eqx.Module):
 
     @abc.abstractmethod
     def touch(self, pose: Pose) -> Touch:
-        """Return penetration, normal and point at a pose; its arrays have a leading axis of length 1."""
+        """Return penetration, normal and point at a pose, whose arrays have a leading axis of length 1."""
 
     @property
     @abc.abstractmethod
     def size(self) -> Float[Array, "candidates *batch"]:
-        """Penetration [m] at which one shape has passed through the other; infinite if this is impossible."""
+        """Return the penetration [m] at which one shape has passed through the other; may be infinite."""
 
 
 class ChaserSpheres(Candidates):

@@ -54,10 +54,10 @@ def known_constants(loop: Loop, scenario: Scenario) -> SixAxisConstants:
 
 
 class _Programs(NamedTuple):
-    """Compiled functions."""
+    """Compiled functions of this module."""
 
-    evaluate: Any
-    record: Any
+    evaluate: Any  # compiled `_evaluate`
+    record: Any  # compiled `_record`
 
 
 @cache

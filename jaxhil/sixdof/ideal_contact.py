@@ -35,7 +35,7 @@ MIN_CHANGE = 0.05
 
 
 class IdealContactSummary(NamedTuple):
-    """Past of the ideal contact: its metrics up to a time, and the states at this time."""
+    """Summary of the ideal contact up to a time: metrics until then, and states of the bodies then."""
 
     time: Float[Array, "*batch"]  # time since the start [s]
     states: States  # states of the bodies at the instants in `time`
@@ -135,9 +135,10 @@ def is_in_gap(reference: IdealContactRecord, time: Array, min_gap: Array) -> Boo
 def summary_at(
     reference: IdealContactRecord, time: Array, common: Bool[Array, "*batch"]
 ) -> IdealContactSummary:
-    """Return the past of the ideal contact at the start of the gap in which a `time` [s] lies.
+    """Return the summary of the ideal contact up to the start of the gap that contains a `time` [s].
 
-    A gap is a period without a touch. In lanes in which `common` is false, return the past at the run's end.
+    A gap is a period without a touch. In lanes in which `common` is false, return the summary of the whole
+    run.
     """
     summary = reference.last
     for slot in range(MAX_GAPS):
@@ -202,7 +203,7 @@ def _summarise(progress: IdealContactProgress) -> IdealContactSummary:
 def _record_gap(
     progress: IdealContactProgress, constants: IntegrationConstants, ahead: IdealContactProgress, now: Instant
 ) -> IdealContactProgress:
-    """Record in `ahead` the gap, if any, that begins or ends in the step from `progress` to `ahead`."""
+    """If a gap begins or ends in the step from `progress` to `ahead`, record it in `ahead`."""
     was, touches = _touches(progress), _touches(ahead)
     slot = jnp.arange(MAX_GAPS, dtype=jnp.int32).reshape(-1, *[1] * was.ndim) == progress.slot[None]
     change = jnp.stack(jax.tree.leaves(jax.tree.map(jnp.subtract, now.twist, constants.twist)))

@@ -266,8 +266,8 @@ def integrate_until(
 def error_speed(contact_model: IdealContactModel, states: States) -> Float[Array, "*batch"]:
     """Return the relative speed [m/s] by which integration errors are divided.
 
-    It is the relative speed of the centres of mass, plus the speed that the relative rotation gives a point
-    at a distance of 1 m. It does not depend on the interface frames.
+    The result is the sum of the relative speed of the centres of mass and the speed that the relative
+    rotation gives a point at a distance of 1 m. The result does not depend on the interface frames.
     """
     target, chaser = (
         rotate(state.attitude, angular_velocity(body, state))
@@ -285,8 +285,8 @@ def _end_tolerance(until: Array) -> Array:
 def _contact_free_time(contact_model: IdealContactModel, now: Instant) -> Float[Array, "*batch"]:
     """Return a step length [s] in which no shapes can touch and no latch can catch.
 
-    It is half of the shortest time until one of these events is possible. A latch is assumed to catch at any
-    angle and speed.
+    The step length is half of the shortest time until one of these events is possible. A latch is assumed to
+    catch at any angle and speed.
     """
     linear, angular = norm(now.twist.linear), norm(now.twist.angular)
     time = jnp.full_like(linear, jnp.inf)

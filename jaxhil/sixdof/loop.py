@@ -104,13 +104,13 @@ def begin(
     """Return the state of the loop before tick 0, from the states of the bodies at tick 0.
 
     Before tick 0, the pose command is assumed to move uniformly with the bodies' relative rates. `command` is
-    the pose command of tick 0; None: that of the compensator.
+    the pose command of tick 0. If it is None, the compensator computes this command.
     """
     law = SIX_AXIS_COMPENSATORS[loop.compensator]
     position, rates, twist = model_motion(rig.bodies, states)
     stride = rates * rig.period[None]
-    # A multiple of the delay line's length, because `start_uniform_motion` fills the line for a start at tick
-    # 0.
+    # The number of ticks is a multiple of the delay line's length, because `start_uniform_motion` fills the
+    # line for a start at tick 0.
     history = 0 if rig.kinematics.is_linear else max(SETTLING_TICKS, loop.ring)
     command = law.pose_command(rig.gains, position, rates) if command is None else command
     legs, leg_rates = jax.jvp(rig.kinematics.command, (command - history * stride,), (stride,))
@@ -156,7 +156,7 @@ def run(loop: Loop, gains: Gains, scenario: Scenario, ticks: int) -> tuple[RunSt
 def tick(loop: Loop, rig: RigConstants, state: RunState) -> tuple[RunState, Tick]:
     """Simulate one control period; return the next state and the record of the tick."""
     sensed, law = sense(loop, rig, state), SIX_AXIS_COMPENSATORS[loop.compensator]
-    # The compensator of a sensor without a tool is given the measured pose only if it reads it.
+    # A compensator that does not use the measured pose does not get it.
     signals = sensed.signals
     signals = signals if law.reads_pose else signals._replace(pose_measured=None)
     commands, law_state = law.step(rig.prepared, state.controller.law, signals, state.tick)

@@ -176,7 +176,7 @@ def _take_snapshots(bodies: Pair, states: list[States]) -> list[Snapshot]:
 def _twist_parts(matrix: Array, after: Twist, expected: Twist, before: Twist) -> tuple[Array, ...]:
     """Return the twist error in the norm of M, and its normal, lateral and rotational parts [1].
 
-    All are divided by the norm of the twist's change in the ideal contact.
+    All results are divided by the norm of the change of the twist in the ideal contact.
     """
     error, impulse = (_stacked(a) - _stacked(b) for a, b in ((after, expected), (expected, before)))
     size = safe_sqrt(_square(matrix, impulse))

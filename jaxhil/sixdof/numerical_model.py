@@ -16,7 +16,8 @@ from jaxhil.sixdof.vectors import assembled, vector
 def model_motion(bodies: Pair, states: States) -> tuple[Array, Array, Array]:
     """Return coordinates, their rates and the twist of the numerical model, (6, *batch) each.
 
-    They describe chaser frame C relative to target frame T; `states` are those of the model's bodies.
+    The results describe chaser frame C relative to target frame T. `states` are the states of the model's
+    bodies.
     """
     pose, twist = relative(bodies, states)
     at, rates = coordinates(pose, twist)

@@ -133,14 +133,14 @@ def wrench_at_chaser(wrench: Wrench, pose: Pose) -> Wrench:
 
 
 def power(wrench_at_chaser: Wrench, twist: Twist) -> Float[Array, "..."]:
-    """Return the power [W] on the relative motion of a wrench about the origin of chaser frame C."""
+    """Return the power [W] of a wrench about the origin of chaser frame C in a relative motion."""
     return dot(wrench_at_chaser.force, twist.linear) + dot(wrench_at_chaser.moment, twist.angular)
 
 
 def loads(wrench: Wrench, target: Frame, states: States) -> tuple[Load, Load]:
     """Return the loads on target and chaser: the wrench acts on the chaser, its reaction on the target.
 
-    Both act at the origin of target frame T.
+    Both loads act at the origin of target frame T.
     """
     force, moment = (rotate(target.attitude, part) for part in wrench)
 

@@ -136,12 +136,12 @@ class SixAxisRun:
 
     @cached_property
     def reference_final(self) -> Final:
-        """Motion of the bodies in the ideal contact from the same start, at the time of `final`."""
+        """Return the motion of the bodies in the ideal contact from the same start, at `final.time`."""
         return compute_ideal_final(self.mechanism, self.final.time)
 
     @cached_property
     def ticks(self) -> RunRecord:
-        """Signals at all ticks of the run, computed when this attribute is first used."""
+        """Return the signals at all ticks of the run; they are computed at the first use."""
         with jax_context():
             return record(self.mechanism, self.compensator, self.gains, self.seed, self.final.time)
 

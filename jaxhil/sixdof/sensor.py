@@ -1,9 +1,9 @@
 """Six-axis force sensor of the rig, and the controller's reconstruction of the contact wrench.
 
-A sensor on the fixed side, under the target's mechanism, reads the reaction force; the constant weight on it
-is tared. A sensor on the moving side is between the robot's flange and the chaser's mechanism (the tool). It
-also reads the tool's weight and inertial force, which depend on the tool's orientation and motion. Delay and
-lag of the sensor are part of `jaxhil.sixdof.loop`.
+A sensor on the fixed side, under the target's mechanism, reads the reaction force. A tare removes the
+constant weight on this sensor. A sensor on the moving side is between the robot's flange and the chaser's
+mechanism (the tool). It also reads the tool's weight and inertial force, which depend on the tool's
+orientation and motion. Delay and lag of the sensor are part of `jaxhil.sixdof.loop`.
 """
 
 from typing import Any, NamedTuple

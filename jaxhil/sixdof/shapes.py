@@ -34,7 +34,7 @@ class Shape(eqx.Module):
 
     @property
     def thickness(self) -> Float[Array, "..."] | float:
-        """Depth below the surface [m] at which a point has passed through the shape."""
+        """Return the depth below the surface [m] at which a point has passed through the shape."""
         return jnp.inf
 
 
@@ -161,7 +161,7 @@ class Capsule(Shape):
         return self.start + s * (self.end - self.start)
 
     def nearest(self, point: Vector) -> Float[Array, "..."]:
-        """Return where the segment is nearest to `point` [m], as a fraction of its length from its start."""
+        """Return the fraction of the segment's length, from its start, at the point nearest to `point`."""
         along = self.end - self.start
         square = dot(along, along)
         return jnp.clip(dot(along, point - self.start) / jnp.where(square > 0, square, 1), 0, 1)

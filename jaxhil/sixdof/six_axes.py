@@ -135,8 +135,8 @@ SIX_AXES = SixAxes()
 def _separate_loops(scenario: Scenario) -> Scenario:
     """Return a copy with equal values that makes XLA compile the tick loop as a separate function.
 
-    Otherwise XLA merges it with the loop over tiles. A dummy sort of two numbers prevents this; see the
-    function of the same name in `jaxhil.simulation.one_axis`.
+    Otherwise, XLA merges the tick loop with the loop over tiles. A dummy sort of two numbers prevents this;
+    see the function of the same name in `jaxhil.simulation.one_axis`.
     """
     most = jnp.max(scenario.duration)
     most = jnp.sort(jnp.stack([most, most + 1]))[1]
