@@ -37,7 +37,7 @@ def format_value(value: object, limit: int = 60) -> str:
         # Shortening a long text before escaping it saves time.
         value = value[: limit + 1]
     if isinstance(value, float):
-        value = float(value)  # the representation of NumPy's numbers names their type
+        value = float(value)  # `repr` of a NumPy number would show its type
     try:
         return to_one_line(repr(value), limit)
     except RecursionError:

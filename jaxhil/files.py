@@ -22,18 +22,18 @@ from typing import BinaryIO
 from jaxhil.errors import InputError, format_value, to_one_line
 
 TEMPORARY_SUFFIX = ".tmp"  # suffix of the temporary name under which a file is first written
-CHECKSUM_LENGTH = 65  # number of bytes before the content of a checksummed file
+CHECKSUM_LENGTH = 65  # bytes before the content of a checksummed file: 64 hexadecimal digits and a line feed
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
 _OPEN_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-_PROCESS_TOKEN = secrets.token_hex(4)  # distinguishes processes with equal numbers, which the system reuses
+_PROCESS_TOKEN = secrets.token_hex(4)  # distinguishes processes, because the system reuses their numbers
 _TEMPORARY_NAME_PATTERN = re.compile(rf"\.jaxhil-(\d+)-([0-9a-f]{{8}})-\d+{re.escape(TEMPORARY_SUFFIX)}")
 _name_counter = count()
 
 
 @contextmanager
 def report_write_errors(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Raise `InputError` if the code in the context cannot write to `path`."""
+    """Raise `InputError` if the code in the `with` block raises OSError when it writes to `path`."""
     try:
         yield
     except (OSError, ValueError) as error:
@@ -230,7 +230,7 @@ def is_temporary(name: str) -> bool:
 
 
 def temporary_name() -> str:
-    """Return a unique name for a file or folder while this process writes it."""
+    """Return a unique name under which this process can write a file or folder before it renames it."""
     return f".jaxhil-{os.getpid()}-{_PROCESS_TOKEN}-{next(_name_counter)}{TEMPORARY_SUFFIX}"
 
 

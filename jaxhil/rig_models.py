@@ -7,7 +7,9 @@ from jaxhil.simulation.one_axis import ONE_AXIS
 
 
 def choose_rig_model(mechanism: AnyMechanism) -> RigModel:
-    """Return the rig model for a mechanism. The six-axis code is imported only for a six-axis mechanism.
+    """Return the rig model (simulation of rig and contact) for a mechanism with one axis or six axes.
+
+    The six-axis code is imported only for a six-axis mechanism.
 
     Example:
         >>> import jaxhil
