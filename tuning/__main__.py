@@ -77,7 +77,7 @@ def command() -> None:
     _open_closed_streams()
     os.environ["MPLBACKEND"] = "agg"  # plots are files, so a window system must not be used
     code = main()
-    # Frozen objects are not collected at exit, which would take a fifth of a short command's time.
+    # Frozen objects are not collected at exit; collecting them would take a fifth of a short command's time.
     gc.freeze()
     sys.exit(code)
 

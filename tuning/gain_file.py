@@ -102,9 +102,9 @@ def validity_envelope(mechanism: Mechanism, scenarios: Scenario) -> dict[str, di
     Returns:
         A dictionary {"low", "high", "unit"} for each of four quantities: `contact_frequency`, sqrt(k/M)/(2
         pi) [Hz]; `delay`, the delay of force sensor plus motion simulator [s]; `approach_velocity`, the speed
-        v before the first contact [m/s]; `force`, the undamped peak force F_peak [N], from the energy M v^2/2
-        = integral of F. k = (F_peak/v)^2/M is the stiffness of the undamped linear contact with this peak
-        force.
+        v before the first contact [m/s]; `force`, the peak force F_peak of the undamped contact [N], at which
+        the contact has stored the whole energy M v^2/2. The frequency is that of the linear contact with this
+        peak force, whose stiffness is k = (F_peak/v)^2/M.
     """
     peak = _peak_forces(mechanism, scenarios)
     mass, velocity = np.asarray(scenarios.equivalent_mass), np.asarray(scenarios.velocity)

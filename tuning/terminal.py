@@ -23,7 +23,7 @@ from rich.text import Text
 from jaxhil.errors import InputError, to_one_line
 
 DEFAULT_WIDTH = 110  # characters; width of lines if no stream is a terminal
-COLUMN_INDEX = re.compile(r"_(\d+)(?=_\d+|$)")  # index from 1 at the end of a sweep's column name
+COLUMN_INDEX = re.compile(r"_(\d+)(?=_\d+|$)")  # one-based index in a sweep's column name, for example `_2`
 # Verdicts in JSON documents for exit codes 2 and 130.
 UNUSABLE_INPUT, INTERRUPTED = "unusable input", "interrupted"
 PROGRESS_INTERVAL = 10.0  # s; time between progress lines if the output is not a terminal

@@ -28,8 +28,8 @@ Result = TypeVar("Result")
 
 
 SIX_AXIS_COMPENSATOR_NAMES = built_in_compensators(6)
-# Default limit of the restitution error, and in six axes of the twist error [1]. A force sensor with the
-# usual cross-talk of 1 % alone leaves twist errors of 0.03 to 0.1, whatever the compensator does.
+# Default limit of the restitution error, and in six axes of the twist error [1]. In six axes, the usual 1 %
+# of cross-talk in a force sensor causes twist errors of 0.03 to 0.1, which no compensator reduces.
 DEFAULT_LIMIT, SIX_AXIS_DEFAULT_LIMIT = 0.01, 0.05
 
 
@@ -105,7 +105,7 @@ def check_limit(value: Any) -> None:
 
 
 def choose_limit(value: float | None, mechanism: AnyMechanism) -> float:
-    """Return the limit of the error that decides the verdict [1], by default that of the number of axes."""
+    """Return `value` or, if it is None, the default error limit for the mechanism's number of axes [1]."""
     if value is not None:
         return value
     return SIX_AXIS_DEFAULT_LIMIT if isinstance(mechanism, SixAxisMechanism) else DEFAULT_LIMIT
@@ -163,7 +163,7 @@ def check_one_axis_arguments(mechanism: AnyMechanism, **values: Any) -> None:
 def compensator_names() -> tuple[str, ...]:
     """Return the names of all built-in compensators, then those of the registered compensators.
 
-    This function does not import jax: a compensator can be registered only after jax was imported.
+    This function does not import jax. As long as jax is not imported, no compensator can be registered.
     """
     module = sys.modules.get("jaxhil.laws.compensators")
     return tuple(dict.fromkeys([*built_in_compensators(), *(module.COMPENSATORS if module else ())]))
@@ -243,7 +243,7 @@ def load_gains(value: Any, argument: str = "gains", any_axes: bool = False) -> "
         value: path of a gain file or of its folder, or an object whose attribute `document` is the content of
             a gain file, such as a result of `tuning.tune`.
         argument: name of the argument in error messages.
-        any_axes: accept gains for six axes too.
+        any_axes: whether gains for six axes are accepted too.
 
     Returns:
         The gains with their compensator and mechanism.

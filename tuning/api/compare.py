@@ -59,9 +59,9 @@ class Board:
     Attributes:
         document: all results, as `jaxhil compare --json` prints them under `mechanisms`.
         figures: metrics by compensator, then by set of gains ("literature", "tuned", or the name of a
-            setting). The metrics are the attributes rms, p99, worst, early, late, slope, peak [1] and more;
-            each is a `ComparedMetric`. For six axes, rms, p99 and worst are those of the twist error, and
-            energy_rms and not_ended replace the metrics of transparency.
+            setting). The metrics are the attributes rms, p99, worst, early, late, slope, peak [1] and more
+            (see `tuning.transparency.metrics`); each is a `ComparedMetric`. For six axes, rms, p99 and worst
+            are those of the twist error, and energy_rms and not_ended replace the metrics of transparency.
         gains: gains [SI units] by compensator, then by set of gains as in `figures`, then by the gain's name.
         winners: for each metric, the compensator that is better than all others by more than the confidence
             intervals, or None if there is no such compensator.

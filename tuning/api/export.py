@@ -71,7 +71,7 @@ class ExportResult:
         return list(self.document["unknown"])
 
 
-ALL_LIMITS = {**SIX_AXIS_LIMITS, **LIMITS}  # of one axis and of six
+ALL_LIMITS = {**SIX_AXIS_LIMITS, **LIMITS}  # limits for one axis and for six axes
 FmiVersions = AllowedValues(2, 3, words="2 or 3")
 ProbabilityRange = AllowedValues(0.0, 1.0, words="0 to 1")
 
@@ -117,7 +117,7 @@ def export(
 
     Args:
         gains: result of `tuning.tune`, or the path of a gain file or of its folder.
-        folder: folder of the bundle. A new or empty folder, or a bundle, which is replaced.
+        folder: folder of the bundle: a new or empty folder, or an earlier bundle, which is replaced.
         sweep: result of `tuning.sweep` for these gains, or the folder with such a result. Limits and alarm
             rates are computed from its runs.
         formats: additional formats of the gains: "ros2", "matlab", "csv", "c99", "fmu"; None: all but "fmu".

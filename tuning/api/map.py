@@ -48,7 +48,7 @@ class StabilityMap:
         x: values of the key along x, (columns,), in the unit of the key.
         y: values of the key along y, (rows,), in the unit of the key.
         error: error with the largest magnitude among the contacts, (rows, columns) [1]; NaN if a contact did
-            not end, or if nothing touched.
+            not end, or if there was no contact.
         restitution: restitution e of the contact with this error, (rows, columns) [1]; for six axes NaN
             unless there is a single touch.
         results: the same results as arrays, with theory and margins (`tuning.stability_map.grid.MapResults`).
@@ -227,7 +227,7 @@ def _build_document(
     closed, radii = computed.closed, computed.radii
     document = {
         "schema": SCHEMA,
-        "verdict": "good",  # a map has no requirement
+        "verdict": "good",  # a map has no requirement that could be violated
         "mechanism": mechanism.name,
         "axes": computed.rig_axes,
         "compensator": compensator,

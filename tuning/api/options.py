@@ -36,17 +36,17 @@ class AllowedValues:
 
 
 def number_option(meaning: str, **more: Any):
-    """Return tyro's description of an option whose value is a number."""
+    """Return tyro's configuration of an option whose value is a number."""
     return arg(metavar="NUMBER", help=meaning, **more)
 
 
 def folder_option(meaning: str):
-    """Return tyro's description of an option whose value is an output folder."""
+    """Return tyro's configuration of an option whose value is an output folder."""
     return arg(aliases=("-o",), metavar="DIR", help=meaning)
 
 
 def text_option(metavar: str | None, meaning: str, **more: Any):
-    """Return tyro's description of an option whose help text states the default value."""
+    """Return tyro's configuration of an option whose help text states the default value."""
     return arg(metavar=metavar, help=meaning, help_behavior_hint="", **more)
 
 

@@ -36,7 +36,7 @@ class ShadowResult:
 
     @property
     def good(self) -> bool:
-        """Return whether the controller would not have tripped."""
+        """Return True unless the controller would have tripped."""
         return self.document["verdict"] == "good"
 
     def plot(self, path: str | os.PathLike[str]) -> None:
@@ -149,7 +149,7 @@ def _prepare_controller(gains: Any, loaded: Any) -> Callable[[Sequence[str]], An
     kind = kind_of(loaded.document)
     arguments.check_has_runtime(loaded.compensator, kind.axes)
     if isinstance(gains, (str, os.PathLike)):
-        # If the check passes, the code of this package behaves like the bundle's code.
+        # If the check passes, this package's code behaves like the bundle's code and runs in its place.
         check_bundle_code(Path(gains), loaded.compensator, kind.axes)
     gain_file = kind.check_document(loaded.document)
 

@@ -17,7 +17,8 @@ from jaxhil.simulation.jax_environment import cache_folder
 from tuning.terminal import format_duration
 
 RECORD_FILE = "tune-times.json"  # time per simulated tick [s], by axes and compensator
-MAX_BATCH_FACTOR = 4  # time of a tuning whose starts disagree, divided by that with one batch of starts
+# largest ratio of the time if the starts disagree to the time with a single batch of starts [1]
+MAX_BATCH_FACTOR = 4
 
 
 def describe_expected_duration(mechanisms: Sequence[AnyMechanism], compensator: str, runs: float) -> str:
@@ -65,7 +66,7 @@ def _name(mechanism: AnyMechanism, compensator: str) -> str:
 
 
 def _count_ticks(mechanisms: Sequence[AnyMechanism]) -> float:
-    """Return the mean number of ticks of a nominal run; for six axes, those of one second."""
+    """Return the mean number of ticks of a nominal run; for six axes, the number of ticks in one second."""
     from jaxhil.simulation.plausibility import summarise_mechanism
 
     ticks = [

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from tuning.gains.settings import TuneSettings
     from tuning.gains.transfer import EarlierGains
 
-    # Only texts on the command line; the function `tune` also accepts results of `tune`, and functions.
+    # On the command line, a value is a text. The function `tune` also accepts a result of `tune` as a start,
+    # and a function as the objective.
     Start = Any
     ObjectiveOption = str | Callable[[Any], Any]
 else:
@@ -194,9 +195,9 @@ class TuneOptions:
     def wants_quiet(self) -> bool:
         """Return whether the options ask for quiet gains.
 
-        Among the gains whose error is within the limit, these amplify sensor noise least and cause the
-        smallest peaks of the force command. The options ask for them if the limit is positive and finite, and
-        all options of the objective have their default values.
+        Quiet gains are those that, among all gains whose error is within the limit, amplify sensor noise
+        least and cause the smallest peaks of the force command. The options ask for quiet gains if the limit
+        is positive and finite, and all options of the objective have their default values.
         """
         weights = self.command_weight, self.noise_weight, self.chatter_weight, self.transparency_weight
         is_default = self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tuning.gains.pareto import ParetoFront, ParetoPoint
     from tuning.gains.tune import ErrorMetrics, TuneResult
 
-# Names in files of those weights of the objective whose fields have a different name.
+# Names in gain files of those weights that have another name as a field of the objective.
 NAMES_IN_FILES = {"transparency_weight": "honesty_weight"}
 
 
@@ -207,7 +207,7 @@ class TradedGains:
         """Return the JSON entry of this point: weight, cost, error [1], and whether it is on the front.
 
         The weight is that of the cost in the objective of the tuning. A point is on the front unless another
-        point has a smaller error or cost, and does not have a larger one.
+        point is better in error or cost and at least as good in the other.
         """
         axis = self.front.axis
         return {

@@ -40,7 +40,7 @@ RENAMED_OPTIONS = {
     "--no-certify": "--no-global-search",
 }
 
-RENAMED_VALUES = {("--pareto-against", "honesty"): "transparency"}  # likewise, by option and old value
+RENAMED_VALUES = {("--pareto-against", "honesty"): "transparency"}  # new value by option and old value
 
 DESCRIPTION = """Gains that keep hardware-in-the-loop docking tests from diverging.
 

@@ -18,7 +18,7 @@ from tuning.cli.options import PLOT_SUFFIXES
 
 # Names that Windows reserves for devices, even with a suffix; results may be copied to a Windows system.
 RESERVED_NAME = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.I)
-MAX_FOLDER_NAME_BYTES = 120  # bytes; file systems allow 255, but some tools allow less
+MAX_FOLDER_NAME_BYTES = 120  # longest folder name [bytes]; file systems allow 255, but some tools allow less
 MAX_NAMES_IN_MESSAGE = 3  # largest number of mechanism names listed in a message
 
 

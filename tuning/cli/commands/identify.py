@@ -24,7 +24,7 @@ from tuning.identification.records import DEFAULT_MECHANISM_NAME, Campaign
 SCHEMA = "jaxhil/identification/1"
 MAX_ORDER = 4  # highest order of a motion simulator that `--order` accepts
 MECHANISM_FILE, DOCUMENT_FILE = "mechanism.toml", "identification.json"
-# Head of the mechanism file, below the verdict.
+# Comment at the head of the mechanism file, below the comment with the verdict.
 SPREAD_COMMENT = """\
 [uncertainty] is the uncertainty of the estimate from these logs, of one rig on one day.
 It does not include variation with temperature, wear or specimen."""
@@ -88,7 +88,8 @@ def run(options: IdentifyOptions) -> int:
     else:
         _print(document, None if result.mechanism is None else folder)
         if result.mechanism is not None:
-            # Runs with the designed commands determine the numbers better.
+            # After a bad result, the next step is to design commands for new runs, which determine the
+            # parameters better.
             step = ("tune",) if result.good else ("identify", "--design")
             terminal.suggest(*step, str(folder / MECHANISM_FILE))
     return 0 if result.good else 1

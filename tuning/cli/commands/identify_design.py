@@ -82,7 +82,7 @@ def _build_document(options: IdentifyOptions, name: str, design: ExcitationDesig
     numbers = zip(design.keys, design.values, design.std, effects, strict=True)
     content = {
         "schema": SCHEMA,
-        "verdict": "good",  # a design has no requirement
+        "verdict": "good",  # a design has no requirement that could be violated
         "mechanism": to_one_line(name),
         "predicted": [
             {"key": key, "value": value, "std": std, "effect": effect, "unit": get_unit(key)}

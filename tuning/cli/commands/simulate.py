@@ -21,7 +21,7 @@ from tuning.cli.options import SimulateOptions
 if TYPE_CHECKING:
     from jaxhil.simulation.run import ContactResult, Run
 
-# Estimates of a compensator; heading and decimals of the table column, which shows 1000 times the SI value.
+# Heading and decimals of the table column of each estimate; a column shows 1000 times the SI value.
 ESTIMATE_COLUMNS = {"force_delay": ("force delay [ms]", 2)}
 
 

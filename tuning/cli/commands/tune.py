@@ -371,7 +371,10 @@ def _draw(result, options: Tune, limit: float, folder: Path) -> list[str]:
 
 
 def _verdict(entries, problems, interrupted) -> str:
-    """Return "good" if the gains of every mechanism are good, else "bad", or why there is no verdict."""
+    """Return the verdict: "good" if the gains of every mechanism are good, else "bad".
+
+    If there is no verdict, return the reason: unusable input or an interruption.
+    """
     if interrupted:
         return terminal.INTERRUPTED
     if problems:
