@@ -1,4 +1,4 @@
-"""Comparison of compensators, each with tuned gains, in the same scenarios and probes.
+"""Comparison of compensators, each with tuned gains, in the same scenarios with the same perturbations.
 
 A task is one compensator and one group of mechanisms that share a compiled program. The tasks are distributed
 to as many processes as there are cores. Each process uses few JAX devices, because most of the time is

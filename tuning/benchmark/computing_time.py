@@ -14,7 +14,7 @@ from jaxhil.rig.six_axes import SIX_AXIS_COMPENSATORS, ModelConstants
 TIMED_TICKS = 2000  # number of ticks whose time is measured
 APPROACH_DURATION, CONTACT_DURATION = 0.02, 0.2  # durations of the simulated approach and contact [s]
 STIFFNESS = 1e5  # stiffness of the simulated contact [N/m]
-DEFAULT_VELOCITY = 0.01  # approach speed for a file with explicit starting states [m/s]
+DEFAULT_VELOCITY = 0.01  # approach speed if the file defines the initial states instead of a speed [m/s]
 
 
 def measure_tick_time(mechanism: AnyMechanism, law: str, gains: Mapping[str, float]) -> float:
@@ -60,7 +60,10 @@ def _build_tick(compensator: Any) -> Callable[[float, float, float], None]:
 def _build_six_axis_tick(
     mechanism: SixAxisMechanism, law: str, gains: Mapping[str, float]
 ) -> Callable[[float, float, float], None]:
-    """Return such a function for a six-axis compensator; all motion is along the docking axis."""
+    """Return a function of force, position and speed that runs one tick of a six-axis compensator.
+
+    The arguments are components along the docking axis; all other components are 0.
+    """
     from jaxhil.sixdof.model_constants import model_constants
 
     constants = ModelConstants(**model_constants(mechanism))

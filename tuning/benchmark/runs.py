@@ -1,4 +1,4 @@
-"""Runs of one compensator on one mechanism with one axis for the comparison, with and without perturbations.
+"""Runs for `jaxhil compare` of one compensator on one one-axis mechanism, with and without perturbations.
 
 The perturbations are pushes and additional damping. All mechanisms that share a `CommonProgram` use the same
 compiled program of a compensator.
@@ -32,7 +32,7 @@ from tuning.transparency.pushes import (
 
 
 class ScenarioSet(NamedTuple):
-    """Scenarios of one mechanism with one axis in which every compensator is evaluated, as NumPy arrays."""
+    """Scenarios of one one-axis mechanism, as NumPy arrays; they are the same for all compensators."""
 
     mechanism: Mechanism  # mechanism with its uncertainty
     common: CommonProgram  # program that the mechanism shares with other mechanisms
@@ -42,7 +42,7 @@ class ScenarioSet(NamedTuple):
 
     @property
     def lanes(self) -> int:
-        """Return the number of lanes that `evaluate` simulates, for progress messages."""
+        """Return the number of runs (lanes) that `evaluate` simulates, for progress messages."""
         return (
             len(PerturbedOutcomes._fields)
             * len(self.plain.velocity)

@@ -1,4 +1,4 @@
-"""Runs of one compensator on one six-axis mechanism for the comparison."""
+"""Runs for `jaxhil compare` of one compensator on one six-axis mechanism."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from tuning.transparency.metrics import compute_error_metrics, compute_ratio_met
 
 
 class SixAxisScenarioSet(NamedTuple):
-    """Scenarios of one six-axis mechanism in which every compensator is evaluated, as NumPy arrays."""
+    """Scenarios of one six-axis mechanism, as NumPy arrays; they are the same for all compensators."""
 
     mechanism: SixAxisMechanism  # mechanism with its uncertainty
     scenarios: Any  # scenarios with their ideal contacts
@@ -22,7 +22,7 @@ class SixAxisScenarioSet(NamedTuple):
 
     @property
     def lanes(self) -> int:
-        """Return the number of lanes that `evaluate` simulates, for progress messages."""
+        """Return the number of runs (lanes) that `evaluate` simulates, for progress messages."""
         return count_lanes(self.scenarios)
 
     def evaluate(

@@ -58,12 +58,16 @@ class CommonProgram:
     precomputed: bool  # whether ideal contacts without a closed form are integrated before the simulation
 
     def law(self, precomputed: bool | None = None) -> LawMixture:
-        """Return a law that selects a law per lane; unless `precomputed`, it also computes ideal contacts."""
+        """Return a contact law that applies the law of each lane's mechanism.
+
+        If `precomputed` is true, the scenarios must contain the ideal contacts of laws without a closed form;
+        otherwise the law computes them.
+        """
         return LawMixture(self._kinds, self.precomputed if precomputed is None else precomputed)
 
     @property
     def _kinds(self) -> tuple[ContactLaw, ...]:
-        """Return the contact laws that the simulation uses, each once even if several names mean it."""
+        """Return the contact laws that the simulation uses; laws with several names occur once."""
         return tuple(dict.fromkeys(find_contact_law(name).simulation_law for name in self.laws))
 
     def loop(self, loop: Loop) -> Loop:
@@ -114,7 +118,7 @@ class CommonProgram:
         return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (self.slots, *leaf.shape)), reference)
 
 
-UNREACHED_DEPTH = 1.0  # m; no mechanism penetrates so deeply
+UNREACHED_DEPTH = 1.0  # m; penetration that no contact reaches
 
 
 @partial(jax.jit, static_argnums=0)
@@ -137,7 +141,8 @@ def group_by_common_program(mechanisms: Sequence[AnyMechanism]) -> list[tuple[li
 
 def _group_one_axis(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], CommonProgram]]:
     """Group one-axis mechanisms that can share a program; return (indices, program) of each group."""
-    # These scenarios have the ends of all uncertain ranges, and so need every part that a draw can need.
+    # These scenarios contain the ends of all uncertain ranges. They therefore need every part of the loop
+    # that any other scenario can need.
     batches = [build_scenarios(mechanism, draw_extremes(mechanism)) for mechanism in mechanisms]
     loops = [build_loop(m, "none", batch) for m, batch in zip(mechanisms, batches, strict=True)]
     groups: dict[Any, list[int]] = {}
@@ -156,7 +161,7 @@ def _group_one_axis(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Co
 
 
 def _needs_simulated_speeds(mechanism: Mechanism) -> bool:
-    """Return whether ideal contacts are integrated numerically from speeds known only during simulation."""
+    """Return whether ideal contacts are integrated from speeds that only the simulation determines."""
     return mechanism.approach.contacts > 1 and not find_contact_law(mechanism.contact.law).has_closed_form
 
 

@@ -1,4 +1,4 @@
-"""Layout of the lanes of several problems: joined along one array axis, and divided into tiles."""
+"""Layout of the lanes (batch elements) of several problems: joined along one axis, and divided into tiles."""
 
 import math
 from collections.abc import Callable

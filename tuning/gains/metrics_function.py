@@ -81,7 +81,10 @@ class MetricsFunction:
         return jax.vmap(self._value)(metrics)
 
     def numbers(self, metrics: ScenarioMetrics) -> Float[np.ndarray, "several"]:
-        """Return `values` as a NumPy array, NaN for infinity; raise `InputError` if a value is negative."""
+        """Return `values` as a NumPy array in which NaN replaces infinity.
+
+        Raise `InputError` if a value is negative.
+        """
         values = np.asarray(self._vectorised(metrics), float)
         if np.any(values < 0):
             raise InputError(

@@ -43,11 +43,12 @@ from tuning.gains.tasks import TuneTask, list_tuned_gains
 from tuning.gains.validation import Validation
 from tuning.optimisation.derivative_free import polish
 
-NONSMOOTH_POLISH_FACTOR = 3  # factor on derivative-free evaluations with a user's function
+# factor on the evaluations of the derivative-free search if the objective is a user's function
+NONSMOOTH_POLISH_FACTOR = 3
 MAX_START_BATCHES = 4  # largest number of batches of starts
 MIN_AGREEING_STARTS = 3  # starts that must reach the best value; two can reach the same poor minimum
 AGREEMENT_TOLERANCE = 0.005  # largest relative difference between values of the same minimum
-# The same with probes, for which the objective varies more between different draws of the scenarios.
+# Largest relative difference with transparency probes, whose errors vary more between draws of scenarios.
 PROBED_AGREEMENT_TOLERANCE = 0.02
 # derivative-free search from a stuck start: generations, initial standard deviation in unit coordinates
 RESTART_GENERATIONS, RESTART_STD = 24, 0.2

@@ -227,9 +227,10 @@ def _choose_call_size(number: int) -> int:
 
 
 def assign_to_devices(size: int) -> np.ndarray:
-    """Return which problem each position of a call holds, so that all devices take about equally long.
+    """Return the index of the problem at each position of a call, so that all devices need about equal times.
 
-    Problems are sorted by duration and dealt to the devices in turn; a device's positions are adjacent.
+    Problems are sorted by duration and assigned to the devices in turn. The positions of a device are
+    adjacent.
     """
     devices = math.gcd(jax.device_count(), size)
     return np.arange(size).reshape(-1, devices).T.ravel()
@@ -246,7 +247,7 @@ def _build_call(tasks, names, bounds, objectives, number):
     lanes = tasks[0].lanes
     terms = join_terms(objectives, tasks[0].probed, tasks[0].contacts)
     model, scenarios = tasks[0].model, tasks[0].scenarios
-    # The Jacobian has a copy of the state for each gain.
+    # The Jacobian needs one more copy of the state for each gain, which the size of a tile must account for.
     tile = find_tile_size(
         size * lanes, LANES_PER_TILE, lambda: (1 + len(names)) * model.count_lane_bytes(loop, scenarios)
     )

@@ -22,11 +22,11 @@ from tuning.gains.tasks import TuneTask, list_tuned_gains
 from tuning.gains.tune import TuneResult
 from tuning.gains.validation import Validation
 
-# Smallest and largest weighted second criterion of accurate gains, divided by their error [1].
-# The first ladder extends to a larger weight, since the solver otherwise finds no quiet, inaccurate gains.
+# Ends of a ladder: weight times second criterion of the accurate gains, divided by their error [1]. The first
+# ladder extends to a larger weight, since the solver otherwise finds no quiet, inaccurate gains.
 LADDER_ENDS, FIRST_LADDER_ENDS = (0.5, 10.0), (1.0, 100.0)
 MAX_ACCURATE_ERROR_RATIO = 1.05  # largest error of accurate gains / least error
-MIN_NOISE_EXCESS = 0.1  # minimum noise amplification minus 1 in the scale of a ladder [1]
+MIN_NOISE_EXCESS = 0.1  # a smaller noise amplification minus 1 counts as this value in a ladder's scale
 MAX_NEIGHBOUR_SEARCHES = 4  # largest number of passes that start from the gains of neighbouring weights
 MIN_IMPROVEMENT = 1e-3  # minimum relative improvement of a point that leads to a further pass
 
@@ -38,7 +38,7 @@ class ParetoCriterion(NamedTuple):
     weight: str  # name of the field of `Objective` that weights the criterion
     cost: str  # name in JSON files
     words: str  # name in sentences
-    least: float  # minimum of the criterion's term in the scale of a ladder [1]
+    least: float  # a smaller term of the criterion counts as this value in a ladder's scale [1]
 
 
 NOISE_CRITERION = ParetoCriterion(
@@ -140,7 +140,7 @@ def solve_weight_ladders(
 
 
 def estimate_ladder_runs(tasks: list[TuneTask], number: int, settings: TuneSettings) -> int:
-    """Return about how many simulated runs `solve_weight_ladders` needs if it makes all passes."""
+    """Return the approximate number of simulated runs of `solve_weight_ladders` if it makes all passes."""
     starts = max(settings.starts, 2) + MAX_NEIGHBOUR_SEARCHES * 2
     return len(tasks) * number * starts * settings.steps * count_step_runs(tasks, list_tuned_gains(tasks))
 
@@ -157,7 +157,10 @@ def _build_fitting_ladder(
 
 
 def replace_weight(objective: Objective, axis: ParetoCriterion, weight: float) -> Objective:
-    """Return a copy of the objective in which the second criterion has a weight of the error `weight` [1]."""
+    """Return a copy of the objective in which the second criterion has the weight `weight`.
+
+    `weight` is the error [1] that counts as much as a value of 1 of the criterion's term.
+    """
     return dataclasses.replace(objective, **{axis.weight: float(weight) / objective.unit(axis.weight)})
 
 

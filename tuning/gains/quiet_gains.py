@@ -1,9 +1,9 @@
 """Search for the quietest gains whose error is within a limit, for rigs with noisy sensors.
 
 Gains are quiet if they amplify sensor noise little and cause small peaks of the force command. The most
-accurate gains need phase lead, which does the opposite. A second search therefore starts at the most accurate
-gains. It gives errors within a tolerance below the limit almost no weight (`Objective.tolerance`), and
-minimises the root of
+accurate gains need phase lead, which amplifies noise and raises the peaks. A second search therefore starts
+at the most accurate gains. It gives errors within a tolerance below the limit almost no weight
+(`Objective.tolerance`), and minimises the root of
 
     (N / max(N_0, 1))^2 + (rms(C) / max(rms(C_0), 0.5))^2
 

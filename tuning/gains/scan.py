@@ -87,7 +87,10 @@ def _evaluate_points(
 def _is_sum_of_squares(
     validation: Validation, which: list[int], objective: Objective | Sequence[Objective]
 ) -> bool:
-    """Return whether the objective is a sum of squares: a sum over a few scenarios is then a lower bound."""
+    """Return whether the objective is a sum of squares.
+
+    If it is, its sum over a few scenarios is a lower bound of its sum over all scenarios.
+    """
     if validation.tasks[0].probed or not isinstance(validation.tasks[0].mechanism, Mechanism):
         return False
     objectives = list_objectives(objective, len(validation.tasks))

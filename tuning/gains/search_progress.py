@@ -22,7 +22,8 @@ class SearchProgress:
         self.name = ""  # name of the current group of mechanisms
         self.runs_after_group = 0.0  # number of runs that remain after the current group
         self.journal: StepCheckpoints = NO_CHECKPOINTS.journal("", None)  # checkpoints of the group's steps
-        self.announce: Callable[[float], None] = lambda runs: None  # called with the number of runs
+        # callback before a search, with its estimated number of runs
+        self.announce: Callable[[float], None] = lambda runs: None
         self._text, self._kept, self._done, self._left = "", 0.0, 0.0, 0.0
 
     @property

@@ -1,1 +1,1 @@
-"""Optimisers in the unit box and the sensitivity at the optimum, independent of docking."""
+"""Optimisers for variables in the unit box, and sensitivities at the optimum, independent of docking."""

@@ -289,7 +289,7 @@ def select_distant_points(ranked, fixed_points, number):
 
 
 def select_points_at_distance(ranked, fixed_points, number, distance=None):
-    """Select points like `select_distant_points`, but return fewer if too few keep the minimum `distance`."""
+    """Select points like `select_distant_points`, but fewer if too few have the minimum `distance`."""
     distance = MIN_START_DISTANCE * np.sqrt(ranked.shape[-1]) if distance is None else distance
     chosen = list(np.clip(fixed_points[:number], 0, 1))
     for point in ranked:

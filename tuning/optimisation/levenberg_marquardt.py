@@ -110,10 +110,11 @@ def _shard_over_devices(one_device: Callable[..., SolverResult], *arguments: Any
 
 
 def _with_jacobian(residuals, free, arguments, tile=None):
-    """Return a function that computes (residuals, loss) of one problem, for `jax.vmap` with all problems.
+    """Return a function of one problem that computes (residuals, loss), to be mapped over all problems.
 
-    The function's derivative multiplies by a Jacobian that is computed once, in forward mode, for `tile`
-    problems at a time. `free` and `arguments` are examples of its arguments with a leading axis of problems.
+    The function must be mapped by `jax.vmap`. Its derivative is a product with the Jacobian, which is
+    computed once, in forward mode, for `tile` problems at a time. `free` and `arguments` are examples of its
+    arguments with a leading axis of problems.
     """
 
     def value_and_jacobian(free, arguments):
