@@ -226,8 +226,8 @@ class ContactProblem:
         if coefficients is None or self.law.pulls or not self.damping_indices:
             return inside
         pushing = inside & (compute_force(coefficients, near.columns) > 0.0)
-        # If the force has the wrong sign, the law pulls in most rows. These rows remain in contact, so that
-        # the fit shows the wrong sign.
+        # If the measured force has the wrong sign, the fitted law pulls in most rows. These rows remain in
+        # contact, so that the fit reveals the wrong sign.
         sound = 2 * pushing.sum(axis=1) > inside.sum(axis=1)
         return np.where(sound[:, None], pushing, inside)
 

@@ -105,7 +105,8 @@ def compute_posterior(
     heights, planes, spreads = _marginalise_over_surface(places, cells, len(finer))
     low, high = _find_likely_delays(problem, finer, heights, FINAL_GRID_DROP)
     delays = np.linspace(low, high, size[0])
-    # If a cell contains the whole posterior of a delay, the surface jumps between delays: smooth it.
+    # If one cell contains the whole posterior at a delay, the estimated surface position jumps from delay to
+    # delay: smooth it.
     planes = uniform_filter1d(planes, SMOOTHING_DELAYS, mode="nearest")
     surface = np.interp(delays, finer, planes), np.interp(delays, finer, np.maximum(spreads, surface[1]))
     places, cells = _fit_grid(problem, delays, surface, size[1])

@@ -17,7 +17,8 @@ class CoefficientFit:
     misfit: float  # chi-squared: sum of squared residuals divided by the variance of the noise
     evidence: float  # log posterior density of force delay and surface position, up to a constant
     slope: float = 0.0  # 1/m, derivative of misfit / 2 with respect to the surface position
-    curvature: float = 0.0  # 1/m^2, second derivative of misfit / 2, for coefficients that are fitted again
+    # 1/m^2, second derivative of misfit / 2, if the coefficients are fitted at every surface position
+    curvature: float = 0.0
     plane: float = 0.0  # m, surface position of the fit
     # derivative of the coefficients with respect to the surface position; None if the position is specified
     by_plane: np.ndarray | None = None

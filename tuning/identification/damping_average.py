@@ -25,7 +25,7 @@ from tuning.identification.law_choice import search_coarsely
 DAMPING_NAME, TIME_CONSTANT_NAME = "damping", "time_constant"
 MAX_DAMPING_OVER_STIFFNESS = 0.01  # s, upper bound of the ratio of damping to stiffness in the prior
 MIN_UNDAMPED_PROBABILITY = 1e-4  # minimum posterior probability of an undamped model that is not ignored
-# Largest increase of the log evidence that the undamped model has because it has one parameter less.
+# Upper bound of the gain in log evidence of the undamped model, which has one parameter less.
 MAX_OCCAM_GAIN = 7.0
 
 # Function that fits a law and returns the posterior and the log evidence.

@@ -70,7 +70,8 @@ class ForceReadings:
 def _assign_contact_entries(run: LoggedRun) -> np.ndarray:
     """Return the index of each row into the lists in the mechanism's `[contact]`.
 
-    Rows out of contact get the index of the previous contact. Rows before the first contact get its index.
+    Rows out of contact get the index of the previous contact. Rows before the first contact get the index of
+    the first contact.
     """
     index = np.full(len(run.tick), -1) if run.contact_index is None else run.contact_index
     if not np.any(index >= 0):

@@ -110,7 +110,7 @@ class Identification:
 
     @property
     def is_compared(self) -> bool:
-        """Return whether any check compares the logs with the model; that of the uncertainty does not."""
+        """Return whether any check compares the logs with the model; the uncertainty check does not."""
         return any(line.name != UNCERTAINTY_CHECK for line in self.lines)
 
     @property

@@ -10,8 +10,8 @@ import numpy as np
 # Values of each column: float64, text objects, or time stamps [s] relative to the first one.
 ColumnsByName = dict[str, np.ndarray]
 
-# Function that returns the time stamps [s] of given columns, according to a column of time stamps; None for a
-# column without separate stamps.
+# Function of column names and the name of the log's column of time stamps. It returns the separate time
+# stamps [s] of each column, or None for a column without separate stamps.
 StampsOfColumns = Callable[[Sequence[str], str | None], Mapping[str, np.ndarray | None]]
 
 

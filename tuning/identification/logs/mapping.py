@@ -93,7 +93,7 @@ class TimingSection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         int, key_metadata("periods from a reading to the command that answers it", ge=0, le=4)
     ] = 0
     clock: Literal["stamps", "index", "separate"] = "stamps"  # "separate": the forces have another clock
-    # Detected from stamps and commands if it is not specified.
+    # Number of log rows per control period; if it is not specified, stamps and commands determine it.
     rows_per_period: (
         Annotated[int, key_metadata("rows of the log per control period", ge=1, le=20)] | None
     ) = None

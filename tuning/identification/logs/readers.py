@@ -48,7 +48,7 @@ class OpenLog(NamedTuple):
 
     @property
     def names(self) -> list[str]:
-        """Names of the columns."""
+        """Return the names of the columns."""
         return self.reader.names
 
     def read(self, wanted: Sequence[str]) -> ColumnsByName:

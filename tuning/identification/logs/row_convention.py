@@ -7,7 +7,8 @@ The force command depends on the force reading, including its noise, and moves t
 The right-hand side depends on the noise of the reading F(n), but not on that of later readings. If a row
 contains the next tick's command, the commands seem to depend on the noise of the following row. If a row
 contains the next tick's readings, the response seems to be one row late. A regression finds the latest
-reading on which the commands depend. Before, all signals are differenced twice, so that mainly noise remains.
+reading on which the commands depend. Before the regression, all signals are differenced twice, so that mainly
+noise remains.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from tuning.identification.logs.contact_detection import estimate_contact_thresh
 from tuning.identification.logs.lost_rows import detect_integrator
 from tuning.identification.records import CampaignTiming, LoggedRun
 
-# The regression contains readings from this many rows after a command to this many rows before it.
+# Numbers of rows after and before a command whose force readings are regressors of this command.
 ROWS_AFTER_COMMAND, ROWS_BEFORE_COMMAND = 2, 6
 MIN_COEFFICIENT_SIGMAS = 6.0  # minimum size of a significant coefficient in standard deviations
 MIN_COEFFICIENT_SHARE = 0.3  # minimum size of a significant coefficient as a share of the largest coefficient

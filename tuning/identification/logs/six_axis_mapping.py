@@ -60,9 +60,9 @@ class VectorChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     columns: Annotated[
         list[ColumnName], Meta(min_length=6, max_length=6)
-    ]  # three translations, three rotations
+    ]  # three components of translation, then three of rotation
     units: Annotated[list[str], Meta(min_length=2, max_length=2)] | None = (
-        None  # of both halves; SI by default
+        None  # units of the translations and of the rotations; None: SI units
     )
     sign: Annotated[int, key_metadata("of all six columns", "", ge=-1, le=1)] = 1
 

@@ -23,7 +23,7 @@ TIME_FORMATS = (
 
 
 def guess_time(sample: LogSample, names: Sequence[str], position: str) -> ChannelGuess | None:
-    """Return the guess of the time stamps' column, or None if no column can be one."""
+    """Return the guess of the time stamps' column, or None if no column can contain time stamps."""
     for seconds in names:
         for nanoseconds in names:
             if (

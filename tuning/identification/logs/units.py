@@ -30,7 +30,7 @@ _NO_UNITS = ("MN", "Mm")  # meganewton and megametre; must not be read as mN or 
 
 
 def parse_unit(text: str, channel: str | None = None) -> str | None:
-    """Return the unit that a log states, as in the tables above; None if it is unknown.
+    """Return the unit that a log states, in the spelling of `UNITS_OF_CHANNEL`; None if it is unknown.
 
     Args:
         text: Unit, possibly in brackets.
