@@ -173,7 +173,7 @@ def _draw_nominal(axes: Axes, stability_map: MapResults) -> list[Any]:
 
 
 def _contour_levels(error: np.ndarray, limit: float, most: int = MAX_CONTOURS) -> list[float]:
-    """Return the contour levels of both signs: the limit, and all larger powers of 10 and their triples.
+    """Return the contour levels of both signs: the limit, and above it 1 and 3 times each power of 10.
 
     Only levels within the range of `error` are returned, at most `most` of each sign.
     """

@@ -63,7 +63,8 @@ class SubsetSimulationEntry(Struct):
     low: float  # lower end of the 95 % interval [1]
     high: float  # upper end of the 95 % interval [1]
     evaluations: int  # number of simulated scenarios
-    coefficient_of_variation: float | None = None  # of the estimate, from the spread of the replicates [1]
+    # coefficient of variation of the estimate, from the replicates [1]
+    coefficient_of_variation: float | None = None
     spread_beyond_formula: bool = False  # whether the replicates differ more than the theory predicts
 
 

@@ -14,7 +14,7 @@ METRIC_HEADINGS = {  # headings of the comparison's table by name of the metric
     "rms": "rms |e - e*|", "p99": "99th percentile", "worst": "worst", "failures": "failures",
     "early": "early", "late": "late", "slope": "slope", "peak": "peak", "noise": "noise",
 }  # fmt: skip
-SIX_AXIS_METRIC_HEADINGS = {  # likewise for six axes
+SIX_AXIS_METRIC_HEADINGS = {  # headings for six axes by name of the metric
     "energy_rms": "rms energy error",
     "rms": "rms twist error",
     "p99": "99th pct of twist error",
@@ -131,7 +131,7 @@ def sensitivity_section(results: Results) -> Section | None:
         if rare.spread_beyond_formula:
             texts.append(
                 "The replicates of the subset simulation differ far more than its formula explains: some "
-                "have missed failures, and the interval may too."
+                "have missed failures, and the interval may be wrong."
             )
     return Section("drivers", "Sensitivity of the error, and rare errors", texts, tables)
 

@@ -31,7 +31,8 @@ MAX_CATCH_UP_PERIODS = 10  # largest delay of the rig [periods] after which it s
 BUSY_WAIT_TIME = 100_000  # time before a tick [ns] in which the loop polls the clock; a sleep may be too long
 START_DELAY = 50_000_000  # time from the start of the loop to the first tick [ns]
 MAX_SILENCE = 2.0  # time without an answer after which the loop ends: the controller has ended or hangs [s]
-MAX_UNANSWERED_TICKS = 100  # at least this number of ticks without an answer, as for the controller's process
+# smallest number of ticks without an answer after which the loop ends; `MAX_SILENCE` must also have passed
+MAX_UNANSWERED_TICKS = 100
 TIME_AFTER_TRIP = 1.0  # time for which the rig continues after the controller has tripped [s]
 
 

@@ -28,7 +28,7 @@ class OneAxisRig:
     """
 
     axes = 1
-    error_name = "error"  # error that decides the verdict: of the restitution
+    error_name = "error"  # error that decides the verdict: the restitution error
     good_statuses = ("ok",)
 
     def __init__(self, mechanism: Mechanism, seed: int = 0) -> None:

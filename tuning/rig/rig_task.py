@@ -36,7 +36,7 @@ STALLED = "stalled"  # status of a contact in which the computer delayed the com
 class SimulatedRig(Protocol):
     """Simulated rig with one axis or six axes; vectors have one number for each axis.
 
-    Its contacts have at least the fields and the method of `RehearsedRun`, except for its state.
+    A contact has at least the fields and the method of `RehearsedRun`, except the field `state`.
     """
 
     axes: int  # number of axes
@@ -200,7 +200,7 @@ class RigTask:
         return _combine(min, _combine(max, command, low), high)
 
     def _largest_command_age(self) -> int:
-        """Return the largest command age [periods] in the current (between runs: in the last) contact."""
+        """Return the largest command age [periods] in the current contact or, between runs, in the last."""
         if self._tick < 0 and self._contacts:
             return self._contacts[-1].oldest_command
         return self._oldest

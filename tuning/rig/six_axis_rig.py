@@ -91,7 +91,7 @@ class SixAxisRig:
             self._compile()
 
     def prepare(self, _: RehearsedRun | None) -> Numbers:
-        """Prepare the next run, with the hardware before its start; return the states of the bodies."""
+        """Prepare the next run, and return the states of both bodies at its start."""
         self._run += 1
         # Lane 0 has the nominal phase.
         lane = (self._run - 1) % max(len(self._starts) - 1, 1) + 1 if self._run else 0
@@ -147,7 +147,7 @@ class SixAxisRig:
         return None if is_active else RehearsedRun(self._run, "ok", self._state)
 
     def continues_after(self, _: RehearsedRun) -> bool:
-        """Return False: every run has its own start."""
+        """Return False, because every run is prepared separately."""
         return False
 
     def cut(self, status: str) -> RehearsedRun | None:

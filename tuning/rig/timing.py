@@ -1,6 +1,6 @@
 """Timing effects of the simulated hardware: delays that vary from tick to tick, and lost readings.
 
-The effects are those of `jaxhil.simulation.timing`, with random numbers of their own.
+The effects are those of `jaxhil.simulation.timing`, but with different random numbers.
 """
 
 from random import Random

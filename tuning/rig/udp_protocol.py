@@ -47,10 +47,10 @@ class PacketFormat:
         axes: number of axes.
         start: number of values that specify the start of a run.
         bodies: number of values that specify the states of both bodies; 0 for one axis.
-        reading: little-endian: mark, version, event, number of axes, session number, sequence number, run,
-            tick, then `ReadingPacket.time` and all later fields.
-        answer: little-endian: mark, version, flags, number of axes, session number, sequence number, run,
-            tick, then `AnswerPacket.position_command` and all later fields.
+        reading: little-endian format of a reading packet: mark, version, event, number of axes, session
+            number, sequence number, run, tick, then `ReadingPacket.time` and all later fields.
+        answer: little-endian format of an answer packet: mark, version, flags, number of axes, session
+            number, sequence number, run, tick, then `AnswerPacket.position_command` and all later fields.
     """
 
     __slots__ = ("answer", "axes", "bodies", "reading", "start")
