@@ -1,1 +1,1 @@
-"""Shadow mode: what a controller would have commanded on the readings in a rig's logs."""
+"""Shadow mode: computation of the commands that a controller would have given on a log's readings."""

@@ -47,8 +47,8 @@ class LoggedTicks:
     tick: np.ndarray  # int64, (rows,), number of the control period, counted from the first row
     time: np.ndarray | None  # time stamps from the first row [s], (rows,); None without a clock
     force: np.ndarray  # force reading [N], wrench on six axes [N, N m]
-    position_desired: np.ndarray  # of the numerical model before the tick [m, rad]
-    velocity_desired: np.ndarray  # of the numerical model before the tick [m/s, rad/s]
+    position_desired: np.ndarray  # position of the numerical model before the tick [m, rad]
+    velocity_desired: np.ndarray  # velocity of the numerical model before the tick [m/s, rad/s]
     position_measured: np.ndarray  # position reading [m, rad]
     command: np.ndarray  # logged command that answers these readings [N, N m]; NaN if it is not in the log
     starts: np.ndarray  # int, rows at which a run begins; the first is 0
@@ -215,7 +215,7 @@ def _read_six_axes(log: OpenLog, mapping: SixAxisLogMapping):
 
 
 def _find_starts(force: np.ndarray, index: np.ndarray | None, period: float) -> np.ndarray:
-    """Return the rows at which a run begins, apart from the first.
+    """Return the rows at which a run begins, without the first row of the log.
 
     Without a contact index, a run begins in the middle between two contacts of a one-axis log.
     """

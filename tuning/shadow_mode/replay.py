@@ -30,8 +30,8 @@ class Audit(NamedTuple):
     """Audit of the watchdog that is left out if the log's commands are not the controller's."""
 
     name: str  # name in notes
-    faults: int  # bits of its faults
-    limits: tuple[str, ...]  # names of its limits
+    faults: int  # bits of the faults that the audit raises
+    limits: tuple[str, ...]  # names of the limits that the audit checks
     tolerance: (
         float  # largest difference of commands, divided by their range, for which the audit is valid [1]
     )
@@ -138,7 +138,7 @@ def _replay_run(controller: Any, ticks: LoggedTicks, rows: slice) -> ReplayedRun
 
 
 def _count(seen: dict[int, list[float]], faults: int, instant: float) -> None:
-    """Count the faults of one tick."""
+    """Add the faults of one tick to the counts in `seen`."""
     while faults:
         bit = faults & -faults
         seen.setdefault(bit, [0, instant])[0] += 1

@@ -54,7 +54,7 @@ class MapAxis(NamedTuple):
 def parse_axis(
     name: str, text: Any, mechanism: AnyMechanism, law: AnyCompensator, gains: Mapping[str, float]
 ) -> MapAxis:
-    """Parse a text PATH or PATH=LOW:HIGH to an axis.
+    """Convert the text PATH or PATH=LOW:HIGH to an axis.
 
     Raise `InputError` for a wrong text; the message begins with `name`, the name of the argument.
     """

@@ -227,7 +227,10 @@ def count_runs(points: int) -> int:
 def run_tile(
     model: RigModel, loop: Any, gains: Mapping[str, Any], scenarios: Any, at_least: int
 ) -> np.ndarray:
-    """Simulate a tile (scenarios that are computed together); return `_worst_contact`, (5, lanes)."""
+    """Simulate a tile (scenarios that are computed together); return the results of `_worst_contact`.
+
+    The results have the shape (5, lanes).
+    """
     outcome = model.evaluate(loop, gains, scenarios, at_least=at_least)
     return np.stack(_worst_contact(model.select_verdict_error(outcome)))
 

@@ -117,7 +117,7 @@ def add_probe(scenarios: Scenario, space: Any, share: float | None = None) -> Sc
 
 
 class _IdealMotion(NamedTuple):
-    """Batch of integrated ideal contacts."""
+    """Batch of ideal contacts, computed by numerical integration."""
 
     restitution: Array  # restitution e* with the push [1], (lanes,)
     peak_force: Array  # peak force with the push [N], (lanes,)

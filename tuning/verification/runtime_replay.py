@@ -47,8 +47,10 @@ class LaneReplay(msgspec.Struct, frozen=True):
     compared: int  # number of compared ticks
     near: int  # number of recorded ticks in which a value is near a threshold
     command_range: float  # range of the recorded force command, including 0 [N]
-    difference: float  # largest difference of force commands not near a threshold / `command_range` [1]
-    near_difference: float  # largest difference of force commands near a threshold / `command_range` [1]
+    # largest difference of force commands in the other ticks, divided by `command_range` [1]
+    difference: float
+    # largest difference of force commands in the `near` ticks, divided by `command_range` [1]
+    near_difference: float
     worst_tick: int  # tick with the largest `difference`
     found: float  # force command of the runtime in this tick [N]
     expected: float  # recorded force command in this tick [N]
