@@ -21,7 +21,7 @@ PARTICLES, ITERATIONS = 15, 13  # values published for real-time hybrid simulati
 INERTIA, PULL = 0.729844, 1.496180  # constriction: Clerc and Kennedy (2002)
 SPREAD = 0.3  # first standard deviation of CMA-ES relative to the box
 EDGE = 0.25  # edge of the first simplex of Nelder-Mead; SciPy's default is 0 for a gain of 0
-POPULATION = 2  # per gain; with SciPy's default of 15 only a few generations fit into the time limit
+POPULATION = 2  # per gain; SciPy's default of 15 allows only a few generations within the time limit
 NEVER = 1 << 40  # evaluation limit that is never reached
 
 

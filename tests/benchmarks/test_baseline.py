@@ -88,13 +88,13 @@ def test_cpp_baseline_is_vectorised_for_every_compensator():
     assert len(loops) == len(KINDS)
 
 
-def test_cpp_baseline_refuses_zero_order_hold(baseline):
+def test_cpp_baseline_rejects_zero_order_hold(baseline):
     loop, gains, scenario, rig = case("none", ["rig.command_hold=zoh"])
     with pytest.raises(ValueError, match="linear hold"):
         baseline.run(loop, rig, gains, scenario, 10)
 
 
-def test_cpp_baseline_refuses_delay_longer_than_its_delay_lines(baseline):
+def test_cpp_baseline_rejects_delay_longer_than_its_delay_lines(baseline):
     loop, gains, scenario, rig = case("response_error")
     gains["identification_delay"] = np.asarray(loop.ring * scenario.control_period)
     with pytest.raises(ValueError, match=f"delays: found {loop.ring} periods"):

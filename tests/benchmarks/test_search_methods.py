@@ -27,7 +27,8 @@ MEMBERS = 3, 8, 9, 18, 19, 20, 37, 48
 STARTS = 8
 SEED = 0  # seed of the starts
 BUDGET = 1.0  # time limit of other optimisers, divided by the time of tuning
-SHARE, COST = 0.9, 0.5  # limits: share of successful starts; rollouts and seconds relative to the best other
+# limits: smallest share of successful starts; largest cost relative to the best other method
+SHARE, COST = 0.9, 0.5
 
 NAMES = [mechanism.name for i, mechanism in enumerate(family()) if i in MEMBERS]
 

@@ -1,8 +1,8 @@
 """Time of a tick of the six-axis controller in C and in Python, with every guard and the watchdog.
 
-The rows are recorded contacts of probe-drogue with noise. The shortest of many repetitions counts in C, and
-times of the processor in Python: the machine is shared. Run with
-`pytest -m benchmark -s tests/benchmarks/test_six_axis_tick.py`.
+The rows are recorded contacts of probe-drogue with noise. In C, the shortest of many repetitions counts; in
+Python, CPU times are compared, because the machine is shared. Run with `pytest -m benchmark -s
+tests/benchmarks/test_six_axis_tick.py`.
 """
 
 import ctypes
@@ -33,7 +33,7 @@ def rows():
 
 @pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 @pytest.mark.parametrize("name", built_in_compensators(6))
-def test_time_of_a_tick_in_c(name, rows, capsys):
+def test_six_axis_c_controller_time_per_tick_is_within_limit(name, rows, capsys):
     _, made = built(name, wide=True)
     count, best = ctypes.c_size_t(len(rows)), np.inf
     for _ in range(REPEATS):
@@ -47,7 +47,7 @@ def test_time_of_a_tick_in_c(name, rows, capsys):
 
 
 @pytest.mark.parametrize("name", built_in_compensators(6))
-def test_time_of_a_tick_in_python(name, rows, capsys):
+def test_six_axis_python_controller_time_per_tick_is_within_limit(name, rows, capsys):
     document, _ = built(name, wide=True)
     times = []
     for _ in range(20):

@@ -49,7 +49,7 @@ def default_gains():
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_sweep_speed_is_compared_with_cpp_baseline(precision, tmp_path, capsys):
+def test_sweep_reaches_80_percent_of_cpp_baseline_speed(precision, tmp_path, capsys):
     baselines = [compile_baseline(skips=skips) for skips in (False, True)]
     if None in baselines:
         pytest.skip("no C++ compiler")

@@ -88,7 +88,7 @@ def timed(function):
 
 @pytest.mark.parametrize("names", [("varying",), ONE_SIDED], ids=["varying", "several"])
 @pytest.mark.parametrize("compensator", ["none", "response_error"])
-def test_rollout_speed_is_compared_with_cpp_baseline(compensator, names, capsys):
+def test_rollout_reaches_required_share_of_cpp_baseline_speed(compensator, names, capsys):
     flying, skipping = ([compile_baseline(width, skips) for width in WIDTHS] for skips in (False, True))
     if None in flying:
         pytest.skip("no C++ compiler")
@@ -147,7 +147,7 @@ def jacobian(lanes, options):
     return timed(partial(program, values))
 
 
-def test_jacobian_time_is_compared_for_compiler_options_and_tile_sizes(capsys):
+def test_jacobian_is_faster_with_compiler_options_and_default_tile_size(capsys):
     tuned = best(
         jacobian(LANES_PER_TILE, supported_options(TICK_OPTIONS)),
         jacobian(2 * LANES_PER_TILE, supported_options(TICK_OPTIONS)),
