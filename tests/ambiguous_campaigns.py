@@ -33,7 +33,7 @@ def campaign(monkeypatch, name, seed, **changes):
 def prior(name):
     """Return a prior with stiffness, inaccurate motion simulator and delay of the position sensor.
 
-    The force sensor has no damping, delay, lag or dead zone in the prior.
+    The prior has no damping, and its force sensor has no delay, lag or dead zone.
     """
     sensor = {"delay": KINDS[name].rig["position_sensor"].get("delay", 0.0)}
     simulator = {"model": "second_order", "natural_frequency": 12.0, "damping_ratio": 0.8, "delay": 0.004}

@@ -39,8 +39,8 @@ STATUS_NUMBERS = {status.name: status.number for status in STATUSES}
 TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY = map(float, range(8))
 EVENTS = (TICK, RESET, NEXT_CONTACT, STOP, RELEASE, TARE, COMMAND_FIRST, STEP_ONLY)
 PERIOD = 0.001
-CAPACITY = 64  # periods of delay, for random gains
-LINES = DelayLine.MAX_DELAY_PERIODS  # periods of delay that the compiled compensators support
+CAPACITY = 64  # longest delay with random gains [periods]
+LINES = DelayLine.MAX_DELAY_PERIODS  # longest delay that the compiled compensators support [periods]
 SANITIZED = ("-fsanitize=undefined,address,float-cast-overflow", "-fno-sanitize-recover=all", "-g")
 SANE_LIMITS = {
     "force_range": 2000.0,

@@ -149,12 +149,12 @@ TRANSFER = {"model": "transfer_function", "numerator": [0.004, 1.0], "denominato
 RATTLING = {"model": "second_order", "natural_frequency": 25.0, "damping_ratio": 0.8, "delay": 0.0021}
 LATE_EULER = {"command_latency": 1, "integrator": "explicit_euler"}
 ALL_ZOH = {"command_hold": "zoh", "integrator": "zoh"}
-# Response-error compensation reduced to its phase lead.
+# Gains that reduce response-error compensation to its phase lead.
 LEAD_ALONE = {"response_error": 0.0, "response_error_damping": 0.0}
 LAGGED = {"force_sensor": {"time_constant": 0.0023}}
 
 CASES: dict[str, Case] = {
-    # Kelvin-Voigt and linear contact with a second-order simulator, uncompensated.
+    # Cases without compensator: Kelvin-Voigt and linear contact with a second-order simulator.
     "linear": Case(mechanism({"law": "linear", "damping": [900.0]})),
     "delays of whole periods": Case(
         mechanism({"damping": [300.0]}, {**SECOND_ORDER, "delay": 2 * PERIOD}, 3 * PERIOD)
@@ -170,21 +170,21 @@ CASES: dict[str, Case] = {
     "two masses": Case(
         mechanism({"damping": [200.0]}) | {"bodies": {"chaser_mass": 500.0, "target_mass": 900.0}}
     ),
-    # Integrators, hold, latency, simulators.
+    # Cases with other integrators, holds, latencies and motion simulators.
     "zoh hold and integrator": Case(
         mechanism(LIST, contacts=2, command_hold="zoh", integrator="zoh"), "phase_lead"
     ),
     "transfer function with latency": Case(mechanism(LIST, TRANSFER, contacts=2, **LATE_EULER)),
     "third order with latency": Case(mechanism(LIST, THIRD_ORDER, **LATE_EULER)),
     "first order": Case(mechanism({"damping": [300.0]}, FIRST_ORDER), "phase_lead"),
-    # The ideal simulator.
+    # Cases with the ideal motion simulator.
     "ideal": Case(mechanism(LIST, IDEAL, contacts=2), "phase_lead"),
     "ideal with transport delay": Case(mechanism(LIST, {**IDEAL, "delay": 0.0033}), "phase_lead"),
     "ideal without delay": Case(mechanism({"damping": [300.0]}, IDEAL, 0.0), "phase_lead", {"phase_lead": 0}),
     "ideal with zoh hold": Case(
         mechanism({"stiffness": [STIFFNESS, 3e5]}, IDEAL, contacts=2, command_hold="zoh", command_latency=1)
     ),
-    # Other contact laws, with response-error compensation too.
+    # Cases with other contact laws, some of them with response-error compensation.
     "hertz": Case(mechanism(HERTZ, FIRST_ORDER, contacts=2, **ALL_ZOH), "response_error"),
     "hunt-crossley": Case(
         mechanism({**HERTZ, "damping": [20.0]}, FIRST_ORDER, **ALL_ZOH),
@@ -217,7 +217,7 @@ CASES: dict[str, Case] = {
     ),
     "preloaded": Case(mechanism(PRELOADED, contacts=2), "phase_lead"),
     "more friction than preload": Case(mechanism({**PRELOADED, "preload": 1.0}), "phase_lead"),
-    # Response-error compensation with sensor errors and the simulator's limits.
+    # Cases of response error and position lead, with sensor errors and limits of the motion simulator.
     "response error": Case(mechanism(LIST, contacts=3), "response_error"),
     "response error, gains off nominal": Case(
         mechanism({"damping": [300.0]}, contacts=2),
@@ -250,7 +250,7 @@ CASES: dict[str, Case] = {
         mechanism(LIST, {**SECOND_ORDER, "velocity_limit": 0.007}, command_latency=1),
         "position_lead",
     ),
-    # A force sensor with a lag.
+    # Cases whose force sensor has a lag.
     "lag": Case(mechanism({}, **LAGGED), "phase_lead"),
     "damped, lag": Case(mechanism({"damping": [500.0]}, **LAGGED), "phase_lead"),
     "damped, lag, 1 kHz": Case(mechanism({"damping": [500.0]}, period=1e-3, **LAGGED), "phase_lead"),
@@ -258,7 +258,7 @@ CASES: dict[str, Case] = {
         mechanism({"stiffness": [3 * STIFFNESS], "damping": [1000.0]}, **LAGGED), "phase_lead"
     ),
     "no lag beside lagged ones": Case(mechanism({"damping": [500.0]}), "phase_lead"),
-    # Two surfaces.
+    # Cases with two contact surfaces.
     "rattling, lag": Case(
         mechanism(
             {**LIST, "damping": [120.0], "clearance": 0.002}, RATTLING, 0.003, 3, velocity=0.01, **LAGGED

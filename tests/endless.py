@@ -97,7 +97,7 @@ def spring(simulator: Mapping[str, Any] = IDEAL, period: float = 5e-4) -> Mechan
 
 
 def characteristic_root(equation: Callable[[complex], complex], start: complex = 1j * OMEGA) -> complex:
-    """Return the root [1/s] of the characteristic equation near `start_rollout`, by the secant method."""
+    """Return the root [1/s] of the characteristic equation near `start`, by the secant method."""
     before, root = start * (1 + 1e-3), start
     value_before = equation(before)
     for _ in range(50):

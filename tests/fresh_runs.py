@@ -55,7 +55,7 @@ class Exported(NamedTuple):
 class Record(NamedTuple):
     """Controller inputs of one lane and the errors of its contacts.
 
-    `rows` are the inputs row by row. Restitution errors are NaN for a contact that did not end; begins are
+    `rows` are the inputs row by row. Restitution errors are NaN for a contact that did not end. `begins` are
     the rows on which contacts begin.
     """
 

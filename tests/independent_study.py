@@ -24,7 +24,7 @@ class Outcome:
 
     kind: str
     seed: int
-    verdict: str  # good, bad or refused
+    verdict: str  # good, bad or refused (exit code 2)
     message: str
     check: str  # verdict of `--check`; empty where no file was written
     restitution: float  # e of the true rig; all e and e - e* are for the file's gains

@@ -79,7 +79,7 @@ LAYERED = {
     "contact.stiffness": [[1e5, 2e5, 3e5]],
 }
 
-# Keys that are refused with law and model of the full table, with otherwise valid values.
+# Keys of other laws and models, with valid values; the law and model of the full table do not allow them.
 OF_OTHERS = {
     "contact.depths": [0.001, 0.002],
     "contact.reference_depth": 2e-4,
@@ -113,7 +113,7 @@ def changed(changes=(), base=FULL):
 
 
 def refusal(raw):
-    """Return the message for a refused table after checking that it is one line that names the source."""
+    """Return the message for a rejected table after checking that it is one line that names the source."""
     with pytest.raises(InputError) as caught:
         from_plain_data(raw, "some file")
     message = str(caught.value)

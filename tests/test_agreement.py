@@ -2,11 +2,13 @@
 
 On the recorded ticks of every built-in mechanism and on a million random ticks, the force commands agree to
 1e-11 of the command's range, or to 1e-9 for compensators with a long recursion. Two groups are counted and
-compared separately: - ticks whose decisions lie within 1e-9 of a threshold (see
-`tuning.verification.runtime_replay`), and - lanes that amplify rounding errors: if successive regressors of
-the identification are nearly parallel, or if the prior variance is 1e15 times the noise variance, one unit in
-the last place of every operation changes the runtime's own command by as much as the difference (Monte Carlo
-arithmetic: Parker, Pierce and Eggert 2000).
+compared separately:
+
+- ticks whose decisions lie within 1e-9 of a threshold (see `tuning.verification.runtime_replay`);
+- lanes that amplify rounding errors. In these lanes, one unit in the last place of every operation changes
+  the runtime's own command by as much as the difference (Monte Carlo arithmetic: Parker, Pierce and Eggert
+  2000). This happens if successive regressors of the identification are nearly parallel, or if the prior
+  variance is 1e15 times the noise variance.
 """
 
 import functools

@@ -41,7 +41,7 @@ STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror"
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("name", LAWS)
-def test_sources_compile_without_a_warning(name, compiler, tmp_path):
+def test_six_axis_c99_sources_compile_without_warnings(name, compiler, tmp_path):
     if shutil.which(compiler) is None:
         pytest.skip(f"no {compiler} on this machine")
     folder = write_sources(tmp_path, six_axis_document(name, limits=LIMITS))
@@ -51,7 +51,7 @@ def test_sources_compile_without_a_warning(name, compiler, tmp_path):
         assert (ran.returncode, ran.stderr) == (0, "")
 
 
-def test_compiled_gains_limits_and_constants_equal_the_document():
+def test_six_axis_c99_gains_limits_and_constants_equal_gain_document():
     document, made = built("impulse_ledger")
     parameters = np.zeros(400)
     count = made.library.driver_exported(pointer(parameters))
@@ -62,13 +62,13 @@ def test_compiled_gains_limits_and_constants_equal_the_document():
     assert count == len(expected) and parameters[:count].tobytes() == expected.tobytes()
 
 
-def test_c_header_has_the_fault_bits_of_python():
+def test_six_axis_c99_header_has_fault_bits_of_python_runtime():
     header = generate_c99(six_axis_document("none"))["jaxhil_controller.h"]
     for fault in SIX_AXIS_FAULTS:
         assert f"    JAXHIL_{fault.name.upper()} = 0x{fault.bit:X},\n" in header
 
 
-def test_unusable_constants_are_rejected():
+def test_six_axis_c99_controller_rejects_unusable_constants():
     document, made = built("impulse_ledger")
     parameters = np.zeros(400)
     made.library.driver_exported(pointer(parameters))
@@ -95,7 +95,7 @@ def test_unusable_constants_are_rejected():
     assert not made.library.driver_init_with(made.state, pointer(parts[0].copy()), pointer(limits), constants)
 
 
-def test_c_sensor_conversion_equals_python_conversion_exactly(tmp_path):
+def test_six_axis_c99_sensor_conversion_equals_python_bit_for_bit(tmp_path):
     document, rng = six_axis_document(limits=LIMITS), np.random.default_rng(3)
     controllers = Controller6.from_dict(document), ControllerInC(document, tmp_path)
     for size in (0.0, 1e-9, 0.03, 1.0, 4.0, 1e300, np.nan):
@@ -107,7 +107,7 @@ def test_c_sensor_conversion_equals_python_conversion_exactly(tmp_path):
 @pytest.mark.parametrize("wide", [False, True], ids=["limited", "wide"])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", LAWS)
-def test_c_commands_equal_python_commands_exactly(name, kind, wide):
+def test_six_axis_c99_commands_equal_python_bit_for_bit(name, kind, wide):
     document, made = built(name, wide)
     for n in range(3):
         rng = np.random.default_rng([LAWS.index(name), KINDS.index(kind), wide, n])
@@ -122,7 +122,7 @@ def of_records():
     return recorded(load_any("probe-drogue", changes).mechanism, "impulse_ledger", 3)
 
 
-def test_c_commands_equal_python_commands_on_recorded_contacts():
+def test_six_axis_c99_commands_equal_python_on_recorded_contacts():
     document, made = built("impulse_ledger")
     for record in of_records().lanes:
         rows = rows_of(record[:4], 1e-3)
@@ -131,7 +131,7 @@ def test_c_commands_equal_python_commands_on_recorded_contacts():
         assert np.any(results[:, :6] != 0)
 
 
-def test_drawn_rows_cause_all_faults_except_three():
+def test_random_rows_of_six_axis_c99_tests_raise_all_faults_except_three():
     """Check that the rows cause all faults except three that the watchdog's tests cause."""
     seen, made = 0, built("impulse_ledger")[1]
     for n in range(150):
@@ -141,7 +141,7 @@ def test_drawn_rows_cause_all_faults_except_three():
     assert missing <= {"contact_too_long", "energy_gain", "unpaid_impulse"}
 
 
-def test_c_export_rejects_delay_longer_than_delay_line():
+def test_six_axis_c99_export_rejects_delay_longer_than_delay_line():
     document = six_axis_document(identification_delay=0.52)
     document["gains"]["identification_delay"]["upper"] = 1.0
     with pytest.raises(ValueError, match="periods"):
@@ -151,7 +151,7 @@ def test_c_export_rejects_delay_longer_than_delay_line():
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=() if n == "impulse_ledger" else pytest.mark.slow) for n in LAWS]
 )
-def test_no_undefined_behaviour_under_sanitizers(name, tmp_path):
+def test_six_axis_c99_has_no_undefined_behaviour_under_sanitizers(name, tmp_path):
     probe = tmp_path / "probe.c"
     probe.write_text("int main(void) { return 0; }\n")
     command = [str(c99_cases.COMPILER), *c99_cases.SANITIZED, str(probe), "-o", str(tmp_path / "probe")]
@@ -171,7 +171,7 @@ def test_no_undefined_behaviour_under_sanitizers(name, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
-def test_c_equals_python_exactly_for_a_million_ticks(name):
+def test_six_axis_c99_commands_equal_python_over_a_million_ticks(name):
     """Run 1e6 ticks with the impulse ledger, and 1e5 with each other compensator."""
     total, chunk = (1_000_000 if name == "impulse_ledger" else 100_000), 5_000
     for n in range(total // chunk):

@@ -231,7 +231,7 @@ def test_user_defined_named_tuple_counts_as_user_object_in_program_arguments():
     assert not cached_programs.has_user_objects((1, ("two", None, KelvinVoigt())))
 
 
-def test_list_of_external_calls_of_a_program_is_complete():
+def test_all_external_calls_of_a_program_are_found():
     text = """%0 = stablehlo.custom_call @lapack_dpotrf_ffi(%1)
     %2 = stablehlo.custom_call @xla.sdy.Sharding(%0)
     %3 = stablehlo.custom_call @"my-own, one"(%2) %4 = stablehlo.custom_call @cu$other(%3)"""

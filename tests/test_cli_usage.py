@@ -99,7 +99,7 @@ def test_cli_reports_unusable_input_with_one_line_message(jaxhil, arguments, wor
         "mechanisms --nowhere",
     ],
 )
-def test_json_of_every_command_states_an_error_in_the_same_form(jaxhil, monkeypatch, tmp_path, words):
+def test_error_documents_of_all_commands_have_the_same_form(jaxhil, monkeypatch, tmp_path, words):
     monkeypatch.chdir(tmp_path)
     ran = jaxhil(*words.split(), "--json")
     document = ran.document
@@ -109,8 +109,8 @@ def test_json_of_every_command_states_an_error_in_the_same_form(jaxhil, monkeypa
     assert ran.err == f"jaxhil: {problem}\n" or problem.startswith("wrong arguments")
 
 
-def test_json_names_every_command_in_its_test():
-    marks = test_json_of_every_command_states_an_error_in_the_same_form.pytestmark
+def test_error_document_test_covers_every_command():
+    marks = test_error_documents_of_all_commands_have_the_same_form.pytestmark
     tested = {words.split()[0] for words in marks[0].args[1]}
     modules = [path for path in COMMANDS.glob("*.py") if "_" not in path.stem]
     assert tested == {path.stem for path in modules if "\ndef run(options" in path.read_text()}

@@ -123,7 +123,7 @@ MESSAGES = [
 @pytest.mark.parametrize(
     ("function", "line", "message"), MESSAGES, ids=lambda value: getattr(value, "__name__", "")
 )
-def test_c99_refusal_names_file_line_and_alternative(function, line, message):
+def test_message_for_rejected_c99_construct_names_file_line_and_alternative(function, line, message):
     with pytest.raises(SubsetError) as error:
         CProgram("t_").add(function)
     location = f"{__file__}:{inspect.getsourcelines(function)[1] + line}: "

@@ -158,7 +158,7 @@ def test_compare_reports_positive_computing_time_per_tick():
         (["--limit", "nan"], "--limit: found nan, expected a number >= 0"),
     ],
 )
-def test_compare_refuses_bad_input_with_one_line_message(jaxhil, arguments, message, tmp_path, monkeypatch):
+def test_compare_rejects_bad_input_with_one_line_message(jaxhil, arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ran = jaxhil("compare", *arguments)
     assert ran.code == 2 and message in ran.err and ran.err.count("\n") == 1

@@ -44,7 +44,7 @@ def evaluate_compensator(raw, law, gains=None, number=LANES):
 
 
 def test_ideal_rig_has_zero_error_and_full_transparency():
-    """Without delay and for a small period T: error 0, transparency 1, slope 1, peak ratio 1."""
+    """Expect error 0, and transparency, slope and peak ratio 1, without delay and for a small period."""
     figures = evaluate_compensator(mechanism({}, IDEAL, 0.0, period=5e-5), "none")
     assert figures["rms"].value < 1e-3 and figures["worst"].value < 1e-3
     for name in ("early", "late", "slope", "peak"):

@@ -203,7 +203,10 @@ def test_identification_with_misaligned_force_is_biased_as_predicted():
 
 
 class Clamped(Compensator):
-    """Another compensator with output max(0, F_c); measured force during the first `blind` ticks."""
+    """Compensator that clamps the output of `inner` to max(0, F_c).
+
+    During the first `blind` ticks, the output is the measured force.
+    """
 
     name: ClassVar[str] = "clamped"
     knows: ClassVar[tuple] = ()

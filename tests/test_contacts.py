@@ -34,7 +34,7 @@ def reference(name, **values):
 
 
 def test_undamped_hardening_contact_matches_closed_form():
-    """e = 1; k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 at the peak force."""
+    """Expect e = 1, and k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 at the peak force."""
     unit = np.array([1e-5, 5e-5, 1e-4, 2e-4, 1e-3, 10.0])
     result = reference("hardening", reference_depth=unit)
     square = np.sqrt(1 + 2 * MASS * VELOCITY**2 / (STIFFNESS * unit**2)) - 1
@@ -89,7 +89,7 @@ PRELOADS = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 6.0], [10.0, 6.0], [3.0, 6.0
 
 
 def test_preloaded_contact_closed_form_matches_integration():
-    """Energy: M v^2/2 = k d^2/2 + (F_0 + F_r) d inwards, k d^2/2 + (F_0 - F_r) d outwards."""
+    """Energy balance: M v^2/2 = k d^2/2 + (F_0 + F_r) d inwards, k d^2/2 + (F_0 - F_r) d outwards."""
     preload, friction = PRELOADS
     result = reference("preloaded", preload=preload, friction=friction)
     energy, inward = MASS * VELOCITY**2 / 2, preload + friction

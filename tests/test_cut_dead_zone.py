@@ -22,7 +22,7 @@ RESTITUTION = {4.0: 1.0945, 8.0: 1.0989, 12.0: 1.1058}
 
 
 def test_cut_dead_zone_increases_restitution_by_the_work_that_it_removes():
-    """Four phases average the jumps of the readings; at each phase the result is the oracle's."""
+    """Average over four phases to cancel the jumps of the readings; compare each phase with the oracle."""
     phases, widths = np.tile(np.arange(4) / 4, len(RESTITUTION)), np.repeat([*RESTITUTION], 4)
     scenario = spread(MECHANISM, len(phases), phase=phases, force_sensor__dead_zone=widths)
     result = first_contact(MECHANISM, scenario)["restitution"]
@@ -36,7 +36,7 @@ def test_cut_dead_zone_increases_restitution_by_the_work_that_it_removes():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "step", "tolerance"), [("dead_zone", 2.0, 0.01), ("delay", 4e-4, 0.01)])
-def test_derivative_of_cut_dead_zone_is_that_of_the_mean_over_phases(name, step, tolerance):
+def test_derivative_with_cut_dead_zone_equals_derivative_of_mean_over_phases(name, step, tolerance):
     lanes = 512
     scenario = spread(MECHANISM, lanes, phase=(np.arange(lanes) + 0.5) / lanes)
     loop = build_loop(MECHANISM, "none", scenario)

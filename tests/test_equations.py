@@ -25,7 +25,7 @@ def test_linear_solve_matches_numpy_for_matrices_with_zero_pivots():
 
 
 def test_linear_solve_derivative_includes_matrix_and_right_hand_side():
-    """A X' = B' - A' X."""
+    """The derivative X' satisfies A X' = B' - A' X."""
     slopes = jnp.asarray(SEEDED.normal(size=MATRIX.shape)), jnp.asarray(SEEDED.normal(size=RIGHT.shape))
     result, slope = jax.jit(lambda: jax.jvp(solve, (jnp.asarray(MATRIX), jnp.asarray(RIGHT)), slopes))()
     both = product(jnp.asarray(MATRIX), slope) + product(slopes[0], result)

@@ -34,7 +34,7 @@ class Command(NamedTuple):
     before: tuple[tuple[str, ...], ...] = ()  # earlier undisturbed runs with these arguments
     one_piece: str | None = None  # folder that is replaced as a whole
     cold: bool = False  # whether the program cache is empty
-    new: str | None = None  # file that the command refuses to overwrite
+    new: str | None = None  # file that the command must not overwrite
     logged: bool = False  # whether the command reads the log of a run
 
 

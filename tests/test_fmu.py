@@ -136,7 +136,7 @@ def test_fmu_sources_compile_without_warning_as_c_and_as_cpp(axes, fmi):
         assert compile_sources(folder, "g++", f"-std={standard}", "-x", "c++", *PEDANTIC) == ""
 
 
-def test_fmu_refuses_another_communication_step(fmu):
+def test_fmu_rejects_communication_step_other_than_control_period(fmu):
     for step in (0.0, -0.001, 0.0005, 0.002, float("nan"), float("inf")):
         with pytest.raises(Exception, match="failed with status 3"):
             fmu.step(step)
@@ -144,7 +144,7 @@ def test_fmu_refuses_another_communication_step(fmu):
     assert all("control period" in message for message in fmu.messages)
 
 
-def test_fmu_refuses_values_beyond_bounds_and_late_or_unknown_values(fmu):
+def test_fmu_rejects_values_beyond_bounds_and_late_or_unknown_values(fmu):
     fmu.instance.reset()
     bounds = fmu.variables["gains.phase_lead"]
     for value in (float(bounds.min) - 1e-9, float(bounds.max) + 1e-9, float("nan"), float("inf")):
@@ -161,7 +161,7 @@ def test_fmu_refuses_values_beyond_bounds_and_late_or_unknown_values(fmu):
         )
 
 
-def test_fmu_refuses_limits_that_contradict_each_other(fmu):
+def test_fmu_rejects_limits_that_contradict_each_other(fmu):
     fmu.instance.reset()
     with pytest.raises(Exception, match="failed with status 3"):
         fmu.begin(**{"limits.command_lowest": 1.0, "limits.command_highest": 0.0})
@@ -241,7 +241,7 @@ def test_fmu_state_restores_the_same_commands(fmu):
     free(state)
 
 
-def test_fmu_refuses_instantiation_with_token_of_another_fmu():
+def test_fmu_rejects_instantiation_with_token_of_another_fmu():
     folder = folder_of("one axis", 3)
     description = fmpy.read_model_description(str(folder))
     description.guid = "{00000000-0000-0000-0000-000000000000}"
@@ -249,7 +249,7 @@ def test_fmu_refuses_instantiation_with_token_of_another_fmu():
         fmpy.instantiate_fmu(str(folder), description)
 
 
-def test_equal_gains_give_equal_fmus_and_other_gains_another_token():
+def test_fmus_of_equal_gains_are_equal_and_of_other_gains_have_another_token():
     first, again = controller_fmu(document(), 3), controller_fmu(document(), 3)
     assert first == again and find_library(first) is None
     other = controller_fmu(document(phase_lead=0.003), 3)
@@ -273,7 +273,7 @@ def test_export_writes_fmu_and_verify_accepts_the_bundle(formats, fmi, name, tmp
     assert f"| `{name}` |" in made.files["README.md"].decode()
 
 
-def test_export_refuses_unknown_version_of_fmi(tmp_path):
+def test_export_rejects_unknown_version_of_fmi(tmp_path):
     with pytest.raises(InputError, match="fmi: found 4, expected 2 or 3"):
         tuning.export("gains.json", tmp_path / "bundle", fmi=4)
 

@@ -28,7 +28,7 @@ class Simulated:
 
 
 @needs_compiler
-def test_fmu_loop_is_left_out_if_the_simulation_cannot_repeat_it(monkeypatch):
+def test_fmu_loop_is_skipped_if_simulation_or_compiler_cannot_reproduce_it(monkeypatch):
     gains = loaded(bundles.document())
     files = fmi3_files(gains.document)
     assert compare_fmu_loop({}, gains) is None

@@ -150,14 +150,14 @@ def test_loop_of_fmus_reproduces_simulation_of_every_compensator(compensator, tm
     assert_same_contacts(*run_both("rig-300kg", compensator, 3, tmp_path))
 
 
-def test_rig_fmu_rejects_contact_law_of_the_user(monkeypatch):
+def test_rig_fmu_rejects_user_registered_contact_law(monkeypatch):
     monkeypatch.setattr("tuning.bundle.fmu.rig.LAWS", ("hardening",))
     message = "fmu: contact.law: found 'kelvin_voigt', expected one of hardening"
     with pytest.raises(InputError, match=re.escape(message)):
         rig_fmu(document(), 3)
 
 
-def test_rig_fmu_leaves_out_the_extra_periods_of_the_co_simulation():
+def test_rig_fmu_excludes_extra_periods_of_co_simulation():
     made = document("rig-300kg", overrides=("rig.command_latency=1",))
     with_entry = {**made, "figures": {"co_simulation": {"extra_periods": 1}}}
     assert rig_fmu(with_entry, 3) == rig_fmu(document("rig-300kg"), 3) != rig_fmu(made, 3)
@@ -166,7 +166,7 @@ def test_rig_fmu_leaves_out_the_extra_periods_of_the_co_simulation():
 
 
 @pytest.mark.slow
-def test_gains_tuned_with_extra_periods_state_them_and_hold_in_co_simulation(tmp_path):
+def test_gains_tuned_with_extra_periods_state_their_number_and_work_in_co_simulation(tmp_path):
     tuned = tuning.tune(
         load("rig-300kg", NOISELESS).mechanism,
         "phase_lead",

@@ -82,7 +82,7 @@ def random_contacts(count, seed):
 
 
 def test_regularised_friction_dissipates_expected_power():
-    """-f_t.t = mu F |t|^2/sqrt(|t|^2 + v_s^2), never negative."""
+    """The dissipated power is -f_t.t = mu F |t|^2/sqrt(|t|^2 + v_s^2), which is never negative."""
     touching, _ = random_contacts(3000, 1)
     force, _ = REGULARISED.step(touching, ())
     taken = np.asarray(-dot(force, touching.slip))

@@ -17,7 +17,8 @@ def test_noise_and_bias_at_rest_lie_within_stated_errors_for_any_resolution(quan
         assert result.quantum == pytest.approx(quantum, rel=1e-12)
         scores.append([(result.mean - 1.3) / result.mean_std, (result.std - 2.67) / result.std_std])
     rms = np.sqrt(np.mean(np.square(scores), axis=0))
-    # With 20 degrees of freedom, 99.9 % are between 0.5 and 1.5; rounding adds to the error of the mean.
+    # With 20 degrees of freedom, 99.9 % of the ratios are between 0.5 and 1.5; rounding adds to the error of
+    # the mean.
     assert np.all(rms < 1.6) and np.all(rms > 0.5)
 
 

@@ -16,7 +16,7 @@ from tuning.verification.runtime_replay import replay_lane
 
 pytestmark = [pytest.mark.slow, pytest.mark.users_options]
 LAW = "impulse_ledger"
-LIMIT = 1e-9  # of the command's range
+LIMIT = 1e-9  # largest difference, divided by the command's range
 TICKS = 250_000
 
 

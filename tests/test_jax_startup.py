@@ -59,7 +59,7 @@ def refused(ran, *words):
         ({"JAX_ENABLE_X64": "perhaps"}, ["JAX_ENABLE_X64=perhaps"]),
     ],
 )
-def test_environment_variables_that_prevent_start_of_jax_are_refused(variables, words):
+def test_environment_variables_that_prevent_start_of_jax_are_rejected(variables, words):
     ran = run("simulate", "rig-300kg", "--json", **variables)
     refused(ran, *words)
     assert json.loads(ran.stdout)["schema"] == "jaxhil/error/1"
@@ -98,7 +98,7 @@ def test_xla_flags_are_read_from_flag_file(tmp_path):
     assert jax_environment.build_xla_flags(str(tmp_path / "flags")) == jax_environment.build_xla_flags(flags)
 
 
-def test_fork_of_process_with_running_jax_is_refused(monkeypatch):
+def test_fork_of_process_with_running_jax_is_rejected(monkeypatch):
     monkeypatch.setattr(jax_startup, "_processes", set())
     jax_startup.check_not_forked()
     jax_startup.check_not_forked()
@@ -107,7 +107,7 @@ def test_fork_of_process_with_running_jax_is_refused(monkeypatch):
         jax_startup.check_not_forked()
 
 
-def test_closed_standard_output_is_refused_before_any_work():
+def test_closed_standard_output_is_rejected_before_any_work():
     refused(run("simulate", shell=">&-"), "standard output: found a closed stream")
 
 

@@ -82,7 +82,7 @@ def test_vibration_modes_of_latched_bodies_grow_as_characteristic_roots(delays):
 
 
 def test_response_error_with_true_stiffness_cancels_rig_dynamics_of_latched_bodies():
-    """-K xi_a - K (xi_d - xi_a) = -K xi_d for six axes; the uncompensated run diverges."""
+    """Expect -K xi_a - K (xi_d - xi_a) = -K xi_d for six axes; the uncompensated run diverges."""
     bodies, start = docked_bodies()
     pose = Pose(vector(jnp.zeros((3, 1))), identity(jnp.zeros(1)))
     one, period = latch(), lanes(PERIOD, BATCH)

@@ -150,7 +150,7 @@ def far_side():
 
 
 @pytest.mark.parametrize("gone", [(), ("velocity_desired", "force_command")])
-def test_log_contacts_on_the_far_side_of_a_clearance_are_refused(tmp_path, gone):
+def test_log_contacts_on_the_far_side_of_a_clearance_are_rejected(tmp_path, gone):
     """Their forces must not be mistaken for forces in a wrong unit."""
     log, back = far_side()
     path = write_csv(tmp_path / "a.csv", log)

@@ -44,7 +44,7 @@ def test_short_logs_and_logs_without_time_stamps_are_assigned_ticks():
     assert result.tick.tolist() == [*range(7)] and result.clock.jitter == result.clock.lost == 0
 
 
-def test_unusable_time_stamps_are_refused():
+def test_unusable_time_stamps_are_rejected():
     times, _ = stamps(3000)
     slower = np.concatenate([times[:1500], times[1500] + 2 * (times[1500:] - times[1500])])
     cases = [

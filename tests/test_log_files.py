@@ -87,7 +87,7 @@ REFUSED = {
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", REFUSED)
-def test_log_file_that_cannot_be_used_is_refused_with_one_line(tmp_path, name):
+def test_log_file_that_cannot_be_used_is_rejected_with_one_line(tmp_path, name):
     file, content, reason = REFUSED[name]
     path = tmp_path / file
     if (library := LIBRARIES.get(path.suffix)) is not None:
@@ -125,7 +125,7 @@ def check_bytes(suffix, content):
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("examples", [10, pytest.param(1000, marks=pytest.mark.slow)])
-def test_log_file_of_any_bytes_is_read_or_refused_with_one_line(examples):
+def test_log_file_of_any_bytes_is_read_or_rejected_with_one_line(examples):
     @settings(deadline=None, max_examples=examples)
     @given(st.sampled_from(SUFFIXES), st.booleans(), st.binary(max_size=400))
     def check(suffix, has_head, content):
@@ -136,7 +136,7 @@ def test_log_file_of_any_bytes_is_read_or_refused_with_one_line(examples):
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("examples", [10, pytest.param(400, marks=pytest.mark.slow)])
-def test_damaged_log_file_of_any_format_is_read_or_refused_with_one_line(valid_files, examples):
+def test_damaged_log_file_of_any_format_is_read_or_rejected_with_one_line(valid_files, examples):
     @settings(deadline=None, max_examples=examples)
     @given(st.data())
     def check(data):
@@ -165,7 +165,7 @@ def valid_files(tmp_path_factory):
     return result
 
 
-def test_draft_lists_columns_where_names_do_not_decide(tmp_path):
+def test_draft_mapping_lists_candidate_columns_if_names_are_ambiguous(tmp_path):
     path = write_csv(tmp_path / "a.csv", {"a": LOG["t"], "b": LOG["xd"], "Fx": LOG["F"], "Fy": 2 * LOG["F"]})
     draft = draft_mapping([path])
     assert 'time = { column = "a", unit = "s" }  # by its values; rows are 0.001 s apart' in draft
@@ -204,7 +204,7 @@ def test_column_name_indicates_its_channel(name, channel):
     [("[mm]", "mm"), ("(µm)", "um"), ("\u03bcm", "um"), ("MM", "mm"), ("Newton", "N"), ("KN", "kN"), ("MN", None),
      ("Mm", None), ("mm/sec", "mm/s"), ("sec", "s"), ("V", None), ("", None), ("Micron", "um")],
 )  # fmt: skip
-def test_stated_unit_is_recognised_by_its_usual_spellings(text, unit):
+def test_unit_stated_in_log_is_recognised_in_its_usual_spellings(text, unit):
     assert parse_unit(text) == unit
 
 
@@ -212,7 +212,7 @@ def test_stated_unit_is_recognised_by_its_usual_spellings(text, unit):
 @given(
     st.floats(-6.0, 6.0), st.floats(0.5, 2.0), st.sampled_from([("x_cmd", "x_act"), ("x_cmd [mm]", "x_act")])
 )
-def test_drafted_positions_have_one_unit_if_their_strokes_are_alike(power, ratio, names):
+def test_drafted_positions_have_the_same_unit_if_their_strokes_are_similar(power, ratio, names):
     scale = 10.0**power
     with tempfile.TemporaryDirectory() as folder:
         columns = zip(("t", *names), (LOG["t"], scale * LOG["xd"], ratio * scale * LOG["xm"]), strict=True)
@@ -221,7 +221,7 @@ def test_drafted_positions_have_one_unit_if_their_strokes_are_alike(power, ratio
     assert len(units) == 2 and units[0] == units[1], draft
 
 
-def test_stated_unit_holds_where_the_mapping_gives_none(tmp_path):
+def test_unit_stated_in_log_is_used_if_mapping_states_none(tmp_path):
     path = tmp_path / "a.csv"
     text("t,xd,xm,F", units="s,mm,mm,N", scale=1e3)(path)
     absent = {"velocity_desired": None, "force_command": None}
@@ -231,7 +231,7 @@ def test_stated_unit_holds_where_the_mapping_gives_none(tmp_path):
     assert campaign.notes == (f"{path}: column 'F': read in kN, as the mapping states; the file states N",)
 
 
-def test_text_table_of_a_mapping_file_guides_the_draft(tmp_path, capsys):
+def test_draft_mapping_uses_text_table_of_mapping_file(tmp_path, capsys):
     lines = ["0;0;0;0", *(f"{t};{x};{m};{f}" for t, x, m, f in zip(*(LOG[n].tolist() for n in ("t", "xd", "xm", "F")), strict=True))]  # fmt: skip
     path = tmp_path / "contact.csv"
     path.write_text("\n".join(["first;line;of;words", "t;SetPos;ActPos;F", *lines]))
@@ -247,7 +247,7 @@ def test_text_table_of_a_mapping_file_guides_the_draft(tmp_path, capsys):
     assert "text.skip_row: found an unknown key" in capsys.readouterr().err
 
 
-def test_text_layout_is_detected_only_where_it_is_not_specified():
+def test_text_log_layout_is_detected_only_if_not_specified():
     lines = ["a b c", "mm mm N", "1,5 2 3", "2,5 3 4"]
     assert detect_layout(lines, TextFormat())[:5] == (["a", "b", "c"], ["mm", "mm", "N"], " ", ",", 2)
     layout = detect_layout(lines, TextFormat(units_row=False, decimal=".", delimiter=" ", skip_rows=0))
@@ -259,7 +259,7 @@ def test_text_layout_is_detected_only_where_it_is_not_specified():
 
 
 @given(st.lists(st.text(st.characters(exclude_characters="\r\n"), max_size=30), max_size=12))
-def test_text_layout_is_detected_for_any_lines(lines):
+def test_text_log_layout_of_any_lines_is_consistent(lines):
     layout = detect_layout(lines, TextFormat())
     assert len(layout.names) == len(layout.units) == len(layout.texts) and layout.skipped <= len(lines)
 
@@ -295,7 +295,7 @@ def test_log_with_several_rows_per_period_is_read_at_the_ticks(tmp_path, rows, h
         read(path, **absent, time=by_rate, timing={"rows_per_period": 3})
 
 
-def test_log_whose_commands_do_not_show_the_ticks_needs_rows_per_period(tmp_path):
+def test_log_whose_commands_do_not_show_the_ticks_requires_rows_per_period(tmp_path):
     times = PERIOD / 2 * np.arange(1200)
     x = np.interp(times, LOG["t"], LOG["xd"]) + 1e-7 * np.random.default_rng(0).standard_normal(1200)
     columns = {"t": times, "xd": x, "xm": x, "F": np.interp(times, LOG["t"], LOG["F"])}
@@ -308,7 +308,7 @@ def test_log_whose_commands_do_not_show_the_ticks_needs_rows_per_period(tmp_path
 
 
 @given(st.integers(2, 20), st.integers(0, 19), st.integers(0, 2**32 - 1), st.booleans())
-def test_command_phase_is_that_of_rows_with_new_commands(rows, phase, seed, hold):
+def test_command_phase_is_phase_of_rows_with_new_commands(rows, phase, seed, hold):
     commands = np.cumsum(np.random.default_rng(seed).standard_normal(60))
     tick = np.arange(rows * 58) + rows
     periods = (tick - phase % rows) / rows

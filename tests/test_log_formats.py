@@ -123,7 +123,7 @@ def test_all_log_formats_give_the_same_campaign(tmp_path, name, write):
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("suffix", [".mat", ".h5", ".mcap", ".mf4", ".tdms"])
-def test_truncated_log_or_missing_library_is_refused_with_one_line_message(tmp_path, suffix):
+def test_truncated_log_or_missing_library_is_rejected_with_one_line_message(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"torn" * 100)
     with pytest.raises(InputError) as caught:
@@ -220,7 +220,7 @@ def test_log_channels_that_begin_at_different_times_are_aligned(tmp_path, name, 
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_log_channels_with_other_rates_or_clocks_are_read_or_refused(tmp_path):
+def test_log_channels_with_other_rates_or_clocks_are_read_or_rejected(tmp_path):
     path, columns = mdf_of_groups(tmp_path / "a.mf4", LOG, 0.005)
     with pytest.raises(InputError, match=r'timing.clock: found "index", expected "stamps", because '):
         read(path, **columns, timing={"clock": "index"})
@@ -248,7 +248,7 @@ def test_log_channels_with_other_rates_or_clocks_are_read_or_refused(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_log_waveform_without_start_time_among_timed_waveforms_is_refused(tmp_path):
+def test_log_waveform_without_start_time_among_timed_waveforms_is_rejected(tmp_path):
     nptdms = pytest.importorskip("nptdms")
     begin = {"wf_start_time": np.datetime64("2026-03-01T10:00:00", "us")}
     with nptdms.TdmsWriter(tmp_path / "a.tdms") as writer:

@@ -1,4 +1,4 @@
-"""Truncated, corrupted or shuffled logs: read as finite numbers or refused in one line."""
+"""Truncated, corrupted or shuffled logs: read as finite numbers or rejected in one line."""
 
 import tempfile
 from contextlib import suppress
@@ -97,12 +97,12 @@ CLOCKS = st.sampled_from([{}, {"clock": "index"}, {"row": "sent"}])
 
 @settings(deadline=None, max_examples=60)
 @given(st.sampled_from(sorted(LOGS)), mutations, CLOCKS)
-def test_damaged_log_is_read_or_refused_with_one_line_message(kind, changes, timing):
+def test_damaged_log_is_read_or_rejected_with_one_line_message(kind, changes, timing):
     check(kind, changes, timing)
 
 
 @pytest.mark.slow
 @settings(deadline=None, max_examples=5000)
 @given(st.sampled_from(sorted(LOGS)), mutations, CLOCKS)
-def test_many_damaged_logs_are_read_or_refused_with_one_line_message(kind, changes, timing):
+def test_many_damaged_logs_are_read_or_rejected_with_one_line_message(kind, changes, timing):
     check(kind, changes, timing)

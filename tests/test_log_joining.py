@@ -1,4 +1,4 @@
-"""Channels with separate clocks: aligned with the rows of the desired position, or refused by name."""
+"""Channels with separate clocks: aligned with the rows of the desired position, or rejected by name."""
 
 import numpy as np
 import pytest
@@ -171,7 +171,7 @@ def test_text_log_channel_of_same_length_is_aligned_by_own_time_stamps(tmp_path)
 
 
 @pytest.mark.parametrize(("unit", "late"), [(1.0, 0.005), (1e3, 0.005), (1.0, 1e-4)])
-def test_time_stamps_of_channel_group_that_differ_from_row_stamps_are_refused(tmp_path, unit, late):
+def test_time_stamps_of_channel_group_that_differ_from_row_stamps_are_rejected(tmp_path, unit, late):
     h5py, log = pytest.importorskip("h5py"), touches(1)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["x/time"], file["f/time"], file["f/count"] = log["t"], unit * (log["t"] + late), 2.0 * log["t"]
@@ -207,7 +207,7 @@ HOSTILE = st.one_of(
     rate=st.sampled_from([1e-9, 1e-4, 1e-3, 1.4e-3, 1e9]),
     whose=st.sampled_from(["position_desired", "force_measured"]),
 )
-def test_log_channel_with_any_clock_is_aligned_or_refused_with_one_line_message(
+def test_log_channel_with_any_clock_is_aligned_or_rejected_with_one_line_message(
     place, value, count, rate, whose
 ):
     rows = {"position_desired": PERIOD * np.arange(300), "force_measured": rate * np.arange(count)}

@@ -110,7 +110,7 @@ def test_mapping_file_is_equivalent_to_mapping_dictionary(tmp_path):
         (("runs",), ["x"], "runs[0]: found 'x', expected a table"),
     ],
 )  # fmt: skip
-def test_unusable_mapping_is_refused(path, value, reason):
+def test_unusable_mapping_is_rejected(path, value, reason):
     with pytest.raises(InputError) as caught:
         parse_mapping(changed(path, value), "map.toml")
     assert str(caught.value).startswith("map.toml: ") and reason in str(caught.value)

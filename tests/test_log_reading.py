@@ -156,7 +156,7 @@ def edit(path: Path, row: int, cell: int, text: str) -> Path:
         (0, 2, "xd", "column 'xd': found 2 columns, expected one"),
     ],
 )  # fmt: skip
-def test_unusable_cells_of_log_files_are_refused(tmp_path, row, cell, text, reason):
+def test_unusable_cells_of_log_files_are_rejected(tmp_path, row, cell, text, reason):
     path = edit(write_csv(tmp_path / "a.csv", LOG), row, cell, text)
     with pytest.raises(InputError) as caught:
         read(path)
@@ -164,7 +164,7 @@ def test_unusable_cells_of_log_files_are_refused(tmp_path, row, cell, text, reas
     assert str(caught.value).isprintable()
 
 
-def test_unusable_log_files_are_refused(tmp_path):
+def test_unusable_log_files_are_rejected(tmp_path):
     short = {name: one[:100] for name, one in LOG.items()}
     cases = {
         "none.csv": "found no such file",

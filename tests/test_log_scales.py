@@ -81,7 +81,7 @@ NO_COMMAND = {"force_command": None}
         ({"vd": -1.0}, {}, "velocity_desired: found -1 times the rate"),
     ],
 )
-def test_log_channel_in_wrong_unit_is_refused_with_factor_and_unit(tmp_path, factors, said, reason):
+def test_log_channel_in_wrong_unit_is_rejected_with_factor_and_unit(tmp_path, factors, said, reason):
     assert reason in refused(tmp_path, scaled(LOG, **factors), **said)
 
 
@@ -162,7 +162,7 @@ def test_damping_by_compensator_and_dead_zone_are_not_mistaken_for_wrong_unit(tm
     lost=st.sampled_from([0.0, 0.01, 0.1]),
     seed=st.integers(0, 99),
 )
-def test_force_command_column_is_read_correctly_or_refused_in_any_log(factor, quantum, noise, lost, seed):
+def test_force_command_column_is_read_correctly_or_rejected_in_any_log(factor, quantum, noise, lost, seed):
     log = {name: column[:500] for name, column in touches(1, noise=noise, seed=seed).items()}
     x = quantum * np.round(log["xd"] / quantum) if quantum else log["xd"]
     valid = np.random.default_rng(seed).uniform(size=len(x)) >= lost

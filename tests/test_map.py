@@ -1,4 +1,4 @@
-"""Stability maps: theory, growth rate compared with long simulations, margins and refusals."""
+"""Stability maps: theory, growth rate compared with long simulations, margins, and rejected arguments."""
 
 import cmath
 import json
@@ -171,7 +171,7 @@ def test_stability_map_has_the_requested_axes(ideal):
         (("contact.stiffness", "rig.simulator.time_constant"), "found no value"),
     ],
 )
-def test_stability_map_refuses_unusable_arguments(jaxhil, tmp_path, axes, said):
+def test_stability_map_rejects_unusable_arguments(jaxhil, tmp_path, axes, said):
     ended = jaxhil("map", "varying", "--x", axes[0], "--y", axes[1], "-o", str(tmp_path))
     assert ended.code == 2 and said in ended.err and ended.out == ""
 

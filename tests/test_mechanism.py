@@ -1,4 +1,4 @@
-"""Mechanism keys: values, defaults, refusals and their messages."""
+"""Mechanism keys: values, defaults, and messages for rejected values."""
 
 import math
 
@@ -136,7 +136,7 @@ def test_error_for_misspelt_mechanism_key_suggests_correct_key():
 
 @pytest.mark.parametrize("path", [*numeric_keys()])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 10**400, -(10**400)])
-def test_non_finite_mechanism_values_are_refused_unless_key_allows_infinity(path, value):
+def test_non_finite_mechanism_values_are_rejected_unless_key_allows_infinity(path, value):
     listed = [value, 1.0, 1.0] if isinstance((OF_OTHERS | dict(flat(FULL))).get(path), list) else value
     base = changed()
     if path in ("bodies.chaser_mass", "bodies.target_mass"):
@@ -157,7 +157,7 @@ def flat(node, path=""):
 
 
 @pytest.mark.parametrize("path", sorted(set(numeric_keys()) & set(leaves())))
-def test_zero_and_negative_mechanism_values_are_refused_if_key_forbids_them(path):
+def test_zero_and_negative_mechanism_values_are_rejected_if_key_forbids_them(path):
     nominal = dict(flat(FULL))[path]
     signed = ("contact_plane", "force_sensor.bias")
     may_be_negative = path.removeprefix("rig.") in signed
@@ -195,7 +195,7 @@ def test_zero_and_negative_mechanism_values_are_refused_if_key_forbids_them(path
         ("schema", "jaxhil/mechanism/1", "jaxhil/mechanism/2"),
     ],
 )
-def test_mechanism_values_at_range_limits_are_accepted_and_beyond_refused(path, inside, outside):
+def test_mechanism_values_at_range_limits_are_accepted_and_beyond_rejected(path, inside, outside):
     assert isinstance(from_plain_data(changed({path: inside}), "f"), Mechanism)
     message = refusal(changed({path: outside}))
     assert f": {path}" in message and ", expected " in message
@@ -210,20 +210,20 @@ def test_mechanism_values_at_range_limits_are_accepted_and_beyond_refused(path, 
         ("bodies.equivalent_mass", 1e-100, 1e-320),
     ],
 )
-def test_hunt_crossley_values_at_range_limits_are_accepted_and_beyond_refused(path, inside, outside):
+def test_hunt_crossley_values_at_range_limits_are_accepted_and_beyond_rejected(path, inside, outside):
     base = changed({"contact.law": "hunt_crossley"})
     assert value_at(from_plain_data(changed({path: inside}, base), "f"), path) in (inside, [inside])
     assert f": {path}" in refusal(changed({path: outside}, base))
 
 
-def test_contact_segment_depths_must_increase():
+def test_contact_segment_depths_that_do_not_increase_are_rejected():
     assert from_plain_data(changed(LAYERED), "f").contact.depths == LAYERED["contact.depths"]
     for wrong in ([0.001, 0.001], [0.0, 0.001], [0.001, -0.1]):
         assert ": contact.depths[" in refusal(changed({**LAYERED, "contact.depths": wrong}))
 
 
 @pytest.mark.parametrize("value", [1e-320, -1e-320, 1e-101, 1.1e100, -1.7e308])
-def test_mechanism_values_that_overflow_or_underflow_in_products_are_refused(value):
+def test_mechanism_values_that_overflow_or_underflow_in_products_are_rejected(value):
     message = refusal(changed({"rig.force_sensor.bias": value}))
     assert f": found {value}, expected a finite number of N, of a magnitude from 1e-100 to 1e+100" in message
 
@@ -236,7 +236,7 @@ def test_mechanism_values_that_overflow_or_underflow_in_products_are_refused(val
     ),
     st.data(),
 )
-def test_any_value_of_any_mechanism_key_is_accepted_or_refused_with_one_line_message(value, data):
+def test_any_value_of_any_mechanism_key_is_accepted_or_rejected_with_one_line_message(value, data):
     path = data.draw(st.sampled_from([*leaves(), *(table[:-1] for table in tables() if table)]))
     raw = changed({path: value})
     try:

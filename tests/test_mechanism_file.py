@@ -116,7 +116,7 @@ def test_mechanism_path_is_never_mistaken_for_builtin_name(tmp_path, monkeypatch
     ],
     ids=lambda value: repr(value[:12]),
 )
-def test_unusable_mechanism_file_content_is_refused(written, content, reason):
+def test_unusable_mechanism_file_content_is_rejected(written, content, reason):
     path = written(content)
     message = file_refusal(path)
     assert message.startswith(f"{path}: ") and reason in message
@@ -151,7 +151,7 @@ def test_long_texts_and_lists_in_mechanism_file_are_accepted(written):
         assert len(load(written(replaced)).mechanism.contact.damping) == 1000
 
 
-def test_unreadable_mechanism_files_are_refused(tmp_path):
+def test_unreadable_mechanism_files_are_rejected(tmp_path):
     assert "found a directory" in file_refusal(tmp_path)
     assert "found a directory" in file_refusal("")
     assert "no such file" in file_refusal(tmp_path / "absent.toml")
@@ -164,7 +164,7 @@ def test_unreadable_mechanism_files_are_refused(tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root reads every file")
-def test_mechanism_file_without_read_permission_is_refused(written):
+def test_mechanism_file_without_read_permission_is_rejected(written):
     path = written(TEXT)
     path.chmod(0)
     assert "Permission denied" in file_refusal(path)
@@ -172,7 +172,7 @@ def test_mechanism_file_without_read_permission_is_refused(written):
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cut=st.integers(0, len(TEXT) - 1))
-def test_truncated_mechanism_file_is_refused_unless_still_complete(written, cut):
+def test_truncated_mechanism_file_is_rejected_unless_still_complete(written, cut):
     path = written(TEXT[:cut])
     try:
         mechanism = load(path).mechanism
@@ -184,7 +184,7 @@ def test_truncated_mechanism_file_is_refused_unless_still_complete(written, cut)
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(noise=st.binary(max_size=40), position=st.integers(0, len(TEXT)))
-def test_damaged_mechanism_file_is_read_or_refused_with_one_line_message(written, noise, position):
+def test_damaged_mechanism_file_is_read_or_rejected_with_one_line_message(written, noise, position):
     data = TEXT.encode()
     path = written(data[:position] + noise + data[position:])
     try:
@@ -201,7 +201,7 @@ def test_mechanism_survives_round_trip_through_json(name):
     assert "null" not in text
 
 
-def test_mechanism_data_that_are_not_a_table_are_refused():
+def test_mechanism_data_that_are_not_a_table_are_rejected():
     with pytest.raises(InputError, match=r"^a\\nfile: found \[1\], expected a table$"):
         from_plain_data([1], "a\nfile")  # pyright: ignore[reportArgumentType]
 

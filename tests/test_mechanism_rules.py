@@ -68,7 +68,7 @@ def test_damping_ratio_gives_damping_of_each_contact(law):
     assert len(repeated.contact.damping) == len(repeated.contact.stiffness)
 
 
-def test_damping_ratio_without_meaning_is_refused():
+def test_damping_ratio_is_rejected_if_negative_ambiguous_or_unsupported_by_contact_law():
     ratio = {"contact.damping": 0, "contact.damping_ratio": 0.1}
     for change, reason in (
         (
@@ -96,7 +96,7 @@ def test_damping_ratio_without_meaning_is_refused():
 
 
 @pytest.mark.parametrize("path", OF_OTHERS)
-def test_mechanism_keys_of_other_contact_laws_and_simulator_models_are_refused(path):
+def test_mechanism_keys_of_other_contact_laws_and_simulator_models_are_rejected(path):
     message = refusal(changed({path: OF_OTHERS[path]}))
     assert f": {path}: found {OF_OTHERS[path]}, expected nothing (" in message
     uncertain = {path: {"distribution": "uniform", "factor": [0.5, 1.5]}}
@@ -116,12 +116,12 @@ def test_keys_that_contact_law_does_not_use_may_only_have_default_value():
     assert '"contact.exponent": found a key only for law hunt' in refusal(changed({"uncertainty": drawn}))
 
 
-def test_preloaded_contact_law_refuses_damping():
+def test_preloaded_contact_law_rejects_damping():
     message = refusal(changed({"contact.law": "preloaded", "contact.damping": [3.0]}))
     assert ": contact.damping: found [3.0], expected 0 (law preloaded dissipates by friction)" in message
 
 
-def test_elastoplastic_contact_law_refuses_damping():
+def test_elastoplastic_contact_law_rejects_damping():
     message = refusal(changed({**ELASTOPLASTIC, "contact.damping": [0.0, 3.0]}))
     assert ": contact.damping: found [0.0, 3.0], expected 0 (law elastoplastic" in message
     drawn = {"contact.damping": {"distribution": "uniform", "low": 0.0, "high": 2.0}}
@@ -148,7 +148,7 @@ def test_elastoplastic_contact_law_refuses_damping():
         (IDEAL, "rig.command_hold"),
     ],
 )
-def test_mechanism_keys_that_contradict_each_other_are_refused(changes, key):
+def test_mechanism_keys_that_contradict_each_other_are_rejected(changes, key):
     assert f": {key}: found" in refusal(changed(changes))
 
 
@@ -188,7 +188,7 @@ def test_mechanism_of_every_contact_law_and_simulator_survives_json_round_trip(c
         ),
     ],
 )
-def test_clearance_too_small_for_starting_positions_is_refused(changes, lag):
+def test_clearance_too_small_for_starting_positions_is_rejected(changes, lag):
     # Distances: free approach, contact phase, command latency, transport delay and lag of x_a.
     start = 0.005 * (0.02 + 0.001 + 0.001 + 0.004 + lag)
     changes = changes | {"rig.contact_plane": ...}
@@ -197,7 +197,7 @@ def test_clearance_too_small_for_starting_positions_is_refused(changes, lag):
     assert ": contact.clearance: found " in message and f"expected a clearance > {start:g}" in message
 
 
-def test_velocity_limit_below_the_approach_speed_is_refused():
+def test_velocity_limit_below_the_approach_speed_is_rejected():
     path = "rig.simulator.velocity_limit"
     speed = value_at(from_plain_data(changed({}), "f"), "approach.velocity")
     expected = f"expected a number >= {speed:g} m/s, the approach speed"
@@ -211,7 +211,7 @@ def test_velocity_limit_below_the_approach_speed_is_refused():
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_contact_plane_beyond_starting_position_is_refused(side):
+def test_contact_plane_beyond_starting_position_is_rejected(side):
     # Distances: free approach, contact phase, command latency, transport delay and lag of x_a.
     plane = side * (0.02 - 0.99 * 0.005 * (0.026 + 2 * 0.8 / (2 * math.pi * 10.0)))
     changes = {"contact.clearance": 0.02}

@@ -131,7 +131,7 @@ def test_json_schema_accepts_builtin_mechanisms(validator, name):
         ("uncertainty", "contact.stiffness", {"distribution": "uniform", "factor": [0.5]}),
     ],
 )
-def test_json_schema_refuses_values_that_mechanism_reader_refuses(validator, table, key, value):
+def test_json_schema_rejects_values_that_mechanism_reader_rejects(validator, table, key, value):
     document = to_plain_data(load("varying").mechanism)
     document[table][key] = value
     assert not validator.is_valid(document)
@@ -149,7 +149,7 @@ def test_json_schema_refuses_values_that_mechanism_reader_refuses(validator, tab
         (("rig", "velocity_limit"), 1.0),
     ],
 )
-def test_json_schema_refuses_values_that_six_axis_reader_refuses(validator, path, value):
+def test_json_schema_rejects_values_that_six_axis_reader_rejects(validator, path, value):
     document = to_plain_data(load_any("probe-drogue").mechanism)
     assert validator.is_valid(document)
     *tables, key = path

@@ -90,7 +90,7 @@ def test_watchdog_without_restitution_check_misses_every_injected_fault():
     assert any(text.startswith(start) for text in blind["reasons"])
 
 
-def test_neutral_gains_are_injected_as_fault_only_if_they_differ_from_gains(rates):
+def test_neutral_gains_are_an_injected_fault_only_if_they_differ_from_tuned_gains(rates):
     result = calibrated("phase_lead")
     # There is no delay here, so the literature's lead is already 0.
     names = [kind.name for kind in INJECTED_FAULTS if kind.name != "gains"]

@@ -181,7 +181,7 @@ def test_monitor_command_prints_a_verdict_and_returns_its_exit_code(jaxhil, tmp_
     (["FAR", "LOG"], "rig.contact_plane: found 0.05 m, which no contact in the logs exceeds"),
     (["OTHER", "LOG"], "contact.law: found 'elastoplastic', expected linear, kelvin_voigt"),
 ))  # fmt: skip
-def test_monitor_refuses_unusable_input_with_one_line_message(jaxhil, tmp_path, arguments, words):
+def test_monitor_rejects_unusable_input_with_one_line_message(jaxhil, tmp_path, arguments, words):
     campaign = contacts(CLEAN, speeds=SPEEDS[:1])
     mapping = tmp_path / "map.toml"
     channels = (

@@ -62,7 +62,7 @@ def test_moving_average_of_rehearsal_agrees_with_oracle(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["linear hold", "zoh", "lag", "response error"])
-def test_derivative_by_window_equals_central_difference(name):
+def test_restitution_derivative_for_moving_average_window_equals_central_difference(name):
     case, path, step = CASES[name], "rig.simulator.window", 1e-7
     parsed = validated(case.mechanism)
     gains = dict(nominal_gains(parsed, case.compensator))

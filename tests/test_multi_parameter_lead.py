@@ -47,7 +47,7 @@ def test_pole_placement_for_undamped_contact_matches_closed_form(frequency, dela
 
 
 @pytest.mark.parametrize("bad", [(0.0, 0.01, 1.0), (1.0, np.inf, 1.0), (1.0, 0.01, 0.0), (1.0, 0.01, np.nan)])
-def test_pole_placement_refuses_nonpositive_and_nonfinite_arguments(bad):
+def test_pole_placement_rejects_nonpositive_and_nonfinite_arguments(bad):
     with pytest.raises(InputError, match=r"^pole_placement: \w+: found .*, expected finite numbers > "):
         pole_placement(*bad)
 

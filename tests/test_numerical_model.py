@@ -155,7 +155,7 @@ def test_torque_free_rotation_converges_to_jacobi_solution_at_second_order(run):
 
 
 def test_attitude_of_axisymmetric_top_matches_closed_form(run):
-    """Precession at |pi|/J_1 about the angular momentum, spin at (1 - J_3/J_1) w_3."""
+    """Expect a precession at |pi|/J_1 about the angular momentum, and a spin at (1 - J_3/J_1) w_3."""
     first = Rotation.from_quat(run["attitude"][0].T)
     time = 250 * PERIOD
     spin = first.apply(SYMMETRIC * SPUN)

@@ -148,7 +148,7 @@ def test_every_problem_of_a_batch_uses_its_own_objective_weights(batch):
         np.testing.assert_allclose(together[i], run(batch, objective=objective)[0][i], rtol=1e-13)
 
 
-def test_objective_terms_with_weight_zero_are_ignored():
+def test_objective_terms_with_weight_zero_have_zero_residuals():
     errors, excesses, swings, noise = [0.1, -0.2], [0.3, 0.4], [0.5, 0.6], 3.0
     terms = *map(padded, (errors, excesses, swings)), np.arange(SLOTS) < 2, np.asarray(noise)
     none = *[padded([])] * 3, np.asarray(0.0)
@@ -387,7 +387,7 @@ def test_objective_without_any_error_has_a_finite_derivative(name):
         ({"command_weight": np.inf}, "objective: command_weight: found inf, expected a finite number >= 0"),
     ],
 )
-def test_unknown_objective_is_refused(values, message):
+def test_unknown_objective_is_rejected(values, message):
     with pytest.raises(InputError) as refused:
         Objective(**values)
     assert str(refused.value) == message

@@ -73,6 +73,6 @@ def test_functions_and_commands_have_the_same_options_and_defaults(function):
     assert "OPTIONS" not in function.__doc__
 
 
-def test_unknown_option_of_function_is_refused():
+def test_unknown_option_of_function_is_rejected():
     with pytest.raises(TypeError, match="unexpected keyword argument 'scenario'"):
         tuning.tune("varying", scenario=3)

@@ -307,7 +307,7 @@ def test_successive_oracle_runs_use_next_stiffness_and_previous_rebound_speed():
     assert results[0]["restitution"] < results[1]["restitution"]
 
 
-def test_oracle_refuses_damped_contact_with_ideal_zero_order_hold():
+def test_oracle_rejects_damped_contact_with_ideal_zero_order_hold():
     law = {"law": "kelvin_voigt", "stiffness": [1e5], "damping": [100.0]}
     with pytest.raises(ValueError, match="damped"):
         simulate(mechanism(contact=law, command_hold="zoh"))

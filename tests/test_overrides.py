@@ -1,4 +1,4 @@
-"""`--set` and `--unset`: changes of mechanism values on the command line, and refusals."""
+"""`--set` and `--unset`: changes of mechanism values on the command line, and error messages."""
 
 import math
 
@@ -122,7 +122,7 @@ def test_unusable_unset_option_is_named_in_error(path, reason):
     assert message.startswith("varying: --unset ") and reason in message
 
 
-def test_uncertainty_of_key_without_value_is_refused():
+def test_uncertainty_of_key_without_value_is_rejected():
     message = file_refusal(
         "varying", ["uncertainty.'rig.simulator.time_constant'={distribution='normal', std=1}"]
     )
@@ -165,7 +165,7 @@ def test_unusable_override_is_named_in_error(override, reason):
     assert message.startswith("varying: --set ") and reason in message
 
 
-def test_override_of_subkey_of_non_table_value_is_refused(written):
+def test_override_of_subkey_of_non_table_value_is_rejected(written):
     path = written("rig = 5")
     message = file_refusal(path, ["rig.simulator.model=ideal"])
     assert "--set rig.simulator.model=ideal: rig: found 5, expected a table" in message
@@ -179,7 +179,7 @@ def test_error_in_mechanism_file_is_not_attributed_to_an_override(written):
 
 @settings(deadline=None)
 @given(st.text(max_size=60) | st.from_regex(r"(contact|rig\.simulator)\.[a-z_.\[\]0-9]*=.*"))
-def test_any_override_is_applied_or_refused_with_one_line_message(text):
+def test_any_override_is_applied_or_rejected_with_one_line_message(text):
     try:
         load("varying", [text])
     except InputError:

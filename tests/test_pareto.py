@@ -163,7 +163,7 @@ def test_pareto_searches_of_all_weights_and_mechanisms_share_one_program(made):
     assert made[1] == 1
 
 
-def test_pareto_search_starts_at_results_of_neighbouring_weights():
+def test_pareto_search_starts_at_gains_of_neighbouring_weights():
     result = [pareto_search._LadderCandidate({"gain": float(n)}, 0.1, 1.0) for n in (1, 2, 2, 4)]
     assert [[gains["gain"] for gains in own] for own in pareto_search._collect_neighbour_gains(result)] == [
         [1, 2],

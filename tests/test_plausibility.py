@@ -1,4 +1,4 @@
-"""Plausibility of a mechanism file: summary, warnings, and refused runs."""
+"""Plausibility of a mechanism file: summary, warnings, and rejected runs."""
 
 import math
 
@@ -16,7 +16,7 @@ from jaxhil.simulation.motion_simulator import matrix_exponential
 from jaxhil.simulation.plausibility import MAX_POLE, check_run, compute_bandwidth, summarise_mechanism
 from jaxhil.simulation.scenario import build_scenarios
 
-MASS, STIFFNESS, SPEED = 300.0, 106592.0, 0.005  # of rig-300kg
+MASS, STIFFNESS, SPEED = 300.0, 106592.0, 0.005  # values of rig-300kg
 
 
 def rig(overrides=(), **others):
@@ -259,7 +259,7 @@ def test_damping_key_of_an_undamped_contact_law_gives_a_warning():
     assert warning == "contact.damping: found 4 N s/m, expected 0: law linear has no damping"
 
 
-# Refusals.
+# Rejections.
 
 
 def refusal(mechanism, **options):
@@ -270,7 +270,7 @@ def refusal(mechanism, **options):
     return message
 
 
-def test_mechanism_whose_run_needs_too_many_ticks_is_refused():
+def test_mechanism_whose_run_needs_too_many_ticks_is_rejected():
     message = (
         "found 1e-09 s, expected at most 1e+07 ticks per contact and 1e+09 per run: "
         "contact 1 takes about 0.195 s"
@@ -286,7 +286,7 @@ def test_mechanism_whose_run_needs_too_many_ticks_is_refused():
     assert "contact 1 takes about 0.195 s, 1.9e+06 ticks" in refusal(rig(many))
 
 
-def test_mechanism_with_endless_approach_is_refused():
+def test_mechanism_with_endless_approach_is_rejected():
     gap = {"contact.clearance": 40.0, "approach.contacts": 2}
     check_run(rig(gap))
     message = refusal(rig(gap, contact__clearance=100.0))
@@ -321,7 +321,7 @@ def test_limit_on_number_of_ticks_applies_to_uncertain_values():
     ],
     ids=str,
 )
-def test_motion_simulator_too_fast_for_control_period_is_refused(simulator):
+def test_motion_simulator_too_fast_for_control_period_is_rejected(simulator):
     message = refusal(behind(**simulator))
     assert (
         ": rig.simulator: found a pole of " in message and "expected at most 64 / control_period" in message
@@ -354,7 +354,7 @@ def test_velocity_limit_check_applies_to_uncertain_values():
     check_run(rig({"uncertainty": normal}, rig__simulator__velocity_limit=2 * SPEED), drawn=True)
 
 
-def test_every_public_function_refuses_endless_run():
+def test_every_public_function_rejects_endless_run():
     endless = rig(rig__control_period=1e-9)
     for function in (jaxhil.simulate, tuning.tune, tuning.compare):
         with pytest.raises(jaxhil.InputError, match="at most 1e\\+07 ticks per contact"):
@@ -397,7 +397,7 @@ def test_simulate_output_begins_with_mechanism_summary_line(jaxhil):
 
 
 @pytest.mark.parametrize("command", ["simulate", "tune", "compare"])
-def test_every_command_refuses_endless_run_with_one_line_message(jaxhil, command, tmp_path, monkeypatch):
+def test_every_command_rejects_endless_run_with_one_line_message(jaxhil, command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ran = jaxhil(command, "rig-300kg", "--set", "rig.control_period=1e-9")
     assert ran.code == 2 and ran.out == "" and ran.err.count("\n") == 1

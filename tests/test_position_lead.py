@@ -123,7 +123,7 @@ def test_position_lead_nominal_gains_are_within_bounds():
         )
 
 
-# Runtime on the rig
+# Tests of the runtime on the rig.
 
 
 def loaded_gains(simulator=SECOND_ORDER, **keys):

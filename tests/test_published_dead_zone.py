@@ -17,7 +17,7 @@ MASS, DELAY, FREQUENCY, SPEED, CONTACTS = 300.0, 0.003, 3.0, 0.005, 4
 STIFFNESS = MASS * (2 * math.pi * FREQUENCY) ** 2
 PERIOD, PHASES = 2.5e-4, (0.0, 0.25, 0.5, 0.75)
 LAWS = "none", "smith_hybrid", "dead_zone_observer"
-# By case: arguments, published restitution by law, and four successive contacts by law.
+# By case: arguments of `restitution`; published restitution by law; restitution of four contacts by law.
 ROWS = {
     "undamped": (
         (0.0, STIFFNESS, SPEED),
@@ -56,7 +56,7 @@ def restitution(law: str, ratio: float, stiffness: float, speed: float) -> list[
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", ROWS)
-def test_published_restitution_behind_cut_dead_zone(row):
+def test_restitution_behind_cut_dead_zone_is_close_to_published_values(row):
     arguments, published, expected = ROWS[row]
     for law, there, ours in zip(LAWS, published, expected, strict=True):
         result = restitution(law, *arguments)

@@ -157,6 +157,6 @@ def test_extreme_quantile_of_few_values_has_no_upper_bound():
 @pytest.mark.parametrize(
     "number, order, level", ((-1, 0.5, 0.9), (5, 0.0, 0.9), (5, 1.0, 0.9), (5, 0.5, 1.0))
 )
-def test_quantile_function_refuses_impossible_orders(number, order, level):
+def test_quantile_function_rejects_impossible_orders(number, order, level):
     with pytest.raises(ValueError, match="number, order, level: found"):
         compute_order_ranks(number, order, level)

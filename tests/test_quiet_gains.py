@@ -222,7 +222,7 @@ def test_tuning_warnings_report_peak_force_and_noise_beyond_bounds():
     assert warned(**loud, silent=None) == ()
 
 
-def test_objective_of_errors_within_tolerance_is_small_but_not_zero():
+def test_objective_of_error_within_tolerance_is_small_but_nonzero():
     within = Objective(tolerance=0.01)
     assert evaluate_objective(within, np.array([0.005])) == pytest.approx(1e-4)
 

@@ -1,4 +1,4 @@
-"""User-registered compensators and contact laws: registered, simulated, differentiated, or refused."""
+"""User-registered compensators and contact laws: registered, simulated, differentiated, or rejected."""
 
 import math
 
@@ -64,7 +64,7 @@ def test_user_registered_contact_law_agrees_with_its_integrated_ideal_contact(re
     np.testing.assert_allclose(slope, contact.reference_peak_force / 3e8, rtol=1e-6)
 
 
-def test_incomplete_contact_law_is_refused(registered):
+def test_incomplete_contact_law_is_rejected(registered):
     mechanism = jaxhil.load("rig-300kg", {"contact": {"law": "squared_spring", "stiffness": [1e8]}})
     for needs, method in (
         (lambda: perturb_damping(mechanism, draw(mechanism, 4, 0)), "perturb_damping"),

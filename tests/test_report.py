@@ -1,4 +1,4 @@
-"""Report page for a review board: refusals, escaped names, and behaviour in a browser."""
+"""Report page for a review board: rejected results, escaped names, and behaviour in a browser."""
 
 import html
 import json
@@ -124,13 +124,13 @@ def test_report_verdict_follows_from_all_requirements(put):
         ({"schema": "jaxhil/gains/1"}, "sha256: found nothing"),
     ],
 )
-def test_report_refuses_third_party_results_with_one_line_message(jaxhil, put, tmp_path, document, said):
+def test_report_rejects_third_party_results_with_one_line_message(jaxhil, put, tmp_path, document, said):
     ended = jaxhil("report", put(document), "-o", tmp_path / "page.html")
     assert ended.code == 2 and said in ended.err and ended.err.count("\n") == 1
     assert not (tmp_path / "page.html").exists()
 
 
-def test_report_command_refuses_invalid_arguments(jaxhil, put, tmp_path):
+def test_report_command_rejects_invalid_arguments(jaxhil, put, tmp_path):
     one = put(write_identification())
     for arguments, message in (
         ([], "RESULT: found none"),

@@ -34,7 +34,7 @@ SETTINGS = TuneSettings(scenarios=4, starts=2, steps=2, validation=16)
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Mechanisms that share one program."""
+    """Return the files of mechanisms that share one program."""
     folder, text = tmp_path_factory.mktemp("files"), builtin_path("rig-300kg").read_text()
     for number in range(FILES):
         (folder / f"m{number}.toml").write_text(text.replace('"rig-300kg"', f'"m{number}"'))

@@ -374,6 +374,6 @@ def test_calibrated_limits_depend_only_on_good_runs(calibrated):
 
 
 @pytest.mark.parametrize("keywords", [{"scenarios": 1}, {"limit": 0.0}, {"limit": math.nan}])
-def test_calibration_refuses_impossible_arguments(keywords):
+def test_calibration_rejects_impossible_arguments(keywords):
     with pytest.raises(InputError, match=r"found .*, expected"):
         calibrate(ONE_SIDED, **keywords)

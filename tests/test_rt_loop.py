@@ -76,7 +76,7 @@ def test_loop_in_c_stops_on_sigterm_with_the_drives_at_rest(folder):
     check_shadow(ran)
 
 
-def test_loop_in_c_refuses_wrong_options(program, tmp_path):
+def test_loop_in_c_rejects_wrong_options(program, tmp_path):
     for arguments, words in (
         (["--lag", "x.csv"], "--lag: unknown option"),
         (["--log"], "--log: found no value"),
@@ -89,7 +89,7 @@ def test_loop_in_c_refuses_wrong_options(program, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seconds", [60, 600])
-def test_loop_in_c_runs_for_minutes(folder, seconds):
+def test_loop_in_c_completes_run_of_several_minutes(folder, seconds):
     ran = rt_loops.run_on_rig(folder, MECHANISM, float(seconds), priority=80)
     print("\n", {name: values for name, values in ran.report.items()}, "rig's packets late by up to",
           1e-9 * max(ran.timing.late), "s")  # fmt: skip
@@ -105,7 +105,7 @@ def test_loop_in_c_runs_for_minutes(folder, seconds):
 @pytest.mark.parametrize(
     "options", [("-O2",), ("-O1", "-g", "-fsanitize=address,undefined"), ("-fsanitize=thread",)]
 )
-def test_loop_in_c_has_no_finding_of_sanitizers(tmp_path, options):
+def test_loop_in_c_has_no_undefined_behaviour_under_sanitizers(tmp_path, options):
     program = rt_loops.compile_loop(c99_cases.COMPILER, Result.document, tmp_path, *options)
     ran = rt_loops.run_on_rig(program, MECHANISM, 3.0)
     assert ran.code == 0

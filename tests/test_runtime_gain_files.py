@@ -1,4 +1,4 @@
-"""Gain files in the runtime controller: inconsistent files are refused in one line."""
+"""Gain files in the runtime controller: inconsistent files are rejected in one line."""
 
 import json
 import math
@@ -53,7 +53,7 @@ JSON_VALUES = st.recursive(
 
 @given(place=st.sampled_from(SIGNED), value=JSON_VALUES, remove=st.booleans())
 @settings(max_examples=300, deadline=None)
-def test_gain_file_with_any_field_mutated_is_refused(place, value, remove):
+def test_gain_file_with_any_field_mutated_is_rejected(place, value, remove):
     name, path = place
     document = gain_document(name)
     container, key = value_at(document, path[:-1]), path[-1]
@@ -68,7 +68,7 @@ def test_gain_file_with_any_field_mutated_is_refused(place, value, remove):
 
 @given(value=JSON_VALUES, path=st.sampled_from([p for n, p in SIGNED if n == "response_error"]))
 @settings(max_examples=300, deadline=None)
-def test_changed_gain_file_with_valid_digest_loads_or_is_refused_with_one_line_message(path, value):
+def test_changed_gain_file_with_valid_digest_loads_or_is_rejected_with_one_line_message(path, value):
     document = gain_document()
     value_at(document, path[:-1])[path[-1]] = value
     try:
@@ -153,17 +153,17 @@ def change(*path_and_value: Any) -> dict[str, Any]:
         (("mechanism", "contact", "clearance", -1.0), ["mechanism.contact.clearance", "-1.0"]),
     ],
 )
-def test_inconsistent_gain_file_is_refused_with_name_of_key(edit, words):
+def test_inconsistent_gain_file_is_rejected_with_name_of_key(edit, words):
     refused(change(*edit), *words)
 
 
-def test_gain_file_with_delay_longer_than_delay_line_is_refused():
+def test_gain_file_with_delay_longer_than_delay_line_is_rejected():
     document = gain_document(control_period=1e-5)
     document["gains"]["identification_delay"] |= {"value": 1.5, "upper": 1.5}
     refused(sign(document), "gains", "periods, expected 0 to 100000")
 
 
-def test_gain_file_schema_and_digest_are_checked_first():
+def test_gain_file_schema_and_digest_are_checked_before_other_entries():
     refused({}, "schema", "nothing")
     refused([], "a list")
     refused({"schema": "jaxhil/gains/2"}, "'jaxhil/gains/2'", "'jaxhil/gains/1'")
@@ -174,7 +174,7 @@ def test_gain_file_schema_and_digest_are_checked_first():
     refused({**document, "seed": {1, 2}}, "JSON")
 
 
-def test_deeply_nested_gain_file_is_refused():
+def test_deeply_nested_gain_file_is_rejected():
     deep: Any = 0
     for _ in range(3000):
         deep = [deep]
@@ -204,7 +204,7 @@ def test_deeply_nested_gain_file_is_refused():
     ],
     ids=lambda value: None if isinstance(value, str) else repr(value[:12]),
 )
-def test_unreadable_gain_file_is_refused_with_one_printable_line(content, word, tmp_path):
+def test_unreadable_gain_file_is_rejected_with_one_printable_line(content, word, tmp_path):
     path = tmp_path / "gains.json"
     path.write_bytes(content)
     with pytest.raises(GainFileError, match=word) as caught:
@@ -213,7 +213,7 @@ def test_unreadable_gain_file_is_refused_with_one_printable_line(content, word, 
     assert message.isprintable() and message.startswith(str(path)) and len(message) < 500
 
 
-def test_unreadable_gain_file_paths_are_refused(tmp_path):
+def test_unreadable_gain_file_paths_are_rejected(tmp_path):
     for path in (tmp_path / "absent\n.json", tmp_path, "nul\0byte"):
         with pytest.raises(GainFileError, match="cannot be read") as caught:
             Controller.from_file(path)

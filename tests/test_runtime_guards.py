@@ -341,7 +341,7 @@ def test_controller_without_limits_trips_beyond_default_bounds(reading, moved, c
         ),
     ],
 )
-def test_inconsistent_controller_limits_are_refused(limits, words):
+def test_inconsistent_controller_limits_are_rejected(limits, words):
     document: dict[str, Any] = gain_document("none")
     document["limits"] = limits
     try:

@@ -217,7 +217,7 @@ def test_delay_line_of_whole_periods_does_not_interpolate():
         assert delayed[whole:] == pytest.approx([float(n % 2) for n in range(100 - whole)], abs=2e-9)
 
 
-def test_delay_line_refuses_excessive_delay():
+def test_delay_line_rejects_excessive_delay():
     with pytest.raises(ValueError, match="periods"):
         DelayLine(1e9, 1e-3)
 

@@ -66,7 +66,7 @@ def restitution_of(late: int) -> float:
     return abs(velocities[-1]) / SPEED
 
 
-def test_watchdog_passes_good_contacts():
+def test_watchdog_does_not_trip_on_good_contacts():
     controller = watched()
     n, positions, _ = bounce(controller)
     assert n == 3000 and positions[-1] < 0 and controller.seen == 0

@@ -269,7 +269,7 @@ def test_self_test_reports_changed_line_endings(files, folder):
     assert not good and "FAIL  gains.csv: its line endings differ from what was exported" in out
 
 
-def test_self_test_refuses_unknown_arguments(folder):
+def test_self_test_rejects_unknown_arguments(folder):
     code, out, err = in_a_bare_process(folder, "--fast")
     assert (code, out, err) == (1, "", "usage: python selftest.py [--c]\n")
 

@@ -44,7 +44,7 @@ def test_nominal_force_delay_includes_the_delay_of_the_filter():
 
 
 def test_filter_of_rehearsal_follows_force_of_a_segment():
-    """A spring that is pressed in at constant speed, against numerical integration of the state space."""
+    """Press a spring in at constant speed, and compare with numerical integration of the state space."""
 
     contact = validated(mechanism({"law": "linear"})).contact
     law = find_contact_law("linear").as_float_law(contact, 1e5, 0.0)
@@ -73,7 +73,7 @@ def test_simulation_and_rehearsal_with_filter_agree_with_oracle(kind, order):
 
 
 @pytest.mark.slow
-def test_filter_of_order_1_is_the_lag():
+def test_sensor_filter_of_order_1_equals_first_order_lag():
     lag = {"time_constant": 1 / (2 * np.pi * 40.0)}
     plain = mechanism({"damping": [300.0]}, SECOND_ORDER, 0.0023, force_sensor=lag)
     expected = jaxhil.simulate(validated(plain)).contacts[0].restitution
@@ -83,7 +83,7 @@ def test_filter_of_order_1_is_the_lag():
 
 
 @pytest.mark.slow
-def test_derivative_by_cutoff_equals_central_difference():
+def test_restitution_derivative_for_filter_cutoff_equals_central_difference():
     name, step = "rig.force_sensor.filter.cutoff", 0.02
     slope = jaxhil.jacobian(validated(filtered()), by=name)[name][0]
     ends = [simulate(filtered(cutoff=40.0 + sign * step))[0]["restitution"] for sign in (1, -1)]
@@ -99,19 +99,19 @@ def test_derivative_by_cutoff_equals_central_difference():
         ({"kind": "bessel", "order": 2}, "rig.force_sensor.filter.cutoff: found nothing"),
     ],
 )
-def test_invalid_filter_is_refused_in_one_line(sensor, message):
+def test_invalid_sensor_filter_is_rejected_with_one_line_message(sensor, message):
     raw = mechanism({}, force_sensor={"filter": sensor})
     with pytest.raises(InputError) as caught:
         validated(raw)
     assert message in str(caught.value) and str(caught.value).isprintable()
 
 
-def test_filter_beside_time_constant_is_refused():
+def test_sensor_filter_together_with_time_constant_is_rejected():
     sensor = {"time_constant": 0.001, "filter": {"kind": "bessel", "order": 2, "cutoff": 90.0}}
     with pytest.raises(InputError, match=r"time_constant: found 0\.001, expected nothing"):
         validated(mechanism({}, force_sensor=sensor))
 
 
-def test_fmu_of_rig_refuses_filter():
+def test_fmu_of_rig_rejects_filter():
     with pytest.raises(InputError, match=r"fmu: rig\.force_sensor\.filter: found a filter, expected none"):
         rig_fmu({"mechanism": filtered(), "figures": {}}, 3)

@@ -82,7 +82,7 @@ def test_controller_in_shadow_mode_repeats_its_own_log_to_the_bit(tmp_path):
     assert document["contacts"][1]["begin"] == pytest.approx(0.26, abs=1e-9)
 
 
-def test_shadow_of_simulated_log_equals_the_simulated_commands(tmp_path):
+def test_shadow_commands_equal_commands_of_simulated_log(tmp_path):
     run = package.simulate("rig-300kg", "phase_lead")
     run.to_csv(tmp_path / "run.csv")
     document = tuning.shadow(gains(), tmp_path / "run.csv").document
@@ -154,7 +154,7 @@ def test_shadow_mode_exits_with_1_if_the_controller_trips(jaxhil, tmp_path):
 
 
 @pytest.mark.parametrize("factor, is_limited", [(1.0, False), (0.8, True), (0.0, True)])
-def test_shadow_verdict_states_that_differences_do_not_count(jaxhil, tmp_path, factor, is_limited):
+def test_shadow_verdict_states_that_it_ignores_differences(jaxhil, tmp_path, factor, is_limited):
     log = write_columns(tmp_path / "log.csv", changed(force_command=factor * recorded()["force_command"]))
     (tmp_path / "gains.json").write_text(json.dumps(gains().document))
     ran = jaxhil("shadow", tmp_path, log)
@@ -163,7 +163,7 @@ def test_shadow_verdict_states_that_differences_do_not_count(jaxhil, tmp_path, f
     assert ("has no such range" in ran.out) == (factor == 0.0)
 
 
-def test_shadow_mode_leaves_out_audits_of_motion_under_other_commands(tmp_path):
+def test_shadow_mode_skips_watchdog_audits_if_logged_commands_differ(tmp_path):
     limited = gains(restitution_margin=1e-9, equivalent_mass=300.0)
     log = write_columns(tmp_path / "log.csv", recorded())
     document = tuning.shadow(limited, log).document
@@ -290,7 +290,7 @@ def test_six_axis_mapping_rejects_wrong_channels(tmp_path):
         (f"{HEAD}{CHANNELS}\n{RUNS}".replace('"*"', '"day2_*"'), "no [[runs]] entry matches"),
     ],
 )
-def test_shadow_mode_refuses_unusable_logs_with_one_line(jaxhil, tmp_path, mapping, words):
+def test_shadow_mode_rejects_unusable_logs_with_one_line(jaxhil, tmp_path, mapping, words):
     (tmp_path / "map.toml").write_text(mapping)
     log = write_columns(tmp_path / "log.csv", recorded())
     (tmp_path / "gains.json").write_text(json.dumps(gains().document))
@@ -304,7 +304,7 @@ def test_shadow_mode_refuses_unusable_logs_with_one_line(jaxhil, tmp_path, mappi
 @pytest.mark.parametrize(
     "compensator", ["response_error", "impulse_ledger", "smith_hybrid", "multi_parameter_lead"]
 )
-def test_shadow_of_simulated_logs_of_other_compensators(tmp_path, mechanism, compensator):
+def test_shadow_commands_equal_simulated_commands_of_other_compensators(tmp_path, mechanism, compensator):
     run = package.simulate(mechanism, compensator)
     run.to_csv(tmp_path / "run.csv")
     document = tuning.shadow(Result(bundles.document(mechanism, compensator)), tmp_path / "run.csv").document
@@ -320,7 +320,7 @@ def test_shadow_of_simulated_logs_of_other_compensators(tmp_path, mechanism, com
         ("rig.integrator='zoh'", "rig.command_latency=2"),
     ],
 )
-def test_shadow_of_simulated_logs_of_other_rigs(tmp_path, overrides):
+def test_shadow_commands_equal_simulated_commands_of_other_rigs(tmp_path, overrides):
     document = bundles.document("rig-300kg", "response_error", overrides)
     values = {name: entry["value"] for name, entry in document["gains"].items()}
     run = package.simulate(check_document(document).mechanism, "response_error", values)
@@ -331,7 +331,7 @@ def test_shadow_of_simulated_logs_of_other_rigs(tmp_path, overrides):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compensator", ["none", "phase_lead", "response_error", "impulse_ledger"])
-def test_shadow_of_simulated_six_axis_logs(tmp_path, compensator):
+def test_shadow_commands_equal_simulated_six_axis_commands(tmp_path, compensator):
     package.simulate("probe-drogue", compensator).to_csv(tmp_path / "run.csv")
     document = tuning.shadow(Result(six_axis_document(compensator)), tmp_path / "run.csv").document
     assert max(shares(document)) < 1e-12 and document["verdict"] == "good"

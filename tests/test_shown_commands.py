@@ -27,7 +27,7 @@ ORDER = ("first_ten_minutes", "tuning", "sweeps", "to_the_rig")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
-def test_numbers_in_guide_stand_below_the_command_that_prints_them(page):
+def test_numbers_in_guide_appear_below_the_command_that_prints_them(page):
     text = page.read_text(encoding="utf-8")
     for block in BLOCK.finditer(text):
         if block[1] == "text" and re.search(r"\d\.\d", block[2]):

@@ -1,4 +1,4 @@
-"""Gain files changed with a valid digest: refused in one line, or loaded within the bounds of the code.
+"""Gain files changed with a valid digest: rejected in one line, or loaded within the bounds of the code.
 
 Loaded controllers run with hostile readings in Python and in C, which agree to the bit.
 """
@@ -38,7 +38,7 @@ COMPILED = "phase_lead", "response_error"  # every day: compiling takes long
 
 
 def load(path: Path) -> GainFile | None:
-    """Load a file into the runtime; return None if the file is refused."""
+    """Load a file into the runtime; return None if the file is rejected."""
     try:
         gain_file = check_gain_document(read_gain_document(path), str(path))
         Controller(gain_file, str(path))
@@ -117,7 +117,7 @@ def longest_line(gain_file: GainFile) -> float:
 
 
 def check(count: int, seed: int, path: Path, laws: Collection[str]) -> dict[str, int]:
-    """Change and sign `count` files; return how many were loaded and refused.
+    """Change and sign `count` files; return how many were loaded and rejected.
 
     The given `laws` also run in C.
     """
@@ -139,7 +139,7 @@ def check(count: int, seed: int, path: Path, laws: Collection[str]) -> dict[str,
             assert is_within_bounds(gain_file), text
             drive(gain_file, rng.choice(pool), in_c)
         elif only_numbers:
-            # Structure and digest are valid, so C must refuse the file for its numbers.
+            # Structure and digest are valid, so C must reject the file for its numbers.
             numbers = as_numbers(document)
             if numbers.compensator in in_c and text == json.dumps(document):
                 line = longest_line(numbers)
@@ -151,13 +151,13 @@ def check(count: int, seed: int, path: Path, laws: Collection[str]) -> dict[str,
     return counts
 
 
-def test_mutated_gain_files_with_valid_digest_are_refused_or_stay_within_bounds(tmp_path):
+def test_mutated_gain_files_with_valid_digest_are_rejected_or_stay_within_bounds(tmp_path):
     counts = check(500, 0, tmp_path / "gains.json", COMPILED)
     assert counts["loaded"] > 50 and counts["refused"] > 200, counts
 
 
 @pytest.mark.slow
-def test_hundred_thousand_mutated_gain_files_are_refused_or_stay_within_bounds(tmp_path):
+def test_hundred_thousand_mutated_gain_files_are_rejected_or_stay_within_bounds(tmp_path):
     counts = check(100_000, 1, tmp_path / "gains.json", {*COMPENSATORS})
     print(counts)
     assert counts["loaded"] > 10_000 and counts["refused"] > 40_000

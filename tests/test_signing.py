@@ -53,7 +53,7 @@ def folder(key, tmp_path):
 
 
 def test_bundle_signature_matches_example_of_rfc_8032(tmp_path):
-    """Section 7.1, test 2."""
+    """Use the example of section 7.1, test 2."""
     secret = "4ccd089b28ff96da9db6c346ec114e0f5b8a319f35aba624da8cf6ed4fb8a6fb"
     signature = (
         "92a009a9f0d4cab8720e820b5f642540a2b27b5416503f8fb3762223ebdb69da"
@@ -75,7 +75,7 @@ def test_verify_without_key_does_not_claim_proof_of_origin(folder):
     assert good and "note  manifest.json: is not signed" in out
 
 
-def test_verify_refuses_signature_of_another_key_or_manifest(key, folder, tmp_path):
+def test_verify_rejects_signature_of_another_key_or_manifest(key, folder, tmp_path):
     by_key = load_verifier(key[1])
     assert check_bundle(folder, by_key).signature == "valid for the given key"
     (tmp_path / "other.pem").write_bytes(as_public(Ed25519PrivateKey.generate()))
@@ -104,7 +104,7 @@ def test_verify_detects_flipped_bits_in_signature_and_signed_content(key, folder
 
 
 @pytest.mark.parametrize("size", [0, 63, 64, 65])
-def test_verify_with_key_refuses_invalid_signature(key, folder, size):
+def test_verify_with_key_rejects_invalid_signature(key, folder, size):
     (folder / "manifest.sig").write_bytes(bytes(size))
     assert check_bundle(folder, load_verifier(key[1])).reasons[0].startswith("manifest.sig: found ")
     assert (check_bundle(folder).reasons == []) is run_selftest(folder)[0] is (size <= 64)
@@ -126,7 +126,7 @@ def test_openssl_creates_keys_and_verifies_bundle_signature(tmp_path):
     assert subprocess.run(proof.split(), cwd=tmp_path, capture_output=True).returncode != 0
 
 
-def test_unusable_signing_keys_are_refused_with_one_line_message(key, folder, tmp_path, jaxhil):
+def test_unusable_signing_keys_are_rejected_with_one_line_message(key, folder, tmp_path, jaxhil):
     pair = Ed25519PrivateKey.generate()
     other = generate_private_key(65537, 2048)
     copy = tmp_path / "kept.pem"

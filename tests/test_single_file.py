@@ -153,7 +153,7 @@ def test_single_file_runtime_contains_only_imports_its_compensator_needs(package
         ("for register in (): pass\n", "register: found in .*registry and in .*controller"),
     ],
 )
-def test_single_file_export_refuses_unsupported_code(package, controller, reason):
+def test_single_file_export_rejects_unsupported_code(package, controller, reason):
     made = package()
     folder = Path(made.__file__).parent
     (folder / "circle.py").write_text(f"from {made.__name__}.controller import B\n")

@@ -56,7 +56,7 @@ def folder(built, tmp_path):
     return tmp_path / "bundle"
 
 
-def test_bundle_is_complete_and_its_vectors_agree_with_simulation(built):
+def test_six_axis_bundle_is_complete_and_its_vectors_agree_with_simulation(built):
     assert built.reasons == [] and built.ended == [None] * 4 and built.runs == 52
     assert {name.partition("/")[0] for name in built.files} == {
         *("gains.json", "vectors.csv", "summary.html", "jaxhil_runtime.py", "selftest.py", "ros2.yaml"),
@@ -70,7 +70,7 @@ def test_bundle_is_complete_and_its_vectors_agree_with_simulation(built):
     assert len(built.files["vectors.csv"]) < 8e6
 
 
-def test_selftest_passes_in_isolated_python_and_in_c(folder):
+def test_six_axis_selftest_passes_in_isolated_python_and_in_c(folder):
     ran = subprocess.run(
         [sys.executable, "-I", "-S", str(folder / "selftest.py")], capture_output=True, text=True, check=False
     )
@@ -91,7 +91,7 @@ def test_six_axis_selftest_detects_a_changed_digit(folder, name):
     assert not good and f"FAIL  {name}" in text
 
 
-def test_c_test_program_detects_a_changed_bit(folder, tmp_path):
+def test_six_axis_c_test_program_detects_a_changed_bit(folder, tmp_path):
     if c99_cases.COMPILER is None:
         pytest.skip("no C compiler (cc) on this machine")
     shutil.copytree(folder / "c99", tmp_path / "c99")
@@ -110,7 +110,7 @@ def test_c_test_program_detects_a_changed_bit(folder, tmp_path):
     assert ran.returncode == 0
 
 
-def test_compare_with_record_ends_at_first_fault_and_reports_difference(built):
+def test_six_axis_vector_comparison_ends_at_first_fault_and_reports_difference(built):
     document = six_axis_document(limits={**LIMITS, "force_limit": 20.0})
     with jax_context():
         loaded = check_document(document, any_axes=True)
@@ -148,7 +148,7 @@ def test_six_axis_export_rejects_one_axis_limit_names(tmp_path):
         tuning.export(Result(six_axis_document()), tmp_path / "b", limits={"torque_limit": -1.0})
 
 
-def test_command_difference_is_divided_by_range_of_force_or_torque():
+def test_six_axis_command_difference_is_divided_by_range_of_force_or_torque():
     expected = np.zeros((3, 6))
     expected[1, 0], expected[2, 4] = 100.0, 2.0
     found = expected.copy()
@@ -158,14 +158,14 @@ def test_command_difference_is_divided_by_range_of_force_or_torque():
     assert command_difference(np.full((1, 6), 1.0), np.zeros((1, 6)))[0] == np.inf
 
 
-def test_longest_sum_adds_successive_steps_only():
+def test_travel_with_constant_reading_adds_only_successive_steps():
     still = np.array([True, True, False, True, False, True, True, True])
     assert longest_sum(np.arange(1.0, 9.0), still) == 6 + 7 + 8
     assert longest_sum(np.ones(3), np.zeros(3, bool)) == 0.0
 
 
 @pytest.mark.slow
-def test_calibrated_limits_accept_good_runs_and_stop_a_wrong_mass():
+def test_calibrated_six_axis_limits_accept_good_runs_and_detect_wrong_mass():
     with jax_context():
         loaded = check_document(six_axis_document(), any_axes=True)
         calibration = calibrate_six_axes(loaded, scenarios=64, seed=3)
@@ -235,7 +235,7 @@ def test_six_axis_summary_states_the_failure_probability_of_the_sweep():
 
 
 @pytest.mark.slow
-def test_verify_passes_in_closed_loop_and_detects_a_changed_digit(folder):
+def test_six_axis_verify_passes_in_closed_loop_and_detects_changed_digit(folder):
     good = tuning.verify(folder, scenarios=3)
     assert good.good and good.document["axes"] == 6
     assert good.document["closed_loop"]["difference"] < 1e-10
@@ -248,7 +248,7 @@ def test_verify_passes_in_closed_loop_and_detects_a_changed_digit(folder):
 
 
 @pytest.mark.slow
-def test_closed_loop_detects_a_controller_with_changed_gains():
+def test_six_axis_closed_loop_detects_controller_with_changed_gains():
     document = six_axis_document()
     with jax_context():
         loaded = check_document(document, any_axes=True)

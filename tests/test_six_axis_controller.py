@@ -78,7 +78,7 @@ def of_records(records, **limits):
     return Controller6.from_dict(document)
 
 
-def test_controller_reproduces_recorded_commands(records):
+def test_six_axis_controller_reproduces_recorded_commands(records):
     for record in records.lanes:
         rig = of_records(records)
         commands, sent = replay(rig, record)
@@ -93,7 +93,7 @@ def test_controller_reproduces_recorded_commands(records):
         assert rig.unpaid_impulse == rig.loop_delay == 0.0
 
 
-def test_changing_an_output_list_does_not_change_the_controller():
+def test_changing_a_returned_list_does_not_change_six_axis_controller():
     rig = controller("none")
     first = rig.step([1.0, 0, 0, 0, 0, 0], START, TWIST, START)
     first[0] = 1e9
@@ -160,7 +160,7 @@ CHANGES = JSON_VALUES | st.sampled_from((-1.0, 0.0, 1 - 1e-6, 1.5, 1e9, 1e300))
 
 @settings(deadline=None, max_examples=60)
 @given(st.sampled_from(PARTS), st.integers(0), CHANGES, st.sampled_from(("replace", "scale", "remove")))
-def test_changed_six_axis_gain_file_loads_or_is_refused_with_one_line(part, index, value, change):
+def test_changed_six_axis_gain_file_loads_or_is_rejected_with_one_line(part, index, value, change):
     """Change or remove one entry, sign the file again, and run the controller if the file loads."""
     document, choices = six_axis_document(limits=LIMITS), paths_by_part()[part]
     *path, key = choices[index % len(choices)]
@@ -191,24 +191,24 @@ def is_json(document):
     return True
 
 
-def test_changed_digit_in_constants_is_rejected():
+def test_six_axis_gain_file_with_changed_digit_in_constants_is_rejected():
     document = six_axis_document()
     document["constants"]["mass_matrix"][0][0] *= 1 + 1e-15
     with pytest.raises(GainFileError, match="sha256"):
         Controller6.from_dict(document)
 
 
-def test_delay_longer_than_delay_line_is_rejected():
+def test_six_axis_gain_file_with_delay_longer_than_delay_line_is_rejected():
     document = six_axis_document(identification_delay=0.52)
     document["gains"]["identification_delay"]["upper"] = 1.0
     with pytest.raises(GainFileError, match="periods"):
         Controller6.from_dict(sign(document))
 
 
-# Force sensor
+# Tests of the force sensor's conversion.
 
 
-def test_sensor_reading_becomes_wrench_about_target():
+def test_six_axis_sensor_reading_is_converted_to_wrench_about_target():
     """Compare a reading of a known contact and tool with the contact's wrench, with SciPy's rotations."""
     rng, tool = np.random.default_rng(4), load_any("probe-drogue").mechanism.rig.force_sensor.tool
     weight, rig = tool.mass * np.array([0.0, 0.0, -9.80665]), controller()
@@ -223,7 +223,7 @@ def test_sensor_reading_becomes_wrench_about_target():
     assert all(map(math.isnan, rig.from_sensor([1.0] * 5, pose)))
 
 
-def test_sensor_on_fixed_side_reads_the_reaction():
+def test_six_axis_sensor_on_target_side_reads_reaction_force():
     rig = Controller6.from_dict(six_axis_document("none", "ring-capture"))
     assert rig.from_sensor([1.0, -2.0, 3.0, -4.0, 5.0, -6.0], START) == [-1.0, 2.0, -3.0, 4.0, -5.0, 6.0]
 
@@ -236,7 +236,7 @@ def test_sensor_on_fixed_side_reads_the_reaction():
     "value, fault",
     [(math.nan, "force_not_finite"), (math.inf, "force_not_finite"), (2e4, "force_out_of_range")],
 )
-def test_bad_wrench_reading_is_replaced_and_trips_if_it_persists(channel, value, fault):
+def test_bad_wrench_reading_is_replaced_and_trips_controller_if_it_persists(channel, value, fault):
     rig = controller()
     fly(rig, 20)
     wrench = list(ZERO)
@@ -251,7 +251,7 @@ def test_bad_wrench_reading_is_replaced_and_trips_if_it_persists(channel, value,
 
 @pytest.mark.parametrize("channel", range(6))
 @pytest.mark.parametrize("value, fault", [(math.nan, "position_not_finite"), (0.6, "position_out_of_range")])
-def test_bad_pose_reading_is_replaced_and_trips_if_it_persists(channel, value, fault):
+def test_bad_pose_reading_is_replaced_and_trips_controller_if_it_persists(channel, value, fault):
     rig = controller()
     fly(rig, 20)
     for tick in range(20, 24):
@@ -268,7 +268,7 @@ def test_bad_pose_reading_is_replaced_and_trips_if_it_persists(channel, value, f
 
 
 @pytest.mark.parametrize("channel", range(6))
-def test_stuck_wrench_channel_trips_while_the_hardware_moves(channel):
+def test_stuck_wrench_channel_trips_controller_while_hardware_moves(channel):
     rig = controller("none")
     wrench = [0.0] * 6
     wrench[channel] = 1.5
@@ -282,14 +282,14 @@ def test_stuck_wrench_channel_trips_while_the_hardware_moves(channel):
     assert free.status == "ok"
 
 
-def test_stuck_pose_trips_while_the_model_moves():
+def test_stuck_pose_reading_trips_controller_while_model_moves():
     rig = controller("none")
     for tick in range(60):
         rig.step(ZERO, along(tick), TWIST, START)
     assert names(rig) == ["position_stuck"] and "z" in rig.status
 
 
-def test_model_that_is_not_finite_trips():
+def test_nonfinite_model_motion_trips_six_axis_controller():
     rig = controller()
     rig.step(ZERO, [math.nan, *START[1:]], TWIST, START)
     assert names(rig) == ["model_not_finite"]
@@ -299,7 +299,7 @@ def test_model_that_is_not_finite_trips():
     assert names(other) == ["model_not_finite"]
 
 
-def test_missed_ticks_are_counted_and_trip_if_too_many():
+def test_six_axis_controller_counts_missed_ticks_and_trips_if_too_many():
     rig = controller()
     fly(rig, 5, timed=True)
     now = along(5)
@@ -309,7 +309,7 @@ def test_missed_ticks_are_counted_and_trip_if_too_many():
     assert names(rig) == ["missed_tick"]
 
 
-def test_invalid_arguments_trip_but_do_not_raise():
+def test_invalid_arguments_trip_six_axis_controller_without_exception():
     for wrong in (None, [1.0], ["a"] * 6, 5.0, [None] * 6):
         rig = controller()
         assert rig.step(ZERO, wrong, TWIST, START) == ZERO
@@ -317,7 +317,7 @@ def test_invalid_arguments_trip_but_do_not_raise():
         assert len(rig.pose_command(wrong, wrong, None)) == 6
 
 
-def test_tare_removes_the_bias():
+def test_six_axis_tare_removes_sensor_bias():
     rig = controller("none")
     reading = [3.0, -2.0, 5.0, 0.5, 0.25, -0.125]
     assert [rig.tare(reading) for _ in range(3)] == [False, False, True]
@@ -329,7 +329,7 @@ def test_tare_removes_the_bias():
     assert other.tare(ZERO) and names(other) == ["tare"]
 
 
-def test_emergency_stop_is_latched_until_reset():
+def test_six_axis_emergency_stop_is_latched_until_reset():
     rig = controller()
     fly(rig, 10)
     rig.emergency_stop(True)
@@ -350,7 +350,7 @@ def test_six_axis_trip_keeps_its_first_cause():
 # Outputs
 
 
-def test_wrench_beyond_force_limit_trips_and_ramps_to_zero():
+def test_wrench_command_ramps_to_zero_after_force_limit_trip():
     rig = controller("none", limited_in_a_row=1000.0)
     for tick in range(20):
         rig.step([0, 0, 900.0, 0, 0, 0], along(tick), TWIST, along(tick))
@@ -360,14 +360,14 @@ def test_wrench_beyond_force_limit_trips_and_ramps_to_zero():
     np.testing.assert_allclose(values[:8], [700, 600, 500, 400, 300, 200, 100, 0], atol=1e-9)
 
 
-def test_pose_command_outside_stroke_trips():
+def test_pose_command_outside_stroke_trips_controller():
     rig = controller()
     fly(rig, 10)
     rig.pose_command([0.41, *START[1:]], TWIST, ZERO)
     assert names(rig) == ["stroke"]
 
 
-def test_retreat_retraces_the_approach_within_speed_limits():
+def test_six_axis_retreat_retraces_approach_within_speed_limits():
     """Follow a curved approach, stop, and compare the retreat with the approach."""
     rig = controller()
     angle = np.linspace(0, 1.5, 600)
@@ -401,7 +401,7 @@ def test_retreat_retraces_the_approach_within_speed_limits():
     assert np.max(change[: braking - 1]) <= 0.5 * PERIOD**2 * (1 + 1e-6)
 
 
-def test_retreat_retraces_a_rotation():
+def test_six_axis_retreat_by_rotation_has_specified_length():
     """Check the length of a retreat by rotation, in which 1 rad counts as 0.02/0.04 m."""
     rig = controller()
     twist = [0.0, 0.0, 0.0, 0.0, 0.05, 0.0]
@@ -418,7 +418,7 @@ def test_retreat_retraces_a_rotation():
     assert np.max(np.abs(np.diff(angles))) <= 0.05 * PERIOD * (1 + 1e-6)
 
 
-def test_first_pose_command_starts_from_measured_pose():
+def test_first_pose_command_of_a_run_starts_at_measured_pose():
     rig = controller("none")
     far = [at + 0.05 for at in START]
     rig.step(ZERO, far, ZERO, START)
@@ -433,7 +433,7 @@ def test_first_pose_command_starts_from_measured_pose():
 # Watchdog
 
 
-def test_watchdog_trips_on_model_with_wrong_mass(records):
+def test_six_axis_watchdog_trips_on_model_with_wrong_mass(records):
     document = six_axis_document(limits=LIMITS, **records.gains)
     document["constants"]["mass_matrix"] = (1.2 * np.array(document["constants"]["mass_matrix"])).tolist()
     document["constants"]["inverse_mass"] = (np.array(document["constants"]["inverse_mass"]) / 1.2).tolist()
@@ -443,7 +443,7 @@ def test_watchdog_trips_on_model_with_wrong_mass(records):
     assert "momentum" in names(rig)
 
 
-def test_watchdog_trips_on_wrong_sign_of_wrench(records):
+def test_six_axis_watchdog_trips_on_wrong_sign_of_wrench(records):
     """Replay wrenches with the wrong sign; the recorded motion then contradicts the commands."""
     rig = of_records(records, unpaid_impulse=1e9)
 
@@ -456,13 +456,13 @@ def test_watchdog_trips_on_wrong_sign_of_wrench(records):
     assert {"momentum", "energy_gain"} & {*names(rig)}
 
 
-def test_watchdog_trips_on_lag_out_of_range(records):
+def test_six_axis_watchdog_trips_on_lag_out_of_range(records):
     rig = of_records(records, lag_highest=0.02)
     replay(rig, records.lanes[0])
     assert names(rig) == ["lag"]
 
 
-def test_watchdog_trips_on_unpaid_impulse(records):
+def test_six_axis_watchdog_trips_on_unpaid_impulse(records):
     rig = of_records(records, unpaid_impulse=1e-6)
     replay(rig, records.lanes[0])
     rig.next_contact()
@@ -485,25 +485,25 @@ def pushed(rig, force, ticks, factor=1.0):
     return rig
 
 
-def test_watchdog_trips_on_contact_that_releases_energy():
+def test_six_axis_watchdog_trips_on_contact_that_releases_energy():
     limits = {"force_stuck_travel": 1.0, "fading": 1.0}
     assert pushed(controller("none", **limits), 30.0, 100).status == "ok"
     rig = pushed(controller("none", **limits), 30.0, 150)
     assert names(rig) == ["energy_gain"] and "energy released" in rig.status
 
 
-def test_watchdog_trips_if_momentum_differs_from_impulse():
+def test_six_axis_watchdog_trips_if_momentum_differs_from_impulse():
     limits = {"force_stuck_travel": 1.0, "fading": 1.0, "energy_gain": 1e9}
     assert pushed(controller("none", **limits), 30.0, 100, 1.03).status == "ok"
     assert names(pushed(controller("none", **limits), 30.0, 100, 1.1)) == ["momentum"]
 
 
-def test_watchdog_trips_on_contact_that_lasts_too_long():
+def test_six_axis_watchdog_trips_on_contact_that_lasts_too_long():
     limits = {"force_stuck_travel": 1.0, "fading": 1.0, "longest_contact": 0.1}
     assert names(pushed(controller("none", **limits), 10.0, 120)) == ["contact_too_long"]
 
 
-# Hostile inputs
+# Tests with hostile inputs.
 
 hostile = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from(
     [0.0, -0.0, 1e308, 5e-324, math.nan, 0.05, -0.05, 0.3]
@@ -522,7 +522,7 @@ calls = st.lists(
 
 @settings(max_examples=200, deadline=None)
 @given(calls=calls, name=st.sampled_from(["none", "phase_lead", "response_error", "impulse_ledger"]))
-def test_outputs_are_finite_and_within_limits_for_hostile_inputs(calls, name):
+def test_six_axis_controller_outputs_are_finite_and_within_limits_for_any_inputs(calls, name):
     rig = controller(name)
     wrench, sent, measured = np.zeros(6), None, None
     most = np.array([100.0] * 3 + [30.0] * 3)
@@ -566,5 +566,5 @@ def test_outputs_are_finite_and_within_limits_for_hostile_inputs(calls, name):
         assert "\n" not in rig.status
 
 
-def test_limits_of_test_documents_cover_every_limit():
+def test_six_axis_test_documents_set_every_limit():
     assert {*LIMITS} | {"late_fraction"} == {*SIX_AXIS_LIMITS}

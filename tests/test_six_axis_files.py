@@ -1,4 +1,4 @@
-"""Six-axis mechanism files: their content, and refusals in one line."""
+"""Six-axis mechanism files: their content, and one-line error messages."""
 
 import copy
 import json
@@ -151,7 +151,7 @@ def test_unusable_six_axis_latches_and_simulators_are_named_in_error(name, chang
     assert reason in refusal(changes, name=name)
 
 
-def test_six_axis_contact_shapes_that_cannot_touch_are_refused():
+def test_six_axis_contact_shapes_that_cannot_touch_are_rejected():
     capsule = {"shape": "capsule", "from": [0, 0, 0], "to": [0, 0, 1], "radius": 0.1}
     raw = copy.deepcopy(RAW["probe-drogue"])
     raw["contact"]["tip"]["chaser"] = capsule
@@ -210,7 +210,7 @@ def test_all_six_axis_values_including_lists_and_inertias_may_be_uncertain():
     assert 0.008 < np.std(drawn["rig.force_sensor.crosstalk"]) < 0.012
 
 
-def test_one_axis_commands_refuse_six_axis_mechanism_files():
+def test_one_axis_commands_reject_six_axis_mechanism_files():
     with pytest.raises(
         InputError, match=r"^petals: schema: found jaxhil/mechanism/2 \(six axes\), expected jaxhil"
     ):
@@ -237,7 +237,7 @@ PLACES = [(name, path) for name, raw in RAW.items() for path in places(raw)]
 
 @settings(deadline=None, max_examples=40)
 @given(place=st.sampled_from(PLACES), junk=JUNK, sibling=st.sampled_from(PLACES))
-def test_any_six_axis_mechanism_table_is_read_or_refused_with_one_line_message(place, junk, sibling):
+def test_any_six_axis_mechanism_table_is_read_or_rejected_with_one_line_message(place, junk, sibling):
     """Replace one value by a value of any type, or by a value from elsewhere in the files."""
     name, path = place
     for value in (junk, value_at(RAW[sibling[0]], sibling[1])):

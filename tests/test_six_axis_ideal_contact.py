@@ -237,7 +237,7 @@ def test_pure_moment_of_six_axis_contact_acts_on_reduced_inertia(run):
 
 
 def test_six_axis_ball_slides_or_rolls_as_in_closed_form(run, request):
-    """Tangential speed: v_t - mu (1 + e) v_n while sliding, 5/7 v_t if rolling (Walton)."""
+    """Expect the tangential speed v_t - mu (1 + e) v_n while sliding, and 5/7 v_t if rolling (Walton)."""
     seen, *_ = run
     bristle = request.node.callspec.params["run"] == "bristle"
     sliding, rolling = seen["sliding"]["twist"][-1], seen["rolling"]["twist"][-1]
@@ -289,7 +289,7 @@ def test_six_axis_contact_is_invariant_to_rotation_and_boost(run):
 
 
 def test_six_axis_contact_combines_elastoplastic_contact_and_tether():
-    """Central contact: e = 1/sqrt(r), with a bristle at rest and a slack tether."""
+    """Expect e = 1/sqrt(r) for a central contact with a bristle at rest and a slack tether."""
     pair, states, contact, step = prepared()
     parameters = contact.parameters._replace(unloading_ratio=jnp.full((2, len(LANES)), 4.0))
     same = [jnp.full((2, len(LANES)), value) for value in (0.2, 1e6, 10.0)]

@@ -78,7 +78,7 @@ def collide(pair, states, group):
 
 
 def close(result, expected, before):
-    """Compare to 1e-9 of the change during the contact, which must not be zero."""
+    """Check that results agree to 1e-9 of the change during the contact, which must not be zero."""
     for one, other, begun in zip(result, expected, before, strict=True):
         for name in ("velocity", "spin", "position"):
             a, b, c = (np.asarray(components(getattr(state, name))) for state in (one, other, begun))

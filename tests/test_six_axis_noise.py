@@ -28,7 +28,7 @@ def noisy_rows(rng):
 
 
 @pytest.mark.parametrize("hours", [0.2, pytest.param(5, marks=pytest.mark.slow)])
-def test_noise_causes_at_most_one_false_onset_an_hour_and_otherwise_no_command(hours):
+def test_noise_causes_at_most_one_false_onset_per_hour_in_six_axis_ledger(hours):
     noise = {"force_noise": NOISE["force"], "torque_noise": NOISE["torque"], "pose_filter": 3e-3}
     document = six_axis_document(limits={}, **noise)
     rng, onsets, ticks = np.random.default_rng(6), 0, 0

@@ -1,4 +1,4 @@
-"""One-axis file of a six-axis contact: equal restitution without friction; refusals in one line."""
+"""One-axis file of a six-axis contact: equal restitution without friction; one-line error messages."""
 
 import numpy as np
 import pytest
@@ -80,14 +80,14 @@ def test_one_axis_file_has_the_values_of_the_first_touch():
         ({}, {"reference_touches": 0}, "contact: found 0 touches"),
     ],
 )
-def test_contact_without_one_axis_equivalent_is_refused(changes, touch, reason):
+def test_contact_without_one_axis_equivalent_is_rejected(changes, touch, reason):
     mechanism = package.load("probe-drogue", OFF_CENTRE | changes)
     with pytest.raises(InputError) as caught:
         convert_to_one_axis(mechanism, first_touch(**touch))
     assert str(caught.value).startswith(f"probe-drogue: {reason}") and str(caught.value).isprintable()
 
 
-def test_one_axis_option_is_refused_for_one_axis_mechanism(jaxhil, tmp_path):
+def test_one_axis_option_is_rejected_for_one_axis_mechanism(jaxhil, tmp_path):
     ran = jaxhil("simulate", "rig-300kg", "--one-axis", tmp_path / "new.toml")
     assert ran.code == 2 and "--one-axis: found" in ran.err and ran.err.count("\n") == 1
     assert not (tmp_path / "new.toml").exists()

@@ -57,7 +57,7 @@ def test_six_axis_rig_command_reports_results_of_a_short_run(jaxhil, gains):
         ({"constants": None}, "constants: found null, expected an object"),
     ],
 )
-def test_rig_command_refuses_gains_for_another_number_of_axes(jaxhil, tmp_path, change, words):
+def test_rig_command_rejects_gains_for_another_number_of_axes(jaxhil, tmp_path, change, words):
     path = tmp_path / "gains.json"
     document = {**six_axis_document("impulse_ledger", NAME), **change}
     path.write_text(json.dumps(sign(document)))
@@ -67,7 +67,7 @@ def test_rig_command_refuses_gains_for_another_number_of_axes(jaxhil, tmp_path, 
 
 
 @pytest.mark.parametrize("axes, other", [(1, 6), (6, 1)])
-def test_controller_process_refuses_gains_for_another_number_of_axes(tmp_path, axes, other):
+def test_controller_process_rejects_gains_for_another_number_of_axes(tmp_path, axes, other):
     documents = {1: gain_document("none"), 6: six_axis_document("none", NAME)}
     for name, content in code_files("none", axes).items():
         (tmp_path / name).write_bytes(content)
@@ -79,7 +79,7 @@ def test_controller_process_refuses_gains_for_another_number_of_axes(tmp_path, a
     assert ran.stderr.strip().count("\n") == 0
 
 
-def test_rig_refuses_controller_with_another_number_of_axes(gains):
+def test_rig_rejects_controller_with_another_number_of_axes(gains):
     process = start_controller(SOURCE_FOLDER, ["--gains", str(gains), "--silence", "0.2", "--wait", "5"])
     try:
         address = "127.0.0.1", read_listening_port(process)

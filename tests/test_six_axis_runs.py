@@ -126,7 +126,7 @@ def test_simulated_six_axis_central_contact_equals_one_axis_contact(name):
 
 
 @pytest.mark.slow
-def test_unusable_six_axis_starting_states_are_refused():
+def test_unusable_six_axis_starting_states_are_rejected():
     above = APART | {"start.chaser.position": [0, 0, 6.3]}
     legs = {"rig.simulator.base": [[0, 0, 0]] * 6}
     for name, changes, reason in (
@@ -306,7 +306,7 @@ def test_six_axis_bodies_at_rest_with_noise_are_not_reported_as_divergent():
     assert run.status == "miss" and run.final.time == pytest.approx(0.2)
 
 
-def test_unsupported_six_axis_options_are_refused_with_one_line_message(jaxhil, tmp_path):
+def test_unsupported_six_axis_options_are_rejected_with_one_line_message(jaxhil, tmp_path):
     for arguments, reason in (
         (["simulate", "petals", "--setting", "x"], "--setting: found 'x', expected none: compensators"),
         (

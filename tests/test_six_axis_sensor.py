@@ -103,7 +103,7 @@ def test_correct_tool_parameters_recover_contact_wrench_from_sensor():
 
 
 def test_wrong_tool_parameters_leave_residual_gravity_wrench():
-    """Mass error: share of the weight; attitude error: weight times angle."""
+    """A mass error leaves its share of the weight; an attitude error leaves weight times angle."""
     still = Twist(triple([0.0] * 3), triple([0.0] * 3))
     level = Pose(triple([0.1, 0.0, 0.2]), exponential(triple([0.0, 0.0, 0.0])))
     down = triple([0.0, 0.0, -9.80665])

@@ -1,4 +1,4 @@
-"""Six-axis mechanisms tuned and swept: gain file, store and report; refusals of unsupported features."""
+"""Six-axis mechanisms tuned and swept: gain file, store and report; errors for unsupported features."""
 
 import json
 
@@ -51,7 +51,7 @@ def test_public_functions_accept_six_axis_mechanisms():
         assert reason in str(caught.value) and str(caught.value).isprintable()
 
 
-def test_unsupported_six_axis_features_are_refused_with_one_line_message(jaxhil, tmp_path):
+def test_unsupported_six_axis_features_are_rejected_with_one_line_message(jaxhil, tmp_path):
     path = tmp_path / "gains.json"
     for given, reason in (
         (
@@ -139,7 +139,7 @@ def test_equal_leads_per_axis_give_the_result_of_a_common_lead():
 
 
 @pytest.mark.slow
-def test_six_axis_gain_file_is_refused_by_one_axis_controller(tuned, jaxhil, tmp_path):
+def test_six_axis_gain_file_is_rejected_by_one_axis_controller(tuned, jaxhil, tmp_path):
     from jaxhil.rig import Controller, GainFileError
 
     _, path = tuned

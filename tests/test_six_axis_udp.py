@@ -43,7 +43,7 @@ from tuning.rig.udp_protocol import (
 )
 from tuning.rig.udp_task import MISSED_TICK, ControllerTask
 
-STATE_TOLERANCE = 1e-8  # of the largest (angular) velocity
+STATE_TOLERANCE = 1e-8  # largest difference, divided by the largest (angular) velocity
 MECHANISMS = ("probe-drogue", "ring-capture", "hydraulic-hexapod", "petals", "claw-two-arms")
 # Functions that make a controller from a gain document and a folder for C sources; a bundle contains the
 # last two controllers.
@@ -63,7 +63,7 @@ def simulated_rig(mechanism):
 
 @functools.cache
 def simulated_run(mechanism, compensator, phase=None):
-    """Return the run of `simulate`; None is the nominal phase."""
+    """Return the run of `simulate` with this phase; None for the nominal phase."""
     changes = {} if phase is None else {"approach.phase": phase}
     return simulate_six_axes(load_any(mechanism, changes).mechanism, compensator)
 
@@ -178,7 +178,7 @@ def new_task():
 
 
 @pytest.mark.parametrize("index, value", [(0, math.nan), (20, math.inf), (6, 0.5)])
-def test_start_that_is_no_state_of_two_bodies_is_dropped(index, value):
+def test_packet_with_invalid_start_state_of_bodies_is_dropped(index, value):
     task, start = new_task(), list(a_reading(0).start)
     start[index] = value
     assert task.answer(a_reading(0, event=PREPARE, start=tuple(start), sequence=1)) is None
@@ -211,7 +211,7 @@ def test_any_readings_of_a_six_axis_rig_are_answered_with_finite_commands(readin
 
 @pytest.mark.parametrize("integrator", SHARES)
 def test_six_axis_numerical_model_equals_simulated_model(integrator):
-    """Bodies with full inertia and rotated interfaces, whose state and wrench are arbitrary."""
+    """Use bodies with full inertia and rotated interfaces, and arbitrary states and wrenches."""
     random, period = np.random.default_rng(5), 0.01
     mechanism, bodies, start = {"rig": {"control_period": period, "integrator": integrator}}, [], []
     for name in ("target", "chaser"):

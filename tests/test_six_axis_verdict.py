@@ -65,7 +65,7 @@ def test_six_axis_pareto_accepts_only_the_command_peak_as_cost():
             options.check_mechanism(mechanism)
 
 
-def test_wide_range_files_are_built_in_mechanisms_with_noise():
+def test_wide_range_files_equal_builtin_mechanisms_with_added_noise_and_ranges():
     assert sorted(path.stem for path in WIDE.glob("*.toml")) == sorted(six_axis_names())
     for name in six_axis_names():
         wide, own = load_wide(name), load_any(name).mechanism

@@ -136,6 +136,6 @@ def test_sobol_indices_without_variance_are_unknown():
         (lambda: sobol_indices(np.full(20, np.nan), 3, 4), "not finite"),
     ),
 )
-def test_saltelli_design_refuses_impossible_sizes(wrong, words):
+def test_saltelli_design_rejects_impossible_sizes(wrong, words):
     with pytest.raises(ValueError, match=words):
         wrong()

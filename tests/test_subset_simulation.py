@@ -200,7 +200,7 @@ def test_subset_simulation_uniform_numbers_stay_within_unit_interval():
         {"levels": 0},
     ),
 )
-def test_subset_simulation_refuses_impossible_settings(wrong):
+def test_subset_simulation_rejects_impossible_settings(wrong):
     settings = {"inputs": 2, "limit": 3.0, "seed": 0} | wrong
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))}: found"):
         subset_simulation(lambda u: u[:, 0], **settings)

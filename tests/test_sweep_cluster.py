@@ -105,7 +105,7 @@ def test_cluster_sweep_rows_are_unchanged_if_a_worker_is_killed(local_sweep, tmp
 
 
 @pytest.mark.slow
-def test_cluster_worker_with_running_jax_is_refused_or_preloaded(local_sweep, tmp_path):
+def test_cluster_worker_with_running_jax_is_rejected_or_preloaded(local_sweep, tmp_path):
     (tmp_path / "early.py").write_text("def dask_setup(worker):\n    import jax\n    jax.devices()\n")
     with started(tmp_path) as cluster:
         wrong = cluster.worker("--preload", str(tmp_path / "early.py"))

@@ -1,4 +1,4 @@
-"""`jaxhil sweep` and `jaxhil replay`: exit codes, JSON documents, refusals in one line."""
+"""`jaxhil sweep` and `jaxhil replay`: exit codes, JSON documents, one-line error messages."""
 
 import json
 import resource
@@ -293,7 +293,7 @@ def test_replay_command_detects_changed_rows(jaxhil, gains, tmp_path):
     refused(jaxhil("replay", folder, 3), "parts/part-000000.parquet: found a damaged file or one of another")
 
 
-def test_sweep_and_replay_refuse_impossible_arguments(jaxhil, gains, store, tmp_path):
+def test_sweep_and_replay_reject_impossible_arguments(jaxhil, gains, store, tmp_path):
     new = ["-o", tmp_path / "new"]
     refused(jaxhil("sweep", gains, *new, "--scenarios", "0"), "--scenarios", "found 0")
     refused(jaxhil("sweep", gains, *new, "--scenarios", 2**33), "--scenarios", str(2**32))

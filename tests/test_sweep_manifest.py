@@ -1,4 +1,4 @@
-"""Manifests of sweeps: read as written; a changed manifest is refused in one line."""
+"""Manifests of sweeps: read as written; a changed manifest is rejected in one line."""
 
 import json
 
@@ -55,13 +55,13 @@ def test_sweep_manifest_contains_interval_width_only_if_specified():
 
 
 @given(st.binary(max_size=200))
-def test_sweep_manifest_of_arbitrary_bytes_is_refused(content):
+def test_sweep_manifest_of_arbitrary_bytes_is_rejected(content):
     refusal(content)
 
 
 @given(st.sampled_from(sorted(DOCUMENT)), JSON, st.booleans())
 @settings(max_examples=200)
-def test_sweep_manifest_with_changed_value_and_valid_digest_is_read_or_refused(key, value, signed):
+def test_sweep_manifest_with_changed_value_and_valid_digest_is_read_or_rejected(key, value, signed):
     changed = {**DOCUMENT, key: value}
     if signed:
         changed["sha256"] = digest(changed)
@@ -70,7 +70,7 @@ def test_sweep_manifest_with_changed_value_and_valid_digest_is_read_or_refused(k
     except InputError as error:
         assert str(error).startswith("store/manifest.json: ") and str(error).isprintable()
     else:
-        # A changed value is read as that value or refused.
+        # A changed value is read as that value or rejected.
         assert msgspec.to_builtins(result) == changed
         assert signed or key in ("created", "sha256") or DOCUMENT[key] == value
 
@@ -98,12 +98,12 @@ def test_sweep_manifest_comparison_names_every_difference(key, value):
     assert difference.startswith(f"{key}: found ")
 
 
-def test_sweep_manifest_of_earlier_schema_is_refused_with_advice():
+def test_sweep_manifest_of_earlier_schema_is_rejected_with_advice():
     old = json.dumps({**DOCUMENT, "schema": "jaxhil/sweep/1"}).encode()
     assert "expected jaxhil/sweep/2: sweep again into a new folder, or use the version" in refusal(old)
 
 
-def test_sweep_manifest_with_flipped_bit_is_refused_unless_only_date_changes():
+def test_sweep_manifest_with_flipped_bit_is_rejected_unless_only_date_changes():
     content = encode_manifest(GOOD)
     for bit in np.random.default_rng(0).integers(0, 8 * len(content), 1000):
         harmed = bytearray(content)
@@ -137,7 +137,7 @@ def test_sweep_manifest_contains_only_xla_flags_that_may_change_results():
     assert rounding_flags("--xla_force_host_platform_device_count=1 --b=1") != rounding_flags("--b=1")
 
 
-def test_sobol_sweep_with_fewer_scenarios_than_replicates_is_refused():
+def test_sobol_sweep_with_fewer_scenarios_than_replicates_is_rejected():
     assert manifest(sampling="sobol", scenarios=16, chunk=5).replicates == 16
     with pytest.raises(InputError, match="--scenarios: found 15, expected 16 or more"):
         manifest(sampling="sobol", scenarios=15)

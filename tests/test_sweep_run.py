@@ -28,7 +28,8 @@ pytestmark = pytest.mark.users_options
 
 MANIFEST = manifest(case(), scenarios=300, limit=1.5)
 HERE = Path(__file__).parent
-UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"  # no process has this number
+# temporary file of a process that does not exist: no process has this number
+UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"
 
 
 class Log(list):

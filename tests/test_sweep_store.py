@@ -29,7 +29,8 @@ from tuning.sweeps.stored_studies import IndicesRequest, write_study
 from tuning.sweeps.studies import ErrorIndices
 
 MANIFEST = manifest(case(2))
-UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"  # no process has this number
+# temporary file of a process that does not exist: no process has this number
+UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"
 
 
 SLOTS = list_error_columns(("error",), 2)
@@ -168,12 +169,12 @@ def test_sweep_store_outcomes_follow_from_errors(store, column):
     assert read_chunk(store, 0) is None
 
 
-def test_sweep_store_refuses_an_index_beyond_the_end(store):
+def test_sweep_store_rejects_an_index_beyond_the_end(store):
     with refused("index: found 100, expected 0 to 99"):
         read_row(store, 100)
 
 
-def test_sweep_store_refuses_a_folder_that_is_not_empty(store, tmp_path):
+def test_sweep_store_rejects_a_folder_that_is_not_empty(store, tmp_path):
     with refused("--resume"):
         open_store(store.folder, MANIFEST, resume=False)
     (tmp_path / "thesis").mkdir()
@@ -183,12 +184,12 @@ def test_sweep_store_refuses_a_folder_that_is_not_empty(store, tmp_path):
             open_store(tmp_path / "thesis", MANIFEST, resume)
 
 
-def test_sweep_store_of_other_inputs_is_refused_with_names_of_differences(store):
+def test_sweep_store_of_other_inputs_is_rejected_with_names_of_differences(store):
     with refused("other inputs", "seed: found 0, requested 7"):
         open_store(store.folder, manifest(case(2), seed=7), resume=True)
 
 
-def test_sweep_store_with_missing_column_is_refused_with_column_name(tmp_path):
+def test_sweep_store_with_missing_column_is_rejected_with_column_name(tmp_path):
     columns = [column for column in MANIFEST.columns if not column.name.startswith("position_shortfall")]
     assert len(columns) == len(MANIFEST.columns) - 2
     old = msgspec.structs.replace(MANIFEST, columns=columns)
@@ -214,7 +215,7 @@ def test_resumed_sweep_removes_unfinished_files_of_the_store(store):
     assert [path.exists() for path in (*unfinished, *remaining)] == [False] * 3 + [True] * 4
 
 
-def test_new_sweep_store_refuses_folder_with_old_studies_or_verdict(store):
+def test_new_sweep_store_rejects_folder_with_old_studies_or_verdict(store):
     (store.folder / "manifest.json").unlink()
     for part in range(MANIFEST.parts):
         store.chunk_path(part).unlink()

@@ -37,7 +37,7 @@ def test_terminal_table_wraps_long_texts_between_words(monkeypatch, capsys):
     assert set(" ".join(lines).split()) >= {LAW, *text.split(), "1.25"}
 
 
-def test_piped_output_is_as_wide_as_columns(monkeypatch, capsys):
+def test_piped_output_is_wrapped_to_environment_variable_columns(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "40")
     terminal.emit("word " * 20)
     lines = capsys.readouterr().out.splitlines()
@@ -68,5 +68,5 @@ def test_json_output_has_numbers_for_numpy_scalars_and_null_for_nonfinite_values
         ("rig.force_sensor.delay", "rig.force_sensor.delay"),
     ],
 )
-def test_entry_of_a_list_has_one_name_in_tables(key, shown):
+def test_list_entry_is_named_with_bracketed_index_in_tables(key, shown):
     assert terminal.format_key(key) == shown

@@ -116,7 +116,7 @@ def test_lane_memory_grows_with_delay_line_and_state():
         pytest.param("probe-drogue", "none", marks=pytest.mark.slow),
     ],
 )
-def test_evaluation_in_one_tile_equals_evaluation_in_many(monkeypatch, name, compensator):
+def test_evaluation_in_one_tile_equals_evaluation_in_many_tiles(monkeypatch, name, compensator):
     case = model, loop, gains, scenarios = setting(name, compensator)
     many = model.evaluate(loop, gains, scenarios)
     lane_bytes = model.count_lane_bytes(loop, scenarios)

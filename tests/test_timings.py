@@ -6,7 +6,7 @@ import pytest
 from tuning.cli import timings
 
 
-def test_timings_count_overlapping_times_once():
+def test_timings_count_overlapping_time_intervals_once():
     assert timings.union_duration([(0.0, 2.0), (1.0, 3.0), (5.0, 6.0), (5.2, 5.5)]) == 4.0
     spans = {
         "importing": [(0.0, 1.0)],
@@ -20,7 +20,7 @@ def test_timings_count_overlapping_times_once():
     )
 
 
-def test_timings_record_events_of_jax(capsys):
+def test_timings_include_compile_and_cache_times_reported_by_jax(capsys):
     with timings.report_timings(True):
         jax.monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", 9.5)
         jax.monitoring.record_event_duration_secs("/jax/compilation_cache/cache_retrieval_time_sec", 4.24)

@@ -74,7 +74,7 @@ class Toy(ContactLaw):
         depth = fitted["stiffness"] / np.maximum(fitted["square"], 1e-9)
         return {**super().file_values(fitted, entry), "contact.doubling_depth": depth}
 '''
-# Keys, refusals and the rehearsal of the rig work without JAX.
+# Keys, messages for rejected values, and the rehearsal of the rig work without JAX.
 WITHOUT_JAX = """
 import sys
 from jaxhil.errors import InputError

@@ -99,7 +99,7 @@ def test_mechanism_properties_do_not_depend_on_form_of_simulator_model():
 
 
 def test_equivalent_damping_of_every_contact_law_matches_its_restitution():
-    """Hunt and Crossley: e = 1 - chi v."""
+    """For Hunt and Crossley, expect e = 1 - chi v."""
     hertz = compute_traits(claw("contact.law='hunt_crossley'", "contact.damping=[4.0]"))
     assert math.exp(-math.pi * hertz.damping_ratio) == pytest.approx(1 - 4.0 * 0.005, rel=1e-3)
     assert compute_traits(claw()).damping_ratio == pytest.approx(0.03, rel=1e-3)
@@ -224,7 +224,7 @@ def in_blocks(monkeypatch):
     return call
 
 
-def test_later_tuning_blocks_start_at_results_of_similar_earlier_mechanisms(in_blocks):
+def test_later_tuning_groups_start_at_results_of_similar_earlier_mechanisms(in_blocks):
     assert in_blocks(starts=3) == [[], [], ["3e5"]]
     assert in_blocks(starts=2) == [[], [], ["3e5"]]
 

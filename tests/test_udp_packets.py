@@ -1,4 +1,4 @@
-"""Packets between rig and controller: decoded as sent; any other bytes are refused."""
+"""Packets between rig and controller: decoded as sent; any other bytes are rejected."""
 
 import math
 
@@ -100,7 +100,7 @@ def mutated(packet):
 
 
 @given(st.one_of(mutated(READING), mutated(SIX_AXIS_READING)))
-def test_arbitrary_bytes_are_refused_or_decoded_as_reading_packet(packet):
+def test_arbitrary_bytes_are_rejected_or_decoded_as_reading_packet(packet):
     try:
         reading = decode_reading(packet, SESSION)
     except PacketError:
@@ -110,7 +110,7 @@ def test_arbitrary_bytes_are_refused_or_decoded_as_reading_packet(packet):
 
 
 @given(st.one_of(mutated(ANSWER), mutated(SIX_AXIS_ANSWER)))
-def test_arbitrary_bytes_are_refused_or_decoded_as_answer_packet(packet):
+def test_arbitrary_bytes_are_rejected_or_decoded_as_answer_packet(packet):
     try:
         answer = decode_answer(packet, SESSION)
     except PacketError:
@@ -119,7 +119,7 @@ def test_arbitrary_bytes_are_refused_or_decoded_as_answer_packet(packet):
     assert same(decode_answer(encode_answer(answer, SESSION), SESSION), answer)
 
 
-def test_packets_of_another_session_are_refused():
+def test_packets_of_another_session_are_rejected():
     packets = ((decode_reading, READING), (decode_answer, ANSWER))
     packets += ((decode_reading, SIX_AXIS_READING), (decode_answer, SIX_AXIS_ANSWER))
     for decode, packet in packets:
@@ -129,7 +129,7 @@ def test_packets_of_another_session_are_refused():
                 decode(packet, other)
 
 
-def test_packets_for_another_number_of_axes_are_refused():
+def test_packets_for_another_number_of_axes_are_rejected():
     for decode, one, six in (
         (decode_reading, READING, SIX_AXIS_READING),
         (decode_answer, ANSWER, SIX_AXIS_ANSWER),

@@ -1,4 +1,4 @@
-"""`jaxhil rig` and the controller process: short runs over UDP, and refusals of both."""
+"""`jaxhil rig` and the controller process: short runs over UDP, and rejections of both."""
 
 import json
 import os
@@ -33,7 +33,7 @@ def gain_file(folder, compensator="response_error", limits=None, **values):
     return path
 
 
-def test_rig_command_refuses_bundle_with_modified_controller(jaxhil, tmp_path):
+def test_rig_command_rejects_bundle_with_modified_controller(jaxhil, tmp_path):
     """Only code exported by this version is run."""
     made = build_bundle(document(), [])
     trap = b"open(%r, 'w')\n" % str(tmp_path / "ran")
@@ -150,7 +150,7 @@ def test_interrupted_rig_command_reports_measurements_so_far(tmp_path):
         (("BROKEN",), "sha256"),
     ],
 )
-def test_rig_command_refuses_unusable_input(jaxhil, tmp_path, options, words):
+def test_rig_command_rejects_unusable_input(jaxhil, tmp_path, options, words):
     good = gain_file(tmp_path)
     broken = tmp_path / "broken.json"
     broken.write_text(good.read_text().replace("0.005", "0.006"))

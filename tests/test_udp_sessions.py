@@ -100,7 +100,7 @@ def process(tmp_path):
 
 @contextmanager
 def flood(*senders):
-    """Packets that are sent during a wait; `next` sends one of each."""
+    """Provide a function that sends the packet of each sender once, and then waits 20 ms."""
 
     def once():
         for rig, packet in senders:

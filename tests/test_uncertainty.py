@@ -181,7 +181,7 @@ def test_quasi_random_points_depend_on_seed_and_fill_the_unit_cube_evenly():
         assert sorted(np.floor(64 * column)) == list(range(64))
 
 
-def test_draw_accepts_zero_scenarios_and_refuses_negative_arguments():
+def test_draw_accepts_zero_scenarios_and_rejects_negative_arguments():
     mechanism = load().mechanism
     for values in (draw(mechanism, 0, 0), draw_quasi_random(mechanism, 0, 0)):
         assert {path: entry.shape for path, entry in values.items()} == {
@@ -277,7 +277,7 @@ def test_normal_draws_are_truncated_to_allowed_values(path, nominal, std):
         ("rig.force_sensor.bias", {"distribution": "loguniform", "low": -1, "high": 1}, "found -1"),
     ],
 )
-def test_unusable_uncertainty_table_is_refused(path, entry, reason):
+def test_unusable_uncertainty_table_is_rejected(path, entry, reason):
     message = refusal(path, entry)
     assert "uncertainty." in message and reason in message
 

@@ -165,7 +165,7 @@ def test_runtime_command_that_differs_from_vectors_is_reported(loaded, monkeypat
 
 
 def test_vectors_of_a_noisy_biased_rig_agree_with_runtime():
-    """Except the first tick, whose force is zero in the simulation."""
+    """Exclude the first tick, whose force is zero in the simulation."""
     rough = ("rig.force_sensor.noise_std=0.5", "rig.force_sensor.bias=0.3", "rig.command_latency=1")
     result = make_vectors(check_document(document("claw-350kg", "phase_lead", rough)), seed=0, draws=1)
     assert result.reasons == [] and result.ended == [None, None]

@@ -145,7 +145,7 @@ def test_verification_reports_a_wrong_runtime(varying, monkeypatch, runtime, sta
         assert len(in_the_loop) == 1 and in_the_loop[0].endswith("1e-09 or less")
 
 
-def test_verification_refuses_single_precision(varying):
+def test_verification_rejects_single_precision(varying):
     with jax.enable_x64(False), pytest.raises(RuntimeError, match="jax_enable_x64"):
         verify(varying)
 

@@ -86,7 +86,7 @@ def test_ros2_texts_that_look_like_numbers_stay_strings():
         "ros__parameters"
     ]
     assert (result["mechanism"], result["sha256"]) == ("1e3", "1234e5")
-    # ROS 2 refuses an empty table.
+    # ROS 2 rejects an empty table.
     assert "gains" not in result and "limits" not in result
 
 
@@ -186,7 +186,7 @@ def test_missing_limit_is_written_as_default_of_runtime():
     }
 
 
-def test_gain_name_too_long_for_matlab_is_refused():
+def test_gain_name_too_long_for_matlab_is_rejected():
     made = json.loads(json.dumps(gain_document("phase_lead")))
     made["gains"]["g" * 64] = made["gains"].pop("phase_lead")
     with pytest.raises(InputError, match="found 64 characters, expected at most 63"):

@@ -74,7 +74,7 @@ def test_third_party_json_document_is_not_replaced(jaxhil, tmp_path, content):
     assert [(tmp_path / name).read_text() for name in ("compare.json", "gains.json")] == [content] * 2
 
 
-def test_sweep_refuses_folder_with_third_party_files(jaxhil, thesis, untouched, tmp_path):
+def test_sweep_rejects_folder_with_third_party_files(jaxhil, thesis, untouched, tmp_path):
     write_gain_file(tmp_path / "gains.json", case())
     for more in ((), ("--resume",)):
         ran = jaxhil("sweep", tmp_path / "gains.json", "--scenarios", "2", "-o", thesis, *more)
@@ -173,7 +173,7 @@ def test_gains_of_different_mechanism_with_same_name_are_replaced_with_warning(j
     ],
     ids=" ".join,
 )
-def test_input_from_a_pipe_or_device_is_refused(jaxhil, tmp_path, monkeypatch, command, kind):
+def test_input_from_a_pipe_or_device_is_rejected(jaxhil, tmp_path, monkeypatch, command, kind):
     """Reading would block on a pipe and never end on a device."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "log.csv").write_text("t\n")
