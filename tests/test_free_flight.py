@@ -5,7 +5,15 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lanes import as_arrays, nominal_gains, run_record, run_rollout
+from lanes import (
+    STIFFNESS,
+    as_arrays,
+    mechanism,
+    nominal_gains,
+    run_record,
+    run_rollout,
+    validated,
+)
 
 from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.none.simulation import NoCompensator
@@ -41,6 +49,20 @@ def test_skipping_the_approach_changes_no_metric(law):
     # Metrics are recorded at the end of a segment, which falls on other ticks.
     later = np.asarray(result.ticks) - np.asarray(flown.ticks)
     assert np.all(np.abs(later) < segment_length(loop) * scenarios.contacts)
+
+
+@pytest.mark.slow
+def test_flight_between_two_surfaces_with_moving_average_is_skipped_and_changes_no_metric():
+    simulator = {"model": "moving_average", "window": 0.0344}
+    rattling = {"stiffness": [STIFFNESS], "clearance": 0.0075}
+    drawn = validated(mechanism(rattling, simulator, 0.003, 2, velocity=0.01))
+    scenarios = build_scenarios(drawn)
+    loop, gains = build_loop(drawn, "none", scenarios), {}
+    result = run_rollout(loop, gains, scenarios)
+    flown, _ = run_record(loop, gains, scenarios, TICKS)
+    np.testing.assert_allclose(result.restitution, flown.restitution, rtol=1e-9)
+    np.testing.assert_allclose(result.peak_force, flown.peak_force, rtol=1e-9)
+    assert np.max(flown.ticks) - np.max(result.ticks) > 100
 
 
 @pytest.mark.parametrize(

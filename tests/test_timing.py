@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import Case, run_oracle
-from lanes import IDEAL, PERIOD, STIFFNESS, mechanism, nominal_gains, validated
+from lanes import IDEAL, PERIOD, SECOND_ORDER, STIFFNESS, mechanism, nominal_gains, validated
 
 import jaxhil
 import tuning
@@ -32,8 +32,10 @@ JITTER, LOSS = {"jitter": 0.0037}, {"loss_probability": 0.1}
 MISSED: dict[str, Any] = {"missed_tick_probability": 0.05}
 
 
-def case(law="phase_lead", *arguments, sensor=None, contact=LIST, **rig):
-    return Case(mechanism(contact, *arguments, force_sensor=sensor, **rig), law)
+def case(
+    law="phase_lead", simulator=SECOND_ORDER, delay=0.0041, contacts=1, sensor=None, contact=LIST, **rig
+):
+    return Case(mechanism(contact, simulator, delay, contacts, force_sensor=sensor, **rig), law)
 
 
 CASES = {
@@ -46,6 +48,7 @@ CASES = {
     "lost frames, two surfaces": case(sensor=LOSS, contact={**LIST, "clearance": 0.004}),
     "missed ticks": case(**MISSED),
     "missed ticks, response error": case("response_error", **MISSED),
+    "missed ticks before contact": case("response_error", delay=0.0401, missed_tick_probability=0.5),
     "all": case("response_error", sensor={**JITTER, **LOSS}, **MISSED),
 }
 

@@ -71,7 +71,8 @@ class IntervalInputs(NamedTuple):
     state: SimulatorState  # state of the motion simulator at the interval's start
     start: Float[Array, "*batch"]  # position command at the interval's start [m]
     end: Float[Array, "*batch"]  # position command at the interval's end [m]
-    surface: Float[Array, "*batch"]  # position of the mechanism's surface [m]
+    # position of the mechanism's surface [m]; None in the delay line of readings with jitter
+    surface: Float[Array, "*batch"] | None
 
 
 def count_cells(fastest: float, lags: Any) -> CellCounts:
@@ -234,6 +235,7 @@ def power_series(cells: Cells, inputs: IntervalInputs) -> Float[Array, "powers c
     position = cells.series[:, None, -2] * drive + cells.series[:, None, -1] * growth
     for i, component in enumerate(state):
         position = position + cells.series[:, None, i] * component
+    assert inputs.surface is not None
     return position.at[0].add(-inputs.surface)
 
 

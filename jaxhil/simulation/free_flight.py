@@ -77,8 +77,12 @@ def advance_to_surface(
     periods = lax.stop_gradient(jnp.floor(jnp.where(stride != 0, strides, 0)))
     arrived = start_uniform_motion(loop, rig, gains, state, position + periods * stride, velocity, tick)
     uniform = start_uniform_motion(loop, rig, gains, state, position, velocity, tick)
+    settled = uniform.plant.state
+    if rig.propagation.window is not None:
+        # The state contains the commands that left the window in the last interval, a stride before.
+        settled = settled[0], *(command - stride for command in settled[1:])
     follows = (tracker.elapsed == 0) & (tracker.force_free_ticks > loop.first_tick)
-    for component, steady in zip(state.plant.state, uniform.plant.state, strict=True):
+    for component, steady in zip(state.plant.state, settled, strict=True):
         # Time is in control periods, so that all components of the state have similar magnitudes.
         scale = jnp.abs(rig.propagation.steady_command[0] * stride)
         follows = follows & (jnp.abs(component - steady) <= SETTLING_TOLERANCE * scale)

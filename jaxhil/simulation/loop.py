@@ -31,7 +31,7 @@ from jaxhil.simulation.motion_simulator import (
 from jaxhil.simulation.moving_average import discretise_moving_average
 from jaxhil.simulation.probe import initial_first_contact
 from jaxhil.simulation.scenario import Scenario
-from jaxhil.simulation.timing import SERIES_DEGREE, HeldValues
+from jaxhil.simulation.timing import SERIES_DEGREE, no_held_values
 
 
 class Loop(eqx.Module):
@@ -241,7 +241,7 @@ def start_uniform_motion(
             stride,
             steady_state(rig.propagation, drive, stride),
             commands[0] if loop.has_limits else None,
-            None if rig.propagation.window is None else (commands[-1], stride),
+            None if rig.propagation.window is None else commands[-1],
         ),
         sensed=state.sensed._replace(
             last=no_contact(position),
@@ -253,5 +253,5 @@ def start_uniform_motion(
         onset_velocity=velocity,
         onset_tick=jnp.broadcast_to(tick, position.shape),
         first_contact=initial_first_contact(position) if loop.probed else None,
-        held=None if state.held is None else HeldValues(0 * position, 0 * position),
+        held=None if state.held is None else no_held_values(position),
     )

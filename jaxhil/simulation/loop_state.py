@@ -19,9 +19,9 @@ class PlantState(NamedTuple):
     state: tuple[Array, ...]  # state of the motion simulator
     # unlimited position command for tick n [m]; None without limits
     unlimited_command: Float[Array, "*batch"] | None
-    # drive command at the end of the last interval before the run [m], and its increase per period; None
-    # unless the motion simulator is a moving average
-    first_command: tuple[Array, Array] | None
+    # drive command at the end of the last interval before the run [m]; None unless the motion simulator is a
+    # moving average
+    first_command: Float[Array, "*batch"] | None
 
     @property
     def sent(self) -> Float[Array, "*batch"]:

@@ -23,7 +23,7 @@ from jaxhil.simulation.probe import initial_first_contact
 from jaxhil.simulation.scenario import Scenario
 from jaxhil.simulation.sensors import SensorNoise, draw_noise
 from jaxhil.simulation.tick import RunState, SegmentConstants, Tick, tick
-from jaxhil.simulation.timing import HeldValues, TimingDraws, draw_timing
+from jaxhil.simulation.timing import TimingDraws, draw_timing, no_held_values
 
 
 def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
@@ -100,7 +100,7 @@ def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool
             zeros,
             (zeros,) * order,
             zeros if loop.has_limits else None,
-            None if rig.propagation.window is None else (zeros, zeros),
+            None if rig.propagation.window is None else zeros,
         ),
         sensed=SensorState(
             rings=_build_rings(loop, rig, ring, measured, order),
@@ -115,7 +115,7 @@ def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool
         onset_velocity=zeros,
         onset_tick=index,
         first_contact=initial_first_contact(zeros) if loop.probed else None,
-        held=None if scenario.timing is None else HeldValues(zeros, zeros),
+        held=None if scenario.timing is None else no_held_values(zeros),
     )
     # Delay lines are read up to their whole length back. With this number of the first tick, no index is
     # negative.
@@ -256,7 +256,7 @@ def _build_rings(loop, rig, ring, measured, order):
     reading = ring if loop.has_lag else None
     position = ring if measured else None
     command = None if rig.propagation.window is None else ring
-    inputs = None if rig.series is None else IntervalInputs((ring,) * order, ring, ring, ring)
+    inputs = None if rig.series is None else IntervalInputs((ring,) * order, ring, ring, None)
     return Rings(plant_signals, reading, position, interval, command, inputs)
 
 

@@ -141,7 +141,8 @@ def tick(
         )
     state = update_state(state, now, plant_signals, model, actuated, contact)
     if state.held is not None:
-        state = state._replace(held=HeldValues(signals.force_measured, force))
+        count = state.held.missed if missed is None else state.held.missed + missed.astype(jnp.int32)
+        state = state._replace(held=HeldValues(signals.force_measured, force, count))
     record = Tick(
         signals,
         force,
@@ -199,7 +200,12 @@ def sense(
 def compensate(
     loop: Loop, prepared: SegmentConstants, state: LoopState, signals: Signals, now: Array
 ) -> tuple[Array, Any]:
-    """Stage 2: return the force command F_c [N] and the compensator's next state."""
+    """Stage 2: return the force command F_c [N] and the compensator's next state.
+
+    The compensator counts the ticks at which it runs, as on the rig; missed ticks are left out.
+    """
+    if state.held is not None:
+        signals = signals._replace(age=signals.age - state.held.missed)
     force, controller = loop.compensator.step(prepared.controller, state.controller, signals, now)
     if loop.reads_always:
         force = jnp.where(signals.age == 0, 0, force)
@@ -241,7 +247,8 @@ def actuate(
     first = state.plant.first_command
     if past is not None and rows.window is not None and first is not None:
         past = write_sample(past, now, end)
-        before_run = UniformCommand(*first, now - state.onset_tick)
+        stride = rig.constants.control_period * state.onset_velocity
+        before_run = UniformCommand(first, stride, now - state.onset_tick)
         simulator = read_leaving_commands(past, now, rows.window, simulator, before_run)
     inputs = IntervalInputs(simulator, start, end, rig.scenario.contact_plane)
     interval = compute_interval_motion(rows, simulator, start, end, rig.scenario.contact_plane)._replace(
@@ -264,7 +271,7 @@ def actuate(
         interval=interval,
         pending=pending,
         commands=past,
-        inputs=None if rig.series is None else inputs,
+        inputs=None if rig.series is None else inputs._replace(surface=None),
     )
 
 

@@ -41,10 +41,16 @@ class TimingDraws(NamedTuple):
 
 
 class HeldValues(NamedTuple):
-    """Values of the last tick, which lost frames and missed ticks repeat."""
+    """Values that lost frames and missed ticks repeat, and the number of missed ticks."""
 
     reading: Float[Array, "*batch"]  # force reading [N]
     command: Float[Array, "*batch"]  # force command [N]
+    missed: Int[Array, "*batch"]  # number of missed ticks since the run began
+
+
+def no_held_values(like: Float[Array, "*batch"]) -> HeldValues:
+    """Return the values before the first tick of a run, for a batch with the shape of `like`."""
+    return HeldValues(0 * like, 0 * like, jnp.zeros(like.shape, jnp.int32))
 
 
 def draw_timing(
