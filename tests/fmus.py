@@ -11,9 +11,8 @@ from typing import Any
 
 import pytest
 
-from jaxhil.rig.six_axes.vectors import COORDINATES
+from jaxhil.rig.flight_recorder import COORDINATES, TWIST, WRENCH
 from tuning.bundle.fmu.archive import add_library, compile_library, find_compiler
-from tuning.bundle.fmu.variables import POSE_PARTS, TWIST_PARTS, WRENCH_PARTS
 from tuning.rig.contact_detector import ContactDetector, RigContact
 
 fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed (pip install jaxhil[fmu])")
@@ -139,7 +138,7 @@ def replay_vectors(fmu: RunningFmu, vectors: bytes) -> int:
 
 SIX_AXIS_INPUTS = ("wrench_measured", "pose_desired", "twist_desired", "pose_measured", "pose", "twist")
 SIX_AXIS_RESULTS = ("wrench_command", "pose_command")
-PARTS = {"wrench": WRENCH_PARTS, "pose": POSE_PARTS, "twist": TWIST_PARTS}
+PARTS = {"wrench": WRENCH, "pose": COORDINATES, "twist": TWIST}
 
 
 def part_names(vector: str) -> list[str]:

@@ -15,9 +15,10 @@ import jaxhil as package
 import tuning
 from jaxhil.errors import InputError
 from jaxhil.rig import Controller
+from jaxhil.rig.flight_recorder import COORDINATES, TWIST, WRENCH
 from jaxhil.rig.six_axes import Controller6
 from jaxhil.simulation.gain_file import check_document
-from jaxhil.sixdof.recording import COORDINATES, TWIST, WRENCH
+from tuning.identification.logs.six_axis_mapping import load_six_axis_mapping
 
 HEAD = 'schema = "jaxhil/log/1"\n[channels]\n'
 RUNS = '[[runs]]\nfiles = "*"\nkind = "contact"\n'
@@ -262,7 +263,7 @@ def test_shadow_mode_reads_six_axis_logs_in_other_units(tmp_path):
 
 def test_six_axis_mapping_rejects_wrong_channels(tmp_path):
     document, columns = six_axis_log()
-    log = write_columns(tmp_path / "log.csv", columns)
+    log = write_columns(tmp_path / "log.csv", columns | {"gap": np.where(columns["time"] > 0.1, np.nan, 0)})
     for change, words in (
         ({"twist_desired": '["a", "b"]'}, "channels.twist_desired.columns: found"),
         (
@@ -271,11 +272,28 @@ def test_six_axis_mapping_rejects_wrong_channels(tmp_path):
         ),
         ({"wrench_command": '["a", "b", "c", "d", "e", "f"]'}, "column 'a': found no column with this name"),
         ({"force_command": '"a"'}, "force_command"),
+        ({"contact_index": '{ column = "time", sign = 0 }'}, "channels.contact_index.sign: found 0"),
+        ({"contact_index": '{ column = "time", time = "t" }'}, "channels.contact_index.time: found"),
+        ({"contact_index": '"text"'}, "column 'text': found no column"),
+        ({"contact_index": '"gap"'}, "column 'gap': found missing values"),
     ):
         (tmp_path / "map.toml").write_text(six_axis_mapping(**change))
         with pytest.raises(InputError) as caught:
             tuning.shadow(Result(document), log, map=tmp_path / "map.toml")
         assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "timing, words",
+    [
+        ('clock = "separate"', "timing.clock: found separate, expected stamps or index"),
+        ("rows_per_period = 2", "timing.rows_per_period: found 2, expected 1"),
+    ],
+)
+def test_six_axis_mapping_rejects_timing_that_its_logs_cannot_have(tmp_path, timing, words):
+    (tmp_path / "map.toml").write_text(six_axis_mapping() + f"[timing]\n{timing}\n")
+    with pytest.raises(InputError, match=words):
+        load_six_axis_mapping(tmp_path / "map.toml")
 
 
 @pytest.mark.parametrize(

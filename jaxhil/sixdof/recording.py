@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhil.mechanism.six_axes import SixAxisMechanism
+from jaxhil.rig.flight_recorder import COORDINATES, TWIST, WRENCH
 from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, supported_options
 from jaxhil.sixdof.bodies import angular_velocity
 from jaxhil.sixdof.building import build_scenarios, make_loop
@@ -81,9 +82,6 @@ class RunRecord(NamedTuple):
     groups: tuple[ContactGroup, ...]
 
 
-COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
-TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
-WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 MOTION = ("x", "y", "z", "qw", "qx", "qy", "qz", *TWIST)
 # For each field of `RunRecord`, the suffixes of its columns in the CSV file.
 COLUMNS: Mapping[str, tuple[str, ...]] = {

@@ -211,6 +211,9 @@ def _read_six_axes(log: OpenLog, mapping: SixAxisLogMapping):
     if index is not None:
         factor, offset = get_si_conversion(index, "contact_index")
         more["contact_index"] = factor * read[index.column] + offset
+        if not np.all(np.isfinite(more["contact_index"])):
+            where = f"{log.label}: column {format_value(index.column)}"
+            raise InputError(f"{where}: found missing values, expected the index of a contact in each row")
     return vectors, more, read_row_stamps(log, read, mapping)[0], []  # pyright: ignore[reportArgumentType]
 
 

@@ -12,12 +12,9 @@ from typing import Any, Literal, NamedTuple
 
 from jaxhil.mechanism.file import from_plain_data
 from jaxhil.rig.faults import UNUSABLE
+from jaxhil.rig.flight_recorder import COORDINATES, TWIST, WRENCH
 from jaxhil.rig.law_status import STATUSES
 from tuning.bundle.controller_kind import ONE_AXIS, kind_of
-
-WRENCH_PARTS = ("fx", "fy", "fz", "mx", "my", "mz")
-POSE_PARTS = ("x", "y", "z", "rx", "ry", "rz")
-TWIST_PARTS = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
 class Variable(NamedTuple):
@@ -124,9 +121,9 @@ def _one_axis_signals(document: Mapping[str, Any]) -> list[Variable]:
 
 def _six_axis_signals() -> list[Variable]:
     parts = {
-        "wrench": (WRENCH_PARTS, ("N", "N m")),
-        "pose": (POSE_PARTS, ("m", "rad")),
-        "twist": (TWIST_PARTS, ("m/s", "rad/s")),
+        "wrench": (WRENCH, ("N", "N m")),
+        "pose": (COORDINATES, ("m", "rad")),
+        "twist": (TWIST, ("m/s", "rad/s")),
     }
 
     def vector(name: str, quantity: str, causality: Any, description: str) -> list[Variable]:

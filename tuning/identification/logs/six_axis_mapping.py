@@ -8,7 +8,7 @@
     ...
 
 The tables `[timing]`, `[text]` and `[[runs]]` are those of one axis (`mapping`). All columns have the time
-stamps of the rows. Wrenches are about the origin of target frame T. Poses and twists are those of chaser
+stamps of the rows, and each control period has one row. Wrenches are about the origin of target frame T. Poses and twists are those of chaser
 frame C relative to T. All are in T axes, as in the files of `jaxhil simulate --log`.
 """
 
@@ -23,6 +23,7 @@ from msgspec import Meta, Struct
 from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.mechanism.conversion import KeyProblem, suggest_names, to_struct
 from jaxhil.mechanism.structs import key_metadata
+from jaxhil.rig.flight_recorder import CHANNELS
 from tuning.identification.logs.mapping import (
     SCHEMA,
     Channel,
@@ -36,11 +37,6 @@ from tuning.identification.logs.mapping import (
     read_mapping_file,
 )
 from tuning.identification.logs.units import FORCE_UNITS, LENGTH_UNITS, SPEED_UNITS
-
-# Suffixes of the columns that `jaxhil simulate --log` writes.
-COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
-TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
-WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 
 ANGLE_UNITS = {"rad": 1.0, "mrad": 1e-3, "deg": 0.017453292519943295}
 ANGULAR_SPEED_UNITS = {f"{unit}/s": factor for unit, factor in ANGLE_UNITS.items()}
@@ -113,27 +109,24 @@ def parse_six_axis_mapping(raw: Mapping[str, Any], label: str) -> SixAxisLogMapp
     try:
         mapping = to_struct(SixAxisLogMapping, tables)
         _check_units(mapping.channels)
+        _check_rows(mapping)
     except KeyProblem as problem:
         raise InputError(f"{label}: {problem}") from None
-    # The checks of the time stamps and of the runs are those of one axis.
-    placeholder = dict.fromkeys(("position_desired", "position_measured"), "x")
-    checked = {"time": tables["channels"]["time"], **placeholder}
+    # The checks of the time stamps, of the contact's index and of the runs are those of one axis.
+    checked = dict.fromkeys(("position_desired", "position_measured"), "x") | {
+        name: tables["channels"][name] for name in ("time", "contact_index") if name in tables["channels"]
+    }
     parse_mapping({"schema": SCHEMA, "channels": checked, "runs": tables["runs"]}, label)
     return mapping
 
 
 def make_six_axis_simulation_mapping() -> SixAxisLogMapping:
     """Return the mapping of six-axis logs that `jaxhil simulate --log` writes."""
-    channels = {
-        "time": "time",
-        "wrench_measured": [f"wrench_measured_{suffix}" for suffix in WRENCH],
-        "pose_desired": [f"desired_{suffix}" for suffix in COORDINATES],
-        "pose_measured": [f"pose_measured_{suffix}" for suffix in COORDINATES],
-        "twist_desired": [f"twist_desired_{suffix}" for suffix in TWIST],
-        "wrench_command": [f"command_{suffix}" for suffix in WRENCH],
-    }
+    channels = {name: [prefix + suffix for suffix in suffixes] for name, prefix, suffixes in CHANNELS[6]}
     runs = [{"files": "*", "kind": "contact"}]
-    return parse_six_axis_mapping({"schema": SCHEMA, "channels": channels, "runs": runs}, "own logs")
+    return parse_six_axis_mapping(
+        {"schema": SCHEMA, "channels": {"time": "time", **channels}, "runs": runs}, "own logs"
+    )
 
 
 def get_factors(channel: VectorChannel, name: str) -> list[float]:
@@ -141,6 +134,18 @@ def get_factors(channel: VectorChannel, name: str) -> list[float]:
     tables = VECTOR_UNITS[name]
     units = channel.units or [next(iter(table)) for table in tables]
     return [channel.sign * table[unit] for table, unit in zip(tables, units, strict=True) for _ in range(3)]
+
+
+def _check_rows(mapping: SixAxisLogMapping) -> None:
+    """Raise `KeyProblem` for time stamps and rows that six-axis logs cannot have."""
+    index, timing = mapping.channels.contact_index, mapping.timing
+    if index is not None and index.time is not None:
+        expected = "none, because six-axis logs have the time stamps of the rows"
+        raise KeyProblem(("channels", "contact_index", "time"), format_value(index.time), expected)
+    if timing.clock == "separate":
+        raise KeyProblem(("timing", "clock"), "separate", "stamps or index, in six-axis logs")
+    if timing.rows_per_period not in (None, 1):
+        raise KeyProblem(("timing", "rows_per_period"), str(timing.rows_per_period), "1, in six-axis logs")
 
 
 def _is_list(entry: Any) -> bool:
