@@ -84,7 +84,7 @@ def tune_each(
     options: TuneOptions,
     bar: terminal.Progress,
     checkpoints: "Checkpoints | None" = None,
-    announce: Callable[[str], None] = lambda text: None,
+    announce: Callable[[str], None] | None = None,
 ) -> Iterator[tuple[int, TunedGains]]:
     """Tune several mechanisms, and yield the index and the result of each as soon as it is finished.
 
@@ -93,7 +93,7 @@ def tune_each(
         options: options of the tuning.
         bar: progress display.
         checkpoints: results of finished work, which is not repeated; new results are added.
-        announce: is called before the search with a text on the time that it will take.
+        announce: is called before the search with a text on the time that it will take, unless it is None.
 
     Yields:
         Index into `loaded`, and tuned gains.
@@ -107,8 +107,11 @@ def tune_each(
     settings, earlier = options.settings(max(map(axes_of, mechanisms))), options.load_start_gains()
     number = len(loaded)
     work = SearchProgress(lambda text, share, before: bar.tell(text, share * number, before * number))
-    work.announce = lambda runs: announce(describe_expected_duration(mechanisms, options.compensator, runs))
-    begun = time.monotonic()
+    if announce is not None:
+        work.announce = lambda runs: announce(
+            describe_expected_duration(mechanisms, options.compensator, runs)
+        )
+    seconds, begun = 0.0, time.monotonic()
     results = tune_all(
         mechanisms,
         options.compensator,
@@ -119,6 +122,7 @@ def tune_each(
         scheduler=options.scheduler,
     )
     for index, result in results:
+        seconds += time.monotonic() - begun  # without the time that the caller spends on a result
         yield (
             index,
             TunedGains(
@@ -128,5 +132,6 @@ def tune_each(
                 extra_periods=options.extra_periods,
             ),
         )
+        begun = time.monotonic()
     if options.scheduler is None:
-        record_duration(mechanisms, options.compensator, work.computed_runs, time.monotonic() - begun)
+        record_duration(mechanisms, options.compensator, work.computed_runs, seconds)
