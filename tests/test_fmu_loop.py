@@ -1,5 +1,9 @@
 """Loop of controller and rig as FMUs, closed by `verify` without FMPy, compared with the simulation."""
 
+import math
+from types import SimpleNamespace
+from typing import ClassVar
+
 import bundles
 import c99_cases
 import pytest
@@ -24,7 +28,13 @@ def loaded(document):
 class Simulated:
     """Stand-in for a run of the simulation."""
 
-    contacts = ()
+    contacts: ClassVar = ()
+
+
+class Stalled(Simulated):
+    """Stand-in for a run with a contact that does not end."""
+
+    contacts: ClassVar = (SimpleNamespace(restitution=math.nan, status="timeout"),)
 
 
 @needs_compiler
@@ -47,6 +57,18 @@ def test_fmu_loop_reports_sources_that_do_not_compile(monkeypatch):
     gains = loaded(bundles.document())
     result = compare_fmu_loop(fmi3_files(gains.document), gains)
     assert result is not None and result.reasons == ("fmi3: the sources cannot be compiled",)
+
+
+@needs_compiler
+@pytest.mark.parametrize("status, number", [("timeout", 0), ("diverged", 1)])
+def test_fmu_loop_compares_statuses_of_contacts_that_do_not_end(monkeypatch, status, number):
+    monkeypatch.setattr(closed_loop, "simulate", lambda *arguments: Stalled)
+    ended = SimpleNamespace(restitution=math.nan, status=status)
+    monkeypatch.setattr(closed_loop, "_run_loop", lambda *arguments: [ended])
+    gains = loaded(bundles.document())
+    result = compare_fmu_loop(fmi3_files(gains.document), gains)
+    assert result is not None and len(result.reasons) == number
+    assert all("status 'diverged' with both FMUs, expected 'timeout'" in text for text in result.reasons)
 
 
 @needs_compiler

@@ -103,7 +103,7 @@ def verify(path: Any, *, progress: bool = False, **options: Any) -> Verification
     if key is not None:
         raise ArgumentError("key", format_value(str(key)), "no key for a gain file: only bundles are signed")
     label = {} if is_result else {"file": str(file)}
-    return Verification(_verify_gains(file, label, scenarios, seed, progress))
+    return Verification(_verify_gains(file, label, scenarios, seed, progress)[0])
 
 
 def _verify_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: bool) -> dict[str, Any]:
@@ -122,24 +122,24 @@ def _verify_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: 
             document["self_test"], reasons = run_selftest(checked, os.path.basename(os.path.abspath(folder)))
     if reasons:
         return {**document, "verdict": "bad", "reasons": reasons}
-    document = _verify_gains(
+    document, loaded = _verify_gains(
         checked, {**document, "file": str(folder / "gains.json")}, scenarios, seed, progress
     )
-    return _add_fmu_loop(document, checked.files, checked, progress)
-
-
-def _add_fmu_loop(document: dict[str, Any], files: Any, gains: Any, progress: bool) -> dict[str, Any]:
-    """Close the loop through the FMUs of a bundle that has both; add the result to the document."""
-    has_rig = any(name.endswith("jaxhil_rig.fmu") for name in files)
-    if not has_rig or "mechanism" not in document:  # the gain file could not be read
+    has_rig = any(name.endswith("jaxhil_rig.fmu") for name in checked.files)
+    if loaded is None or not has_rig:
         return document
+    return _add_fmu_loop(document, checked.files, loaded, progress)
+
+
+def _add_fmu_loop(document: dict[str, Any], files: Any, loaded: Any, progress: bool) -> dict[str, Any]:
+    """Close the loop through the FMUs of a bundle that has both; add the result to the document."""
     import msgspec
 
     from tuning.bundle.fmu.closed_loop import compare_fmu_loop
 
     with jax_context(), terminal.show_stages(1, progress) as stages:
         stages.begin("running the nominal contacts with the FMUs")
-        loop = compare_fmu_loop(files, arguments.load_gains(gains))
+        loop = compare_fmu_loop(files, loaded)
     if loop is None:
         return {**document, "fmu_loop": None}
     reasons = [*document["reasons"], *loop.reasons]
@@ -152,14 +152,17 @@ def _add_fmu_loop(document: dict[str, Any], files: Any, gains: Any, progress: bo
 
 
 def _verify_gains(gains: Any, document: dict[str, Any], scenarios: int, seed: int, progress: bool):
-    """Verify a gain file, or gains in memory; return `document` together with the result's JSON entries."""
+    """Verify a gain file, or gains in memory.
+
+    Return `document` together with the result's JSON entries, and the loaded gains: None if they are invalid.
+    """
     with jax_context():
         import msgspec
 
         try:
             loaded = arguments.load_gains(gains, any_axes=True)
         except InputError as error:
-            return {**document, "verdict": "bad", "reasons": [str(error)]}
+            return {**document, "verdict": "bad", "reasons": [str(error)]}, None
         axes = loaded.document.get("axes", 1)
         arguments.check_has_runtime(loaded.compensator, axes)
         if axes == 6:
@@ -170,7 +173,7 @@ def _verify_gains(gains: Any, document: dict[str, Any], scenarios: int, seed: in
             result = compare(loaded, scenarios, seed, stages.begin)
         verdict = "good" if result.verdict else "bad"
         content = {"mechanism": loaded.mechanism.name, **msgspec.to_builtins(result)}
-        return {**document, **content, "verdict": verdict}
+        return {**document, **content, "verdict": verdict}, loaded
 
 
 def _is_folder(path: Path) -> bool:

@@ -33,7 +33,6 @@ from jaxhil.simulation.tick import (
     sense,
     update_state,
 )
-from jaxhil.simulation.timing import HeldValues
 from tuning.verification.stops import ControllerStop, RecordingController
 
 
@@ -161,7 +160,7 @@ def _advance(
     tracker = record_contact(loop, rules, run.tracker, signals, plant_signals, command, shortfall)
     state = update_state(state, now, plant_signals, model, actuated, contact)
     if state.held is not None:
-        state = state._replace(held=HeldValues(signals.force_measured, command))
+        state = state._replace(held=state.held._replace(reading=signals.force_measured, command=command))
     return run._replace(state=state, tracker=tracker, tick=now + 1)
 
 

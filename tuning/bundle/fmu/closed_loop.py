@@ -27,6 +27,7 @@ class FmuContact(msgspec.Struct, frozen=True):
     restitution: float | None  # restitution with the FMUs [1]; None if the contact does not end
     simulated_restitution: float | None  # restitution of `simulate` with the master's period [1]
     status: str  # status of the contact in the loop of FMUs
+    simulated_status: str  # status of the contact in the simulation
 
 
 class FmuLoop(msgspec.Struct, frozen=True):
@@ -66,23 +67,25 @@ def compare_fmu_loop(files: Mapping[str, bytes], loaded: Any) -> FmuLoop | None:
     except FmuError as error:
         return FmuLoop(fmi, latency, (), (f"fmi{fmi}: {error}",))
     comparisons = tuple(
-        FmuContact(_number(contact.restitution), _number(other.restitution), contact.status)
+        FmuContact(_number(contact.restitution), _number(other.restitution), contact.status, other.status)
         for contact, other in zip(contacts, expected, strict=False)
     )
     reasons = [
-        f"fmi{fmi}, contact {number}: found e = {contact.restitution!r} with both FMUs, expected "
-        f"{contact.simulated_restitution!r} (simulation with rig.command_latency = {latency})"
+        f"fmi{fmi}, contact {number}: found {difference} (simulation with rig.command_latency = {latency})"
         for number, contact in enumerate(comparisons, start=1)
-        if not _agrees(contact)
+        if (difference := _find_difference(contact))
     ]
     return FmuLoop(fmi, latency, comparisons, tuple(reasons))
 
 
-def _agrees(contact: FmuContact) -> bool:
+def _find_difference(contact: FmuContact) -> str:
+    """Return the difference between both loops in words; an empty text if they agree."""
     found, simulated = contact.restitution, contact.simulated_restitution
-    if found is None or simulated is None:
-        return found is simulated
-    return abs(found - simulated) <= FMU_LOOP_LIMIT
+    if contact.status != contact.simulated_status:
+        return f"status '{contact.status}' with both FMUs, expected '{contact.simulated_status}'"
+    if found is None or simulated is None or abs(found - simulated) <= FMU_LOOP_LIMIT:
+        return ""
+    return f"e = {found!r} with both FMUs, expected {simulated!r}"
 
 
 def _number(value: float) -> float | None:

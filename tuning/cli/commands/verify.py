@@ -70,17 +70,18 @@ def _fmu_table(loop: dict[str, Any]) -> Any:
     return terminal.build_table(
         f"Nominal contacts with the FMUs of FMI {loop['fmi']}, rig.command_latency = "
         f"{loop['command_latency']}",
-        ["contact", "e", "e simulated", "status"],
+        ["contact", "e", "e simulated", "status", "simulated"],
         [
             (
                 number,
                 terminal.format_number(contact["restitution"], 9),
                 terminal.format_number(contact["simulated_restitution"], 9),
                 contact["status"],
+                contact["simulated_status"],
             )
             for number, contact in enumerate(loop["contacts"], start=1)
         ],
-        texts=(3,),
+        texts=(3, 4),
     )
 
 
