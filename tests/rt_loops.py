@@ -19,9 +19,10 @@ SOURCES = ("rt_loop.c", "rt_plant_udp.c", "jaxhil_controller.c")
 
 
 class Ran(NamedTuple):
-    """Result of the program: exit code, its report, and the rig's packets and contacts."""
+    """Result of the program: exit code, standard error, its report, and the rig's packets and contacts."""
 
     code: int
+    errors: str
     report: dict[str, list[int]]
     timing: PacketTimes
     task: RigTask
@@ -52,11 +53,16 @@ class StoppingTask(RigTask):
         return packet
 
 
-def run_on_rig(program: Path, mechanism, seconds: float, stop_at: int = -1, priority=0) -> Ran:
-    """Run the loop against the simulated rig; send SIGTERM at the packet with the number `stop_at`."""
+def run_on_rig(
+    program: Path, mechanism, seconds: float, stop_at: int = -1, priority=0, vanishes: bool = False
+) -> Ran:
+    """Run the loop against the simulated rig; send SIGTERM at the packet with the number `stop_at`.
+
+    If the rig `vanishes`, it sends no stop packet at its end.
+    """
     log, period = program.parent / "session.csv", mechanism.rig.control_period
     command = [str(program), "--log", str(log), "--priority", str(priority)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         port = int(process.stdout.readline().split()[1])
         ticks = round(seconds / period)
@@ -66,14 +72,14 @@ def run_on_rig(program: Path, mechanism, seconds: float, stop_at: int = -1, prio
         session = open_session(network, 1)
         with real_time_priority(priority > 0):
             run_loop(task, network, session, period, timing, lambda done: None)
-        if stop_at < 0:
+        if stop_at < 0 and not vanishes:
             stop_packet = build_empty_reading(1, STOP, MAX_PACKET_NUMBER)
             network.send_without_faults(encode_reading(stop_packet, session))
         network.close()
-        output, _ = process.communicate(timeout=20)
+        output, errors = process.communicate(timeout=20)
     finally:
         if process.poll() is None:
             process.kill()
             process.communicate()
     report = {line.split()[0]: [int(number) for number in line.split()[1:]] for line in output.splitlines()}
-    return Ran(process.returncode, report, timing, task, log)
+    return Ran(process.returncode, errors, report, timing, task, log)

@@ -76,6 +76,13 @@ def test_loop_in_c_stops_on_sigterm_with_the_drives_at_rest(folder):
     check_shadow(ran)
 
 
+@pytest.mark.slow
+def test_loop_in_c_exits_with_1_if_it_loses_the_plant(folder):
+    ran = rt_loops.run_on_rig(folder, MECHANISM, 0.1, vanishes=True)
+    assert ran.code == 1
+    assert ran.errors.splitlines()[-1] == "rt_loop: plant: found no readings for 2 s, expected some"
+
+
 def test_loop_in_c_rejects_wrong_options(program, tmp_path):
     for arguments, words in (
         (["--lag", "x.csv"], "--lag: unknown option"),

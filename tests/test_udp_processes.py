@@ -146,6 +146,7 @@ def test_interrupted_rig_command_reports_measurements_so_far(tmp_path):
         (("GAINS", "--jitter", "-1"), "--jitter: found -1"),
         (("GAINS", "--delay", "nan"), "--delay: found nan"),
         (("GAINS", "--connect", "0"), "--connect: found 0, expected an integer >= 1"),
+        (("GAINS", "--connect", "9", "--rate", "0.004"), "--rate: found 0.004, expected 0.005 to 1 with"),
         (("GAINS", "--duration", "0"), "--duration: found 0, expected 0.001 to 2000 s"),
         (("BROKEN",), "sha256"),
     ],

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
-from jaxhil.rig.faults import FAULTS
 from jaxhil.rig.flight_recorder import FlightRecorder
 from tuning.rig.numerical_model import NumericalModel
 
@@ -37,10 +36,6 @@ def rt_loop_files(document: Mapping[str, Any]) -> dict[str, str]:
         f"#define HAS_NOISE_OR_BIAS {int(has_noise_or_bias)} /* of the force sensor */",
         "/* Displacement in a period, from the velocities before and after it, and the acceleration. */",
         f"#define MODEL_STEP(before, acceleration, after) {MODEL_STEPS[integrator]}",
-        "/* Bits and names of the controller's faults. */",
-        "#define FAULT_NAMES \\",
-        *(f'    {{{fault.bit:#x}u, "{fault.name}"}}, \\' for fault in FAULTS),
-        '    {0u, ""}',
         "/* Mapping (jaxhil/log/1) of the log. */",
         "#define MAPPING \\",
         *(f"    {json.dumps(line)} \\" for line in mapping.splitlines(keepends=True)),

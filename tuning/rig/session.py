@@ -51,7 +51,8 @@ from tuning.rig.udp_protocol import (
 START_TIMEOUT = 30.0  # longest time until the controller's process listens, then until it answers [s]
 REQUEST_INTERVAL = 0.1  # time between two requests for a session [s]
 END_TIMEOUT = 120.0  # longest time until the controller's process ends, including its replay [s]
-SILENCE_TIMEOUT = 2.0  # time without a packet after which the controller's process ends the session [s]
+# Time without a packet after which the controller's process ends [s]; also the constant SILENCE of rt_loop.c.
+SILENCE_TIMEOUT = 2.0
 
 SOURCE_FOLDER = Path(__file__).parent
 # Record of a controller that this process has not started: it contains no times of ticks.

@@ -5,7 +5,8 @@
  *
  * The plant (sensors and drives) is behind the four functions of `plant_io` in rt_loop.h. After the start, the
  * loop allocates no memory and writes no file: a second thread writes the log, which `jaxhil shadow` reads.
- * SIGTERM and SIGINT trip the controller; the loop ends when the drives are at rest out of contact.
+ * SIGTERM and SIGINT trip the controller; the loop ends when the drives are at rest out of contact. The exit
+ * code is 1 if the plant is lost or the log cannot be written, and 2 for an unusable option.
  */
 #ifdef __linux__
 #define _GNU_SOURCE /* for the affinity to a processor */
@@ -236,7 +237,8 @@ static void count_latency(uint32_t *histogram, int64_t ns) {
     histogram[us < LATENCIES ? us : LATENCIES]++;
 }
 
-static void run_loop(const plant_io *io, double seconds) {
+/* Run until the plant or a signal ends the loop; return false if the plant is lost. */
+static bool run_loop(const plant_io *io, double seconds) {
     const int64_t period = (int64_t)(1e9 * PERIOD + 0.5), begin = now_ns();
     const int64_t end = seconds > 0.0 ? begin + (int64_t)(1e9 * seconds) : INT64_MAX;
     int64_t due = begin, last_readings = begin, stopped = 0;
@@ -260,13 +262,13 @@ static void run_loop(const plant_io *io, double seconds) {
         }
         if (stopped != 0 && (!loop.has_run || (jaxhil_at_rest(&loop.controller) && loop.force == 0.0) ||
                              (double)(woken - stopped) > 1e9 * STOP_TIME)) {
-            break;
+            return true;
         }
         if (io->read(io->plant, &now)) {
             const int64_t started = last_readings = now_ns();
             due += (int64_t)(1e9 * now.shift);
             if (now.event == STOP || (stopped != 0 && now.event != TICK)) {
-                break;
+                return true;
             }
             if (compute(&now, &answer)) {
                 report.ticks += now.event == TICK;
@@ -280,7 +282,7 @@ static void run_loop(const plant_io *io, double seconds) {
         } else {
             report.without_readings += counts;
             if ((double)(woken - last_readings) > 1e9 * SILENCE) {
-                break;
+                return false;
             }
         }
         for (const int64_t finished = now_ns(); due + period <= finished; due += period) {
@@ -373,11 +375,14 @@ int main(int count, char **arguments) {
     if (pthread_create(&writer, NULL, write_log, NULL) != 0) {
         return 2;
     }
-    const bool is_open = io->open(io->plant);
-    if (is_open) {
+    bool is_complete = io->open(io->plant);
+    if (is_complete) {
         request_real_time(cpu, (int)priority);
-        run_loop(io, seconds);
+        is_complete = run_loop(io, seconds);
         io->close(io->plant);
+        if (!is_complete) {
+            fprintf(stderr, "rt_loop: plant: found no readings for %g s, expected some\n", SILENCE);
+        }
     }
     __atomic_store_n(&ring.ends, true, __ATOMIC_RELEASE);
     pthread_join(writer, NULL);
@@ -391,5 +396,5 @@ int main(int count, char **arguments) {
     print_latency("lateness", report.lateness);
     print_latency("computing", report.computing);
     printf("at_rest %d\n", !loop.has_run || jaxhil_at_rest(&loop.controller));
-    return is_open && is_written ? 0 : 1;
+    return is_complete && is_written ? 0 : 1;
 }

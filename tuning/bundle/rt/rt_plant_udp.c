@@ -13,6 +13,7 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "jaxhil_controller.h"
 #include "rt_loop.h"
 
 typedef struct {
@@ -144,17 +145,14 @@ static bool udp_read(void *plant, readings *now) {
 
 /* Write "tripped: " and the names of the faults, at most 95 characters. */
 static void describe_trip(uint32_t cause, char *text) {
-    static const struct {
-        uint32_t bit;
-        const char *name;
-    } faults[] = {FAULT_NAMES};
     size_t length = 8;
     memcpy(text, "tripped:", 8);
-    for (size_t n = 0; n < sizeof faults / sizeof faults[0]; n++) {
-        const size_t size = strlen(faults[n].name);
-        if ((cause & faults[n].bit) && length + size < 95) {
+    for (uint32_t bit = 1; bit != 0; bit <<= 1) {
+        const char *const name = jaxhil_fault_name(bit);
+        const size_t size = strlen(name);
+        if ((cause & bit) && length + size < 95) {
             text[length] = ' ';
-            memcpy(text + length + 1, faults[n].name, size);
+            memcpy(text + length + 1, name, size);
             length += size + 1;
         }
     }

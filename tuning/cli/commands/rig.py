@@ -17,6 +17,7 @@ MAX_EMPTY_LOOP_DURATION = 30.0  # s; longest duration of the empty loop, which o
 EMPTY_LOOP_SHARE = 0.2  # duration of the empty loop, divided by the run's duration
 MAX_TICKS = 2_000_000  # largest number of ticks in a run
 MINIMUM_RATE = 1e-3  # [1]; at this rate, a run of 10 s takes almost 3 hours
+MIN_PACKETS = 10  # smallest number of packets in the time after which a running controller ends
 MAX_TABLE_ROWS = 12  # largest number of contacts in the printed table
 
 
@@ -46,9 +47,15 @@ def run(options: RigOptions) -> int:
 
     from tuning.rig.network import Injection
     from tuning.rig.rig_task import build_simulated_rig
-    from tuning.rig.session import SessionSettings, real_time_priority, run_session
+    from tuning.rig.session import SILENCE_TIMEOUT, SessionSettings, real_time_priority, run_session
     from tuning.rig.session_report import evaluate_session
 
+    slowest = MIN_PACKETS * period / SILENCE_TIMEOUT
+    if options.connect is not None and options.rate < slowest:
+        raise InputError(
+            f"--rate: found {options.rate:g}, expected {slowest:g} to 1 with --connect, because a running "
+            f"controller ends after {SILENCE_TIMEOUT:g} s without a packet"
+        )
     try:
         with real_time_priority(options.realtime):
             pass
