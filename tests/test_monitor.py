@@ -9,6 +9,7 @@ import pytest
 
 import jaxhil as package
 from jaxhil.mechanism.file import from_plain_data, to_plain_data
+from tuning.identification.mechanism_check import check_against_mechanism
 from tuning.identification.mechanism_file import to_toml
 from tuning.identification.monitor.metrics import BIAS_INDEX, METRIC_NAMES, NOISE_INDEX
 from tuning.identification.monitor.monitor import monitor_contacts
@@ -60,6 +61,38 @@ def changed_kind(kind, **sections):
 CLEAN = campaigns.KINDS["clean"]
 EVERY = ("lagging", "stiffnesses", "dead_zone")
 RARER = ("clean", "third_order", "resonance", "hertz", "layered")
+
+
+@pytest.fixture(scope="module")
+def silent():
+    """Return a campaign of one contact without noise."""
+    return contacts(noiseless(CLEAN), speeds=(0.006,))
+
+
+@pytest.mark.parametrize(
+    "effect, finding",
+    [
+        ({"filter": {"kind": "butterworth", "order": 2, "cutoff": 250.0}}, "a butterworth filter of order 2"),
+        ({"dead_zone": 4.0, "dead_zone_kind": "cut"}, "a cut dead zone of 4 N"),
+        ({"jitter": 1e-4}, "jitter = 0.0001"),
+        ({"loss_probability": 0.01}, "loss_probability = 0.01"),
+    ],
+)
+def test_file_with_unmodelled_effect_is_rejected_by_monitor_and_not_good_in_identify(silent, effect, finding):
+    kind = noiseless(CLEAN)
+    changed = file_of(changed_kind(kind, force_sensor=effect))
+    with pytest.raises(package.InputError, match=f"found {finding}, expected none: monitor does not"):
+        monitor_contacts(silent, changed)
+    result = check_against_mechanism(silent, changed)
+    assert not result.good and any(line.finding.startswith(finding) for line in result.lines)
+    assert f"{finding}, which `identify` does not model" in result.verdict
+
+
+def test_file_with_missed_ticks_in_its_uncertainty_is_rejected_by_monitor(silent):
+    key = "rig.missed_tick_probability"
+    changed = file_of(noiseless(CLEAN), {key: {"distribution": "uniform", "low": 0.0, "high": 0.01}})
+    with pytest.raises(package.InputError, match=f"{key}: found missed_tick_probability in .uncertainty"):
+        monitor_contacts(silent, changed)
 
 
 @pytest.mark.parametrize("name", (*EVERY, *(pytest.param(one, marks=pytest.mark.slow) for one in RARER)))

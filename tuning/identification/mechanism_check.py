@@ -32,6 +32,7 @@ from tuning.identification.result import (
     suggest_experiment,
 )
 from tuning.identification.uncertainty_effect import UncertaintyEffect, compute_uncertainty_effect
+from tuning.identification.unmodelled_effects import check_modelled_effects
 
 MIN_DELAY_STD = 2e-5  # s, minimum standard deviation of a delay
 ASSUMED_CONTACT_FREQUENCY = 3.0  # Hz, contact frequency that is assumed if the logs have no contact
@@ -74,7 +75,7 @@ def check_against_mechanism(
     frequency = (
         ASSUMED_CONTACT_FREQUENCY if contact is None else contacts.estimate_contact_frequency(contact, mass)
     )
-    lines = validation.check_sensor_effects(mechanism.rig.force_sensor)
+    lines = check_modelled_effects(mechanism)
     if motion is not None:
         fitted = fitted or free_motion.fit_free_motion(free, campaign.timing)
         assert fitted is not None

@@ -19,6 +19,7 @@ from tuning.identification.options import IdentificationOptions
 from tuning.identification.rational import MotionModel
 from tuning.identification.records import CONTACT_KINDS, Campaign, LoggedRun
 from tuning.identification.uncertainty_effect import compute_uncertainty_effect
+from tuning.identification.unmodelled_effects import check_modelled_effects
 
 
 def check_result(
@@ -91,7 +92,7 @@ def _check_fits(
     written: Mechanism | None,
 ) -> list[validation.CheckResult]:
     """Return the checks of the fits to free motion and contact, at the contact frequency [Hz]."""
-    lines = [] if written is None else validation.check_sensor_effects(written.rig.force_sensor)
+    lines = [] if written is None else check_modelled_effects(written)
     if motion is not None:
         lines += [
             *validation.check_motion_model(motion, frequency),

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special, stats
 
-from jaxhil.mechanism.structs import ForceSensor
 from tuning.identification.clock_drift import estimate_residual_delays, fit_weighted_slope
 from tuning.identification.contact_fit import ContactFit
 from tuning.identification.contact_problem import MAX_FORCE_DELAY
@@ -281,20 +280,6 @@ def _check_cutting_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list
         return []
     finding = f"no reading lies between 0 and {least:.2g} N, as with a dead zone that is not subtracted"
     return [CheckResult("dead zone of the force sensor", finding, True, float(least / np.median(peaks)))]
-
-
-def check_sensor_effects(sensor: ForceSensor) -> list[CheckResult]:
-    """Return a failed check if a file's force sensor has an effect that `identify` does not model."""
-    lines = []
-    if sensor.dead_zone_kind == "cut" and sensor.dead_zone > 0.0:
-        finding = f"a cut dead zone of {sensor.dead_zone:g} N, which `identify` does not model"
-        lines.append(CheckResult("dead zone of the force sensor", finding, True, 1.0))
-    if sensor.filter is not None:
-        finding = (
-            f"a {sensor.filter.kind} filter of order {sensor.filter.order}, which `identify` does not model"
-        )
-        lines.append(CheckResult("filter of the force sensor", finding, True, 1.0))
-    return lines
 
 
 def estimate_restitution_errors(

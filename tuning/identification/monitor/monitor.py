@@ -28,6 +28,7 @@ from tuning.identification.monitor.predicted_readings import (
 )
 from tuning.identification.monitor.uncertain_parameters import UncertainParameter, list_uncertain_parameters
 from tuning.identification.records import Campaign, CampaignTiming, LoggedRun
+from tuning.identification.unmodelled_effects import reject_unmodelled_effects
 
 RUNS_PER_BATCH = 64  # number of runs that are computed together
 SENSOR_DELAY_KEYS = "rig.force_sensor.delay", "rig.position_sensor.delay"
@@ -122,12 +123,9 @@ def monitor_contacts(campaign: Campaign, mechanism: Mechanism) -> MonitorResult:
     runs = [run for run in campaign.runs if run.kind in ("contact", "tap") and run.force_measured is not None]
     if not runs:
         raise InputError("logs: found no contact, expected a run of kind contact or tap")
+    reject_unmodelled_effects(mechanism)
     numbers, correlation = list_uncertain_parameters(mechanism)
     sensor = mechanism.rig.force_sensor
-    if sensor.filter is not None:
-        raise InputError(
-            "rig.force_sensor.filter: found a filter, expected none: monitor does not predict it"
-        )
     prediction = MetricFilter(correlation, float(np.hypot(sensor.noise_std, sensor.quantum)))
     monitor = _MonitorState(prediction)
     for run, features in zip(runs, _compute_run_metrics(runs, mechanism, campaign, numbers), strict=True):

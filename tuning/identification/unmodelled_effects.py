@@ -1,0 +1,45 @@
+"""Effects of a mechanism file that neither `identify` nor `monitor` models."""
+
+from __future__ import annotations
+
+from jaxhil.errors import InputError
+from jaxhil.mechanism.structs import Mechanism
+from tuning.identification.validation import CheckResult
+
+
+def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
+    """Return name and description of each effect in a file that is not modelled, by key.
+
+    An effect that only the table `[uncertainty]` contains counts too.
+    """
+    rig, sensor, effects = mechanism.rig, mechanism.rig.force_sensor, {}
+    if sensor.dead_zone_kind == "cut" and sensor.dead_zone > 0.0:
+        text = f"a cut dead zone of {sensor.dead_zone:g} N"
+        effects["rig.force_sensor.dead_zone_kind"] = "dead zone of the force sensor", text
+    if sensor.filter is not None:
+        text = f"a {sensor.filter.kind} filter of order {sensor.filter.order}"
+        effects["rig.force_sensor.filter"] = "filter of the force sensor", text
+    for key, name, value in (
+        ("rig.force_sensor.jitter", "jitter of the force sensor", sensor.jitter),
+        ("rig.force_sensor.loss_probability", "lost frames of the force sensor", sensor.loss_probability),
+        ("rig.missed_tick_probability", "missed ticks", rig.missed_tick_probability),
+    ):
+        if key in mechanism.uncertainty:
+            effects[key] = name, f"{key.rpartition('.')[2]} in [uncertainty]"
+        elif value > 0.0:
+            effects[key] = name, f"{key.rpartition('.')[2]} = {value:g}"
+    return effects
+
+
+def check_modelled_effects(mechanism: Mechanism) -> list[CheckResult]:
+    """Return a failed check for each effect in a mechanism file that `identify` does not model."""
+    return [
+        CheckResult(name, f"{text}, which `identify` does not model", True, 1.0)
+        for name, text in list_unmodelled_effects(mechanism).values()
+    ]
+
+
+def reject_unmodelled_effects(mechanism: Mechanism) -> None:
+    """Raise `InputError` if a mechanism file has an effect that `monitor` does not predict."""
+    for key, (_, text) in list_unmodelled_effects(mechanism).items():
+        raise InputError(f"{key}: found {text}, expected none: monitor does not predict it")
