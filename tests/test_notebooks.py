@@ -40,6 +40,7 @@ def test_every_notebook_cell_runs_without_error(path, tmp_path, monkeypatch):
     inherited = os.environ.get("PYTHONPATH")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *([inherited] if inherited else [])]))
     notebook = nbformat.read(copy, as_version=4)
+    # The limit applies to each cell. Each of the two tunings with six axes in notebook 09 takes some minutes.
     client = NotebookClient(
         notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
     )
