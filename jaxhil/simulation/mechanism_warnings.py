@@ -5,13 +5,16 @@ from typing import NamedTuple
 
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.laws.shared.nominal_values import force_delay
+from jaxhil.mechanism.number_ranges import value_at
 from jaxhil.mechanism.structs import Mechanism
 
-PLAUSIBLE_FREQUENCIES = 0.05, 50.0  # Hz; lowest and highest plausible contact frequency
+PLAUSIBLE_FREQUENCIES = 0.15, 50.0  # Hz; lowest and highest plausible contact frequency
 MIN_FREQUENCY_RATIO = 1e-4  # [1]; lowest plausible contact frequency as a fraction of the control rate
 MAX_PLAUSIBLE_BANDWIDTH = 50.0  # Hz; highest plausible natural frequency of a motion simulator
 MAX_FREQUENCY_RATIO = 0.1  # [1]; highest plausible contact frequency as a fraction of the control rate
 MAX_PLAUSIBLE_VELOCITY = 1.0  # m/s; highest plausible approach velocity
+# m; largest plausible distances by key
+MAX_PLAUSIBLE_DISTANCES = {"rig.contact_plane": 0.1, "contact.clearance": 1.0}
 
 
 class ContactSummary(NamedTuple):
@@ -47,7 +50,14 @@ def find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) ->
     lowest = max(lowest, MIN_FREQUENCY_RATIO / rig.control_period)
     if slowest.frequency < lowest:
         hint = "is the stiffness in N/mm, or a mass in g?"
-        warnings.append(f"{_format_frequency(slowest)}, expected at least {lowest:g} Hz ({hint})")
+        if find_contact_law(contact.law).is_linear:
+            hint += f" then it is {math.sqrt(1000) * slowest.frequency:.2g} Hz"
+        lasts = f", which lasts {slowest.duration:.2g} s" if math.isfinite(slowest.duration) else ""
+        warnings.append(f"{_format_frequency(slowest)}{lasts}, expected at least {lowest:g} Hz ({hint})")
+    for key, largest in MAX_PLAUSIBLE_DISTANCES.items():
+        distance = abs(value_at(mechanism, key))
+        if math.isfinite(distance) and distance > largest:
+            warnings.append(f"{key}: found {distance:.4g} m, expected at most {largest:g} m (is it in mm?)")
     if mechanism.approach.velocity > MAX_PLAUSIBLE_VELOCITY:
         velocity = f"{mechanism.approach.velocity:.4g} m/s"
         warnings.append(
