@@ -1,26 +1,21 @@
 """C99 generator on small programs: the same bits as Python, or an error with file and line."""
 
 import ctypes
-import inspect
 import itertools
 import math
-import struct
 from math import exp, floor, inf, isfinite, log, nan, sqrt
 from typing import Annotated, NamedTuple
 
-import c99_cases
 import pytest
+from codegen_programs import Inner, Pair, compiled, needs_compiler, same
 
-from jaxhil.codegen import CProgram, SubsetError
+from jaxhil.codegen import CProgram
 from jaxhil.rig.filters import DelayLine
 from jaxhil.rig.types import Positive
 
-needs_compiler = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 NUMBERS = (0.0, -0.0, 0.5, 1.0, -1.0, 1.5, -2.5, 2.5, 7.0, -7.3, 1e-320, 1e300, -1e300, inf, -inf, nan)
 FAILED = 12345.0
 WEIGHTS = (0.5, -2.0, 3.0)  # weights of readings in a sum
-HEADER = "#include <math.h>\n#include <stdbool.h>\n#include <stddef.h>\n#include <stdint.h>\n"
-STRICT = ("-O2", "-Wconversion", "-Wshadow", "-Wno-unused-function", "-shared", "-fPIC")
 
 
 def divide(a: float, b: float) -> float:
@@ -88,36 +83,6 @@ def conditions(a: float, b: float) -> float:
     return first / a if between and b / a > 1.0 else first
 
 
-class Pair(NamedTuple):
-    """Two numbers and a count."""
-
-    first: float
-    second: float
-    count: int
-
-
-class Inner:
-    """Sum of numbers and their last values."""
-
-    __slots__ = ("_last", "_sum", "calls")
-
-    def __init__(self, start: float) -> None:
-        self._sum = start
-        self._last = [0.0] * 3
-        self.calls = 0
-
-    def add(self, value: float) -> float:
-        """Add a value."""
-        last = self._last
-        last[self.calls % 3] = value
-        self.calls += 1
-        self._sum += value / last[2] if value > 1.0 else last[1]
-        return self._sum
-
-    def pair(self) -> Pair:
-        return Pair(self._sum, self._last[-1], self.calls)
-
-
 class Outer:
     """Objects, lists of lists, and a delay line whose length is known at run time."""
 
@@ -180,20 +145,6 @@ FUNCTIONS = (
 OF_INTS = (whole, product_of_ints, sums_of_ints, remainders_of_ints)
 
 
-def compiled(tmp_path, program: CProgram, more: str = "") -> ctypes.CDLL:
-    """Return the program as a shared library, compiled with the controller's strict flags."""
-    output = program.output()
-    text = f"{HEADER}#define T_DELAY_LINE_SAMPLES 4\n{output.declarations}\n{output.definitions}\n{more}"
-    (tmp_path / "program.c").write_text(text)
-    return ctypes.CDLL(str(c99_cases.compiled(tmp_path, "program.c", "program.so", *STRICT)))
-
-
-def same(actual: float, expected: float) -> bool:
-    return struct.pack("d", actual) == struct.pack("d", expected) or (
-        actual != actual and expected != expected
-    )
-
-
 @needs_compiler
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda function: function.__name__)
 def test_c99_function_equals_python_and_fails_where_python_raises(function, tmp_path):
@@ -248,220 +199,6 @@ def test_c99_classes_records_and_lists_equal_python_bit_for_bit(tmp_path):
             expected, failures = FAILED, failures + 1
         assert same(library.step(a, b), expected), (a, b)
     assert 0 < failures < 9
-
-
-def uses_sum(a: float, b: float) -> float:
-    return sum([a, b])
-
-
-def has_two_types(a: float, b: float) -> float:
-    value = 1
-    value = a + b
-    return value
-
-
-def shares_a_list(a: float, b: float) -> float:
-    shared = Sharing(a)
-    return shared.first[0] + b
-
-
-def has_no_annotation(a, b):
-    return a + b
-
-
-def uses_text(a: float, b: float) -> float:
-    return a + len("ab") + b
-
-
-def calls_itself(a: float, b: float) -> float:
-    return a if b > 0.0 else calls_itself(a, b + 1.0)
-
-
-def has_a_dictionary(a: float, b: float) -> float:
-    return {1: a}[1] + b
-
-
-def hides_a_branch(a: float, b: float) -> float:
-    with open("file") as file:
-        return a + b + len(file.name)
-
-
-class Aliasing:
-    """Local name for a list that is then replaced in its attribute."""
-
-    rows: Annotated[list[list[float]], 2, 2]
-
-    def __init__(self, start: float) -> None:
-        self.last = [start] * 2
-        self.rows = [[start, 1.0] for _ in range(2)]
-        self.inner = Inner(start)
-
-    def replace(self) -> None:
-        self.last = [1.0, 2.0]
-
-    def then_read(self, a: float, b: float) -> float:
-        last = self.last
-        self.last = [a, b]
-        return last[0]
-
-    def replaced_by_a_call(self, a: float, b: float) -> float:
-        last = self.last
-        self.replace()
-        return last[0]
-
-    def replace_and_read(self, values: Annotated[list[float], 2]) -> float:
-        self.replace()
-        return values[0]
-
-    def replaced_by_the_called(self, a: float, b: float) -> float:
-        return self.replace_and_read(self.last) + a + b
-
-    def read_in_the_next_pass(self, a: float, b: float) -> float:
-        last, total = self.last, 0.0
-        for _ in range(3):
-            total += last[0]
-            self.last = [total, b]
-        return total
-
-    def replaced_while_looped_through(self, a: float, b: float) -> float:
-        total = 0.0
-        for value in self.last:
-            total += value
-            self.last = [a, total]
-        return total
-
-    def object_replaced(self, a: float, b: float) -> float:
-        inner = self.inner
-        self.inner = Inner(a)
-        return inner.add(b)
-
-    def row_replaced(self, a: float, b: float) -> float:
-        row = self.rows[0]
-        self.rows[0] = [a, b]
-        return row[0]
-
-    def changed_in_place(self, a: float, b: float) -> float:
-        last, rows = self.last, self.rows
-        row = rows[1]
-        last[:] = [last[1] + a, b]
-        row[:] = [b, a]
-        rows[0] = [row[0] - 1.0, last[1]]
-        total = 0.0
-        for value in last:
-            total += value + self.rows[0][0] + self.rows[1][1]
-        self.last = [total, last[0]]
-        return total + self.last[1] + rows[0][0]
-
-
-class Sharing:
-    """Two attributes that share one list, which is modified in place."""
-
-    def __init__(self, start: float) -> None:
-        self.first = [start] * 2
-        self.second = self.first
-        self.first[0] = 0.0
-
-
-class Defaulting:
-    """Class with an attribute that has a default and that only a method assigns, not `__init__`."""
-
-    count: int = 3
-
-    def __init__(self, start: float) -> None:
-        self.total = start
-
-    def step(self, a: float, b: float) -> float:
-        self.total += a * self.count
-        self.count = 2
-        return self.total + b
-
-
-@pytest.mark.parametrize(
-    ("function", "line", "message"),
-    [
-        (uses_sum, 1, "found sum(...), expected a loop"),
-        (has_two_types, 2, "found a float for a int, expected one type for each name"),
-        (shares_a_list, 1, "found Sharing(...) here, expected `self.name = Class(...)`"),
-        (has_no_annotation, 0, "found no type in C for a of has_no_annotation, expected an annotation"),
-        (uses_text, 1, "found len of a non-number, expected len of a list"),
-        (calls_itself, 0, "found calls_itself calling itself, expected a loop"),
-        (has_a_dictionary, 1, "found Dict, expected an expression of numbers"),
-        (hides_a_branch, 1, "found With, expected assignments, if, for"),
-        (Sharing.__init__, 2, "found a list that is shared and changed in place, expected a copy"),
-        (
-            Defaulting.step,
-            2,
-            "found the first assignment to count, which has a default, expected an assignment",
-        ),
-    ],
-    ids=lambda value: getattr(value, "__name__", ""),
-)
-def test_python_construct_outside_c99_subset_is_rejected_with_file_and_line(function, line, message):
-    program = CProgram("t_")
-    owner = {Sharing.__init__: Sharing, Defaulting.step: Defaulting}.get(function)
-    with pytest.raises(SubsetError) as error:
-        if owner is not None:
-            program.add(owner.__init__, owner)
-        program.add(function, owner)
-        program.output()
-    location = f"{inspect.getsourcefile(function)}:{inspect.getsourcelines(function)[1] + line}: "
-    assert str(error.value).startswith(location + message), error.value
-
-
-@pytest.mark.parametrize(
-    ("method", "line", "name"),
-    [
-        (Aliasing.then_read, 2, "last"),
-        (Aliasing.replaced_by_a_call, 2, "last"),
-        (Aliasing.read_in_the_next_pass, 4, "last"),
-        (Aliasing.replaced_while_looped_through, 4, "the loop"),
-        (Aliasing.row_replaced, 2, "row"),
-        (Aliasing.object_replaced, 2, "inner"),
-    ],
-    ids=lambda value: getattr(value, "__name__", ""),
-)
-def test_c99_access_to_replaced_list_through_old_alias_is_rejected(method, line, name):
-    program = CProgram("t_")
-    program.add(Aliasing.__init__, Aliasing)
-    with pytest.raises(SubsetError) as error:
-        program.add(method, Aliasing)
-    location = f"{__file__}:{inspect.getsourcelines(method)[1] + line}: "
-    assert str(error.value).startswith(
-        f"{location}found a new list or object while {name} uses the old one, expected"
-    )
-
-
-def test_c99_list_alias_is_rejected_if_called_method_replaces_the_list():
-    program = CProgram("t_")
-    program.add(Aliasing.__init__, Aliasing)
-    with pytest.raises(SubsetError, match="found values as an argument of replace_and_read, which"):
-        program.add(Aliasing.replaced_by_the_called, Aliasing)
-
-
-@needs_compiler
-def test_c99_list_with_two_names_is_modified_in_place_as_in_python(tmp_path):
-    program = CProgram("t_")
-    program.add(Aliasing.__init__, Aliasing)
-    program.add(Aliasing.changed_in_place, Aliasing)
-    more = """
-static t_aliasing aliasing;
-void begin(double start) { t_aliasing_init(&aliasing, start); }
-double step(double a, double b) { return t_aliasing_changed_in_place(&aliasing, a, b); }
-"""
-    library = compiled(tmp_path, program, f"void begin(double);\ndouble step(double, double);\n{more}")
-    library.begin.argtypes, library.step.argtypes = [ctypes.c_double], [ctypes.c_double] * 2
-    library.step.restype = ctypes.c_double
-    library.begin(0.5)
-    aliasing = Aliasing(0.5)
-    for a, b in itertools.product((0.1, -3.0, 7.5), repeat=2):
-        assert same(library.step(a, b), aliasing.changed_in_place(a, b))
-
-
-def test_c99_public_function_that_may_raise_is_rejected():
-    program = CProgram("t_", public={divide: "t_divide"})
-    program.add(divide)
-    with pytest.raises(SubsetError, match=r"found a division whose divisor may be 0 within t_divide"):
-        program.output()
 
 
 def test_c99_code_omits_zero_check_for_nonzero_constant_divisors():

@@ -128,3 +128,105 @@ def test_message_for_rejected_c99_construct_names_file_line_and_alternative(func
         CProgram("t_").add(function)
     location = f"{__file__}:{inspect.getsourcelines(function)[1] + line}: "
     assert str(error.value).startswith(f"{location}found {message}"), error.value
+
+
+def uses_sum(a: float, b: float) -> float:
+    return sum([a, b])
+
+
+def has_two_types(a: float, b: float) -> float:
+    value = 1
+    value = a + b
+    return value
+
+
+def shares_a_list(a: float, b: float) -> float:
+    shared = Sharing(a)
+    return shared.first[0] + b
+
+
+def has_no_annotation(a, b):
+    return a + b
+
+
+def uses_text(a: float, b: float) -> float:
+    return a + len("ab") + b
+
+
+def calls_itself(a: float, b: float) -> float:
+    return a if b > 0.0 else calls_itself(a, b + 1.0)
+
+
+def has_a_dictionary(a: float, b: float) -> float:
+    return {1: a}[1] + b
+
+
+def hides_a_branch(a: float, b: float) -> float:
+    with open("file") as file:
+        return a + b + len(file.name)
+
+
+class Sharing:
+    """Two attributes that share one list, which is modified in place."""
+
+    def __init__(self, start: float) -> None:
+        self.first = [start] * 2
+        self.second = self.first
+        self.first[0] = 0.0
+
+
+class Defaulting:
+    """Class with an attribute that has a default and that only a method assigns, not `__init__`."""
+
+    count: int = 3
+
+    def __init__(self, start: float) -> None:
+        self.total = start
+
+    def step(self, a: float, b: float) -> float:
+        self.total += a * self.count
+        self.count = 2
+        return self.total + b
+
+
+@pytest.mark.parametrize(
+    ("function", "line", "message"),
+    [
+        (uses_sum, 1, "found sum(...), expected a loop"),
+        (has_two_types, 2, "found a float for a int, expected one type for each name"),
+        (shares_a_list, 1, "found Sharing(...) here, expected `self.name = Class(...)`"),
+        (has_no_annotation, 0, "found no type in C for a of has_no_annotation, expected an annotation"),
+        (uses_text, 1, "found len of a non-number, expected len of a list"),
+        (calls_itself, 0, "found calls_itself calling itself, expected a loop"),
+        (has_a_dictionary, 1, "found Dict, expected an expression of numbers"),
+        (hides_a_branch, 1, "found With, expected assignments, if, for"),
+        (Sharing.__init__, 2, "found a list that is shared and changed in place, expected a copy"),
+        (
+            Defaulting.step,
+            2,
+            "found the first assignment to count, which has a default, expected an assignment",
+        ),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_python_construct_outside_c99_subset_is_rejected_with_file_and_line(function, line, message):
+    program = CProgram("t_")
+    owner = {Sharing.__init__: Sharing, Defaulting.step: Defaulting}.get(function)
+    with pytest.raises(SubsetError) as error:
+        if owner is not None:
+            program.add(owner.__init__, owner)
+        program.add(function, owner)
+        program.output()
+    location = f"{inspect.getsourcefile(function)}:{inspect.getsourcelines(function)[1] + line}: "
+    assert str(error.value).startswith(location + message), error.value
+
+
+def divide(a: float, b: float) -> float:
+    return a / b
+
+
+def test_c99_public_function_that_may_raise_is_rejected():
+    program = CProgram("t_", public={divide: "t_divide"})
+    program.add(divide)
+    with pytest.raises(SubsetError, match=r"found a division whose divisor may be 0 within t_divide"):
+        program.output()

@@ -1,96 +1,20 @@
-"""Controller of a six-axis rig: guards, limits, watchdog, retreat, and hostile inputs."""
+"""Controller of a six-axis rig: sensor, guards, limits, retreat, and hostile inputs."""
 
-import functools
-import json
 import math
-from itertools import groupby
-from operator import itemgetter
 
 import numpy as np
 import pytest
-from gain_documents import sign
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from six_axis_documents import LIMITS, six_axis_document
-from six_axis_ranges import NOISE, POSE_NOISE
-from six_axis_records import recorded
-from test_runtime_gain_files import JSON_VALUES, paths, value_at
+from six_axis_flights import PERIOD, START, TWIST, ZERO, along, controller, fly, names
 
 from jaxhil.mechanism.file import load_any
 from jaxhil.rig.faults import fault_names
-from jaxhil.rig.six_axes import Controller6, GainFileError
+from jaxhil.rig.six_axes import Controller6
 from jaxhil.rig.six_axes.faults import SIX_AXIS_FAULTS
 from jaxhil.rig.six_axes.limits import SIX_AXIS_LIMITS
-
-PERIOD = 1e-3
-ZERO = [0.0] * 6
-START = [0.01, -0.02, 0.05, 0.01, 0.0, -0.01]
-TWIST = [0.001, 0.0, -0.02, 0.002, 0.0, 0.0]
-
-
-def controller(compensator="impulse_ledger", **limits):
-    return Controller6.from_dict(six_axis_document(compensator, limits={**LIMITS, **limits}))
-
-
-def along(tick, pose=START, twist=TWIST):
-    """Return the pose at a tick of uniform motion."""
-    return [at + tick * PERIOD * rate for at, rate in zip(pose, twist, strict=True)]
-
-
-def fly(rig, ticks, first=0, wrench=ZERO, timed=False):
-    """Run ticks of free flight; return the pose commands."""
-    sent = []
-    for tick in range(first, first + ticks):
-        now = along(tick)
-        rig.step(wrench, now, TWIST, now, tick * PERIOD if timed else None)
-        sent.append(rig.pose_command(along(tick + 1), TWIST, ZERO))
-    return sent
-
-
-def names(rig):
-    return fault_names(rig.cause, SIX_AXIS_FAULTS)
-
-
-@pytest.fixture(scope="module")
-def records():
-    changes = {"rig.force_sensor.noise_std": NOISE, "rig.position_sensor.noise_std": POSE_NOISE}
-    return recorded(load_any("probe-drogue", changes).mechanism, "impulse_ledger", 3)
-
-
-def replay(rig, record, change=lambda tick, inputs: inputs):
-    """Run a controller with a record's inputs; return its wrench and pose commands."""
-    commands, sent = [], []
-    rows = list(zip(*(column.tolist() for column in record[:4]), strict=True))
-    for tick, row in enumerate(rows):
-        inputs = change(tick, [list(vector) for vector in row])
-        commands.append(rig.step(*inputs, tick * PERIOD))
-        if tick + 1 < len(rows):
-            sent.append(rig.pose_command(rows[tick + 1][1], rows[tick + 1][2], ZERO))
-        if rig.tripped:
-            break
-    return np.array(commands), np.array(sent)
-
-
-def of_records(records, **limits):
-    document = six_axis_document(limits={**LIMITS, **limits}, **records.gains)
-    # The document's gain bounds are those of the mechanism without noise.
-    return Controller6.from_dict(document)
-
-
-def test_six_axis_controller_reproduces_recorded_commands(records):
-    for record in records.lanes:
-        rig = of_records(records)
-        commands, sent = replay(rig, record)
-        assert rig.status == "ok" and rig.seen == 0
-        span = np.ptp(record.command)
-        np.testing.assert_allclose(commands, record.command, rtol=0, atol=1e-9 * span)
-        np.testing.assert_allclose(sent, record.sent[:-1], rtol=0, atol=1e-13)
-        assert 0 < rig.unpaid_impulse < 0.1 and 0.02 < rig.loop_delay < 0.035
-        rig.next_contact()
-        contact = rig.last_contact
-        assert contact.number >= 1 and contact.status == "identified" and not contact.in_doubt
-        assert rig.unpaid_impulse == rig.loop_delay == 0.0
 
 
 def test_changing_a_returned_list_does_not_change_six_axis_controller():
@@ -101,108 +25,6 @@ def test_changing_a_returned_list_does_not_change_six_axis_controller():
     pose = rig.pose_command(START, TWIST, ZERO)
     pose[0] = 1e9
     assert rig.pose_command(START, TWIST, ZERO)[0] == START[0]
-
-
-# Gain file
-
-
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        (lambda d: d.pop("constants"), "constants: found nothing"),
-        (lambda d: d.update(axes=1), "axes: found 1, expected 6"),
-        (lambda d: d["constants"].pop("mass_matrix"), "constants.mass_matrix: found nothing"),
-        (lambda d: d["constants"]["mass_matrix"].pop(), "6 rows of 6 numbers"),
-        (lambda d: d["constants"]["mass_matrix"][0].__setitem__(0, math.inf), "JSON"),
-        (lambda d: d["constants"]["inverse_mass"][2].__setitem__(2, 0.01), "the inverse of"),
-        (lambda d: d["constants"]["mass_matrix"][0].__setitem__(1, 1.0), "positive definite"),
-        (lambda d: d["constants"]["mass_matrix"][3].__setitem__(3, -9.0), "positive definite"),
-        (lambda d: d["constants"].update(mass_matrix=[[1.0] * 6] * 6), "positive definite"),
-        (lambda d: d["constants"]["mass_matrix"][4].append(0.0), "6 rows of 6 numbers"),
-        (lambda d: d["constants"].update(mass_matrix="M"), "6 rows of 6 numbers"),
-        (lambda d: d["constants"]["mass_matrix"][4].__setitem__(0, [1.0]), "a finite number"),
-        (lambda d: d["constants"]["tool_correction"][2].__setitem__(2, -1.0), "tool_correction"),
-        (lambda d: d["constants"]["tool_correction"][0].__setitem__(5, 1.0), "tool_correction"),
-        (lambda d: d["constants"].update(more=1), "an extra key 'more'"),
-        (lambda d: d["constants"].update(longest_delay=5.0), "constants.longest_delay"),
-        (lambda d: d["constants"].update(sensor_sign=0.5), "constants.sensor_sign"),
-        (lambda d: d["constants"]["tool_load"].pop(), "constants.tool_load"),
-        (lambda d: d["limits"].update(stroke={"value": 1.0, "unit": "m"}), "an unknown limit"),
-        (lambda d: d["limits"]["force_range"].update(unit="N m"), "limits.force_range.unit"),
-        (lambda d: d["limits"]["command_lowest_x"].update(value=0.41), "is not below"),
-        (lambda d: d["gains"]["velocity_gain"].update(value=1e9, upper=1e9), "gains.velocity_gain"),
-        (lambda d: d.update(compensator="smith_predictor"), "compensator"),
-    ],
-)
-def test_invalid_six_axis_gain_file_is_rejected(change, message):
-    document = six_axis_document(limits=LIMITS)
-    change(document)
-    try:
-        document = sign(document)
-    except ValueError:
-        pass
-    with pytest.raises(GainFileError, match=message) as error:
-        Controller6.from_dict(document)
-    assert "\n" not in str(error.value)
-
-
-@functools.cache
-def paths_by_part():
-    """Return the paths of a gain file's entries, by the first key."""
-    return {
-        part: list(group) for part, group in groupby(paths(six_axis_document(limits=LIMITS)), itemgetter(0))
-    }
-
-
-PARTS = "constants", "gains", "limits", "axes", "control_period", "compensator"
-CHANGES = JSON_VALUES | st.sampled_from((-1.0, 0.0, 1 - 1e-6, 1.5, 1e9, 1e300))
-
-
-@settings(deadline=None, max_examples=60)
-@given(st.sampled_from(PARTS), st.integers(0), CHANGES, st.sampled_from(("replace", "scale", "remove")))
-def test_changed_six_axis_gain_file_loads_or_is_rejected_with_one_line(part, index, value, change):
-    """Change or remove one entry, sign the file again, and run the controller if the file loads."""
-    document, choices = six_axis_document(limits=LIMITS), paths_by_part()[part]
-    *path, key = choices[index % len(choices)]
-    container = value_at(document, path)
-    if change == "remove":
-        del container[key]
-    elif change == "scale" and isinstance(container[key], float) and isinstance(value, float):
-        container[key] *= value
-    else:
-        container[key] = value
-    try:
-        rig = Controller6.from_dict(sign(document))
-    except GainFileError as error:
-        assert str(error).isprintable() and len(str(error)) < 1500
-    except ValueError:
-        assert not is_json(document)  # `sign` cannot express the value in JSON
-    else:
-        for pose in fly(rig, 20, wrench=[50.0, 0.0, 200.0, 1.0, 0.0, 0.0]):
-            assert all(map(math.isfinite, pose))
-
-
-def is_json(document):
-    """Return whether JSON can express the document."""
-    try:
-        json.dumps(document, allow_nan=False)
-    except ValueError:
-        return False
-    return True
-
-
-def test_six_axis_gain_file_with_changed_digit_in_constants_is_rejected():
-    document = six_axis_document()
-    document["constants"]["mass_matrix"][0][0] *= 1 + 1e-15
-    with pytest.raises(GainFileError, match="sha256"):
-        Controller6.from_dict(document)
-
-
-def test_six_axis_gain_file_with_delay_longer_than_delay_line_is_rejected():
-    document = six_axis_document(identification_delay=0.52)
-    document["gains"]["identification_delay"]["upper"] = 1.0
-    with pytest.raises(GainFileError, match="periods"):
-        Controller6.from_dict(sign(document))
 
 
 # Tests of the force sensor's conversion.
@@ -428,79 +250,6 @@ def test_first_pose_command_of_a_run_starts_at_measured_pose():
     beside = [at + 0.001 for at in START]
     near.step(ZERO, beside, ZERO, START)
     assert near.pose_command(beside, ZERO, ZERO) == beside
-
-
-# Watchdog
-
-
-def test_six_axis_watchdog_trips_on_model_with_wrong_mass(records):
-    document = six_axis_document(limits=LIMITS, **records.gains)
-    document["constants"]["mass_matrix"] = (1.2 * np.array(document["constants"]["mass_matrix"])).tolist()
-    document["constants"]["inverse_mass"] = (np.array(document["constants"]["inverse_mass"]) / 1.2).tolist()
-    rig = Controller6.from_dict(sign(document))
-    replay(rig, records.lanes[0])
-    rig.next_contact()
-    assert "momentum" in names(rig)
-
-
-def test_six_axis_watchdog_trips_on_wrong_sign_of_wrench(records):
-    """Replay wrenches with the wrong sign; the recorded motion then contradicts the commands."""
-    rig = of_records(records, unpaid_impulse=1e9)
-
-    def turned(tick, inputs):
-        inputs[0] = [-value for value in inputs[0]]
-        return inputs
-
-    replay(rig, records.lanes[0], turned)
-    rig.next_contact()
-    assert {"momentum", "energy_gain"} & {*names(rig)}
-
-
-def test_six_axis_watchdog_trips_on_lag_out_of_range(records):
-    rig = of_records(records, lag_highest=0.02)
-    replay(rig, records.lanes[0])
-    assert names(rig) == ["lag"]
-
-
-def test_six_axis_watchdog_trips_on_unpaid_impulse(records):
-    rig = of_records(records, unpaid_impulse=1e-6)
-    replay(rig, records.lanes[0])
-    rig.next_contact()
-    assert names(rig) == ["unpaid_impulse"] and "unpaid impulse" in rig.status
-
-
-def pushed(rig, force, ticks, factor=1.0):
-    """Push a model at 5 mm/s with a force; its mass is too small by `factor`."""
-    inverse = np.array(six_axis_document()["constants"]["inverse_mass"])
-    twist, wrench = np.array([0, 0, -0.005, 0, 0, 0]), np.array([0, 0, force, 0, 0, 0])
-    at = np.array([0, 0, 0.05, 0, 0, 0])
-    rig.step(ZERO, at.tolist(), twist.tolist(), at.tolist())
-    for tick in range(ticks + 40):
-        felt = wrench if tick < ticks else 0 * wrench
-        command = np.array(rig.step(felt.tolist(), at.tolist(), twist.tolist(), at.tolist()))
-        # The force along z has no lever arm at this pose, which hardly changes.
-        twist = twist + factor * PERIOD * inverse @ command
-        at = at + PERIOD * twist
-        at[:2] = 0
-    return rig
-
-
-def test_six_axis_watchdog_trips_on_contact_that_releases_energy():
-    limits = {"force_stuck_travel": 1.0, "fading": 1.0}
-    assert pushed(controller("none", **limits), 30.0, 100).status == "ok"
-    rig = pushed(controller("none", **limits), 30.0, 150)
-    assert names(rig) == ["energy_gain"] and "energy released" in rig.status
-
-
-def test_six_axis_watchdog_trips_if_momentum_differs_from_impulse():
-    limits = {"force_stuck_travel": 1.0, "fading": 1.0, "energy_gain": 1e9}
-    assert pushed(controller("none", **limits), 30.0, 100, 1.03).status == "ok"
-    assert names(pushed(controller("none", **limits), 30.0, 100, 1.1)) == ["momentum"]
-
-
-def test_six_axis_watchdog_trips_on_contact_that_lasts_too_long():
-    limits = {"force_stuck_travel": 1.0, "fading": 1.0, "longest_contact": 0.1}
-    assert names(pushed(controller("none", **limits), 10.0, 120)) == ["contact_too_long"]
 
 
 # Tests with hostile inputs.
