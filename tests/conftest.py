@@ -49,7 +49,12 @@ CHECKED = [
     for path in sorted((Path(__file__).parent.parent / "jaxhil" / package).glob("[a-z]*.py"))
     if path.stem not in FRONT_DOOR
 ]
-OWN_TESTS = {"test_compensators", "test_contacts", *(f"test_{name.split('.')[1]}" for name in CHECKED)}
+OWN_TESTS = {
+    "test_compensators",
+    "test_contacts",
+    "test_run_limits",
+    *(f"test_{name.split('.')[1]}" for name in CHECKED),
+}
 OWN_TESTS -= {"test_rollout"}  # the longest; other tests check the shapes of the same modules
 jaxtyping.install_import_hook([f"jaxhil.{name}" for name in CHECKED], "beartype.beartype")
 

@@ -2,8 +2,8 @@
 
 The motion simulator's output is a polynomial in time (`oracle_motion`), and the contact force is one smooth
 formula on each of the segments between events (`oracle_contact`). Sensor readings (delayed, lagging,
-quantised) are evaluated on these segments; then the compensator computes the command, and the numerical model
-is integrated.
+quantised; `oracle_sensors`) are evaluated on these segments; then the compensator computes the command, and
+the numerical model is integrated.
 Time inside this module is counted in control periods ("ticks", a float); all other quantities are in SI
 units.
 """
@@ -12,17 +12,14 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import dataclass
-from itertools import pairwise
-from math import ceil, inf, isfinite
+from math import inf, isfinite
 from typing import Any
 
 import numpy as np
 from numpy.polynomial.polynomial import polyder
-from oracle_contact import SMOOTH_NODES, SMOOTH_WEIGHTS, Law, Piece, Work, cut
+from oracle_contact import Law, Piece, Work, cut
 from oracle_motion import TIME_TOLERANCE, Motion, delay_in_ticks
-from scipy import signal
-
-FORGOTTEN = 50.0  # time constants after which a lagging reading no longer depends on a past force
+from oracle_sensors import LaggingSensor, quantise
 
 
 class NoCompensator:
@@ -136,17 +133,14 @@ class _Run:
         sensor = rig.get("force_sensor", {})
         self.sensor = sensor
         self.force_delay = delay_in_ticks(sensor.get("delay", 0.0), T)
-        self.lag = sensor.get("time_constant", 0.0)
-        self.lag_state = 0.0
-        self.filter_poles, self.filter_gains = _filter_modes(sensor.get("filter"))
-        if len(self.filter_poles):
-            self.lag = -1.0 / max(self.filter_poles.real)
-            self.lag_state = 0.0 * self.filter_poles
+        self.lag = LaggingSensor(sensor, T)
         std, bias = sensor.get("noise_std", 0.0), sensor.get("bias", 0.0)
         self.noisy = std != 0.0 or bias != 0.0 or self.force_noise is not None
         self.jitter, self.lost, self.missed = jitter, lost, missed
         self.reading = self.command = 0.0
-        self.quiet_ticks = self.force_delay + 20.0 * self.lag / T + 2.0 + sensor.get("jitter", 0.0) / T
+        self.quiet_ticks = (
+            self.force_delay + 20.0 * self.lag.time_constant / T + 2.0 + sensor.get("jitter", 0.0) / T
+        )
         position_sensor = rig.get("position_sensor", {})
         self.position_quantum = position_sensor.get("quantum", 0.0)
         self.position_delay = delay_in_ticks(position_sensor.get("delay", 0.0), T)
@@ -166,7 +160,7 @@ class _Run:
         if self.ideal_zoh and self.law.damped():
             raise ValueError("ideal simulator with zoh hold has no velocity: refuse damped laws")
 
-        self.pieces, self.cursor = [], 0
+        self.pieces = []
         self.last_force_end, self.last_side = -inf, 1
         self.died_out, self.armed = 0.0, True
         self.log, self.shortfalls = [], [0.0]
@@ -335,14 +329,14 @@ class _Run:
         return self.pieces[newest - 1].force_at(time) if newest else 0.0
 
     def _read_force(self, n):
-        if self.lag > 0.0:
-            force = self._lagged(n)
+        if self.lag.time_constant > 0.0:
+            force = self.lag.read(n, self.force_delay, self.pieces)
         else:
             late = 0.0 if self.jitter is None else self.jitter[n] / self.period
             force = self._true_force(n - self.force_delay - late)
         force += self.sensor.get("bias", 0.0)
         force += 0.0 if self.force_noise is None else self.force_noise[n]
-        force = _quantise(force, self.sensor.get("quantum", 0.0))
+        force = quantise(force, self.sensor.get("quantum", 0.0))
         beyond = abs(force) - self.sensor.get("dead_zone", 0.0)
         if self.sensor.get("dead_zone_kind") == "cut":
             force = force if beyond > 0.0 else 0.0
@@ -353,56 +347,10 @@ class _Run:
             self.reading = float(min(max(force, -limit), limit))
         return self.reading
 
-    def _lagged(self, n):
-        """Return the output of the lag at t_n: lag y' = F(t - tau_f) - y, exact over the last period."""
-        if n == 0:
-            return 0.0
-        start, end = n - 1 - self.force_delay, n - self.force_delay
-        rate = self.period / self.lag
-        total = 0.0
-        while self.cursor < len(self.pieces) and self.pieces[self.cursor].end <= start:
-            self.cursor += 1
-        for piece in self.pieces[self.cursor :]:
-            # Earlier forces no longer affect the reading.
-            a, b = max(piece.start, start, end - FORGOTTEN / rate), min(piece.end, end)
-            if piece.start >= end:
-                break
-            if piece.side == 0 or b <= a:
-                continue
-            # In time constants before the end: for a short lag, absolute times would lose digits.
-            edges = np.linspace((end - a) * rate, (end - b) * rate, max(1, ceil((b - a) * rate)) + 1)
-            for early, late in pairwise(edges):
-                ago = early + (late - early) * SMOOTH_NODES
-                forces = piece.force((end - ago / rate - piece.origin) / piece.length)
-                if len(self.filter_poles):
-                    responses = np.exp(np.outer(self.filter_poles, ago * self.lag)) * self.lag
-                else:
-                    responses = np.exp(-ago)
-                total += (responses @ (forces * SMOOTH_WEIGHTS)) * (early - late)
-        if len(self.filter_poles):
-            self.lag_state = np.exp(self.filter_poles * self.period) * self.lag_state + total
-            return float((self.filter_gains @ self.lag_state).real)
-        self.lag_state = float(np.exp(-rate)) * self.lag_state + float(total)
-        return self.lag_state
-
     def _read_position(self, n):
         position = self.motion.at_left(n - self.position_delay)
         position += 0.0 if self.position_noise is None else self.position_noise[n]
-        return float(_quantise(position, self.position_quantum))
-
-
-def _filter_modes(stated):
-    """Return poles [1/s] and residues [1/s] of the sensor's filter; empty arrays without a filter."""
-    if stated is None:
-        return np.zeros(0), np.zeros(0)
-    design = (
-        signal.buttap(stated["order"])
-        if stated["kind"] == "butterworth"
-        else signal.besselap(stated["order"], norm="mag")
-    )
-    scale = 2.0 * np.pi * stated["cutoff"]
-    residues, poles, _ = signal.residue(design[2], np.poly(design[1]))
-    return poles * scale, residues * scale
+        return float(quantise(position, self.position_quantum))
 
 
 def _equivalent_mass(bodies):
@@ -416,10 +364,6 @@ def _excess_variation(commands):
     """Return half of the command's total variation, from 0 to 0, minus its range."""
     path = np.array([0.0, *commands, 0.0])
     return float(np.sum(np.abs(np.diff(path))) / 2.0 - np.ptp(path))
-
-
-def _quantise(value, quantum):
-    return quantum * np.round(value / quantum) if quantum > 0.0 else value
 
 
 def _noise_of_run(noise, index):

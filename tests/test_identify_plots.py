@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import jaxhil as package
-from tuning.cli.commands.identify import PLOTS, _estimate_entry
+from tuning.cli.commands.identify import PLOTS
+from tuning.cli.commands.identify_tables import build_estimate_entry
 from tuning.identification.identify import IdentificationOptions, identify
 from tuning.plots.identification import (
     draw_identification,
@@ -57,7 +58,7 @@ def test_contact_plots_show_contacts_and_residuals(identified):
 
 
 def test_comparison_plot_shows_prior_beside_estimates(identified):
-    entries = [_estimate_entry(estimate, package.load("rig-300kg")) for estimate in identified.estimates]
+    entries = [build_estimate_entry(estimate, package.load("rig-300kg")) for estimate in identified.estimates]
     (axes,) = plot_estimates(entries).axes
     names = [tick.get_text() for tick in axes.get_yticklabels()]
     row = next(i for i, name in enumerate(names) if name.startswith("rig.simulator.delay"))
@@ -71,7 +72,7 @@ def test_comparison_plot_shows_prior_beside_estimates(identified):
 def test_identification_plots_are_reproducible(identified, tmp_path):
     from jaxhil.simulation.contact_plot import save_figure
 
-    entries = [_estimate_entry(estimate, None) for estimate in identified.estimates]
+    entries = [build_estimate_entry(estimate, None) for estimate in identified.estimates]
     for again in ("one", "other"):
         for name, figure in draw_identification(identified, entries).items():
             save_figure(figure, tmp_path / again / name)

@@ -11,7 +11,7 @@ from browser import LAYOUT
 import jaxhil
 import tuning
 from jaxhil.rig import digest
-from tuning.cli.commands.identify import SCHEMA
+from tuning.cli.commands.identify_tables import SCHEMA
 
 SCRIPT = "<script>window.hurt = 1</script>"
 HOSTILE = f'x"\'>{SCRIPT}<img src=x onerror="window.hurt=1"> {{{{ 9**9 }}}} $\\frac$ &amp;'
