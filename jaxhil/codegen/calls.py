@@ -15,20 +15,19 @@ from .values import CExpression, Rank, as_float, combine, constant
 
 # Condition on the operands `{0}`, `{1}` and the result `{r}` for which a function of `math` raises.
 MATH_DOMAIN_ERRORS = {
-    "sqrt": "{0} < 0.0",
-    "log": "{0} <= 0.0",
-    "exp": "isinf({r}) && isfinite({0})",
+    **{"sqrt": "{0} < 0.0", "log": "{0} <= 0.0", "exp": "isinf({r}) && isfinite({0})"},
     **dict.fromkeys(("sin", "cos", "tan"), "isinf({0})"),
     **dict.fromkeys(("asin", "acos"), "fabs({0}) > 1.0"),
     "fmod": "isinf({0}) || {1} == 0.0",
-    **dict.fromkeys(("atan", "atan2", "tanh", "fabs", "copysign"), ""),
+    **dict.fromkeys(("atan", "atan2", "tanh", "fabs", "copysign", "isfinite", "isnan", "isinf"), ""),
 }
 SAFE_SIGNS = {
     "sqrt": Sign.NONNEGATIVE,
     "log": Sign.POSITIVE,
-}  # signs of operands for which a function does not raise
+}  # of operands for which a function does not raise
 INT_CONVERSIONS = {"floor": "floor({})", "ceil": "ceil({})", "round": "nearbyint({})"}
-FLOAT_TESTS = ("isfinite", "isnan", "isinf")
+# C cannot reproduce the rounding of these functions.
+IRREPRODUCIBLE = ("sum", "fsum", "hypot", "pow")
 
 
 class CallLowering(ListLowering):
@@ -60,10 +59,8 @@ class CallLowering(ListLowering):
         is_object = owner.type.kind == "object" or new_type is None
         self.require(is_object, node, f"an attribute of a {owner.type.kind}", "an object")
         self.function.reads |= keys
-        default, fields = (
-            inspect.getattr_static(class_, name, None),
-            self.program.fields.setdefault(class_, {}),
-        )
+        fields = self.program.fields.setdefault(class_, {})
+        default = inspect.getattr_static(class_, name, None)
         if name not in fields and isinstance(default, (bool, int, float)):
             if new_type is None:
                 return self._class_constant(class_, name, default)
@@ -80,11 +77,8 @@ class CallLowering(ListLowering):
     def _class_constant(self, class_: type, name: str, value: float) -> CExpression:
         """Return the value of a class attribute, as an enumerator if its module has an equal constant."""
         owner = next(owner for owner in class_.__mro__ if name in vars(owner))
-        namespace, numbers, result = (
-            vars(sys.modules[owner.__module__]),
-            self.program.enumerators,
-            constant(value),
-        )
+        namespace, result = vars(sys.modules[owner.__module__]), constant(value)
+        numbers = self.program.enumerators
         names = [name for name, number in numbers.items() if namespace.get(name) == number == value]
         return result._replace(text=f"{self.program.prefix}{names[0]}".upper()) if names else result
 
@@ -192,30 +186,20 @@ class CallLowering(ListLowering):
             self.fail_if(condition, node, "a float to int conversion that may fail")
         return CExpression(f"(int64_t){text}", INT, Rank.UNARY, sign=value.sign & Sign.NONNEGATIVE)
 
-    def builtin_round(self, node: Any) -> CExpression:
-        return self.builtin_int(node, INT_CONVERSIONS["round"])
-
     def _math(self, node: Any, name: str) -> CExpression:
         if name in INT_CONVERSIONS:
             return self.builtin_int(node, INT_CONVERSIONS[name])
-        is_available = (name in MATH_DOMAIN_ERRORS or name in FLOAT_TESTS) and not node.keywords
-        # C cannot reproduce the rounding of `sum`, `fsum`, `hypot` and `pow`.
-        other = (
-            "a loop or a product"
-            if name in ("sum", "fsum", "hypot", "pow")
-            else "a function with source code"
-        )
-        functions = ", ".join([*MATH_DOMAIN_ERRORS, *FLOAT_TESTS])
-        expected = f"{other}, or a function of the module math ({functions})"
+        is_available = name in MATH_DOMAIN_ERRORS and not node.keywords
+        other = "a loop or a product" if name in IRREPRODUCIBLE else "a function with source code"
+        expected = f"{other}, or a function of the module math ({', '.join(MATH_DOMAIN_ERRORS)})"
         self.require(is_available, node, f"{name}(...)", expected)
         values = [as_float(operand) for operand in self.operands(node.args, self.number)]
-        test, sign = MATH_DOMAIN_ERRORS.get(name, ""), values[0].sign
-        if name in SAFE_SIGNS and sign & SAFE_SIGNS[name] == SAFE_SIGNS[name]:
-            test = ""
+        safe, sign = SAFE_SIGNS.get(name), values[0].sign
+        test = "" if safe and sign & safe == safe else MATH_DOMAIN_ERRORS[name]
         values = [self.simple(operand, "operand") for operand in values] if test else values
         texts = [operand.text for operand in values]
         signs = {"sqrt": sign | Sign.NONNEGATIVE, "fabs": sign | Sign.NONNEGATIVE, "exp": Sign.NONNEGATIVE}
-        type_ = BOOL if name in FLOAT_TESTS else FLOAT
+        type_ = BOOL if name.startswith("is") else FLOAT
         value = combine(f"{name}({', '.join(texts)})", type_, Rank.ATOM, *values, sign=signs.get(name, 0))
         if test:
             value = self.temporary(value, f"{name}_value") if "{r}" in test else value

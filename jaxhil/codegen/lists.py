@@ -46,8 +46,7 @@ class ListLowering(ExpressionLowering):
             type_ = self._fill(name, node, target and target.type)
         reads, self.function.reads = self.function.reads, self.function.reads | reads_before
         if target is not None and self.failures == failures and not target.reads & reads:
-            # Write to the target directly: no element reads the old list, and no failure leaves it
-            # incomplete.
+            # Write to the target directly: no element reads the old list, no failure leaves it incomplete.
             self.fit_length(node, target.type, type_)
             self.emit(*(re.sub(rf"\b{name}\b", target.text, line) for line in lines))
             self.function.taken.discard(name)
@@ -226,15 +225,13 @@ class ListLowering(ExpressionLowering):
         return index.text if is_above else f"{index.text} < 0 ? {index.text} + {length} : {index.text}"
 
     def _entry(self, node: Any, value: CExpression) -> CExpression:
-        texts = {
-            name: value.constant for name, value in self.names.items() if value.type.kind == "non-number"
-        }
+        texts = {name: text.constant for name, text in self.names.items() if text.type.kind == "non-number"}
         try:
             code = compile(ast.Expression(node.slice), self.function.file, "eval")
             key = eval(code, {"__builtins__": {}}, texts)
             lowest = self.program.lowest[value.type.of][key]
         except Exception:
-            raise self.reject(node, f"{ast.unparse(node)}", "the name of a gain or limit") from None
+            raise self.reject(node, ast.unparse(node), "the name of a gain or limit") from None
         return CExpression(f"{value.text}->{key}", FLOAT, sign=sign_of(lowest) if lowest >= 0.0 else 0)
 
     def _slice(self, node: Any, value: CExpression, part: ast.Slice) -> CExpression:

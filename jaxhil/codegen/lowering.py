@@ -16,10 +16,13 @@ from .values import ZEROS, CExpression, Rank, as_float, combine, constant, sign_
 if TYPE_CHECKING:
     from .program import CFunction, CProgram
 
-# C operators, and functions of the module `operator` that compute their values at export.
-NODES = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Lt, ast.LtE, ast.Gt, ast.GtE, ast.Eq, ast.NotEq)
-MARKS: dict[Any, str] = dict(zip(NODES, "+ - * / < <= > >= == !=".split(), strict=True))
-FUNCTIONS: dict[Any, str] = dict(zip(NODES, "add sub mul truediv lt le gt ge eq ne".split(), strict=True))
+# C operators, and functions that compute their values at export.
+OPERATORS: dict[Any, tuple[str, Callable[..., Any]]] = {
+    **{ast.Add: ("+", operator.add), ast.Sub: ("-", operator.sub), ast.Mult: ("*", operator.mul)},
+    **{ast.Div: ("/", operator.truediv), ast.Eq: ("==", operator.eq), ast.NotEq: ("!=", operator.ne)},
+    **{ast.Lt: ("<", operator.lt), ast.LtE: ("<=", operator.le)},
+    **{ast.Gt: (">", operator.gt), ast.GtE: (">=", operator.ge)},
+}
 BIT_MARKS = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}
 HELPERS = {ast.FloorDiv: "floor_division", ast.Mod: "modulo", ast.Pow: "power"}
 LARGEST_INT = 2**53  # largest int of the subset; a double represents all smaller ints exactly
@@ -27,10 +30,12 @@ MAX_SQUARABLE_INT = 94906265  # largest int whose square is at most LARGEST_INT
 MAX_INCREMENT = 2**10  # with this increment every millisecond, a counter needs 278 years to reach LARGEST_INT
 # Sums of these nodes need no test if they are only compared: terms up to LARGEST_INT cannot overflow.
 TERMS = (ast.BinOp, ast.Add, ast.Sub, ast.Name, ast.Attribute, ast.Constant, ast.expr_context)
-# Sign of x if the comparison `x OP limit` is true, and if it is false, for the limit 0.
-SIGN_IF_TRUE = {ast.Gt: ">", ast.GtE: ">=", ast.Lt: "!=", ast.LtE: "", ast.NotEq: "!="}
-SIGN_IF_FALSE = {ast.Lt: ">=", ast.LtE: ">", ast.Eq: "!="}
-SIGNS = {"": 0, ">=": Sign.NONNEGATIVE, "!=": Sign.NONZERO, ">": Sign.POSITIVE}
+# Sign of x if the comparison `x OP 0` is true, and if it is false.
+SIGN_IF_TRUE: dict[Any, int] = {
+    **{ast.Gt: Sign.POSITIVE, ast.GtE: Sign.NONNEGATIVE, ast.LtE: 0},
+    **dict.fromkeys((ast.Lt, ast.NotEq), Sign.NONZERO),
+}
+SIGN_IF_FALSE: dict[Any, int] = {ast.Lt: Sign.NONNEGATIVE, ast.LtE: Sign.POSITIVE, ast.Eq: Sign.NONZERO}
 
 
 def is_small(value: CExpression) -> bool:
@@ -111,11 +116,8 @@ class ExpressionLowering:
         self.failures += 1
         self.function.fails = True
         if node is not None:
-            self.function.reason = self.function.reason or (
-                self.function.file,
-                getattr(node, "lineno", 0),
-                reason,
-            )
+            location = self.function.file, getattr(node, "lineno", 0)
+            self.function.reason = self.function.reason or (*location, reason)
             self.emit("*error = true;")
         self.emit(f"return {ZEROS.get(self.function.returns.kind, '')}".rstrip() + ";")
 
@@ -187,14 +189,15 @@ class ExpressionLowering:
             return {key: fact for part in node.values for key, fact in self.facts_of(part, truth).items()}
         if not isinstance(node, ast.Compare) or not isinstance(node.left, (ast.Name, ast.Attribute)):
             return {}
-        mark, span = (SIGN_IF_TRUE if truth else SIGN_IF_FALSE).get(type(node.ops[0])), None
-        if mark is None or len(node.ops) > 1:
+        sign, span = (SIGN_IF_TRUE if truth else SIGN_IF_FALSE).get(type(node.ops[0])), None
+        if sign is None or len(node.ops) > 1:
             return {}
         with self.captured():
             value, limit = self.expression(node.left), self.expression(node.comparators[0]).constant
         if not isinstance(limit, (int, float)) or not value.is_number:
             return {}
-        sign = SIGNS[mark] if limit == 0 else Sign.POSITIVE if mark in (">", ">=") and limit > 0 else 0
+        if limit != 0:
+            sign = Sign.POSITIVE * (limit > 0 and sign & Sign.NONNEGATIVE)
         if truth and isinstance(node.ops[0], (ast.Lt, ast.LtE)) and value.sign & Sign.NONNEGATIVE:
             sign, span = value.sign, (0, limit)
         return {value.text: value._replace(sign=sign, span=span)} if sign else {}
@@ -225,8 +228,8 @@ class ExpressionLowering:
         if op in HELPERS:
             return self.call_helper(node, left, right, HELPERS[op] + "_int" * is_int)
         expected = "+, -, *, /, //, % or ** of numbers, &, | or ^ of ints"
-        self.require(op in MARKS, node, op.__name__, expected)
-        mark, rank = MARKS[op], Rank.SUM if op in (ast.Add, ast.Sub) else Rank.PRODUCT
+        self.require(op in OPERATORS, node, op.__name__, expected)
+        (mark, compute), rank = OPERATORS[op], Rank.SUM if op in (ast.Add, ast.Sub) else Rank.PRODUCT
         if op is ast.Div:
             right = self.divisor(node, right)
         elif is_int and op is ast.Mult and not (left.span and right.span):
@@ -242,7 +245,6 @@ class ExpressionLowering:
                 return self._limit(node, self.temporary(total, "total"), LARGEST_INT, "sum")
         value, span, sign = None, None, self._sign(op, left, right)
         if op is not ast.Div and left.span and right.span:
-            compute = getattr(operator, FUNCTIONS[op])
             ends = [compute(first, second) for first in left.span for second in right.span]
             span = (min(ends), max(ends))
             if left.constant is not None and right.constant is not None:
@@ -306,16 +308,15 @@ class ExpressionLowering:
         values[1:-1] = [self.simple(middle, "middle") for middle in values[1:-1]]
         for mark, left, right in zip(map(type, node.ops), values, values[1:], strict=False):
             kinds = {left.type.kind, right.type.kind}
-            is_defined = mark in MARKS and (kinds == {"bool"} or kinds <= {"int", "float"})
+            is_defined = mark in OPERATORS and (kinds == {"bool"} or kinds <= {"int", "float"})
             self.require(is_defined, node, f"{mark.__name__} of {left.type.kind}", "a comparison of numbers")
             if left.constant is not None and right.constant is not None:
-                compare = getattr(operator, FUNCTIONS[mark])
-                conditions.append(constant(compare(left.constant, right.constant)))
+                conditions.append(constant(OPERATORS[mark][1](left.constant, right.constant)))
                 continue
             if len(kinds) > 1:
                 left, right = as_float(left), as_float(right)
             rank = Rank.EQUALITY if mark in (ast.Eq, ast.NotEq) else Rank.RELATION
-            text = f"{left.at(Rank.SUM)} {MARKS[mark]} {right.at(Rank.SUM)}"
+            text = f"{left.at(Rank.SUM)} {OPERATORS[mark][0]} {right.at(Rank.SUM)}"
             conditions.append(combine(text, BOOL, rank, left, right))
         return self._join_conditions(conditions, True)
 

@@ -28,13 +28,11 @@ const double whole = floor(quotient);
 return quotient == 0.0 ? copysign(0.0, value / divisor) : quotient - whole > 0.5 ? whole + 1.0 : whole;
 }""",
     "modulo_int": """int64_t @modulo_int(int64_t value, int64_t divisor) {
-const int64_t rest = divisor == -1 ? 0 : value % divisor;
+const int64_t rest = value % divisor;
 return rest != 0 && (rest < 0) != (divisor < 0) ? rest + divisor : rest;
 }""",
     "floor_division_int": """int64_t @floor_division_int(int64_t value, int64_t divisor) {
-const int64_t quotient = divisor == -1 ? -value : value / divisor;
-const int64_t rest = divisor == -1 ? 0 : value % divisor;
-return rest != 0 && (rest < 0) != (divisor < 0) ? quotient - 1 : quotient;
+return value / divisor - (value % divisor != 0 && (value < 0) != (divisor < 0) ? 1 : 0);
 }""",
 }
 

@@ -57,11 +57,9 @@ class BodyLowering(CallLowering):
         return leaves
 
     def do_assign(self, node: Any) -> None:
-        is_simple = isinstance(node.value, (ast.Constant, ast.Attribute, ast.Name))
-        expected = "an assignment for each target"
-        self.require(
-            len(node.targets) == 1 or is_simple, node, "one expression for several targets", expected
-        )
+        is_simple = len(node.targets) == 1 or isinstance(node.value, (ast.Constant, ast.Attribute, ast.Name))
+        found, expected = "one expression for several targets", "an assignment for each target"
+        self.require(is_simple, node, found, expected)
         for target in reversed(node.targets):
             if isinstance(target, ast.Tuple):
                 self._unpack(node, target)
@@ -169,9 +167,8 @@ class BodyLowering(CallLowering):
             return self._alias(node, target, value)
         if value.type.kind == "non-number":
             is_text = isinstance(value.constant, (str, tuple, list, frozenset))
-            return self.require(
-                is_text, node, "a value without equivalent in C", "a number, a bool or a text"
-            )
+            found, expected = "a value without equivalent in C", "a number, a bool or a text"
+            return self.require(is_text, node, found, expected)
         if is_name:
             return self._store_name(node, target.id, value, required)
         if value.fails:
