@@ -11,7 +11,7 @@ from jaxhil.laws.compensators import COMPENSATORS, SIX_AXIS_COMPENSATORS, litera
 from jaxhil.mechanism.file import load_any
 from jaxhil.rig_models import choose_rig_model
 from jaxhil.simulation import cached_programs, jax_environment, tile_size
-from jaxhil.simulation.evaluation import run_tiles
+from jaxhil.simulation.evaluation import place_gains, run_tiles
 from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS, build_xla_flags, supported_options
 from tuning.gains.multistart_solver import MIN_PROBLEMS_PER_CALL, compile_solver
 from tuning.gains.tasks import build_task
@@ -45,9 +45,11 @@ def case(name, compensator):
 def batch(name, compensator):
     """Return the external calls of a rollout batch on all devices, with one tile per device."""
     model, loop, gains, scenarios = case(name, compensator)
-    arguments = model.shard(scenarios, gains, at_least=4096, loop=loop)
-    assert arguments[-1].control_period.shape == (jax.device_count(), 1, 4096 // jax.device_count())
-    return calls(lambda *parts: run_tiles((model, loop), *parts), *arguments)
+    placed = model.place_batch(scenarios, 4096, loop)
+    assert placed.scenarios.control_period.shape == (jax.device_count(), 1, 4096 // jax.device_count())
+    return calls(
+        lambda *parts: run_tiles((model, loop), *parts), *place_gains(placed, gains), placed.scenarios
+    )
 
 
 @pytest.fixture(autouse=True)

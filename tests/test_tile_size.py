@@ -45,7 +45,7 @@ def setting(name, compensator, lanes=LANES):
 
 def tile_shape(model, loop, gains, scenarios):
     """Return the shape (devices, tiles, lanes of a tile) of a batch."""
-    return model.shard(scenarios, gains, loop=loop)[-1].control_period.shape
+    return model.place_batch(scenarios, loop=loop).scenarios.control_period.shape
 
 
 def assert_same_outcomes(first, second):

@@ -201,26 +201,11 @@ class RigModel(abc.ABC):
         wanted: Callable[[Outcome], Any] = lambda outcome: outcome,
     ) -> Callable[[], Any]:
         """Start the evaluation of scenarios on the devices; see `begin_evaluation` for the result."""
-        common, per_lane = _arrange_gains(batch.assignment, batch.scenarios, gains)
-        placed = _place_leaves(common, PartitionSpec()), _place_leaves(per_lane, DEVICE_AXIS)
-        outcome = wanted(self.run_tiles(loop, *placed, batch.scenarios))
-
+        outcome = wanted(self.run_tiles(loop, *place_gains(batch, gains), batch.scenarios))
         return lambda: unfold_tiles(batch, outcome)
 
-    def shard(
-        self, scenarios: Any, gains: Mapping[str, Any], at_least: int = 1, loop: Any = None
-    ) -> tuple[dict[str, Any], dict[str, Any], Any]:
-        """Arrange scenarios and gains in tiles; return the arguments of `run_tiles`.
-
-        The arguments are the gains common to all lanes, the gains with one value per lane, and the scenarios.
-        Arrays with one value per lane are padded with idle lanes and have the shape
-        (devices, tiles, ..., lanes of a tile).
-        """
-        assignment = self._assign_tiles(scenarios, at_least, loop)
-        return *_arrange_gains(assignment, scenarios, gains), self._arrange_scenarios(assignment, scenarios)
-
     def run_tiles(self, loop: Any, common: Any, per_lane: Any, scenarios: Any) -> Outcome:
-        """Run the scenarios that `shard` has arranged and `place_on_devices` has placed."""
+        """Run the scenarios of a batch with the gains that `place_gains` returned."""
         static, options = (self, loop), self.compiler_options
         return cached_programs.run_cached(run_tiles, static, common, per_lane, scenarios, options=options)
 
@@ -269,13 +254,14 @@ class RigModel(abc.ABC):
         return self.at_rest(jax.tree.map(fold, scenarios), assignment.idle)
 
 
-def place_on_devices(common: Any, per_lane: Any, scenarios: Any) -> tuple[Any, Any, Any]:
-    """Place the arrays that `RigModel.shard` returned on the devices, to run them several times."""
-    return (
-        _place_leaves(common, PartitionSpec()),
-        _place_leaves(per_lane, DEVICE_AXIS),
-        _place_leaves(scenarios, DEVICE_AXIS),
-    )
+def place_gains(batch: Batch, gains: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Place gains on the devices; return the gains common to all lanes, and the gains per lane, in tiles."""
+    # The program computes in the floating-point precision of the scenarios.
+    dtype = batch.scenarios.control_period.dtype
+    values = {name: np.asarray(value, dtype) for name, value in gains.items()}
+    common = {name: value for name, value in values.items() if not value.ndim}
+    per_lane = {name: _arrange_leaf(batch.assignment, v) for name, v in values.items() if v.ndim}
+    return _place_leaves(common, PartitionSpec()), _place_leaves(per_lane, DEVICE_AXIS)
 
 
 def count_lanes(scenarios: Any) -> int:
@@ -349,14 +335,6 @@ def _count_state_bytes(model: RigModel, loop: Any, structure: Any, leaves: tuple
 
 def _place_leaves(tree: Any, spec: PartitionSpec) -> Any:
     return jax.device_put(tree, NamedSharding(_build_device_mesh(), spec))
-
-
-def _arrange_gains(assignment: _TileAssignment, scenarios: Any, gains: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return the gains common to all lanes, and the gains per lane, arranged in tiles."""
-    # The program computes in the floating-point precision of the scenarios.
-    values = {name: np.asarray(value, scenarios.control_period.dtype) for name, value in gains.items()}
-    common = {name: value for name, value in values.items() if not value.ndim}
-    return common, {name: _arrange_leaf(assignment, value) for name, value in values.items() if value.ndim}
 
 
 def _arrange_leaf(assignment: _TileAssignment, leaf: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from test_sweep import default_gains
 from test_throughput import best, case, jacobian, ticks_run, timed
 
 from jaxhil.simulation import tile_size
-from jaxhil.simulation.evaluation import place_on_devices
+from jaxhil.simulation.evaluation import place_gains
 from jaxhil.simulation.one_axis import ONE_AXIS
 from jaxhil.simulation.tile_size import DeviceDescription
 from tuning.gain_file import write_gain_file
@@ -40,7 +40,8 @@ def measure_rollout(
     try:
         loop, gains, scenarios = case(compensator, lanes, (name,))
         scenarios = convert_precision(scenarios, precision)
-        arguments = place_on_devices(*ONE_AXIS.shard(scenarios, gains, loop=loop))
+        batch = ONE_AXIS.place_batch(scenarios, loop=loop)
+        arguments = *place_gains(batch, gains), batch.scenarios
     finally:
         tile_size.describe_devices = described
     shape = arguments[-1].control_period.shape

@@ -101,7 +101,8 @@ def test_rollout_reaches_required_share_of_cpp_baseline_speed(compensator, names
         return int(baseline.run(loop, rig, gains, on_device, 4000)["ticks"].max())
 
     # The inputs of the C++ code are also prepared before the measurement.
-    arguments = evaluation.place_on_devices(*ONE_AXIS.shard(scenarios, gains))
+    batch = ONE_AXIS.place_batch(scenarios)
+    arguments = *evaluation.place_gains(batch, gains), batch.scenarios
     tiles = ticks_run(loop, *arguments)
     lane_steps = int(np.sum(tiles)) * arguments[-1].velocity.shape[-1]
     flown, skipped = horizon(flying[0]), horizon(skipping[0])

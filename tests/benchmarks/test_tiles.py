@@ -36,9 +36,9 @@ def test_default_tile_size_and_vector_width_are_the_fastest(compensator, monkeyp
         monkeypatch.setattr(evaluation, "TILE_SIZE", tile)
         use(options)
         outcomes.append(ONE_AXIS.evaluate(loop, gains, scenarios))
-        runs.append(
-            timed(partial(run, options, evaluation.place_on_devices(*ONE_AXIS.shard(scenarios, gains))))
-        )
+        batch = ONE_AXIS.place_batch(scenarios)
+        arguments = *evaluation.place_gains(batch, gains), batch.scenarios
+        runs.append(timed(partial(run, options, arguments)))
     ours, *others = best(*runs)
     rates = {own: ours / time for own, time in zip(OTHERS, others, strict=True)}
     with capsys.disabled():
