@@ -25,7 +25,8 @@ from jaxhil.mechanism.file import (
     suite_names,
     to_plain_data,
 )
-from jaxhil.mechanism.number_ranges import mechanism_type
+from jaxhil.mechanism.number_ranges import describe_struct
+from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.toml_table import MAX_BYTES
 
 TEXT = builtin_path("claw-350kg").read_text()
@@ -228,7 +229,7 @@ def test_every_mechanism_key_has_a_description_and_every_number_a_unit():
             return texts(kind.item_type) if isinstance(kind, ListType) else []
         return [*texts(kind.type), ((kind.extra_json_schema or {}).get("description"), kind.extra or {})]
 
-    described = {path: texts(kind) for path, kind in keys(mechanism_type())}
+    described = {path: texts(kind) for path, kind in keys(describe_struct(Mechanism))}
     assert "rig.force_sensor.delay" in described and len(described) > 40
     for path, result in described.items():
         assert any(meaning for meaning, _ in result), path

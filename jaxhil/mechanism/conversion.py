@@ -18,7 +18,7 @@ import msgspec
 from msgspec import inspect
 
 from jaxhil.errors import format_value, to_one_line
-from jaxhil.mechanism.number_ranges import is_computable, mechanism_type, range_of
+from jaxhil.mechanism.number_ranges import describe_struct, is_computable, range_of
 from jaxhil.mechanism.structs import MAGNITUDE_LIMITS, NO_METADATA, Mechanism
 
 __all__ = [
@@ -125,7 +125,7 @@ def to_mechanism(raw: Mapping[str, Any]) -> Mechanism:
     Integers are accepted as numbers. `contact.stiffness`, `contact.damping` and `contact.damping_ratio` may
     be a single number instead of a list. Leading zeros of a transfer function's polynomials are dropped.
     """
-    return msgspec.convert(_convert(mechanism_type(), raw, (), NO_METADATA), Mechanism)
+    return msgspec.convert(_convert(describe_struct(Mechanism), raw, (), NO_METADATA), Mechanism)
 
 
 def to_struct(kind: type[AnyStruct], raw: Mapping[str, Any]) -> AnyStruct:

@@ -57,9 +57,9 @@ def range_of(kind: msgspec.inspect.FloatType | msgspec.inspect.IntType, extra: M
 
 
 @functools.cache
-def mechanism_type() -> msgspec.inspect.StructType:
-    """Return msgspec's description of the type `Mechanism`."""
-    info = msgspec.inspect.type_info(Mechanism)
+def describe_struct(kind: type[Struct]) -> msgspec.inspect.StructType:
+    """Return msgspec's description of a type, such as `Mechanism`."""
+    info = msgspec.inspect.type_info(kind)
     assert isinstance(info, msgspec.inspect.StructType)
     return info
 
@@ -67,7 +67,7 @@ def mechanism_type() -> msgspec.inspect.StructType:
 @functools.cache
 def numeric_keys() -> dict[str, Range]:
     """Return the allowed values of every real-valued key, or of its list entries, by dotted path."""
-    return ranges_of(mechanism_type(), NO_METADATA)
+    return ranges_of(describe_struct(Mechanism), NO_METADATA)
 
 
 def ranges_of(kind: msgspec.inspect.Type, names: Mapping[str, Sequence[str]]) -> dict[str, Range]:

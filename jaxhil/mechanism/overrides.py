@@ -21,9 +21,9 @@ from jaxhil.mechanism.conversion import (
     suggest_names,
 )
 from jaxhil.mechanism.correlation import remove_keys
-from jaxhil.mechanism.number_ranges import Range, mechanism_type, numeric_keys
-from jaxhil.mechanism.six_axes import is_six_axes, numeric_keys_with, six_axis_type
-from jaxhil.mechanism.structs import MAX_CONTACTS
+from jaxhil.mechanism.number_ranges import Range, describe_struct, numeric_keys
+from jaxhil.mechanism.six_axes import SixAxisMechanism, is_six_axes, numeric_keys_with
+from jaxhil.mechanism.structs import MAX_CONTACTS, Mechanism
 
 __all__ = ["apply_override", "parse_key", "parse_override"]
 
@@ -92,7 +92,7 @@ def apply_override(raw: Mapping[str, Any], path: KeyPath, value: Any) -> dict[st
     to remove does not exist.
     """
     has_six_axes = is_six_axes(raw)
-    kind = six_axis_type() if has_six_axes else mechanism_type()
+    kind = describe_struct(SixAxisMechanism if has_six_axes else Mechanism)
     for depth, part in enumerate(path):
         try:
             kind = find_member_type(kind, part, path[:depth])

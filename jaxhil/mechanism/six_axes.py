@@ -13,12 +13,11 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import msgspec
 from msgspec import Meta, Struct, defstruct, field
 
 from jaxhil.contact.keys import key_metadata
 from jaxhil.contact.laws import CONTACT_KEYS, laws_with_key
-from jaxhil.mechanism.number_ranges import Range, numeric_keys, ranges_of
+from jaxhil.mechanism.number_ranges import Range, describe_struct, numeric_keys, ranges_of
 from jaxhil.mechanism.six_axes_rig import (
     Inertia,
     Length,
@@ -58,7 +57,6 @@ __all__ = [
     "is_six_axes",
     "numeric_keys_of",
     "numeric_keys_with",
-    "six_axis_type",
 ]
 
 SIX_AXIS_SCHEMA = "jaxhil/mechanism/2"
@@ -319,12 +317,4 @@ def numeric_keys_of(mechanism: AnyMechanism) -> dict[str, Range]:
 def numeric_keys_with(contacts: tuple[str, ...], latches: tuple[str, ...]) -> dict[str, Range]:
     """Return the allowed values of every real-valued key, given the names of all contacts and latches."""
     names: Any = {"contact": contacts, "latch": latches}
-    return ranges_of(six_axis_type(), names)
-
-
-@functools.cache
-def six_axis_type() -> msgspec.inspect.StructType:
-    """Return msgspec's description of the type `SixAxisMechanism`."""
-    info = msgspec.inspect.type_info(SixAxisMechanism)
-    assert isinstance(info, msgspec.inspect.StructType)
-    return info
+    return ranges_of(describe_struct(SixAxisMechanism), names)

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.files import open_input
 from jaxhil.laws import built_in_compensators
-from jaxhil.mechanism.file import AnyMechanism, LoadedAnyMechanism, LoadedMechanism, source_sha256
-from jaxhil.mechanism.loading import as_any_mechanism, as_mechanism
+from jaxhil.mechanism.file import AnyMechanism, LoadedAnyMechanism, source_sha256
+from jaxhil.mechanism.loading import as_any_mechanism
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.structs import Mechanism
 
@@ -200,19 +200,6 @@ def check_path(name: str, value: Any) -> Path:
     if not isinstance(value, (str, os.PathLike)):
         raise ArgumentError(name, format_value(value), "a path")
     return Path(value)
-
-
-def load_mechanisms(value: Any) -> tuple[list[LoadedMechanism], bool]:
-    """Return a list of loaded one-axis mechanisms, and whether `value` was a list of mechanisms.
-
-    A mechanism is a result of `jaxhil.load`, or a name or path that `jaxhil.load` accepts. Raise `InputError`
-    if a mechanism is unusable or has six axes.
-    """
-    listed, is_list = _as_mechanism_list(value)
-    checked = [as_mechanism(entry) for entry in listed]
-    return [
-        LoadedMechanism(mechanism, source_sha256(mechanism), mechanism.name) for mechanism in checked
-    ], is_list
 
 
 def load_any_mechanisms(value: Any) -> tuple[list[LoadedAnyMechanism], bool]:

@@ -68,7 +68,7 @@ def plot_bode(motion: FreeMotion) -> Figure:
         _to_decibel(modelled),
         color=BLACK,
         linewidth=1.2,
-        label=f"model: {_compute_program_digest(motion)}",
+        label=f"model: {motion.model.structure.name.replace('_', ' ')}",
     )
     size.plot(frequency, _to_decibel(noise), color="0.6", linewidth=1.2, label="noise of the measurement")
     size.plot(
@@ -257,10 +257,6 @@ def _to_decibel(value):
 
 def _compute_phase(response: np.ndarray) -> np.ndarray:
     return np.degrees(np.unwrap(np.angle(response)))
-
-
-def _compute_program_digest(motion: FreeMotion) -> str:
-    return motion.model.structure.name.replace("_", " ")
 
 
 def _find_distortion_levels(motion: FreeMotion) -> list[float]:
