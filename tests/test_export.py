@@ -34,7 +34,8 @@ from tuning.gain_file import write_gain_file
 pytestmark = pytest.mark.users_options
 
 ALWAYS = {
-    *("gains.json", "jaxhil_runtime.py", "vectors.csv", "selftest.py", "manifest.json", "README.md"),
+    *("gains.json", "jaxhil_runtime.py", "vectors.csv", "selftest.py", "vector_replay.py", "manifest.json"),
+    "README.md",
     "summary.html",
 }
 UDP = ("udp_controller.py", "udp_protocol.py", "udp_task.py", "numerical_model.py", "flight_recorder.py")
@@ -373,12 +374,13 @@ def test_each_export_format_writes_its_own_files():
         "matlab": {"gains.mat"},
         "csv": {"gains.csv"},
         "c99": {f"c99/{file}" for file in (*C_FILES, *LOOP_FILES)},
-        "fmu": {"fmi3/jaxhil_controller.fmu", "fmi3/jaxhil_rig.fmu"},
-        "fmu2": {"fmi2/jaxhil_controller.fmu", "fmi2/jaxhil_rig.fmu"},
+        "fmu": {f"fmi3/{file}" for file in FMU_FILES},
+        "fmu2": {f"fmi2/{file}" for file in FMU_FILES},
     }.items():
         assert {*WRITERS[name](made)} == names
     assert len(WRITERS) == 6
 
 
 C_FILES = ("jaxhil_controller.h", "jaxhil_controller.c", "jaxhil_gains.h", "test_vectors.c")
+FMU_FILES = ("jaxhil_controller.fmu", "jaxhil_rig.fmu", "test_vectors.c")
 LOOP_FILES = ("rt_loop.h", "rt_loop.c", "rt_plant_udp.c")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from bundles import TICKS, run_selftest, signed, small_files
 
-from tuning.bundle import selftest
+from tuning.bundle import selftest, vector_replay
 from tuning.bundle.manifest import is_text
 
 MUTATIONS = 50  # mutations of each text file
@@ -161,7 +161,7 @@ def test_self_test_detects_a_change_of_any_digit_of_any_gain(files, folder):
 
 def test_self_test_names_recorded_and_computed_command_if_different(files, folder):
     lines = files["vectors.csv"].decode().split("\n")
-    force = selftest.VECTOR_COLUMNS.split(",").index("force_command")
+    force = vector_replay.VECTOR_COLUMNS.split(",").index("force_command")
     number = next(n for n, line in enumerate(lines[1:], start=1) if float(line.split(",")[force]) > 1)
     fields = lines[number].split(",")
     expected = fields[force]
@@ -200,7 +200,7 @@ def test_self_test_tolerance_of_simulated_forces_is_a_fraction_of_force_range(fi
     span = max(forces) - min(0.0, *forces)
     tick = max(range(len(forces)), key=lambda index: forces[index] < 0.9 * max(forces) and forces[index])
     rows[tick][-1] = repr(float(rows[tick][-1]) + share * span)
-    text = "\n".join([selftest.VECTOR_COLUMNS, *(",".join(row) for row in rows), ""])
+    text = "\n".join([vector_replay.VECTOR_COLUMNS, *(",".join(row) for row in rows), ""])
     for name, content in signed({**files, "vectors.csv": text.encode()}, document).items():
         (folder / name).write_bytes(content)
     result, out = run_selftest(folder)
@@ -209,10 +209,10 @@ def test_self_test_tolerance_of_simulated_forces_is_a_fraction_of_force_range(fi
 
 
 def test_self_test_compares_controller_commands_bit_for_bit():
-    assert selftest.are_same_bits(float("nan"), -float("nan"))
-    assert not selftest.are_same_bits(0.0, -0.0)
-    assert not selftest.are_same_bits(0.1 + 0.2, 0.3)
-    assert not selftest.are_same_bits(float("nan"), 0.0)
+    assert vector_replay.are_same_bits(float("nan"), -float("nan"))
+    assert not vector_replay.are_same_bits(0.0, -0.0)
+    assert not vector_replay.are_same_bits(0.1 + 0.2, 0.3)
+    assert not vector_replay.are_same_bits(float("nan"), 0.0)
 
 
 @pytest.mark.parametrize(
@@ -240,9 +240,9 @@ def test_self_test_reports_unreadable_files_with_matching_checksums(files, folde
         ("jaxhil_runtime.py", "Controller = 3", "cannot be executed: NameError"),
         ("gains.json", "[]", "found a list"),
         ("vectors.csv", "a,b\n", "unknown columns"),
-        ("vectors.csv", selftest.VECTOR_COLUMNS + "\n1,2,3\n", "line 2: not a row of 14 numbers"),
-        ("vectors.csv", selftest.VECTOR_COLUMNS + "\n" + "0," * 13 + "0\n", "line 2: event: found 0.0"),
-        ("vectors.csv", selftest.VECTOR_COLUMNS + "\n", "contains no ticks"),
+        ("vectors.csv", vector_replay.VECTOR_COLUMNS + "\n1,2,3\n", "line 2: not a row of 14 numbers"),
+        ("vectors.csv", vector_replay.VECTOR_COLUMNS + "\n" + "0," * 13 + "0\n", "line 2: event: found 0.0"),
+        ("vectors.csv", vector_replay.VECTOR_COLUMNS + "\n", "contains no ticks"),
     ]:
         for other, content in signed({**files, name: text.encode()}, document).items():
             (folder / other).write_bytes(content)

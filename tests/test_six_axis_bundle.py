@@ -25,8 +25,8 @@ from jaxhil.rig.six_axes.limits import SIX_AXIS_LIMITS, complete_six_axis_limits
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.jax_environment import jax_context
 from tuning.bundle.bundle import build_bundle, write_bundle
-from tuning.bundle.selftest import SIX_AXIS_VECTOR_COLUMNS
 from tuning.bundle.summary import summary_html
+from tuning.bundle.vector_replay import SIX_AXIS_VECTOR_COLUMNS
 from tuning.bundle.vectors_six_axes import compare_with_record, record_inputs, run_controller
 from tuning.sweeps.draws import draw_scenarios
 from tuning.sweeps.manifest import ManifestOptions, build_manifest
@@ -61,7 +61,7 @@ def test_six_axis_bundle_is_complete_and_its_vectors_agree_with_simulation(built
     assert {name.partition("/")[0] for name in built.files} == {
         *("gains.json", "vectors.csv", "summary.html", "jaxhil_runtime.py", "selftest.py", "ros2.yaml"),
         *("udp_controller.py", "udp_protocol.py", "udp_task.py", "numerical_model_six_axes.py"),
-        "flight_recorder.py",
+        *("flight_recorder.py", "vector_replay.py"),
         *("gains.mat", "gains.csv", "c99", "README.md", "manifest.json"),
     }
     readme, summary = (built.files[name].decode() for name in ("README.md", "summary.html"))

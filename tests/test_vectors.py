@@ -15,7 +15,7 @@ from jaxhil.rig import Controller
 from jaxhil.rig.gain_file import check_gain_document
 from jaxhil.simulation.gain_file import check_document
 from jaxhil.simulation.recording import nominal_and_draws, record_lanes
-from tuning.bundle import selftest
+from tuning.bundle import vector_replay
 from tuning.bundle.bundle import replace_limits
 from tuning.bundle.vectors import (
     NEXT_CONTACT,
@@ -50,7 +50,7 @@ def runs_of(vectors):
 
 
 def test_vector_file_columns_equal_columns_read_by_self_test():
-    assert ",".join(VectorRow._fields) == selftest.VECTOR_COLUMNS
+    assert ",".join(VectorRow._fields) == vector_replay.VECTOR_COLUMNS
 
 
 def test_recorded_vectors_contain_simulation_and_agree_with_runtime(loaded, vectors):

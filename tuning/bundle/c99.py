@@ -30,6 +30,13 @@ HEADER_FILE, SOURCE_FILE = "jaxhil_controller.h", "jaxhil_controller.c"
 GAINS_FILE, TEST_FILE = "jaxhil_gains.h", "test_vectors.c"
 COMPILER_FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 
+_TESTED_CONTROLLER = """\
+#include "jaxhil_controller.h"
+#include "jaxhil_gains.h"
+
+static jaxhil_controller controller;
+"""
+
 _HEADER_TEMPLATE = """\
 /* Controller of a hardware-in-the-loop docking rig, with the compensator `{law}`.
  *
@@ -195,13 +202,22 @@ def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> 
         GAINS_FILE: _GAINS_TEMPLATE.format(
             law=law, digest=document["sha256"], constants=gain_file_constants(gain_file, kind)
         ),
-        TEST_FILE: _read_test_program(TEST_FILE).replace(
-            "@columns@\n", _read_test_program(kind.test_program)
-        ),
+        TEST_FILE: test_program(_TESTED_CONTROLLER, _read_text(kind.test_program)),
     }
 
 
-def _read_test_program(file: str) -> str:
+def test_program(controller: str, columns: str) -> str:
+    """Return the program that replays vectors.csv.
+
+    Args:
+        controller: C code that includes the controller's headers and declares the controller.
+        columns: C code that defines the columns, and the functions that call the controller.
+    """
+    text = _read_text(TEST_FILE)
+    return text.replace("@controller@\n", controller).replace("@columns@\n", columns)
+
+
+def _read_text(file: str) -> str:
     return (resources.files("tuning") / "bundle" / file).read_text(encoding="utf-8")
 
 

@@ -17,7 +17,7 @@ from tuning.bundle.manifest import manifest_text
 
 TUNING_FOLDER = Path(__file__).parents[1]
 # Files that are copied unchanged into a bundle.
-SELFTEST = "bundle/selftest.py"
+SELFTEST_FILES = ("bundle/selftest.py", "bundle/vector_replay.py")
 UDP_FILES = ("rig/udp_controller.py", "rig/udp_protocol.py", "rig/udp_task.py")
 FLIGHT_RECORDER = Path(jaxhil.rig.__file__).with_name("flight_recorder.py")
 
@@ -42,7 +42,7 @@ def code_files(compensator: str, axes: int = 1) -> dict[str, bytes]:
     from tuning.bundle.single_file import build_runtime_source
 
     kind = kind_of({"axes": axes})
-    names = (SELFTEST, *UDP_FILES, kind.numerical_model)
+    names = (*SELFTEST_FILES, *UDP_FILES, kind.numerical_model)
     paths = [FLIGHT_RECORDER, *(TUNING_FOLDER / name for name in names)]
     copied = {path.name: path.read_bytes() for path in paths}
     runtime = build_runtime_source(compensator, kind.package, kind.table)

@@ -23,6 +23,7 @@ FILE_DESCRIPTIONS = {
     "flight_recorder.py": "log of readings and commands, which `jaxhil shadow` and `identify` read",
     "vectors.csv": "test vectors: recorded and damaged ticks, with the controller's commands",
     "selftest.py": "program that checks all files and replays the test vectors",
+    "vector_replay.py": "replay of the test vectors for this program",
     "summary.html": "summary on one page: gains, limits, errors, range of validity",
     "udp_controller.py": "program that runs the controller as a process, which answers a rig over UDP",
     "udp_protocol.py": "protocol between this process and a rig",

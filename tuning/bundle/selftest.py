@@ -1,25 +1,25 @@
 """Self-test of a bundle: program that checks the files and replays recorded ticks through the controller.
 
     python selftest.py          check the files and the gains, and replay all test vectors in Python
-    python selftest.py --c      also compile the C controller (with cc or $CC) and replay them in C
+    python selftest.py --c      also compile the controller in C and its FMUs (with cc or $CC), and replay
+                                them in C
 
 The program needs only Python 3.11 or later. It prints one line per check. The exit code is 0 if all checks
 pass, else 1. The program cannot show who exported the bundle: use `jaxhil verify --key` on a workstation.
 """
 
 import hashlib
+import io
 import json
-import math
 import os
 import re
 import shutil
 import stat
-import struct
 import subprocess
 import sys
 import tempfile
+import zipfile
 import zlib
-from collections import namedtuple
 
 MANIFEST_FILE, SIGNATURE_FILE, PYTHON_CACHE = "manifest.json", "manifest.sig", "__pycache__/"
 # Pattern of a file's path in the manifest.
@@ -28,34 +28,11 @@ PATH_PATTERN = re.compile(r"(?:\w[\w.-]{0,99}/){0,3}\w[\w.-]{0,99}", re.ASCII)
 MAX_FILES, MAX_BUNDLE_BYTES, MAX_TEXT_BYTES = 1000, 1 << 26, 1 << 23
 SCHEMA = "jaxhil/bundle/1"
 MAX_REPORTED_DIFFERENCES = 8  # largest number of reported differences in one file
-C_SOURCES = ("c99/test_vectors.c", "c99/jaxhil_controller.c")
+RUNTIME_FILE, REPLAY_FILE = "jaxhil_runtime.py", "vector_replay.py"
+# Folders with the controller in C, and the FMU in each; the sources of an FMU are in its archive.
+C_FOLDERS = {"c99": None, "fmi3": "fmi3/jaxhil_controller.fmu", "fmi2": "fmi2/jaxhil_controller.fmu"}
+C_FILES = ("test_vectors.c", "jaxhil_controller.c")  # files to compile in the folder c99
 C_FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
-VECTOR_COLUMNS = (
-    "run,event,force_measured,position_desired,velocity_desired,position_measured,time,position,velocity,"
-    "acceleration,force_command,position_command,faults,force_simulated"
-)
-VECTORS_BEFORE_TIME = ("wrench_measured", "pose_desired", "twist_desired", "pose_measured")
-VECTORS_AFTER_TIME = ("pose", "twist", "wrench_command", "pose_command")
-COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
-SIX_AXIS_VECTOR_COLUMNS = ",".join(
-    [
-        "run,event",
-        *(f"{name}_{axis}" for name in VECTORS_BEFORE_TIME for axis in COORDINATES),
-        "time",
-        *(f"{name}_{axis}" for name in VECTORS_AFTER_TIME for axis in COORDINATES),
-        "faults",
-        *(f"wrench_simulated_{axis}" for axis in COORDINATES),
-    ]
-)
-# Layout of vectors.csv for a controller: its columns; numbers of each quantity; number of quantities after
-# the time that describe the model's motion; the method that commands the drives; parts of a force command
-# with a common range and unit; largest difference between runtime and simulation, divided by the range of a
-# run's commands [1] (the simulation rounds in another order).
-Layout = namedtuple("Layout", "columns width motions method parts error")
-LAYOUTS = {
-    "Controller": Layout(VECTOR_COLUMNS, 1, 3, "position_command", ((0, 1, "N"),), 1e-11),
-    "Controller6": Layout(SIX_AXIS_VECTOR_COLUMNS, 6, 2, "pose_command", ((0, 3, "N"), (3, 6, "N m")), 1e-9),
-}
 
 
 def main(arguments, folder):
@@ -65,10 +42,11 @@ def main(arguments, folder):
         f"{sys.version.split()[0]}"
     )
     found, damaged = check_files(folder)
-    runtime = check_runtime(folder, found, damaged)
-    runs = runtime is not None and "gains.json" in found
-    agrees = runs and check_gains(folder, runtime) and check_vectors(folder, found, runtime)
-    agrees_in_c = "--c" not in arguments or check_c(folder, found, damaged)
+    replay = load_module(folder, REPLAY_FILE, found, damaged, ("replay_vectors",))
+    runtime = load_module(folder, RUNTIME_FILE, found, damaged, ("GainFileError",))
+    runs = None not in (replay, runtime) and "gains.json" in found
+    agrees = runs and check_gains(folder, replay, runtime) and check_vectors(folder, found, replay, runtime)
+    agrees_in_c = "--c" not in arguments or check_c(found, damaged)
     good = not damaged and agrees is agrees_in_c is True
     print("PASSED" if good else "FAILED: do not use this bundle on a rig")
     return good
@@ -220,28 +198,30 @@ def find_unlisted_paths(folder, files, within=""):
             yield f"{path}/" if is_folder else path
 
 
-def check_runtime(folder, found, damaged):
-    """Execute the checked source of the runtime; return its namespace, or None after an error."""
-    if {"jaxhil_runtime.py", MANIFEST_FILE} & damaged:
+def load_module(folder, name, found, damaged, expected):
+    """Execute a checked source file; return its namespace, or None after an error.
+
+    `expected` are names that the namespace must contain.
+    """
+    if {name, MANIFEST_FILE} & damaged:
         return report_failure(
-            "jaxhil_runtime.py",
-            "is not executed, because this file or the manifest differs from what was exported",
+            name, "is not executed, because this file or the manifest differs from what was exported"
         )
-    runtime = {"__name__": "jaxhil_runtime", "__file__": os.path.join(folder, "jaxhil_runtime.py")}
+    namespace = {"__name__": name.removesuffix(".py"), "__file__": os.path.join(folder, name)}
     try:
         # An import statement could load a cached older version, and does not find this folder with -I.
-        exec(compile(found["jaxhil_runtime.py"], "jaxhil_runtime.py", "exec"), runtime)
-        if "GainFileError" not in runtime or not {*LAYOUTS} & {*runtime}:
-            raise NameError("Controller or GainFileError is missing")
+        exec(compile(found[name], name, "exec"), namespace)
+        if missing := [text for text in expected if text not in namespace]:
+            raise NameError(f"{', '.join(missing)} is missing")
     except BaseException as error:
-        return report_failure("jaxhil_runtime.py", f"cannot be executed: {describe_error(error)}")
-    return runtime
+        return report_failure(name, f"cannot be executed: {describe_error(error)}")
+    return namespace
 
 
-def check_gains(folder, runtime):
+def check_gains(folder, replay, runtime):
     """Check that the controller accepts the gain file."""
     try:
-        controller = runtime[controller_name(runtime)].from_file(os.path.join(folder, "gains.json"))
+        controller = runtime[replay["controller_name"](runtime)].from_file(os.path.join(folder, "gains.json"))
     except runtime["GainFileError"] as error:
         return report_failure("gains.json", escape_unprintable(str(error)))
     except BaseException as error:
@@ -251,25 +231,20 @@ def check_gains(folder, runtime):
     return report_pass("gains.json", f"loads: {' '.join(laws)}, control period {period!r} s")
 
 
-def controller_name(runtime):
-    """Return the name of the runtime's controller."""
-    return next(name for name in LAYOUTS if name in runtime)
-
-
-def check_vectors(folder, found, runtime):
+def check_vectors(folder, found, replay, runtime):
     """Replay the test vectors through the runtime, and compare its commands.
 
     Every command must equal the recorded command to the last bit, and be close to the simulated command.
     """
     try:
-        layout = LAYOUTS[controller_name(runtime)]
-        rows = list(read_vectors(found["vectors.csv"].decode("ascii"), layout))
+        layout = replay["LAYOUTS"][replay["controller_name"](runtime)]
+        rows = list(replay["read_vectors"](found["vectors.csv"].decode("ascii"), layout))
     except Exception as error:
         return report_failure("vectors.csv", f"cannot be read: {describe_error(error)}")
     if not rows:
         return report_failure("vectors.csv", "contains no ticks")
     try:
-        runs, different = replay_vectors(rows, os.path.join(folder, "gains.json"), runtime)
+        runs, different = replay["replay_vectors"](rows, os.path.join(folder, "gains.json"), runtime)
     except BaseException as error:
         return report_failure("vectors.csv", f"cannot be replayed: {describe_error(error)}")
     for text in different[:MAX_REPORTED_DIFFERENCES]:
@@ -277,128 +252,57 @@ def check_vectors(folder, found, runtime):
     if different:
         return report_failure("vectors.csv", f"{len(different)} of {len(rows)} ticks differ")
     report_pass("vectors.csv", f"{len(rows)} ticks of {len(runs)} runs, the same bit for bit")
-    return check_simulated(runs, layout)
+    agrees, text = replay["compare_simulated"](runs, layout)
+    return (report_pass if agrees else report_failure)("vectors.csv", text)
 
 
-def check_simulated(runs, layout):
-    """Compare the force commands of each run with the simulated force commands."""
-    largest, compared = 0.0, 0
-    for run, ticks in runs.items():
-        stated = [tick for tick in ticks if not any(map(math.isnan, tick[2]))]
-        compared += len(stated)
-        for first, last, unit in layout.parts:
-            expected = [0.0, *(value for tick in stated for value in tick[2][first:last])]
-            span = max(expected) - min(expected)
-            for number, forces, commands in stated:
-                for force, simulated in zip(forces[first:last], commands[first:last], strict=True):
-                    error = abs(force - simulated)
-                    if not error <= layout.error * span:
-                        text = (
-                            f"run {run}: force command: found {force!r} {unit}, expected {simulated!r} {unit}"
-                        )
-                        limit = f"within {layout.error} of the range {span!r} {unit}"
-                        return report_failure("vectors.csv", f"line {number}: {text} {limit}")
-                    largest = max(largest, error / span if span else 0.0)
-    text = f"{compared} ticks, forces agree with the simulation within {largest:.1e} of their range"
-    return (
-        report_pass("vectors.csv", text)
-        if compared
-        else report_failure("vectors.csv", "contains no simulated forces")
-    )
-
-
-def read_vectors(text, layout=LAYOUTS["Controller"]):
-    """Yield (line number, list of numbers) for each row of vectors.csv; an empty field becomes None."""
-    lines = text.split("\n")
-    if lines[0].rstrip("\r") != layout.columns:
-        raise ValueError(f"line 1: unknown columns, expected {layout.columns}")
-    width, time = layout.columns.count(",") + 1, 2 + 4 * layout.width
-    for number, line in enumerate(lines[1:], start=2):
-        if number == len(lines) and not line:
-            return
-        try:
-            row = [float(field) if field else None for field in line.rstrip("\r").split(",")]
-        except ValueError:
-            row = []
-        if len(row) != width or any(value is None for index, value in enumerate(row) if index != time):
-            raise ValueError(f"line {number}: not a row of {width} numbers")
-        yield number, row
-
-
-def replay_vectors(rows, gains, runtime):
-    """Replay all rows of vectors.csv through the runtime's controller with the gain file `gains`.
-
-    Return a dictionary of lists of (line number, force command, simulated force command) for each run, each
-    command as a list of numbers, and descriptions of the differences from the recorded commands.
-    """
-    name = controller_name(runtime)
-    layout, controller, runs, different = LAYOUTS[name], None, {}, []
-    width, time = layout.width, 2 + 4 * layout.width
-    after = time + 1 + layout.motions * width
-    columns = layout.columns.split(",")[after : after + 2 * width + 1]
-    for number, row in rows:
-        run, event = row[:2]
-        if event == 1:
-            controller = runtime[name].from_file(gains)
-        elif controller is None or event not in (0, 2):
-            raise ValueError(
-                f"line {number}: event: found {event!r}, expected 0, 1 or 2, and 1 in the first row"
-            )
-        elif event == 2:
-            controller.next_contact()
-        command = controller.step(*quantities(row[2:time], width), row[time])
-        sent = getattr(controller, layout.method)(*quantities(row[time + 1 : after], width))
-        command, sent = ([command], [sent]) if width == 1 else (command, sent)
-        # The faults are integers in the file, and are compared as floats like all other columns.
-        found = [*command, *sent, float(controller.faults)]
-        texts = [
-            f"{column}: found {value!r}, expected {expected!r}"
-            for column, value, expected in zip(columns, found, row[after:], strict=False)
-            if not are_same_bits(value, expected)
-        ]
-        if texts:
-            different.append(f"line {number}, run {int(run)}: {', '.join(texts)}")
-        runs.setdefault(int(run), []).append((number, command, row[-width:]))
-    return runs, different
-
-
-def quantities(row, width):
-    """Return the quantities of a row: numbers, or lists of `width` numbers."""
-    if width == 1:
-        return row
-    return [row[index : index + width] for index in range(0, len(row), width)]
-
-
-def are_same_bits(found, expected):
-    """Return whether two floats are equal, including the sign of zero; any NaN equals any other."""
-    both_nan = math.isnan(found) and math.isnan(expected)
-    return both_nan or struct.pack("<d", found) == struct.pack("<d", expected)
-
-
-def check_c(folder, found, damaged):
-    """Compile the C controller, and check that it reproduces the test vectors."""
-    sources = [os.path.join(folder, name) for name in C_SOURCES]
-    differs = any(name == MANIFEST_FILE or name.startswith("c99/") for name in damaged)
-    if differs or not {*C_SOURCES} <= {*found}:
-        return report_failure("c99", "is not compiled, because a file is missing or differs")
+def check_c(found, damaged):
+    """Compile the controller in C and its FMUs; check that each of them reproduces the test vectors."""
+    folders = [name for name in C_FOLDERS if any(path.startswith(f"{name}/") for path in {*found, *damaged})]
     compiler = shutil.which(os.environ.get("CC") or "cc") or shutil.which("gcc") or shutil.which("clang")
-    if compiler is None:
-        return report_failure("c99", "found no C compiler, expected cc, gcc, clang or $CC")
+    good = bool(folders) or report_failure("c99", "found no file in C, expected a bundle with c99 or FMUs")
+    for name in folders:
+        if MANIFEST_FILE in damaged or any(path.startswith(f"{name}/") for path in damaged):
+            good = report_failure(name, "is not compiled, because a file is missing or differs")
+        elif compiler is None:
+            good = report_failure(name, "found no C compiler, expected cc, gcc, clang or $CC")
+        else:
+            good = compile_and_replay(name, found, compiler) and good
+    return good
+
+
+def compile_and_replay(name, found, compiler):
+    """Compile the C files of a folder in the bundle, and check that they reproduce the test vectors."""
     try:
         with tempfile.TemporaryDirectory() as build_folder:
+            sources = read_c_files(name, found)
+            for file, content in [*sources.items(), ("vectors.csv", found["vectors.csv"])]:
+                with open(os.path.join(build_folder, file), "wb") as copy:
+                    copy.write(content)
+            files = C_FILES if name == "c99" else [file for file in sources if file.endswith(".c")]
             program = os.path.join(build_folder, "test_vectors")
-            vectors = os.path.join(os.path.abspath(folder), "vectors.csv")
-            for command in ([compiler, *C_FLAGS, "-o", program, *sources, "-lm"], [program, vectors]):
-                done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
-                lines = (done.stdout + done.stderr).replace(vectors, "vectors.csv").strip().split("\n")
+            for command in ([compiler, *C_FLAGS, "-o", program, *files, "-lm"], [program, "vectors.csv"]):
+                done = subprocess.run(
+                    command, capture_output=True, text=True, errors="replace", check=False, cwd=build_folder
+                )
+                lines = (done.stdout + done.stderr).strip().split("\n")
                 if done.returncode:
                     reported = next((line for line in lines if "error" in line), lines[0])
                     return report_failure(
-                        "c99", escape_unprintable(reported) or f"exit code {done.returncode}"
+                        name, escape_unprintable(reported) or f"exit code {done.returncode}"
                     )
     except Exception as error:
-        return report_failure("c99", f"cannot be compiled and run: {describe_error(error)}")
-    return report_pass("c99", escape_unprintable(lines[-1]))
+        return report_failure(name, f"cannot be compiled and run: {describe_error(error)}")
+    return report_pass(name, escape_unprintable(lines[-1]))
+
+
+def read_c_files(name, found):
+    """Return the C files of a folder in the bundle and those in the archive of its FMU, by file name."""
+    files = {path: content for path, content in found.items() if path.startswith(f"{name}/")}
+    if C_FOLDERS[name]:
+        with zipfile.ZipFile(io.BytesIO(found[C_FOLDERS[name]])) as archive:
+            files.update({path: archive.read(path) for path in archive.namelist()})
+    return {os.path.basename(path): files[path] for path in files if path.endswith((".c", ".h"))}
 
 
 def read_plain_file(folder, name, most=MAX_BUNDLE_BYTES):

@@ -9,10 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "jaxhil_controller.h"
-#include "jaxhil_gains.h"
-
-static jaxhil_controller controller;
+@controller@
 static char line[65536];
 
 static int is_same(double found, double expected) {
@@ -59,7 +56,7 @@ static int begin(const char *name, long number, double event, int *begun) {
         return start() ? 0 : unreadable(name, number, "the controller refuses its own gains");
     }
     if (event == 2.0 && *begun) {
-        jaxhil_next_contact(&controller);
+        next_contact();
     } else if (event != 0.0 || !*begun) {
         return unreadable(name, number, "an unknown event, or a tick before a run");
     }

@@ -11,6 +11,10 @@ static bool start(void) {
     return jaxhil_init(&controller, &jaxhil_exported_gains, &jaxhil_exported_limits);
 }
 
+static void next_contact(void) {
+    jaxhil_next_contact(&controller);
+}
+
 /* Pass one row to the controller; return 0 if the results equal those of the row. */
 static int replay(const char *name, long number, const double *row, const int *given) {
     const double force =

@@ -33,6 +33,10 @@ static bool start(void) {
                        &jaxhil_exported_constants);
 }
 
+static void next_contact(void) {
+    jaxhil_next_contact(&controller);
+}
+
 /* Pass one row to the controller; return 0 if the results equal those of the row. */
 static int replay(const char *name, long number, const double *row, const int *given) {
     double wrench[6], pose[6];

@@ -17,7 +17,7 @@ from jaxhil.rig.six_axes.faults import SIX_AXIS_FAULTS
 from jaxhil.rig.six_axes.gain_file import SixAxisGainFile, check_six_axis_document
 from jaxhil.simulation.gain_file import LoadedGains
 from jaxhil.sixdof.controller_record import ControllerRecord
-from tuning.bundle.selftest import SIX_AXIS_VECTOR_COLUMNS
+from tuning.bundle.vector_replay import SIX_AXIS_VECTOR_COLUMNS
 from tuning.bundle.vectors import (
     DAMAGED_RUN_TICKS,
     DAMAGED_RUNS,

@@ -146,19 +146,27 @@ def c99_files(document: Mapping[str, Any]) -> dict[str, bytes]:
 
 
 def fmi3_files(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the sources of FMUs of FMI 3.0: the controller and, for one axis, the rig, in `fmi3`."""
+    """Return the FMUs of FMI 3.0 without library, in the folder `fmi3`.
+
+    These are the controller and, for one axis, the rig. A test program replays the test vectors through the
+    controller's FMU.
+    """
     return _fmu_files(document, 3)
 
 
 def fmi2_files(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the sources of FMUs of FMI 2.0, in the folder `fmi2`; see `fmi3_files`."""
+    """Return the FMUs of FMI 2.0 without library, in the folder `fmi2`; see `fmi3_files`."""
     return _fmu_files(document, 2)
 
 
 def _fmu_files(document: Mapping[str, Any], fmi: int) -> dict[str, bytes]:
+    from tuning.bundle.c99 import TEST_FILE
     from tuning.bundle.fmu import controller, rig
 
-    files = {f"fmi{fmi}/{controller.IDENTIFIER}.fmu": controller.controller_fmu(document, fmi)}
+    files = {
+        f"fmi{fmi}/{controller.IDENTIFIER}.fmu": controller.controller_fmu(document, fmi),
+        f"fmi{fmi}/{TEST_FILE}": controller.fmu_test_program(document, fmi).encode("ascii"),
+    }
     if kind_of(document) is ONE_AXIS:
         files[f"fmi{fmi}/{rig.IDENTIFIER}.fmu"] = rig.rig_fmu(document, fmi)
     return files

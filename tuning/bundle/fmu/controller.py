@@ -3,13 +3,25 @@
 from collections.abc import Mapping
 from typing import Any
 
-from tuning.bundle.c99 import GAINS_FILE, HEADER_FILE, SOURCE_FILE, generate_c99
+from tuning.bundle.c99 import GAINS_FILE, HEADER_FILE, SOURCE_FILE, generate_c99, test_program
 from tuning.bundle.controller_kind import ONE_AXIS, kind_of
 from tuning.bundle.fmu.archive import build_fmu
 from tuning.bundle.fmu.sources import read_source
 from tuning.bundle.fmu.variables import c_names, controller_variables
+from tuning.bundle.vector_replay import LAYOUTS
 
 IDENTIFIER = "jaxhil_controller"
+_TESTED_FMU = """\
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "fmi{fmi}Functions.h"
+#include "fmu_variables.h"
+
+#define FMI_VERSION {fmi}
+
+static fmi{fmi}{type} controller;
+"""
 
 
 def controller_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
@@ -50,3 +62,31 @@ def controller_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
         },
         fmi=fmi,
     )
+
+
+def fmu_test_program(document: Mapping[str, Any], fmi: int) -> str:
+    """Return the C program that replays vectors.csv through the FMU, to be compiled with the FMU's sources.
+
+    Args:
+        document: gain document.
+        fmi: version of FMI, 2 or 3.
+    """
+    kind = kind_of(document)
+    layout = LAYOUTS[kind.controller.__name__]
+    if kind is ONE_AXIS:
+        force, position, first = "force", "position", ("V_FORCE_MEASURED", "V_POSITION", "V_FORCE_COMMAND")
+    else:
+        force, position, first = "wrench", "pose", ("V_WRENCH_MEASURED_FX", "V_POSE_X", "V_WRENCH_COMMAND_FX")
+    text = read_source("test_vectors_fmu.c")
+    for name, value in {
+        "width": layout.width,
+        "motions": layout.motions,
+        "header": layout.columns,
+        "readings": first[0],
+        "motion": first[1],
+        "commands": first[2],
+        "force": force,
+        "position": position,
+    }.items():
+        text = text.replace(f"@{name}@", str(value))
+    return test_program(_TESTED_FMU.format(fmi=fmi, type="Instance" if fmi == 3 else "Component"), text)
