@@ -15,7 +15,9 @@ from tuning.rig.session import open_session, real_time_priority
 from tuning.rig.udp_protocol import MAX_PACKET_NUMBER, STOP, encode_reading
 
 FLAGS = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-pthread"]
-SOURCES = ("rt_loop.c", "rt_plant_udp.c", "jaxhil_controller.c")
+SOURCES = ("rt_loop.c", "rt_log.c", "jaxhil_controller.c")
+UDP_PLANT = "rt_plant_udp.c"
+SLOW_PLANT = Path(__file__).with_name("slow_plant.c")
 
 
 class Ran(NamedTuple):
@@ -29,12 +31,13 @@ class Ran(NamedTuple):
     log: Path
 
 
-def compile_loop(compiler, document, folder: Path, *options: str) -> Path:
-    """Write the C files of a gain document to the folder, and compile the loop."""
+def compile_loop(compiler, document, folder: Path, *options: str, plant: str | Path = UDP_PLANT) -> Path:
+    """Write the C files of a gain document to the folder, and compile the loop with a plant."""
     for name, text in c99_files(document).items():
         (folder / Path(name).name).write_bytes(text)
     program = folder / "rt_loop"
-    command = [compiler, *FLAGS, *options, "-o", program, *(folder / name for name in SOURCES), "-lm"]
+    sources = [folder / name for name in (*SOURCES, plant)]
+    command = [compiler, *FLAGS, *options, f"-I{folder}", "-o", program, *sources, "-lm"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     return program
@@ -81,5 +84,10 @@ def run_on_rig(
         if process.poll() is None:
             process.kill()
             process.communicate()
-    report = {line.split()[0]: [int(number) for number in line.split()[1:]] for line in output.splitlines()}
-    return Ran(process.returncode, errors, report, timing, task, log)
+    return Ran(process.returncode, errors, read_report(output), timing, task, log)
+
+
+def read_report(output: str) -> dict[str, list[int]]:
+    """Return the numbers that the loop has printed, by name."""
+    lines = [line.split() for line in output.splitlines() if " " in line]
+    return {name: [int(number) for number in numbers] for name, *numbers in lines}

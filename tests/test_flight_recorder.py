@@ -1,5 +1,6 @@
 """Flight recorder: shadow mode, identification and monitoring read its log, and nothing is overwritten."""
 
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -81,6 +82,24 @@ def test_flight_recorder_overwrites_no_file_and_ignores_wrong_vectors(tmp_path):
     with pytest.raises(ValueError, match="expected 1 or 6"):
         FlightRecorder(0.001, axes=2)
     assert (tmp_path / "session.csv").read_text().splitlines()[1].endswith("5.0,nan,0,0")
+
+
+def test_flight_recorder_leaves_no_incomplete_file_on_a_full_disk(tmp_path):
+    recorder = FlightRecorder(0.001)
+    for _ in range(2000):
+        recorder.add(0.0, 0.0, 0.0, 0.0, None, 0.0)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            recorder.write(tmp_path / "session.csv")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(FileNotFoundError):
+        recorder.write(tmp_path / "missing" / "session.csv")
+    recorder.write(tmp_path / "session.csv")
+    assert len((tmp_path / "session.csv").read_text().splitlines()) == 2001
 
 
 def test_flight_recorder_needs_only_the_standard_library():

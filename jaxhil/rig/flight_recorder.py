@@ -15,7 +15,7 @@ needs only the standard library, and a bundle contains a copy of it.
 
 import os
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
@@ -123,21 +123,29 @@ class FlightRecorder:
         Raises:
             ValueError: if the name does not end in `.csv`.
             FileExistsError: if one of the files exists; no file is overwritten.
-            OSError: if a file cannot be written.
+            OSError: if a file cannot be written. No incomplete file remains, and the ticks stay in memory.
         """
         log = Path(path)
         if log.suffix != ".csv":
             raise ValueError(f"{log}: found {log.suffix!r}, expected a name that ends in .csv")
-        with log.open("x", encoding="ascii", newline="\n") as file:
-            file.write(",".join(self._names) + "\n")
-            first = self._count % self._ticks if self._count > self._ticks else 0
-            for number in range(len(self)):
-                start = (first + number) % self._ticks * self._width
-                *values, contact, faults = self._rows[start : start + self._width]
-                file.write(",".join([*map(repr, values), f"{contact:.0f}", f"{faults:.0f}"]) + "\n")
-        with log.with_suffix(".toml").open("x", encoding="utf-8", newline="\n") as file:
-            # A literal string of TOML contains no quotes, and file patterns treat brackets as sets.
-            file.write(self.mapping("".join("?" if letter in "'[]*" else letter for letter in log.name)))
+        # A literal string of TOML contains no quotes, and file patterns treat brackets as sets.
+        pattern = "".join("?" if letter in "'[]*" else letter for letter in log.name)
+        mapping = log.with_suffix(".toml")
+        _create(mapping, [self.mapping(pattern)])
+        try:
+            _create(log, self._lines())
+        except BaseException:
+            mapping.unlink()
+            raise
+
+    def _lines(self) -> Iterator[str]:
+        """Yield the lines of the log, from the oldest tick to the newest one."""
+        yield ",".join(self._names) + "\n"
+        first = self._count % self._ticks if self._count > self._ticks else 0
+        for number in range(len(self)):
+            start = (first + number) % self._ticks * self._width
+            *values, contact, faults = self._rows[start : start + self._width]
+            yield ",".join([*map(repr, values), f"{contact:.0f}", f"{faults:.0f}"]) + "\n"
 
     def mapping(self, pattern: str) -> str:
         """Return the mapping of the logs whose names match a pattern, in TOML."""
@@ -149,3 +157,14 @@ class FlightRecorder:
         if self._mass is not None:
             lines += ["[bodies]", f"equivalent_mass = {self._mass!r}", ""]
         return "\n".join([*lines, "[[runs]]", f"files = '{pattern}'", 'kind = "contact"', ""])
+
+
+def _create(path: Path, lines: Iterable[str]) -> None:
+    """Create a file with these lines; delete it if it cannot be completed."""
+    with path.open("x", encoding="utf-8", newline="\n") as file:
+        try:
+            file.writelines(lines)
+            file.flush()
+        except BaseException:
+            path.unlink()
+            raise

@@ -8,7 +8,7 @@ from typing import Any
 from jaxhil.rig.flight_recorder import FlightRecorder
 from tuning.rig.numerical_model import NumericalModel
 
-FILES = ("rt_loop.h", "rt_loop.c", "rt_plant_udp.c")
+FILES = ("rt_loop.h", "rt_loop.c", "rt_log.h", "rt_log.c", "rt_plant_udp.c")
 # Displacement of the numerical model in a period, by integrator.
 MODEL_STEPS = {
     "semi_implicit_euler": "(PERIOD * (after))",

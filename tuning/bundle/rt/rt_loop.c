@@ -1,12 +1,13 @@
 /* Real-time loop of the controller and the numerical model on Linux, with one axis.
  *
- *     cc -std=c99 -O2 -ffp-contract=off -pthread -o rt_loop rt_loop.c rt_plant_udp.c jaxhil_controller.c -lm
+ *     cc -std=c99 -O2 -ffp-contract=off -pthread -o rt_loop rt_loop.c rt_log.c rt_plant_udp.c \
+ *         jaxhil_controller.c -lm
  *     ./rt_loop [--log session.csv] [--cpu N] [--priority 80] [--seconds S] [--port 0]
  *
  * The plant (sensors and drives) is behind the four functions of `plant_io` in rt_loop.h. After the start, the
  * loop allocates no memory and writes no file: a second thread writes the log, which `jaxhil shadow` reads.
- * SIGTERM and SIGINT trip the controller; the loop ends when the drives are at rest out of contact. The exit
- * code is 1 if the plant is lost or the log cannot be written, and 2 for an unusable option.
+ * SIGTERM, SIGINT and SIGHUP trip the controller; the loop ends when the drives are at rest out of contact. The
+ * exit code is 1 if the plant is lost or the log cannot be written, and 2 for an unusable option.
  */
 #ifdef __linux__
 #define _GNU_SOURCE /* for the affinity to a processor */
@@ -26,88 +27,18 @@
 
 #include "jaxhil_controller.h"
 #include "jaxhil_gains.h"
+#include "rt_log.h"
 #include "rt_loop.h"
 
 #define START_GRACE 0.1   /* s; overruns before this time are not counted */
 #define LATE_SHARE 0.25   /* periods; if the loop wakes up later than this, it was woken too late */
-#define BUDGET_SHARE 0.8  /* periods; a tick that computes for longer is an overrun */
+#define BUDGET_SHARE 0.8  /* periods; computation, or plant, that takes longer is an overrun */
 #define SILENCE 2.0       /* s; the loop ends if there are no readings for this time */
 #define STOP_TIME 5.0     /* s; longest time until the drives are at rest */
 #define MAX_INTERPOLATED 10.0 /* ticks without readings in a row that are interpolated */
-#define RING_ROWS 8192u   /* rows between both threads, a power of 2 */
 #define LATENCIES 100000u /* us; length of the histograms */
 
 volatile sig_atomic_t stop_requested = 0;
-
-/* ---- Ring for the log: one thread adds rows, the other takes them, without a lock ---- */
-typedef struct {
-    double values[6]; /* time, force reading without bias, model's position and velocity, position, force */
-    uint32_t contact, faults;
-} log_row;
-
-static struct {
-    log_row rows[RING_ROWS];
-    uint32_t added, taken; /* counters; each is written by one thread only */
-    uint64_t lost;         /* rows that did not fit */
-    bool ends;
-    FILE *file;
-} ring;
-
-static void add_row(const log_row *row) {
-    const uint32_t added = ring.added;
-    if (added - __atomic_load_n(&ring.taken, __ATOMIC_ACQUIRE) == RING_ROWS) {
-        ring.lost++;
-        return;
-    }
-    ring.rows[added % RING_ROWS] = *row;
-    __atomic_store_n(&ring.added, added + 1, __ATOMIC_RELEASE);
-}
-
-static void *write_log(void *unused) {
-    const struct timespec pause = {0, 20000000};
-    for (;;) {
-        const bool ends = __atomic_load_n(&ring.ends, __ATOMIC_ACQUIRE);
-        const uint32_t added = __atomic_load_n(&ring.added, __ATOMIC_ACQUIRE);
-        for (uint32_t taken = ring.taken; taken != added; taken++) {
-            const log_row *const row = &ring.rows[taken % RING_ROWS];
-            if (ring.file != NULL) {
-                for (int n = 0; n < 6; n++) {
-                    const double value = row->values[n];
-                    fprintf(ring.file, value == value ? "%.17g," : "nan,", value);
-                }
-                fprintf(ring.file, "%u,%u\n", (unsigned)row->contact, (unsigned)row->faults);
-            }
-            __atomic_store_n(&ring.taken, taken + 1, __ATOMIC_RELEASE);
-        }
-        if (ends) {
-            return unused;
-        }
-        nanosleep(&pause, NULL);
-    }
-}
-
-/* Create the log NAME.csv and its mapping NAME.toml, which must not exist; return false on an error. */
-static bool create_log(const char *path) {
-    char mapping[4096];
-    const size_t length = strlen(path);
-    if (length < 5 || length >= sizeof mapping || strcmp(path + length - 4, ".csv") != 0) {
-        fprintf(stderr, "rt_loop: --log: expected a name that ends in .csv\n");
-        return false;
-    }
-    memcpy(mapping, path, length - 4);
-    memcpy(mapping + length - 4, ".toml", 6);
-    FILE *const table = access(path, F_OK) != 0 && access(mapping, F_OK) != 0 ? fopen(mapping, "w") : NULL;
-    ring.file = table == NULL ? NULL : fopen(path, "w");
-    if (ring.file == NULL) {
-        fprintf(stderr, "rt_loop: %s: cannot be created, or exists\n", path);
-        return false;
-    }
-    fputs(MAPPING, table);
-    fclose(table);
-    fputs("time,force_measured,position_desired,velocity_desired,position_measured,force_command,contact,faults\n",
-          ring.file);
-    return true;
-}
 
 /* ---- One tick of controller and numerical model ---- */
 static struct {
@@ -221,20 +152,53 @@ static bool compute(const readings *now, commands *answer) {
 }
 
 /* ---- Loop with absolute deadlines ---- */
+enum { WAKING, PLANT, COMPUTING, INTERRUPTION, CAUSES }; /* causes of a missed deadline */
+
 static struct {
-    uint64_t periods, ticks, without_readings, woken_late, too_long, skipped, not_sent;
+    uint64_t periods, ticks, without_readings, skipped, not_sent;
+    uint64_t overruns[CAUSES], skipped_after[CAUSES]; /* periods that exceed a limit, skipped deadlines */
     uint32_t lateness[LATENCIES + 1], computing[LATENCIES + 1]; /* histograms [us] */
 } report;
 
-static int64_t now_ns(void) {
+static int64_t read_clock(clockid_t clock) {
     struct timespec now;
-    clock_gettime(CLOCK_MONOTONIC, &now);
+    clock_gettime(clock, &now);
     return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
+}
+
+static int64_t now_ns(void) {
+    return read_clock(CLOCK_MONOTONIC);
 }
 
 static void count_latency(uint32_t *histogram, int64_t ns) {
     const int64_t us = ns < 0 ? 0 : ns / 1000;
     histogram[us < LATENCIES ? us : LATENCIES]++;
+}
+
+/* Compute the commands; measure the processor time, and the time during which other work had the processor. */
+static bool compute_timed(const readings *now, commands *answer, int64_t *spent) {
+    const int64_t started = now_ns(), processor = read_clock(CLOCK_THREAD_CPUTIME_ID);
+    const bool has_answer = compute(now, answer);
+    spent[COMPUTING] = read_clock(CLOCK_THREAD_CPUTIME_ID) - processor;
+    spent[INTERRUPTION] = now_ns() - started - spent[COMPUTING];
+    return has_answer;
+}
+
+/* Count a period by the time spent in each of its parts [ns], and the deadlines that have passed meanwhile. */
+static void count_period(const int64_t *spent, uint64_t skipped, bool has_readings) {
+    const double period = 1e9 * PERIOD;
+    int longest = WAKING;
+    for (int cause = 0; cause < CAUSES; cause++) {
+        report.overruns[cause] += (double)spent[cause] > (cause == WAKING ? LATE_SHARE : BUDGET_SHARE) * period;
+        longest = spent[cause] > spent[longest] ? cause : longest;
+    }
+    report.skipped += skipped;
+    report.skipped_after[longest] += skipped;
+    report.without_readings += !has_readings;
+    count_latency(report.lateness, spent[WAKING]);
+    if (has_readings) {
+        count_latency(report.computing, spent[COMPUTING]);
+    }
 }
 
 /* Run until the plant or a signal ends the loop; return false if the plant is lost. */
@@ -250,12 +214,8 @@ static bool run_loop(const plant_io *io, double seconds) {
         while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, NULL) == EINTR) {
         }
         const int64_t woken = now_ns();
-        const bool counts = woken - begin > (int64_t)(1e9 * START_GRACE);
+        int64_t spent[CAUSES] = {woken - due, 0, 0, 0};
         report.periods++;
-        if (counts) {
-            count_latency(report.lateness, woken - due);
-            report.woken_late += (double)(woken - due) > LATE_SHARE * (double)period;
-        }
         if ((stop_requested || woken > end) && stopped == 0) {
             stopped = woken;
             jaxhil_emergency_stop(&loop.controller, true); /* the force fades, the drives come to rest */
@@ -264,29 +224,30 @@ static bool run_loop(const plant_io *io, double seconds) {
                              (double)(woken - stopped) > 1e9 * STOP_TIME)) {
             return true;
         }
-        if (io->read(io->plant, &now)) {
-            const int64_t started = last_readings = now_ns();
+        const bool has_readings = io->read(io->plant, &now);
+        const int64_t read = now_ns();
+        spent[PLANT] = read - woken;
+        if (has_readings) {
+            last_readings = read;
             due += (int64_t)(1e9 * now.shift);
             if (now.event == STOP || (stopped != 0 && now.event != TICK)) {
                 return true;
             }
-            if (compute(&now, &answer)) {
+            if (compute_timed(&now, &answer, spent)) {
+                const int64_t computed = now_ns();
                 report.ticks += now.event == TICK;
                 report.not_sent += !io->write(io->plant, &answer);
+                spent[PLANT] += now_ns() - computed;
             }
-            const int64_t duration = now_ns() - started;
-            if (counts) {
-                count_latency(report.computing, duration);
-                report.too_long += (double)duration > BUDGET_SHARE * (double)period;
-            }
-        } else {
-            report.without_readings += counts;
-            if ((double)(woken - last_readings) > 1e9 * SILENCE) {
-                return false;
-            }
+        } else if ((double)(woken - last_readings) > 1e9 * SILENCE) {
+            return false;
         }
+        uint64_t skipped = 0;
         for (const int64_t finished = now_ns(); due + period <= finished; due += period) {
-            report.skipped += counts; /* the deadline has passed: continue with the next one */
+            skipped++; /* the deadline has passed: continue with the next one */
+        }
+        if (woken - begin > (int64_t)(1e9 * START_GRACE)) {
+            count_period(spent, skipped, has_readings);
         }
     }
 }
@@ -303,7 +264,7 @@ static void print_latency(const char *name, const uint32_t *histogram) {
     for (uint32_t n = 0; n <= LATENCIES; n++) {
         total += histogram[n];
     }
-    printf("%s_us", name);
+    printf("%s", name);
     for (int n = 0; n < 3; n++) {
         while (us < LATENCIES && (double)(sum + histogram[us]) < shares[n] * (double)total) {
             sum += histogram[us++];
@@ -311,6 +272,53 @@ static void print_latency(const char *name, const uint32_t *histogram) {
         printf(" %u", (unsigned)us);
     }
     printf("\n");
+}
+
+static void print_counts(const char *name, const uint64_t *counts, int number) {
+    printf("%s", name);
+    for (int n = 0; n < number; n++) {
+        printf(" %llu", (unsigned long long)counts[n]);
+    }
+    printf("\n");
+}
+
+/* Print all numbers of the session; return false if they cannot be written. */
+static bool print_report(void) {
+    const uint64_t lost = lost_rows(), faults = loop.controller.seen;
+    const uint64_t at_rest = !loop.has_run || jaxhil_at_rest(&loop.controller);
+    print_counts("periods", &report.periods, 1);
+    print_counts("ticks", &report.ticks, 1);
+    print_counts("without_readings", &report.without_readings, 1);
+    print_counts("woken_late", &report.overruns[WAKING], 1);
+    print_counts("plant_too_long", &report.overruns[PLANT], 1);
+    print_counts("too_long", &report.overruns[COMPUTING], 1);
+    print_counts("interrupted", &report.overruns[INTERRUPTION], 1);
+    print_counts("skipped", &report.skipped, 1);
+    print_counts("skipped_after", report.skipped_after, CAUSES);
+    print_counts("not_sent", &report.not_sent, 1);
+    print_counts("lost_rows", &lost, 1);
+    print_counts("faults", &faults, 1);
+    print_latency("lateness_us", report.lateness);
+    print_latency("computing_us", report.computing);
+    print_counts("at_rest", &at_rest, 1);
+    return fflush(stdout) == 0;
+}
+
+/* Stop on signals that end a session; a full disk or a closed output must not end the process. */
+static void handle_signals(void) {
+    const int ends[] = {SIGTERM, SIGINT, SIGHUP}, ignored[] = {SIGPIPE, SIGXFSZ};
+    struct sigaction action, before;
+    memset(&action, 0, sizeof action);
+    action.sa_handler = request_stop;
+    for (size_t n = 0; n < sizeof ends / sizeof ends[0]; n++) {
+        if (sigaction(ends[n], NULL, &before) == 0 && before.sa_handler != SIG_IGN) { /* SIG_IGN: nohup */
+            sigaction(ends[n], &action, NULL);
+        }
+    }
+    action.sa_handler = SIG_IGN;
+    for (size_t n = 0; n < sizeof ignored / sizeof ignored[0]; n++) {
+        sigaction(ignored[n], &action, NULL);
+    }
 }
 
 /* Lock the memory, and request the processor and the priority; continue without what is not permitted. */
@@ -366,13 +374,8 @@ int main(int count, char **arguments) {
     if (path != NULL && !create_log(path)) {
         return 2;
     }
-    struct sigaction action;
-    memset(&action, 0, sizeof action);
-    action.sa_handler = request_stop;
-    sigaction(SIGTERM, &action, NULL);
-    sigaction(SIGINT, &action, NULL);
-    pthread_t writer; /* starts before the priority is raised, and therefore does not inherit it */
-    if (pthread_create(&writer, NULL, write_log, NULL) != 0) {
+    handle_signals();
+    if (!start_log()) { /* before the priority is raised, which the thread therefore does not inherit */
         return 2;
     }
     bool is_complete = io->open(io->plant);
@@ -384,17 +387,6 @@ int main(int count, char **arguments) {
             fprintf(stderr, "rt_loop: plant: found no readings for %g s, expected some\n", SILENCE);
         }
     }
-    __atomic_store_n(&ring.ends, true, __ATOMIC_RELEASE);
-    pthread_join(writer, NULL);
-    const bool is_written = ring.file == NULL || fclose(ring.file) == 0;
-    printf("periods %llu\nticks %llu\nwithout_readings %llu\nwoken_late %llu\ntoo_long %llu\nskipped %llu\n",
-           (unsigned long long)report.periods, (unsigned long long)report.ticks,
-           (unsigned long long)report.without_readings, (unsigned long long)report.woken_late,
-           (unsigned long long)report.too_long, (unsigned long long)report.skipped);
-    printf("not_sent %llu\nlost_rows %llu\nfaults %u\n", (unsigned long long)report.not_sent,
-           (unsigned long long)ring.lost, (unsigned)loop.controller.seen);
-    print_latency("lateness", report.lateness);
-    print_latency("computing", report.computing);
-    printf("at_rest %d\n", !loop.has_run || jaxhil_at_rest(&loop.controller));
-    return is_complete && is_written ? 0 : 1;
+    const bool is_written = finish_log();
+    return print_report() && is_complete && is_written ? 0 : 1;
 }
