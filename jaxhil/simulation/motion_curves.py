@@ -58,9 +58,9 @@ def compute_nominal_motion(mechanism: Mechanism, laws: NamedCompensators, seed: 
     return _build_run_motions(mechanism, lanes[0][-1], {name: runs[name] for name in laws})
 
 
-def compute_scenario_motion(loaded: LoadedGains, scenarios: Scenario, name: str = "rig") -> list[RunMotion]:
-    """Simulate one scenario; return the curves of each run, with `name` as the name of the rig's curve."""
-    return _build_run_motions(loaded.mechanism, scenarios, _compute_run_curves(loaded, scenarios, [name]))
+def compute_scenario_motion(loaded: LoadedGains, scenarios: Scenario) -> list[RunMotion]:
+    """Simulate one scenario; return the curves of each run."""
+    return _build_run_motions(loaded.mechanism, scenarios, _compute_run_curves(loaded, scenarios, ["rig"]))
 
 
 def prepare_motion(mechanism: Mechanism, laws: NamedCompensators) -> None:

@@ -43,19 +43,16 @@ def choose_metric_headings(axes: int) -> dict[str, str]:
     return SIX_AXIS_METRIC_HEADINGS if axes == 6 else METRIC_HEADINGS
 
 
-def find_winners(results: Sequence[CompensatorMetrics], which: str = TUNED_GAINS) -> dict[str, str | None]:
-    """Return for each metric the compensator that is significantly the best on one mechanism, or None.
-
-    A compensator without the gains `which` is compared with its gains from the literature.
-    """
-    by_law = {result.compensator: choose_best_metrics(result, which) for result in results}
+def find_winners(results: Sequence[CompensatorMetrics]) -> dict[str, str | None]:
+    """Return for each metric the compensator that is significantly the best on one mechanism, or None."""
+    by_law = {result.compensator: choose_best_metrics(result) for result in results}
     headings = choose_metric_headings(results[0].axes)
     return {name: find_winner(name, {law: m[name] for law, m in by_law.items()}) for name in headings}
 
 
-def choose_best_metrics(result: CompensatorMetrics, which: str = TUNED_GAINS) -> dict[str, IntervalEstimate]:
-    """Return the metrics with the gains `which` or, if there are none, with the literature's gains."""
-    return result.figures.get(which) or result.figures[LITERATURE_GAINS]
+def choose_best_metrics(result: CompensatorMetrics) -> dict[str, IntervalEstimate]:
+    """Return the metrics with the tuned gains or, if there are none, with the literature's gains."""
+    return result.figures.get(TUNED_GAINS) or result.figures[LITERATURE_GAINS]
 
 
 def build_mechanism_table(name: str, results: Sequence[CompensatorMetrics]) -> Table:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+MIN_PERIOD_ROWS = 100  # shortest period of a command that is searched for
 VARIANCE_SMOOTHING_LINES = 15  # number of adjacent lines whose noise variance is averaged
 SIDE_LINES = 6  # local polynomial method: lines on either side of the estimated line
 POLYNOMIAL_DEGREE = 2  # local polynomial method: degree of response and transient
@@ -44,7 +45,7 @@ class Spectrum:
     periods: int  # number of averaged periods; 0 for a non-periodic command
 
 
-def find_repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100) -> tuple[int, slice] | None:
+def find_repetition(command: np.ndarray, valid: np.ndarray) -> tuple[int, slice] | None:
     """Find the period of a command, and the range of rows in which the command is periodic.
 
     The command need not be periodic from its first row, because a multisine usually fades in.
@@ -52,7 +53,6 @@ def find_repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100)
     Args:
         command: Commanded position of each row.
         valid: Flags of the rows that were not lost.
-        shortest: Shortest period to search for, in rows.
 
     Returns:
         The number of rows per period, and the range of rows; or None if the command is not periodic.
@@ -68,7 +68,7 @@ def find_repetition(command: np.ndarray, valid: np.ndarray, shortest: int = 100)
         (correlation[1:-1] >= correlation[:-2]) & (correlation[1:-1] > correlation[2:])
     )
     scale = np.std(command[valid])
-    for lag in peaks[(peaks >= shortest) & (correlation[peaks] > 0.5 * correlation[0])]:
+    for lag in peaks[(peaks >= MIN_PERIOD_ROWS) & (correlation[peaks] > 0.5 * correlation[0])]:
         both_valid = valid[lag:] & valid[:-lag]
         same = (np.abs(command[lag:] - command[:-lag]) <= 1e-4 * scale) | ~both_valid
         first, length = _find_longest_run(same)

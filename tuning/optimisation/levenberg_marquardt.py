@@ -26,6 +26,7 @@ INITIAL_DAMPING = 0.1  # damping of the first step, relative to the mean diagona
 MIN_STEP_LENGTH = 1e-6  # minimum step, in unit coordinates; a problem whose step is shorter has converged
 # Number of steps and minimum relative decrease of the loss in these steps; below it, a problem has converged.
 PROGRESS_STEPS, MIN_LOSS_DECREASE = 5, 1e-3
+RTOL, ATOL = 1e-4, 1e-6  # relative and absolute tolerance of convergence
 
 
 @partial(jax.jit, static_argnames=("residuals", "static", "longest", "tile"))
@@ -38,12 +39,10 @@ def solve_least_squares(
     steps: Int[Array, ""],
     longest: int = 32,
     tile: int | None = None,
-    rtol: float = 1e-4,
-    atol: float = 1e-6,
 ) -> SolverResult:
     """Minimise half the sum of squared residuals of many problems, which are distributed to all devices.
 
-    A problem has converged if residuals and coordinates change by less than `rtol` and `atol` permit, if a
+    A problem has converged if residuals and coordinates change by less than `RTOL` and `ATOL` permit, if a
     step is shorter than `MIN_STEP_LENGTH`, or if the relative decrease of the loss in `PROGRESS_STEPS` steps
     is below `MIN_LOSS_DECREASE`.
 
@@ -57,8 +56,6 @@ def solve_least_squares(
         steps: largest number of steps, at most `longest`.
         longest: upper limit on `steps`, a constant of the compiled program.
         tile: number of problems that are evaluated together; None: all problems of a device.
-        rtol: relative tolerance of convergence.
-        atol: absolute tolerance of convergence.
 
     Returns:
         The best point of each problem, and the history of the loss.
@@ -68,7 +65,7 @@ def solve_least_squares(
         bounds, arguments = arguments
         return residuals(static, to_gains(coordinates, bounds), arguments)
 
-    solver = _LossRecordingSolver(_BoxedLevenbergMarquardt(rtol, atol), steps, longest)
+    solver = _LossRecordingSolver(_BoxedLevenbergMarquardt(RTOL, ATOL), steps, longest)
 
     def one_device(starts, bounds, arguments):
         function = _with_jacobian(of_coordinates, starts, (bounds, arguments), tile)

@@ -34,7 +34,6 @@ def compute_error_intervals(
     good: Bool[np.ndarray, "slots scenarios"],
     *,
     resamples: int = BOOTSTRAP_RESAMPLES,
-    level: float = CONFIDENCE_LEVEL,
     seed: int = 0,
 ) -> ErrorIntervals:
     """Compute bootstrap confidence intervals of the rms and the 99th percentile of restitution errors.
@@ -50,7 +49,6 @@ def compute_error_intervals(
         errors: restitution error e - e* of each contact [1].
         good: whether each contact has ended; the others are ignored.
         resamples: number of bootstrap resamples.
-        level: confidence level, between 0 and 1.
         seed: seed of the resamples.
     """
     magnitudes = np.where(good, np.abs(errors), 0)
@@ -74,11 +72,11 @@ def compute_error_intervals(
         vectorized=True,
         n_resamples=resamples,
         batch=max(1, 2_000_000 // len(squares)),
-        confidence_level=level,
+        confidence_level=CONFIDENCE_LEVEL,
         method="BCa" if len(squares) <= MAX_BCA_SCENARIOS else "percentile",
         rng=np.random.default_rng(seed),
     ).confidence_interval
-    tails = np.array([(1 - level) / 2, (1 + level) / 2])
+    tails = np.array([(1 - CONFIDENCE_LEVEL) / 2, (1 + CONFIDENCE_LEVEL) / 2])
     percentiles = _resample_percentile(magnitudes, good, 0.99, resamples, np.random.default_rng(seed))
     return ErrorIntervals(
         Interval(float(rms.low), float(rms.high)),

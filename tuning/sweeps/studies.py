@@ -98,12 +98,13 @@ def group_independent_inputs(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
     }
 
 
-def count_most_scenarios(samples: int = SUBSET_SAMPLES, replicates: int = SUBSET_REPLICATES) -> int:
+def count_most_scenarios() -> int:
     """Return the largest number of scenarios that `estimate_rare_failure` can run.
 
     Each level except the first reuses some scenarios of the previous level.
     """
-    return replicates * (samples + (MAX_LEVELS - 1) * (samples - samples // CHAIN_LENGTH))
+    new = SUBSET_SAMPLES - SUBSET_SAMPLES // CHAIN_LENGTH
+    return SUBSET_REPLICATES * (SUBSET_SAMPLES + (MAX_LEVELS - 1) * new)
 
 
 def estimate_rare_failure(

@@ -107,9 +107,7 @@ def _add_push(
     return pushed._replace(reference=reference)
 
 
-def compute_probe_metrics(
-    probed: ProbedScenarios, outcome: Outcome, seed: int = 0
-) -> dict[str, IntervalEstimate]:
+def compute_probe_metrics(probed: ProbedScenarios, outcome: Outcome) -> dict[str, IntervalEstimate]:
     """Compute the metrics `early`, `late`, `slope` and `peak` from the outcome of probed scenarios.
 
     The leaves of `outcome` have the shape (slots, scenarios, `LANES_PER_SCENARIO`).
@@ -118,4 +116,4 @@ def compute_probe_metrics(
         jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[..., i], outcome) for i in range(LANES_PER_SCENARIO)
     )
     runs = PerturbedOutcomes(plain, early, late, damped)
-    return compute_transparency_metrics(runs, (probed.early, probed.late), probed.plain, seed)
+    return compute_transparency_metrics(runs, (probed.early, probed.late), probed.plain, seed=0)

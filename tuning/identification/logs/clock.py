@@ -40,26 +40,25 @@ class RowTicks(NamedTuple):
     clock: StampClock
 
 
-def assign_ticks(stamps: np.ndarray, period: float, label: str, column: str = "time") -> RowTicks:
+def assign_ticks(stamps: np.ndarray, period: float, label: str) -> RowTicks:
     """Return the tick of each row from its time stamp.
 
     Args:
         stamps: Time stamps [s].
         period: Control period [s].
         label: Name of the log in messages.
-        column: Name of the column in messages.
 
     Raises:
         InputError: If the time stamps do not increase at the control rate.
     """
-    stamps, phase, tick = _round_to_ticks(stamps, period, label, column)
+    stamps, phase, tick = _round_to_ticks(stamps, period, label, "time")
     error = stamps - phase - period * tick
     error -= np.mean(error)
     jitter = float(np.std(error))
     if jitter > MAX_STAMP_SCATTER * period:
         finding = f"stamps that scatter by {1e3 * jitter:.3g} ms about the ticks"
         expected = f'at most {MAX_STAMP_SCATTER:g} control periods, or timing.clock = "index"'
-        raise InputError(f"{label}: {column}: found {finding}, expected {expected}")
+        raise InputError(f"{label}: time: found {finding}, expected {expected}")
     slope = float(np.polynomial.polynomial.polyfit(tick.astype(float), stamps, 1)[1])
     clock = StampClock(slope, 1e6 * (slope / period - 1.0), jitter, int(tick[-1] - tick[0] + 1 - len(tick)))
     return RowTicks(tick - tick[0], clock)

@@ -176,13 +176,12 @@ def parse_mapping(raw: Mapping[str, Any], label: str) -> LogMapping:
     return mapping
 
 
-def make_simulation_mapping(kind: RunKind = "contact") -> LogMapping:
+def make_simulation_mapping() -> LogMapping:
     """Return the mapping of logs that `jaxhil simulate --log` writes."""
     names = ("position_desired", "position_measured", "force_measured", "velocity_desired", "force_command")
     channels = {"time": "time", **{name: name for name in names}, "contact_index": "contact"}
-    return parse_mapping(
-        {"schema": SCHEMA, "channels": channels, "runs": [{"files": "*", "kind": kind}]}, "own logs"
-    )
+    runs = [{"files": "*", "kind": "contact"}]
+    return parse_mapping({"schema": SCHEMA, "channels": channels, "runs": runs}, "own logs")
 
 
 def get_si_conversion(channel: Channel, name: str, stated: str | None = None) -> tuple[float, float]:
