@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import QUICK
-from six_axis_ranges import POSE_NOISE, load_wide, with_ranges
+from six_axis_ranges import POSE_NOISE, with_ranges
 
 from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS, literature_gains
 from jaxhil.laws.impulse_ledger.six_axes.tangent_model.rig import TangentModel
@@ -135,28 +135,6 @@ def test_tangent_model_keeps_slope_and_force_when_contact_direction_turns():
     model.settle(0.0, speed)
     model.bridge(force, 0.0, 0.0, 0.0, 1e-4)
     assert model.force == pytest.approx(force, rel=1e-3)
-
-
-# Lanes of 511 fresh scenarios in which the direction turns at a large force, and the largest twist error.
-TURNING = {"petals": ([410, 484], 0.15), "claw-two-arms": ([124, 262], 0.35)}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", TURNING)
-def test_twist_errors_are_small_if_another_surface_takes_over(name):
-    lanes, largest = TURNING[name]
-
-    def chosen(scenarios):
-        def pick(leaf):
-            is_drawn = jnp.ndim(leaf) > 0 and jnp.shape(leaf)[-1] == 511
-            return jnp.asarray(leaf)[..., np.array(lanes)] if is_drawn else leaf
-
-        return jax.tree.map(pick, scenarios)
-
-    [metrics] = evaluated(load_wide(name), LAW, lanes=511, scenario=chosen, seed=0x5EED)
-    check_good(metrics)
-    print(name, metrics["twist_error"])
-    assert np.max(metrics["twist_error"]) < largest
 
 
 def test_six_axis_impulse_ledger_gains_follow_from_mechanism_file():

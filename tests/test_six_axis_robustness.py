@@ -15,9 +15,11 @@ from jaxhil.laws.impulse_ledger.simulation_six_axes import ImpulseLedger
 from jaxhil.sixdof.equations import solve
 
 WRONG_MASS = "impulse_ledger_with_wrong_mass"
-# Largest rms energy errors, on the hexapod divided by the undisturbed error. The hexapod has no tool.
+# Largest rms energy errors, divided by the undisturbed error except for `probe-drogue`, the only mechanism
+# with a tool on its sensor.
 LIMITS = {
     "probe-drogue": {"bias": 0.055, "tool": 0.055, "mass": 0.06, "delay": 0.13},
+    "ring-capture": {"bias": 1.3, "mass": 1.5, "delay": 4.0},
     "hydraulic-hexapod": {"bias": 1.3, "mass": 1.5, "delay": 4.6},
 }
 
