@@ -39,8 +39,9 @@ def simulate(
         mechanism: Result of `jaxhil.load`, name of a built-in mechanism, or path of a mechanism file.
         compensator: Name of a compensator; with six axes "none", "phase_lead" or "phase_lead_per_axis".
             With a gain file, "none" stands for the compensator of the file.
-        gains: None for the gains that the literature recommends, a dict of gains by name (for missing gains,
-            the literature's values), the name of a setting of the compensator, or the path of a gain file.
+        gains: None for the gains that the literature recommends. Alternatively a dict of gains by name
+            (missing gains have the literature's values), the name of a setting of the compensator, or the
+            path of a gain file.
         seed: Seed of the sensors' noise.
 
     Returns:

@@ -1,8 +1,9 @@
 """Interface of the contact laws, which compute the contact force from the penetration and its rate.
 
-A law defines its keys in a mechanism file, its force (in JAX, and in Python floats for real time), its ideal
-contact, and functions for tuning, benchmarks and identification. To add a law, write a module with a subclass
-of `ContactLaw` and add an entry to `jaxhil.contact.laws`.
+A law defines its keys in a mechanism file, its force and its ideal contact. It also has functions for tuning,
+benchmarks and identification. The force has two versions: one in JAX, and one in Python floats for loops in
+real time. To add a law, write a module with a subclass of `ContactLaw` and add an entry to
+`jaxhil.contact.laws`.
 
 In the simulation a law is a pure function of the penetration d [m], its rate d' [m/s] and the law's state
 (`init`, `step`); a law without memory has an empty state. The force is 0 for d <= 0 and, unless the law
@@ -40,7 +41,8 @@ class ContactLaw(abc.ABC):
     """
 
     name: ClassVar[str] = ""  # name in mechanism files
-    # Keys of `[contact]` that this law uses in addition to the keys of all laws; None: it may use any key.
+    # Keys of `[contact]` that this law uses in addition to the keys of all laws; None: the law may use any
+    # key.
     keys: ClassVar[tuple[ContactKey, ...] | None] = None
     stiffness_unit: ClassVar[str] = "N/m"
     damping_unit: ClassVar[str] = "N s/m"
@@ -85,7 +87,7 @@ class ContactLaw(abc.ABC):
 
     @property
     def has_closed_form(self) -> bool:
-        """Return whether the ideal contact has a closed form; if not, it is integrated numerically."""
+        """Return whether the ideal contact has a closed form, so that no numerical integration is needed."""
         return type(self).ideal_contact is not ContactLaw.ideal_contact
 
     @property
@@ -184,7 +186,7 @@ class ContactLaw(abc.ABC):
     def perturb_damping(
         self, drawn: Callable[[str], np.ndarray], ratio: np.ndarray, mass: np.ndarray, velocity: np.ndarray
     ) -> tuple[str, np.ndarray]:
-        """Increase the contacts' energy loss by that of a linear oscillator with the damping ratio zeta.
+        """Increase the contacts' energy loss by the loss of a linear oscillator with the damping ratio zeta.
 
         Args:
             drawn: function that returns the random draws of a key, (draws, ...). For `stiffness` and
@@ -209,7 +211,10 @@ class ContactLaw(abc.ABC):
         raise self._missing_method_error("as_float_law")
 
     def regression(self, contact: Any) -> Regression:
-        """Return the law as a linear regression. Raise `InputError` if the law does not define it."""
+        """Return the law as a linear regression.
+
+        Raise `InputError` if the law does not define this method.
+        """
         raise self._missing_method_error("regression")
 
     def families(self, deepest: float, entries: int) -> list[RegressionFamily]:

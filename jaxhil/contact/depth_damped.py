@@ -51,8 +51,8 @@ class DepthDamped(PowerLaw):
     def perturb_damping(self, drawn, ratio, mass, velocity):
         """Add to `damping` the effect of Hunt and Crossley's damping constant chi = pi zeta/v.
 
-        zeta is the damping ratio `ratio`, and v is the approach speed. The added force equals that of Hunt
-        and Crossley's law at the deepest penetration of the undamped contact.
+        zeta is the damping ratio `ratio`, and v is the approach speed. At the deepest penetration of the
+        undamped contact, the added force equals the damping force of Hunt and Crossley's law.
         """
         stiffness, order = drawn("stiffness"), drawn("exponent")[:, None] + 1
         depth = (order * mass * velocity**2 / (2 * stiffness)) ** (1 / order)

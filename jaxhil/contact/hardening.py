@@ -18,9 +18,9 @@ class Hardening(ContactLaw):
     k is `stiffness` [N/m], d_0 is `reference_depth` [m], and b is `damping` [N s/m]. The slope of the
     spring's force is k at the surface and 4 k at the depth d_0.
 
-    The ideal contact is integrated numerically. Without damping the restitution is 1, and the force is
-    largest at the deepest point, where k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 for the equivalent mass M [kg] and
-    the approach speed v [m/s].
+    The ideal contact is integrated numerically. Without damping, the restitution is 1, and the force is
+    largest at the deepest point. There, k d^2/2 + k d^4/(4 d_0^2) = M v^2/2 with the equivalent mass M [kg]
+    and the approach speed v [m/s].
     """
 
     name: ClassVar[str] = "hardening"

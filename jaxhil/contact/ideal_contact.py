@@ -101,8 +101,8 @@ def ideal_hunt_crossley(
 
     and F is largest where G(q) - G(y) = n y / (n + 1). All three results are computed in forms that are
     regular at chi = 0. The integral uses the double-exponential rule after a substitution that removes the
-    singularity at s = S. The law is that of Hunt and Crossley, J. Appl. Mech. 42 (1975) 440-445; the solution
-    is derived here.
+    singularity at s = S. The law is from Hunt and Crossley, J. Appl. Mech. 42 (1975) 440-445; the solution is
+    derived here.
 
     Args:
         mass: equivalent mass M [kg].
@@ -145,7 +145,7 @@ def ideal_piecewise_linear(
 # s coth(s) - 1 = sum_k _COTH_SERIES[k-1] s^(2k), radius of convergence pi.
 _SERIES_ORDERS = np.arange(1, 9)
 _MAX_SERIES_ARGUMENT = 0.3
-# Riemann's zeta(2), zeta(4), ... are listed because SciPy, which has them, takes long to import.
+# Values of Riemann's zeta function, zeta(2), zeta(4), ... They are listed because SciPy takes long to import.
 _ZETA = np.array(
     [
         1.6449340668482264,

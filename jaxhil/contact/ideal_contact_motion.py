@@ -101,7 +101,7 @@ def integrate_contact(
     position = rate = None
     if nodes is not None:
         position, rate = _interpolate_nodes(nodes, end, velocity, times)
-    # Bodies that come to rest at the surface may cross it by rounding; this is no separation.
+    # Rounding may move bodies that come to rest at the surface out of the surface; this is no separation.
     is_moving = jnp.abs(end.velocity) > tolerance * velocity
     return IdealContactMotion(
         restitution=jnp.abs(end.velocity) / velocity,

@@ -105,7 +105,7 @@ class _SegmentPassage(NamedTuple):
     spring: Array  # spring force at the start, divided by mass [m/s^2]
     velocity: Array  # velocity at the start [m/s]
     crosses: Array  # whether the motion crosses the far depth of the segment, instead of ending within it
-    target: Array  # distance to the far depth [m]; 0 if it is not reached
+    target: Array  # distance to the far depth [m]; 0 if the motion ends before it
     time: Array  # duration, without derivative [s]
     grows: Array  # whether the motion is inward and the force increases at the start
     culmination: Array  # time until the force is largest [s]

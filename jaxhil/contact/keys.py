@@ -34,7 +34,7 @@ class ContactKey(NamedTuple):
     meaning: str  # description; "{laws}" stands for the names of the laws that have the key
     unit: str | None = None  # unit of the number or of the list's entries; None for a flag
     limits: Mapping[str, float] = {}  # allowed values of the number or list entries, by msgspec's names
-    default: Any = None  # None: the key is required for the laws that have it
+    default: Any = None  # None: laws that have the key require it
     neutral: float = 0.0  # value in `ContactParameters` if the file has no value
     name_in_six_axes: str = ""  # name in six-axis files, if it differs from `name`
     meaning_in_six_axes: str = ""  # description in six-axis files, if `name_in_six_axes` is not empty

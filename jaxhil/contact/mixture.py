@@ -17,8 +17,8 @@ from jaxhil.contact.laws import ContactLaw, ContactParameters
 class LawMixture(ContactLaw):
     """Contact law that applies the law `laws[parameters.kind]` to each batch element.
 
-    Stiffness and depths have a leading axis of segments; laws without segments use the first segment. The
-    parameters of a batch element are those of its own law. For the other laws, the damping is set to 0.
+    Stiffness and depths have a leading axis of segments; laws without segments use the first segment. Each
+    batch element has only the parameters of its own law. For the other laws, the damping is set to 0.
 
     If `precomputed` is true, the scenarios contain the ideal contacts of laws without a closed form
     (`Scenario.reference`). The method `ideal_contact` then returns NaN for these laws.

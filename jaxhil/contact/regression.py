@@ -48,4 +48,4 @@ class RegressionFamily(NamedTuple):
     make: Callable[[float], Regression]  # returns the regression for a value of the parameter
     low: float = 0.0  # smallest value
     high: float = 0.0  # largest value; equal to `low` if there is no such parameter
-    preferred: tuple[float, ...] = ()  # values that are preferred if they fit equally well
+    preferred: tuple[float, ...] = ()  # values that identification prefers if they fit equally well

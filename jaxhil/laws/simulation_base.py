@@ -2,7 +2,7 @@
 
 A compensator object does not change. Its methods take and return the state, a pytree of arrays of the batch
 shape; ring buffers have an additional leading axis of samples. Gains are a dict of arrays, scalar or of the
-batch shape. `Compensator.gains` lists them with unit, bounds and the rule of the literature.
+batch shape. `Compensator.gains` lists all gains with unit, bounds and the rule of the literature.
 """
 
 import abc

@@ -96,7 +96,8 @@ class SixAxisCompensator(eqx.Module):
     def pose_command(self, gains: Gains, pose: Six, rates: Six) -> Six:
         """Return the pose command from the numerical model's coordinates `pose` and their `rates`.
 
-        By default, the command is pose + lead * rates with the gains `lag_lead_...`; without them, the pose.
+        By default, the command is pose + lead * rates with the gains `lag_lead_...`. Without these gains, the
+        command is the pose.
         """
         if LAG_LEADS[0] not in gains:
             return pose
@@ -111,7 +112,7 @@ def lag_leads(equalise: bool) -> tuple[Gain, ...]:
 
     Args:
         equalise: if True, the nominal lead time is the coordinate's lag minus the shortest lag, so that all
-            coordinates lag equally; if False, it is 0.
+            coordinates lag equally. If False, the nominal lead time is 0.
     """
 
     def gain(index: int, name: str) -> Gain:

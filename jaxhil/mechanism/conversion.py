@@ -80,7 +80,7 @@ def raise_problems(problems: Sequence[KeyProblem]) -> None:
 
 
 def run_checks(checks: Iterable[Callable[[], object]]) -> None:
-    """Run all checks, and raise `KeyProblem` with the problems of those that fail."""
+    """Run all checks, and raise `KeyProblem` with the problems of all checks that fail."""
     problems = []
     for check in checks:
         try:

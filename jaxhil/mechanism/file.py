@@ -1,8 +1,8 @@
 """Reader of mechanism files: bytes, TOML, overrides and validation.
 
-`load` makes a validated `Mechanism` from a file (or from the name of a built-in mechanism), the
-``PATH=VALUE`` overrides of ``--set`` and the keys that ``--unset`` removes; `load_any` also reads six-axis
-files. Every error raises `InputError` with a one-line message.
+`load` reads a one-axis mechanism file or a built-in mechanism, applies the ``PATH=VALUE`` overrides of
+``--set``, removes the keys of ``--unset``, and returns a validated `Mechanism`. `load_any` also reads
+six-axis files. Every error raises `InputError` with a one-line message.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def load_any(
 
 
 def source_sha256(mechanism: AnyMechanism) -> str:
-    """Return the SHA-256 of the mechanism's file in hexadecimal; without a file, that of the content."""
+    """Return the SHA-256 of the mechanism's file in hexadecimal or, without a file, of its content."""
     content = _content_sha256(mechanism)
     return _file_hashes.get(content, content)
 
@@ -178,7 +178,7 @@ def to_plain_data(mechanism: AnyMechanism) -> dict[str, Any]:
 
 
 def builtin_names() -> list[str]:
-    """Return the names of the built-in one-axis mechanisms, except those of `suite_names`."""
+    """Return the names of the built-in one-axis mechanisms, except the mechanisms of `suite_names`."""
     return [name for name in _builtin_paths() if not name.startswith(SUITE_PREFIX)]
 
 

@@ -56,7 +56,7 @@ def _to_python(value: Any) -> Any:
     """Convert the NumPy and JAX numbers and arrays in a value to Python numbers and lists."""
     if isinstance(value, (list, tuple)):
         if len(value) > MAX_CONTACTS:
-            return value  # validation rejects the length before it reads the entries
+            return value  # validation rejects the length without reading the entries
         return [_to_python(entry) for entry in value]
     if isinstance(value, Mapping):
         return {key: _to_python(entry) for key, entry in value.items()}

@@ -86,7 +86,8 @@ def check_mechanism_rules(mechanism: Mechanism) -> None:
 def resolve_damping_ratio(mechanism: Mechanism) -> Mechanism:
     """Return the mechanism with `contact.damping` computed from its key `contact.damping_ratio`.
 
-    The mechanism is returned unchanged if it has no such key, or if `check_mechanism_rules` will reject it.
+    The mechanism is returned unchanged if it has no such key, or if `check_mechanism_rules` will reject the
+    key.
     """
     contact, bodies = mechanism.contact, mechanism.bodies
     if contact.damping_ratio is None:
@@ -333,7 +334,7 @@ def _check_jitter(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
     key, found = tuple(path.split(".")), format_value(extreme(path, 1))
     shortest = extreme("rig.force_sensor.delay", 0)
     if not extreme(path, 1) <= shortest:
-        raise KeyProblem(key, found, f"at most {shortest:g} s, the least rig.force_sensor.delay")
+        raise KeyProblem(key, found, f"at most {shortest:g} s, the smallest rig.force_sensor.delay")
     reasons = {
         "a time_constant": _is_used(mechanism, "rig.force_sensor.time_constant"),
         "a filter": mechanism.rig.force_sensor.filter is not None,
@@ -341,11 +342,11 @@ def _check_jitter(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
         "a clearance": math.isfinite(mechanism.contact.clearance),
     }
     for reason in (reason for reason, is_true in reasons.items() if is_true):
-        raise KeyProblem(key, found, f"0, because {reason} excludes jitter")
+        raise KeyProblem(key, found, f"0, because jitter is not supported with {reason}")
 
 
 def _check_missed_ticks(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    """Raise `KeyProblem` if a mechanism with two surfaces has missed ticks."""
+    """Raise `KeyProblem` if a mechanism has both two surfaces and missed ticks."""
     path = "rig.missed_tick_probability"
     if _is_used(mechanism, path) and math.isfinite(mechanism.contact.clearance):
         found = format_value(_build_extreme_function(mechanism, spans)(path, 1))

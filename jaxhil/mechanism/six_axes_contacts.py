@@ -38,7 +38,7 @@ KEYS_OF_FRICTION: Mapping[str, tuple[str, ...]] = {
 
 
 def check_contact(mechanism: SixAxisMechanism, name: str, contact: Contact) -> None:
-    """Raise `KeyProblem` unless a contact's shapes form a supported pair and have the keys that they need."""
+    """Raise `KeyProblem` unless a contact's shapes form a supported pair and have their required keys."""
     path: KeyPath = ("contact", name)
     for body in ("chaser", "target"):
         _check_shape((*path, body), getattr(contact, body))

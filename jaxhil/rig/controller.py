@@ -177,14 +177,14 @@ class Controller(ControllerBase):
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
         """Return the position [m] to command for the numerical model's motion after this tick's step.
 
-        Two successive commands differ by at most `velocity_limit` times the period. A run's first command
-        may differ from the measured position by at most this amount or, if the model is out of contact, by
-        at most `start_distance`, because moving drives lag behind. Before a run's first `step`, the model's
-        position replaces the measured position if the model is out of contact.
+        Two successive commands differ by at most `velocity_limit` times the period. A run's first command may
+        differ from the measured position by at most the same amount. If the model is out of contact, the
+        limit is `start_distance` instead, because moving drives lag behind. Before a run's first `step`, the
+        model's position replaces the measured position if the model is out of contact.
 
-        After a trip, the commands move to rest out of contact. They start from the last command, or if there
-        is none, from the last measured position. If there is neither, they start from a position out of
-        contact.
+        After a trip, the commands move to rest out of contact. The commands start from the last command or,
+        if there is none, from the last measured position. If there is neither, they start from a position out
+        of contact.
 
         Args:
             position: position of the numerical model [m].
@@ -208,7 +208,7 @@ class Controller(ControllerBase):
         return positions.output
 
     def _sent(self, position: float, velocity: float, acceleration: float) -> float:
-        """Return the compensator's position command [m]; NaN if it raises or the motion is not finite."""
+        """Return the compensator's position command [m]; NaN after an exception or a non-finite motion."""
         if not (isfinite(position) and isfinite(velocity) and isfinite(acceleration)):
             return nan
         try:
@@ -244,7 +244,7 @@ class Controller(ControllerBase):
         Call this method after the rig has moved to the start of the run: the first position command continues
         from the measured position, not from the last command. Identified parameters remain, a trip stays
         latched, and the gap before the next tick counts no missed ticks. If a contact has not ended, it is
-        audited first, and `faults` has its faults until the next `step`.
+        audited first, and `faults` contains the faults of this audit until the next `step`.
         """
         if self.cause:
             return

@@ -175,5 +175,5 @@ FAULTS = (
 
 
 def fault_names(bits: int, faults: Sequence[Fault] = FAULTS) -> list[str]:
-    """Return the names of the faults whose bits are set; `faults` are those of the controller."""
+    """Return the names of the faults whose bits are set; `faults` is the controller's fault table."""
     return [fault.name for fault in faults if bits & fault.bit]

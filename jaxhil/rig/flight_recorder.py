@@ -8,9 +8,9 @@
     # after the session:
     recorder.write("session.csv")
 
-`jaxhil shadow`, `identify` and `monitor` read the log. It has the columns of `jaxhil simulate --log`, the
-index of the contact, and the bits of the faults. Its mapping (`jaxhil/log/1`) is a second file. This module
-needs only the standard library, and a bundle contains a copy of it.
+`jaxhil shadow`, `identify` and `monitor` read the log. The log has the columns of `jaxhil simulate --log`,
+the index of the contact, and the bits of the faults. Its mapping (`jaxhil/log/1`) is a second file. This
+module needs only the standard library, and a bundle contains a copy of it.
 """
 
 import os
@@ -41,7 +41,7 @@ DEFAULT_TICKS = 600_000  # number of ticks in memory: ten minutes at 1 kHz
 
 
 class FlightRecorder:
-    """Recorder of the newest ticks of a controller; it allocates all memory when it is created.
+    """Recorder of the newest ticks of a controller, which allocates all memory when it is created.
 
     Args:
         period: control period [s].
@@ -89,7 +89,7 @@ class FlightRecorder:
         command: float | Sequence[float],
         faults: int = 0,
     ) -> None:
-        """Add one tick; the arguments are those of the controller's `step`, its command and its faults.
+        """Add one tick: the arguments of the controller's `step`, its command and its faults.
 
         Args:
             force_measured: force reading [N]; six axes: wrench [N, N m].

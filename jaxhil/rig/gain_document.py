@@ -44,7 +44,7 @@ def digest(document: Mapping[str, Any]) -> str:
 
 
 def read_gain_document(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the JSON object in a gain file. Raise GainFileError if the file is unreadable or no object."""
+    """Return the JSON object in a gain file. Raise GainFileError if this is not possible."""
     source = os.fspath(path)
     try:
         mode = os.stat(source).st_mode
@@ -148,7 +148,7 @@ def read_limits(
         document: content of a gain file.
         source: name of the document in error messages.
         table: all limits by name.
-        complete: function that adds the defaults. It raises ValueError if two limits contradict each other.
+        complete: function that adds the defaults, and raises ValueError if two limits contradict each other.
     """
     limits = {}
     entries = read_object(document, "limits", source, "") if "limits" in document else {}

@@ -52,8 +52,8 @@ def check_gain_document(
     Args:
         document: content of a gain file.
         source: name of the document in error messages.
-        others: gain specifications of compensators that can only be simulated, by compensator name. They
-            take precedence over those of the registered compensators.
+        others: gain specifications of compensators that can only be simulated, by compensator name. These
+            specifications take precedence over the specifications of registered compensators.
         axes: accepted numbers of axes.
 
     Raises:

@@ -124,7 +124,7 @@ def complete_limit_table(
     ranges: Sequence[tuple[str, str]],
     order: Sequence[tuple[str, str]],
 ) -> dict[str, float]:
-    """Add the defaults of missing limits to those of a table. Raise ValueError if two limits contradict.
+    """Add the defaults of missing limits to the limits of a table. Raise ValueError if two limits contradict.
 
     Args:
         limits: limits that have been set, by name.

@@ -1,7 +1,7 @@
 """Interface of the rig's compensators, and the table `COMPENSATORS` of registered compensators.
 
-A compensator is a class with the methods of `Compensator`; it may inherit their defaults. `@register(name)`
-adds the class to the table; gain files refer to the compensator by this name.
+A compensator is a class with the methods of `Compensator`, and may inherit the default methods.
+`@register(name)` adds the class to the table; gain files refer to the compensator by this name.
 """
 
 from collections.abc import Callable, Mapping

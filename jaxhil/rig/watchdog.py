@@ -1,13 +1,13 @@
 """Watchdog: energy audit of every contact, from the motion of the numerical model.
 
 A contact begins on the first tick on which the model's or the measured position is beyond a specified
-surface, or on which the compensator acts (it may detect a nearer surface). The watchdog audits the contact as
-soon as none of these conditions has been true for the time `settling`. In addition, the model must move away
-and the force must have decayed. The watchdog waits for the decay for at most `MAX_DECAY_WAIT`. No threshold
-depends on the noise, because a noisy force can be small by chance before it has given its whole impulse. The
-audit takes place at the latest in the middle between two surfaces, or at the call of `next_contact`. With
-v_in and v, the model's velocities on the tick before the contact and on the present tick, the audit checks
-three conditions:
+surface. It also begins if the compensator acts, which may detect a nearer surface. The watchdog audits the
+contact as soon as none of these conditions has been true for the time `settling`. In addition, the model must
+move away and the force must have decayed. The watchdog waits for the decay for at most `MAX_DECAY_WAIT`. No
+threshold depends on the noise, because a noisy force can be small by chance before its whole impulse has
+acted. The audit takes place at the latest in the middle between two surfaces, or at the call of
+`next_contact`. With v_in and v, the model's velocities on the tick before the contact and on the present
+tick, the audit checks three conditions:
 
 - Energy: M (v^2 - v_in^2)/2 equals the work -T sum F_c(n) (v(n) + v(n+1))/2 of the controller's force. This
   is an identity for every integrator with v(n+1) = v(n) - T F_c(n)/M.
@@ -15,11 +15,11 @@ three conditions:
 - Status: the compensator reports that it identified the contact (`law_status`). Without `equivalent_mass`
   the audit checks only this condition. A contact with no force reading above `fading` is `not_reached`.
 
-The expected restitution depends on stiffness k and damping b of this contact. They are the least-squares fit,
-during the whole contact, of the measured force to the measured position (delayed by `alignment`) and its
-rate. If the delay is wrong by delta, k changes only by a factor cos(omega delta) with any compensator. But b
-changes by -k delta, which on the rig is indistinguishable from damping. The polynomial therefore has terms in
-z only if they improve the fit (`tuning.watchdog.expectation`):
+The expected restitution depends on stiffness k and damping b of this contact. k and b come from a
+least-squares fit, during the whole contact, of the measured force to the measured position (delayed by
+`alignment`) and its rate. If the delay is wrong by delta, k changes only by a factor cos(omega delta) with
+any compensator. But b changes by -k delta, which on the rig is indistinguishable from damping. The polynomial
+therefore has terms in z only if they improve the fit (`tuning.watchdog.expectation`):
 
     p = sqrt(reference_stiffness / k) - 1,  w = |v_in| / reference_velocity - 1,  z = b / (2 sqrt(k M)),
     e* = c_1 + c_p p + c_pp p^2 + c_ppp p^3 + c_w w + c_ww w^2 + c_pw p w

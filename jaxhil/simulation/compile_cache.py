@@ -3,8 +3,8 @@
 JAX has its own cache of machine code. If zstandard is installed, JAX's cache does not verify the content of
 its files, so that a flipped bit is executed as machine code. JAX also never replaces a damaged file, and
 warns about the damage at every use. This module therefore replaces JAX's cache in the folders of this
-project. It uses a private interface of JAX, because JAX has no public one. If that interface is missing,
-nothing is cached, which costs only time.
+project. This module uses a private interface of JAX, because JAX has no public one. If that interface is
+missing, nothing is cached, which costs only time.
 """
 
 import os

@@ -5,9 +5,10 @@ at the same approach speed.
 
 A correct restitution does not prove that a contact tests the hardware. The force command can return the
 correct energy although the real contact is much harder and longer than the ideal contact. A contact is
-therefore good only if its largest real force is at most `MAX_PEAK_FORCE_RATIO` times the ideal contact's peak
-force, and if the duration of the real force is `MIN_DURATION_RATIO` to `MAX_DURATION_RATIO` times the ideal
-contact's duration. Section 2 of notebooks/guide/model.md gives the reasons for these numbers.
+therefore good only if its peak force and its duration are within bounds. The largest real force must be at
+most `MAX_PEAK_FORCE_RATIO` times the ideal contact's peak force. The duration of the real force must be
+`MIN_DURATION_RATIO` to `MAX_DURATION_RATIO` times the ideal contact's duration. Section 2 of
+notebooks/guide/model.md gives the reasons for these numbers.
 """
 
 import math

@@ -1,6 +1,6 @@
 """Real contact in one sampling interval, for slow motion: force, peak force, work, and the sensor's lag.
 
-A sampling interval lasts from one tick to the next. The motion simulator moves smoothly within it
+A sampling interval lasts from one tick to the next. Within an interval, the motion simulator moves smoothly
 (`jaxhil.simulation.motion_simulator`). The instant at which the force sensor samples divides the interval
 into two sections.
 
@@ -53,7 +53,7 @@ class PlantSignals(NamedTuple):
     force: Float[Array, "*batch"]  # contact force at the sampling instant [N]
     # work done on the mechanism and work returned by it [J]; None unless energies are recorded
     work: tuple[Array, Array] | None
-    # peak force in the interval [N]; None if it follows from the samples
+    # peak force in the interval [N]; None if the peak force follows from the samples
     peak: Float[Array, "*batch"] | None
     # duration of contact since the previous sample [periods]; None if samples in contact are counted instead
     contact_time: Float[Array, "*batch"] | None
@@ -117,7 +117,7 @@ class Surfaces(NamedTuple):
         )
 
     def sample(self, motion: MotionSample, force: Array) -> "ContactSample":
-        """Return the `ContactSample` for this position and velocity, given the contact force [N]."""
+        """Return the `ContactSample` for this position, velocity and contact force [N]."""
         if self.clearance is None:
             onset_force = self.law.onset_force(self.parameters, motion.velocity)
             return ContactSample(motion.position, force, onset_force, jnp.ones_like(onset_force))

@@ -50,8 +50,8 @@ class RigModel(abc.ABC):
     The methods of a model accept only scenarios and loops that the same model has built. A model has no
     state; all instances of a class are equal.
 
-    A run is one contact on a rig with one axis. On a rig with six axes it is one episode: a contact with all
-    its touches.
+    A run is one contact on a rig with one axis. On a rig with six axes, a run is one episode: a contact with
+    all its touches.
     """
 
     axes: ClassVar[int]  # number of axes, 1 or 6
@@ -78,7 +78,7 @@ class RigModel(abc.ABC):
 
     @abc.abstractmethod
     def loop(self, mechanism: Any, compensator: str, scenarios: Any, **parts: bool) -> Any:
-        """Return the loop that runs all these scenarios; `parts` are options that only one-axis rigs have."""
+        """Return the loop that runs all scenarios; `parts` contains options that only one-axis rigs have."""
 
     @abc.abstractmethod
     def runs(self, mechanism: Any) -> int:
@@ -113,7 +113,7 @@ class RigModel(abc.ABC):
 
     @abc.abstractmethod
     def with_compensator(self, loop: Any, compensator: str) -> Any:
-        """Return a copy of the loop with the given compensator."""
+        """Return a copy of the loop with another compensator, chosen by its name."""
 
     @abc.abstractmethod
     def compensator_name(self, loop: Any) -> str:
@@ -131,7 +131,7 @@ class RigModel(abc.ABC):
         return scenarios
 
     def outcome(self, loop: Any, gains: Gains, rig: Any) -> Outcome:
-        """Run the scenarios given to `prepared`; the outcome is differentiable with respect to the gains."""
+        """Run the scenarios that `prepared` received. The outcome is differentiable with respect to gains."""
         return self.run(loop, gains, rig)
 
     def noise_amplification(self, loop: Any, gains: Gains, rig: Any) -> Float[Array, "*batch"]:
@@ -220,7 +220,7 @@ class RigModel(abc.ABC):
         number = count_lanes(scenarios)
         capacity = max(number, at_least)
         devices = jax.device_count()
-        # Each number and size of tiles needs its own compiled program; both are therefore rounded up.
+        # Each number and each size of tiles needs a separate compiled program; both are therefore rounded up.
         units = _round_up(-(-capacity // (TILE_SIZE * devices)))
         tile = find_tile_size(units * TILE_SIZE, TILE_SIZE, lambda: self.count_lane_bytes(loop, scenarios))
         while tile > MIN_TILE_SIZE and tile * devices >= 2 * capacity:
@@ -270,7 +270,7 @@ def count_lanes(scenarios: Any) -> int:
 
 
 def run_tiles(static: tuple[RigModel, Any], common: Any, per_lane: Any, scenarios: Any) -> Outcome:
-    """Run all tiles: on all devices in parallel, on each device one tile after another.
+    """Run all tiles. The devices work in parallel, and each device runs its tiles one after another.
 
     `static` is the pair (model, loop).
     """

@@ -16,8 +16,8 @@ from jaxhil.simulation.loop_state import LoopState
 from jaxhil.simulation.motion_simulator import apply_row, steady_state
 
 APPROACH_TIME = 0.02  # s; duration of the approach before a contact, to which a part of a period is added
-# [1]; maximum deviation of a settled motion simulator from its steady state, divided by the distance that it
-# moves in a control period.
+# [1]; maximum deviation of a settled motion simulator from its steady state, divided by the travel in a
+# control period.
 SETTLING_TOLERANCE = 1e-6
 # [1]; maximum change of a freely flying model's speed in a control period, divided by the speed.
 FREE_FLIGHT_TOLERANCE = 1e-12
@@ -63,10 +63,10 @@ def advance_to_surface(
     command: Array,
     tick: Array,
 ) -> tuple[LoopState, Bool[Array, "*batch"]]:
-    """Return the state shortly before the next touch of a surface, and whether each lane may skip to it.
+    """Return the state shortly before the next touch of a surface, and whether a lane may skip to this state.
 
-    The state is a whole number of control periods later. A lane may skip to it if the lane flies freely: its
-    motion simulator has settled, and no force acts. `command` is the magnitude of the force command [N].
+    The state is a whole number of control periods later. A lane may skip to this state if it flies freely:
+    its motion simulator has settled, and no force acts. `command` is the magnitude of the force command [N].
     """
     scenario, period = rig.scenario, rig.constants.control_period
     velocity, position = state.velocity, state.position

@@ -4,7 +4,7 @@ Each integrator adds its own delay to the loop: 0 for semi-implicit Euler, T/2 f
 and T for explicit Euler, where T is the control period (notebooks/guide/model.md, section 6, item 7).
 
 All functions take position [m], velocity [m/s], acceleration [m/s^2] and control period [s], as floats or as
-arrays that broadcast. They return the position and the velocity one control period later.
+arrays that broadcast. The functions return position and velocity one control period later.
 """
 
 from typing import TypeVar

@@ -133,7 +133,7 @@ def _check_no_quantum(mechanism: Mechanism) -> None:
 
 
 def _parse_variable(mechanism: Mechanism, law: Compensator, path: object) -> _Variable:
-    """Return the variable with the given `path`; raise `InputError` if there is no derivative for it."""
+    """Return the variable with this `path`; raise `InputError` if it has no derivative."""
     if isinstance(path, str) and path.startswith(GAIN_PREFIX):
         gain, names = path.removeprefix(GAIN_PREFIX), [gain.name for gain in law.gains]
         if gain not in names:
@@ -202,7 +202,7 @@ def _perturb_scenarios(
 ) -> tuple[Gains, Gains, Scenario, Scenario]:
     """Return gains, their derivatives, scenarios, and their derivatives, with one lane per variable.
 
-    The derivatives in lane i are those with respect to variable i.
+    Lane i contains the derivatives with respect to variable i.
     """
     lanes = len(variables)
     values = {name: jnp.full(lanes, value) for name, value in gains.items()}

@@ -1,8 +1,9 @@
 """Settings of JAX: number of devices, fast compilation, precision, and the folder of compiled programs.
 
-A command of the command line has its own process. It calls `prepare_jax` before it imports any module that
-imports JAX. A function of the Python interface runs in the process of its caller. It computes within
-`jax_context`, which restores the caller's settings of JAX and environment variables afterwards.
+A command of the command line has its own process. The command calls `prepare_jax` before it imports any
+module that imports JAX. A function of the Python interface runs in the process of its caller. The function
+computes within `jax_context`, which restores the caller's settings of JAX and environment variables
+afterwards.
 """
 
 import gc
@@ -43,15 +44,15 @@ TICK_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_copy_insertion_use_
 ROLLOUT_OPTIONS = {**TICK_OPTIONS, "xla_disable_hlo_passes": "cpu_multi_output_fusion"}
 # Compiler options for six axes: with hundreds of arrays, loops of XLA's older code generator are faster.
 SIX_AXIS_OPTIONS = {**ROLLOUT_OPTIONS, "xla_cpu_use_fusion_emitters": False}
-# The same with derivatives, where it also compiles faster.
+# The same with derivatives; the older code generator also compiles them faster.
 SIX_AXIS_DERIVATIVE_OPTIONS = {**TICK_OPTIONS, "xla_cpu_use_fusion_emitters": False}
 # Compiler options of short programs that run only once: these options reduce the compile time.
 SINGLE_RUN_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-# Option of LLVM to unroll loops completely or not at all, and versions of jaxlib for which it was tested: an
-# option that LLVM does not know would end the process.
+# Option of LLVM to unroll loops completely or not at all, and versions of jaxlib for which the option was
+# tested: an option that LLVM does not know would end the process.
 FULL_UNROLL_OPTION, TESTED_JAXLIB_VERSIONS = "-unroll-allow-partial=false", ("0.10.",)
-# Settings that switch off JAX's debugging modes, even if the user's environment variables switch them on.
-# These modes treat NaN as an error, prevent compilation ahead of time, or forbid implicit transfers.
+# Settings that switch off JAX's debugging modes, even if the user's environment variables request these
+# modes. These modes treat NaN as an error, prevent compilation ahead of time, or forbid implicit transfers.
 DEBUGGING_OFF = {
     "jax_debug_nans": False,
     "jax_debug_infs": False,
@@ -244,7 +245,7 @@ def build_xla_flags(user_flags: str) -> str:
         # Unlike our other flags, this flag would also make programs on a graphics card slower.
         del ours["--xla_backend_optimization_level"]
     elif version("jaxlib").startswith(TESTED_JAXLIB_VERSIONS):
-        # Each time LLVM unrolls a loop partially, it repeats its analysis of the surrounding loops. For a
+        # Each time LLVM unrolls a loop partially, LLVM repeats its analysis of the surrounding loops. For a
         # compensator with a thousand loops, this analysis takes a third of the compile time, and partial
         # unrolling does not make the program faster.
         ours["--xla_backend_extra_options"] += f",{FULL_UNROLL_OPTION}"
@@ -301,7 +302,7 @@ def use_half_the_cores(half: int) -> Iterator[None]:
 
 
 def _restrict_to_cores(cores: Collection[int]) -> None:
-    """Restrict this thread to these cores; do nothing if there are none or if the system forbids it."""
+    """Restrict this thread to a set of cores; do nothing if the set is empty or the system forbids this."""
     with suppress(OSError):
         if cores:
             os.sched_setaffinity(0, cores)

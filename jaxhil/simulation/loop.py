@@ -74,10 +74,9 @@ class Loop(eqx.Module):
     def is_idle_in_flight(self) -> bool:
         """Return whether the approach to a contact is uniform motion without any event, and can be skipped.
 
-        This requires that readings have no noise, bias or quantisation, that the motion simulator has no
-        limits, that there are no timing effects, and that the compensator does nothing before the contact.
-        It also requires that the scenarios have no `Probe`, whose time starts at the numerical model's first
-        touch.
+        Several conditions must hold. Readings have no noise, bias or quantisation. The motion simulator has
+        no limits, and there are no timing effects. The compensator does nothing before the contact. The
+        scenarios have no `Probe`, whose time starts at the numerical model's first touch.
         """
         uneven = self.reads_always or self.has_position_noise or self.has_sample_effects or self.has_limits
         waits = vars(type(self.compensator)).get("waits_for_contact", False)

@@ -41,7 +41,7 @@ def build_loop(
     Args:
         mechanism: Mechanism.
         compensator: Name of the compensator.
-        scenarios: Scenarios; every effect that one of them has is included in the loop.
+        scenarios: Scenarios. The loop includes every effect that at least one scenario has.
         energies: Whether to record the mechanical work of the real force.
         chatter: Whether to record the excess variation of the force command.
         exact: Whether to compute the contact from the exact motion between the samples in every case.
@@ -124,9 +124,9 @@ def _choose_cell_counts(mechanism: Mechanism, scenarios: Scenario, exact: bool) 
 def _max_contact_frequency(mechanism: Mechanism, scenarios: Scenario) -> float:
     """Return the largest contact frequency [rad/s] of all scenarios, at the velocity of the first approach.
 
-    The contact frequency is the larger of sqrt(k/M) and 2 b/M. Here M is the equivalent mass, k is the
-    derivative of the force with respect to the penetration at the maximum penetration, and b is the
-    derivative with respect to the penetration rate at the onset of contact.
+    The contact frequency is the larger of sqrt(k/M) and 2 b/M. Here M is the equivalent mass, and k is the
+    slope of the force over the penetration at the deepest point. b is the derivative of the force with
+    respect to the penetration rate at the onset of contact.
     """
     # Convert JAX arrays: only NumPy broadcasts arrays with a contact axis against arrays without one.
     law, contact = find_contact_law(mechanism.contact.law), jax.tree.map(np.asarray, scenarios.contact)

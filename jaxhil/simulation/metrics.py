@@ -32,10 +32,10 @@ CONTACT_STATUS_REASONS = {
 class Metrics(NamedTuple):
     """Metrics of every contact; arrays of shape (contacts, *batch).
 
-    `excess_variation` measures the chatter of the force command F_c. It is V/2 - (max F_c - min F_c), where
-    V = sum |F_c(n+1) - F_c(n)| is the total variation of F_c, which counts as 0 before and after the contact.
-    The excess variation is 0 for a command that rises to its maximum, falls to its minimum and returns to 0.
-    Each further swing of the command adds the height of the swing.
+    `excess_variation` measures the chatter of the force command F_c. The excess variation is V/2 - R, where V
+    = sum |F_c(n+1) - F_c(n)| is the total variation of F_c, and R is its range max F_c - min F_c. Before and
+    after the contact, F_c counts as 0. The excess variation is 0 for a command that rises to its maximum,
+    falls to its minimum and returns to 0. Each further swing of the command adds the height of the swing.
 
     `position_shortfall` is the largest |c - c'| at any tick of the contact. Here c is the compensator's
     position command, and c' is the command after the velocity and acceleration limits. The shortfall is
@@ -59,7 +59,7 @@ class Metrics(NamedTuple):
     work_out: Float[Array, "slots *batch"]  # work returned by the mechanism [J]; 0 unless recorded
     # rms difference of the penetration from the ideal contact's [m]; 0 without a probe
     trajectory_error: Float[Array, "slots *batch"]
-    # delay of the force measurement as estimated by the compensator [s]; 0 if it estimates no delay
+    # delay of the force measurement as estimated by the compensator [s]; 0 without an estimate
     force_delay: Float[Array, "slots *batch"]
     status: Int[Array, "slots *batch"]  # key of `CONTACT_STATUS_NAMES`
     # ticks from the start of the first run to the end of this contact, with the skipped ticks of approaches
@@ -131,8 +131,8 @@ def store_metrics(
         has_ended: Whether the current contact of each lane has ended.
         status: Status of the current contact.
         ticks: Number of ticks since the first run began.
-        force_delay: Delay of the force measurement as estimated by the compensator [s]; None if it estimates
-            no delay.
+        force_delay: Delay of the force measurement as estimated by the compensator [s]; None if the
+            compensator estimates no delay.
     """
     period = scenario.control_period
     zeros = jnp.zeros_like(period)

@@ -38,7 +38,8 @@ class Curve(NamedTuple):
 class RunMotion(NamedTuple):
     """Curves of one run: a single contact or, with two surfaces, all contacts.
 
-    The time of the first touch is 0. It is extrapolated from the start of the run, assuming uniform motion.
+    The time 0 is the first touch. The time of the first touch is extrapolated from the start of the run,
+    assuming uniform motion.
     """
 
     name: str  # name of the run, for the title of its panel

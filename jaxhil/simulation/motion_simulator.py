@@ -31,8 +31,8 @@ class SplitDelay(NamedTuple):
     """Delay, divided into a number of whole sampling intervals and a fraction of a sampling interval."""
 
     intervals: Int[Array, "*batch"]  # number of intervals to look back from the newest complete interval
-    # Relative time in (0, 1] within the interval that the look-back gives. At a tick it is 1, not 0: readings
-    # have the value just before the tick.
+    # Relative time in (0, 1] within this interval. At a tick, the relative time is 1, not 0: readings have
+    # the value just before the tick.
     fraction: Float[Array, "*batch"]
 
 
@@ -86,10 +86,10 @@ def discretise(
 ) -> Propagation:
     """Discretise the transfer function num(s)/den(s) of the motion simulator exactly.
 
-    With time in control periods, the state z follows z' = A z + B u. At the fraction s of an interval it is
-    z(s) = E(s) (z(0), u(0), u(1) - u(0)). Here E(s) consists of the first rows of the matrix exponential of
-    s [[A, B, 0], [0, 0, 1], [0, 0, 0]] (Van Loan 1978). The result is differentiable with respect to every
-    numeric argument.
+    With time in control periods, the state z follows z' = A z + B u. At the fraction s of an interval, the
+    state is z(s) = E(s) (z(0), u(0), u(1) - u(0)). Here E(s) consists of the first rows of the matrix
+    exponential of s [[A, B, 0], [0, 0, 1], [0, 0, 0]] (Van Loan 1978). The result is differentiable with
+    respect to every numeric argument.
 
     Args:
         numerator: Coefficients of num(s), descending powers; the transfer function is strictly proper.
@@ -246,7 +246,7 @@ def steady_state(plant: Propagation, command: Array, step: Array) -> SimulatorSt
 
 
 def _ideal_propagation(control_period, force_fraction, position_fraction, hold, ends):
-    """Return the rows for an ideal motion simulator, whose position equals the command."""
+    """Return the row vectors for an ideal motion simulator, whose position equals the command."""
 
     def position(fraction):
         return jnp.stack([1 - fraction, fraction])
@@ -305,7 +305,7 @@ def _steady_velocity(system, transition, steady_command, hold):
 
 
 def _weighted_sum(weights, rows):
-    """Return the weighted sum of rows, (columns, *batch)."""
+    """Return the sum of row vectors (columns, *batch), each multiplied by its weight."""
     total = weights[0][None] * rows[0]
     for weight, row in zip(weights[1:], rows[1:], strict=True):
         total = total + weight[None] * row

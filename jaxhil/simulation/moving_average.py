@@ -12,8 +12,8 @@ fraction f of every interval, where w = N + f with a whole number N. The motion 
 before f and another one after f.
 
 The state is (x_a(m), a, b, c). Here a, b and c are the commands at the three ticks m - N - 1, m - N and
-m - N + 1, between which the start of the window moves during the interval. They come from a delay line of
-commands (`read_leaving_commands`). All rows have the form that `Propagation` describes.
+m - N + 1, between which the start of the window moves during the interval. These commands come from a delay
+line (`read_leaving_commands`). All rows have the form that `Propagation` describes.
 """
 
 from typing import NamedTuple
@@ -103,7 +103,7 @@ def is_before_kink(window: Array, control_period: Array, s: Array) -> Bool[Array
 def motion_rows(
     window: Array, control_period: Array, s: Array, is_before: Array, hold: str
 ) -> tuple[Array, Array, Array]:
-    """Return the rows of the position and of its first two derivatives by time, in periods.
+    """Return the row vectors for the position and its first two time derivatives; time is in periods.
 
     Args:
         window: Length of the window [s].

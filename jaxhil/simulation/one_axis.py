@@ -36,7 +36,7 @@ class OneAxis(RigModel):
         return build_scenarios(mechanism, draws, seed, first)
 
     def loop(self, mechanism: Mechanism, compensator: str, scenarios: Scenario, **parts: bool) -> Loop:
-        """Return the loop that runs all these scenarios; `parts` are the options of `build_loop`."""
+        """Return the loop that runs all scenarios; `parts` contains options of `build_loop`."""
         return build_loop(mechanism, compensator, scenarios, **parts)
 
     def runs(self, mechanism: Mechanism) -> int:
@@ -87,7 +87,7 @@ class OneAxis(RigModel):
         return scenarios._replace(force_sensor=force, position_sensor=position)
 
     def with_compensator(self, loop: Loop, compensator: str) -> Loop:
-        """Return a copy of the loop with the given compensator."""
+        """Return a copy of the loop with another compensator, chosen by its name."""
         return dataclasses.replace(loop, compensator=COMPENSATORS[compensator])
 
     def compensator_name(self, loop: Loop) -> str:
@@ -99,7 +99,7 @@ class OneAxis(RigModel):
         return build_rig_constants(loop, scenarios, measured=loop.compensator.reads_position)
 
     def outcome(self, loop: Loop, gains: Gains, rig: RigConstants) -> Outcome:
-        """Run the scenarios given to `prepared`; the outcome is differentiable with respect to the gains."""
+        """Run the scenarios that `prepared` received. The outcome is differentiable with respect to gains."""
         if loop.compensator.is_large:
             rig = _separate_loops(rig)
         return compare_with_ideal(loop, rig.scenario, run_contacts(loop, gains, rig))

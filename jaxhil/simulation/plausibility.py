@@ -1,7 +1,8 @@
 """Plausibility of a mechanism file: its ideal contacts compared with the capabilities of the rig.
 
 No run is simulated. The ideal contacts are computed by `ContactLaw.ideal_contact`, in closed form if the
-contact law has one. They show which numbers of the file are implausible, and how many ticks a run will take.
+contact law has one. The ideal contacts show which numbers of the file are implausible, and how many ticks a
+run will take.
 """
 
 import itertools
@@ -277,7 +278,8 @@ def _estimate_durations(scenarios: Scenario, reference: IdealContact) -> tuple[n
 def _longest_wait(scenarios: Scenario) -> np.ndarray:
     """Return the longest time [s] that the simulation waits for a contact to begin.
 
-    With one surface, this time is in addition to `MAX_CONTACT_DURATION`; with two, it includes this duration.
+    With one surface, the simulation waits for this time in addition to `MAX_CONTACT_DURATION`. With two
+    surfaces, this time includes `MAX_CONTACT_DURATION`.
     """
     with np.errstate(all="ignore"):
         crossing_time = 10 * scenarios.clearance / scenarios.velocity

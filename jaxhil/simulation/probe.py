@@ -1,8 +1,8 @@
 """Probe for tests of a compensator: an additional push on the hardware, and a reference trajectory.
 
-No model contains the push. It shows whether a compensator is transparent, that is, whether events on the
-hardware reach the numerical model. The reference trajectory is the motion in the ideal contact; the numerical
-model should follow it.
+No model contains the push. The push shows whether a compensator is transparent, that is, whether events on
+the hardware reach the numerical model. The reference trajectory is the motion in the ideal contact; the
+numerical model should follow it.
 
 The time of the push counts from the hardware's first touch. The time of the reference trajectory counts from
 the numerical model's first touch.

@@ -57,7 +57,7 @@ def nominal_and_draws(mechanism: Mechanism, number: int, seed: int) -> Scenario:
         nominal = np.broadcast_to(np.asarray(value_at(mechanism, path), float), drawn.shape[1:])
         draws[path] = np.concatenate([nominal[None], drawn])
     scenarios = build_scenarios(mechanism, draws, seed=seed)
-    # The rig's controller is compared tick by tick: it must run at every tick.
+    # The rig's controller is compared tick by tick and must therefore run at every tick.
     timing = scenarios.timing
     return scenarios if timing is None else scenarios._replace(timing=timing._replace(missed=None))
 

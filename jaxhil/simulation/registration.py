@@ -32,7 +32,7 @@ def register(law: Compensator | ContactLaw, runtime: type | None = None) -> None
     Args:
         law: Compensator or contact law. Simulation, tuning and gain files can then use its name.
         runtime: Class of the compensator for the rig, in plain Python, with gains of the same names and units
-            (see `jaxhil.rig.registry.Compensator`). It is needed to export a controller.
+            (see `jaxhil.rig.registry.Compensator`). The class is needed to export a controller.
 
     Raises:
         InputError: `law` is not an instance of `Compensator` or `ContactLaw`; its name belongs to a
@@ -139,7 +139,7 @@ def _check_bounds(law: Compensator, gain: Gain, mechanism: Mechanism) -> None:
 
 
 def _check_runtime(law: Compensator, runtime: object) -> None:
-    """Raise `InputError` if a class for the rig lacks a method or has gains unlike the compensator's."""
+    """Raise `InputError` if the class for the rig lacks a method, or has other gains than the compensator."""
     if not inspect.isclass(runtime):
         raise _make_error(
             law, "runtime", format_value(runtime), "a class like jaxhil.rig.registry.Compensator"
@@ -147,7 +147,7 @@ def _check_runtime(law: Compensator, runtime: object) -> None:
     missing = [name for name in _RUNTIME_METHODS if not callable(getattr(runtime, name, None))]
     if missing:
         raise _make_error(
-            law, "runtime", f"{runtime.__name__} without method {missing[0]}", "a class with it"
+            law, "runtime", f"{runtime.__name__} without method {missing[0]}", "a class with this method"
         )
     gains = getattr(runtime, "gains", None)
     units = (

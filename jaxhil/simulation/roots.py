@@ -33,8 +33,8 @@ def find_sign_change(
 ) -> Array:
     """Return the argument in [low, high] at which a function changes sign.
 
-    If the function is positive at both ends, return `positive`. If it is negative at both ends, return
-    `negative`, or `positive` if `negative` is None.
+    If the function is positive at both ends, return `positive`. If the function is negative at both ends,
+    return `negative` or, if that is None, `positive`.
     """
     root, at_low, at_high = _find_root(function, data, low, high)
     none = positive if negative is None else jnp.where(at_low > 0, positive, negative)

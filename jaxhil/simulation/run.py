@@ -101,8 +101,8 @@ class Ticks(NamedTuple):
 class Run:
     """Simulated run of a mechanism's contacts with a compensator.
 
-    The signals at all ticks (see `Ticks`) are also attributes of the run, such as `run.force_measured`. They
-    are computed when one of them is first used.
+    The signals at all ticks (see `Ticks`) are also attributes of the run, such as `run.force_measured`. All
+    signals are computed when one of them is first used.
 
     Attributes:
         mechanism: Mechanism.

@@ -211,7 +211,7 @@ def _build_phases(mechanism, table) -> Any:
 
 
 def _build_mass(mechanism, table) -> Any:
-    """Return the equivalent mass [kg], given in the file or computed from the masses of both bodies."""
+    """Return the equivalent mass [kg] from the file, or from the masses of both bodies."""
     if mechanism.bodies.equivalent_mass is not None:
         return table.scalar("bodies.equivalent_mass")
     chaser, target = table.scalar("bodies.chaser_mass"), table.scalar("bodies.target_mass")

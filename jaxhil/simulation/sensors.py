@@ -65,8 +65,8 @@ def apply_lag(
 ) -> Float[Array, "*batch"]:
     """Return the output y [N] of a first-order lag T_s y' = F - y after an interval with one contact.
 
-    During contact, the force F is interpolated by parabolas, each through three of the given values. The
-    result is exact for the interpolated force.
+    During contact, the force F is interpolated by parabolas, each through three of the values in `forces`.
+    The result is exact for the interpolated force.
 
     Args:
         reading: Output of the lag at the interval's start [N].

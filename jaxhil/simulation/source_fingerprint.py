@@ -1,4 +1,4 @@
-"""Fingerprint of source code and versions of dependencies: results depend on them and on the input."""
+"""Fingerprint of source code and versions of dependencies, on which results depend besides the input."""
 
 import hashlib
 import inspect

@@ -1,8 +1,8 @@
 """Number of lanes that run together on a device (a tile), for processors and for accelerators.
 
 A processor's core runs few lanes at a time, whose state fits into its cache. An accelerator (graphics card)
-starts one operation after the other, each for all lanes of a tile; with few lanes, it is idle most of the
-time. All lanes of a batch therefore run in one tile, as far as the accelerator's memory allows.
+starts one operation after the other, each for all lanes of a tile; with few lanes, the accelerator is idle
+most of the time. All lanes of a batch therefore run in one tile, as far as the accelerator's memory allows.
 """
 
 from collections.abc import Callable

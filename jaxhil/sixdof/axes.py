@@ -1,4 +1,4 @@
-"""Axes of the motion simulator, each with a transfer function and a delay of its own.
+"""Axes of the motion simulator, each with its own transfer function and delay.
 
 An axis is a coordinate of the pose, a coordinate of one of two robots, or a leg of a hexapod. Arrays have the
 shape (axes, *batch). Each axis follows its command like the single axis of

@@ -46,7 +46,7 @@ class Load(NamedTuple):
 def build_body(
     mass: Float[Array, "..."], inertia: Matrix, interface: Vector, interface_attitude: Quaternion | None
 ) -> Body:
-    """Return a body; `mass` is in kg, `inertia` in kg m^2, symmetric and positive definite."""
+    """Return a body with a `mass` [kg] and a symmetric, positive definite `inertia` [kg m^2]."""
     return Body(mass, inertia, inverse(inertia), interface, interface_attitude)
 
 

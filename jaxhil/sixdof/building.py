@@ -160,7 +160,7 @@ def _simulator(mechanism: SixAxisMechanism, numbers: DrawnValues) -> MotionSimul
     path, model = "rig.simulator.", mechanism.rig.simulator.model
 
     def of(key: str) -> Any:
-        """Return the values of a key for all axes; with two robots, first those of the chaser's robot.
+        """Return the values of a key for all axes; with two robots, the axes of the chaser's robot are first.
 
         If the file has no value for the target's robot, both robots have the same value.
         """

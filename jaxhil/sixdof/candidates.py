@@ -17,7 +17,7 @@ from jaxhil.sixdof.shapes import Capsule, Shape
 from jaxhil.sixdof.vectors import Vector, cross, direction, dot, norm
 
 # Regularisation, divided by the squared length of a segment [1]. For parallel segments, whose nearest points
-# are not unique, it selects points near the middles of both segments.
+# are not unique, the regularisation selects points near the middles of both segments.
 PARALLEL_WEIGHT = 1e-9
 
 

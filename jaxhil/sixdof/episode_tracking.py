@@ -146,7 +146,7 @@ def mass_share(rig: RigConstants) -> Array:
 
 
 def _updated(rig: RigConstants, tracker: EpisodeTracker, seen: Tick) -> EpisodeTracker:
-    """Update the touches, peaks and decay of the record with those of a tick."""
+    """Update the touches, peaks and decay in the record of the episode with a tick."""
     touching = tuple(forces.touch.depth > 0 for forces in seen.forces)
     caught = tracker.caught
     for latch in seen.latch_states:

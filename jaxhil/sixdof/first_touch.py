@@ -28,7 +28,7 @@ class FirstTouch(NamedTuple):
 def find_first_touch(
     contact_model: IdealContactModel, before: States, depths: tuple[Float[Array, "candidates *batch"], ...]
 ) -> FirstTouch:
-    """Compute the first touch by Newton's method for the time of the free flight that leads to it.
+    """Compute the first touch: Newton's method finds the duration of the free flight before the touch.
 
     Args:
         contact_model: Constants of the ideal contact.

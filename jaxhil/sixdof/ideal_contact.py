@@ -62,7 +62,7 @@ class IdealContactRecord(NamedTuple):
 
     first_touch: FirstTouch  # first touch
     gaps: Gaps
-    # ideal contact up to the end of the run; the time is infinite if it was too stiff to be integrated
+    # summary up to the end of the run; the time is infinite if the contact was too stiff to be integrated
     last: IdealContactSummary
 
 

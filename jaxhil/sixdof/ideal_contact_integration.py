@@ -249,7 +249,7 @@ def integrate_until(
 ) -> IntegrationState:
     """Continue an integration up to the time `until` [s] since its start.
 
-    `longest` and `speed` are those of `advance_integration`.
+    See `advance_integration` for `longest` and `speed`.
     """
 
     def body(integration):

@@ -4,8 +4,8 @@ A tick has four steps. The sensors read the delayed wrench of the real contact a
 The compensator computes the wrench command. The numerical model integrates the motion of both bodies under
 this wrench. The motion simulator receives the relative pose of the bodies as its command.
 
-The contact wrench is computed at the hardware's pose, in the axes of target frame T and about T's origin. It
-acts on the numerical model at the origin of the model's frame T.
+The contact wrench is computed at the hardware's pose, in the axes of target frame T and about T's origin.
+This wrench acts on the numerical model at the origin of the model's frame T.
 """
 
 from typing import Any

@@ -29,8 +29,8 @@ from jaxhil.sixdof.rollout import CAPTURED, MISS, EpisodeBatch, rollout
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.vectors import components, cross, dot
 
-# Minimum energy by which errors are divided, relative to the energy of the approach [1]. Without it, a first
-# touch that only grazes the surface would enlarge all errors.
+# Minimum energy by which errors are divided, relative to the energy of the approach [1]. Without this
+# minimum, a first touch that only grazes the surface would enlarge all errors.
 MIN_ENERGY_SHARE = 0.05
 
 
@@ -60,7 +60,7 @@ class Metrics(NamedTuple):
     peak_moment: Float[Array, "..."]  # largest moment about T's origin in the real contact [N m]
     reference_peak_moment: Float[Array, "..."]  # largest moment about T's origin, ideal contact [N m]
     duration: Float[Array, "..."]  # time during which the hardware touches [s]
-    # time during which the ideal contact touches; NaN if it was too stiff to be integrated [s]
+    # time during which the ideal contact touches [s]; NaN if this contact was too stiff to be integrated
     reference_duration: Float[Array, "..."]
     touches: Int[Array, "..."]  # number of touches of the hardware's shapes
     reference_touches: Int[Array, "..."]  # number of touches of the ideal contact

@@ -27,7 +27,8 @@ def model_motion(bodies: Pair, states: States) -> tuple[Array, Array, Array]:
 def controller_constants(scenario: Scenario, has_tool: bool) -> SixAxisConstants:
     """Return the constants of the rig that the compensator knows.
 
-    `has_tool` states whether the force sensor carries a tool, whose inertia it also reads.
+    `has_tool` states whether the force sensor carries a tool. Such a sensor also reads the tool's inertial
+    force.
     """
     bodies, period = scenario.bodies, scenario.control_period
     zero = jnp.zeros_like(period)

@@ -171,7 +171,7 @@ def _convert_simulator(mechanism: SixAxisMechanism, shares: np.ndarray) -> dict[
 
 
 def _convert_force_sensor(mechanism: SixAxisMechanism, normal: np.ndarray) -> dict[str, Any]:
-    """Return the force sensor along the normal, whose errors are those of the three force channels."""
+    """Return the force sensor along the normal, with the errors of the three force channels."""
     sensor = mechanism.rig.force_sensor
 
     def along(values: list[float]) -> float:

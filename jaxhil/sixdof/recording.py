@@ -32,9 +32,9 @@ class RunRecord(NamedTuple):
     """Signals of the rig and of the ideal contact at all ticks of a run, in SI units.
 
     Coordinates (p, theta), twists (v, w) and wrenches (force, moment about the origin) are in target frame T.
-    Signals of the hardware are those at the force sensor's sampling instant. The measured signals are the
-    controller's inputs, with the sensors' delays and errors. The motion of a body consists of
-    position, attitude (w, x, y, z), velocity and angular velocity, in the axes of the file's table [start].
+    Signals of the hardware belong to the force sensor's sampling instant. The measured signals are the
+    controller's inputs, with the sensors' delays and errors. The motion of a body consists of position,
+    attitude (w, x, y, z), velocity and angular velocity, in the axes of the file's table [start].
 
     Attributes:
         time: Time since the start of the run [s], (ticks,).

@@ -164,7 +164,7 @@ def simulate_six_axes(
 ) -> SixAxisRun:
     """Simulate the episodes of a nominal six-axis mechanism once.
 
-    The arguments are those of `jaxhil.simulate`; `compensator` is one of `SIX_AXIS_COMPENSATORS`. Raise
+    See `jaxhil.simulate` for the arguments; `compensator` is one of `SIX_AXIS_COMPENSATORS`. Raise
     `InputError` if an argument is invalid.
     """
     if compensator not in SIX_AXIS_COMPENSATORS:

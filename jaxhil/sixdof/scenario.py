@@ -30,5 +30,5 @@ class Scenario(NamedTuple):
     control_period: Float[Array, "*batch"]  # control period T [s]
     duration: Float[Array, "*batch"]  # maximum duration of the run [s], which is rounded to ticks
     key: UInt32[Array, "2 *batch"]  # key of the sensors' noise
-    # ideal contact from `start`; None: every run computes it
+    # ideal contact from `start`; None: every run computes the ideal contact
     ideal_contact: IdealContactRecord | None = None

@@ -55,7 +55,7 @@ class SixAxes(RigModel):
     axes: ClassVar[int] = 6
     run_name: ClassVar[str] = "episode"
     errors: ClassVar[tuple[str, ...]] = ("energy_error", "twist_error")
-    verdict_error: ClassVar[str] = "twist_error"  # where it is 0, so is the energy error
+    verdict_error: ClassVar[str] = "twist_error"  # an episode without twist error has no energy error
     compiler_options: ClassVar[Mapping[str, int | str]] = jax_environment.SIX_AXIS_OPTIONS
     derivative_options: ClassVar[Mapping[str, int | str]] = jax_environment.SIX_AXIS_DERIVATIVE_OPTIONS
 
@@ -121,7 +121,7 @@ class SixAxes(RigModel):
         return scenarios._replace(sensor=sensor._replace(**quiet))
 
     def with_compensator(self, loop: Loop, compensator: str) -> Loop:
-        """Return the loop with the given compensator."""
+        """Return a copy of the loop with another compensator, chosen by its name."""
         return dataclasses.replace(loop, compensator=compensator)
 
     def compensator_name(self, loop: Loop) -> str:

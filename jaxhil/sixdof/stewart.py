@@ -73,7 +73,7 @@ def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 
 
 
 def condition(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "*batch"]:
-    """Return the condition number of the Jacobian, with lengths in m; it is large near singular poses."""
+    """Return the condition number of the Jacobian, with lengths in m, which is large near singular poses."""
     return jnp.linalg.cond(jnp.moveaxis(jacobian(hexapod, at), (0, 1), (-2, -1)))
 
 

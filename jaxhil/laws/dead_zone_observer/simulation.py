@@ -9,7 +9,7 @@ clip(F, -dz, dz). A cut dead zone removes F if |F| <= dz, else 0.
 Li et al. 2026 combine a hybrid Smith predictor with a disturbance observer (|Q| near 1 below 15 Hz) for a cut
 dead zone. A general disturbance observer adds Q (F_n - F), where F_n is the force of a nominal model. This
 observer uses the known effect of a dead zone; the nominal model k_n d replaces F in u. If k_n is wrong, the
-observer has an error only for |F| < dz. With a cut dead zone, it also has an error between |F| = dz and
+observer has an error only for |F| < dz. With a cut dead zone, there is also an error between |F| = dz and
 |k_n d| = dz.
 
 Q is discretised by Tustin's rule. |Q| >= 0.9 up to 15 Hz needs f >= 15 Hz/sqrt(1/0.81 - 1) = 31 Hz. Q lags by

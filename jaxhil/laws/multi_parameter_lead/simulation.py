@@ -6,8 +6,8 @@ s^2 + omega^2 (a + b s) e^(-s tau) = 0. The rule of the literature places one of
 damped oscillation with the desired restitution (notebooks/guide/model.md section 6, item 16).
 
 For the nominal gains, the desired restitution is 1, and tau is the delay of the force measurement plus the
-lag of the motion simulator. These gains compensate for the delay of the loop; the mechanism's own damping
-still acts, because the equation does not contain it.
+lag of the motion simulator. These gains compensate for the delay of the loop. The mechanism's damping still
+acts, because the equation does not contain this damping.
 """
 
 import cmath
@@ -82,7 +82,8 @@ class MultiParameterLead(PhaseLead):
     name: ClassVar[str] = "multi_parameter_lead"
     knows: ClassVar[tuple[str, ...]] = (CONTACT_FREQUENCY, FORCE_DELAY, SIMULATOR_LAG)
     waits_for_contact: ClassVar[bool] = True
-    # a is negative for delays above a quarter of the oscillation period, b for delays above half of it.
+    # a is negative for delays above a quarter of the oscillation period, b for delays above half of the
+    # period.
     gains: ClassVar[tuple[Gain, ...]] = (
         rig_gain(
             "force_gain",

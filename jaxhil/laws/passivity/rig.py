@@ -1,4 +1,4 @@
-"""Time-domain passivity control (De Stefano et al.): a contact returns at most the energy it absorbed."""
+"""Time-domain passivity control (De Stefano et al.): no contact returns more energy than it absorbed."""
 
 from collections.abc import Mapping
 from math import inf
@@ -14,7 +14,8 @@ class Passivity(Compensator):
     E is the energy that the numerical model has given to the contact until this tick, v_d the velocity of the
     numerical model, and T the control period. Each period adds T F_c times the mean of v_d at its start and
     end. This is the energy that the model loses, for every mass and integrator. The second form of F_c
-    returns E to 0; it corresponds to a virtual damping alpha. Its magnitude never exceeds that of F.
+    returns E to 0, and corresponds to a virtual damping alpha. The magnitude of F_c never exceeds the
+    magnitude of F.
     """
 
     __slots__ = ("_command", "_energy", "_period", "_velocity")
@@ -30,7 +31,7 @@ class Passivity(Compensator):
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """Return the measured force [N], reduced if the contact would return more energy than it absorbed."""
         energy = self._energy + self._command * (0.5 * self._period * (self._velocity + velocity_desired))
-        # Do not store an infinite or NaN energy, because it would never become finite again.
+        # Do not store an infinite or NaN energy, because all later energies would not be finite either.
         if -inf < energy < inf:
             self._energy = energy
         travel = self._period * velocity_desired

@@ -1,4 +1,4 @@
-"""Time-domain passivity control (De Stefano et al.): a contact returns at most the energy it absorbed.
+"""Time-domain passivity control (De Stefano et al.): no contact returns more energy than it absorbed.
 
     E(n) = E(n-1) + T F_c(n-1) (v_d(n-1) + v_d(n))/2
     if E(n) + T F v_d < 0:  F_c = F + alpha v_d,  alpha = -(E(n) + T F v_d)/(T v_d^2)
@@ -49,7 +49,7 @@ class Passivity(Compensator):
     def step(self, prepared, state, signals, tick):
         force, velocity = signals.force_measured, signals.velocity_desired
         energy = state.energy + state.command * (0.5 * prepared * (state.velocity + velocity))
-        # Do not store an infinite or NaN energy, because it would never become finite again.
+        # Do not store an infinite or NaN energy, because all later energies would not be finite either.
         energy = jnp.where(jnp.isfinite(energy), energy, state.energy)
         travel = prepared * velocity
         active, limit = energy + force * travel < 0, jnp.abs(force)

@@ -31,5 +31,5 @@ class PhaseLead(Compensator):
         return self._lead.step(force_measured)
 
     def reset(self) -> None:
-        """Restart the filter."""
+        """Set the past input and output of the filter to 0."""
         self._lead.reset()

@@ -36,5 +36,5 @@ class PhaseLead(SixAxisCompensator):
         return lead_pose(self._pose_leads, pose, rates)
 
     def reset(self) -> None:
-        """Restart the filters."""
+        """Set the past inputs and outputs of the filters to 0."""
         self._lead.reset()

@@ -5,7 +5,7 @@
 y is the lead-filtered force, k and b are the identified contact stiffness and damping, and x_d - x_m is the
 distance by which the motion simulator lags behind the numerical model. The compensator needs no model of the
 simulator. The gate is open while the aligned position is in contact. It opens and closes smoothly within two
-periods, depending on the time between two ticks at which the position crosses the surface. F_c is not
+periods, as a function of the time (between two ticks) at which the position crosses the surface. F_c is not
 clamped, because a clamp increases the divergence.
 
 Source: Qi, Zhao, Gao, Ren, Hu, "Divergence compensation for hardware-in-the-loop simulation of
@@ -127,7 +127,7 @@ class ResponseError(Compensator):
         aligned = alignment.step(position)
         self._aligned_velocity.start(aligned, velocity)
         self._aligned = aligned - self._period * velocity
-        # Undo the step above, which only served to compute the aligned position.
+        # The step above only served to compute the aligned position; restart the delay line.
         alignment.start(position, velocity)
         self._force = 0.0
         self._contact_share = 0.0

@@ -10,7 +10,7 @@ position is delayed like the force (`identification_delay`); without this alignm
 biased (section 6, item 6). v_a is a filtered difference, s/(1 + T_v s) by Tustin's rule.
 
 `gate` is 1 while the aligned position is in contact and 0 outside. It opens and closes smoothly within two
-periods, depending on the time between two ticks at which the position crosses the surface
+periods, as a function of the time (between two ticks) at which the position crosses the surface
 (`jaxhil.laws.shared.gates`). The weight of a reading in the identification is this gate times a gate of the
 force above `contact_threshold`. F_c is therefore a continuous function of the delays.
 """
@@ -54,7 +54,7 @@ from jaxhil.laws.simulation_base import Compensator, Gain, Gains, clear_lanes, r
 def _stiffness_covariance(mechanism) -> float:
     """Return the initial covariance of the stiffness [1/m^2].
 
-    With it, a first sample at 3 % of the peak depth has the weight 1/2 in the estimate.
+    With this covariance, a first sample at 3 % of the peak depth has the weight 1/2 in the estimate.
     """
     return 1 / (0.03 * peak_force(mechanism) / typical_stiffness(mechanism)) ** 2
 
@@ -62,7 +62,7 @@ def _stiffness_covariance(mechanism) -> float:
 def _damping_covariance(mechanism) -> float:
     """Return the initial covariance of the damping [s^2/m^2].
 
-    With it, a first sample at the approach speed has the weight 1/2 in the estimate.
+    With this covariance, a first sample at the approach speed has the weight 1/2 in the estimate.
     """
     return 1 / mechanism.approach.velocity**2
 

@@ -36,7 +36,7 @@ class LeadState(NamedTuple):
 
 
 class LeadFilter(NamedTuple):
-    """Coefficients [1] of the lead filter y(n) = pole y(n-1) + now F(n) + before F(n-1)."""
+    """Lead filter y(n) = `pole` y(n-1) + `now` F(n) + `before` F(n-1), with these coefficients [1]."""
 
     pole: Array
     now: Array

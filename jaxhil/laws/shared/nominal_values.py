@@ -32,9 +32,9 @@ def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
 def simulator_inverse(mechanism: Mechanism) -> tuple[float, float]:
     """Return the coefficients a_1 [s] and a_2 [s^2] of the series e^(s tau)/G(s) = 1 + a_1 s + a_2 s^2 + ...
 
-    tau is the transport delay of the motion simulator plus the mean delay of the command. With the control
-    period T and a latency of L periods, the latter is L T with linear interpolation, and (L - 1/2) T with
-    zero-order hold (notebooks/guide/model.md section 6, item 7).
+    tau is the transport delay of the motion simulator plus the mean delay of the command. For the control
+    period T and a latency of L periods, the delay of the command is L T with linear interpolation, and L T -
+    T/2 with zero-order hold (notebooks/guide/model.md section 6, item 7).
     """
     rig = mechanism.rig
     first, second = _inverse_series(rig.simulator)

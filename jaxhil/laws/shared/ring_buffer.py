@@ -1,8 +1,8 @@
 """Ring buffer of past samples, updated in place; each lane may read a sample of a different age.
 
 The first axis of the array contains the samples; its length is a power of two. All lanes have the same
-`tick`. XLA updates the array in place only if the write depends on all reads; otherwise it copies the array.
-`depend_on` creates this dependence.
+`tick`. XLA updates the array in place only if the write depends on all reads. Otherwise, XLA copies the
+array. `depend_on` creates this dependence.
 """
 
 from typing import Any

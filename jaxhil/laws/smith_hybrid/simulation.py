@@ -1,7 +1,7 @@
 """Mean of Smith predictor and phase lead: (1 + (1/2) T_s s/(1 + T_s s/2)) (1 + T_l s) F.
 
-The hybrid compensates for half of the lag T_s. Compared with `smith_predictor`, it amplifies the noise less,
-but contacts diverge more.
+The hybrid compensates for half of the lag T_s. Compared with `smith_predictor`, the hybrid amplifies the
+noise less, but contacts diverge more.
 """
 
 from typing import ClassVar

@@ -1,9 +1,10 @@
 """Controller of a six-axis rig, which the rig calls once per control period.
 
-Like the one-axis controller (`jaxhil.rig.controller`), it checks the inputs, audits every contact, computes
-the wrench with the compensator that the gain file names, and limits the outputs. A trip is latched until
-`reset`: the wrench ramps to 0, and the pose command retraces its path backwards. After construction no method
-raises, and each method takes bounded time. C and T are the frames of the chaser's and the target's interface.
+Like the one-axis controller (`jaxhil.rig.controller`), this controller checks the inputs, audits every
+contact and limits the outputs. The compensator that the gain file names computes the wrench. A trip is
+latched until `reset`: the wrench ramps to 0, and the pose command retraces its path backwards. After
+construction no method raises, and each method takes bounded time. C and T are the frames of the chaser's and
+the target's interface.
 """
 
 from collections.abc import Sequence
@@ -250,12 +251,12 @@ class Controller6(ControllerBase):
         """Return the pose [m, rad] to command for the numerical model's motion after this tick's step.
 
         Two successive commands differ by at most `velocity_limit` and `angular_velocity_limit` times the
-        period. A run's first command may differ from the measured pose by this step, or out of contact by
-        `start_distance` and `start_angle`, because moving drives lag behind. Before a run's first `step`,
-        the model's pose replaces the measured pose.
+        period. A run's first command may differ from the measured pose by the same step. Out of contact, the
+        limits are `start_distance` and `start_angle` instead, because moving drives lag behind. Before a
+        run's first `step`, the model's pose replaces the measured pose.
 
-        After a trip, the commands brake and then retrace their path for `retreat_distance`. They start from
-        the last command, or if there is none, from the last measured pose.
+        After a trip, the commands brake and then retrace their path for `retreat_distance`. The commands
+        start from the last command or, if there is none, from the last measured pose.
 
         Args:
             pose: pose of C relative to T in the numerical model [m, rad].
@@ -329,8 +330,8 @@ class Controller6(ControllerBase):
 
         Call this method after the rig has moved to the start of the run: the first pose command continues
         from the measured pose, not from the last command. A trip stays latched, and the gap before the next
-        tick counts no missed ticks. If a contact has not ended, it is audited first, and `faults` has its
-        faults until the next `step`.
+        tick counts no missed ticks. If a contact has not ended, it is audited first, and `faults` contains
+        the faults of this audit until the next `step`.
         """
         if self.cause:
             return

@@ -1,7 +1,7 @@
 """Faults that the six-axis controller detects, and its reactions.
 
-A fault that also exists on one axis has the same bit and name as there (`jaxhil.rig.faults`). Documentation,
-exports and error texts are generated from the table `SIX_AXIS_FAULTS`.
+A fault that also exists on one axis has the same bit and the same name for six axes (`jaxhil.rig.faults`).
+Documentation, exports and error texts are generated from the table `SIX_AXIS_FAULTS`.
 """
 
 from jaxhil.rig.faults import (
@@ -35,7 +35,7 @@ MOMENTUM = 0x1000000
 ENERGY_GAIN = 0x2000000
 LAG = 0x4000000
 
-# Descriptions of the faults whose conditions differ from those on one axis, by bit.
+# Descriptions, by bit, of the faults whose conditions are different with one axis.
 CONDITIONS = {
     FORCE_NOT_FINITE: "a channel of the measured wrench is not a finite number",
     POSITION_NOT_FINITE: "a coordinate of the measured pose is not a finite number",

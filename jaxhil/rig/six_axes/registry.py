@@ -1,6 +1,6 @@
 """Interface of the rig's six-axis compensators, and the table of registered compensators.
 
-A compensator is a class with the methods of `SixAxisCompensator`; it may inherit their defaults.
+A compensator is a class with the methods of `SixAxisCompensator`, and may inherit the default methods.
 `@register_six_axes(name)` adds the class to the table; gain files refer to the compensator by this name.
 """
 
@@ -55,7 +55,7 @@ class SixAxisCompensator(Protocol):
 
     @property
     def is_acting(self) -> bool:
-        """Return whether the compensator's status says that it acts on a contact; False without a status."""
+        """Return whether the compensator's status is that of a contact; False without a status."""
         return self.status not in (UNSTATED, OUT_OF_CONTACT)
 
     def step(
@@ -76,7 +76,7 @@ class SixAxisCompensator(Protocol):
         return list(pose)
 
     def reset(self) -> None:
-        """Restart everything."""
+        """Restart filters, delay lines and estimates."""
 
     def next_contact(self) -> None:
         """Restart filters and delay lines for the next run."""

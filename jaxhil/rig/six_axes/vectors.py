@@ -61,14 +61,14 @@ def multiply(factor: float, vector: Vector) -> Vector:
 
 
 def wrench_at_chaser(wrench: Vector, pose: Vector) -> Vector:
-    """Move the reference point of a wrench from T's to C's origin; `pose` is that of C relative to T."""
+    """Move the reference point of a wrench from T's to C's origin; `pose` is the pose of C relative to T."""
     fx, fy, fz, mx, my, mz = wrench
     x, y, z = pose[:3]
     return [fx, fy, fz, mx - (y * fz - z * fy), my - (z * fx - x * fz), mz - (x * fy - y * fx)]
 
 
 def wrench_at_target(wrench: Vector, pose: Vector) -> Vector:
-    """Move the reference point of a wrench from C's to T's origin; `pose` is that of C relative to T."""
+    """Move the reference point of a wrench from C's to T's origin; `pose` is the pose of C relative to T."""
     fx, fy, fz, mx, my, mz = wrench
     x, y, z = pose[:3]
     return [fx, fy, fz, mx + (y * fz - z * fy), my + (z * fx - x * fz), mz + (x * fy - y * fx)]
@@ -82,7 +82,7 @@ def cross(left: Triple, right: Triple) -> Triple:
 
 
 def rotate(pose: Vector, vector: Triple) -> Triple:
-    """Convert a vector from C axes to T axes; `pose` is that of C relative to T.
+    """Convert a vector from C axes to T axes; `pose` is the pose of C relative to T.
 
     R v = v + sin t/t theta x v + (1 - cos t)/t^2 theta x (theta x v), t = |theta|.
     """

@@ -1,11 +1,12 @@
 """Six-axis watchdog: an audit of every contact, from the motion of the numerical model.
 
-A contact begins on the first tick on which the compensator acts or, if it has no status, on which the
-measured force exceeds `fading`. If the compensator then knows the hardware's lag behind the model, the
-lag must be between `lag_lowest` and `lag_highest`. The contact is audited as soon as the condition of its
-beginning has been false for the time `settling`, at the latest at the call of `next_contact`. V_in is the
-twist on the tick before the contact, V the present twist, M the relative mass matrix, W_c the controller's
-wrench about the chaser's origin, and |W|^2 = W . M^-1 W. The audit checks four conditions:
+A contact begins on the first tick on which the compensator acts. For a compensator without a status, it
+begins on the first tick on which the measured force exceeds `fading`. If the compensator then knows the
+hardware's lag behind the model, the lag must be between `lag_lowest` and `lag_highest`. The contact is
+audited as soon as the condition of its beginning has been false for the time `settling`, at the latest at the
+call of `next_contact`. V_in is the twist on the tick before the contact, V the present twist, M the relative
+mass matrix, W_c the controller's wrench about the chaser's origin, and |W|^2 = W . M^-1 W. The audit checks
+four conditions:
 
 - Momentum: |M (V - V_in) - T sum W_c| is at most `momentum_error` times the sum of |T sum W_c| and 0.05
   |M V_in|. Otherwise the model integrates a different wrench, or has a different mass.
@@ -46,7 +47,7 @@ class SixAxisWatchdog:
         contacts: number of audited contacts.
         record: compensator status of the last audited contact.
         momentum_error: momentum error of that contact, divided by its impulse [1]; 0 after `restart`.
-        energy_gain: energy that it released, divided by the approach energy [1]; 0 after `restart`.
+        energy_gain: energy that the contact released, divided by the approach energy [1]; 0 after `restart`.
         unpaid_impulse: uncorrected impulse error, divided by the contact's impulse [1]; 0 after `restart`.
     """
 

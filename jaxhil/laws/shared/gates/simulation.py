@@ -3,8 +3,8 @@
 A reading is assumed to be linear between two ticks. `share_beyond` returns the share of a control period in
 which the reading exceeds a threshold. `gate` weights the shares of the last two periods with a triangle of
 two periods. The gate is 1 above the threshold, 0 below, and once differentiable with respect to the time of
-the crossing. If crossings are at least two periods apart, the gates of all ticks add up to the time above the
-threshold in periods, and the mean delay of the gate is one period. A gate that switches at the next tick
+the crossing. If crossings are at least two periods apart, the sum of the gates of all ticks is the time above
+the threshold in periods. The mean delay of the gate is one period. A gate that switches at the next tick
 would have an error of up to half a period, which would be a sawtooth function of every delay.
 """
 
@@ -20,8 +20,8 @@ def share_beyond(
     The reading is assumed to be linear in time between two ticks.
 
     Args:
-        excess: reading minus threshold if the reading exceeds the threshold, else 0. It is negative for a
-            reading below a lower threshold.
+        excess: reading minus threshold if the reading exceeds the threshold, else 0. For a reading below a
+            lower threshold, the excess is negative.
         excess_before: excess on the previous tick.
         moved: change of the reading since the previous tick, in the unit of `excess`.
     """

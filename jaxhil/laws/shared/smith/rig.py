@@ -28,6 +28,6 @@ class Smith(Compensator):
         self._predictor = LeadFilter(lag, 0.5 * lag, period)
 
     def reset(self) -> None:
-        """Restart the filters."""
+        """Set the past inputs and outputs of the filters to 0."""
         self._lead.reset()
         self._predictor.reset()
