@@ -208,7 +208,7 @@ def make_folder(folder: Path) -> None:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove the temporary files and folders in `folder` whose processes no longer run.
+    """Remove temporary files and folders in `folder` that ended processes have left there.
 
     Raise OSError if the folder cannot be read or a file cannot be removed.
     """

@@ -186,7 +186,7 @@ def _langevin(s):
 
 @jax.custom_jvp
 def _hunt_crossley_shape(onset, exponent):
-    """Return restitution, peak force and duration of a contact with Hunt and Crossley's law, dimensionless.
+    """Return the dimensionless restitution, peak force and duration for Hunt and Crossley's law.
 
     The unit of force is M v^2 / D and the unit of time D / v, where the length D satisfies
     D^(n+1) = (n + 1) M v^2 / k. `onset` is q = 3 chi v / 2 (`ideal_hunt_crossley`).

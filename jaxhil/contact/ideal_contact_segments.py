@@ -160,7 +160,7 @@ def _traverse(decay, segment: _Segment, inward, state: _State) -> _State:
 
 
 def _compute_passage(decay, segment: _Segment, inward, state: _State, active) -> _SegmentPassage:
-    """Compute the motion of the `active` batch elements through a segment, with times without derivatives."""
+    """Compute the motion of the `active` batch elements through a segment. Times have no derivatives."""
     stiffness, turns_here = segment.stiffness, state.segment == segment.number
     # The outward motion starts at the turning point, and enters each further segment at its deeper end.
     depth = jnp.where(inward, 0.0, jnp.where(turns_here, state.depth, segment.thickness))

@@ -218,7 +218,10 @@ def _unknown_key(kind: inspect.StructType, key: str, path: KeyPath) -> KeyProble
 
 
 def _convert(kind: inspect.Type, value: Any, path: KeyPath, extra: TypeMetadata) -> Any:
-    """Convert `value` to plain data of type `kind`, with numbers as floats. Raise `KeyProblem` if invalid."""
+    """Convert `value` to plain data of type `kind`, with numbers as floats.
+
+    Raise `KeyProblem` if the value is invalid.
+    """
     if path in SCALAR_LIST_KEYS and isinstance(value, (int, float)) and not isinstance(value, bool):
         value = [value]
     match kind:

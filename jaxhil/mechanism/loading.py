@@ -44,7 +44,10 @@ def load(
 
 
 def as_mechanism(argument: object) -> Mechanism:
-    """Return a validated one-axis mechanism from a name, path or object. Raise `InputError` if invalid."""
+    """Return a validated one-axis mechanism from a name, path or object.
+
+    Raise `InputError` if the mechanism is invalid.
+    """
     if not isinstance(argument, (Mechanism, SixAxisMechanism)):
         return file.load(_source(argument)).mechanism
     # Structs do not validate their fields: a mechanism that was not read from a file is unchecked.
@@ -52,7 +55,10 @@ def as_mechanism(argument: object) -> Mechanism:
 
 
 def as_any_mechanism(argument: object) -> file.AnyMechanism:
-    """Return a validated mechanism, one-axis or six-axis. Raise `InputError` if it is invalid."""
+    """Return a validated one-axis or six-axis mechanism from a name, path or object.
+
+    Raise `InputError` if the mechanism is invalid.
+    """
     if not isinstance(argument, (Mechanism, SixAxisMechanism)):
         return file.load_any(_source(argument)).mechanism
     return file.any_from_plain_data(file.to_plain_data(argument), f"mechanism {format_value(argument.name)}")

@@ -217,7 +217,7 @@ class Controller(ControllerBase):
             return nan
 
     def reset(self) -> bool:
-        """Restart everything except the tare. While the emergency stop is active, only return False.
+        """Restart everything except the tare. While the emergency stop is active, do nothing; return False.
 
         Filters, identified parameters, trip and tick counts restart. Force and position command continue
         from their last values without a jump. If something else has moved the drives since the trip, also

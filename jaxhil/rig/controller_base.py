@@ -139,7 +139,7 @@ class ControllerBase:
             self._fail(EMERGENCY_STOP, "")
 
     def _fail(self, cause: int, detail: str) -> None:
-        """Trip the controller."""
+        """Trip the controller with the fault bits `cause`; the status shows the text `detail`."""
         # Keep the first cause, because later faults may be its consequences.
         if not self.cause:
             self.cause = cause

@@ -148,7 +148,7 @@ class FlightRecorder:
             yield ",".join([*map(repr, values), f"{contact:.0f}", f"{faults:.0f}"]) + "\n"
 
     def mapping(self, pattern: str) -> str:
-        """Return the mapping of the logs whose names match a pattern, in TOML."""
+        """Return the mapping, as TOML text, of the logs whose names match a pattern."""
         lines = ['schema = "jaxhil/log/1"', "", "[channels]", 'time = "time"']
         for channel, prefix, suffixes in CHANNELS[self._axes]:
             columns = [f'"{prefix}{suffix}"' for suffix in suffixes]

@@ -84,7 +84,7 @@ def compile_cached(
 
 
 def _find_program(function, static, arguments, options):
-    """Return the compiled program for these arguments, and the array leaves with which to call it."""
+    """Return the compiled program for these arguments, and the arrays to pass to this program."""
     leaves, structure = jax.tree.flatten(arguments)
     folder = program_folder()
     shapes = tuple([(leaf.shape, leaf.dtype) for leaf in leaves])
@@ -178,7 +178,7 @@ def _hash_program(identity) -> str:
 
 
 def _read_jax_settings() -> tuple[tuple[str, Any], ...]:
-    """Return names and values of JAX's settings in this thread, except folders; empty if unavailable."""
+    """Return names and values of JAX's settings in this thread, except folders; none if JAX hides them."""
     values = getattr(jax.config, "values", {})
     return tuple([(name, getattr(jax.config, name, values[name])) for name in values if name[-4:] != "_dir"])
 

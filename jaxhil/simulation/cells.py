@@ -34,7 +34,7 @@ MIN_LAG = 1e-12  # control periods; a force sensor with a shorter lag counts as 
 
 
 class CellCounts(NamedTuple):
-    """Number of cells in each of the two parts of a sampling interval, and degree of their power series."""
+    """Number of cells in each of the two parts of a sampling interval, and degree of the power series."""
 
     plain: int  # number of cells before the window of a force sensor with lag
     window: int  # number of cells in the sensor's window; 0 for a sensor without lag
@@ -101,7 +101,7 @@ def count_cells(fastest: float, lags: Any) -> CellCounts:
 
 
 def merge_cell_counts(counts: Sequence[CellCounts]) -> CellCounts:
-    """Return numbers of cells that are large enough for several mechanisms in one program."""
+    """Return numbers of cells that suffice for several mechanisms in a common program."""
     used = [count for count in counts if count.part]
     if not used:
         return NO_CELLS
@@ -265,7 +265,7 @@ def _divide_part(counts, whole, lag):
 
 
 def _divide_at(edges, before):
-    """Add an edge at the time `before` [periods] before the part's end, clipped to the range of the edges."""
+    """Add an edge at the time `before` [periods] before the end of the part, clipped to the part's range."""
     kink = jnp.clip(before, edges.before[-1], edges.before[0])
     edges = -jnp.sort(-jnp.concatenate([edges.before, kink[None]]), axis=0)
     return _CellEdges(edges, edges[:-1] - edges[1:])
@@ -293,7 +293,7 @@ def _line_series(control_period, degree):
 
 
 def _series(generator, output, degree):
-    """Return rows that give the power series of y = output w, where w' = generator w.
+    """Return row vectors that give the power series of y = output w, where w' = generator w.
 
     Here w = (state, command, increase of the command in a period). Row j, multiplied by w, gives y^(j)/j!.
     The result has the shape (degree + 1, columns, *batch).

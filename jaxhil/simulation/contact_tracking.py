@@ -118,7 +118,7 @@ def record_contact(
     command: Array,
     shortfall: Array | None,
 ) -> ContactTracker:
-    """Stage 6: return the record of the current contact, updated with the current tick.
+    """Return the record of the current contact, updated with the current tick (stage 6 of a tick).
 
     Args:
         loop: Structure of the loop.

@@ -139,7 +139,7 @@ class RigModel(abc.ABC):
         return jnp.ones_like(rig.control_period)
 
     def by_error(self, outcome: Outcome) -> dict[str, Outcome]:
-        """Split an outcome into one outcome for each error metric, by name."""
+        """Return a separate outcome for each error metric, by the name of the metric."""
         runs = len(outcome.error) // len(self.errors)
         return {
             name: jax.tree.map(lambda leaf, first=first: leaf[first : first + runs], outcome)
@@ -284,7 +284,7 @@ def run_tiles(static: tuple[RigModel, Any], common: Any, per_lane: Any, scenario
 
 
 def map_tiles(function: Callable[[Any, Any], Any], common: Any, per_lane: Any) -> Any:
-    """Return `function(common, tile)` of all tiles of `per_lane`, (devices, tiles, ..., lanes of a tile)."""
+    """Apply `function(common, tile)` to all tiles of `per_lane`, (devices, tiles, ..., lanes of a tile)."""
 
     def one_device(common, tiles):
         tiles = jax.tree.map(lambda leaf: leaf[0], tiles)
@@ -326,7 +326,7 @@ def _round_up(number: int) -> int:
 
 @lru_cache(maxsize=32)
 def _count_state_bytes(model: RigModel, loop: Any, structure: Any, leaves: tuple[Any, ...]) -> int:
-    """Return the memory [bytes] of a lane's state between ticks; `leaves` are a scenario without values."""
+    """Return the memory [bytes] of a lane's state between ticks; `leaves` are the shapes of a scenario."""
     lane = jax.tree.unflatten(structure, leaves)
     compensator = get_compensator(model.compensator_name(loop), model.axes)
     gains = {gain.name: lane.control_period for gain in compensator.gains}

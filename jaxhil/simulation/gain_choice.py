@@ -77,7 +77,7 @@ def _is_path(text: str) -> bool:
 def _complete_gains(
     mechanism: AnyMechanism, law: Compensator | SixAxisCompensator, choice: Mapping[Any, Any]
 ) -> dict[str, float]:
-    """Return the gains of a dict; missing gains have the values of the literature."""
+    """Return the gains from the dict `choice`, completed with the literature's values for missing gains."""
     gains = literature_gains(mechanism, law.name)
     specifications = {gain.name: gain for gain in law.gains}
     for name, value in choice.items():

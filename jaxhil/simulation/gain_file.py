@@ -46,7 +46,7 @@ class LoadedGains(NamedTuple):
 
 
 def load_gain_file(path: str | os.PathLike[str], any_axes: bool = False) -> LoadedGains:
-    """Read and check the gain file at `path`. A file for six axes is accepted only with `any_axes`.
+    """Read and check the gain file at `path`. Accept a file for six axes only if `any_axes` is true.
 
     Raise `InputError` if the file cannot be read or is invalid.
     """
@@ -61,7 +61,7 @@ def load_gain_file(path: str | os.PathLike[str], any_axes: bool = False) -> Load
 def check_document(
     document: dict[str, Any], source: str = "gain document", any_axes: bool = False
 ) -> LoadedGains:
-    """Check the content of a gain file. A file for six axes is accepted only with `any_axes`.
+    """Check the content of a gain file. Accept a file for six axes only if `any_axes` is true.
 
     Raise `InputError` if the content is invalid; `source` names the file in the message.
     """
@@ -89,9 +89,9 @@ def check_document(
 
 
 def find_compensator(compensator: object, source: str, axes: int = 1) -> Compensator | SixAxisCompensator:
-    """Return the compensator with the given name for rigs with `axes` axes.
+    """Return the compensator with the name `compensator` for rigs with `axes` axes.
 
-    Raise `InputError` that begins with `source` if there is none.
+    Raise `InputError` if there is none; the message begins with `source`.
     """
     table = SIX_AXIS_COMPENSATORS if axes == 6 else COMPENSATORS
     if not isinstance(compensator, str) or compensator not in table:
@@ -126,7 +126,7 @@ def _gains_without_runtime(axes: int) -> dict[str, dict[str, GainSpecification]]
 
 
 def _check_entry(gain: Gain, entry: Mapping[str, Any], mechanism: AnyMechanism, source: str) -> None:
-    """Raise `InputError` if unit or bounds of a gain in the file differ from the compensator's."""
+    """Raise `InputError` if unit or bounds of a gain are different in the file and in the compensator."""
     key = f"gains.{gain.name}"
     if entry["unit"] != gain.unit:
         raise _make_error(source, f"{key}.unit", format_value(entry["unit"]), f"'{gain.unit}'")

@@ -181,7 +181,7 @@ def program_folder() -> str | None:
 
 
 def build_jax_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables with which JAX is started, given the user's `environment`."""
+    """Return the environment variables with which JAX is started, for the user's `environment`."""
     # XLA's devices share a pool of threads. A thread that splits a large task waits for a free thread. With
     # only one thread per device, all threads could wait forever.
     threads = environment.get("NPROC", str(4 * count_usable_cores()))
@@ -210,12 +210,12 @@ def _check_jax_variables() -> dict[str, str]:
 
 
 def active_xla_flags() -> str:
-    """Return the XLA_FLAGS with which this process compiles programs, as far as known."""
+    """Return the XLA_FLAGS with which this process compiles programs, as far as this module knows."""
     return _startup_flags[0] if _startup_flags else os.environ.get("XLA_FLAGS", "")
 
 
 def rounding_flags(flags: str) -> str:
-    """Return, sorted, the XLA flags that may change the last bits of a result.
+    """Return a sorted text of the XLA flags that may change the last bits of a result.
 
     The flag for the number of devices is included only if the number is 1. All other flags are included.
     """

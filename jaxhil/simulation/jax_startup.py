@@ -26,7 +26,10 @@ _processes: set[int] = set()
 
 @cache
 def check_xla_flags(flags: str) -> None:
-    """Raise `InputError` if XLA rejects these flags, tested in a child process, which XLA may end."""
+    """Raise `InputError` if XLA rejects these flags.
+
+    The flags are tested in a child process, because XLA ends a process with an invalid flag.
+    """
     variables = {
         name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "TF_CPP_"))
     }

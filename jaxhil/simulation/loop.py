@@ -84,7 +84,7 @@ class Loop(eqx.Module):
 
     @property
     def first_tick(self) -> int:
-        """Return the number of the first tick: large enough that no index into a delay line is negative."""
+        """Return the number of the first tick, so large that no index into a delay line is negative."""
         return max(self.ring, self.controller_ring)
 
     @property

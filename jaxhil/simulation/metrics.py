@@ -121,7 +121,7 @@ def store_metrics(
 ) -> Metrics:
     """Return the metrics, updated with the contacts that have ended.
 
-    A contact that was not reached is not written.
+    Nothing is stored for a contact that was not reached.
 
     Args:
         scenario: Scenarios.

@@ -33,7 +33,7 @@ class MonotoneSections(NamedTuple):
 
 
 def build_cell_motion(series: Array, length: Array) -> CellMotion:
-    """Return the motion with these coefficients of the position [m] in cells of `length` [periods]."""
+    """Return the motion in cells of `length` [periods] from the coefficients of the position [m]."""
     return CellMotion(series, _derivative(series), length)
 
 

@@ -92,7 +92,7 @@ def discretise_moving_average(
 
 
 def is_before_kink(window: Array, control_period: Array, s: Array) -> Bool[Array, "*batch"]:
-    """Return whether a reading at the fraction `s` of an interval has the motion before the kink.
+    """Return whether a reading at the fraction `s` of an interval is before the kink of the motion.
 
     The kink is at the instant at which the window's start passes a tick. A reading at this instant has the
     value just before it.

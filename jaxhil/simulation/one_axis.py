@@ -114,7 +114,7 @@ evaluate = ONE_AXIS.evaluate
 
 
 def _separate_loops(rig: RigConstants) -> RigConstants:
-    """Return a copy with equal values that makes XLA compile the contact loop as a separate function.
+    """Return an equal copy of `rig` that makes XLA compile the contact loop as a separate function.
 
     XLA merges nested loops into one function, but does not merge a loop that contains a sort. A dummy sort of
     two numbers therefore splits the code into shorter functions. LLVM's time for a function grows with the

@@ -231,7 +231,7 @@ def _compute_ideal_contacts(mechanism: Mechanism, scenarios: Scenario) -> IdealC
 def _compute_reference(
     law: ContactLaw, parameters: ContactParameters, mass: Any, velocity: Any
 ) -> IdealContact:
-    """Return the ideal contacts of a contact law, (contacts, lanes); compiled by `run_cached`."""
+    """Compute the ideal contacts of a contact law, (contacts, lanes), with a program of `run_cached`."""
     return law.ideal_contact(parameters_by_slot(parameters), mass, velocity)
 
 

@@ -156,7 +156,7 @@ def update_deviation(
     period: Array,
     lasts: Array,
 ) -> Deviation:
-    """Return the sums of `deviation`, with the numerical model's deviation at the current tick added.
+    """Add the numerical model's deviation at the current tick to the sums of `deviation`.
 
     Args:
         deviation: Deviation up to the previous tick.

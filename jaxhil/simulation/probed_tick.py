@@ -74,7 +74,7 @@ def apply_push(
 def update_model_deviation(
     constants: KnownConstants, probe: Probe, has_ended: Array, signals: Signals, tracker: ContactTracker
 ) -> ContactTracker:
-    """Add the model's deviation from the ideal contact to the contact's record, unless this has ended."""
+    """Add the model's deviation from the ideal contact to the record, unless the contact has ended."""
     assert tracker.deviation is not None
     depth, rate = signals.position_desired, signals.velocity_desired
     if tracker.side is not None:

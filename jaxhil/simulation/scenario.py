@@ -226,7 +226,7 @@ def _build_timing(mechanism, table) -> TimingBatch | None:
 
 
 def _build_force_sensor(sensor, table) -> ForceSensorBatch:
-    """Return the force sensor; with a filter, its cutoff and the time constant of its slowest mode."""
+    """Return the force sensor. The time constant of a filter is that of its slowest mode."""
     path, names = "rig.force_sensor.", ForceSensorBatch._fields[:-1]
     batch = ForceSensorBatch(*(table.scalar(path + name) for name in names))
     if sensor.filter is None:
@@ -237,7 +237,7 @@ def _build_force_sensor(sensor, table) -> ForceSensorBatch:
 
 
 def _build_motion_simulator(simulator, table) -> MotionSimulatorBatch:
-    """Return the motion simulator; the transfer function of `ideal` and `moving_average` has order 0."""
+    """Return the motion simulator. For `ideal` and `moving_average`, the transfer function has order 0."""
     path = "rig.simulator."
     ones = table.constant(1.0)
     numerator: Any

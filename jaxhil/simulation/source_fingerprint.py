@@ -45,7 +45,7 @@ def dependency_versions(packages: tuple[str, ...] = ("jaxhil", *DEPENDENCIES)) -
 
 
 def _read_class_source(kind: type) -> str:
-    """Return the source of a class's module, else of the class, else (if unavailable) an empty text."""
+    """Return the source of a class's module or, without it, of the class; an empty text without both."""
     for source in (sys.modules.get(kind.__module__), kind):
         with suppress(OSError, TypeError):
             return inspect.getsource(source)  # pyright: ignore[reportArgumentType]

@@ -164,7 +164,7 @@ def sense(
     timing: TimingDraws | None = None,
     probe: Probe | None = None,
 ) -> tuple[Signals, PlantSignals]:
-    """Stage 1: return the sensor readings at tick `now`, and the real forces in the last interval."""
+    """Return the sensor readings at tick `now` and the real forces in the last interval (stage 1)."""
     scenario, sensed = rig.scenario, state.sensed
     age = now - state.onset_tick
     rings, delays, sensor = sensed.rings, rig.delays, scenario.force_sensor
@@ -200,7 +200,7 @@ def sense(
 def compensate(
     loop: Loop, prepared: SegmentConstants, state: LoopState, signals: Signals, now: Array
 ) -> tuple[Array, Any]:
-    """Stage 2: return the force command F_c [N] and the compensator's next state.
+    """Return the force command F_c [N] and the compensator's next state (stage 2 of a tick).
 
     The compensator counts the ticks at which it runs, as on the rig; missed ticks are left out.
     """
@@ -213,7 +213,7 @@ def compensate(
 
 
 def integrate(loop: Loop, rig: RigConstants, state: LoopState, force: Array) -> ModelState:
-    """Stage 3: integrate the numerical model for one control period, under the force -`force` [N]."""
+    """Integrate the numerical model for one control period, under the force -`force` [N] (stage 3)."""
     acceleration = -force * rig.inverse_mass
     step = INTEGRATORS[loop.integrator]
     position, velocity = step(state.position, state.velocity, acceleration, rig.constants.control_period)
@@ -230,7 +230,7 @@ def actuate(
     controller: Any,
     missed: Array | None = None,
 ) -> ActuationResult:
-    """Stage 4: apply limits, latency, hold and motion simulator to the position command.
+    """Apply limits, latency, hold and motion simulator to the position command (stage 4 of a tick).
 
     In lanes that `missed` the tick, the drives receive the last command again, and the compensator keeps its
     state.
@@ -278,7 +278,7 @@ def actuate(
 def compute_contact(
     loop: Loop, rig: RigConstants, state: LoopState, interval: SamplingInterval
 ) -> IntervalContact:
-    """Stage 5: return the real contact in a sampling interval."""
+    """Return the real contact in a sampling interval (stage 5 of a tick)."""
     if rig.cells is not None:
         return _compute_contact_in_cells(loop, rig, state, interval)
     scenario, period = rig.scenario, rig.constants.control_period
@@ -396,7 +396,7 @@ def _delayed_position(rig, state, now, age):
 
 
 def _apply_limits(rig, plant, command):
-    """Return limited command [m], its step [m], and unlimited command [m], which is None without limits."""
+    """Return the limited command [m], its step [m] and the unlimited command [m] (None without limits)."""
     if plant.unlimited_command is None:
         return command, plant.step, None
     simulator = rig.scenario.simulator

@@ -79,7 +79,7 @@ def draw_timing(
 
 
 def hold_compensator(missed: Bool[Array, "*batch"], before: Any, after: Any, ring: int) -> Any:
-    """Return the compensator's next state: the last one in lanes that missed the tick.
+    """Return the compensator's next state, which is its last state in lanes that missed the tick.
 
     Args:
         missed: Lanes that missed the tick.

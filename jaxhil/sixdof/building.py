@@ -156,7 +156,7 @@ def _kinematics(mechanism: SixAxisMechanism, numbers: DrawnValues) -> Kinematics
 
 
 def _simulator(mechanism: SixAxisMechanism, numbers: DrawnValues) -> MotionSimulatorBatch:
-    """Return the motion simulator of every axis; "ideal" and "moving_average" have order 0."""
+    """Return the motion simulator of every axis. For "ideal" and "moving_average", G(s) has order 0."""
     path, model = "rig.simulator.", mechanism.rig.simulator.model
 
     def of(key: str) -> Any:

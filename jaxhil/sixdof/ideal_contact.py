@@ -35,7 +35,7 @@ MIN_CHANGE = 0.05
 
 
 class IdealContactSummary(NamedTuple):
-    """Summary of the ideal contact up to a time: metrics until then, and states of the bodies then."""
+    """Metrics of the ideal contact up to a time, and states of the bodies at this time."""
 
     time: Float[Array, "*batch"]  # time since the start [s]
     states: States  # states of the bodies at the instants in `time`

@@ -184,7 +184,7 @@ def complete_tick(
     model: tuple[States, Array, Array],
     sent: Float[Array, "6 *batch"],
 ) -> tuple[RunState, Tick]:
-    """Move the hardware; return the next state, with the compensator's old state, and the tick's record.
+    """Move the hardware. Return the next state (with the old state of the compensator) and the record.
 
     Args:
         loop: structure of the loop.

@@ -22,7 +22,7 @@ SETTLING_TICKS = 256
 
 
 class Loop(eqx.Module):
-    """Structure of the loop: static fields, for each combination of which a program is compiled."""
+    """Structure of the loop. Each combination of the static fields needs a separate compiled program."""
 
     integrator: str = eqx.field(static=True)  # integrator of the numerical model, a name of `SHARES`
     hold: str = eqx.field(static=True)  # hold of the command within a period, "linear" or "zoh"

@@ -155,13 +155,13 @@ def compare_with_ideal(bodies: Pair, episodes: EpisodeBatch) -> Metrics:
 
 
 def _approach_speed(pose: Pose, first_touch: FirstTouch, twist: Twist) -> Array:
-    """Return the approach speed [m/s] at the first touch's point, along its normal, for a pose and twist."""
+    """Return the approach speed [m/s] at the point and along the normal of the first touch."""
     velocity = twist.linear + cross(twist.angular, first_touch.point - pose.position)
     return -dot(first_touch.normal, velocity)
 
 
 def _take_snapshots(bodies: Pair, states: list[States]) -> list[Snapshot]:
-    """Return the twist, energy and mass matrix that belong to each of the states."""
+    """Return twist, kinetic energy and mass matrix for each of the states."""
 
     # The compiler would unroll a Python loop, fuse its computations and repeat them.
     def snapshot(_, states: States) -> tuple[None, Snapshot]:

@@ -201,7 +201,7 @@ def _convert_position_sensor(mechanism: SixAxisMechanism, lever: np.ndarray) -> 
 def _convert_uncertainty(
     mechanism: SixAxisMechanism, name: str
 ) -> tuple[dict[str, dict[str, Any]], tuple[str, ...]]:
-    """Return the uncertainty of the keys that a one-axis file has, and the keys that it leaves out.
+    """Return the uncertainty of the keys that a one-axis file has, and the keys without equivalent.
 
     `name` is the name of the contact. If the six-axis value is a list, only a common factor is converted.
     """

@@ -214,6 +214,6 @@ def effective_mass(bodies: Pair, states: States, point: Vector, normal: Vector) 
 
 
 def _turning(body: Body, state: State, target: Frame, torque: Vector) -> Vector:
-    """Return the angular acceleration J^-1 torque of a body; both vectors are in target frame T."""
+    """Return the angular acceleration J^-1 torque of a body; torque and result are in target frame T."""
     in_body = rotate_back(state.attitude, rotate(target.attitude, torque))
     return rotate_back(target.attitude, rotate(state.attitude, body.inverse_inertia @ in_body))

@@ -104,7 +104,7 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> RolloutResult:
 
 
 def compute_ideal_contact(scenario: Scenario) -> IdealContactRecord:
-    """Return the ideal contact from the start of a batch of scenarios; it does not depend on the gains."""
+    """Return the ideal contact from the start of a batch of scenarios, which does not depend on gains."""
     period = scenario.control_period
     until = jnp.round(scenario.duration / period) * period
     contact_model = IdealContactModel(scenario.bodies, scenario.groups, scenario.latches)

@@ -214,7 +214,7 @@ def _result(
 
 
 def episodes_of(metrics: Metrics) -> tuple[Episode, ...]:
-    """Return the episodes of a run with one lane, without misses after the first episode."""
+    """Return the episodes of a run with one lane, except later episodes with the status "miss"."""
     return tuple(
         _episode(metrics, slot)
         for slot in range(metrics.status.shape[0])
@@ -230,7 +230,7 @@ def compute_ideal_final(mechanism: SixAxisMechanism, time: float) -> Final:
 
 
 def check_integrated(mechanism: SixAxisMechanism, metrics: Metrics) -> None:
-    """Raise `InputError`, with advice, if the ideal contact could not be integrated to its end."""
+    """Raise `InputError` if the ideal contact could not be integrated; the message says what to change."""
     if not np.all(np.isfinite(metrics.reference_duration)):
         raise InputError(f"{mechanism.name}: {_stiffest(mechanism)}")
 

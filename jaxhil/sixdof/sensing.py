@@ -133,7 +133,7 @@ def _wrench(channels: Array) -> Wrench:
 
 
 def _noise(rig: RigConstants, now: Array, sensor: int) -> Array:
-    """Return standard normal noise for the six channels of a sensor: 0 for the force, 1 for the pose."""
+    """Return standard normal noise for six channels; `sensor` is 0 for the force and 1 for the pose."""
     channel = jnp.arange(6, dtype=jnp.int32).reshape(6, *[1] * rig.period.ndim)
     count = jnp.broadcast_to(6 * now + channel, (6, *rig.period.shape))
     stream = jnp.full(rig.period.shape, sensor, jnp.int32)

@@ -78,7 +78,7 @@ class SixAxes(RigModel):
         return mechanism.approach.episodes if mechanism.approach else 1
 
     def with_ideal_contacts(self, batches: Sequence[Scenario]) -> list[Scenario]:
-        """Add the ideal contacts to batches of scenarios; integrate them together on all devices."""
+        """Add the ideal contacts, integrated together on all devices, to batches of scenarios."""
         together = self.place_batch(jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *batches))
         results = cached_programs.run_cached(
             _compute_ideal_contacts, self, together.scenarios, options=self.compiler_options
@@ -144,7 +144,7 @@ def _separate_loops(scenario: Scenario) -> Scenario:
 
 
 def _compute_ideal_contacts(_: SixAxes, scenarios: Any) -> tuple[Array, ...]:
-    """Return the leaves of the scenarios' ideal contacts; `scenarios` and leaves are arranged in tiles."""
+    """Compute the ideal contacts of scenarios in tiles, as a tuple of arrays that have the same tiles."""
     return tuple(map_tiles(lambda _, tile: jax.tree.leaves(compute_ideal_contact(tile)), (), scenarios))
 
 

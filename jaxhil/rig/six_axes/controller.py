@@ -240,7 +240,7 @@ class Controller6(ControllerBase):
         return list(forces.output)
 
     def _compute(self, pose_desired: Vector, twist_desired: Vector) -> bool:
-        """Compute the compensator's wrench from the checked readings; return true."""
+        """Compute the compensator's wrench from the checked readings. Return true to mark success."""
         inputs = self._inputs
         self._command = self._law.step(inputs.wrench, pose_desired, twist_desired, inputs.measured)
         return True
@@ -288,7 +288,7 @@ class Controller6(ControllerBase):
         return list(poses.output)
 
     def _try_lead(self, pose: Vector, twist: Vector) -> bool:
-        """Compute the compensator's pose command; return whether this has succeeded."""
+        """Try to compute the compensator's pose command; return whether this has succeeded."""
         try:
             computed = self._lead(pose, twist)
         except Exception:  # whatever the compensator raises, the rig needs a command
@@ -296,12 +296,12 @@ class Controller6(ControllerBase):
         return computed
 
     def _lead(self, pose: Vector, twist: Vector) -> bool:
-        """Compute the compensator's pose command; return true."""
+        """Compute the compensator's pose command. Return true to mark success."""
         self._sent = self._law.pose_command(pose, coordinate_rates(pose, twist))
         return True
 
     def reset(self) -> bool:
-        """Restart everything except the tare. While the emergency stop is active, only return False.
+        """Restart everything except the tare. While the emergency stop is active, do nothing; return False.
 
         Wrench and pose command continue from their last values without a jump. If something else has moved
         the drives since the trip, also call `next_contact`.

@@ -126,7 +126,7 @@ def _is_positive_definite(matrix: list[list[float]]) -> bool:
 
 
 def _check_inverse(constants: ModelConstants, source: str) -> None:
-    """Raise GainFileError unless `inverse_mass` is the inverse of M."""
+    """Raise GainFileError unless `inverse_mass` is the inverse of the mass matrix."""
     mass, inverse = constants.mass_matrix, constants.inverse_mass
     for i in range(AXES):
         column = product(mass, [row[i] for row in inverse])

@@ -195,7 +195,7 @@ class PoseGuard:
         return fault
 
     def retreat(self, measured: Vector, pose: Vector) -> None:
-        """Move the output by one period of the retreat; arguments as in `limit`."""
+        """Move the output by one period of the retreat; see `limit` for the arguments."""
         if not self.has_output:
             self._stand(measured, pose)
         if not self._back:

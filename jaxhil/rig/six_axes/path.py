@@ -70,7 +70,7 @@ class CommandPath:
         self.newest = list(self._points[head])
 
     def distance(self, pose: Vector, other: Vector) -> float:
-        """Return the larger of distance and lever times rotation between two poses [m]."""
+        """Return the distance of two poses or, if larger, the lever times their relative rotation [m]."""
         return max(length(pose, other), self._lever * angle(pose, other))
 
     def length_back(self) -> float:

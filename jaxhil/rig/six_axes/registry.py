@@ -55,7 +55,7 @@ class SixAxisCompensator(Protocol):
 
     @property
     def is_acting(self) -> bool:
-        """Return whether the compensator's status is that of a contact; False without a status."""
+        """Return whether the status says that the compensator acts on a contact; False without a status."""
         return self.status not in (UNSTATED, OUT_OF_CONTACT)
 
     def step(

@@ -84,7 +84,8 @@ def cross(left: Triple, right: Triple) -> Triple:
 def rotate(pose: Vector, vector: Triple) -> Triple:
     """Convert a vector from C axes to T axes; `pose` is the pose of C relative to T.
 
-    R v = v + sin t/t theta x v + (1 - cos t)/t^2 theta x (theta x v), t = |theta|.
+    The result is R v = v + sin t/t theta x v + (1 - cos t)/t^2 theta x (theta x v), where R is the rotation
+    matrix, theta the rotation vector of the pose, and t = |theta|.
     """
     _, _, _, a, b, c = pose
     square = a * a + b * b + c * c

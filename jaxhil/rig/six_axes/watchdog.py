@@ -114,7 +114,7 @@ class SixAxisWatchdog:
         pose: Vector,
         twist: Vector,
     ) -> int:
-        """Process one tick; return the fault bits, 0 if there are none.
+        """Process one tick and audit a contact that has ended; return the fault bits, 0 if none.
 
         Args:
             previous: wrench W_c of the last tick [N, N m].
@@ -200,7 +200,7 @@ class SixAxisWatchdog:
         self.unpaid_impulse = 0.0
 
     def _account(self, previous: Vector, twist: Vector) -> None:
-        """Add the impulse and work of the last tick's wrench; `twist` is the twist after it."""
+        """Add the impulse and work of the last tick's wrench; `twist` is the twist after that tick."""
         wrench = wrench_at_chaser(previous, self._pose)
         self._impulse = add_multiple(self._impulse, self._period, wrench)
         self._work += self._period * 0.5 * (dot(wrench, self._twist) + dot(wrench, twist))

@@ -48,7 +48,7 @@ class ContactIdentification:
         self.stiffness_variance, self.damping_variance = self._initial_covariance  # d1, d2
 
     def update(self, force: float, deflection: float, rate: float, weight: float) -> None:
-        """Update with one force reading [N], signed penetration [m], its rate [m/s] and a weight, 0 to 1."""
+        """Update the estimate with force [N], signed penetration [m], its rate [m/s] and weight (0 to 1)."""
         u = self.coupling
         d1 = self.stiffness_variance
         d2 = self.damping_variance
