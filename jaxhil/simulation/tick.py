@@ -202,7 +202,7 @@ def compensate(
 ) -> tuple[Array, Any]:
     """Return the force command F_c [N] and the compensator's next state (stage 2 of a tick).
 
-    The compensator counts the ticks at which it runs, as on the rig; missed ticks are left out.
+    As on the rig, the compensator counts only the ticks at which it runs, not the missed ticks.
     """
     if state.held is not None:
         signals = signals._replace(age=signals.age - state.held.missed)
