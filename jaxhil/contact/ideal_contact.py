@@ -39,11 +39,11 @@ def ideal_kelvin_voigt(
 ) -> IdealContact:
     """Return the ideal contact with F = k d + b d', at any damping ratio xi = b / (2 sqrt(k M)).
 
-    Without `tension`, F = max(0, k d + b d'). The bodies separate at F = 0, after 2 g(xi) / sqrt(k / M), with
-    e = exp(-2 xi g(xi)) and g(xi) = acos(xi) / sqrt(1 - xi^2), continued analytically through xi = 1. With
-    `tension`, the bodies separate at d = 0 with e = exp(-pi xi / sqrt(1 - xi^2)), or stick together (e = 0,
-    infinite duration) if xi >= 1. For xi >= 1/2 the peak force is b v, at the onset of contact. Source:
-    impulse response of the damped oscillator.
+    Without `tension`, F = max(0, k d + b d'). The bodies separate at F = 0, after the time 2 g(xi) / sqrt(k /
+    M), with the restitution e = exp(-2 xi g(xi)). Here g(xi) = acos(xi) / sqrt(1 - xi^2), continued
+    analytically through xi = 1. With `tension`, the bodies separate at d = 0 with e = exp(-pi xi / sqrt(1 -
+    xi^2)), or stick together (e = 0, infinite duration) if xi >= 1. For xi >= 1/2 the peak force is b v, at
+    the onset of contact. Source: impulse response of the damped oscillator.
 
     Args:
         mass: equivalent mass M [kg].

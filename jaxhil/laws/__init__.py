@@ -4,8 +4,7 @@
 them alone, or in addition to the files for one axis. The files define which compensators exist; there is no
 list of names. Each JAX file assigns the compensator to `COMPENSATOR`. `rig.py` registers its class with
 `@register(NAME)`, and `rig_six_axes.py` with `@register_six_axes(NAME)`. The folder `shared` contains parts
-that several compensators use. Importing this package, or any file of the rig,
-does not import JAX.
+that several compensators use. Importing this package, or any file of the rig, does not import JAX.
 """
 
 from functools import cache

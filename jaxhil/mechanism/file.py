@@ -185,7 +185,8 @@ def builtin_names() -> list[str]:
 def suite_names() -> list[str]:
     """Return the names of the built-in mechanisms for comparing compensators.
 
-    All have the same rig; each adds one difficulty, such as a dead zone of the force sensor.
+    All these mechanisms have the same rig. Each mechanism adds one difficulty, such as a dead zone of the
+    force sensor.
     """
     return [name for name in _builtin_paths() if name.startswith(SUITE_PREFIX)]
 

@@ -9,8 +9,8 @@
     recorder.write("session.csv")
 
 `jaxhil shadow`, `identify` and `monitor` read the log. The log has the columns of `jaxhil simulate --log`,
-the index of the contact, and the bits of the faults. Its mapping (`jaxhil/log/1`) is a second file. This
-module needs only the standard library, and a bundle contains a copy of it.
+the index of the contact, and the bits of the faults. The mapping of the log (`jaxhil/log/1`) is a second
+file. This module needs only the standard library, and a bundle contains a copy of it.
 """
 
 import os

@@ -7,7 +7,7 @@ table `STATUSES`. The status of a whole contact is the first in this list whose 
     unsure         the compensator never acted
     unsure, too_short or noisy
                    together, these three statuses occurred on more than `MAX_DOUBTFUL_SHARE` of the ticks on
-                   which the compensator acted; the most frequent of the three counts
+                   which the compensator acted; the contact gets the most frequent of the three
     unexplained or saturated
                    it was the status of the last tick on which the compensator acted
     identified     none of the conditions above holds

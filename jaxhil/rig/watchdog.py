@@ -13,7 +13,8 @@ tick, the audit checks three conditions:
   is an identity for every integrator with v(n+1) = v(n) - T F_c(n)/M.
 - Restitution: |v|/|v_in| differs from the expected restitution by at most `restitution_margin`.
 - Status: the compensator reports that it identified the contact (`law_status`). Without `equivalent_mass`
-  the audit checks only this condition. A contact with no force reading above `fading` is `not_reached`.
+  the audit checks only this condition. A contact without a force reading above `fading` has the status
+  `not_reached`.
 
 The expected restitution depends on stiffness k and damping b of this contact. k and b come from a
 least-squares fit, during the whole contact, of the measured force to the measured position (delayed by
@@ -25,7 +26,8 @@ therefore has terms in z only if they improve the fit (`tuning.watchdog.expectat
     e* = c_1 + c_p p + c_pp p^2 + c_ppp p^3 + c_w w + c_ww w^2 + c_pw p w
          + c_z z + c_zz z^2 + c_pz p z + c_wz w z,
 
-where p, w and z are clamped to the ranges for which the polynomial was fitted, and e* to 0 to 1.
+where p, w and z are clamped to the ranges for which the polynomial was fitted. e* is clamped to the range
+from 0 to 1.
 """
 
 from math import inf, sqrt

@@ -149,7 +149,7 @@ def find_calls(text: str) -> set[str]:
 def has_user_objects(value: Any) -> bool:
     """Return whether a value contains objects whose `repr` may be an incomplete description.
 
-    These are arrays, functions, and objects whose class is defined outside this project.
+    Such objects are arrays, functions, and objects whose class is defined outside this project.
     """
     if value is None or isinstance(value, (str, bool, int, float)):
         return False

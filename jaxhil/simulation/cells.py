@@ -5,8 +5,8 @@ divided into cells. The length of a cell times the motion simulator's fastest po
 Within a cell, a Taylor series of the motion simulator's response is therefore accurate to rounding.
 
 If the lag of the force sensor is much shorter than a control period, a reading depends only on the force in a
-short window before the sample. This window has separate cells, each at most one time constant of the lag
-long.
+short window before the sample. This window has separate cells, whose lengths are at most one time constant of
+the lag.
 
 The number of cells is static. The positions of the cells differ between the lanes of a batch.
 """

@@ -206,8 +206,8 @@ def _has_ended(rules, signals, side, force_free_ticks, magnitude, peak_command):
 
     The contact ends if the numerical model moves away from the surface, the last real force was long enough
     ago, and the force command has decayed. The threshold of the decay does not depend on the sensor noise.
-    With such a threshold, a noisy command that is small by chance could end the contact before its whole
-    impulse has acted.
+    Otherwise, a noisy command that is small by chance could end the contact before its whole impulse has
+    acted.
     """
     velocity = signals.velocity_desired
     faded = (magnitude <= COMMAND_DECAY_RATIO * peak_command) | (

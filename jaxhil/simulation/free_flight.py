@@ -37,7 +37,7 @@ def begin_approach(
 
     The numerical model starts at x_d = min(p, 0) - v (0.02 s + phi T). Here p is the position of the
     hardware's surface, v the approach speed, T the control period, and phi the phase: a fraction of T. With
-    `skip_flight`, a flight in which nothing can happen is skipped. Only its last two control periods before
+    `skip_flight`, a flight in which nothing can happen is skipped. Only the last two control periods before
     the hardware touches the surface are simulated.
     """
     nearer = jnp.minimum(rig.scenario.contact_plane, 0)

@@ -110,7 +110,8 @@ class Delays(NamedTuple):
 
     With one surface, the contact law is evaluated as soon as the motion is computed: one transport delay
     before the motion takes place. With two surfaces, the parameters of the contact law may change in this
-    time. The law is then evaluated when the motion takes place, and the force's delay counts from there.
+    time. The law is then evaluated when the motion takes place, and the delay of the force counts from this
+    time.
     """
 
     force: SplitDelay  # delay of the force reading

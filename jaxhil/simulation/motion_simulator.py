@@ -225,7 +225,7 @@ def rate_row(
 ) -> Float[Array, "columns *batch"]:
     """Return the row that gives the time derivative of the quantity that `row` gives [per s].
 
-    The derivation uses d/ds E(s) = E(s) G, where G is the generator in `discretise`.
+    The formula follows from d/ds E(s) = E(s) G, where G is the generator in `discretise`.
     """
     *state, start, end = row
     zero = jnp.zeros_like(start)

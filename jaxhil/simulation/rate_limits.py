@@ -18,9 +18,10 @@ def limit_command(
     The velocity limit v_max restricts the step to v_max T. The acceleration limit a_max restricts the change
     of the step to q = a_max T^2.
 
-    The limited command follows a uniformly moving unlimited command without overshoot. If the limited
-    command is a distance b behind, a closing step s and m further steps close this distance. Each step is
-    shorter by q than the step before it, so that b = (m + 1) s - q m (m + 1)/2. The largest such s is used.
+    The limited command follows a uniformly moving unlimited command without overshoot. If the limited command
+    is a distance b behind, a step s and m further steps close this distance. Each of these steps is shorter
+    by q than the step before it, so that b = (m + 1) s - q m (m + 1)/2. Here m is the largest number for
+    which none of these steps is negative.
 
     If no limit is active, apart from rounding, c(n+1) equals the unlimited command exactly.
 

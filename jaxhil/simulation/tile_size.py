@@ -58,7 +58,8 @@ def choose_tile_size(device: DeviceDescription, lanes: int, cpu_size: int, lane_
 def find_tile_size(lanes: int, cpu_size: int, lane_bytes: Callable[[], int] = lambda: 0) -> int:
     """Return the maximum number of lanes per tile on JAX's devices; see `choose_tile_size`.
 
-    `lane_bytes` computes the memory of a lane [bytes]. It is called only if there is an accelerator.
+    `lane_bytes` is a function that returns the memory of a lane [bytes]. This function is called only if
+    there is an accelerator.
     """
     device = describe_devices()
     return choose_tile_size(device, lanes, cpu_size, 0 if device.is_cpu else lane_bytes())

@@ -24,9 +24,9 @@ def find_touching_height(
 ) -> Float[Array, "*batch"]:
     """Return the z coordinate [m] of chaser frame C at the first touch, in target frame T.
 
-    The chaser moves along -z of T. If it passes without a touch, the result is NaN. Each search step is as
-    long as the gap between the shapes, so that no step can pass a surface. Newton's method then refines the
-    result to within rounding error.
+    The chaser moves along -z of T. If the chaser passes the target without a touch, the result is NaN. Each
+    search step is as long as the gap between the shapes, so that no step can pass a surface. Newton's method
+    then refines the result to within rounding error.
     """
 
     def depth(height: Array) -> Array:
@@ -47,7 +47,8 @@ def find_touching_height(
 def begin(bodies: Pair, pose: Pose, twist: Twist, before: Float[Array, "*batch"]) -> States:
     """Return the states from which a free flight of `before` [s] leads to this relative pose and twist.
 
-    The target is at rest with its centre of mass at the world's origin. Its body axes equal the world axes.
+    The target is at rest with its centre of mass at the world's origin. The target's body axes equal the
+    world axes.
     """
     zero = jnp.zeros_like(before)
     still = Vector(zero, zero, zero)

@@ -84,7 +84,7 @@ def kick_drift(
 ) -> State:
     """Integrate the motion of a body for a control `period` [s] under a constant load.
 
-    `share` selects the integrator (see `SHARES`). In one dimension the results equal those of
+    `share` selects the integrator (see `SHARES`). In one dimension, the results equal the results of
     `jaxhil.simulation.integrators`. The rotation is integrated by an explicit Lie midpoint step of second
     order (Krysl and Endres, Int. J. Numer. Methods Eng. 62, 2005).
     """

@@ -46,7 +46,8 @@ class Regularised(Friction):
     """Regularised Coulomb friction f_t = -mu F t/sqrt(|t|^2 + v_s^2) for a slip t.
 
     The law is Coulomb friction at slips well above v_s, and a viscous damper at slips well below v_s. Bodies
-    that should stick creep instead, with the slip v_s s/sqrt(1 - s^2) for s = |f_t|/(mu F).
+    that would stick under Coulomb friction creep instead, with the slip v_s s/sqrt(1 - s^2) for s = |f_t|/(mu
+    F).
     """
 
     coefficient: Float[Array, "candidates *batch"]  # friction coefficient mu [1]

@@ -49,7 +49,7 @@ class IdealContactSummary(NamedTuple):
 class Gaps(NamedTuple):
     """Gaps of the ideal contact: periods without a touch that follow a noticeable change of the twist.
 
-    Arrays are (GAPS, *batch). If there are more gaps, the latest gap overwrites the last entry. An unused
+    Arrays are (MAX_GAPS, *batch). If there are more gaps, the latest gap overwrites the last entry. An unused
     entry begins at infinity.
     """
 

@@ -3,8 +3,9 @@
 To first order in the rotation, a contact without friction equals a contact with one axis along the normal of
 the first touch. Its mass is the effective mass at this touch (notebooks/guide/six_axes.md, section 1). An
 impulse along the normal moves all axes of the motion simulator. The motion along the normal is the weighted
-sum of the axes' motions. The weight (share) of an axis is the product of three numbers: the axis' component
-of the wrench of a unit force, its component of the twist that this wrench causes, and the effective mass.
+sum of the axes' motions. The weight (share) of an axis is the product of three numbers. These are the axis'
+component of the wrench of a unit force along the normal, the axis' component of the twist that this wrench
+causes, and the effective mass.
 """
 
 import math

@@ -138,7 +138,7 @@ def power(wrench_at_chaser: Wrench, twist: Twist) -> Float[Array, "..."]:
 
 
 def loads(wrench: Wrench, target: Frame, states: States) -> tuple[Load, Load]:
-    """Return the loads on target and chaser: the wrench acts on the chaser, its reaction on the target.
+    """Return the loads on target and chaser: the wrench acts on the chaser, the reaction on the target.
 
     Both loads act at the origin of target frame T.
     """

@@ -1,11 +1,11 @@
 """Phase lead with an observer of the force that the force sensor's dead zone removes.
 
-A dead zone of half-width dz [N] removes the force F up to dz. A continuous dead zone also subtracts dz from
-larger forces; a cut dead zone leaves them unchanged. The observer estimates the removed force from k_n d.
-Here k_n is the gain `observer_stiffness`, and d is the measured penetration, delayed like the force. A
-first-order low-pass filter smooths the estimate, and the phase lead acts on the sum of measured force and
-estimate. The method follows Li et al. 2026: their dead zone is cut, and the gain of their disturbance
-observer is near 1 below 15 Hz.
+A dead zone of half-width dz [N] replaces every force of at most dz by 0. A continuous dead zone also
+subtracts dz from larger forces; a cut dead zone leaves larger forces unchanged. The observer estimates the
+removed force from k_n d. Here k_n is the gain `observer_stiffness`, and d is the measured penetration,
+delayed like the force. A first-order low-pass filter smooths the estimate, and the phase lead acts on the sum
+of measured force and estimate. The method follows Li et al. 2026: their dead zone is cut, and the gain of
+their disturbance observer is near 1 below 15 Hz.
 """
 
 from collections.abc import Mapping

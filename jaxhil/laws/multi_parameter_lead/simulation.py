@@ -32,8 +32,8 @@ from jaxhil.mechanism.structs import Mechanism
 def pole_placement(frequency: float, delay: float, restitution: float) -> tuple[float, float]:
     """Compute the gains a [1] and b [s] that give a delayed contact the desired restitution.
 
-    The gains solve a + b s_d = -(s_d^2/omega^2) e^(s_d tau), where s_d is the desired root, the root of a
-    damped oscillation.
+    The gains solve a + b s_d = -(s_d^2/omega^2) e^(s_d tau), where s_d is the root of a damped oscillation
+    with the desired restitution.
 
     Args:
         frequency: angular frequency omega of the contact [rad/s], above 0.

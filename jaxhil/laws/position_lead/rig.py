@@ -11,7 +11,8 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 class PositionLead(Compensator):
     """Compensator F_c = F, command x + a_1 v + a_2 a, a_1 = position_lead, a_2 = acceleration_lead.
 
-    The coefficients of the motion simulator's inverse, 1 + a_1 s + a_2 s^2 + ..., compensate for its lag.
+    With a_1 and a_2 of the motion simulator's inverse, 1/G(s) = 1 + a_1 s + a_2 s^2 + ..., the command
+    compensates for the simulator's lag.
     """
 
     __slots__ = ("_of_acceleration", "_of_velocity")

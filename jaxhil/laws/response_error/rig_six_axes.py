@@ -2,9 +2,10 @@
 
     F_c = lead(F) + g k_hat (x_d - x_a) + g_b b_hat (v_d - v_a)
 
-x = -z is position and v velocity along the docking axis, of the numerical model (d) or measured (a). The
-gains are g and g_b; k_hat and b_hat are the identified stiffness and damping. In contact, the force exceeds
-`contact_threshold`; the surface is at the last position before contact. All other channels are lead(F).
+x = -z is the position and v the velocity along the docking axis. The index d marks the numerical model, the
+index a the measured motion. The gains are g and g_b; k_hat and b_hat are the identified stiffness and
+damping. In contact, the force exceeds `contact_threshold`; the surface is at the last position before
+contact. All other channels are lead(F).
 """
 
 from collections.abc import Mapping

@@ -32,7 +32,8 @@ from jaxhil.mechanism.structs import Mechanism
 def damping_at_the_limit(stiffness: float, frequency: float, delay: float) -> tuple[float, float]:
     """Compute b_v [N s/m] and omega_c [rad/s] at the stability limit of M s^2 + b_v s + k e^(-s tau) = 0.
 
-    If there are several limits, return the limit with the lowest frequency: above its b_v, contact is stable.
+    If there are several limits, return the limit with the lowest frequency. Contact is stable for every
+    larger b_v.
 
     Args:
         stiffness: k [N/m], above 0.

@@ -1,7 +1,7 @@
 """Six-axis linear algebra: wrenches, poses and twists are lists of six floats (x, y, z, rx, ry, rz).
 
-All are in the axes of target frame T (notebooks/guide/six_axes.md, section 1). Sums are added in the order of
-their terms. C is the frame of the chaser's docking interface.
+All vectors are in the axes of target frame T (notebooks/guide/six_axes.md, section 1). Sums are added in the
+order of their terms. C is the frame of the chaser's docking interface.
 """
 
 from math import factorial, isfinite, sqrt
@@ -108,8 +108,8 @@ def rotate(pose: Vector, vector: Triple) -> Triple:
 def coordinate_rates(pose: Vector, twist: Vector) -> Vector:
     """Return the time derivatives of a pose's coordinates (p, theta) at the twist (v, w).
 
-    theta' = Jl(theta)^-1 w = w - theta x w/2 + c theta x (theta x w), with the inverse left Jacobian and
-    c = (1 - t/2 cot(t/2))/t^2, t = |theta|.
+    theta' = Jl(theta)^-1 w = w - theta x w/2 + c theta x (theta x w), where Jl is the left Jacobian, c = (1 -
+    t/2 cot(t/2))/t^2 and t = |theta|.
     """
     _, _, _, a, b, c = pose
     x, y, z, u, v, w = twist

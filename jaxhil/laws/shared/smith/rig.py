@@ -11,7 +11,8 @@ from jaxhil.rig.registry import Compensator, GainSpecification
 class Smith(Compensator):
     """Base class with the filters 1 + T_l s and 1 + T_s s/(1 + T_s s/2), discretised by Tustin's rule.
 
-    T_l = phase_lead, with the time constant lead_filter as in `PhaseLead`; T_s = simulator_lag.
+    T_l is the gain `phase_lead`, and T_s the gain `simulator_lag`. As in `PhaseLead`, the first filter has
+    the time constant `lead_filter`.
     """
 
     __slots__ = ("_lead", "_predictor")
