@@ -91,10 +91,13 @@ def ideal_hunt_crossley(
 ) -> IdealContact:
     """Return the ideal contact with F = k d^n (1 + a d'), a = 3 chi / 2.
 
-    With y = a d' and q = a v, the first integral is k a^2 d^(n+1) / ((n + 1) M) = G(q) - G(y),
-    G(y) = y - log(1 + y). At each depth the inward rate y and the outward rate -p satisfy G(y) = G(-p). With
-    the parameter s = (y + p) / 2 the rates are y = s + L and p = s - L, L(s) = s coth(s) - 1, and
-    G = L(s) + log(sinh(s) / s). Hence, with the root S of S + L(S) = q,
+    With y = a d' and q = a v, the equation of motion has the first integral
+
+        k a^2 d^(n+1) / ((n + 1) M) = G(q) - G(y),   G(y) = y - log(1 + y).
+
+    At each depth, the inward rate y and the outward rate -p satisfy G(y) = G(-p). With the parameter
+    s = (y + p) / 2, the rates are y = s + L(s) and p = s - L(s), where L(s) = s coth(s) - 1. Then
+    G(y) = L(s) + log(sinh(s) / s). At the surface, s is the root S of S + L(S) = q. Hence
 
         e = (S - L(S)) / (S + L(S)),
         duration = 2 M / (a k) int_0^S d(s)^-n ds,

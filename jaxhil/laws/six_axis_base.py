@@ -30,7 +30,7 @@ class SixAxisSignals(NamedTuple):
     wrench: tuple[Array, ...]  # measured wrench about T's origin [N, N m], six arrays (*batch)
     pose_desired: Six  # coordinates of the numerical model [m, rad]
     twist_desired: Six  # twist of the numerical model [m/s, rad/s]
-    pose_measured: Six | None  # coordinates of the hardware [m, rad]; None unless the class `reads_pose`
+    pose_measured: Six | None  # coordinates of the hardware [m, rad]; None unless `reads_pose` is true
     age: Int[Array, "*batch"]  # number of ticks since the run began; 0 on the first tick
 
 

@@ -29,7 +29,7 @@ from jaxhil.mechanism.structs import Correlation, Mechanism
 
 __all__ = ["check_correlation", "correlate", "find_correlated_groups", "fix_at_nominal", "remove_keys"]
 
-MIN_EIGENVALUE = 1e-10  # 1; minimum for the matrix: below it, rounding may prevent a Cholesky factor
+MIN_EIGENVALUE = 1e-10  # 1; smaller eigenvalues may prevent a Cholesky factor by rounding
 
 # Bounds of uniform numbers, so that normal numbers are finite.
 _MIN_UNIFORM, _MAX_UNIFORM = 2.0**-54, 1.0 - 2.0**-53

@@ -195,8 +195,8 @@ class PositionGuard:
     def _stand(self, measured: float, position: float) -> None:
         """Set the output to the measured position or, without one, to a position out of contact.
 
-        If `measured` is NaN, use `position` if it is out of contact, else a position out of contact. This
-        position is moved into the stroke.
+        If `measured` is NaN, the output is `position`, moved out of contact if necessary, then moved into the
+        stroke.
         """
         self.has_output = True
         self.output = measured

@@ -313,5 +313,5 @@ def _series(generator, output, degree):
 
 
 def _power_of_two(number: float) -> int:
-    """Round a number up to a power of two, unless it exceeds a power by at most `CELL_LENGTH_TOLERANCE`."""
+    """Round a number up to a power of two; ignore a relative excess of at most `CELL_LENGTH_TOLERANCE`."""
     return 1 << max(0, math.ceil(math.log2(max(number, 1.0) / (1 + CELL_LENGTH_TOLERANCE))))

@@ -241,7 +241,7 @@ def _decay_reading(lagged, rates, readings):
 
 
 def _decay_modes(state, rates, readings):
-    """Return the output [N] of the filter at the sample, and its state at the interval's end."""
+    """Return the output [N] of the filter at the sample, and the filter's state at the interval's end."""
     half, states = len(readings) // 2, []
     for duration, added in zip(rates.part_durations, (readings[:half], readings[half:]), strict=True):
         decayed = []

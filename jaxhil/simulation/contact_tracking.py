@@ -42,7 +42,7 @@ class ContactTracker(NamedTuple):
     recent_forces: tuple[Array, Array]  # real force at the last two ticks [N]
     in_contact: Float[Array, "*batch"]  # duration of the real force so far [control periods]
     has_reading: Bool[Array, "*batch"]  # whether the force sensor has read a force
-    # number of ticks since the last real force; in a contact without a real force so far, since its beginning
+    # number of ticks since the last real force or, without one in this contact, since the contact's beginning
     force_free_ticks: Float[Array, "*batch"]
     work: tuple[Array, ...]  # work done on the mechanism and work returned by it [J]; empty unless recorded
     command_variation: CommandVariation | None  # variation of the force command; None unless recorded
@@ -189,7 +189,7 @@ def _has_begun(loop, rules, tracker, signals, touching, magnitude):
 
 
 def _choose_side(rules, tracker, signals):
-    """Return the side of the nearer surface, constant during a contact; None with one surface."""
+    """Return the side of the nearer surface, which is fixed during a contact; None with one surface."""
     if tracker.side is None:
         return None
     position = signals.position_desired

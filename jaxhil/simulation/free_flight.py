@@ -65,8 +65,9 @@ def advance_to_surface(
 ) -> tuple[LoopState, Bool[Array, "*batch"]]:
     """Return the state shortly before the next touch of a surface, and whether a lane may skip to this state.
 
-    The state is a whole number of control periods later. A lane may skip to this state if it flies freely:
-    its motion simulator has settled, and no force acts. `command` is the magnitude of the force command [N].
+    The returned state lies a whole number of control periods ahead. A lane may skip to this state if it flies
+    freely: its motion simulator has settled, and no force acts. `command` is the magnitude of the force
+    command [N].
     """
     scenario, period = rig.scenario, rig.constants.control_period
     velocity, position = state.velocity, state.position

@@ -86,7 +86,7 @@ def _check_name(law: Compensator | ContactLaw, table: dict[str, Any]) -> None:
 
 
 def _check_static(law: Compensator | ContactLaw) -> None:
-    """Raise `InputError` if a law cannot be a static argument, which is hashable and equal to itself."""
+    """Raise `InputError` unless a law is hashable and equal to itself, as a static argument must be."""
     try:
         hash(law)
         is_equal = bool(law == law)

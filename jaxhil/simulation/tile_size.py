@@ -66,5 +66,5 @@ def find_tile_size(lanes: int, cpu_size: int, lane_bytes: Callable[[], int] = la
 
 
 def count_bytes(arrays: Any) -> int:
-    """Return the memory [bytes] of all arrays of a pytree; their values need not exist."""
+    """Return the memory [bytes] of all arrays of a pytree; shapes and types without values suffice."""
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(arrays))

@@ -34,7 +34,7 @@ class SampleErrors(NamedTuple):
     bias: Float[Array, "6 *batch"]
     quantum: Float[Array, "6 *batch"]  # resolution; 0 without quantisation
     dead_zone: Float[Array, "6 *batch"]
-    range: Float[Array, "6 *batch"]  # infinite if unlimited
+    range: Float[Array, "6 *batch"]  # largest |reading|; infinite if unlimited
 
 
 class Sensor(NamedTuple):
@@ -44,7 +44,7 @@ class Sensor(NamedTuple):
     time_constant: Float[Array, "*batch"]  # time constant of the lag of all channels [s]; 0 without a lag
     errors: SampleErrors
     noise_std: Float[Array, "6 *batch"]  # standard deviation of the white noise [N, N m]
-    mounting: Pose | None  # pose of a sensor on the fixed side in target frame T; None if equal
+    mounting: Pose | None  # pose of a fixed sensor's frame in target frame T; None if equal to T
     tool: Tool  # tool that a sensor on the moving side carries
     gravity: Vector  # gravity in target frame T [m/s^2]
     assumed_tool: Tool  # tool that the controller assumes
