@@ -1,7 +1,8 @@
 """Checks of the inputs: sensor readings and the numerical model's motion.
 
 The last good sensor reading replaces a bad reading. `InputGuard.check` returns the faults of a tick, and
-stores in `fatal` the faults that trip the controller. The compensator then gets `force` and `measured`.
+stores in `fatal` the faults that trip the controller. The compensator then gets the attributes `force` and
+`measured`.
 """
 
 from math import inf, isfinite, nan

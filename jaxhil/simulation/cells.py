@@ -153,7 +153,7 @@ def build_cells(
     """Compute positions and matrices of the cells of a sampling interval.
 
     Args:
-        counts: Numbers of cells.
+        counts: Numbers of cells, from `count_cells`.
         numerator: Numerator of the motion simulator's transfer function, descending powers of s.
         denominator: Denominator of this transfer function.
         control_period: Control period [s].

@@ -69,7 +69,7 @@ class RigModel(abc.ABC):
         """Return scenarios of a mechanism as NumPy arrays.
 
         Args:
-            mechanism: Mechanism.
+            mechanism: Mechanism to be simulated.
             draws: Values of uncertain parameters by dotted path, one per scenario; None for the nominal
                 scenario.
             seed: Seed of the sensors' noise.

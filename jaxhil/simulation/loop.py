@@ -138,8 +138,8 @@ def build_rig_constants(loop: Loop, scenario: Scenario, measured: bool = True) -
 
     Args:
         loop: Loop that will run the scenarios.
-        scenario: Scenarios.
-        measured: Whether the position sensor is simulated. Without it, every tick takes less time.
+        scenario: Scenarios to be simulated.
+        measured: Whether the position sensor is simulated. Without this sensor, every tick takes less time.
     """
     period, simulator = scenario.control_period, scenario.simulator
     delays = split_delays(scenario, loop.is_two_sided)

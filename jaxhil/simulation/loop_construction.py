@@ -39,7 +39,7 @@ def build_loop(
     """Build the loop that runs all `scenarios` of a mechanism.
 
     Args:
-        mechanism: Mechanism.
+        mechanism: Mechanism to be simulated.
         compensator: Name of the compensator.
         scenarios: Scenarios. The loop includes every effect that at least one scenario has.
         energies: Whether to record the mechanical work of the real force.

@@ -124,7 +124,7 @@ def store_metrics(
     Nothing is stored for a contact that was not reached.
 
     Args:
-        scenario: Scenarios.
+        scenario: Scenarios that are simulated.
         metrics: Metrics of earlier contacts.
         tracker: Record of the current contact of each lane.
         index: Index of the current contact of each lane.

@@ -109,7 +109,7 @@ def check_run(mechanism: Mechanism, label: str | None = None, drawn: bool = Fals
     simulator may exceed `MAX_POLE`. The drives must be able to follow the first approach.
 
     Args:
-        mechanism: Mechanism.
+        mechanism: Mechanism to be checked.
         label: Name of the mechanism in messages; None for the mechanism's own name.
         drawn: Whether to check all draws of the uncertain parameters, not only the nominal run.
     """

@@ -126,8 +126,8 @@ def update_first_contact(
 
     Args:
         first_contact: Record up to the previous sample.
-        depth: Penetration [m].
-        rate: Penetration rate [m/s].
+        depth: Penetration of the hardware [m].
+        rate: Penetration rate of the hardware [m/s].
         side: Side of the surface, 1 or -1.
         now: Time since the start of the run [control periods].
         period: Control period [s].

@@ -35,7 +35,7 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
     Args:
         loop: Loop that runs the scenarios.
         gains: Gains by name [SI units], scalars or arrays of the batch shape.
-        scenario: Scenarios.
+        scenario: Scenarios to be simulated.
     """
     rig = build_rig_constants(loop, scenario, measured=loop.compensator.reads_position)
     return run_contacts(loop, gains, rig)

@@ -105,7 +105,7 @@ class Run:
     signals are computed when one of them is first used.
 
     Attributes:
-        mechanism: Mechanism.
+        mechanism: Simulated mechanism.
         compensator: Name of the compensator.
         gains: Gains of the compensator by name [SI units].
         seed: Seed of the sensors' noise.

@@ -113,10 +113,10 @@ def sample_force(
     """Apply quantisation, dead zone and range of the force sensor, in this order, to a force [N].
 
     Args:
-        force: Force [N].
+        force: Force before these effects [N].
         quantum: Quantisation step [N]; 0 without quantisation.
         dead_zone: Half-width of the dead zone [N].
-        range_: Largest reading [N].
+        range_: Largest |reading| [N].
         step: Change of the force since the last tick [N], for a cut dead zone (`cut_dead_zone`). None for a
             continuous dead zone, which is also subtracted from larger forces.
     """

@@ -1,10 +1,10 @@
 """Timing effects of the rig: delays that vary from tick to tick, lost frames, and missed ticks.
 
-The delay of the force reading at a tick deviates from its nominal value by at most the jitter, uniformly. The
-reading is the real force at exactly this delay before the tick, from the exact motion between the samples. If
-a frame of the force sensor is lost, the controller reads the last frame again. At a missed tick the
-controller does not run: the numerical model keeps its position and velocity, and the drives receive the last
-position command again.
+The delay of the force reading at a tick deviates from its nominal value. The deviation is uniformly
+distributed between minus and plus the jitter. The reading is the real force at exactly this delay before the
+tick, from the exact motion between the samples. If a frame of the force sensor is lost, the controller reads
+the last frame again. At a missed tick the controller does not run: the numerical model keeps its position and
+velocity, and the drives receive the last position command again.
 
 Like the noise of the sensors, the effects at a tick depend only on the key of the scenario, the index of the
 contact, and the number of ticks since the run began. No effect occurs at the first tick of a run.
@@ -59,7 +59,7 @@ def draw_timing(
     """Return the timing effects of scenarios; None if they have none.
 
     Args:
-        scenario: Scenarios.
+        scenario: Scenarios whose timing effects are drawn.
         contact: Index of the current contact.
         age: Number of ticks since the run began.
     """

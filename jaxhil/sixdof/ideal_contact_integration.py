@@ -227,7 +227,8 @@ def sample_ideal_contact(
         longest: Maximum length of a step while something touches or may touch soon [s].
 
     Returns:
-        State of the integration at the end, and motion and forces at the starts, (periods, ...).
+        State of the integration at the end, and motion and forces at the start of each period, (periods,
+        ...).
     """
     speed = error_speed(contact_model, states)
 

@@ -114,7 +114,7 @@ class SixAxisRun:
     """Simulated run of a six-axis mechanism with a compensator.
 
     Attributes:
-        mechanism: Mechanism.
+        mechanism: Simulated mechanism.
         compensator: Name of the compensator.
         gains: Gains of the compensator by name [SI units].
         seed: Seed of the sensors' noise.

@@ -144,7 +144,10 @@ def _separate_loops(scenario: Scenario) -> Scenario:
 
 
 def _compute_ideal_contacts(_: SixAxes, scenarios: Any) -> tuple[Array, ...]:
-    """Compute the ideal contacts of scenarios in tiles, as a tuple of arrays that have the same tiles."""
+    """Compute the ideal contacts of scenarios that are arranged in tiles.
+
+    The result is a tuple of arrays that are arranged like the scenarios.
+    """
     return tuple(map_tiles(lambda _, tile: jax.tree.leaves(compute_ideal_contact(tile)), (), scenarios))
 
 

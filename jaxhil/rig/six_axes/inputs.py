@@ -1,8 +1,8 @@
 """Checks of the six-axis inputs: sensor readings, channel by channel, and the numerical model's motion.
 
 The last good reading of a channel replaces a bad reading. `SixAxisInputGuard.check` returns the faults of a
-tick, and stores in `fatal` the faults that trip the controller. The compensator then gets `wrench` and
-`measured`.
+tick, and stores in `fatal` the faults that trip the controller. The compensator then gets the attributes
+`wrench` and `measured`.
 """
 
 from math import inf, isfinite, nan
