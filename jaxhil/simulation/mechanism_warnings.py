@@ -1,4 +1,4 @@
-"""Warnings about numbers of a mechanism file that are implausible beside its ideal contacts."""
+"""Warnings about numbers of a mechanism file that are implausible compared with its ideal contacts."""
 
 import math
 from typing import NamedTuple

@@ -144,7 +144,7 @@ def read_leaving_commands(
     state: SimulatorState,
     before_run: UniformCommand | None = None,
 ) -> SimulatorState:
-    """Return the state with the commands between which the window's start moves in the current interval.
+    """Return the motion simulator's state, with the commands at the three ticks around the window's start.
 
     Args:
         ring: Delay line of the drive commands at the end of each interval [m], including this interval.

@@ -101,7 +101,10 @@ class Controller6(ControllerBase):
 
     @property
     def unpaid_impulse(self) -> float:
-        """Return the uncorrected impulse error after a contact, divided by its impulse; 0 if unknown."""
+        """Return the remaining impulse error after a contact, as a share of the contact's impulse [1].
+
+        The share is 0 if the compensator does not know it.
+        """
         return self._law.unpaid_impulse
 
     @property

@@ -24,7 +24,9 @@ def share_beyond(excess: float, excess_before: float, moved: float) -> float:
 
 
 def gate(share: float, share_before: float) -> float:
-    """Return the gate, from 0 to 1: the time above the threshold, weighted with a triangle of two periods.
+    """Return the gate, from 0 to 1, for the shares of the last two periods.
+
+    The gate is the integral of a triangular weight over the time above the threshold in the last two periods.
 
     The result is exact if the reading crossed the threshold once. The gates of all ticks add up to the time
     above the threshold in periods, and the mean delay of the gate is one period.

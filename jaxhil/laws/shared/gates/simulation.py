@@ -32,7 +32,9 @@ def share_beyond(
 
 
 def gate(share: Float[Array, "*batch"], share_before: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return the gate (s^2 + l^2)/2 + s l (2 - s - l) of the last period's share s and the previous share l.
+    """Return the gate, from 0 to 1, for the last period's share s and the previous period's share l.
+
+    The gate is (s^2 + l^2)/2 + s l (2 - s - l).
 
     If the reading crossed the threshold once, the gate is the integral of a weight over the time during which
     the reading was above the threshold. At the age u [periods], the weight is u for u < 1 and 2 - u for
