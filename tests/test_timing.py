@@ -125,9 +125,15 @@ def test_drawn_timing_effects_have_stated_distribution_and_no_effect_at_first_ti
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sensor": {"jitter": 0.005}}, "jitter: found 0.005, expected at most 0.0041 s, the least"),
-        ({"sensor": {**JITTER, "time_constant": 0.001}}, "jitter: found 0.0037, expected 0, because a time_"),
-        ({"sensor": JITTER, "contact": {**LIST, "clearance": 0.01}}, "expected 0, because a clearance"),
+        ({"sensor": {"jitter": 0.005}}, "jitter: found 0.005, expected at most 0.0041 s, the smallest"),
+        (
+            {"sensor": {**JITTER, "time_constant": 0.001}},
+            "jitter: found 0.0037, expected 0, because jitter is not supported with a time_",
+        ),
+        (
+            {"sensor": JITTER, "contact": {**LIST, "clearance": 0.01}},
+            "expected 0, because jitter is not supported with a clearance",
+        ),
         (
             {"contact": {**LIST, "clearance": 0.01}, **MISSED},
             "missed_tick_probability: found 0.05, expected 0",
