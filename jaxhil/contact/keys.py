@@ -46,7 +46,10 @@ class ContactKey(NamedTuple):
         return self._replace(name=self.name_in_six_axes, meaning=self.meaning_in_six_axes)
 
     def struct_field(self, laws: str) -> tuple[str, Any, Any]:
-        """Return name, type and default for `msgspec.defstruct`; the description contains the text `laws`."""
+        """Return the field for `msgspec.defstruct`: name, type and default.
+
+        The text `laws` replaces "{laws}" in the description.
+        """
         meaning = self.meaning.format(laws=laws)
         if isinstance(self.default, bool):
             return self.name, Annotated[bool, key_metadata(meaning)], self.default

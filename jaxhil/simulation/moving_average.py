@@ -114,7 +114,7 @@ def motion_rows(
     """
     width, fraction = window / control_period, split_window(window, control_period).fraction
     zeros, ones = jnp.zeros_like(s + width), jnp.ones_like(s + width)
-    early = jnp.where(is_before, s, fraction)  # time until the window's start passes a tick
+    early = jnp.where(is_before, s, fraction)  # time before the window's start passes a tick
     late = jnp.where(is_before, 0, s - fraction)
     late_share = jnp.where(is_before, 0, ones)
     if hold == "linear":
