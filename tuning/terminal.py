@@ -352,7 +352,7 @@ def _make_console(stream) -> Console:
 
 
 def _width_without_terminal() -> int:
-    """Return the width of piped output: `COLUMNS`, or that of the terminal behind another stream."""
+    """Return the width of piped output: `COLUMNS`, or the width of a terminal on another standard stream."""
     if (columns := os.environ.get("COLUMNS", "")).isdigit() and int(columns) > 0:
         return int(columns)
     for descriptor in range(3):

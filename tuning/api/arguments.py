@@ -248,7 +248,7 @@ def load_gains(value: Any, argument: str = "gains", any_axes: bool = False) -> "
 
 
 def find_gain_file(value: Any, argument: str = "gains") -> Path:
-    """Return the path of a gain file from its own path or that of its folder.
+    """Return the path of a gain file; `value` is this path or the path of the file's folder.
 
     Raise `InputError` if the file cannot be read.
     """

@@ -161,7 +161,7 @@ def _prepare_controller(gains: Any, loaded: Any) -> Callable[[Sequence[str]], An
 
 
 def _load_mapping(path: Any, axes: int) -> Any:
-    """Return the mapping of the logs, by default that of the logs of `jaxhil simulate`."""
+    """Return the mapping of the logs; by default, the one for logs of `jaxhil simulate`."""
     from tuning.identification.logs import mapping, six_axis_mapping
 
     if path is None:

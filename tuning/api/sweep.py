@@ -133,7 +133,8 @@ def sweep(
 ) -> SweepStudy:
     """Estimate the failure probability of gains on scenarios drawn from the mechanism's uncertainty.
 
-    Scenario i depends only on the seed and on i. Its results equal those of `jaxhil sweep` to the last bit.
+    Scenario i depends only on the seed and on i. The results of a scenario equal those of `jaxhil sweep` to
+    the last bit.
 
     Args:
         gains: path of a gain file or of its folder, or a result of `tuning.tune`.

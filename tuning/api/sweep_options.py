@@ -112,7 +112,7 @@ class SweepOptions:
             self._check_rare(self.rare, 0.0 if self.limit is None else self.limit)
 
     def with_limit(self, mechanism: AnyMechanism) -> "SweepOptions":
-        """Return the options with the limit for a mechanism, by default that of its number of axes."""
+        """Return the options with an error limit; by default, the one for the mechanism's number of axes."""
         limit = arguments.choose_limit(self.limit, mechanism)
         if self.rare is not None:
             self._check_rare(self.rare, limit)

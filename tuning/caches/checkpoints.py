@@ -80,7 +80,7 @@ class Checkpoints:
             write_checksummed(path, content)
 
     def journal(self, name: str, inputs: Any) -> "StepCheckpoints":
-        """Return the checkpoints for the steps of the computation `name`, which `inputs` determine."""
+        """Return the checkpoints for the steps of the computation `name`; `inputs` determine its result."""
         steps = Checkpoints(
             None if self._folder is None else self._folder / _build_file_name(name), self._resume
         )

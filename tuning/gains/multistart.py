@@ -313,7 +313,7 @@ def _restart_stuck_starts(
 def _recompute_exact_values(
     validation: Validation, task: int, starts: list[StartResult], objective: Objective
 ) -> list[StartResult]:
-    """Replace the objective in each solver result, which is a smooth norm, by the exact objective."""
+    """Replace the smooth norm in each solver result by the exact objective."""
     if objective.name == "rms" or not starts:
         return starts
     values = validation.losses(objective, [task], np.stack([start.coordinates for start in starts])[None])[0]

@@ -112,7 +112,7 @@ class Objective:
             )
 
     def unit(self, weight: str) -> float:
-        """Return the error [1] that a value of 1 in the field `weight` stands for."""
+        """Return the error [1] that corresponds to a value of 1 in the field `weight`."""
         return self.limit if weight in LIMIT_SCALED_WEIGHTS else 1.0
 
     @property

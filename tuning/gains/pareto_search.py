@@ -54,9 +54,10 @@ PARETO_CRITERIA = {axis.name: axis for axis in (NOISE_CRITERION, PEAK_CRITERION,
 
 
 def choose_default_criterion(compensator: str, axes: int = 1) -> ParetoCriterion | None:
-    """Return a compensator's second criterion in Pareto fronts: noise, else the peak command, else None.
+    """Return the second criterion of a compensator's Pareto fronts if the user names none.
 
-    With six axes it is the peak command, because the noise amplification is unknown.
+    The criterion is noise amplification if it depends on the gains, otherwise the peak command for a
+    compensator that predicts contacts, and otherwise None. With six axes, the criterion is the peak command.
     """
     if axes != 1:
         return PEAK_CRITERION

@@ -62,7 +62,10 @@ def compute_training_tolerance(limit: float, scenarios: int) -> float:
 
 
 def build_least_error_objective(objective: Objective) -> Objective:
-    """Return the objective of accurate gains; a tolerance of 0 lets it share the quiet search's program."""
+    """Return the objective of accurate gains, with a tolerance of 0.
+
+    Because of the tolerance, this objective shares the compiled program of the search for quiet gains.
+    """
     return replace(objective, tolerance=0.0)
 
 

@@ -40,7 +40,7 @@ DEFAULT_SCENARIOS, DEFAULT_NOISY_SCENARIOS = 32, 128
 
 @dataclass(frozen=True)
 class TuneTask:
-    """One mechanism with the compensator to tune for it and the training scenarios."""
+    """Tuning task: one mechanism, the compensator to tune, and the training scenarios."""
 
     mechanism: AnyMechanism
     compensator: str  # name of the compensator
@@ -162,7 +162,7 @@ def list_tuned_gains(tasks: list[TuneTask]) -> tuple[str, ...]:
 
 
 def build_gain_bounds(task: TuneTask, names: tuple[str, ...]) -> GainBounds:
-    """Return the bounds (gains,) of the gains `names`; those of an untuned gain are its literature value."""
+    """Return the bounds (gains,) of the gains `names`; an untuned gain is bounded to its literature value."""
     gains = {gain.name: gain for gain in get_compensator(task.compensator, task.model.axes).gains}
     moved = {gain.name for gain in task.tuned}
 

@@ -1,4 +1,4 @@
-"""Transfer of tuned gains to a similar mechanism, whose tuning then starts from them.
+"""Transfer of tuned gains to a similar mechanism, as starting gains for its tuning.
 
 `compute_mechanism_distance` measures how much two mechanisms differ, `find_nearest` selects the most similar
 tuned mechanism, and `transfer_gains` converts gains from one mechanism to another.

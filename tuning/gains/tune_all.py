@@ -1,6 +1,6 @@
 """Tuning of many mechanisms in groups, one after the other in this process or in parallel on a cluster.
 
-If there is a cache (`tuning.caches.checkpoints`), it stores every result and, during a search in this
+If there is a cache (`tuning.caches.checkpoints`), the cache stores every result and, during a search in this
 process, a checkpoint after every step.
 """
 

@@ -41,7 +41,7 @@ VALIDATION_SEED_OFFSET = 0x5EED  # added to the seed of training, so that fresh 
 
 @dataclass(frozen=True)
 class Validation:
-    """Evaluator of gains for tasks that share a compiled program; `build_validation` builds it."""
+    """Evaluator of gains for tasks that share a compiled program, built by `build_validation`."""
 
     tasks: list[TuneTask]  # tasks with their training scenarios
     fresh: list[Any]  # fresh scenarios of each task
@@ -289,7 +289,11 @@ def draw_fresh_scenarios(task: TuneTask, number: int, seed: int) -> Any:
 def _draw_evaluation_lanes(
     task: TuneTask, number: int, seed: int
 ) -> tuple[Any, ProbedScenarios | None, Any, Any]:
-    """Return a task's fresh scenarios, with probes (else None), with all lanes to evaluate, and the loop."""
+    """Draw the scenarios with which gains are evaluated on a task.
+
+    Return the fresh scenarios; the same scenarios with probes, or None; all lanes to evaluate, which include
+    the nominal run; and the loop.
+    """
     drawn = draw(task.mechanism, number, seed)
     fresh, probed = task.model.scenarios(task.mechanism, drawn, seed), None
     if task.probed and isinstance(task.mechanism, Mechanism):

@@ -284,7 +284,7 @@ def _has_dead_zone(posterior: Posterior) -> bool:
 
 
 def _is_silent_outside(runs: Sequence[LoggedRun], problem: ContactProblem, posterior: Posterior) -> bool:
-    """Return whether most readings before and after the contacts are exactly 0, as a dead zone makes them.
+    """Return whether most readings before and after the contacts are exactly 0, which shows a dead zone.
 
     A fit alone may not reveal a dead zone: a nearer surface gives more penetration, and so more model force,
     which hides the force that the dead zone removes.
@@ -305,7 +305,7 @@ def _estimate_noise_from_contact(
 ) -> ForceReadings:
     """Estimate the noise of the force readings from the residuals of a Kelvin-Voigt fit.
 
-    If there is a dead zone, only readings of forces well above it are used.
+    If there is a dead zone, only readings of forces well above the dead zone are used.
 
     Args:
         motion: Motion of the mechanism in all runs.

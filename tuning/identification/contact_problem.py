@@ -97,9 +97,9 @@ class ContactProblem:
         return _whiten(values.swapaxes(-1, -2), self.readings.whitening).swapaxes(-1, -2)
 
     def changed(self, law: Law, time_constant: float, delay: float | None = None) -> ContactProblem:
-        """Return the same problem with this contact law and this time constant of the sensor [s].
+        """Return a copy of the problem with this contact law and this time constant of the sensor [s].
 
-        `delay` [s] is the approximate delay of the later fits, if it is known.
+        `delay` [s] is the approximate force delay of the later fits, or None if it is unknown.
         """
         return ContactProblem(self.motion, self.readings, law, self.plane, time_constant)
 
@@ -182,8 +182,8 @@ class ContactProblem:
     def _find_nearby_rows(self, moved: Motion, planes: np.ndarray, only_used: bool) -> list[NearbyRows]:
         """Return the rows near contact at each of the times `periods_before`.
 
-        They include all rows that are in contact for at least one of the surface positions `planes` [m]. If
-        the readings are filtered, they also include later rows, which depend on them through the filters.
+        The result includes all rows that are in contact for at least one of the surface positions `planes`
+        [m]. If the readings are filtered, the result also includes the later rows that the filters affect.
 
         Args:
             moved: Position [m] and velocity [m/s] in all rows, at each of the times `periods_before`.

@@ -72,7 +72,7 @@ def select_representative_lanes(problem: ContactProblem) -> np.ndarray:
 
 
 def _approximate_surface(problem: ContactProblem) -> float:
-    """Return the specified surface position [m]; if there is none, fit it for a typical force delay."""
+    """Return the surface position [m]: the specified one, or a fit for a typical force delay."""
     if problem.plane is not None:
         return problem.plane
     return find_best_surface(
@@ -81,7 +81,7 @@ def _approximate_surface(problem: ContactProblem) -> float:
 
 
 class SummarisedProblem(ContactProblem):
-    """Contact problem that uses pseudo-rows instead of its deep lanes wherever they are accurate enough."""
+    """Contact problem in which pseudo-rows replace the deep lanes wherever they are accurate enough."""
 
     def __init__(self, problem: ContactProblem, deep: np.ndarray, delay: float):
         """Split the lanes of a problem into deep lanes, which pseudo-rows replace, and other lanes.
@@ -100,9 +100,9 @@ class SummarisedProblem(ContactProblem):
         self.planes = SURFACE_NODES
 
     def changed(self, law: Law, time_constant: float, delay: float | None = None) -> ContactProblem:
-        """Return the same problem with this contact law and this time constant of the sensor [s].
+        """Return a copy of the problem with this contact law and this time constant of the sensor [s].
 
-        `delay` [s] is the approximate delay of the later fits, if it is known.
+        `delay` [s] is the approximate force delay of the later fits, or None if it is unknown.
         """
         if delay is None:
             delay = self.delay + self.time_constant - time_constant
@@ -135,7 +135,7 @@ class SummarisedProblem(ContactProblem):
         return all(np.all(compute_force(fit.coefficients[None], table.extreme) > 0.0) for fit in fits)
 
     def _find_table(self, delay: float, planes: np.ndarray) -> _DesignTable | None:
-        """Find or compute a table for a delay and surface positions; return None if it is not accurate."""
+        """Find or compute a table for a delay and surface positions; return None if no table is accurate."""
         for table in self.tables:
             if table.covers(delay, planes):
                 return table

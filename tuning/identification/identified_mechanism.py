@@ -96,7 +96,7 @@ def make_mechanism(
 
 
 def compute_bound_excess(key: str, draws: np.ndarray) -> float:
-    """Return minus the mean of the draws if it is below the lower bound 0 of the parameter; otherwise 0."""
+    """Return how far the mean of the draws is below the lower bound 0; 0 if it is not, or without a bound."""
     bounded = key.endswith(".delay") or key.startswith("contact.damping")
     return max(-float(draws.mean()), 0.0) if bounded else 0.0
 
@@ -106,7 +106,7 @@ def _merge_uncertainty(
 ) -> dict[str, Any]:
     """Return the tables `[uncertainty]` and `[correlation]` of the mechanism file.
 
-    The tables contain the identified parameters, and the prior's uncertainty of the others.
+    The tables contain the identified parameters, and the prior's uncertainty of the other parameters.
     """
     # A damping that is 0 in every draw has no uncertainty.
     keys = [key for key, draws in draws_by_key.items() if np.ptp(draws) > 0.0]

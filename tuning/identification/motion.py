@@ -216,7 +216,8 @@ def _make_companion_form(numerator: np.ndarray, denominator: np.ndarray, period:
 def compute_matrix_exponential(matrix: np.ndarray) -> np.ndarray:
     """Return the matrix exponential by scaling, Taylor series and squaring, accurate to rounding.
 
-    For hundreds of small matrices, it is faster than SciPy's routine, which must choose a method first.
+    For hundreds of small matrices, this function is faster than SciPy's routine, which must choose a method
+    first.
     """
     halvings = max(6, int(np.ceil(np.log2(np.abs(matrix).sum(axis=0).max(initial=1.0)))))
     identity = np.eye(len(matrix))

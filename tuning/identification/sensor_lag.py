@@ -103,7 +103,8 @@ def _average_over_lag(
 ) -> SensorLag | None:
     """Average over the models with and without a lag; return None if the readings exclude a lag.
 
-    The prior of the time constant is uniform up to `MAX_TIME_CONSTANT`. The resulting delays include it.
+    The prior of the time constant is uniform up to `MAX_TIME_CONSTANT`. The delays of the result include the
+    time constant.
     """
     heights = (
         np.array([posterior.best[2].misfit, *(at(value)[1][2] for value in TRIAL_TIME_CONSTANTS)]) / -2.0

@@ -180,7 +180,7 @@ def check_contact_model(
 def check_held_out_contacts(
     contact: ContactFit, runs: list[LoggedRun], mass: float, held_out: np.ndarray
 ) -> list[CheckResult]:
-    """Compare a fit with the contacts that it did not use, which `held_out` flags.
+    """Compare a fit with the contacts that the fit did not use; `held_out` flags these contacts.
 
     The verdict ignores these checks, because the mechanism file comes from another fit, to all contacts.
     """

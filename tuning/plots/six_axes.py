@@ -74,8 +74,8 @@ def six_axes_plot(recorded: RunRecord, title: str) -> Figure:
 def find_time_origin(recorded: RunRecord) -> tuple[int, str]:
     """Return the tick at which the plots' time is 0, and a text that describes this tick.
 
-    This is the tick of the first touch in the ideal contact. If there is none, it is the first touch on the
-    rig, or without any contact the start of the run.
+    This is the tick of the first touch in the ideal contact. Without such a touch, it is the tick of the
+    first touch on the rig; without any contact, the start of the run.
     """
     ideal = np.flatnonzero(np.any(recorded.wrench_ideal != 0, axis=1))
     if len(ideal):

@@ -16,7 +16,7 @@ STATE_SIZE = 4  # position, and the commands a, b, c
 def discretise_moving_average(
     window: float, period: float, hold: str, force_fraction: float, position_fraction: float
 ) -> DiscreteSimulator:
-    """Discretise a moving average; the last four arguments are those of `discretise_simulator`.
+    """Return the exact discretisation of a moving average, in the form of `discretise_simulator`.
 
     Args:
         window: length of the window [s].
@@ -50,7 +50,10 @@ def discretise_moving_average(
 
 
 def average_rows(window: float, period: float, hold: str, fraction: float, is_before: bool) -> MotionRows:
-    """Return the rows at a fraction of an interval, before or after the window's start passes a tick."""
+    """Return the rows at a fraction of a sampling interval.
+
+    `is_before` is true until the start of the window passes a tick within the interval.
+    """
     width = window / period
     kink = width - math.floor(width + DELAY_ROUNDING_TOLERANCE)
     early, late = (fraction, 0.0) if is_before else (kink, fraction - kink)

@@ -16,7 +16,8 @@ def is_stalled(contact: dict[str, Any], setup: SessionSettings, run: LoopReport 
 
     This is the case if a command was older than `MAX_COMMAND_AGE` periods and the controller did not cause
     any missed tick of the contact. Such a contact says nothing about the controller. The result is always
-    False if faults are injected, and for a running controller, whose missed ticks have unknown causes.
+    False if faults are injected, and for a controller that this session did not start, because the causes of
+    its missed ticks are unknown.
     """
     if (
         run is None
@@ -94,7 +95,7 @@ def _describe_error(rig: SimulatedRig) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Replace tuples with one number, which one axis has, by this number."""
+    """Replace each tuple of one number, which only one axis has, by the number."""
     if isinstance(value, dict):
         return {name: _plain(entry) for name, entry in value.items()}
     if not isinstance(value, tuple):

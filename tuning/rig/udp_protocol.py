@@ -113,7 +113,7 @@ def decode_reading(
     """Decode a packet from the rig; sensor readings may be NaN.
 
     Raise PacketError if it is not a valid packet of the session with number `session` for this number of
-    axes. With None, a packet of any session, or for any number of axes, is valid.
+    axes. If `session` or `axes` is None, any session or any number of axes is valid.
     """
     layout = _format_of(packet, axes)
     if len(packet) != layout.reading.size:
@@ -146,7 +146,7 @@ def decode_answer(packet: bytes, session: int | None, axes: int | None = None) -
     """Decode a packet from the controller's process.
 
     Raise PacketError if it is not a valid packet of the session with number `session` for this number of
-    axes. With None, a packet of any session, or for any number of axes, is valid.
+    axes. If `session` or `axes` is None, any session or any number of axes is valid.
     """
     layout = _format_of(packet, axes)
     if len(packet) != layout.answer.size:
@@ -165,7 +165,7 @@ def decode_answer(packet: bytes, session: int | None, axes: int | None = None) -
 
 
 def _format_of(packet: bytes | bytearray, axes: int | None) -> PacketFormat:
-    """Return the layout for the number of axes in a packet, which must equal `axes` unless this is None."""
+    """Return the layout for a packet's number of axes, which must equal `axes` unless `axes` is None."""
     number = packet[6] if len(packet) > 6 else 0
     if number not in FORMATS or axes not in (None, number):
         raise PacketError(f"packet for {number} axes, expected {axes or 'one or six'}")
@@ -237,9 +237,9 @@ class SessionNumbers:
 class SequenceFilter:
     """Filter that accepts a packet only if it is newer than all previous packets.
 
-    It compares sequence numbers of 32 bits, which wrap around (RFC 1982). One packet with a wrong number must
-    not make all later packets old. Therefore a jump by more than `MAX_SEQUENCE_STEP` is accepted only when a
-    second packet continues from the new number (RFC 3550, A.1).
+    The filter compares sequence numbers of 32 bits, which wrap around (RFC 1982). One packet with a wrong
+    number must not make all later packets old. Therefore a jump by more than `MAX_SEQUENCE_STEP` is accepted
+    only when a second packet continues from the new number (RFC 3550, A.1).
     """
 
     __slots__ = ("_awaited", "_newest")

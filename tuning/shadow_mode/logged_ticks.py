@@ -233,7 +233,8 @@ def _find_starts(force: np.ndarray, index: np.ndarray | None, period: float) -> 
 def _align(ticks: LoggedTicks, timing: CampaignTiming) -> LoggedTicks:
     """Return one row per tick with the readings of this tick and the command that answers them.
 
-    The row convention and the computing delay of the mapping state which rows of the log these are.
+    The row convention and the computing delay of the mapping determine the rows of the log from which
+    readings and command come.
     """
     motion, readings, command = {"tick": (0, 0, 0), "sent": (-1, 0, 0), "after": (0, -1, 0)}[timing.row]
     command += timing.computing_delay

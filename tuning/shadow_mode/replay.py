@@ -183,7 +183,7 @@ def _divide(value: float, size: float) -> float:
 def replay_logs(
     make_controller: Callable[[Sequence[str]], Any], logs: Sequence[LoggedTicks], is_session: bool
 ) -> tuple[list[list[ReplayedRun]], list[str]]:
-    """Replay all logs without the audits that are not valid for them.
+    """Replay all logs, without the audits that are not valid for these logs.
 
     Args:
         make_controller: Function that takes names of limits, and returns a new controller without them.

@@ -83,7 +83,7 @@ class Growth(NamedTuple):
 
 
 def explain_nonlinearity(mechanism: Mechanism, compensator: str) -> str | None:
-    """Return the reason why the growth is not computed, such as a nonlinear loop; else None."""
+    """Return the reason why the growth is not computed, such as a nonlinear loop; None if it is computed."""
     if compensator not in LINEAR_COMPENSATORS:
         return f"{compensator} is not linear"
     if not find_contact_law(mechanism.contact.law).is_linear:

@@ -35,7 +35,7 @@ PointComputer = Callable[[SweepProgram, Iterable[PointBatch]], Iterator[tuple[st
 
 
 def run_batch(sweep: SweepProgram, points: np.ndarray, noise: np.ndarray) -> Rows:
-    """Run one scenario per point, at most a chunk of them; return the columns `POINT_COLUMNS`."""
+    """Run one scenario per point, for at most one chunk of points; return the columns `POINT_COLUMNS`."""
     manifest = sweep.manifest
     scenarios = sweep.model.scenarios(sweep.mechanism, draw_at_points(sweep.mechanism, points), manifest.seed)
     key = np.stack([scenarios.key[0], noise.astype(np.uint32)])

@@ -115,7 +115,7 @@ def _describe_study(manifest: Manifest, request: StudyRequest) -> dict[str, Any]
 
 
 def _convert_to_plain(value: Any, null: float | None) -> Any:
-    """Convert records to dictionaries, arrays to lists, and the number that null stands for to None."""
+    """Convert records to dictionaries, arrays to lists, and the non-finite number `null` to None."""
     if hasattr(value, "_fields"):
         null = NULL_VALUES[type(value)]
         return {

@@ -97,7 +97,7 @@ def compute_error_metrics(outcome: Any, limit: float, seed: int) -> dict[str, In
 
 
 def compute_ratio_metrics(outcome: Any, names: Sequence[str], seed: int) -> dict[str, IntervalEstimate]:
-    """Compute the 99th percentiles of ratios to the ideal contact, which are attributes of an outcome.
+    """Compute the 99th percentiles of attributes of an outcome that are ratios to the ideal contact.
 
     `names` are the names of the attributes, `seed` is the seed of the bootstrap.
     """

@@ -54,7 +54,7 @@ def build_drawn_scenarios(
 def record_runs(
     mechanism: SixAxisMechanism, compensator: str, gains: Mapping[str, float], number: int, seed: int
 ) -> tuple[Metrics, list[ControllerRecord]]:
-    """Return metrics and records of `number` drawn runs; those of the nominal run for 0."""
+    """Return metrics and records of `number` drawn runs; if `number` is 0, those of the nominal run."""
     return record_scenarios(mechanism, compensator, gains, draw_scenarios(mechanism, number, seed))
 
 

@@ -184,7 +184,10 @@ class _LaneDelayLine:
         self._past: list[np.ndarray] = []
 
     def step(self, position: np.ndarray, velocity: np.ndarray, begins: np.ndarray) -> np.ndarray:
-        """Return the delayed position [m]; the motion before a run `begins` is assumed to be uniform."""
+        """Return the delayed position [m].
+
+        In the lanes `begins`, a run begins; the motion before this tick is assumed to be uniform.
+        """
         if not self._past:
             self._past = [np.zeros_like(position)] * (self._whole + 1)
         if np.any(begins):

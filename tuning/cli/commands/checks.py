@@ -58,7 +58,7 @@ def write_mechanism_file(option: str, path: Path, text: str) -> None:
 
 
 def prepare_output_folder(folder: Path) -> None:
-    """Check that results can be written to a folder; create it, and delete stale temporary files."""
+    """Check that results can be written to a folder; create the folder, and delete stale temporary files."""
     with report_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         remove_stale(folder)

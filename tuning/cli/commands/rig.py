@@ -146,7 +146,7 @@ def load_checked_gains(gains: Path) -> tuple[dict[str, Any], Any, tuple[Any, Any
 
 
 class _LoopProgress:
-    """Progress display of the real-time loop; the texts are short, because the loop itself writes them."""
+    """Progress display of the real-time loop; the texts are short, because writing takes the loop's time."""
 
     def __init__(self, period: float) -> None:
         self._period, self._terminal = period, sys.stderr.isatty()

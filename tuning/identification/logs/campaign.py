@@ -286,7 +286,8 @@ def make_timing(mapping: LogMapping, prior: Mechanism | None) -> CampaignTiming:
     """Return the timing of the logs, from the mapping or, where the mapping omits it, from the prior.
 
     Raises:
-        InputError: If neither states the control period, or if the rate of the rows does not fit it.
+        InputError: If neither states the control period, or if the rate of the rows does not fit the control
+            period.
     """
     spec, rig = mapping.timing, None if prior is None else prior.rig
     period = spec.control_period or (rig and rig.control_period)

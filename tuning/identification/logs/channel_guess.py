@@ -28,7 +28,7 @@ MAX_EQUAL_UNIT_RATIO = 30.0  # maximum ratio of the strokes of two positions in 
 
 
 def match_columns(log: OpenLog) -> dict[str, list[str]]:
-    """Return the columns of each channel whose names fit best; several if they fit equally."""
+    """Return for each channel the columns whose names fit best: one, or several that fit equally well."""
     matches: dict[str, list[tuple[int, str]]] = {}
     for name in dict.fromkeys(log.names):
         match = match_channel(name, log.reader.units.get(name) or find_unit(name))

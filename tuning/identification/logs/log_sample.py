@@ -28,7 +28,7 @@ class ChannelGuess(NamedTuple):
 
 
 class LogSample(NamedTuple):
-    """First rows of a log's columns, and what the file states about them."""
+    """First rows of a log's columns, and what the file states about these columns."""
 
     values: ColumnsByName  # of equal lengths; a missing number has the value of the row above
     present: Mapping[str, np.ndarray]  # whether each row of a column of numbers has a number

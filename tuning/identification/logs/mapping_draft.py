@@ -150,7 +150,7 @@ def _format_timing(sample: LogSample, guesses: Mapping[str, ChannelGuess]) -> li
 
 
 def _count_rows_per_period(x: np.ndarray) -> int:
-    """Return the number of rows per command, or 1 if the commands do not show it."""
+    """Return the number of rows per command, or 1 if the commands do not show this number."""
     if len(x) < checks.MIN_LOG_ROWS:
         return 1
     if (rows := checks.find_change_interval(x)) > 1:

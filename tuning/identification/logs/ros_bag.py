@@ -2,7 +2,7 @@
 
 The columns are named `/topic.field`. Entries of an array are numbered from 1, and also have the names that
 the message gives them (JointState: `/topic.position.joint`). `/topic.time` is the recording time of the
-messages; `/topic.header.stamp` is the time of their headers, `sec` and `nanosec` in one number.
+messages; `/topic.header.stamp` is the time in their headers, as one number computed from `sec` and `nanosec`.
 """
 
 # The library is optional.

@@ -1,6 +1,6 @@
-"""Rows of a log that has several rows per control period: one row per tick is used.
+"""Selection of one row per tick from a log that has several rows per control period.
 
-A logger may be faster than the controller. Its commands are then constant between two ticks, or change
+A logger may be faster than the controller. The logged commands are then constant between two ticks, or change
 linearly between them. The rows in which the command or its slope changes are those of the ticks.
 """
 
@@ -16,7 +16,7 @@ MIN_CHANGE_SHARE = 0.9  # minimum share of the commands' changes in the rows of 
 
 
 def find_command_phase(tick: np.ndarray, x: np.ndarray, rows: int) -> int | None:
-    """Return which row of each control period has the new command, or None if the commands do not show it.
+    """Return the index of the row in a control period that has the new command; None if it is unclear.
 
     Args:
         tick: Number of each row, counted at the rate of the rows, shape (rows,); lost rows are omitted.

@@ -1,8 +1,8 @@
 """Checks of the units of forces, positions and velocities, from the momentum of the numerical model.
 
 During a contact, the numerical model is a free body. Its change of momentum therefore equals the impulse of
-the force command. The impulse of the measured force differs from it because of the compensator, but by a much
-smaller factor than a wrong unit causes. Velocities are compared with the differences of positions.
+the force command. The impulse of the measured force differs from this change because of the compensator, but
+by a much smaller factor than a wrong unit causes. Velocities are compared with the differences of positions.
 """
 
 from __future__ import annotations
@@ -217,7 +217,7 @@ def _estimate_force_ratio(
 
 
 def make_triangular_weights(width: int) -> np.ndarray:
-    """Return the weights with which adjacent second differences add up to that of rows `width` apart."""
+    """Return the weights that convert second differences of adjacent rows to those of rows `width` apart."""
     return width - np.abs(np.arange(1.0 - width, width))
 
 
