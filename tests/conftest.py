@@ -16,7 +16,7 @@ from jaxhil.simulation.jax_environment import (
     prepare_jax,
 )
 
-# Two devices on every machine; otherwise the settings of users.
+# Use two host devices on every machine, and otherwise the XLA flags that commands set for users.
 os.environ["XLA_FLAGS"] = build_xla_flags(
     os.environ.get("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
 )

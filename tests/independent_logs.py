@@ -138,7 +138,7 @@ class Noise:
         if kind.walk:
             force += kind.walk * np.sqrt(self.period) * np.cumsum(rng.normal(size=shape), axis=0)
         if kind.colour:
-            # First-order low-pass noise up to 30 Hz.
+            # Add noise that a first-order low-pass filter limits to 30 Hz.
             keep = np.exp(-2 * np.pi * 30.0 * self.period)
             noise = np.asarray(lfilter([1], [1, -keep], rng.normal(size=(ticks + 2000, runs)), axis=0))
             force += kind.colour * np.sqrt(1 - keep**2) * noise[2000:]

@@ -154,7 +154,7 @@ class Plant:
             for point, (x, v) in enumerate(
                 zip(position[:, lane].tolist(), velocity[:, lane].tolist(), strict=True)
             ):
-                # Midpoint rule.
+                # Integrate the motion by the midpoint rule.
                 acceleration = structure_acceleration(rig, offset, rate, x - step * v, v, start)
                 half, half_rate = offset + step / 2 * rate, rate + step / 2 * acceleration
                 acceleration = structure_acceleration(rig, half, half_rate, x - step / 2 * v, v, start)
@@ -225,7 +225,7 @@ def restitution(rig, speed, law):
     ]
     peak = np.maximum.accumulate(np.abs(command))
     last = np.flatnonzero(real > 0)
-    # Last contact before the final release of the body.
+    # Find the last contact before the final release of the body.
     for index, end in enumerate(last):
         quiet_until = last[index + 1] if index + 1 < len(last) else ticks
         over = np.arange(end + 1 + int(memory / rig.period), quiet_until)

@@ -28,7 +28,7 @@ def touches(number: int = 1, speed: float = 5e-3, noise: float = 0.3, seed: int 
     x, v, rows = -1e-3, speed, []
     for _ in range(number * 600):
         if x < -1e-3:
-            # Commanded motion back towards the hardware.
+            # Command a motion back towards the hardware.
             x, v = -1e-3, speed
         depth = max(x, 0.0)
         force = STIFFNESS * depth + noise * random.standard_normal() * (depth > 0)

@@ -162,7 +162,7 @@ def test_recorded_ticks_of_a_run_agree_with_its_contacts(run):
         # The contact ends a tick later, after the command has decayed.
         assert -run.velocity_desired[in_contact][-1] == pytest.approx(rebound, rel=1e-6)
         assert np.max(np.abs(run.force_command[in_contact])) == pytest.approx(contact.peak_command, rel=1e-12)
-        # M dv = -F_c T, tick by tick.
+        # In every tick, M dv = -F_c T.
         kicks = -run.force_command[in_contact][:-1] * period / run.mechanism.bodies.mass
         np.testing.assert_allclose(np.diff(run.velocity_desired[in_contact]), kicks, rtol=1e-9, atol=1e-18)
     with pytest.raises(AttributeError):
@@ -302,7 +302,7 @@ KEYS = {
 
 
 def central_difference(law, of, key, step):
-    """Return the metric's central difference over twice the step."""
+    """Return the central difference of a metric, divided by twice the step."""
     base = jaxhil.load("varying", TWO)
     gains = jaxhil.simulate(base, law).gains
     figures = []

@@ -31,7 +31,7 @@ def test_bootstrap_resamples_whole_scenarios():
     once = compute_error_intervals(errors[:1], np.ones((1, 300), bool))
     five = compute_error_intervals(errors, np.ones((5, 300), bool))
     np.testing.assert_allclose(five.rms, once.rms, rtol=1e-12)
-    # Five times as many contacts move the 99th percentile between its neighbours only.
+    # Five copies of every contact move the 99th percentile only between neighbouring values.
     np.testing.assert_allclose(five.p99, once.p99, rtol=0.06)
 
 

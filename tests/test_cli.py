@@ -72,7 +72,7 @@ def test_simulate_applies_set_overrides_to_mechanism(jaxhil):
 
 
 def test_simulate_reports_failed_run(jaxhil):
-    # The sensor measures at most 1 N: the bodies are never stopped.
+    # The force sensor saturates at 1e-6 N, so that the force command never stops the bodies.
     weak = ["--set", "rig.force_sensor.range=1e-6"]
     ran = jaxhil("simulate", "rig-300kg", "--json", *weak)
     assert ran.code == 1

@@ -71,7 +71,10 @@ def derivative(name, signals, gains, constants, along_signals, along_gains):
 
 
 def readings(shape=(), clearance=math.inf):
-    """Return readings of two runs at either surface with delayed force and position, (ticks, *shape)."""
+    """Return the signals, each (ticks, *shape), of a contact with both surfaces, and the known constants.
+
+    The measured force and position lag the sinusoidal motion.
+    """
     size = 1 + 0.1 * np.arange(math.prod(shape)).reshape(shape)
     time = PERIOD * np.arange(TICKS).reshape(-1, *(1 for _ in shape))
 

@@ -77,7 +77,7 @@ def test_derivatives_of_contact_with_sensor_lag_match_finite_differences():
 
 
 def loops_of(raw):
-    """Return scenarios at eight phases of a tick, the loop of tuning and sweeps, and the exact loop."""
+    """Return scenarios at eight phases of a tick, and the loops with sampled and with exact contacts."""
     parsed = validated(raw)
     scenarios = spread(parsed, 8, phase=np.arange(8) / 8)
     return scenarios, *(build_loop(parsed, "none", scenarios, exact=exact) for exact in (False, True))

@@ -40,7 +40,7 @@ LONGEST = 120.0  # s; on a busy machine most of it is compilation
 
 
 def overrides(others, key, value):
-    """Yield overrides of the key itself, or of a list entry."""
+    """Yield overrides that set a key to a value: the whole entry, or one entry of its list."""
     for path in (key, key + ENTRIES.get(key, "[0]")):
         certain = ["uncertainty={}"] if others else []
         yield [*certain, *others, *COMPANIONS.get(key, []), f"{path}={value}"]

@@ -32,7 +32,7 @@ def undelayed(members, damped: bool) -> Any:
         indices = [i for i, m in enumerate(members) if m.contact.law == name]
         contacts = [members[i].contact for i in indices]
         parameters: dict[str, Any] = {
-            # Segments and depths come first.
+            # The axis of segments (or depths) comes first.
             "stiffness": np.moveaxis(np.array([c.stiffness[0] for c in contacts]), 0, -1),
             "damping": np.array([c.damping[0] if damped else 0.0 for c in contacts]),
             "exponent": np.array([c.exponent for c in contacts]),

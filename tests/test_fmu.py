@@ -249,7 +249,7 @@ def test_fmu_rejects_instantiation_with_token_of_another_fmu():
         fmpy.instantiate_fmu(str(folder), description)
 
 
-def test_fmus_of_equal_gains_are_equal_and_of_other_gains_have_another_token():
+def test_fmus_are_equal_for_equal_gains_and_have_another_token_for_other_gains():
     first, again = controller_fmu(document(), 3), controller_fmu(document(), 3)
     assert first == again and find_library(first) is None
     other = controller_fmu(document(phase_lead=0.003), 3)

@@ -79,7 +79,7 @@ def kelvin_voigt():
     return dict(zip(LIMITS, results, strict=True))
 
 
-# Items 1 and 3 of model.md, section 6.
+# Tests of items 1 and 3 of model.md, section 6.
 
 
 @pytest.mark.parametrize("name", LIMITS)
@@ -142,7 +142,7 @@ def test_restitution_of_delayed_contact_is_close_to_characteristic_root(kelvin_v
     assert excess == pytest.approx(0.05 * phase**4, rel=0.15, abs=1e-6)
 
 
-# Item 9 of model.md, section 6, and nonlinear contact laws.
+# Tests of item 9 of model.md, section 6, and of nonlinear contact laws.
 
 LAYERS = {"law": "piecewise_linear", "depths": [1e-4, 2e-4], "stiffness": [[8e4, 1.6e5, 3.2e5]]}
 
@@ -229,7 +229,7 @@ def test_work_of_nonlinear_contact_converges_to_continuous_solution(nonlinear, n
     assert np.abs(work_in[-1] - 1).max() < (1e-3 if damped else 2e-4)
 
 
-# Item 7 of model.md, section 6; the tests above cover hold and latency.
+# Tests of item 7 of model.md, section 6; the tests above cover hold and latency.
 
 
 @pytest.mark.parametrize(

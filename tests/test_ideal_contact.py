@@ -146,7 +146,7 @@ def test_kelvin_voigt_contact_is_smooth_through_critical_damping():
         np.testing.assert_allclose(slope[below], slope[above], rtol=2e-12)
 
 
-# exponent, onset q = 1.5 chi v
+# Cases: exponent, and onset q = 1.5 chi v [1].
 HUNT_CROSSLEY = [
     (1.5, 0.0), (1.5, 1e-9), (1.5, 1e-3), (1.5, 0.3), (1.5, 0.5), (1.5, 3.0), (1.5, 10.0),
     (1.0, 0.0), (1.0, 0.2), (1.2, 0.05), (2.0, 0.8), (3.0, 5.0),
@@ -192,7 +192,7 @@ def test_undamped_hertz_contact_has_closed_form_duration():
     assert_close(result, expected, 2e-13)
 
 
-# slopes / STIFFNESS, depths / (v PERIOD), damping ratio of the first segment
+# Cases: slopes / STIFFNESS, depths / (v PERIOD), and damping ratio of the first segment.
 PIECEWISE_LINEAR = [
     ([1, 3, 5], [0.5, 0.7], 0.0),
     ([1, 3, 5], [0.5, 0.7], 1e-8),

@@ -192,7 +192,7 @@ def scrambled(region, dimensions, points, replicates, rng):
 
 
 REGIONS = {
-    # Closed forms: a strip, a triangle, a half space of normals, a box.
+    # Regions of failure with closed forms: strip, triangle, half space of normals, box.
     "strip": (1, lambda p: lambda x: x[:, 0] < p),
     "triangle": (2, lambda p: lambda x: np.sum(x, axis=1) < np.sqrt(2 * p)),
     "half space": (5, lambda p: lambda x: np.sum(ndtri(x), axis=1) > stats.norm.isf(p) * np.sqrt(5)),

@@ -46,7 +46,7 @@ def simulated_growth(run, period):
     begin, step = round(1.5 / period), round(0.7 / period)
     end = np.flatnonzero(position > 0)[-1] - round(0.2 / period)
     now, later, last = (position[begin + k * step : end - (2 - k) * step] for k in range(3))
-    # x(n + 2s) = 2 Re z^s x(n + s) - |z|^(2s) x(n)
+    # The mode satisfies x(n + 2s) = 2 Re z^s x(n + s) - |z|^(2s) x(n).
     solved = np.linalg.lstsq(np.stack([later, -now], axis=1), last, rcond=None)[0]
     return math.log(solved[1]) / (2 * step * period)
 

@@ -172,7 +172,7 @@ def test_monitor_uses_correlations_stated_in_mechanism_file():
     assert numbers[place["rig.simulator.delay", None]].std == 2e-5
     one = numbers[place["contact.stiffness", (1,)]]
     stepped = one.step_parameter(from_plain_data(document, "known")).contact.stiffness
-    # Of a loguniform number between m/f and m f: m^2 (f^2 - f^-2)/(4 log f) - mean^2.
+    # Variance of a loguniform number between m/f and m f: m^2 (f^2 - f^-2)/(4 log f) - mean^2.
     mean = (2.0 - 0.5) / np.log(4.0)
     expected = 2.4e5 * np.sqrt((4.0 - 0.25) / (2.0 * np.log(4.0)) - mean**2)
     assert one.std == pytest.approx(expected, rel=0.05)

@@ -253,7 +253,7 @@ def test_oracle_with_ideal_simulator_has_exact_readings_and_peak_force():
     result = simulate(case, record=True)[0]
     signals = result["signals"]
     time, x = signals["tick"], signals["x_desired"]
-    # Linear hold: x_a is the polygon through x_d, uniform before 0.
+    # With linear hold, x_a is the polygon through the values of x_d, and moves uniformly before t = 0.
     past = np.arange(-10.0, 0.0)
     time, x = np.append(past, time), np.append(x[0] + VELOCITY * 1e-3 * past, x)
     late = np.interp(signals["tick"] - 3.41, time, x)

@@ -65,7 +65,7 @@ def power_law(stiffness, exponent):
     """Return peak force and duration of M d'' = -k d^n, in closed form."""
     order = exponent + 1
     deepest = (order * MASS * SPEED**2 / (2 * stiffness)) ** (1 / order)
-    # 2 int_0^d_m dd / sqrt(v^2 - ...), with d = d_m s^(1/(n+1)).
+    # The duration is 2 int_0^d_m dd / sqrt(v^2 - ...), with d = d_m s^(1/(n+1)).
     duration = 2 * deepest / SPEED / order * beta(1 / order, 0.5)
     return stiffness * deepest**exponent, duration
 

@@ -96,7 +96,7 @@ def test_early_probe_push_takes_energy_and_late_push_gives_energy():
 
 
 def test_trajectory_error_is_rms_deviation_from_reference_trajectory():
-    # Ideal linear contact without delay: x_d is the sine itself, and the table lies 1 mm deeper.
+    # In ideal linear contact without delay, x_d is the sine. The second reference trajectory is 1 mm deeper.
     parsed = validated(mechanism({}, IDEAL, 0.0))
     shape = build_scenarios(parsed).phase.shape
     omega = np.sqrt(parsed.contact.stiffness[0] / parsed.bodies.mass)
@@ -105,6 +105,6 @@ def test_trajectory_error_is_rms_deviation_from_reference_trajectory():
     table = np.broadcast_to(sine[None, :, None], (shape[0], 513, shape[1]))
     on = run(parsed, depth=table, span=span).trajectory_error[0, 0]
     off = run(parsed, depth=table + 1e-3, span=span).trajectory_error[0, 0]
-    # The sampled loop itself is off by half a period of the semi-implicit rule.
+    # The sampled loop has a small error of its own: the semi-implicit rule delays it by half a period.
     assert on < 1e-2 * np.max(sine)
     assert off == pytest.approx(1e-3, rel=0.02)

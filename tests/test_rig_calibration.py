@@ -229,7 +229,7 @@ def test_watchdog_without_specified_damping_cannot_distinguish_damping_from_dela
     loaded = gains(uncertainty={**UNCERTAIN, **DAMPING})
     rates = calibrate(loaded, scenarios=8 * LANES, limit=LIMIT, lanes=LANES).rates
     assert "z" in rates["terms"]
-    # pi omega sd(delay) / 2, of a delay of 0.5 ms more or less at 3 Hz.
+    # The expected rms is pi omega sd(delay) / 2, here for 0.5 ms at 3 Hz.
     assert rates["expectation_rms"] == pytest.approx(math.pi * 2 * math.pi * 3 * 0.0005 / 2, rel=0.3)
     narrow = rates["widened_from"]
     assert narrow < 0.75 * LIMIT < LIMIT < rates["restitution_margin"]

@@ -116,7 +116,7 @@ def test_rotation_derivatives_at_zero_match_power_series():
 
 
 @pytest.mark.slow
-def test_rotation_derivatives_to_third_order_agree_along_a_ray():
+def test_rotation_derivatives_up_to_third_order_match_finite_differences_along_a_ray():
     angles = jnp.asarray([0.0, 1e-8, 0.1, 0.19, 0.2, 0.21, 0.49, 0.5, 0.51, 1.5, 3.0])
     axis, rate = (vector(jnp.asarray(part)[:, :11]) for part in (AXES, RATE))
 

@@ -101,7 +101,7 @@ def test_six_axis_impulse_ledger_commands_zero_wrench_without_contact():
     assert np.all(depths < 0)
 
 
-def test_elastic_force_of_the_tangent_model_changes_in_the_direction_of_the_depth():
+def test_elastic_force_of_tangent_model_never_opposes_change_of_depth():
     """Use a negative curvature: the force of the parabola falls beyond a depth of 0.1 mm."""
     stiffness, curvature, path, speed = 100.0, -1e4, 0.004, 0.02
     changes = np.linspace(-1e-3, 1e-3, 201)

@@ -64,7 +64,7 @@ def test_six_axis_lead_can_be_twice_as_long_as_the_delay_of_the_loop(name):
 
 
 def check_agreement(name, gains, constants, period, readings, expected):
-    """Compare the rig's commands with expected commands; return whether only rounding explains them."""
+    """Compare the rig's commands with expected commands; return whether the difference is due to rounding."""
     found, _ = rig_commands(name, gains, constants, period, readings)
     difference = relative_difference(found, expected)
     if difference <= LIMIT:

@@ -58,7 +58,7 @@ def test_run_without_limits_is_not_stopped(loaded, recorded):
 
 
 def reaches(lane):
-    """Return the values that the nominal run requires of every guard limit, from its record alone."""
+    """Return the value that the nominal run reaches for every guard limit, computed from its record alone."""
     signals, period = lane.signals, 1e-3
     same = np.asarray(signals.age)[1:] > 0
     sent = np.asarray(lane.sent)

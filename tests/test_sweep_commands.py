@@ -116,7 +116,7 @@ def test_sweep_stops_at_the_requested_interval_width(jaxhil, gains, tmp_path):
     refused(jaxhil("replay", tmp_path / "n", 999), "before the sweep's end")
 
 
-def test_sweep_reports_quantiles(jaxhil, gains, store):
+def test_sweep_command_reports_quantiles_of_the_error(jaxhil, gains, store):
     again = ["sweep", gains, *TINY, "-o", store, "--limit", "1.5", "--resume"]
     result = document(jaxhil(*again, "--json"))["error_quantiles"]
     assert [one["order"] for one in result] == [0.5, 0.95, 0.99, 0.999]
@@ -125,7 +125,7 @@ def test_sweep_reports_quantiles(jaxhil, gains, store):
     assert "99.9 %" in out and "no bound" in out
 
 
-def test_sweep_reports_studies(jaxhil, own_store):
+def test_sweep_command_reports_sobol_indices_and_subset_simulation(jaxhil, own_store):
     again = [*own_store[1], "--drivers", "16", "--rare"]
     result = document(jaxhil(*again, "--json"))
     drivers, rare = result["drivers"], result["rare"]

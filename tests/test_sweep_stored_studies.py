@@ -140,7 +140,7 @@ def test_changed_study_file_with_valid_digest_is_read_as_written_or_ignored(stud
 
 
 def test_study_result_that_json_cannot_express_is_not_written(store):
-    # JSON has no symbol for NaN where NaN is impossible.
+    # Null cannot stand for NaN in a field that must not be NaN.
     with unwritten("drivers-2.json: ", "JSON"):
         write_study(store, IndicesRequest(2), SOME_DRIVERS._replace(cap=math.nan))
     with unwritten("rare-1.5-10x1000.json: ", "JSON"):

@@ -190,7 +190,7 @@ def test_first_packet_after_a_long_loss_is_also_dropped():
     for gap in (MAX_SEQUENCE_STEP + 1, 10**6, 2**31 - 10):
         sequence = SequenceFilter(5)
         assert accept_numbers(sequence, 5 + gap, 6 + gap, 7 + gap) == [False, True, True]
-    # Two arbitrary numbers that are not consecutive.
+    # Arbitrary numbers that are not consecutive are dropped; the next regular number is accepted.
     assert accept_numbers(SequenceFilter(5), 2**30, 2**29, 2**28, 6) == [False, False, False, True]
-    # Never an older number, which may be a replay of earlier packets.
+    # An older number is never accepted, because it may be a replay of an earlier packet.
     assert not any(accept_numbers(SequenceFilter(2**31), *range(1000)))

@@ -6,7 +6,7 @@ array are named by their labels (Simulink's "Structure With Time": `log.signals.
 (`log.position_2`), and so are its rows if it has more columns than rows (Simulink's "To File": `ans_2`).
 """
 
-# The library is optional.
+# The optional library may not be installed.
 # pyright: reportMissingImports=false
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ the message gives them (JointState: `/topic.position.joint`). `/topic.time` is t
 messages; `/topic.header.stamp` is the time in their headers, as one number computed from `sec` and `nanosec`.
 """
 
-# The library is optional.
+# The optional library may not be installed.
 # pyright: reportMissingImports=false
 
 from __future__ import annotations

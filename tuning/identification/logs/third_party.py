@@ -4,7 +4,7 @@ Every public function takes a path and returns a `LogReader`. Time stamps relati
 to seconds after the first time stamp of the log.
 """
 
-# The libraries are optional.
+# The optional libraries may not be installed.
 # pyright: reportMissingImports=false
 
 from __future__ import annotations
