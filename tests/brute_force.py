@@ -14,7 +14,7 @@ BEFORE = -300  # ticks: start so early that the initial transient has decayed at
 
 
 def brute_force(case, compensator, ticks, mass, velocity):
-    """Return v_d [m/s] at every tick for a second-order motion simulator."""
+    """Return the desired velocity v_d [m/s] at every tick, for a second-order motion simulator."""
     T = case["rig"]["control_period"]
     x, v = -velocity * (0.02 + T / 3), velocity
     commands = {m: x + velocity * m * T for m in range(-2000, 1)}

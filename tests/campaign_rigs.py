@@ -23,7 +23,10 @@ def mechanism(name, **changed):
 
 
 def commanded(name, what, command, seed, noise=True):
-    """Return a "free" or "press" run of this kind of rig under a command [m], which may start in contact."""
+    """Return a "free" or "press" run of a kind of rig under a command [m].
+
+    A press run may start in contact.
+    """
     kind, rng = campaigns.KINDS[name], np.random.default_rng(seed)
     rig, T, sensor = kind.rig, kind.rig["control_period"], kind.rig["force_sensor"]
     plant, law = campaigns.Plant(rig), Law(kind.contact, rig.get("contact_plane", 0.0))

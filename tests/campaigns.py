@@ -87,7 +87,10 @@ def _total_delay(rig):
 
 
 def _position(plant, command, lag):
-    """Return the response at the ticks minus `lag` ticks; the command was constant before the start."""
+    """Return the motion simulator's position at the ticks, delayed by `lag` ticks.
+
+    The command was constant before the first tick.
+    """
     history = int(np.ceil(lag)) + plant.latency + 3
     c = np.concatenate([np.full(history, command[0]), command])
     # Inputs at the ends of interval `latency` of `c` and of the following intervals.
@@ -129,7 +132,7 @@ def touches(kind, speeds, indices, phases, rng, seconds=0.42, lead=0.05, damping
     first = plant.latency + 2
 
     def ends(k):
-        """Return the input at both ends of interval k of the rows of `c`."""
+        """Return the motion simulator's inputs at both ends of interval k of the rows of `c`."""
         end = c[k + 1 - plant.latency]
         return (end if plant.hold == "zoh" else c[k - plant.latency]), end
 
@@ -309,7 +312,7 @@ def _press_run(kind, rng, seconds=30.0, depth=0.0008, rms=5e-5):
 
 
 def _lagged(force_at, lag, time_constant):
-    """Return the force after the sensor's first-order lag [ticks], at the ticks minus `lag` ticks."""
+    """Return the force after the sensor's lag `time_constant` [ticks], delayed by `lag` ticks."""
     if time_constant == 0.0:
         return force_at(lag)
     drive = sum(

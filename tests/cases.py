@@ -51,7 +51,7 @@ class Batch(NamedTuple):
     scenario: Scenario
 
     def run(self) -> Metrics:
-        """Return the metrics (slots, lanes) as NumPy arrays."""
+        """Run all cases, and return their metrics (slots, lanes) as NumPy arrays."""
         return jax.tree.map(np.asarray, run_rollout(self.loop, self.gains, self.scenario))
 
 

@@ -31,13 +31,13 @@ def delayed_restitution(phase: float) -> float:
 
 
 def separates_at_no_force(ratio: float) -> float:
-    """Return e of Kelvin-Voigt contact that ends at F = 0, xi < 1 (model.md section 6, item 3)."""
+    """Return e of Kelvin-Voigt contact that ends at F = 0, damping ratio < 1 (model.md section 6, item 3)."""
     root = math.sqrt(1 - ratio**2)
     return math.exp(-ratio / root * math.atan2(2 * ratio * root, 2 * ratio**2 - 1))
 
 
 def separates_at_surface(ratio: float) -> float:
-    """Return e of Kelvin-Voigt contact that ends at d = 0, xi < 1 (model.md section 6, item 3)."""
+    """Return e of Kelvin-Voigt contact that ends at the surface, ratio < 1 (model.md section 6, item 3)."""
     return math.exp(-math.pi * ratio / math.sqrt(1 - ratio**2))
 
 

@@ -244,7 +244,10 @@ def _stroke(run: FaultRun, begin: int, rng: np.random.Generator) -> int:
 
 
 def _fast_position(run: FaultRun, begin: int, rng: np.random.Generator) -> int | None:
-    """Inject a jump of a few millimetres and back, limited per tick; the model itself moves 12 um."""
+    """Inject a jump of the model's position by a few millimetres, and back after 8 ticks.
+
+    The command moves by at most 1 mm per tick; the model moves by at most 12 um per tick without the fault.
+    """
     cuts = int(rng.integers(1, CUT + 2))
     length = 8
     run.rows[begin : begin + length, MODEL] += _pick(rng, (-1.0, 1.0)) * (cuts + 0.5) * 1e-3
@@ -262,7 +265,10 @@ def _strong_force(run: FaultRun, begin: int, rng: np.random.Generator) -> int:
 
 
 def _fast_force(run: FaultRun, begin: int, rng: np.random.Generator) -> int | None:
-    """Inject a jump of some thousand newtons and back, limited to 1000 N per tick; contact adds 50 N."""
+    """Inject a jump of the force reading by some thousand newtons, and back after 8 ticks.
+
+    The limit is a change of 1000 N per tick; the force of a contact is at most 50 N.
+    """
     cuts = int(rng.integers(1, CUT + 2))
     length = 8
     run.rows[begin : begin + length, FORCE] += _pick(rng, (-1.0, 1.0)) * (cuts + 0.5) * 1000.0

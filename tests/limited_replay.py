@@ -9,10 +9,10 @@ from tuning.watchdog.recording import RecordedSignals
 
 
 class Tripped(NamedTuple):
-    """Trip of a run.
+    """Time and reason of a run's trip.
 
-    tick: tick of the record on which, or before which, the controller tripped; after the last tick for a trip
-    at the end. status: status of the controller.
+    tick: tick of the record at which the controller tripped; the number of ticks if it tripped after the last
+    one. status: status of the controller, which contains the reason.
     """
 
     tick: int

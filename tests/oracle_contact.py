@@ -197,8 +197,9 @@ class Work:
 def cut(position, velocity, a, b, law, index):
     """Divide theta in [a, b] where the force's formula changes: [((start, end), side, reached, deepest)].
 
-    `deepest` is the law's value at the beginning of the segment; at the end the law has the value of the last
-    segment.
+    `side` is 1 or -1 if the near or far surface exerts a force, otherwise 0; `reached` tells whether the
+    position is beyond a surface. `deepest` is the law's value at the beginning of the segment; at the end the
+    law has the value of the last segment.
     """
 
     x, v = polynomial(position), polynomial(velocity)

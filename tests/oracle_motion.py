@@ -134,7 +134,10 @@ class Motion:
         return polynomials
 
     def _average(self, j, part):
-        """Return the polynomial of the mean of u over the window before (part 0) or after the kink."""
+        """Return the mean of u over the moving-average window as a polynomial of theta.
+
+        Part 0 is valid before `kink`, part 1 after it.
+        """
         whole = int(self.window - self.kink + 0.5)
         oldest = j - whole - 1 + part  # interval in which the window starts
         left = 1.0 - self.kink if part == 0 else -self.kink  # its start in that interval, at theta = 0

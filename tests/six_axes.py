@@ -81,7 +81,10 @@ def plain_body(mass, inertia, interface, batch=()):
 
 
 def meeting(bodies, pose, twist, before):
-    """Return states `before` [s] the pose (p, theta) with twist (v, w), each (6, *batch)."""
+    """Return the bodies' states `before` [s] ahead of the given pose (p, theta) with twist (v, w).
+
+    Pose and twist are (6, *batch).
+    """
     at = Pose(vector(pose[:3]), exponential(vector(pose[3:])))
     return begin(bodies, at, Twist(vector(twist[:3]), vector(twist[3:])), before)
 

@@ -5,7 +5,8 @@ It uses rotation matrices, the matrix exponential and a Runge-Kutta method of or
 angular velocity (body axes) of each; `spheres` (centre, radius), `shape` ("plane" or "drogue", with its
 numbers in `numbers`), `stiffness`, `exponent`, `damping`, `friction`, `slip`; for the rig `period`,
 `frequency`, `ratio` and `delays` of the six axes, `force_delay`, `position_delay`; for a sensor on the moving
-side `tool` (mass, centre, inertia), `assumed` (mass, centre) and `gravity`, else None.
+side `tool` (mass, centre, inertia), `assumed` (mass, centre) and `gravity`,else None. Frame T is fixed to
+the target, frame C to the chaser; `interfaces` are their origins in body axes.
 """
 
 import numpy as np
@@ -63,7 +64,11 @@ def wrench(case, p, rotation, v, w):
 
 
 def relative(case, bodies):
-    """Return p, R, v, w of C relative to T, and position and attitude of T in the world."""
+    """Return pose and motion of C relative to T, and pose of T in the world.
+
+    The first four are position, rotation matrix, velocity and angular velocity in T axes; the last two are
+    the position of T's origin and the rotation matrix of T.
+    """
     (r1, v1, a1, w1), (r2, v2, a2, w2) = bodies
     o1, o2 = (np.asarray(o) for o in case["interfaces"])
     world1, world2 = a1 @ w1, a2 @ w2

@@ -223,7 +223,7 @@ def test_c99_output_is_deterministic():
 
 
 class Constants(NamedTuple):
-    """Record of which a function uses some fields, in another order."""
+    """Record with a field that a function does not use; the function uses the others in another order."""
 
     first: float
     rows: Annotated[list[list[float]], 2, 3]

@@ -105,7 +105,7 @@ MARGIN = np.array([0.8, 0.95, 1.0, 1.05, 1.2])
 
 
 def critical(damping):
-    """Return (omega_c, tau_c) of M x'' + b x'(t - tau) + k x(t - tau) = 0."""
+    """Return the critical frequency omega_c and delay tau_c of M x'' + b x'(t - tau) + k x(t - tau) = 0."""
     squared = damping**2 + np.sqrt(damping**4 + 4 * MASS**2 * STIFFNESS**2)
     omega = np.sqrt(squared / (2 * MASS**2))
     return omega, np.arctan(damping * omega / STIFFNESS) / omega
@@ -143,7 +143,7 @@ LEADS = np.array([[0.1, 0], [0.2, 0], [0.3, 0], *([a, m] for a in (0.4, 0.6) for
 
 @functools.cache
 def first_order_leads():
-    """Return growth for T -> 0 of endless contacts under phase lead, and the dominant roots."""
+    """Return the growth for T -> 0 of endless contacts under phase lead, and that of the dominant roots."""
     angle, multiple = LEADS
     # At the threshold (k + j omega b)(1 + j theta) e^(-j theta) is real and M omega^2, theta = omega tau:
     # b omega/k = tan(theta - atan theta), about theta^3/3, twice the damping ratio.

@@ -33,7 +33,7 @@ def kept_sum(x):
 
 
 def compute():
-    """Compute the value as in a new process."""
+    """Compute `kept_sum(VALUE)` as in a new process."""
     jax.clear_caches()
     return float(jax.jit(kept_sum)(VALUE))
 

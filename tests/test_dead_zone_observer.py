@@ -16,7 +16,7 @@ GAINS = nominal_gains(MECHANISM, "dead_zone_observer")
 
 @pytest.fixture(scope="module")
 def lead_metrics():
-    """Run phase lead alone, with a negligible dead zone and with the nominal dead zone."""
+    """Return the metrics of phase lead without an observer, for a negligible and the nominal dead zone."""
     scenario = spread(MECHANISM, 2, force_sensor__dead_zone=np.array([1e-9, DEAD_ZONE]))
     return first_contact(MECHANISM, scenario, "phase_lead", nominal_gains(MECHANISM, "phase_lead"))
 

@@ -57,7 +57,7 @@ def test_command_velocity_and_acceleration_limits_hold_for_any_motion(speeds):
 
 
 def gap(distance, speed=0.0):
-    """Return the distance of the command from a target that jumps by `distance` at constant speed."""
+    """Return the distance of the command behind a target that moves at `speed` and jumps by `distance`."""
     targets = moves(np.full(800, speed))
     targets[2:] += distance
     return (targets - limited_motion(targets, VELOCITY_LIMIT, ACCELERATION_LIMIT)) * np.sign(distance)

@@ -27,13 +27,17 @@ def rounded(log, **quanta):
 
 
 def drop_rows(log, share, seed=0):
-    """Drop some rows."""
+    """Return the log without a random `share` of its rows."""
     rows = np.random.default_rng(seed).uniform(size=len(log["t"])) >= share
     return {name: column[rows] for name, column in log.items()}
 
 
 def scatter(log, std, seed=1, samples=False):
-    """Add jitter to the time stamps, optionally with samples at the jittered times."""
+    """Return the log with random errors of the time stamps, with standard deviation `std` [s].
+
+    With `samples`, the readings are interpolated to these times, as if the samples themselves were late or
+    early.
+    """
     late = np.clip(std * np.random.default_rng(seed).standard_normal(len(log["t"])), -4e-4, 4e-4)
     times = log["t"] + late
     if samples:

@@ -167,7 +167,7 @@ def test_failed_tuning_task_does_not_affect_best_gains_of_other_tasks(tasks, val
 
 
 class Kinked:
-    """Validation whose objective has a kink along an edge."""
+    """Validation of two gains x and y, whose objective has a kink along x = y."""
 
     def losses(self, objective, which, points):
         x, y = points[..., 0], points[..., 1]

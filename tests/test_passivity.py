@@ -113,7 +113,7 @@ def test_passivity_energy_is_reset_at_next_contact_but_not_at_other_surface():
 
 @pytest.mark.parametrize("damping", [0.0, 300.0])
 def test_passivity_controller_limits_restitution_of_delayed_contact(damping):
-    """The observer leaves (T F_c)^2/(2 M) of one tick, of second order in T."""
+    """The contact gains at most (T F_c)^2/(2 M), the energy of one tick, which is of second order in T."""
     parsed = validated(mechanism({"damping": [damping]}, IDEAL))
     delay = np.array([0.001, 0.004, 0.01, 0.02])
     scenario = spread(parsed, len(delay), force_sensor__delay=delay)

@@ -1,4 +1,4 @@
-"""Position lead: the simulator's exact inverse removes its lag; recorded commands are those sent."""
+"""Position lead: the simulator's exact inverse removes its lag; commands are recorded before the limits."""
 
 import functools
 from math import pi

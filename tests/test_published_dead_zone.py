@@ -38,7 +38,9 @@ ROWS = {
 
 
 def restitution(law: str, ratio: float, stiffness: float, speed: float) -> list[float]:
-    """Return e of successive contacts, means over phases, for a damping ratio of the contact."""
+    """Return the restitution of each successive contact with damping ratio `ratio`, averaged over contact
+    phases.
+    """
     damping = 2 * ratio * math.sqrt(stiffness * MASS)
     contact = {"law": "kelvin_voigt", "stiffness": [stiffness], "damping": [damping], "tension": ratio > 0}
     sensor = {"dead_zone": 8.0, "dead_zone_kind": "cut"}

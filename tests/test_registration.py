@@ -26,7 +26,7 @@ def registered():
 
 
 def test_user_registered_compensator_is_simulated(registered):
-    """It equals the built-in phase lead without its filter, so the results differ little."""
+    """The compensator equals the built-in phase lead without its filter, so the results differ little."""
     mechanism = jaxhil.load("varying", TWO)
     plain, none = jaxhil.simulate(mechanism, "scaled_lead", {"toy_lead": 0.0}), jaxhil.simulate(mechanism)
     assert [c.restitution for c in plain.contacts] == [c.restitution for c in none.contacts]

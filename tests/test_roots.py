@@ -11,7 +11,7 @@ POWERS = np.array([1.0, 0.5, 0.2, 0.1])
 
 
 def root_of(height):
-    """Return roots of s^p - height between 0 and 1 for all powers."""
+    """Return the roots of s^p - height between 0 and 1, one for each power p in `POWERS`."""
 
     def function(height, s):
         touching = s > 0

@@ -1,4 +1,4 @@
-"""Real-time loop in C: its log is complete, shadow mode repeats it to the bit, SIGTERM leaves no force."""
+"""Real-time loop in C: complete log, equal commands in shadow mode, and force command 0 after SIGTERM."""
 
 import subprocess
 

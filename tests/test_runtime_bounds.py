@@ -1,4 +1,4 @@
-"""Bounds in the code: they admit gains from tuning, literature and settings for any realistic rig."""
+"""Bounds of gains in the code: they admit gains from tuning, literature and settings for realistic rigs."""
 
 import math
 

@@ -18,9 +18,10 @@ from jaxhil.rig.filters import DelayLine, LeadFilter, VelocityFilter
 def by_matrices(document: dict[str, Any], ticks: list[Reading]) -> tuple[np.ndarray, np.ndarray]:
     """Return force command and estimates of the response-error law per tick, from whole signals and matrices.
 
-    Lead and velocity are state-space models discretised by the bilinear transform. The delay interpolates the
-    whole record, and the time in contact within a period is a length on the polygon. The identification is
-    textbook weighted recursive least squares with bounded covariance.
+    Lead and velocity filter are state-space models discretised by the bilinear transform. The delay is a
+    linear interpolation in the whole record. The time in contact within a period is measured on the straight
+    lines between the samples. The identification is textbook weighted recursive least squares with bounded
+    covariance.
     """
     gain = {name: entry["value"] for name, entry in document["gains"].items()}
     period = document["control_period"]
@@ -91,7 +92,10 @@ def measure(signal: np.ndarray, start: float, low: float, high: float) -> np.nda
 
 
 def triangle(share: np.ndarray) -> np.ndarray:
-    """Return for each period the time beyond a threshold, weighted with a triangle of two periods."""
+    """Return, for each tick, the time beyond a threshold, weighted with a triangle over the last two periods.
+
+    `share` is the share of each period beyond the threshold.
+    """
     before = np.concatenate([[0.0], share[:-1]])
     return (share**2 + before**2) / 2 + share * before * (2 - share - before)
 

@@ -1,4 +1,4 @@
-"""Gain files changed with a valid digest: rejected in one line, or loaded within the bounds of the code.
+"""Gain files changed with a valid digest: rejected in one line, or loaded and within the code's bounds.
 
 Loaded controllers run with hostile readings in Python and in C, which agree to the bit.
 """

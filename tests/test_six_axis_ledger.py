@@ -116,7 +116,7 @@ def test_elastic_force_of_tangent_model_never_opposes_change_of_depth():
 
 
 def test_tangent_model_keeps_slope_and_force_when_contact_direction_turns():
-    """Learn F = 500 x/s^2 + 2e4 x|x|/(m s^2) up to 20 mm, where the slope is 1300/s^2, then turn."""
+    """The model learns F = 500 x/s^2 + 2e4 x|x|/(m s^2) up to 20 mm, with slope 1300/s^2, and turns."""
     gains = {"stiffness_spread": 1e3, "damping_spread": 3.0, "force_spread": 1.0, "curvature_spread": 1e3}
     model, speed, force, noise = TangentModel(gains | {"forgetting": 1.0}, 1e-3), 0.3, 7.0, 1e-6
     for depth in np.linspace(1e-4, 0.02, 200):

@@ -61,7 +61,9 @@ CASES = {
 
 
 def initial_bodies(case):
-    """Return the initial states of the case: frame C is away from T, rotated, and approaches T."""
+    """Return the case with its initial states: the chaser's frame C is rotated, and approaches the target's
+    frame T.
+    """
     o1, o2 = (np.asarray(o) for o in case["interfaces"])
     apart = np.array([0.03, -0.025, case["height"]])
     chaser = (o1 + apart - TURN @ o2, np.array([1e-3, -2e-3, -0.025]), TURN, np.array([3e-3, -2e-3, 1e-3]))

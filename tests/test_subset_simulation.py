@@ -141,7 +141,7 @@ def test_subset_simulation_counts_nonfinite_performance_as_failure(broken):
 
 @pytest.mark.parametrize("quantum", (0.25, 1.0))
 def test_subset_simulation_works_for_stepwise_performance_function(quantum):
-    """Many scenarios have equal performance, often more than a tenth."""
+    """Many scenarios have the same performance, often more than a tenth of all."""
 
     def performance(u):
         return quantum * np.floor(np.sum(u, axis=1) / np.sqrt(3) / quantum)

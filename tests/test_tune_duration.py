@@ -1,4 +1,4 @@
-"""Estimate of the time of a tuning from the last one on this computer."""
+"""Estimate of the duration of a tuning from the previous tuning on this computer."""
 
 import time
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""`jaxhil rig` and the controller process: short runs over UDP, and rejections of both."""
+"""`jaxhil rig` and the controller process: short runs over UDP, interrupts, and rejected input."""
 
 import json
 import os

@@ -89,7 +89,7 @@ def test_verification_with_the_same_seed_gives_the_same_report(varying):
 
 
 class Late(ON_THE_RIG["response_error"]):
-    """Runtime that loses the identification when the next contact begins."""
+    """Runtime that loses its identified parameters when the next contact begins."""
 
     def next_contact(self):
         self.reset()

@@ -1,4 +1,4 @@
-"""Protection of files: commands replace only files that they have written, and no links or pipes."""
+"""Protection of files: commands replace only files that they have written, and never links or pipes."""
 
 import json
 import os

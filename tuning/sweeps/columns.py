@@ -107,7 +107,7 @@ UNENDED_METRICS = (
 
 
 class ContactColumns(NamedTuple):
-    """Names of the error and status columns of a contact or, for six axes, of one error of an episode."""
+    """Names of the error and status columns of a contact; for six axes, of one error of an episode."""
 
     number: int  # number of the contact or episode, from 1
     error: str  # name of the error's column
