@@ -96,7 +96,7 @@ class _Simulator:
             solution = solve_ivp(rhs, span, self.state, events=events, dense_output=True, **OPTIONS)
             self.dense.append((self.time, solution.t[-1], solution.sol))
             self.time, self.state = solution.t[-1], solution.y[:, -1]
-            if solution.status == 1 and end - self.time > 1e-12:  # step off the event
+            if solution.status == 1 and end - self.time > 1e-12:  # continue just after the event
                 nudge = solve_ivp(rhs, (self.time, self.time + 1e-12), self.state, **OPTIONS)
                 self.time, self.state = nudge.t[-1], nudge.y[:, -1]
 

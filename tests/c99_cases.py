@@ -254,7 +254,10 @@ def contact_rows(
 
 
 def drawn_rows(kind: str, count: int, rng: np.random.Generator, period: float) -> np.ndarray:
-    """Draw ticks of the given kind ("contact", "random" or "hostile"), with some resets and next contacts."""
+    """Draw ticks of the given kind: "contact", "random" or "hostile".
+
+    On some ticks the controller is reset, or the next contact is announced.
+    """
     phase, rate, amplitude = rng.uniform(0, 2 * np.pi), rng.uniform(10, 60), 10 ** rng.uniform(-5, -3)
     rows = contact_rows(count, rng, period, phase, rate, amplitude)
     time = rows[:, 5].copy()

@@ -189,7 +189,7 @@ def _early(run: FaultRun, begin: int, rng: np.random.Generator) -> None:
 
 
 def _rate(run: FaultRun, begin: int, rng: np.random.Generator) -> int:
-    """Inject ticks with a slightly wrong rate; no single tick is early or late."""
+    """Inject ticks whose period is slightly wrong; no single tick is early or late."""
     wrong = _pick(rng, (-0.24, -0.21, -0.16, 0.16, 0.21, 0.24))
     end = begin + UNTIL_RESET
     run.rows[begin:end, TIME] += PERIOD * wrong * np.arange(1, UNTIL_RESET + 1)

@@ -30,7 +30,7 @@ class Outcome:
     restitution: float  # e of the true rig; all e and e - e* are for the file's gains
     error: float  # e of the file minus e of the true rig
     difference: float  # e - e* of the file minus e - e* of the true rig
-    named: bool  # the message names the defect or, for a clean kind, a check
+    named: bool  # whether the message names the defect or, for a clean kind, a check
     trouble: str  # an internal error
     seconds: float  # processor time of identify without plots
     covered: dict[str, bool]  # whether each interval includes the true value, by key

@@ -92,7 +92,9 @@ class Law:
         return self.preload + stiffness * depth + damping * rate + self.friction * np.sign(rate)
 
     def sign_of(self, depth, rate, index, deepest=0.0):
-        """Return a value with the sign of the unclamped force, without the factor d^n hiding the root."""
+        """Return a value with the sign of the unclamped force, without the factor d^n, which would hide the
+        root.
+        """
         if self.kind == "hunt_crossley":
             return 1.0 + 1.5 * self.parameters(index)[1] * rate + 0.0 * depth
         if self.kind == "depth_damped":

@@ -16,7 +16,7 @@ HARDWARE_LAG, FORCE_LAG = 12, 4  # periods: position behind the command, force b
 
 
 def record_contacts(make_controller, mechanism, contacts=2, force_lag=FORCE_LAG, ticks=260):
-    """Return the columns of a log of `contacts` runs of a controller; each contact is a spring."""
+    """Return the columns of a log of `contacts` runs of a controller; in each run the body meets a spring."""
     controller, rows = make_controller(), []
     for contact in range(contacts):
         if contact:

@@ -29,7 +29,10 @@ def rig(readings, weights, forgetting):
 
 
 def batch(readings, weights, forgetting):
-    """Return theta and P that minimise the weighted squares of prior and readings with forgetting."""
+    """Return parameters and their covariance P by weighted batch least squares with forgetting.
+
+    The values are theta_1, theta_2, and U_12, D_1 and D_2 of the factors P = U D U'.
+    """
     retention = 1 - weights * (1 - forgetting)
     faded = np.append(np.cumprod(retention[::-1])[::-1][1:], 1.0)
     phi, force = readings[:, :2], readings[:, 2]

@@ -17,7 +17,10 @@ from tuning.identification.rational import STRUCTURES, MotionModel
 
 
 def checked(monkeypatch, lag):
-    """Return the check of onset and end for a file with the true lag [s], or with the lag as a delay."""
+    """Return the check of onset and end of contact for a mechanism file with the time constant `lag` [s].
+
+    The sum of force delay and lag is that of the true rig.
+    """
     campaign = ambiguous.campaign(monkeypatch, "lag", 0, seconds=5.0)
     raw: dict[str, Any] = to_plain_data(ambiguous.truth("lag")) | {"source": "identified from logs"}
     sensor = raw["rig"]["force_sensor"]

@@ -180,7 +180,7 @@ TRUE = {
 def test_identify_command_is_accurate_despite_gaps_and_noise(jaxhil, day, tmp_path, case):
     spoil, options = FAIR[case]
     ran = identified(jaxhil, tmp_path, spoil(day), MAPPING, *options)
-    # Fewer readings separate force delay and damping less well: only that may make the verdict bad.
+    # With fewer readings, force delay and damping are less certain; no other reason may make the verdict bad.
     uncertain = ran.document["reason"].startswith("Bad: the parameters are too uncertain")
     assert ran.code == 0 or (uncertain and case in ("a gap in every contact", "two contacts"))
     off = {item["key"]: (item["value"] - TRUE[item["key"]]) / item["std"]

@@ -10,7 +10,7 @@ PERIOD = 1e-3
 
 
 def stamps(rows=20_000, jitter=0.0, drift=0.0, lost=(), seed=0):
-    """Return time stamps of the remaining ticks, and these ticks."""
+    """Return the time stamps of all ticks that are not `lost`, and the numbers of these ticks."""
     tick = np.setdiff1d(np.arange(rows), np.asarray(lost, int))
     error = jitter * np.random.default_rng(seed).standard_normal(len(tick))
     return 12.3 + PERIOD * (1 + drift) * tick + np.clip(error, -0.45 * PERIOD, 0.45 * PERIOD), tick

@@ -259,7 +259,7 @@ def test_text_log_layout_is_detected_only_if_not_specified():
 
 
 @given(st.lists(st.text(st.characters(exclude_characters="\r\n"), max_size=30), max_size=12))
-def test_text_log_layout_of_any_lines_is_consistent(lines):
+def test_text_log_layout_has_equal_numbers_of_names_units_and_texts(lines):
     layout = detect_layout(lines, TextFormat())
     assert len(layout.names) == len(layout.units) == len(layout.texts) and layout.skipped <= len(lines)
 

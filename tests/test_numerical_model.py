@@ -134,7 +134,7 @@ def run():
 
 
 def at_the_same_time(series):
-    """Return the tops' states (components, lanes) after 250 of the longest periods."""
+    """Return the tops' states (components, lanes) at one time: after 250 of the longest steps."""
     return np.stack([series[250 * 2**lane, :, lane] for lane in range(3)], axis=-1)
 
 

@@ -186,7 +186,7 @@ def test_errors_within_tolerance_hardly_affect_objective(tolerance):
     expected = np.sqrt(counted**2 + (0.01 * 0.2 * 0.4) ** 2 + (0.01 * 0.1 * 2.0) ** 2)
     assert evaluate_objective(objective, errors, excesses, 3.0) == pytest.approx(expected, rel=1e-13)
     assert sum_of_squares(objective, errors, excesses, 3.0) == pytest.approx(expected**2, rel=1e-12)
-    # The derivative along the errors themselves equals their rms, which is homogeneous.
+    # The rms is homogeneous, so its derivative in the direction of the errors equals the rms (Euler).
     _, slopes = single_residuals(objective, errors, excesses, 3.0, (), (errors, (), (), 0.0))
     values, _ = single_residuals(objective, errors, excesses, 3.0)
     grown = counted if counted <= TOLERATED_ERROR_FACTOR * size or tolerance == 0 else size

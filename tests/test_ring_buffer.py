@@ -41,7 +41,7 @@ def test_ring_buffer_is_the_same_if_samples_are_written_singly_or_together():
         jax.tree.map(np.testing.assert_array_equal, write_samples(rings, tick, values), one_by_one)
 
 
-def test_ring_buffer_data_dependency_changes_no_value_and_no_derivative():
+def test_added_dependency_of_a_value_changes_neither_value_nor_derivative():
     value, read = jnp.array([1.0, 2.0, 3.0]), jnp.array([4.0, -0.0, jnp.inf])
     np.testing.assert_array_equal(depend_on(value, read), value)
     tangents = jnp.ones(3), 5 * jnp.ones(3)

@@ -66,7 +66,7 @@ def shares(document):
 
 
 def changed(**columns):
-    """Return the recorded columns with changed ones."""
+    """Return the columns of `recorded`, with the given columns in place of those with the same names."""
     return {**recorded(), **columns}
 
 

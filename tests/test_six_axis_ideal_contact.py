@@ -34,7 +34,7 @@ EYE, Z = np.eye(3), np.array([0.0, 0.0, 1.0])
 
 
 def case(**changes):
-    """Return a lane (lengths in m, speeds in m/s) whose contact lasts half a period of sqrt(mass/k)."""
+    """Return a lane in m and m/s; by default its contact lasts half a period of sqrt(mass/k)."""
     values = {
         "masses": (1800.0, 420.0),
         "inertias": (np.diag([1400.0, 1100.0, 800.0]), np.diag([150.0, 180.0, 110.0])),

@@ -33,7 +33,7 @@ UNFINISHED = f".jaxhil-{2**22 + 1}-0123abcd-0.tmp"
 
 
 class Log(list):
-    """Log of rows reported, found and computed."""
+    """Counters of the rows that `run_sweep` reports as found in the store and as computed."""
 
     def __init__(self):
         self.found, self.computed = 0, 0

@@ -210,7 +210,10 @@ def spread_points(first: np.ndarray, number: int, seed: int | tuple[int, ...]) -
 
 @partial(jax.jit, static_argnums=0)
 def _compute_time_limit(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*batch"]:
-    """Return the time limit [s] of a contact in each training scenario (`TIME_LIMIT_FACTOR`)."""
+    """Return the time limit [s] of a contact in each training scenario, based on its ideal duration.
+
+    The limit contains the longest wait for the decay of the command if the force sensor has noise or bias.
+    """
     shape = scenarios.phase.shape
     mass = jnp.broadcast_to(scenarios.equivalent_mass, shape)
     velocity = jnp.broadcast_to(scenarios.velocity, shape)

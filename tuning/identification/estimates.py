@@ -80,7 +80,7 @@ def select_dampings_at_zero(draws_by_key: Mapping[str, np.ndarray]) -> dict[str,
 
 
 def shift_to_zero_damping(values: np.ndarray, at_bound: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Shift the draws of a parameter to the values for zero damping, by linear regression on the damping.
+    """Shift the draws of a parameter to the values that a linear regression predicts for zero damping.
 
     Args:
         values: Draws of the parameter.

@@ -24,7 +24,7 @@ from tuning.sweeps.columns import find_key_unit
 
 GAIN_PREFIX = "gains."
 DEFAULT_RANGE_FACTORS = 0.3, 3.0  # axis' ends for a key without uncertainty, divided by its nominal value
-NORMAL_RANGE_PROBABILITIES = 0.001, 0.999  # quantiles of a normal distribution that are the axis' ends
+NORMAL_RANGE_PROBABILITIES = 0.001, 0.999  # probabilities of the quantiles at the axis' ends
 MIN_LOGARITHMIC_RATIO = 5.0  # smallest ratio of the axis' ends for a logarithmic scale
 AnyCompensator = Compensator | SixAxisCompensator
 AXIS_FORMAT = "PATH or PATH=LOW:HIGH, such as contact.stiffness=5e4:5e5"
