@@ -215,7 +215,7 @@ def test_replicate_interval_has_stated_coverage_for_scrambled_sequences(name, pr
     failures, interval = replicated(name, probability, 60)
     assert covered(interval, probability) >= BAR
     if probability == 0.3:
-        # Even points give a narrower interval than independent scenarios.
+        # Evenly distributed points give a narrower interval than independent scenarios.
         exact = binomial_interval(np.sum(failures, axis=1), 8 * 256)
         assert np.mean(interval.width) < 0.7 * np.mean(exact.width)
 

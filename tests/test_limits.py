@@ -114,7 +114,7 @@ def test_command_limits_that_are_not_reached_leave_commands_bit_identical(offset
     targets = smooth.astype(dtype)
     for limits in (loose, (loose[0], np.inf), (np.inf, loose[1])):
         np.testing.assert_array_equal(limited_motion(targets, *limits), targets)
-    # A limit that is lower by this amount does bind.
+    # Limits that are lower than the motion requires change the commands.
     assert np.abs(limited_motion(targets, loose[0] / margin**2, np.inf) - targets).max() > 1e-6
     assert np.abs(limited_motion(targets, np.inf, loose[1] / margin**2) - targets).max() > 1e-7
 

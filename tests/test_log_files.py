@@ -177,7 +177,7 @@ def test_draft_mapping_lists_candidate_columns_if_names_are_ambiguous(tmp_path):
     # A constant column is no candidate if another one moves.
     path = write_csv(tmp_path / "b.csv", LOG | {"Fz": LOG["F"], "F": 0 * LOG["F"]})
     assert 'force_measured = { column = "Fz" }' in draft_mapping([path])
-    # Few or no rows give a draft, too.
+    # A log with few or no rows also gives a draft.
     for rows in (0, 1, 3):
         path = write_csv(tmp_path / "c.csv", {name: column[:rows] for name, column in LOG.items()})
         assert 'position_desired = { column = "xd" }' in draft_mapping([path])

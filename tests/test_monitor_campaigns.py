@@ -78,5 +78,5 @@ def test_monitor_detects_drifts_early(files, number):
         print(f"{number} contacts: {name} when it was found: {np.round(reached, 2)}")
     assert np.median(result["stiffness [%]"]) < 3.0
     if number > 15:
-        # The first five of the fifteen are too slow to show a delay.
+        # The first five of the fifteen contacts are too slow to show a delay.
         assert np.max(result["stiffness [%]"]) < 3.0 and np.max(result["force delay [ms]"]) < 0.3

@@ -20,7 +20,7 @@ CUSUM_LIMIT, AVERAGE_LIMIT = (
 def test_monitor_change_point_equals_calculation_by_hand():
     z = np.array([[0.0, 1.0], [0.0, np.nan], [2.0, 1.0], [2.0, np.nan]])
     likelier, since = detect_changes(z)
-    # (2 + 2)^2 / 2 and (1 + 1)^2 / 2: the unknown change point does not alter these.
+    # (2 + 2)^2 / 2 and (1 + 1)^2 / 2: the statistics equal those for a known change point.
     np.testing.assert_allclose(likelier, [8.0, 2.0])
     assert since.tolist() == [2, 0]
     long = np.zeros((CHANGE_WINDOW + 50, 1))

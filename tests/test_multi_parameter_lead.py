@@ -35,7 +35,7 @@ def test_pole_placed_by_lead_is_a_root_of_the_characteristic_equation(frequency,
     value = root**2 + frequency**2 * (gain + rate * root) * shift
     size = frequency**2 * (abs(gain) + abs(rate * root)) * abs(shift) + abs(root) ** 2
     assert abs(value) < 1e-9 * size
-    # It is no root for any other gains either: the equation is linear in both gains.
+    # With other gains this number is no root, because the equation is linear in both gains.
     assert abs(value + frequency**2 * 1e-3 * shift) > 1e-4 * frequency**2 * abs(shift)
 
 

@@ -63,7 +63,7 @@ def test_option_defined_once_appears_in_command_function_and_range_check():
 def test_functions_and_commands_have_the_same_options_and_defaults(function):
     command = {field.name: field for field in dataclasses.fields(COMMANDS[function])}
     parameters = inspect.signature(function).parameters
-    # The command line reads these differently: as files, or as words.
+    # The command line reads these options differently: as files, or as words.
     read = {"formats", "limits", "gains"} | ({"compensator"} if function is tuning.map else set())
     shared = [name for name in parameters if name in command and name not in read]
     assert len(shared) >= 3

@@ -178,7 +178,7 @@ def test_oracle_starts_in_steady_state_of_uniform_approach(simulator, hold):
     assert matrices is not None
     A, B, C = matrices
     assert float(-C @ np.linalg.solve(A, B)) == pytest.approx(1.0, abs=1e-12)
-    # Compute its value by brute force: a long staircase (or ramp) from rest through the same system.
+    # Compute the offset by brute force: a long staircase (or ramp) from rest through the same system.
     T, delay, z = 1e-3, simulator["delay"], np.zeros(len(B))
     ticks = np.arange(-2000, 1)
     steps = np.append((ticks * T + delay)[ticks * T + delay < 0.0], 0.0)

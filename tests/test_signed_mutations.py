@@ -125,7 +125,7 @@ def check(count: int, seed: int, path: Path, laws: Collection[str]) -> dict[str,
     rng = random.Random(seed)
     source = np.random.default_rng(seed)
     pool = [drawn_rows("hostile", TICKS, source, period) for period in (1e-5, 1e-3, 0.1) for _ in range(60)]
-    for rows in pool:  # one command a tick
+    for rows in pool:  # one command per tick
         rows[np.isin(rows[:, 0], (COMMAND_FIRST, STEP_ONLY)), 0] = TICK
     counts = {"loaded": 0, "refused": 0}
     for number in range(count):

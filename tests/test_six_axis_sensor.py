@@ -92,7 +92,7 @@ def test_correct_tool_parameters_recover_contact_wrench_from_sensor():
     load = tool_load(tool(), pose, twist, acceleration, triple(GRAVITY))
     reading = read_moving(wrench(), load, pose)
     close(undo_moving(reading, load, pose), wrench(), rtol=1e-12)
-    # About C's origin, in C axes, and without a tool.
+    # Also convert a reading without a tool, about C's origin and in C axes.
     turn = Rotation.from_rotvec(MOTION[0, 3:])
     force, moment = (np.array(jax.tree.leaves(part)) for part in wrench())
     nothing = jax.tree.map(jnp.zeros_like, load)

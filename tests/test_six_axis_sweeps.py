@@ -49,7 +49,7 @@ def test_replay_of_six_axis_scenario_is_bit_identical(local_sweep, jaxhil, tmp_p
     ran = jaxhil("replay", local_sweep.folder, 31)
     assert ran.code == 0 and "Episodes" in ran.out and "to the bit" in ran.out
 
-    # The draw is that scenario, and no other, until it ends.
+    # The record contains only this scenario, until its end.
     with jax_context():
         ticks = record_six_axes(build_sweep(local_sweep.manifest), 7)
     touching = ticks.depth.max(axis=1) > 0

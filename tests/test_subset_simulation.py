@@ -53,7 +53,7 @@ def test_subset_simulation_interval_contains_the_probability(name, probability, 
             end="",
         )
     assert inside >= 17
-    # The interval is informative: well within a factor of two either way.
+    # The estimate is right within a factor of two, and the interval is not excessively wide.
     assert all(0.5 < result.probability / probability < 2.0 for result in results)
     assert all(result.high / result.low < 5 for result in results)
 

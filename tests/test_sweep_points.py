@@ -28,7 +28,7 @@ def test_finished_study_points_are_not_simulated_again(simulated_points, tmp_pat
     ran, result = [], []
 
     def interrupted(sweep, pieces):
-        # As on a cluster: in any order, and each only once.
+        # Compute the batches in another order, as on a cluster, and each only once.
         for number, one in enumerate(run_locally(sweep, list(pieces)[::-1])):
             if number == 3:
                 raise KeyboardInterrupt

@@ -99,7 +99,7 @@ def test_sensor_noise_is_an_input_of_the_sensitivity_study():
     }
     assert shares[NOISE_INPUT].total_low > 0.1 and result.inputs[0].input != "bodies.equivalent_mass"
     assert shares["bodies.equivalent_mass"].total_high < 1e-3
-    # Without noise its index is zero.
+    # Without sensor noise, the noise is not among the inputs.
     quiet = compute_error_indices(sweep_of(case(uncertainty={"bodies.equivalent_mass": TIGHT})), 64)
     assert NOISE_INPUT not in {one.input for one in quiet.inputs}
 

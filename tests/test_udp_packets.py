@@ -181,7 +181,7 @@ def test_packet_with_any_sequence_number_outdates_at_most_one_window_of_packets(
     sequence.is_newer(wild)
     following = accept_numbers(sequence, *range(newest + 1, newest + MAX_SEQUENCE_STEP + 3))
     first = following.index(True)
-    # The following packets are accepted at once; if `wild` lies within the window, from its number on.
+    # The next packets are accepted: all of them or, if `wild` lies within the window, those from `wild` on.
     assert first <= MAX_SEQUENCE_STEP and all(following[first:])
     assert first in (0, (wild - newest) & 0xFFFFFFFF)
 

@@ -22,7 +22,7 @@ from tuning.watchdog.calibration import DEFAULT_DRAWS, DEFAULT_ERROR_LIMIT
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C compiler (cc) on this machine")
 CHOSEN = {
     "literature": {},
-    # Tuned for the default mechanism, rounded.
+    # These gains were tuned for the default mechanism, and rounded.
     "tuned": {
         "phase_lead": 0.00529,
         "response_error": 0.898,
