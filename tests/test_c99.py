@@ -39,7 +39,7 @@ from tuning.bundle.c99_tables import UNUSABLE, format_double
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
 LAWS = tuple(COMPENSATORS)
 # These compensators cover most of the C code.
-LONG_CODE = ("response_error", "virtual_contact", "impulse_ledger")
+LONG_CODE = ("impulse_ledger",)
 KINDS = ("contact", "random", "hostile")
 
 

@@ -157,6 +157,7 @@ def test_export_reports_limits_that_stop_the_nominal_run(jaxhil, gains, tmp_path
     assert (tmp_path / "bundle" / "manifest.json").exists()
 
 
+@pytest.mark.slow
 def test_export_takes_limits_from_the_specified_sweep(jaxhil, gains, tmp_path):
     store, folder = tmp_path / "store", tmp_path / "bundle"
     assert jaxhil("sweep", gains, "--scenarios", "40", "--limit", "5", "-o", store).code == 0

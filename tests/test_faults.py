@@ -207,6 +207,7 @@ def _differing(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
     return [name for name in first.keys() | second.keys() if first.get(name) != second.get(name)]
 
 
+@pytest.mark.slow
 def test_sweep_recovers_from_failed_system_call_and_kill(runner, tmp_path):
     bench = Bench(runner, tmp_path, "sweep")
     bench.restore()

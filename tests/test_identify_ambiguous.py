@@ -43,7 +43,7 @@ def written(result, folder):
     return load(folder / "mechanism.toml").mechanism
 
 
-@pytest.mark.parametrize(("name", "seed"), (("plain", 0), ("hidden", 1)))
+@pytest.mark.parametrize(("name", "seed"), (("plain", 0), pytest.param("hidden", 1, marks=pytest.mark.slow)))
 def test_identify_keeps_damping_in_the_model_while_delay_is_estimated(monkeypatch, tmp_path, name, seed):
     campaign = ambiguous.campaign(monkeypatch, name, seed, seconds=10.0)
     result = identify(campaign, ambiguous.prior(name), IdentificationOptions(seed=seed))
@@ -149,7 +149,7 @@ def test_identify_verdict_equals_verdict_of_check_of_written_file(
     assert again.effect == result.effect and again.effect_on_error == result.effect_on_error
 
 
-@pytest.mark.parametrize("noise", (0.0, 0.5))
+@pytest.mark.parametrize("noise", (0.0, pytest.param(0.5, marks=pytest.mark.slow)))
 def test_identify_accepts_log_of_one_contact(monkeypatch, noise):
     rig = campaign_kinds.rig(noise=noise, position_noise=noise * 1e-5)
     monkeypatch.setitem(campaigns.KINDS, "one", campaign_kinds.Kind(rig, ambiguous.SOFT))

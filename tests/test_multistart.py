@@ -63,7 +63,7 @@ def test_starting_gains_are_literature_gains_and_best_points_of_a_scan(tasks, va
         assert (apart >= 0.1 * np.sqrt(points.shape[1]) - 1e-12).all()
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
 def test_scan_of_starting_gains_on_few_scenarios_chooses_same_points_as_full_scan(seed, monkeypatch):
     runs = []
     work = SearchProgress()

@@ -30,11 +30,16 @@ AGAINST_THE_ORACLE = (
     *("depth-damped, linear spring, lag", "elastoplastic, lag", "rattling, elastoplastic"),
     *("contact plane deeper", "rattling, contact plane nearer", "elastoplastic, contact plane nearer"),
 )
+# Cases whose oracle takes seconds.
+LONG = ("elastoplastic, lag", "rattling, contact plane nearer")
 # The oracle uses parabolas for the output of a lagging sensor.
 LAGGED = 1e-7
 
 
-@pytest.mark.parametrize("name", AGAINST_THE_ORACLE)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in AGAINST_THE_ORACLE],
+)
 def test_rig_plant_agrees_with_oracle_in_every_contact(name):
     case = CASES[name]
     mechanism = validated(case.mechanism)

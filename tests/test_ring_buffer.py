@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxhil.laws.shared.ring_buffer import depend_on, look_back, write_sample, write_samples
@@ -11,6 +11,7 @@ from jaxhil.laws.shared.ring_buffer import depend_on, look_back, write_sample, w
 SAMPLES, LANES = 8, 3
 
 
+@settings(max_examples=30)
 @given(st.integers(0, 40), st.lists(st.integers(0, SAMPLES - 1), min_size=LANES, max_size=LANES))
 def test_ring_buffer_returns_its_last_samples(extra, ticks):
     history = np.random.default_rng(extra).normal(size=(SAMPLES + extra, LANES))
@@ -22,6 +23,7 @@ def test_ring_buffer_returns_its_last_samples(extra, ticks):
     np.testing.assert_array_equal(read, history[newest - np.array(ticks), np.arange(LANES)])
 
 
+@settings(max_examples=30)
 @given(st.integers(0, 40), st.integers(0, SAMPLES - 1), st.integers(0, SAMPLES - 1))
 def test_ring_buffer_returns_default_for_unknown_samples(newest, ticks, last):
     ring = jnp.asarray(np.random.default_rng(newest).normal(size=(SAMPLES, LANES)))

@@ -35,6 +35,7 @@ def gains(tmp_path):
     return path
 
 
+@pytest.mark.slow  # two runs of 600 ticks in two processes
 def test_six_axis_rig_command_reports_results_of_a_short_run(jaxhil, gains):
     ran = jaxhil("rig", gains, "--duration", 0.6, "--limit", "inf", "--json", "--seed", 3)
     result = ran.document
