@@ -76,7 +76,8 @@ def test_identify_command_writes_mechanism_file_from_logs(jaxhil, day, tmp_path)
     assert refused.code == 2 and "mechanism.toml: found a file that jaxhil did not write" in refused.err
 
 
-def test_identify_command_verdict_is_bad_for_wrong_mapping_file(jaxhil, day, tmp_path):
+def test_identify_command_verdict_is_bad_for_wrong_mapping_file(jaxhil, day, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
     path = tmp_path / "map.toml"
     path.write_text(drafted(jaxhil, day).read_text().replace('"linear"', '"zoh"'))
     command = (
@@ -93,10 +94,10 @@ def test_identify_command_verdict_is_bad_for_wrong_mapping_file(jaxhil, day, tmp
     )
     ran = jaxhil(*command)
     assert ran.code == 1
-    assert "Bad: the model does not explain this rig: command hold" in ran.out
-    assert re.search(r"prior +change", ran.out) and re.search(
-        r"contact.stiffness\[0\] .* [+-][\d.]+ %", ran.out
-    )
+    assert "Bad: the model does not explain this rig: command hold" in " ".join(ran.out.split())
+    assert [line for line in ran.out.splitlines() if len(line) > 80 and not line.startswith("Next: ")] == []
+    assert re.search(r"prior +\[%\]", ran.out)
+    assert re.search(r"contact.stiffness\[0\] .* [+-][\d.]+ *$", ran.out, re.M)
     head = (tmp_path / "mechanism.toml").read_text().splitlines()[:3]
     assert head[0].startswith("# Bad: ") and head[1].startswith(
         "# [uncertainty] is the uncertainty of the estimate"

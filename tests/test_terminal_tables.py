@@ -37,6 +37,19 @@ def test_terminal_table_wraps_long_texts_between_words(monkeypatch, capsys):
     assert set(" ".join(lines).split()) >= {LAW, *text.split(), "1.25"}
 
 
+def test_narrow_table_breaks_long_keys_before_their_last_part(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    keys = "rig.simulator.natural_frequency", "rig.force_sensor.time_constant", "contact.damping[0]"
+    rows = [[key, 0.0043028, 0.0043001, 0.0043056, "N s/m", 124355.1234, "+848 %"] for key in keys]
+    heads = ["number", "estimate", "95 % from", "to", "unit", "prior", "change"]
+    terminal.emit(terminal.build_table("Identified", heads, rows, texts=(0, 4)))
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert {line.split()[0] for line in lines[5:-1]} == {
+        *("rig.simulator.", "natural_frequency", "rig.force_sensor.", "time_constant", keys[2])
+    }
+
+
 def test_piped_output_is_wrapped_to_environment_variable_columns(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "40")
     terminal.emit("word " * 20)

@@ -6,7 +6,6 @@ import os
 import re
 import shlex
 import sys
-import textwrap
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,6 +20,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from jaxhil.errors import InputError, to_one_line
+from tuning.table_layout import fit_table
 
 DEFAULT_WIDTH = 110  # characters; width of lines if no stream is a terminal
 COLUMN_INDEX = re.compile(r"_(\d+)(?=_\d+|$)")  # one-based index in a sweep's column name, for example `_2`
@@ -39,7 +39,7 @@ def emit(*things: RenderableType, wrap: bool = True) -> None:
             if isinstance(thing, Table):
                 console.print(thing.title or "")  # the table would cut a title that is wider than itself
                 thing.title = None
-                console.width = _table_width(thing, console)
+                console.width = fit_table(thing, console)
             console.print(thing, soft_wrap=not wrap)
         sys.stdout.flush()
 
@@ -305,29 +305,6 @@ def _show_bar(shown: bool, *columns: rich.progress.ProgressColumn) -> Iterator[r
         return
     with rich.progress.Progress(*columns, console=console, transient=True) as bar:
         yield bar
-
-
-def _table_width(table: Table, console: Console) -> int:
-    """Return the smallest width of a table, at least the terminal's, that breaks no number and no word.
-
-    If the terminal is too narrow, break headings to the width of their column's cells. The terminal wraps
-    the lines that are still too long.
-    """
-
-    def full_width() -> int:
-        return console.measure(table, options=console.options.update(max_width=10_000)).maximum
-
-    if full_width() <= console.width:
-        return console.width
-    table.padding, broken = 0, 0
-    for column in table.columns:
-        cells = [str(cell) for cell in column.cells]
-        longest = max(map(len, (*cells, *str(column.header).split())), default=1)
-        column.header = "\n".join(textwrap.wrap(str(column.header), max(longest, 1)))
-        if not column.no_wrap:
-            words = [word for text in (*cells, column.header) for word in text.split()]
-            broken += max(map(len, cells), default=0) - max(map(len, words), default=0)
-    return max(console.width, full_width() - max(broken, 0))
 
 
 def format_duration(seconds: float) -> str:

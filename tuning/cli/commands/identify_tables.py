@@ -61,7 +61,7 @@ def print_estimates(document: dict[str, Any], folder: Path | None) -> None:
     """Print the estimates and checks of a document; `folder` is the folder of the written files."""
     runs = ", ".join(f"{number} {kind}" for kind, number in document["runs"].items())
     rows = [_estimate_row(entry) for entry in (*document["estimates"], *document["combinations"])]
-    headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "change"]
+    headings = ["number", "estimate", "95 % from", "to", "unit", "prior", "change [%]"]
     items: list[Any] = [terminal.build_table(f"Identified from runs: {runs}", headings, rows, texts=(0, 4))]
     items.append(build_check_table(document, "What the model does not explain"))
     items += [
@@ -130,12 +130,12 @@ def _estimate_row(entry: dict[str, Any]) -> list[Any]:
     """Return the table row of an estimate; the uncertainty determines the number of digits."""
     digits = 4
     if entry["std"] and entry["value"]:
-        digits = min(max(1 + math.ceil(math.log10(abs(entry["value"]) / entry["std"])), 2), 9)
+        digits = min(max(1 + math.ceil(math.log10(abs(entry["value"]) / entry["std"])), 2), 6)
     change = entry["change"]
     return [
         terminal.format_key(entry["key"]),
         *(terminal.format_number(float(entry[name]), digits) for name in ("value", "low", "high")),
         entry["unit"],
         entry["prior"],
-        "-" if change is None else f"{100.0 * change:+.2g} %",
+        "-" if change is None else f"{100.0 * change:+.2g}",
     ]

@@ -34,7 +34,7 @@ def run(options: Map) -> int:
     stability_map = map(
         mechanism, options.x, options.y, compensator, gains, folder=target, progress=True, **settings
     )
-    mechanism_summary.report_summary(mechanism, None if options.json else terminal.emit_line)
+    mechanism_summary.report_summary(mechanism, None if options.json else terminal.emit)
     if options.json:
         terminal.emit_json("map", stability_map.document)
     else:

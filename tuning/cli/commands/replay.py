@@ -127,10 +127,12 @@ def _contact_table(document: dict[str, Any]) -> Any:
             *(number, entry["restitution"], entry["reference_restitution"], *error),
             *(entry["peak_force"], terminal.format_ratio(entry["peak_force"], entry["reference_peak_force"])),
             *(1e3 * entry["duration"], terminal.format_ratio(entry["duration"], entry["reference_duration"])),
-            *(1e3 * entry["approach_velocity"], entry["status"]),
+            *([1e3 * entry["approach_velocity"]] if kind == "contact" else []),
+            entry["status"],
         )
         for number, (entry, error) in enumerate(zip(runs, cells, strict=True), start=1)
     ]
-    headings = [kind, "e", "e*", *errors, "peak [N]", "/ ideal", "duration [ms]", "/ ideal"]
-    headings += ["speed [mm/s]", "status"]
+    duration = "duration [ms]" if kind == "contact" else "in touch [ms]"
+    headings = [kind, "e", "e*", *errors, "peak [N]", "/ ideal", duration, "/ ideal"]
+    headings += [*(["speed [mm/s]"] if kind == "contact" else []), "status"]
     return terminal.build_table(f"{kind.capitalize()}s", headings, rows, texts=(len(headings) - 1,))

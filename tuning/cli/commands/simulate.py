@@ -62,7 +62,7 @@ def run(options: SimulateOptions) -> int:
 
     mechanism, compensator, gains = select_compensator(options, mechanism)
     _check_simulation(mechanism, compensator, gains)
-    mechanism_summary.report_summary(mechanism, None if options.json else terminal.emit_line)
+    mechanism_summary.report_summary(mechanism, None if options.json else terminal.emit)
     result = simulate(mechanism, compensator, gains, seed=options.seed)
     limit = arguments.choose_limit(options.limit, mechanism)
     reasons = result.reasons(limit)

@@ -71,7 +71,7 @@ def run(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
     if options.json:
         terminal.emit_json("simulate", _build_document(limit, result, good))
     else:
-        terminal.emit_line(result.summary.line(mechanism.name))
+        terminal.emit(result.summary.line(mechanism.name))
         _print(options, limit, result, good)
         suggest_next(options, "phase_lead" if result.compensator == "none" else result.compensator)
     return 0 if good else 1

@@ -162,7 +162,7 @@ def _check_mechanisms(
             problems.append(str(error))
             terminal.note(f"jaxhil: {error}")
         else:
-            mechanism_summary.report_summary(entry.mechanism, None if options.json else terminal.emit_line)
+            mechanism_summary.report_summary(entry.mechanism, None if options.json else terminal.emit)
             usable.append(entry)
     return usable
 

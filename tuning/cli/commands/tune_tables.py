@@ -19,12 +19,12 @@ def print_overview(options: Tune, results: list[Any], entries: list[dict[str, An
     for result, entry in zip(results, entries, strict=True):
         tuned = result.figures["tuned"]
         best = min(result.starts, key=lambda start: start.rms).status if result.starts else "nothing to tune"
-        verdict = entry["verdict"] if entry["better_than_literature"] else "NOT better than the literature's"
+        verdict = entry["verdict"] if entry["better_than_literature"] else "NOT better than by rule"
         rms = (result.figures[key].rms for key in ("before", "literature", "tuned"))
         above = [f"{100 * result.global_comparison.above:+.1f} %"] if result.global_comparison else []
         failed = [tuned.failed] if some_failed else []
         rows.append((entry["mechanism"], *rms, tuned.p99, tuned.peak_ratio, *failed, *above, best, verdict))
-    headings = ["mechanism", "before", "literature", "tuned", "99th pct", "peak ratio"]
+    headings = ["mechanism", "before", "by rule", "tuned", "99th pct", "peak ratio"]
     headings += ["not ended"] if some_failed else []
     headings += ["above best"] if results[0].global_comparison else []
     error = (
