@@ -54,12 +54,15 @@ static fmi3Status values(fmi3Instance instance) {
     double reals[MAX_VALUES];
     int32_t integers[MAX_VALUES];
     bool booleans[MAX_VALUES];
-    const size_t count = draw(MAX_VALUES + 1), kind = draw(6);
+    static const char *const paths[] = {"", "x", "session.txt", "no/such/folder/session.csv", NULL};
+    const char *texts[MAX_VALUES];
+    const size_t count = draw(MAX_VALUES + 1), kind = draw(20) == 0 ? 6 + draw(2) : draw(6);
     for (size_t n = 0; n < count; n++) {
         do {
             references[n] = (uint32_t)draw(draw(100) == 0 ? 4000000000u : V_COUNT);
         } while (references[n] < V_COUNT && draw(50) != 0 &&
-                 fmu_variables[references[n]].type != (fmu_type)(kind % 3));
+                 fmu_variables[references[n]].type != (kind < 6 ? (fmu_type)(kind % 3) : FMU_STRING));
+        texts[n] = paths[draw(sizeof paths / sizeof *paths)];
         reals[n] = draw_value();
         integers[n] = (int32_t)draw(3);
         booleans[n] = draw(8) == 0;
@@ -75,8 +78,12 @@ static fmi3Status values(fmi3Instance instance) {
         return fmi3GetFloat64(instance, references, count, reals, count);
     case 4:
         return fmi3GetInt32(instance, references, count, integers, count);
-    default:
+    case 5:
         return fmi3GetBoolean(instance, references, count, booleans, count);
+    case 6:
+        return fmi3SetString(instance, references, count, texts, count);
+    default:
+        return fmi3GetString(instance, references, count, texts, count);
     }
 }
 

@@ -22,8 +22,8 @@ if find_compiler() is None:
 
 GETTERS = {"Float64": "getFloat64", "Int32": "getInt32", "Real": "getReal", "Integer": "getInteger"}
 SETTERS = {"Float64": "setFloat64", "Int32": "setInt32", "Real": "setReal", "Integer": "setInteger"}
-GETTERS |= {"Boolean": "getBoolean"}
-SETTERS |= {"Boolean": "setBoolean"}
+GETTERS |= {"Boolean": "getBoolean", "String": "getString"}
+SETTERS |= {"Boolean": "setBoolean", "String": "setString"}
 
 
 class RunningFmu:
@@ -42,7 +42,7 @@ class RunningFmu:
             return None
         return lambda environment, status, category, message: self.messages.append(message.decode())
 
-    def begin(self, **values: float) -> None:
+    def begin(self, **values: Any) -> None:
         """Set parameters and inputs, and initialise at time 0."""
         self.ticks = 0
         if self.description.fmiVersion == "2.0":
@@ -51,7 +51,7 @@ class RunningFmu:
         self.set(values)
         self.instance.exitInitializationMode()
 
-    def reset(self, **values: float) -> None:
+    def reset(self, **values: Any) -> None:
         self.instance.reset()
         self.begin(**values)
 

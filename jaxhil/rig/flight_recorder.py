@@ -79,6 +79,11 @@ class FlightRecorder:
         """Return the number of ticks in memory."""
         return min(self._count, self._ticks)
 
+    @property
+    def heading(self) -> str:
+        """Return the first line of the log, with the names of the columns."""
+        return ",".join(self._names) + "\n"
+
     def add(
         self,
         force_measured: float | Sequence[float],
@@ -140,7 +145,7 @@ class FlightRecorder:
 
     def _lines(self) -> Iterator[str]:
         """Yield the lines of the log, from the oldest tick to the newest one."""
-        yield ",".join(self._names) + "\n"
+        yield self.heading
         first = self._count % self._ticks if self._count > self._ticks else 0
         for number in range(len(self)):
             start = (first + number) % self._ticks * self._width

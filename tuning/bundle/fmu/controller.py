@@ -1,8 +1,12 @@
 """FMU of the controller: its C99 code of the bundle as a co-simulation FMU."""
 
+import copy
+import json
 from collections.abc import Mapping
 from typing import Any
 
+from jaxhil.mechanism.file import from_plain_data
+from jaxhil.rig.flight_recorder import FlightRecorder
 from tuning.bundle.c99 import GAINS_FILE, HEADER_FILE, SOURCE_FILE, generate_c99, test_program
 from tuning.bundle.controller_kind import ONE_AXIS, kind_of
 from tuning.bundle.fmu.archive import build_fmu
@@ -58,10 +62,25 @@ def controller_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
             "FMU_GAIN_COUNT": len(gains),
             "FMU_FIRST_GAIN": names.index(gains[0]) if gains else 0,
             "FMU_FIRST_LIMIT": names.index(limits[0]),
+            **_log_constants(document),
             "FMU_INTEGRATOR": f"INTEGRATOR_{document['mechanism']['rig']['integrator'].upper()}",
         },
         fmi=fmi,
     )
+
+
+def _log_constants(document: Mapping[str, Any]) -> dict[str, str]:
+    """Return heading and mapping of the flight log, as string literals of C."""
+    mass = None
+    if kind_of(document) is ONE_AXIS:
+        mass = from_plain_data(copy.deepcopy(document["mechanism"]), "gain document").bodies.mass
+    recorder = FlightRecorder(
+        float(document["control_period"]), document.get("axes", 1), ticks=1, equivalent_mass=mass
+    )
+    return {
+        "FMU_LOG_COLUMNS": json.dumps(recorder.heading),
+        "FMU_LOG_MAPPING": json.dumps(recorder.mapping("*")),
+    }
 
 
 def fmu_test_program(document: Mapping[str, Any], fmi: int) -> str:

@@ -19,8 +19,8 @@ BASE_UNITS = {
     "rad": {"rad": 1},
 }
 TYPES = {
-    2: {"real": "Real", "integer": "Integer", "boolean": "Boolean"},
-    3: {"real": "Float64", "integer": "Int32", "boolean": "Boolean"},
+    2: {"real": "Real", "integer": "Integer", "boolean": "Boolean", "string": "String"},
+    3: {"real": "Float64", "integer": "Int32", "boolean": "Boolean", "string": "String"},
 }
 LOG_CATEGORY = "logStatusError"
 _UNIT_FACTOR = re.compile(r"([A-Za-z]+)(?:\^(-?\d+))?$")
@@ -132,17 +132,21 @@ def _add_variable(listed: Element, reference: int, variable: Variable, fmi: int)
             typed["min"] = repr(variable.lowest)
         if math.isfinite(variable.highest):
             typed["max"] = repr(variable.highest)
-    if variable.causality in ("input", "parameter"):
+    if variable.causality in ("input", "parameter") and (variable.type != "string" or fmi == 2):
         typed["start"] = _start_text(variable)
     name = TYPES[fmi][variable.type]
     if fmi == 3:
-        SubElement(listed, name, {**common, **typed})
+        element = SubElement(listed, name, {**common, **typed})
+        if variable.type == "string":
+            SubElement(element, "Start", value="")
     else:
         SubElement(SubElement(listed, "ScalarVariable", common), name, typed)
 
 
 def _start_text(variable: Variable) -> str:
     """Return the start value as XML text."""
+    if variable.type == "string":
+        return ""
     if variable.type == "boolean":
         return "true" if variable.start else "false"
     return str(int(variable.start)) if variable.type == "integer" else repr(float(variable.start))

@@ -8,7 +8,12 @@ from tuning.bundle.fmu.variables import Variable
 
 FOLDER = Path(__file__).parent
 FMI_FILES = {2: ("fmi2.c",), 3: ("fmi3.c", "fmi3_missing.c")}
-VARIABLE_TYPES = {"real": "FMU_REAL", "integer": "FMU_INTEGER", "boolean": "FMU_BOOLEAN"}
+VARIABLE_TYPES = {
+    "real": "FMU_REAL",
+    "integer": "FMU_INTEGER",
+    "boolean": "FMU_BOOLEAN",
+    "string": "FMU_STRING",
+}
 CAUSALITIES = {
     "independent": "FMU_TIME",
     "parameter": "FMU_PARAMETER",
@@ -24,7 +29,7 @@ _HEADER_TEMPLATE = """\
 #define FMU_TOKEN "{token}"
 #define FMU_PERIOD {period} /* control period [s] */
 {constants}
-typedef enum {{ FMU_REAL, FMU_INTEGER, FMU_BOOLEAN }} fmu_type;
+typedef enum {{ FMU_REAL, FMU_INTEGER, FMU_BOOLEAN, FMU_STRING }} fmu_type;
 typedef enum {{ FMU_TIME, FMU_PARAMETER, FMU_INPUT, FMU_OUTPUT }} fmu_causality;
 
 typedef struct {{
@@ -90,7 +95,7 @@ def variable_files(
 
 def common_files(fmi: int) -> dict[str, str]:
     """Return the C files that do not depend on the model: FMI functions, and the headers of the standard."""
-    names = ("fmu.h", "fmu.c", *FMI_FILES[fmi])
+    names = ("fmu.h", "fmu.c", "fmu_log.h", "fmu_log.c", *FMI_FILES[fmi])
     headers = sorted((FOLDER / "headers").glob(f"fmi{fmi}*.h"))
     return {
         path.name: path.read_text(encoding="utf-8") for path in (*(FOLDER / "c" / n for n in names), *headers)

@@ -22,7 +22,7 @@ class Variable(NamedTuple):
 
     name: str
     causality: Literal["independent", "parameter", "input", "output"]
-    type: Literal["real", "integer", "boolean"]
+    type: Literal["real", "integer", "boolean", "string"]
     description: str
     unit: str = "1"  # "1" if dimensionless
     start: float = 0.0  # value before the first step
@@ -37,6 +37,9 @@ class Variable(NamedTuple):
 
 MODEL_MASSES = 1e-9, 1e12  # [kg]; bounds of the equivalent mass
 TIME = Variable("time", "independent", "real", "time of the communication point", "s")
+FLIGHT_LOG = Variable(
+    "flight_log", "parameter", "string", "path of the flight log, which ends in .csv; empty for no log"
+)
 EVENTS = (
     Variable("next_contact", "input", "boolean", "true in the first step of each run of a series"),
     Variable("reset", "input", "boolean", "true in a step that begins with a reset after a trip"),
@@ -78,7 +81,7 @@ def controller_variables(document: Mapping[str, Any]) -> list[Variable]:
         output._replace(description=f"{output.description}: {names}") if output.name == "faults" else output
         for output in STATUS_OUTPUTS
     ]
-    return [TIME, *EVENTS, *signals, *outputs, *_parameters(document)]
+    return [TIME, *EVENTS, *signals, *outputs, FLIGHT_LOG, *_parameters(document)]
 
 
 def c_names(variables: Iterable[Variable]) -> list[str]:

@@ -9,7 +9,10 @@ typedef struct {
     jaxhil_controller controller;
     bool stopped; /* whether the emergency stop is active */
     bool begins;  /* whether the next step is the first step of a run */
+    bool has_tick;    /* whether there was a tick since the initialisation */
+    uint32_t contact; /* index of the contact in the flight log */
     numerical_model model; /* only if the FMU integrates the numerical model */
+    double position_desired, velocity_desired; /* of the last tick, on one axis */
 } fmu_model;
 
 #endif

@@ -2,7 +2,11 @@
 #include <string.h>
 
 #include "fmu.h"
+#include "fmu_log.h"
 #include "jaxhil_gains.h"
+
+const char *const fmu_log_columns = FMU_LOG_COLUMNS;
+const char *const fmu_log_mapping = FMU_LOG_MAPPING;
 
 static double limited_integer(int64_t value) {
     return value < INT32_MAX ? (double)value : (double)INT32_MAX;
@@ -30,7 +34,9 @@ static void apply_events(fmu_state *state) {
     }
     if (values[V_NEXT_CONTACT] != 0.0) {
         jaxhil_next_contact(controller);
+        state->model.contact += state->model.has_tick;
     }
+    state->model.has_tick = state->model.has_tick || values[V_TARE] == 0.0;
 }
 
 /* Set the outputs that describe the controller's state. */
@@ -48,4 +54,24 @@ static void set_statuses(fmu_state *state) {
     values[V_LATE_TICKS] = limited_integer(jaxhil_late_ticks(controller));
     values[V_CONTACT_NUMBER] = limited_integer(contact.number);
     values[V_CONTACT_STATUS] = (double)contact.status;
+}
+
+/* Fill a row of the flight log; a vector has `width` numbers, and the readings are without their bias. */
+static size_t fill_row(const fmu_state *state, const double *readings, const double *bias, const double *command,
+                       size_t width, double *row) {
+    const double *const values = state->values;
+    size_t count = 0;
+    if (values[V_TARE] != 0.0) {
+        return 0;
+    }
+    row[count++] = values[V_HAS_TICK_TIME] != 0.0 ? values[V_TICK_TIME] : state->begin;
+    for (size_t n = 0; n < 4 * width; n++) {
+        row[count++] = n < width ? readings[n] - bias[n] : readings[n];
+    }
+    for (size_t n = 0; n < width; n++) {
+        row[count++] = command[n];
+    }
+    row[count++] = (double)state->model.contact;
+    row[count++] = (double)((uint32_t)values[V_FAULTS] | (uint32_t)values[V_TRIP_CAUSE]);
+    return count;
 }

@@ -24,6 +24,8 @@ static void tick(fmu_state *state, bool integrates, numerical_model *model) {
     jaxhil_controller *const controller = &state->model.controller;
     const double position = integrates ? model->position : values[V_POSITION_DESIRED];
     const double velocity = integrates ? model->velocity : values[V_VELOCITY_DESIRED];
+    state->model.position_desired = position;
+    state->model.velocity_desired = velocity;
     values[V_FORCE_COMMAND] =
         jaxhil_step(controller, values[V_FORCE_MEASURED], position, velocity, values[V_POSITION_MEASURED],
                     values[V_HAS_TICK_TIME] != 0.0 ? &values[V_TICK_TIME] : NULL);
@@ -60,4 +62,11 @@ void fmu_model_step(fmu_state *state) {
     values[V_FORCE_DELAY] = jaxhil_force_delay(&model->controller);
     jaxhil_identified(&model->controller, &values[V_STIFFNESS], &values[V_DAMPING]);
     set_statuses(state);
+}
+
+size_t fmu_model_row(const fmu_state *state, double *row) {
+    const double *const values = state->values;
+    const double readings[4] = {values[V_FORCE_MEASURED], state->model.position_desired,
+                                state->model.velocity_desired, values[V_POSITION_MEASURED]};
+    return fill_row(state, readings, &values[V_FORCE_BIAS], &values[V_FORCE_COMMAND], 1, row);
 }

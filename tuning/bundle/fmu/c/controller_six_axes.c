@@ -36,3 +36,9 @@ void fmu_model_step(fmu_state *state) {
     values[V_UNPAID_IMPULSE] = jaxhil_unpaid_impulse(controller);
     set_statuses(state);
 }
+
+size_t fmu_model_row(const fmu_state *state, double *row) {
+    const double *const values = state->values;
+    return fill_row(state, values + V_WRENCH_MEASURED_FX, values + V_WRENCH_BIAS_FX, values + V_WRENCH_COMMAND_FX,
+                    6, row);
+}

@@ -6,9 +6,11 @@
 #include <string.h>
 
 #include "fmu.h"
+#include "fmu_log.h"
 
 typedef struct {
     fmu_state state;
+    fmu_log flight_log;
     double start_time;
     const fmi2CallbackFunctions *callbacks;
     char name[64];
@@ -78,17 +80,30 @@ SET(fmi2SetInteger, fmi2Integer, FMU_INTEGER, NUMBER)
 GET(fmi2GetBoolean, fmi2Boolean, FMU_BOOLEAN)
 SET(fmi2SetBoolean, fmi2Boolean, FMU_BOOLEAN, TRUTH)
 
-/* No variable is a text: these functions return an error if values are requested. */
 fmi2Status fmi2GetString(fmi2Component component, const fmi2ValueReference references[], size_t count,
                          fmi2String values[]) {
-    (void)references, (void)values;
-    return component != NULL && count == 0 ? fmi2OK : fmi2Error;
+    fmu_instance *const self = (fmu_instance *)component;
+    const char *problem = NULL;
+    if (self == NULL || (count > 0 && (references == NULL || values == NULL))) {
+        return finish(self, "fmi2GetString", fmu_argument_missing);
+    }
+    for (size_t n = 0; n < count && problem == NULL; n++) {
+        problem = fmu_get_text(&self->flight_log, references[n], &values[n]);
+    }
+    return finish(self, "fmi2GetString", problem);
 }
 
 fmi2Status fmi2SetString(fmi2Component component, const fmi2ValueReference references[], size_t count,
                          const fmi2String values[]) {
-    (void)references, (void)values;
-    return component != NULL && count == 0 ? fmi2OK : fmi2Error;
+    fmu_instance *const self = (fmu_instance *)component;
+    const char *problem = NULL;
+    if (self == NULL || (count > 0 && (references == NULL || values == NULL))) {
+        return finish(self, "fmi2SetString", fmu_argument_missing);
+    }
+    for (size_t n = 0; n < count && problem == NULL; n++) {
+        problem = fmu_set_text(&self->state, &self->flight_log, references[n], values[n]);
+    }
+    return finish(self, "fmi2SetString", problem);
 }
 
 const char *fmi2GetTypesPlatform(void) {
@@ -124,6 +139,9 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
 }
 
 void fmi2FreeInstance(fmi2Component component) {
+    if (component != NULL) {
+        fmu_close_log(&((fmu_instance *)component)->flight_log);
+    }
     free(component);
 }
 
@@ -145,12 +163,22 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component component) {
 
 fmi2Status fmi2ExitInitializationMode(fmi2Component component) {
     fmu_instance *const self = (fmu_instance *)component;
-    return self == NULL ? fmi2Error : finish(self, "initialisation", fmu_exit_initialisation(&self->state));
+    fmi2Status status;
+    if (self == NULL || self->state.phase != FMU_INITIALISING) {
+        return finish(self, "initialisation", "the instance is not being initialised");
+    }
+    status = finish(self, "flight_log", fmu_open_log(&self->flight_log));
+    return status == fmi2OK ? finish(self, "initialisation", fmu_exit_initialisation(&self->state)) : status;
 }
 
 fmi2Status fmi2Terminate(fmi2Component component) {
     fmu_instance *const self = (fmu_instance *)component;
-    return self == NULL ? fmi2Error : finish(self, "termination", fmu_terminate(&self->state));
+    fmi2Status status;
+    if (self == NULL) {
+        return fmi2Error;
+    }
+    status = finish(self, "termination", fmu_terminate(&self->state));
+    return status == fmi2OK ? finish(self, "flight_log", fmu_close_log(&self->flight_log)) : status;
 }
 
 fmi2Status fmi2Reset(fmi2Component component) {
@@ -160,13 +188,21 @@ fmi2Status fmi2Reset(fmi2Component component) {
     }
     self->start_time = 0.0;
     fmu_reset(&self->state);
-    return fmi2OK;
+    return finish(self, "flight_log", fmu_close_log(&self->flight_log));
 }
 
 fmi2Status fmi2DoStep(fmi2Component component, fmi2Real time, fmi2Real step, fmi2Boolean no_return) {
     fmu_instance *const self = (fmu_instance *)component;
+    fmi2Status status;
     (void)no_return;
-    return self == NULL ? fmi2Error : finish(self, "step", fmu_step(&self->state, time, step));
+    if (self == NULL) {
+        return fmi2Error;
+    }
+    status = finish(self, "step", fmu_step(&self->state, time, step));
+    if (status == fmi2OK) {
+        finish(self, "flight_log", fmu_write_log(&self->flight_log, &self->state)); /* reported, no error */
+    }
+    return status;
 }
 
 /* A step is finished when fmi2DoStep returns, so that it cannot be cancelled. */

@@ -9,9 +9,11 @@
 #include <string.h>
 
 #include "fmu.h"
+#include "fmu_log.h"
 
 typedef struct {
     fmu_state state;
+    fmu_log flight_log;
     fmi3LogMessageCallback log;
     fmi3InstanceEnvironment environment;
 } fmu_instance;
@@ -95,7 +97,32 @@ NO_VALUES(UInt16, fmi3UInt16)
 NO_VALUES(UInt32, fmi3UInt32)
 NO_VALUES(Int64, fmi3Int64)
 NO_VALUES(UInt64, fmi3UInt64)
-NO_VALUES(String, fmi3String)
+
+fmi3Status fmi3GetString(fmi3Instance instance, const fmi3ValueReference references[], size_t count,
+                         fmi3String values[], size_t size) {
+    fmu_instance *const self = (fmu_instance *)instance;
+    const char *problem = NULL;
+    if (self == NULL || count != size || (count > 0 && (references == NULL || values == NULL))) {
+        return finish(self, "fmi3GetString", "an argument is missing, or the numbers of values differ");
+    }
+    for (size_t n = 0; n < count && problem == NULL; n++) {
+        problem = fmu_get_text(&self->flight_log, references[n], &values[n]);
+    }
+    return finish(self, "fmi3GetString", problem);
+}
+
+fmi3Status fmi3SetString(fmi3Instance instance, const fmi3ValueReference references[], size_t count,
+                         const fmi3String values[], size_t size) {
+    fmu_instance *const self = (fmu_instance *)instance;
+    const char *problem = NULL;
+    if (self == NULL || count != size || (count > 0 && (references == NULL || values == NULL))) {
+        return finish(self, "fmi3SetString", "an argument is missing, or the numbers of values differ");
+    }
+    for (size_t n = 0; n < count && problem == NULL; n++) {
+        problem = fmu_set_text(&self->state, &self->flight_log, references[n], values[n]);
+    }
+    return finish(self, "fmi3SetString", problem);
+}
 
 const char *fmi3GetVersion(void) {
     return fmi3Version;
@@ -131,6 +158,9 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
 }
 
 void fmi3FreeInstance(fmi3Instance instance) {
+    if (instance != NULL) {
+        fmu_close_log(&((fmu_instance *)instance)->flight_log);
+    }
     free(instance);
 }
 
@@ -143,12 +173,22 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean has_to
 
 fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
     fmu_instance *const self = (fmu_instance *)instance;
-    return self == NULL ? fmi3Error : finish(self, "initialisation", fmu_exit_initialisation(&self->state));
+    fmi3Status status;
+    if (self == NULL || self->state.phase != FMU_INITIALISING) {
+        return finish(self, "initialisation", "the instance is not being initialised");
+    }
+    status = finish(self, "flight_log", fmu_open_log(&self->flight_log));
+    return status == fmi3OK ? finish(self, "initialisation", fmu_exit_initialisation(&self->state)) : status;
 }
 
 fmi3Status fmi3Terminate(fmi3Instance instance) {
     fmu_instance *const self = (fmu_instance *)instance;
-    return self == NULL ? fmi3Error : finish(self, "termination", fmu_terminate(&self->state));
+    fmi3Status status;
+    if (self == NULL) {
+        return fmi3Error;
+    }
+    status = finish(self, "termination", fmu_terminate(&self->state));
+    return status == fmi3OK ? finish(self, "flight_log", fmu_close_log(&self->flight_log)) : status;
 }
 
 fmi3Status fmi3Reset(fmi3Instance instance) {
@@ -156,7 +196,7 @@ fmi3Status fmi3Reset(fmi3Instance instance) {
         return fmi3Error;
     }
     fmu_reset(&((fmu_instance *)instance)->state);
-    return fmi3OK;
+    return finish((fmu_instance *)instance, "flight_log", fmu_close_log(&((fmu_instance *)instance)->flight_log));
 }
 
 fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 time, fmi3Float64 step, fmi3Boolean no_return,
@@ -168,6 +208,9 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 time, fmi3Float64 step,
         return finish(self, "step", fmu_argument_missing);
     }
     status = finish(self, "step", fmu_step(&self->state, time, step));
+    if (status == fmi3OK) {
+        finish(self, "flight_log", fmu_write_log(&self->flight_log, &self->state)); /* reported, no error */
+    }
     *event = *terminate = *early = false;
     *reached = self->state.time;
     return status;

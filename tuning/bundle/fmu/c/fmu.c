@@ -89,6 +89,7 @@ const char *fmu_step(fmu_state *state, double time, double step) {
         return "the communication step differs from the control period; they must be equal";
     }
     fmu_model_step(state);
+    state->begin = time;
     state->time = state->values[V_TIME] = time + step;
     return NULL;
 }

@@ -19,6 +19,7 @@ typedef enum { FMU_INSTANTIATED, FMU_INITIALISING, FMU_STEPPING, FMU_TERMINATED 
 typedef struct {
     fmu_phase phase;
     double time;               /* communication point [s] */
+    double begin;              /* of the last step [s] */
     double values[V_COUNT];    /* values of the variables, by value reference */
     fmu_model model;
 } fmu_state;
