@@ -176,10 +176,9 @@ class ExpressionLowering:
 
     def note(self, writes: Locations) -> None:
         """Record that a statement changes the variables `writes`; drop facts that depend on them."""
-        if writes:
-            self.effects.append(writes)
-            self.function.writes |= writes
-            self.facts = {key: fact for key, fact in self.facts.items() if not fact.reads & writes}
+        self.effects.append(writes)
+        self.function.writes |= writes
+        self.facts = {key: fact for key, fact in self.facts.items() if not fact.reads & writes}
 
     def facts_of(self, node: Any, truth: bool) -> dict[str, CExpression]:
         """Return the facts about numbers that are certain if a condition has the value `truth`."""

@@ -186,8 +186,7 @@ class BodyLowering(CallLowering):
         elif field.type.kind != "non-number":
             self._emit_store(node, field, value)
         self.changed(field, is_element)
-        if value.sign:
-            self.facts[field.text] = field._replace(sign=value.sign)
+        self.facts[field.text] = field._replace(sign=value.sign)
 
     def _replace_at(self, node: Any, target: Any, field: CExpression) -> None:
         if not (isinstance(target, ast.Subscript) and isinstance(target.slice, ast.Slice)):
@@ -220,9 +219,7 @@ class BodyLowering(CallLowering):
         else:
             self._emit_store(node, existing._replace(text=text), value)
         self.check(value)
-        self.facts.pop(text, None)
-        if value.sign:
-            self.facts[text] = CExpression(text, value.type, sign=value.sign)
+        self.facts[text] = CExpression(text, value.type, sign=value.sign)
 
     def changed(self, field: CExpression, in_place: bool) -> None:
         """Record an assignment to an attribute or an element."""
