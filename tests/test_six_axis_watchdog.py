@@ -90,7 +90,10 @@ def test_six_axis_watchdog_trips_on_unpaid_impulse(records):
 
 
 def pushed(rig, force, ticks, factor=1.0):
-    """Push a model at 5 mm/s with a force; its mass is too small by `factor`."""
+    """Push a model that moves at 5 mm/s with a force [N] for some ticks, and return the controller.
+
+    The model accelerates as if its mass were smaller by `factor`.
+    """
     inverse = np.array(six_axis_document()["constants"]["inverse_mass"])
     twist, wrench = np.array([0, 0, -0.005, 0, 0, 0]), np.array([0, 0, force, 0, 0, 0])
     at = np.array([0, 0, 0.05, 0, 0, 0])
