@@ -59,7 +59,7 @@ def test_failed_atomic_write_keeps_the_old_file(tmp_path, monkeypatch, step):
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_errors_other_than_write_errors_pass_through_report_write_errors(tmp_path):
+def test_report_write_errors_does_not_change_other_errors(tmp_path):
     with pytest.raises(InputError, match=r"^something else$"), report_write_errors(tmp_path):
         raise InputError("something else")
 

@@ -97,7 +97,7 @@ def test_saltelli_design_consists_of_two_sample_sets_and_their_mixtures():
     assert not np.array_equal(saltelli_design(3, 64, seed=4), points.reshape(-1, 3))
 
 
-def test_sobol_study_caps_results_on_request():
+def test_sobol_study_with_cap_replaces_larger_and_missing_results_by_the_cap():
     points = saltelli_design(2, 256, seed=5)
     values = points @ [1.0, 3.0]
     cut = sobol_indices(np.minimum(values, 3.5), 2, 256)

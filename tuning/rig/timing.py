@@ -54,7 +54,7 @@ class TimingEffects:
         return law.force(position - self._plane, velocity) if position > self._plane else 0.0
 
     def hold_lost(self, tick: int, reading: float) -> float:
-        """Return the reading [N], or the last one if this reading is lost."""
+        """Draw whether the reading [N] is lost; return the reading or, if it is lost, the last one."""
         if not (self._loss > 0.0 and self._random.random() < self._loss and tick > 0):
             self._reading = reading
         return self._reading
