@@ -130,7 +130,7 @@ def test_tune_command_prints_tables_or_json_if_requested(jaxhil, table, tmp_path
     assert json.loads((tmp_path / "rig-300kg" / "gains.json").read_text())["sha256"] == again["sha256"]
 
 
-def test_commands_end_with_next_command(jaxhil, table, tmp_path):
+def test_last_line_of_command_output_suggests_the_next_command(jaxhil, table, tmp_path):
     tuned, _, out, _ = table
     assert out.splitlines()[-1] == "Next: jaxhil compare rig-300kg"  # the gains are not good
     for arguments, words in ((["mechanisms"], "init NAME"), (["init", "-o", tmp_path / "a"], "simulate ")):

@@ -118,7 +118,7 @@ RETIRED_NAMES = re.compile(
 )
 
 
-def test_retired_names_do_not_come_back():
+def test_retired_names_are_not_used():
     folders = ("jaxhil", "tuning", "tests", "notebooks")
     paths = [path for folder in folders for path in sorted((ROOT / folder).rglob("*"))]
     wrong = [
