@@ -1,4 +1,4 @@
-"""Refused runs of a mechanism file: too many ticks, too fast poles, and a too low velocity limit."""
+"""Rejected runs of mechanism files: too many ticks, too fast poles, or too low a velocity limit."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Self-test of a bundle with FMUs: compiles their sources, and notices one changed digit."""
+"""Self-test of a bundle with FMUs: the test compiles their sources and detects one changed digit."""
 
 import io
 import json
@@ -59,7 +59,7 @@ def test_self_test_replays_vectors_through_the_fmu(name, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WRITERS)
-def test_self_test_notices_a_changed_digit_in_the_sources_of_an_fmu(name, tmp_path):
+def test_self_test_detects_a_changed_digit_in_the_sources_of_an_fmu(name, tmp_path):
     files, path = files_of(name), f"{name}/{CONTROLLER}"
     folder = placed(tmp_path, files)
     changed = with_changed_digit(files[path])

@@ -1,4 +1,4 @@
-"""Gain file of a six-axis rig: invalid and changed files are refused with one line."""
+"""Gain file of a six-axis rig: invalid and changed files are rejected with one line."""
 
 import functools
 import json
