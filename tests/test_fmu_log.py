@@ -75,7 +75,7 @@ def test_shadow_mode_repeats_the_log_of_the_fmu_bit_for_bit(fmu, tmp_path):
     assert {contact["share"] for contact in result["contacts"]} == {0.0}
 
 
-def test_fmu_refuses_a_log_that_exists_or_cannot_be_created(fmu, tmp_path):
+def test_fmu_rejects_a_log_that_exists_or_cannot_be_created(fmu, tmp_path):
     (tmp_path / "there.toml").write_text("user's file")
     for path in (tmp_path / "there.csv", tmp_path / "missing" / "session.csv"):
         with FAILED:

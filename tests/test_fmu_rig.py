@@ -17,6 +17,7 @@ from jaxhil.mechanism.file import load, to_plain_data
 from jaxhil.rig import COMPENSATORS
 from tuning.bundle.fmu.controller import controller_fmu
 from tuning.bundle.fmu.rig import rig_fmu
+from tuning.bundle.writers import describe_fmus, fmi3_files
 from tuning.rig.plant import RigHardware
 
 PEDANTIC = ("-pedantic", "-Wall", "-Wextra", "-Werror")
@@ -148,6 +149,28 @@ def test_loop_of_fmus_reproduces_simulation_of_other_mechanisms(name, compensato
 @pytest.mark.parametrize("compensator", [name for name in COMPENSATORS if name != "position_lead"])
 def test_loop_of_fmus_reproduces_simulation_of_every_compensator(compensator, tmp_path):
     assert_same_contacts(*run_both("rig-300kg", compensator, 3, tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("override", "reason"),
+    [
+        ("rig.force_sensor.jitter=0.0005", "rig.force_sensor.jitter: found 0.0005, expected 0"),
+        (
+            "rig.force_sensor.loss_probability=0.01",
+            "rig.force_sensor.loss_probability: found 0.01, expected 0",
+        ),
+        ("rig.force_sensor.filter.cutoff=200", "rig.force_sensor.filter: found a filter, expected none"),
+    ],
+)
+def test_export_writes_the_controller_fmu_alone_if_the_rig_has_effects_that_its_fmu_lacks(override, reason):
+    others = ("rig.force_sensor.filter.kind=bessel", "rig.force_sensor.filter.order=2")
+    made = document("rig-300kg", "none", (*others, override) if "filter" in override else (override,))
+    files = fmi3_files(made)
+    assert {*files} == {"fmi3/jaxhil_controller.fmu", "fmi3/test_vectors.c"}
+    rig, library = describe_fmus(made, files)
+    assert rig == f"The rig has no FMU: {reason}."
+    assert library.startswith("The FMUs contain no library: found no C compiler, or it failed")
+    assert describe_fmus(made, {}) == []
 
 
 def test_rig_fmu_rejects_user_registered_contact_law(monkeypatch):

@@ -181,6 +181,7 @@ def export(
 
 def _build_document(loaded, bundle, format_names, rates) -> dict[str, Any]:
     """Return the JSON document of the export, in which the path of the bundle is still missing (None)."""
+    from tuning.bundle.writers import describe_fmus
     from tuning.verification.stops import describe_limit_changes
 
     stops = []
@@ -198,6 +199,7 @@ def _build_document(loaded, bundle, format_names, rates) -> dict[str, Any]:
         "gains_sha256": bundle.document["sha256"],
         "formats": ["fmu" if name == "fmu2" else name for name in format_names],
         "files": sorted(bundle.files),
+        "fmu_notes": describe_fmus(bundle.document, bundle.files),
         "signed": SIGNATURE_FILE in bundle.files,
         "limits": bundle.document.get("limits"),
         "rates": rates,

@@ -5,9 +5,11 @@ and returns the content of each file by its path. All formats preserve the bits 
 null is written as its default. To add a format, add a function and its entry in `WRITERS`.
 """
 
+import copy
 import csv
 import io
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -148,8 +150,8 @@ def c99_files(document: Mapping[str, Any]) -> dict[str, bytes]:
 def fmi3_files(document: Mapping[str, Any]) -> dict[str, bytes]:
     """Return the FMUs of FMI 3.0 without library, in the folder `fmi3`.
 
-    These are the controller and, for one axis, the rig. A test program replays the test vectors through the
-    controller's FMU.
+    These are the controller and, for one axis, the rig if its FMU can simulate it. A test program replays the
+    test vectors through the controller's FMU.
     """
     return _fmu_files(document, 3)
 
@@ -168,8 +170,29 @@ def _fmu_files(document: Mapping[str, Any], fmi: int) -> dict[str, bytes]:
         f"fmi{fmi}/{TEST_FILE}": controller.fmu_test_program(document, fmi).encode("ascii"),
     }
     if kind_of(document) is ONE_AXIS:
-        files[f"fmi{fmi}/{rig.IDENTIFIER}.fmu"] = rig.rig_fmu(document, fmi)
+        with suppress(rig.UnsupportedRig):  # `describe_fmus` states it
+            files[f"fmi{fmi}/{rig.IDENTIFIER}.fmu"] = rig.rig_fmu(document, fmi)
     return files
+
+
+def describe_fmus(document: Mapping[str, Any], files: Mapping[str, bytes]) -> list[str]:
+    """Describe what the FMUs in a bundle lack: a library for Linux, or the rig on one axis."""
+    from jaxhil.mechanism.file import from_plain_data
+    from tuning.bundle.fmu import rig
+    from tuning.bundle.fmu.archive import find_library
+
+    archives = [content for name, content in files.items() if name.endswith(".fmu")]
+    notes = []
+    if archives and kind_of(document) is ONE_AXIS:
+        unsupported = rig.describe_unsupported(
+            from_plain_data(copy.deepcopy(document["mechanism"]), "gain document")
+        )
+        notes += [f"The rig has no FMU: {unsupported}."] if unsupported else []
+    if any(find_library(archive) is None for archive in archives):
+        notes.append(
+            "The FMUs contain no library: found no C compiler, or it failed; their sources are complete."
+        )
+    return notes
 
 
 WRITERS: dict[str, Callable[[Mapping[str, Any]], dict[str, bytes]]] = {

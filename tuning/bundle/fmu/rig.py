@@ -44,6 +44,28 @@ enum {{ {laws} }};
 """
 
 
+class UnsupportedRig(InputError):
+    """Rig with a property that its FMU cannot simulate."""
+
+
+def describe_unsupported(mechanism: Mechanism) -> str | None:
+    """Describe the first property of the rig that its FMU cannot simulate; return None if there is none."""
+    sensor = mechanism.rig.force_sensor
+    if mechanism.contact.law not in LAWS:
+        found = format_value(mechanism.contact.law)
+        return f"contact.law: found {found}, expected one of {', '.join(LAWS)}"
+    if sensor.filter is not None:
+        return "rig.force_sensor.filter: found a filter, expected none"
+    for key, value in {
+        "force_sensor.jitter": sensor.jitter,
+        "force_sensor.loss_probability": sensor.loss_probability,
+        "missed_tick_probability": mechanism.rig.missed_tick_probability,
+    }.items():
+        if value:
+            return f"rig.{key}: found {value:g}, expected 0"
+    return None
+
+
 def rig_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
     """Return the archive of the rig's FMU, without library, for the mechanism of a gain document.
 
@@ -52,26 +74,12 @@ def rig_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
         fmi: version of FMI, 2 or 3.
 
     Raises:
-        InputError: If the contact law is not a built-in one, or if the rig has a filter or timing effects.
+        UnsupportedRig: If the rig's FMU cannot simulate the rig, see `describe_unsupported`.
     """
     mechanism = _without_extra_periods(document)
-    if mechanism.contact.law not in LAWS:
-        found = f"found {format_value(mechanism.contact.law)}, expected one of {', '.join(LAWS)}"
-        raise InputError(f"fmu: contact.law: {found}; use `--format c99` to export without the rig")
-    sensor = mechanism.rig.force_sensor
-    for key, value in {
-        "force_sensor.jitter": sensor.jitter,
-        "force_sensor.loss_probability": sensor.loss_probability,
-        "missed_tick_probability": mechanism.rig.missed_tick_probability,
-    }.items():
-        if value:
-            found = f"found {value:g}, expected 0; use `--format c99` to export without the rig"
-            raise InputError(f"fmu: rig.{key}: {found}")
-    if sensor.filter is not None:
-        found = "found a filter, expected none"
-        raise InputError(
-            f"fmu: rig.force_sensor.filter: {found}; use `--format c99` to export without the rig"
-        )
+    unsupported = describe_unsupported(mechanism)
+    if unsupported is not None:
+        raise UnsupportedRig(f"fmu: {unsupported}; the rig has no FMU")
     return build_fmu(
         identifier=IDENTIFIER,
         name=f"{IDENTIFIER}: {mechanism.name}",

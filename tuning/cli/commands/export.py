@@ -99,7 +99,8 @@ def _print(document: dict[str, Any], sizes: dict[str, int]) -> None:
             ),
             f"On the rig: python {Path(document['bundle']).name}/selftest.py",
         ]
-        if "fmu" in document["formats"]:
+        lines += document["fmu_notes"]
+        if any(name.endswith("jaxhil_rig.fmu") for name in document["files"]):
             lines.append(
                 "A co-simulation that steps the controller's FMU before the rig's FMU adds one control "
                 "period: tune with `--extra-periods 1`."
