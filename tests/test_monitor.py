@@ -74,7 +74,7 @@ def silent():
     [
         ({"filter": {"kind": "butterworth", "order": 2, "cutoff": 250.0}}, "a butterworth filter of order 2"),
         ({"dead_zone": 4.0, "dead_zone_kind": "cut"}, "a cut dead zone of 4 N"),
-        ({"jitter": 1e-4}, "jitter = 0.0001"),
+        ({"jitter": 1e-4}, "jitter = 0.0001 s"),
         ({"loss_probability": 0.01}, "loss_probability = 0.01"),
     ],
 )

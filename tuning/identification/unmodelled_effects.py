@@ -19,15 +19,15 @@ def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
     if sensor.filter is not None:
         text = f"a {sensor.filter.kind} filter of order {sensor.filter.order}"
         effects["rig.force_sensor.filter"] = "filter of the force sensor", text
-    for key, name, value in (
-        ("rig.force_sensor.jitter", "jitter of the force sensor", sensor.jitter),
-        ("rig.force_sensor.loss_probability", "lost frames of the force sensor", sensor.loss_probability),
-        ("rig.missed_tick_probability", "missed ticks", rig.missed_tick_probability),
+    for key, name, value, unit in (
+        ("rig.force_sensor.jitter", "jitter of the force sensor", sensor.jitter, " s"),
+        ("rig.force_sensor.loss_probability", "lost frames of the force sensor", sensor.loss_probability, ""),
+        ("rig.missed_tick_probability", "missed ticks", rig.missed_tick_probability, ""),
     ):
         if key in mechanism.uncertainty:
             effects[key] = name, f"{key.rpartition('.')[2]} in [uncertainty]"
         elif value > 0.0:
-            effects[key] = name, f"{key.rpartition('.')[2]} = {value:g}"
+            effects[key] = name, f"{key.rpartition('.')[2]} = {value:g}{unit}"
     return effects
 
 
