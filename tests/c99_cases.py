@@ -75,27 +75,10 @@ SANE_LIMITS = {
     "speed_lowest": -0.5,
 }
 AUDIT = {"settling", *list(LIMITS)[list(LIMITS).index("equivalent_mass") :]}
-HOSTILE = np.array(
-    [
-        *(
-            0.0,
-            -0.0,
-            5e-324,
-            -5e-324,
-            1e-310,
-            2.3e-308,
-            1e-160,
-            1e-16,
-            1.0,
-            -1.0,
-            1e16,
-            -1e160,
-            1e300,
-            -1e308,
-        ),
-        *(1.7976931348623157e308, -1.7976931348623157e308, math.inf, -math.inf, math.nan),
-    ]
-)
+HOSTILE = np.array([
+    0.0, -0.0, 5e-324, -5e-324, 1e-310, 2.3e-308, 1e-160, 1e-16, 1.0, -1.0, 1e16, -1e160, 1e300, -1e308,
+    1.7976931348623157e308, -1.7976931348623157e308, math.inf, -math.inf, math.nan,
+])  # fmt: skip
 
 
 class Batch:

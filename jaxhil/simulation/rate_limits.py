@@ -3,6 +3,21 @@
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxhil.simulation.loop import RigConstants
+from jaxhil.simulation.loop_state import PlantState
+
+
+def apply_limits(rig: RigConstants, plant: PlantState, command: Array) -> tuple[Array, Array, Array | None]:
+    """Return the limited command [m], its step [m] and the unlimited command [m] (None without limits)."""
+    if plant.unlimited_command is None:
+        return command, plant.step, None
+    simulator = rig.scenario.simulator
+    limited, step = limit_command(
+        command, plant.unlimited_command, plant.commands[0], plant.step, rig.constants.control_period,
+        simulator.velocity_limit, simulator.acceleration_limit,
+    )  # fmt: skip
+    return limited, step, command
+
 
 def limit_command(
     unlimited_command: Array,

@@ -42,7 +42,7 @@ from jaxhil.simulation.motion_simulator import advance_state, read_measured_posi
 from jaxhil.simulation.moving_average import UniformCommand, read_leaving_commands
 from jaxhil.simulation.probe import Probe
 from jaxhil.simulation.probed_tick import apply_probe
-from jaxhil.simulation.rate_limits import limit_command
+from jaxhil.simulation.rate_limits import apply_limits
 from jaxhil.simulation.sensors import SensorNoise, quantise, sample_force
 from jaxhil.simulation.timing import HeldValues, TimingDraws, hold_compensator, read_force
 
@@ -239,7 +239,7 @@ def actuate(
     if missed is not None:
         command = jnp.where(missed, state.plant.sent, command)
         controller = hold_compensator(missed, state.controller, controller, loop.controller_ring)
-    command, step, unlimited_command = _apply_limits(rig, state.plant, command)
+    command, step, unlimited_command = apply_limits(rig, state.plant, command)
     commands = (command, *state.plant.commands)
     end = commands[loop.latency]
     start = commands[loop.latency + 1] if loop.hold == "linear" else end
@@ -393,15 +393,3 @@ def _delayed_position(rig, state, now, age):
     stride = rig.constants.control_period * state.onset_velocity
     before = state.sensed.first_position + (age - intervals).astype(stride.dtype) * stride
     return look_back(ring, now - 1, intervals, age > intervals, before)
-
-
-def _apply_limits(rig, plant, command):
-    """Return the limited command [m], its step [m] and the unlimited command [m] (None without limits)."""
-    if plant.unlimited_command is None:
-        return command, plant.step, None
-    simulator = rig.scenario.simulator
-    limited, step = limit_command(
-        command, plant.unlimited_command, plant.commands[0], plant.step, rig.constants.control_period,
-        simulator.velocity_limit, simulator.acceleration_limit,
-    )  # fmt: skip
-    return limited, step, command
