@@ -37,7 +37,9 @@ from tuning.identification.records import Campaign, CampaignTiming, LoggedRun, R
 
 KINDS_SPLIT_AT_CONTACTS = ("tap", "contact")
 MIN_SEGMENT_ROWS = 50  # minimum number of rows in a segment between gaps
-MIN_VELOCITY_JUMP = 0.5  # minimum velocity jump between simulated runs as a share of the 95 % speed quantile
+# A simulated contact begins with the rebound velocity of the contact before it, reversed. Minimum velocity jump
+# there, as a multiple of the speed beside it, and of the velocity change in the two periods before and after it.
+MIN_JUMP_PER_SPEED, MIN_JUMP_PER_CHANGE = 1.2, 10.0
 
 
 def read_campaign(
@@ -345,9 +347,13 @@ def find_restarts(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
     if index is None:
         return np.empty(0, int)
     rows = np.flatnonzero(index[1:] != index[:-1]) + 1
-    rows = rows[(rows >= 2) & (rows < len(x) - 1)]
+    rows = rows[(rows >= 4) & (rows < len(x) - 3)]
     step = np.diff(x)
-    return rows[np.abs(step[rows] - step[rows - 2]) > MIN_VELOCITY_JUMP * np.percentile(np.abs(step), 95)]
+    before, after = step[rows - 2], step[rows]
+    change = np.maximum(np.abs(before - step[rows - 4]), np.abs(step[rows + 2] - after))
+    speed = np.maximum(np.abs(before), np.abs(after))
+    jump = np.abs(after - before)
+    return rows[(jump > MIN_JUMP_PER_SPEED * speed) & (jump > MIN_JUMP_PER_CHANGE * change)]
 
 
 def _estimate_approach_speed(x: np.ndarray, begin: int, period: float) -> float | None:
