@@ -140,7 +140,7 @@ def test_motion_model_fit_is_unbiased_if_log_rows_are_lost():
     (run,) = campaign.runs
     assert 0.98 < run.valid.mean() < 1.0
     result = free_motion.fit_free_motion([run], campaign.timing)
-    assert result.model.structure.name == "second_order" and result.left < 1.5
+    assert result.model.structure.name == "second_order" and result.reduced_chi_square < 1.5
     assert abs(result.model.delay - 0.0043) < 2e-5
     assert result.noise_std == pytest.approx(5e-6, rel=0.02)
 

@@ -50,7 +50,7 @@ def fit(run, noise):
     ],
     ids=["multisine", "biased", "ten times the noise", "slow"],
 )
-def test_surface_is_estimated_from_bias_at_rest_and_press_run_always_in_contact(run, noise, bias):
+def test_press_run_always_in_contact_gives_surface_if_bias_at_rest_is_measured(run, noise, bias):
     result = fit(replace(run, force_measured=run.force_measured + bias), rest(noise, bias)).posterior
     plane, stiffness = (result.names.index(name) for name in ("plane", "stiffness.0"))
     assert abs(result.mean[plane]) < 4.0 * np.std(result.draws[:, plane]) < 1e-4

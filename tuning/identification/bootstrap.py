@@ -24,8 +24,7 @@ from tuning.identification.force_readings import ForceReadings
 
 MIN_CONTACTS_FOR_BOOTSTRAP = 6  # minimum number of contacts for a bootstrap
 FITS_PER_CHUNK = 5  # number of fits that one worker computes and saves as one checkpoint
-# Maximum ratio of the bootstrap's standard deviation to the posterior's; above it, the bootstrap's intervals
-# are used.
+# The bootstrap's intervals are used if its standard deviation divided by the posterior's exceeds this value.
 MIN_STD_RATIO = 1.5
 
 

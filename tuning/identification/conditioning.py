@@ -162,7 +162,7 @@ def _invert_scaled(covariance: np.ndarray) -> np.ndarray:
 
 
 def _draw_normal_marginals(prior: Mechanism, number: int, seed: int) -> DrawsByKey:
-    """Draw the parameters to which the prior gives a normal distribution; return one key per list entry."""
+    """Draw the parameters with a normal prior distribution; each element of a list gets its own key."""
     normal = {key for key, entry in prior.uncertainty.items() if entry.distribution == "normal"}
     result: DrawsByKey = {}
     for key, values in draw(prior, number, seed).items():

@@ -65,16 +65,16 @@ class ContactFit:
         return self.problem.readings
 
     @property
-    def left(self) -> float:
+    def reduced_chi_square(self) -> float:
         """Return chi-squared per degree of freedom."""
         return self.posterior.best[2].misfit / self.degrees_of_freedom
 
     def draws(self) -> np.ndarray:
         """Return posterior draws, shape (draws, parameters), widened if the residuals exceed the noise."""
         values = self.posterior.draws
-        if self.left <= MAX_REDUCED_CHI_SQUARE or self.resampled:
+        if self.reduced_chi_square <= MAX_REDUCED_CHI_SQUARE or self.resampled:
             return values
-        return values.mean(axis=0) + (values - values.mean(axis=0)) * np.sqrt(self.left)
+        return values.mean(axis=0) + (values - values.mean(axis=0)) * np.sqrt(self.reduced_chi_square)
 
 
 def fit_contact(
@@ -286,8 +286,8 @@ def _has_dead_zone(posterior: Posterior) -> bool:
 def _is_silent_outside(runs: Sequence[LoggedRun], problem: ContactProblem, posterior: Posterior) -> bool:
     """Return whether most readings before and after the contacts are exactly 0, which shows a dead zone.
 
-    A fit alone may not reveal a dead zone: a nearer surface gives more penetration, and so more model force,
-    which hides the force that the dead zone removes.
+    A fit alone may not reveal a dead zone, because a wrong surface position can have the same effect on the
+    force as the dead zone.
     """
     delay, plane, _ = posterior.best
     position, _ = problem.motion.at(delay)

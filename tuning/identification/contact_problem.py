@@ -245,13 +245,13 @@ class ContactProblem:
         return Onsets(plane, row, columns, *compute_onset_weights(rate, left))
 
     def _filter(self, tables: list[np.ndarray], onsets: Onsets | None, first, whitening) -> np.ndarray:
-        """Apply the lag of the sensor and the whitening filter to values in the rows near contact.
+        """Apply the sensor's lag and the whitening filter to the regressors in the rows near contact.
 
         Args:
-            tables: Values in these rows at each of the times `periods_before`, each (surface positions,
-                regressors, rows); 0 out of contact.
+            tables: Regressors in the rows near contact, one array (surface positions, regressors, rows) for
+                each of the times `periods_before`; 0 out of contact.
             onsets: Onsets of contact, or None if the sensor has no lag.
-            first: Values just after the onsets, shape (regressors, onsets), or None.
+            first: Regressors just after the onsets, shape (regressors, onsets), or None.
             whitening: Coefficients of the whitening filter.
         """
         if onsets is None or not tables[0].size:

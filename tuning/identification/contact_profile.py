@@ -28,7 +28,7 @@ FINAL_GRID_DROP = 30.0  # twice the maximum drop of the log posterior from its p
 # Twice the maximum drop in the second grid; larger, because the coarse grid's log posterior is inaccurate.
 COARSE_GRID_DROP = 400.0
 SECOND_GRID_SURFACES = 15  # number of surface positions at each delay of the second grid
-MAX_CELL_EDGES = 1000  # maximum number of cell edges; a surface that is hardly determined would need more
+MAX_CELL_EDGES = 1000  # maximum number of cell edges; an uncertain surface position would need more
 COARSE_STD_FACTOR = 2.0  # the coarse grid's standard deviation of the surface is multiplied by this factor
 FINAL_GRID_DELAYS, FINAL_GRID_SURFACES = 61, 13  # numbers of delays and surface positions of the final grid
 DELAY_SEARCH_HALF_WIDTH = 0.003  # s, half width of the search around an approximate delay
@@ -67,8 +67,8 @@ def compute_posterior(
     Args:
         problem: Readings, motion and contact law.
         seed: Seed of the random numbers.
-        near: Approximate delay [s] and surface position [m]. All delays are searched if it is None, or if the
-            best delay may be far from the approximate one.
+        near: Approximate delay [s] and surface position [m]. All delays are searched if `near` is None, or if
+            the best delay may be far from the approximate one.
         size: Numbers of delays and surface positions of the final grid.
     """
     delays, start = (

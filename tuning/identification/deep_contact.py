@@ -28,11 +28,12 @@ MIN_DEEP_LANES = 6  # minimum number of deep lanes for which pseudo-rows save ti
 LANES_FOR_LAW_CHOICE = 8  # number of deep lanes that suffice to fit the shape of a contact law
 MIN_DEPTH_SHARE = 0.1  # minimum ratio of the smallest depth of a deep lane to its median depth
 DELAY_RANGE = 0.002  # s, range of delays that one table covers
-DELAY_TOLERANCE = 1e-9  # s; a search near a delay ends at the limits of the range, up to rounding errors
+DELAY_TOLERANCE = 1e-9  # s; a table also covers delays that exceed its range by a rounding error
 DELAY_NODES = 8  # number of delays at which the interpolation is exact
 # numbers of surface positions at which the interpolation is exact: first for a linear force, then for others
 SURFACE_NODES = 2, 4
-# range of surface positions that one table of a nonlinear force covers, relative to the smallest depth
+# width of the range of surface positions that one table covers, divided by the smallest depth; the range of a
+# linear force has no lower end
 SURFACE_RANGE_SHARE = 0.1
 # maximum norm of the interpolation errors of all readings, in standard deviations of the noise
 MAX_INTERPOLATION_ERROR = 0.01
@@ -129,7 +130,7 @@ class SummarisedProblem(ContactProblem):
         return super().fit_surfaces(delay, planes, pseudo)
 
     def _is_pushing(self, table: _DesignTable, fits: list[CoefficientFit]) -> bool:
-        """Return whether the force is positive in every row of the deep lanes for all fits."""
+        """Return whether all fits give a positive force in every reading that the table replaces."""
         if self.law.pulls or not self.damping_indices:
             return True
         return all(np.all(compute_force(fit.coefficients[None], table.extreme) > 0.0) for fit in fits)
@@ -200,7 +201,7 @@ class _DesignTable:
         return distance <= DELAY_TOLERANCE and low <= planes.min() and planes.max() < high
 
     def rows(self, delay: float, planes: np.ndarray) -> PseudoRows:
-        """Interpolate the pseudo-rows at a delay [s] and at surface positions [m]."""
+        """Interpolate the rows that replace the readings, for a force delay [s] and surface positions [m]."""
         by_delay = self.by_delay(delay)
         nodes = self.factor[:, :-2].reshape(len(self.factor), len(self.delays), len(self.planes), -1)
         columns = np.einsum("rdpc,d->rpc", nodes, by_delay)

@@ -13,7 +13,7 @@ from tuning.identification.contact_fit import ContactFit
 from tuning.identification.result import ParameterEstimate
 
 DAMPING_KEY, FORCE_DELAY_KEY = "contact.damping", "rig.force_sensor.delay"
-# Draws accumulate at 0 if more than this share of them is below this number of their standard deviations.
+# Draws accumulate at 0 if a share above the first number lies below the second number of standard deviations.
 MAX_SHARE_AT_ZERO, ZERO_WIDTH_SIGMAS = 0.005, 0.1
 
 

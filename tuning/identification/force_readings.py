@@ -25,7 +25,7 @@ class ForceReadings:
     entries: tuple[int, ...]  # indices that occur in `entry`
     std: float  # N, standard deviation of the noise after whitening
     whitening: tuple[float, ...] = (1.0,)  # coefficients of the filter that whitens the noise
-    threshold: float = 0.0  # N, smallest predicted force at which a reading is used; a dead zone hides others
+    threshold: float = 0.0  # N, smallest predicted force of a used reading; a dead zone affects smaller ones
     bias: tuple[float, float] | None = None  # N, prior mean and standard deviation of the sensor's bias
 
     @classmethod

@@ -25,7 +25,7 @@ from tuning.identification.structure_choice import (
 
 SETTLING_TIME_CONSTANTS = 10.0  # duration of a transient, in time constants
 ASSUMED_TIME_CONSTANT = 0.05  # s, time constant of the motion simulator that is assumed before the fit
-MAX_REDUCED_CHI_SQUARE = 1.3  # maximum chi-squared per degree of freedom without wider intervals
+MAX_REDUCED_CHI_SQUARE = 1.3  # chi-squared per degree of freedom above which the intervals are widened
 # Minimum p-value of the residual without a model error. It is low, because a model error widens the
 # intervals.
 MODEL_ERROR_P_VALUE = 1e-6
@@ -55,7 +55,7 @@ class FreeMotion:
         return self.chosen.fit
 
     @property
-    def left(self) -> float:
+    def reduced_chi_square(self) -> float:
         """Return chi-squared per degree of freedom: the ratio of residual power to noise power."""
         error, noise = self.misfit()
         return float(2.0 * np.sum(np.abs(error / noise) ** 2)) / max(self.fit.degrees_of_freedom, 1)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-MIN_PERIOD_ROWS = 100  # shortest period of a command that is searched for
+MIN_PERIOD_ROWS = 100  # rows, shortest period that the search for a periodic command considers
 VARIANCE_SMOOTHING_LINES = 15  # number of adjacent lines whose noise variance is averaged
 SIDE_LINES = 6  # local polynomial method: lines on either side of the estimated line
 POLYNOMIAL_DEGREE = 2  # local polynomial method: degree of response and transient

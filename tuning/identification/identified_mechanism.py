@@ -96,7 +96,10 @@ def make_mechanism(
 
 
 def compute_bound_excess(key: str, draws: np.ndarray) -> float:
-    """Return how far the mean of the draws is below the lower bound 0; 0 if it is not, or without a bound."""
+    """Return how far the mean of the draws is below the parameter's lower bound of 0.
+
+    Return 0 if the mean is not below 0, or if the parameter has no lower bound.
+    """
     bounded = key.endswith(".delay") or key.startswith("contact.damping")
     return max(-float(draws.mean()), 0.0) if bounded else 0.0
 

@@ -8,9 +8,9 @@ contacts, the information criterion replaces cross-validation.
 
 A law without damping is chosen only if the user names it. To first order, a contact determines only the
 difference damping - stiffness * force delay. A law without damping attributes the whole difference to the
-delay, whose interval is then much too narrow. The linear law is not needed, because the Kelvin-Voigt law
-includes it. For the same reason, a law whose damping is zero at zero depth is chosen only if the contacts
-exclude damping at the onset.
+delay, whose interval is then much too narrow. A law whose damping is zero at zero depth has this fault at the
+onset. It is therefore chosen only if the contacts exclude damping at the onset. The linear law is not needed,
+because the Kelvin-Voigt law includes it.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ class IdentificationOptions:
     law: str | None = None  # name of the contact law, or None to choose the simplest law
     fixed: Mapping[str, Any] = field(default_factory=dict)  # fixed parameters by key: numbers or lists
     bayes: bool = False  # whether to combine the logs with the normal distributions of the prior
-    hold_out: float = 0.2  # share of the contacts that a test fit omits; they test this fit
+    hold_out: float = 0.2  # share of the contacts that a test fit omits; these contacts test the fit
     bootstrap: int = 0  # number of bootstrap fits; 0: no bootstrap
     limit: float = 0.01  # largest allowed effect of all defects on the restitution
     calibration: float = 0.001  # relative standard uncertainty of the force sensor's scale

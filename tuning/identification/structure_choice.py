@@ -2,8 +2,9 @@
 
 The Bayesian information criterion (Schwarz 1978) compares the candidates. If even the best candidate has a
 chi-squared per degree of freedom above 1, the noise variance is multiplied by this value for all candidates.
-Otherwise, additional poles would fit nonlinear friction. A candidate is excluded if a smaller structure is
-equivalent: if a zero cancels a pole, or if the spectra hardly determine a parameter.
+Without this factor, structures with additional poles would be chosen because they fit nonlinear friction. A
+candidate is excluded if a smaller structure is equivalent: if a zero cancels a pole, or if the spectra hardly
+determine a parameter.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ POLE_ZERO_TOLERANCE = 0.05  # maximum distance of a zero that cancels a pole, di
 MAX_RELATIVE_STD = 0.3  # maximum relative standard deviation of a parameter that the spectra determine
 NOISE_P_VALUE = 0.01  # minimum p-value of a residual that noise explains; no larger structure is then fitted
 NEGATIVE_DELAY_SIGMAS = 3.0  # minimum distance of a significantly negative delay from 0, in std
-# Maximum difference of an acceptable structure's criterion from the best value; the smallest one is chosen.
+# Maximum difference of an acceptable structure's criterion from the best value; the smallest acceptable
+# structure is chosen.
 MAX_CRITERION_DEFICIT = 2.0
 
 
@@ -92,8 +94,7 @@ def find_fault(fit: SpectrumFit, inflation: float = 1.0) -> str:
     if fit.model.delay < -NEGATIVE_DELAY_SIGMAS * relative[-1] and fit.model.structure.order:
         return "its delay is negative"
     for name, std, value in zip(fit.model.names, relative, fit.model.parameters, strict=True):
-        # Logarithms are fitted, so their standard deviations are relative already; coefficients of zeros are
-        # not.
+        # The standard deviation of a logarithm is relative. Coefficients of zeros are not logarithms.
         share = std / abs(value) if name.startswith("zero") else 0.0 if name == "delay" else std
         if not share < MAX_RELATIVE_STD:
             return f"{name} is not determined"

@@ -25,7 +25,7 @@ MIN_HOLD_CRITERION_GAIN = 2.0  # minimum decrease of the information criterion t
 DEFECT_P_VALUE = 1e-3  # maximum p-value of a significant defect
 MAX_FREQUENCY_RATIO = 4.0  # highest evaluated frequency, divided by the contact frequency
 CONTACT_STATE_DRAWS = 40  # number of posterior draws that must agree whether a row is in contact
-MAX_DELAY_SHARE = 0.93  # maximum force delay that passes the check, as a share of the longest in the search
+MAX_DELAY_SHARE = 0.93  # maximum force delay that passes the check, as a share of the longest delay searched
 MIN_CONTACTS_FOR_DEAD_ZONE = 5  # minimum number of contacts for the check of small readings
 MAX_NONZERO_SHARE = 0.8  # maximum share of nonzero readings with a dead zone
 CUTTING_DEAD_ZONE_P_VALUE = 0.01  # maximum p-value that shows a dead zone which is not subtracted
@@ -91,10 +91,11 @@ def _check_motion_misfit(motion: FreeMotion, frequency: float) -> CheckResult:
     near = middle <= max(MAX_FREQUENCY_RATIO * frequency, middle[0])
     worst = int(np.argmax(excess * near))
     degrees_of_freedom = max(motion.fit.degrees_of_freedom, 1)
-    probability = stats.chi2.sf(motion.left * degrees_of_freedom, degrees_of_freedom)
+    probability = stats.chi2.sf(motion.reduced_chi_square * degrees_of_freedom, degrees_of_freedom)
     return CheckResult(
         "motion model",
-        f"leaves {motion.left:.3g} times the noise's power, {excess[worst]:.2g} of the motion near contacts",
+        f"leaves {motion.reduced_chi_square:.3g} times the noise's power, "
+        f"{excess[worst]:.2g} of the motion near contacts",
         bool(probability < DEFECT_P_VALUE),
         float(np.pi / 2.0 * excess[worst]),
         f"{middle[worst]:.3g} Hz",
@@ -162,7 +163,7 @@ def check_contact_model(
         mass: Equivalent mass of the numerical model [kg].
         frequency: Contact frequency [Hz].
         lag: Phase delay from the command to the force reading [s].
-        flags: Flag of each run.
+        flags: Whether to compare each run.
     """
     lines = [
         _check_law_residual(contact, runs, flags),
@@ -314,7 +315,7 @@ def estimate_restitution_errors(
         residual = (readings.force[:rows, lane] - predicted[:rows, lane]) * touching
         scale = mass * before * abs(after / before)
         errors[lane] = -float(np.sum(residual * speed)) * period / scale / before
-        # Of coloured noise, only the low-frequency part affects the impulse.
+        # Only the low-frequency part of coloured noise affects the impulse.
         slow = readings.std / abs(float(np.sum(readings.whitening)))
         stds[lane] = slow * period * float(np.sqrt(np.sum((speed * touching) ** 2))) / scale / before
     return errors, stds
@@ -335,7 +336,7 @@ def _check_restitution(
 
 
 def _locate_worst(contact: ContactFit, runs: list[LoggedRun], chosen: np.ndarray, values: np.ndarray) -> str:
-    """Return the log file and the time of that chosen run that has the largest of `values`."""
+    """Return the log file and the time of the run with the largest of `values` among the chosen runs."""
     run = runs[int(np.flatnonzero(chosen)[np.argmax(values)])]
     first = run.tick[int(np.argmax(run.valid))]
     return f"{run.source} from {run.begin + first * contact.problem.motion.period:.1f} s on"

@@ -255,7 +255,7 @@ class _RunsOfFile:
         contact: tuple[int, int] | None,
         number: int | None,
     ) -> LoggedRun:
-        """Convert part of a segment to a run; `number` is the contact index if the log contains none."""
+        """Convert part of a segment to a run; `number` is the run's contact index if the log has none."""
         channels = {
             name: None if values is None else values[part] for name, values in segment.channels.items()
         }
@@ -288,8 +288,8 @@ def make_timing(mapping: LogMapping, prior: Mechanism | None) -> CampaignTiming:
     """Return the timing of the logs, from the mapping or, where the mapping omits it, from the prior.
 
     Raises:
-        InputError: If neither states the control period, or if the rate of the rows does not fit the control
-            period.
+        InputError: If neither the mapping nor the prior states the control period, or if the rate of the rows
+            does not fit the control period.
     """
     spec, rig = mapping.timing, None if prior is None else prior.rig
     period = spec.control_period or (rig and rig.control_period)

@@ -103,7 +103,10 @@ def _convert_to_si(
 def _select_tick_rows(
     log: OpenLog, mapping: LogMapping, x: np.ndarray, stamps: np.ndarray | None, period: float
 ) -> tuple[np.ndarray | slice, list[str]]:
-    """Select the rows at the ticks, and return notes; without stamps, `rate` states the rows per period."""
+    """Select the rows at the ticks, and return notes.
+
+    Without time stamps, the rate of the rows in the mapping determines the number of rows per period.
+    """
     rows, rate = mapping.timing.rows_per_period, mapping.channels.time.rate
     if mapping.timing.clock == "index":
         stamps, rows = None, rows or 1
@@ -171,7 +174,7 @@ def _check_stamps_in_groups(log: OpenLog, mapping: LogMapping, wanted: Mapping[s
 
 
 def _find_other_stamps(column: str, time: str, names: Sequence[str]) -> list[str]:
-    """Return the columns of time stamps in those groups that contain `column` but not the column `time`."""
+    """Return the time-stamp columns of every group that contains `column` but not `time` (column names)."""
     result = []
     for candidate in names:
         name = re.split(r"[/.]", candidate)[-1]

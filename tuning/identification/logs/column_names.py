@@ -1,8 +1,8 @@
 """Channel and unit that the name of a log's column indicates.
 
 A name consists of words: `SetPos`, `x_cmd`, `Position command [mm]`, `/drive/position/act`. One word states
-the quantity, another one whether it is desired or measured. A name that states no quantity has the quantity
-of its unit.
+the quantity, another one the role (desired or measured). A name that states no quantity has the quantity of
+its unit.
 """
 
 from __future__ import annotations

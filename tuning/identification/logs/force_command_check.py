@@ -107,7 +107,10 @@ def _check_mass(label: str, fits: dict[int, FitsByConvention], mass: float) -> N
 
 
 def _check_row(label: str, fits: dict[int, FitsByConvention], mass: float, row: str) -> str | None:
-    """Raise `InputError` if the log shows another row convention; return a note if the log shows none."""
+    """Raise `InputError` if the log shows another row convention than `row`.
+
+    Return a note if the log shows no row convention.
+    """
     clearest, choice = 0.0, None
     for by_way in fits.values():
         way, best = _select_best_fit(by_way)

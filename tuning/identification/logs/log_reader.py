@@ -27,7 +27,7 @@ class LogReader(NamedTuple):
     read: Callable[[Sequence[str]], ColumnsByName]
     # Time stamps [s] of columns that were read, with a common origin.
     clocks: StampsOfColumns = find_no_stamps
-    stamps: Collection[str] = ()  # names of the columns that contain such time stamps
+    stamps: Collection[str] = ()  # names of the columns that contain separate time stamps of other columns
     units: Mapping[str, str] = {}  # unit of each column for which the file states one, as the file spells it
 
 

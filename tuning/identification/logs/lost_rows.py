@@ -36,7 +36,7 @@ class LogSegment(NamedTuple):
     """Segment of a log without a long gap, with one row per tick."""
 
     tick: np.ndarray  # int64
-    channels: dict[str, np.ndarray | None]  # values of each channel in SI units; NaN or -1 in lost rows
+    channels: dict[str, np.ndarray | None]  # SI values of each channel; NaN (integers: -1) in lost rows
     valid: np.ndarray  # bool, False in lost rows
 
 

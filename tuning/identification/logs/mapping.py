@@ -38,7 +38,7 @@ class Channel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Numeric column of a log and its conversion to SI units."""
 
     column: ColumnName  # name of the column
-    # If it is not specified, the unit that the file states, else the SI unit.
+    # Unit of the column; by default the unit that the file states or, if it states none, the SI unit.
     unit: Annotated[str, Meta(min_length=1, max_length=20)] | None = None
     # Factor; if the unit is "counts", the value of one count in SI units.
     scale: Annotated[float, key_metadata("of the column's number", "")] = 1.0

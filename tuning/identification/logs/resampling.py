@@ -49,8 +49,9 @@ def split_sparse_rows(
 ) -> dict[str, np.ndarray | None] | None:
     """Replace columns with empty cells by their readings; return the time stamps of the readings [s].
 
-    Such a log has one row per message, with the channels of one topic. Returns None, and changes nothing, if
-    no column has so many empty cells.
+    Many cells are empty if a log has one row per message, because a message contains only the channels of one
+    topic. Returns None, and changes nothing, if the share of empty cells is below `MIN_EMPTY_SHARE` in every
+    column, or if a column is empty.
 
     Args:
         columns: Values of each channel, changed in place.

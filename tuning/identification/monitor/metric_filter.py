@@ -15,7 +15,8 @@ from scipy import stats
 from tuning.identification.monitor.metrics import BIAS_INDEX, METRIC_NAMES, NOISE_INDEX
 
 NOISE_LEVEL_STD = 0.1  # day-to-day variation of the force noise's level (relative standard deviation)
-COVERAGE_PROBABILITY = 0.99  # probability that metrics which agree with the file's uncertainty are covered
+# probability that `covers` is true for metrics of a rig that agrees with the mechanism file
+COVERAGE_PROBABILITY = 0.99
 
 
 class MetricFilter:
