@@ -35,7 +35,10 @@ def compare_with_global_search(
     settings: TuneSettings,
     factor: int = EVALUATION_FACTOR,
 ) -> GlobalComparison | None:
-    """Compare tuned gains with a search of `factor` times the evaluations of tuning; None without gains."""
+    """Compare tuned gains with a global search that makes `factor` times as many evaluations as tuning.
+
+    Return None if tuning found no gains.
+    """
     if found.best is None:
         return None
 

@@ -19,7 +19,7 @@ PROBED_LANES_PER_TILE = 32
 def map_over_tiles(function: Callable[[Any], Outcome], arguments: Any) -> Outcome:
     """Apply `function` to groups (tiles) of lanes, so that a slow lane delays only its own tile."""
     lanes = jax.tree.leaves(arguments)[0].shape[-1]
-    # On an accelerator, the memory already limits the number of problems, and thereby of lanes.
+    # On an accelerator, the memory already limits the number of problems, and thereby the number of lanes.
     size = math.gcd(lanes, find_tile_size(lanes, PROBED_LANES_PER_TILE))
     chunks = jax.tree.map(
         lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes // size, size), -2, 0), arguments

@@ -103,7 +103,7 @@ def find_gains(
                 validation, i, search.starts, agreed, settings.seed, objective
             )
             search.evaluations += more
-    # With probes, if the starts agree, polishing changes the value less than other scenarios would.
+    # With probes, if the starts agree, polishing changes the objective less than new scenarios would.
     polishing = 0 if probed and not unfinished else settings.polish * len(validation.names)
     if objective.function is not None:
         # A user's function may have many kinks, for example if it is the maximum of several metrics.

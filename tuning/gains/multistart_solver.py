@@ -139,7 +139,10 @@ def solve_tasks(
 
 
 def _mark_converged(problems: list[_StartState], before: list[float]) -> None:
-    """Mark each problem as converged if the round reduced its loss from `before` by less than the minimum."""
+    """Mark problems as converged whose objective improved by less than `MIN_RELATIVE_IMPROVEMENT` in a round.
+
+    `before` holds the loss of each problem before the round.
+    """
     for problem, loss in zip(problems, before, strict=True):
         if problem.status == STEP_LIMIT and problem.loss > (1 - MIN_RELATIVE_IMPROVEMENT) ** 2 * loss:
             problem.status = SOLVER_STATUSES.index("converged")
@@ -267,7 +270,10 @@ def _build_call(tasks, names, bounds, objectives, number):
 
 
 def _sort_by_duration(task: TuneTask) -> Any:
-    """Return the task's scenarios; sort them by duration if they have probes, which are computed in tiles."""
+    """Return the task's scenarios, sorted by duration if they have probes.
+
+    Scenarios with probes are simulated in tiles. After sorting, all scenarios of a tile take a similar time.
+    """
     if not task.probed:
         return task.scenarios
     # The time limit increases with the duration of the contacts.

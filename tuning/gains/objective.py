@@ -72,15 +72,16 @@ class Objective:
         N  max(0, A - 1) [1], where A is the amplification of the force sensor's white noise, which depends
            only on the gains (`Compensator.noise_amplification`)
 
-    C and S include the contacts of the probes. Let m be the least metric of all gains, X the value of one
-    penalty (C, S or N) at these gains, and w its weight. At the minimum of J, the metric is at most sqrt(m^2
-    + (w limit X)^2). A weight thus costs the same multiple of the limit on every rig.
+    C and S include the contacts of the probes. Let m be the least metric that any gains reach, X the value of
+    one penalty (C, S or N) at these gains, and w the penalty's weight. At the minimum of J, the metric is at
+    most sqrt(m^2 + (w limit X)^2). Because of the factor `limit`, a weight permits the same additional error,
+    in multiples of the limit, on every rig.
 
     With a `tolerance`, max(metric - tolerance, `TOLERATED_ERROR_FACTOR` metric) replaces the metric, so that
     the penalties decide between gains whose error is within the tolerance.
 
     Raises:
-        InputError: If the name is unknown, a weight is negative or not finite, or `divergence_weight` is 0.
+        InputError: If `name` is unknown, a weight is negative or not finite, or `divergence_weight` is 0.
     """
 
     name: str = "rms"  # name of the metric, one of `OBJECTIVE_NAMES`

@@ -108,7 +108,7 @@ class ParetoFront(NamedTuple):
 
 
 def find_dominated(places: Sequence[tuple[float, float]]) -> list[bool]:
-    """Return for each pair (error, cost) whether another has a smaller number and no larger number."""
+    """Return for each pair (error, cost) whether another pair is smaller in one number and larger in none."""
     return [
         any(e <= error and a <= noise and (e, a) != (error, noise) for e, a in places)
         for error, noise in places

@@ -26,7 +26,7 @@ from tuning.gains.validation import Validation
 # ladder extends to a larger weight, since the solver otherwise finds no quiet, inaccurate gains.
 LADDER_ENDS, FIRST_LADDER_ENDS = (0.5, 10.0), (1.0, 100.0)
 MAX_ACCURATE_ERROR_RATIO = 1.05  # largest error of accurate gains / least error
-MIN_NOISE_EXCESS = 0.1  # a smaller noise amplification minus 1 counts as this value in a ladder's scale
+MIN_NOISE_EXCESS = 0.1  # lower bound, in a ladder's scale, of the noise amplification minus 1
 MAX_NEIGHBOUR_SEARCHES = 4  # largest number of passes that start from the gains of neighbouring weights
 MIN_IMPROVEMENT = 1e-3  # minimum relative improvement of a point that leads to a further pass
 
@@ -38,7 +38,7 @@ class ParetoCriterion(NamedTuple):
     weight: str  # name of the field of `Objective` that weights the criterion
     cost: str  # name in JSON files
     words: str  # name in sentences
-    least: float  # a smaller term of the criterion counts as this value in a ladder's scale [1]
+    least: float  # lower bound, in a ladder's scale, of the criterion's term [1]
 
 
 NOISE_CRITERION = ParetoCriterion(

@@ -72,7 +72,8 @@ def build_least_error_objective(objective: Objective) -> Objective:
 def build_quiet_objective(objective: Objective, scenarios: int, accurate: CommandExcess) -> Objective:
     """Return the objective for tuning quiet gains.
 
-    It divides each penalty by that penalty's value at the most accurate gains, or by a minimum value.
+    The objective divides each penalty by the penalty's value at the most accurate gains or, if this value is
+    small, by a minimum.
     """
     return replace(
         objective,

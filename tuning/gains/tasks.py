@@ -92,8 +92,9 @@ def build_task(
 
     Each scenario has its own realisation of the sensor noise. With noise, the default number of `scenarios`
     is larger, because the gains would fit a few realisations too closely. If `probed` is true, the number
-    includes transparency probes. `setting` names one of the compensator's fixed sets of gains, which replaces
-    the gains by the literature's rule. Raise ValueError if `probed` is true and a `common` program is given.
+    includes transparency probes. `setting` names one of the compensator's fixed sets of gains. The task then
+    has these gains in place of the gains by the literature's rule. Raise ValueError if `probed` is true and a
+    `common` program is given.
     """
     if probed and common is not None:
         raise ValueError("probed: found True, expected False for mechanisms that share a program")

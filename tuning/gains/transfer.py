@@ -109,7 +109,7 @@ def find_nearest(mechanism: Mechanism, tuned: Sequence[EarlierGains]) -> Earlier
 def find_nearest_of_each(
     mechanism: AnyMechanism, sources: Sequence[Sequence[EarlierGains]]
 ) -> list[EarlierGains]:
-    """Return the nearest gains of each list in `sources`; none for six axes, without a distance measure."""
+    """Return the nearest gains of each list in `sources`; none for six axes (no distance is defined)."""
     if not isinstance(mechanism, Mechanism):
         return []
     return [find_nearest(mechanism, tuned) for tuned in sources]
@@ -133,7 +133,7 @@ def transfer_gains(
         old, new = old_literature[gain.name], new_literature[gain.name]
         lower, upper = float(gain.lower(target)), float(gain.upper(target))
         span = float(gain.upper(source)) - float(gain.lower(source))
-        # These forms leave a gain unchanged to the last digit if the mechanisms are equal.
+        # These formulas leave a gain unchanged to the last digit if the mechanisms are equal.
         if gain.logarithmic and old > 0:
             value = gains[gain.name] * (new / old)
         else:

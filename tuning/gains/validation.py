@@ -134,7 +134,7 @@ class Validation:
             probes = mask_probes(number) & self.tasks[0].probed
             values = self._evaluate_function(objectives[which[0]], outcome, pairs)
             for index, task in enumerate(which[rows]):
-                mask = is_scheduled[:, index, 0]  # the wanted contacts are the same at every point
+                mask = is_scheduled[:, index, 0]  # the scheduled contacts are the same at every point
                 error, excess, chatter = (np.moveaxis(term[:, index], 1, 0) for term in terms)
                 losses[rows.start + index, columns] = evaluate_objective(
                     objectives[task],
@@ -173,7 +173,7 @@ class Validation:
         ended = self.tasks[0].model.begin_batch(self.loop, values, batch, read)
         if not noise:
             return lambda: (ended(), np.ones(shape))
-        # A point's amplification is the mean of its scenarios', as in `gains.objective.compute_residuals`.
+        # A point's amplification is the mean over its scenarios, as in `gains.objective.compute_residuals`.
         constants = KnownConstants(
             jax.numpy.asarray(scenarios.control_period), jax.numpy.asarray(scenarios.clearance)
         )
