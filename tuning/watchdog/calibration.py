@@ -39,7 +39,7 @@ from tuning.watchdog.signal_extremes import SignalExtremes
 from tuning.watchdog.verdict import DEFAULT_ALLOWED_RATES, AllowedAlarmRates, add_verdict
 
 LIMIT_MARGIN = 1.5  # limit divided by the extreme signal of good runs [1]
-FITTED_RUNS = 2048  # number of runs that determine the limits, clipped to 1/16 to 1/4 of all runs
+FITTED_RUNS = 2048  # number of runs that determine the limits; at least 1/16, at most 1/4 of all runs
 MIN_FORCE_LIMIT_SHARE = 0.02  # smallest limit of a force, divided by the largest force reading [1]
 DEFAULT_DRAWS = 2048  # number of draws without a sweep; enough for the false-alarm rate if 1/3 are good runs
 DEFAULT_ERROR_LIMIT = 0.01  # limit of the restitution error without a sweep [1]
@@ -273,9 +273,9 @@ def _find_largest_draws(loaded: LoadedGains) -> dict[str, float]:
 
 
 def _has_status(loaded: LoadedGains) -> bool:
-    """Return whether the compensator reports a status on the rig.
+    """Return whether the compensator reports a status (`jaxhil.rig.law_status`) on the rig.
 
-    With a status, the watchdog detects a contact by the force command, wherever the surface is.
+    If it does, the watchdog detects a contact by the force command, and needs no position of the surface.
     """
     law = COMPENSATORS.get(loaded.compensator)
     if law is None:

@@ -4,8 +4,8 @@ The expected restitution is a polynomial in p = sqrt(k_0/k) - 1, w = v/v_0 - 1 a
 is the approach speed, M the equivalent mass, k and b are the stiffness and damping that the watchdog
 estimates (`jaxhil.rig.watchdog`), and k_0 and v_0 are reference values. An unknown delay delta of the force
 changes the estimate of k only by the factor cos(omega delta), but the estimate of b by -k delta, which the
-rig cannot distinguish from damping. The polynomial contains b only if this reduces the error for other
-contacts.
+rig cannot distinguish from damping. The polynomial contains b only if this reduces the error for contacts to
+which it was not fitted.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ class ExpectationFit(NamedTuple):
     loss: tuple[float, float]  # range of z in which the polynomial is valid [1]
 
     def limits(self) -> dict[str, float]:
-        """Return coefficients, reference values and ranges as limits of a gain file, by name."""
+        """Return coefficients, reference values and ranges as entries of the gain file's `limits`."""
         ranges = {"softness": self.softness, "speed": self.speed, "loss": self.loss}
         return {
             "reference_stiffness": self.stiffness,

@@ -24,7 +24,8 @@ from tuning.watchdog.alarms import (
 from tuning.watchdog.expectation import ExpectationFit, expected_restitution
 
 UNSEEN_RUN_FACTOR = 1.25  # bound for all other runs / largest value in the used runs [1]
-# Smallest margin, and margin for an accurate expectation, divided by the limit [1].
+# Smallest restitution margin, and restitution margin if the expected restitution is accurate, both divided by
+# the limit of the restitution error [1].
 MIN_MARGIN_SHARE, USUAL_MARGIN_SHARE = 0.25, 0.75
 
 

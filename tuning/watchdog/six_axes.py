@@ -4,7 +4,7 @@ Runs of drawn scenarios are recorded. A run is good if its contacts end well and
 half of the limit. One part of the runs determines the limits: the extreme signals of its good runs times
 a margin. The other part is replayed through the rig's controller with these limits. An alarm in a good run is
 false. A missed alarm is a run without an alarm, although its error exceeds the limit or the mass of the
-numerical model is wrong. The runs with a wrong mass are good runs that are repeated.
+numerical model is wrong. The runs with a wrong mass are repetitions of good runs.
 
 The limit is that of the sweep whose scenarios are recorded or, without a sweep, `ERROR_LIMIT`.
 """
@@ -117,7 +117,7 @@ def _record(
     limit: float,
     progress: Callable[[int], None],
 ) -> list[DrawnRun]:
-    """Record runs with drawn values of the mechanism's uncertain quantities, or those `chosen` of a sweep."""
+    """Record runs with drawn values of the uncertain quantities, or the `chosen` runs of a sweep."""
     runs, mechanism = [], loaded.mechanism
     for first in range(0, scenarios, LANES):
         number = min(LANES, scenarios - first)
@@ -207,7 +207,7 @@ def _stuck_limits(records: list[ControllerRecord]) -> dict[str, float]:
 
 
 def longest_sum(steps: np.ndarray, still: np.ndarray) -> float:
-    """Return the largest sum of successive steps during which the reading is `still` (unchanged)."""
+    """Return the largest sum of successive `steps` of a motion while a reading is `still` (unchanged)."""
     sums = np.cumsum(np.where(still, steps, 0.0))
     last_moved = np.maximum.accumulate(np.where(still, 0.0, sums))
     return float(np.max(sums - last_moved, initial=0.0))
