@@ -76,6 +76,19 @@ def test_identify_command_writes_mechanism_file_from_logs(jaxhil, day, tmp_path)
     assert refused.code == 2 and "mechanism.toml: found a file that jaxhil did not write" in refused.err
 
 
+@pytest.mark.parametrize("mass", [300.0, pytest.param(12.0, marks=pytest.mark.slow)])
+def test_every_contact_of_a_diverging_simulated_log_is_a_run(tmp_path, mass):
+    contacts = {"approach.contacts": 5, "approach.velocity": 0.003}
+    bodies = {"bodies.equivalent_mass": mass, "contact.stiffness": [mass * (2.0 * np.pi * 3.0) ** 2]}
+    mechanism = package.load("rig-300kg", {**contacts, **bodies})
+    run = package.simulate(mechanism, "none")
+    run.to_csv(tmp_path / "run.csv")
+    campaign = read_campaign([tmp_path / "run.csv"], None, mechanism)
+    velocities = [contact.approach_velocity for contact in run.contacts]
+    assert velocities[-1] > 5.0 * velocities[0]
+    assert [logged.speed for logged in campaign.runs] == pytest.approx(velocities, rel=1e-3)
+
+
 def test_identify_command_verdict_is_bad_for_wrong_mapping_file(jaxhil, day, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     path = tmp_path / "map.toml"

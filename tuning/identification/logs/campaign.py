@@ -37,9 +37,9 @@ from tuning.identification.records import Campaign, CampaignTiming, LoggedRun, R
 
 KINDS_SPLIT_AT_CONTACTS = ("tap", "contact")
 MIN_SEGMENT_ROWS = 50  # minimum number of rows in a segment between gaps
-# A simulated contact begins with the rebound velocity of the contact before it, reversed. Minimum velocity jump
-# there, as a multiple of the speed beside it, and of the velocity change in the two periods before and after it.
-MIN_JUMP_PER_SPEED, MIN_JUMP_PER_CHANGE = 1.2, 10.0
+# A simulated contact begins with the rebound velocity of the contact before it, reversed. Minimum jump of the
+# velocity there, relative to the speed and to the velocity's change in the two periods before or after it.
+MIN_JUMP_PER_SPEED, MIN_JUMP_PER_CHANGE = 1.2, 3.0
 
 
 def read_campaign(
@@ -350,7 +350,7 @@ def find_restarts(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
     rows = rows[(rows >= 4) & (rows < len(x) - 3)]
     step = np.diff(x)
     before, after = step[rows - 2], step[rows]
-    change = np.maximum(np.abs(before - step[rows - 4]), np.abs(step[rows + 2] - after))
+    change = np.minimum(np.abs(before - step[rows - 4]), np.abs(step[rows + 2] - after))
     speed = np.maximum(np.abs(before), np.abs(after))
     jump = np.abs(after - before)
     return rows[(jump > MIN_JUMP_PER_SPEED * speed) & (jump > MIN_JUMP_PER_CHANGE * change)]
