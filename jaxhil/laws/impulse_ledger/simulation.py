@@ -139,18 +139,16 @@ class ImpulseLedger(Compensator):
 
     def init(self, gains, constants, ring):
         zeros = jnp.zeros_like(constants.control_period)
-        estimate = contact_model.begin(*contact_model.prior(zeros, [zeros] * len(rig.SPREADS), zeros))
-        reference = reference_trajectory.begin(zeros, estimate.theta)
+        full = {name: zeros + value for name, value in gains.items()}
+        variance = full["delay_spread"] ** 2
         return LedgerState(
             line=empty_delay_line(ring, zeros),
             aligned=Aligned(zeros, zeros),
             flight=FreeFlight(*[zeros] * len(FreeFlight._fields)),
             in_contact=zeros > 0,
-            contact=LedgerContact(
-                zeros, zeros, zeros, zeros, zeros, zeros, zeros, estimate, reference, zeros, zeros
-            ),
+            contact=self._begin(full, zeros, zeros, zeros, zeros, zeros, variance),
             delay=zeros,
-            variance=zeros + gains["delay_spread"] ** 2,
+            variance=variance,
         )
 
     def restart(self, gains, state, begins, fresh):
@@ -210,6 +208,14 @@ class ImpulseLedger(Compensator):
         spreads[-1] = jnp.sqrt(spreads[-1] ** 2 + rig.USUAL_PRELOAD**2)
         return contact_model.prior(gains["prior_stiffness"], spreads, variance)
 
+    def _begin(self, gains, side, speed, origin, lag, depth, variance) -> LedgerContact:
+        """Return a contact before its first reading; arguments as in `LedgerContact`, `depth` [s] scaled."""
+        zeros, prior = jnp.zeros_like(speed), self._prior(gains, variance)
+        return LedgerContact(
+            side, speed, origin, lag, zeros, zeros + rig.MIN_PEAK, zeros, contact_model.begin(*prior),
+            reference_trajectory.begin(depth, prior[0]), zeros, variance,
+        )  # fmt: skip
+
     def _approach(self, prepared, state, contact, signals, position, in_contact):
         """Test the force readings for contact; on lanes in free flight, prepare a contact on the next tick.
 
@@ -231,13 +237,8 @@ class ImpulseLedger(Compensator):
         divisor = jnp.where(approaches, speed, 1)
         origin = side * position - rig.ONSET_PLACE * (period * speed)
         lag = jnp.clip(side * (signals.position_desired - position) / divisor, 0, rig.MAX_LAG)
-        zeros = jnp.zeros_like(speed)
-        prior = self._prior(gains, state.variance)
-        reference = reference_trajectory.begin((side * position - origin) / divisor, prior[0])
-        fresh = LedgerContact(
-            side, speed, origin, lag, zeros, zeros + rig.MIN_PEAK, zeros,
-            contact_model.begin(*prior), reference, zeros, state.variance,
-        )  # fmt: skip
+        depth = (side * position - origin) / divisor
+        fresh = self._begin(gains, side, speed, origin, lag, depth, state.variance)
         contact = select_lanes(free & approaches, fresh, contact)
         contact = contact._replace(
             side=jnp.where(free, side, contact.side), speed=jnp.where(free & ~approaches, 0, contact.speed)

@@ -104,14 +104,14 @@ def estimate_delay(
         (last + 1, 0, *rig.WIDE_STIFFNESS),
         (last + 2, PRELOAD, preload, preload_spread),
     ):
-        old, new = 1 / _above(variances[j], rig.MIN_VARIANCE), 1 / spread**2
+        old, new = 1 / jnp.maximum(variances[j], rig.MIN_VARIANCE), 1 / spread**2
         mean, rows = _observe(mean, rows, index, index, new * value - old * prior_mean[j], new - old)
-    excess = rig.SURPLUS * _above(estimate.squares / _above(estimate.count, 1.0), 1.0)
+    excess = rig.SURPLUS * jnp.maximum(estimate.squares / jnp.maximum(estimate.count, 1.0), 1.0)
     lossy, lossy_rows = _dissipate(mean, rows, 0, variances, False)
     evidence = 0.0
     for index in range(last):
-        variance = _above(rows[index][index], rig.MIN_VARIANCE)
-        ratio = _above(variances[DAMPING + index], rig.MIN_VARIANCE) / variance
+        variance = jnp.maximum(rows[index][index], rig.MIN_VARIANCE)
+        ratio = jnp.maximum(variances[DAMPING + index], rig.MIN_VARIANCE) / variance
         evidence += 0.5 * (jnp.log(ratio) - mean[index] ** 2 / (variance * excess))
         mean, rows = _observe(mean, rows, index, index, 0.0, rig.EXACT)
     odds = jnp.exp(jnp.clip(evidence, -50, 50))  # odds of an elastic contact, from the readings alone
@@ -134,9 +134,9 @@ def _dissipate(
     """Return mean and covariance rows with the dissipative parameters constrained to be >= 0."""
     for row in range(len(DISSIPATIVE)):
         index = first + row
-        variance = _above(rows[row][index], rig.MIN_VARIANCE)
+        variance = jnp.maximum(rows[row][index], rig.MIN_VARIANCE)
         expected, left = zero_or_positive(mean[index], variance, prior_variances[DAMPING + row])
-        old, new = 1 / variance, rig.EXACT if certain else 1 / _above(left, 1 / rig.EXACT)
+        old, new = 1 / variance, rig.EXACT if certain else 1 / jnp.maximum(left, 1 / rig.EXACT)
         mean, rows = _observe(mean, rows, row, index, new * expected - old * mean[index], new - old)
     return mean, rows
 
@@ -172,7 +172,3 @@ def dot(left: Array, right: Array) -> Array:
     XLA fuses these additions with the loop over the lanes; a reduction would be a separate loop.
     """
     return reduce(add, (left[j] * right[j] for j in range(len(left))))
-
-
-def _above(value: Array, least: float) -> Array:
-    return jnp.where(value > least, value, least)
