@@ -22,6 +22,9 @@ LIMITS = {
     "ring-capture": {"bias": 1.3, "mass": 1.5, "delay": 4.0},
     "hydraulic-hexapod": {"bias": 1.3, "mass": 1.5, "delay": 4.6},
 }
+# Largest undisturbed twist error of the scenarios that count. In one scenario of `ring-capture`, a hook that
+# catches in the ideal contact does not catch on the rig.
+SAME_SEQUENCE = 0.3
 
 
 class LedgerWithWrongMass(ImpulseLedger):
@@ -51,8 +54,8 @@ def light_tool(scenarios):
 
 
 @functools.cache
-def energy_error(name, wrong):
-    """Return the rms energy error if a parameter, or None, is wrong."""
+def simulated(name, wrong):
+    """Return the metrics of the scenarios if a parameter, or None, is wrong."""
     mechanism = load_wide(name)
     scenario = {"bias": biased, "tool": light_tool}.get(wrong)
     change = {}
@@ -61,7 +64,13 @@ def energy_error(name, wrong):
     law = WRONG_MASS if wrong == "mass" else LAW
     [metrics] = evaluated(mechanism, law, change, scenario=scenario)
     check_good(metrics)
-    return rms(metrics["energy_error"])
+    return metrics
+
+
+def energy_error(name, wrong):
+    """Return the rms energy error if a parameter, or None, is wrong."""
+    counts = simulated(name, None)["twist_error"] < SAME_SEQUENCE
+    return rms(simulated(name, wrong)["energy_error"][counts])
 
 
 @pytest.mark.slow
