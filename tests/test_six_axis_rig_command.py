@@ -52,9 +52,9 @@ def test_six_axis_rig_command_reports_results_of_a_short_run(jaxhil, gains):
 @pytest.mark.parametrize(
     "change, words",
     [
-        ({"axes": 1}, "mechanism: found 6 axes, expected 1 as in the key axes"),
+        ({"axes": 1}, "mechanism: found 6 axes, expected 1 like the controller"),
         ({"mechanism": gain_document("none")["mechanism"]}, "mechanism: found 1 axes, expected 6"),
-        ({"axes": 3}, "mechanism: found 6 axes, expected 1 as in the key axes"),
+        ({"axes": 3}, "mechanism: found 6 axes, expected 1 like the controller"),
         ({"constants": None}, "constants: found null, expected an object"),
     ],
 )
@@ -85,7 +85,7 @@ def test_rig_rejects_controller_with_another_number_of_axes(gains):
     try:
         address = "127.0.0.1", read_listening_port(process)
         network = Network(address, Injection(), 0, 1, loop.answered_packet_number)
-        with pytest.raises(InputError, match="axes of the controller: found 6, expected 1, as the rig"):
+        with pytest.raises(InputError, match="controller's axes: found 6, expected 1 like the rig"):
             open_session(network, 1)
     finally:
         process.kill()

@@ -233,7 +233,7 @@ class RigHardware:
     def _filter(self, clearance: float, *segments: tuple[MotionState, MotionState, float, float]) -> float:
         """Advance the force sensor's filter by two segments; return its output [N] between the segments.
 
-        A segment contains the motion at both ends, the duration [s] and the deepest penetration before [m].
+        A segment contains the motion at both ends, the duration [s] and the deepest earlier penetration [m].
         """
         outputs = []
         for start, end, duration, deepest in segments:

@@ -144,10 +144,10 @@ class _ContactInterval:
         self._bottom = max(self._before, bottom)
 
     def forces(self) -> tuple[float, float, list[float]]:
-        """Return start and end of the force's interval, and the force [N] at equidistant nodes in between.
+        """Return start and end of the force, and its values [N] at equidistant nodes in between.
 
-        Start and end are elapsed fractions s of the segment. Parabola i of `FORCE_PARABOLAS` passes through
-        the nodes 2 i, 2 i + 1 and 2 i + 2.
+        Start and end are fractions s of the segment's duration. Of the `FORCE_PARABOLAS` parabolas, number i
+        passes through the nodes 2 i, 2 i + 1 and 2 i + 2.
         """
         enters, leaves = _positive_interval(self._depth)
         force_starts, force_ends = _positive_interval(self._hold)

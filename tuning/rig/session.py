@@ -111,8 +111,8 @@ class LoopReport(NamedTuple):
 class SessionReport(NamedTuple):
     """Results of a session: both loops, the contacts, the commands and the trips."""
 
-    empty: LoopReport | None  # loop without a rig; None if the session ended before it
-    run: LoopReport | None  # loop with the simulated rig; None if the session ended before it
+    empty: LoopReport | None  # loop without a rig; None if the session ended before this loop began
+    run: LoopReport | None  # loop with the simulated rig; None if the session ended before this loop began
     contacts: tuple[Any, ...]  # contacts that have ended (for six axes, runs)
     commanded: CommandRange | None  # extreme values of the commands
     tripped: str  # reason for the controller's trip; empty if it has not tripped
@@ -305,7 +305,7 @@ def open_session(network: Network, axes: int, name: str = "udp_controller.py") -
         if opening.axes == axes:
             return opening.session
         network.close()
-        raise InputError(f"{name}: axes of the controller: found {opening.axes}, expected {axes}, as the rig")
+        raise InputError(f"{name}: controller's axes: found {opening.axes}, expected {axes} like the rig")
     network.close()
     raise InputError(f"{name}: the process did not answer a request for a session within {START_TIMEOUT:g} s")
 

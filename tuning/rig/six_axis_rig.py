@@ -1,7 +1,7 @@
 """Simulated rig with six axes for the rehearsal: motion simulator, contact and sensors as in `simulate`.
 
-A run has the episodes of a run of `simulate`, with the same end. The first run is the nominal run. The phases
-of later runs are random, unless the mechanism file specifies the states at the start. All programs are
+A run has the same episodes and the same end as a run of `simulate`. The first run is the nominal run. The
+phases of later runs are random, unless the mechanism file specifies the states at the start. All programs are
 compiled before the session, because compiling takes seconds.
 """
 

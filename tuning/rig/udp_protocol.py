@@ -173,7 +173,7 @@ def _format_of(packet: bytes | bytearray, axes: int | None) -> PacketFormat:
 
 
 def _split(values: list[float], *sizes: int) -> list[Numbers]:
-    """Split a list of values into tuples with these sizes."""
+    """Split a list of values into tuples; `sizes` are their lengths."""
     parts, begin = [], 0
     for size in sizes:
         parts.append(tuple(values[begin : begin + size]))
@@ -212,7 +212,7 @@ class SessionNumbers:
     an answer is not longer than its request, so that forged requests cannot exhaust memory or network.
 
     Args:
-        axes: number of axes of the controller; None to state that of each request.
+        axes: number of axes of the controller; None to repeat the number in each request.
     """
 
     def __init__(self, axes: int | None = None) -> None:

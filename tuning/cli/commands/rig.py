@@ -135,7 +135,7 @@ def load_checked_gains(gains: Path) -> tuple[dict[str, Any], Any, tuple[Any, Any
         if isinstance(mechanism, dict) and is_six_axes(mechanism) != (kind.axes == 6):
             other = 7 - kind.axes
             raise InputError(
-                f"{source}: mechanism: found {other} axes, expected {kind.axes} as in the key axes"
+                f"{source}: mechanism: found {other} axes, expected {kind.axes} like the controller"
             )
         limits = kind.check_document(document, source).limits
     except GainFileError as error:
