@@ -142,7 +142,10 @@ def _list_logs(logs: Any) -> list[Path]:
 
 
 def _prepare_controller(gains: Any, loaded: Any) -> Callable[[Sequence[str]], Any]:
-    """Return a function that makes a controller without given limits; check the code of a bundle."""
+    """Check the code if `gains` is a bundle; return a function that makes controllers.
+
+    The function's argument is a list of limit names. The controller gets the default of each of these limits.
+    """
     from tuning.bundle.checking import check_bundle_code
     from tuning.bundle.controller_kind import kind_of
 

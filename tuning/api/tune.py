@@ -29,7 +29,7 @@ def tune(
 ) -> Any:
     """Tune a compensator's gains for a mechanism, and evaluate the tuned gains on fresh scenarios.
 
-    Equal arguments give gains that are equal to the last bit; so does the command `jaxhil tune`.
+    Equal arguments give equal gains to the last bit. The command `jaxhil tune` gives the same gains.
 
     Args:
         mechanism: result of `jaxhil.load`, or a name or path that `jaxhil.load` accepts; or a list of these,

@@ -77,7 +77,7 @@ class Growth(NamedTuple):
 
     spectral_radius: float  # growth factor of the amplitude per control period [1]
     per_second: float  # growth rate ln(spectral radius)/T [1/s]
-    per_half_oscillation: float | None  # growth factor per half oscillation [1]; None if there is none
+    per_half_oscillation: float | None  # growth factor per half oscillation [1]; None without one
     frequency: float  # frequency of the oscillation [Hz]
     by_gain: dict[str, float]  # derivative of the radius with respect to each gain [1/unit of the gain]
 
@@ -130,7 +130,7 @@ def eigenvalue_cost(mechanism: Mechanism, compensator: str, scenarios: Scenario)
 def compute_growth(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, float], scenarios: Scenario
 ) -> Growth:
-    """Return the growth in that contact of the first scenario that has the largest spectral radius."""
+    """Return the growth in the contact with the largest spectral radius, for the first scenario."""
     shape, values = (
         _program_parameters(mechanism, compensator, scenarios),
         {k: jnp.asarray(v) for k, v in gains.items()},

@@ -66,7 +66,7 @@ class NominalPoint(NamedTuple):
     growth: Growth | None  # growth of the oscillation in contact; None if the loop is not linear
     # ranges of x and y with an error within the limit; None if the error at the nominal point exceeds it
     error_margins: tuple[NominalMargin, NominalMargin] | None
-    # ranges of x and y with peak force and duration within their bounds; None if the nominal point's are not
+    # ranges of x and y with peak force and duration within bounds; None if the nominal point violates a bound
     contact_margins: tuple[NominalMargin, NominalMargin] | None
     # ranges of x and y with a spectral radius of at most 1; None if the radius at the nominal point exceeds 1
     radius_margins: tuple[NominalMargin, NominalMargin] | None
