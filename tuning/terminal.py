@@ -207,9 +207,9 @@ class Progress:
             self.say(text)
 
     def turn_to(self, text: str) -> None:
-        """Count the previous unit, if any, as done, and begin a unit that may be short.
+        """Begin a unit that may be short; the previous unit, if any, counts as done.
 
-        Without a bar, `text` is printed only if no line was printed for `PROGRESS_INTERVAL`.
+        Without a progress bar, `text` is printed only if no line was printed for `PROGRESS_INTERVAL`.
         """
         with self._lock:
             self._end_unit()

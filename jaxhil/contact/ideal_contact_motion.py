@@ -309,9 +309,10 @@ def _update_search(search, step, proposed, value, at_start, crosses, is_located)
 
 
 def _update_state(problem, state, step, trial, correction, is_located):
-    """Return the state after a `step` [s] and its `correction` [s].
+    """Return the state at the end of a step.
 
-    If the step ends at a located event, the next phase of the motion starts.
+    The step has a duration of `step` [s], plus `correction` [s] if it ends at an event (`is_located`). The
+    next phase of the motion starts at the event.
     """
 
     def force_at(s):

@@ -52,7 +52,8 @@ MAX_PROBLEMS = 20  # maximum number of invalid keys of a file in a message
 SUITE_PREFIX = "suite-"  # prefix of the names of the mechanisms for benchmarks
 
 _SIX_INFINITIES = [math.inf] * 6  # default of limits for six axes
-_file_hashes: dict[str, str] = {}  # SHA-256 of the file of each mechanism, by the SHA-256 of its content
+# SHA-256 of the file from which a mechanism was read; the key is the SHA-256 of the mechanism's content
+_file_hashes: dict[str, str] = {}
 
 _BUILTIN_FOLDER = Path(__file__).parent / "builtin"
 _SIX_AXIS_FOLDER = _BUILTIN_FOLDER / "six_axes"

@@ -88,7 +88,7 @@ def count_cells(fastest: float, lags: Any) -> CellCounts:
     plain, window = _power_of_two(fastest), 0
     if np.any(lags > 0):
         shortest = float(np.min(lags))
-        # If the lag is long, the window covers the whole part.
+        # If the lag is long, the sensor's window covers each part of the sampling interval completely.
         if shortest * LAG_WINDOW >= 1:
             plain, window = 0, max(plain, _power_of_two(1 / shortest))
         else:

@@ -226,7 +226,10 @@ def _perturb_scenarios(
 def _compute_derivatives(
     of: str, loop: Loop, gains: Gains, gain_rates: Gains, batch: Scenario, batch_rates: Any
 ) -> tuple[Array, Array]:
-    """Return the derivative of the result `of`, and the status, of every contact, (contacts, lanes)."""
+    """Return the derivative of a result, and the status, for every contact, (contacts, lanes).
+
+    `of` is the name of the result.
+    """
     moving, fixed = eqx.partition(batch, eqx.is_inexact_array)
 
     def result(gains: Gains, moving: Any) -> tuple[Array, Array]:

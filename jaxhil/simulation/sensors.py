@@ -134,9 +134,9 @@ def cut_dead_zone(force: Float[Array, "*batch"], dead_zone: Array, step: Array) 
     """Replace forces [N] up to `dead_zone` [N] by 0; larger forces remain unchanged.
 
     The reading jumps at the first tick after the force crosses the edge of the dead zone. The phase of the
-    contact in the control period determines this tick. Different phases therefore give different readings;
-    the derivative is that of their mean. For this mean, the force is assumed to be uniformly distributed over
-    its last change `step` [N]. With a `step` of 0, the derivative does not include the jumps.
+    contact in the control period determines this tick. Different phases therefore give different readings.
+    This function has the derivative of the mean reading. The mean assumes that the force is uniformly
+    distributed over its last change `step` [N]. With a `step` of 0, the derivative excludes the jumps.
     """
     return jnp.where(jnp.abs(force) > dead_zone, force, 0)
 

@@ -54,7 +54,13 @@ class EpisodeTracker(NamedTuple):
 
 
 def start_tracking(rig: RigConstants, states: States, now: Array) -> EpisodeTracker:
-    """Return the record at the start of an episode, for the model's `states` after `now` ticks."""
+    """Return the tracker of an episode that starts now.
+
+    Args:
+        rig: Constants of the run.
+        states: States of the numerical model at the start of the episode.
+        now: Number of ticks from the start of the run to the start of the episode.
+    """
     zero, none = jnp.zeros_like(rig.period), jnp.zeros(rig.period.shape, jnp.int32)
     peak = zero_peak(zero)
     return EpisodeTracker(

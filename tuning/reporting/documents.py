@@ -248,9 +248,10 @@ class MarginOfMap(Struct):
 
 
 class MarginsOfMap(Struct):
-    """Margins of the nominal point for three conditions, each with one range for axis "x" and "y".
+    """Margins of the nominal point for three conditions.
 
-    A field is None if the nominal point itself violates the condition.
+    Each field has one range for axis "x" and another for axis "y", or is None if the nominal point itself
+    violates the condition.
     """
 
     error: dict[str, MarginOfMap] | None = None  # error within the limit

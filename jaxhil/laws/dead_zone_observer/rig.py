@@ -22,8 +22,10 @@ from jaxhil.rig.surfaces import deflection
 class DeadZoneObserver(Compensator):
     """Compensator F_c = lead(F + w), w = Q u, Q = 1/(1 + s/(2 pi f)).
 
-    u is k_n d up to `observer_limit`. Beyond this limit, u is `observer_limit` times `observer_saturation`,
-    which is 1 for a continuous and 0 for a cut dead zone. Q is realised by Tustin's rule with c = 2 pi f T:
+    F is the measured force, k_n is `observer_stiffness`, f is `observer_bandwidth`, and T is the control
+    period. d is the penetration (`deflection`), delayed by `identification_delay`. u is k_n d up to
+    `observer_limit`. Beyond this limit, u is `observer_limit` times `observer_saturation`, which is 1 for a
+    continuous and 0 for a cut dead zone. Q is realised by Tustin's rule with c = 2 pi f T:
 
     w = ((2 - c) w_prev + c (u + u_prev)) / (2 + c)
     """

@@ -1,8 +1,9 @@
 """Limits of the six-axis outputs: the wrench on the numerical model and the pose command to the drives.
 
-Both guards continue from their last output, so that no output jumps at a trip or a reset. At the beginning of
-a run the pose command continues from the measured pose. After a trip the wrench ramps to 0, and the pose
-command brakes, retraces its path backwards and comes to rest.
+`WrenchGuard` limits the wrench, and `PoseGuard` the pose command. After a trip or a reset, each guard
+continues from its last output, so that no output jumps. At the beginning of a run the pose command continues
+from the measured pose. After a trip the wrench ramps to 0, and the pose command brakes, retraces its path
+backwards and comes to rest.
 """
 
 from math import sqrt

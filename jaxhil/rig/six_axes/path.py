@@ -14,8 +14,8 @@ class CommandPath:
     """Stored points of the path of the pose commands; a new point overwrites the oldest.
 
     Args:
-        spacing: minimum distance between two points [m].
-        turn: minimum rotation between two points, if their distance is shorter [rad].
+        spacing: distance from the newest point beyond which a command becomes a point [m].
+        turn: rotation from the newest point beyond which a command becomes a point at any distance [rad].
         lever: distance that counts as much as a rotation of 1 rad [m].
 
     Attributes:

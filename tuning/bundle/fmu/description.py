@@ -153,7 +153,10 @@ def _start_text(variable: Variable) -> str:
 
 
 def _add_structure(root: Element, variables: Sequence[Variable], fmi: int) -> None:
-    """Add the list of outputs, which change only in steps and therefore depend on no input directly."""
+    """Add the list of outputs.
+
+    The outputs change only at the ends of steps. The list therefore states no direct dependency on an input.
+    """
     structure = SubElement(root, "ModelStructure")
     outputs = [n for n, variable in enumerate(variables) if variable.causality == "output"]
     if fmi == 3:

@@ -150,7 +150,7 @@ def rig_constants(mechanism: Mechanism) -> str:
     plant = compute_plant_constants(mechanism)
     stiffness, damping, depths = _contact_tables(contact)
     integers = {
-        "RIG_ORDER": max(1, len(plant.rows.transition)),  # arrays have no length of 0
+        "RIG_ORDER": max(1, len(plant.rows.transition)),  # an array in C has at least one element
         "RIG_LATENCY": rig.command_latency,
         "RIG_LINEAR_HOLD": int(rig.command_hold == "linear"),
         "RIG_RING": plant.ring_size,

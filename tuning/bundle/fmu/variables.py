@@ -155,7 +155,7 @@ def _six_axis_signals() -> list[Variable]:
 
 
 def _parameters(document: Mapping[str, Any]) -> Sequence[Variable]:
-    """Return gains and limits, with the bounds of the controller's code."""
+    """Return gains and limits as parameters of the FMU, with the bounds that the controller accepts."""
     kind = kind_of(document)
     gain_file = kind.check_document(document, "gain document")
     law = gain_file.compensator

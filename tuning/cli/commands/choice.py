@@ -13,7 +13,7 @@ from tuning.cli.options_report import Map
 
 
 def suggest_next(options: SimulateOptions | Map, compensator: str) -> None:
-    """Print the command after a simulation or map: a sweep of the gains, or a tuning of the compensator."""
+    """Suggest a command after a simulation or map: a sweep of the gains or, without gains, a tuning."""
     if options.gains is not None:
         terminal.suggest("sweep", options.gains)
         return

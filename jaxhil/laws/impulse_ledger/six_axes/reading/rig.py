@@ -42,8 +42,8 @@ class SixAxisReader:
         moved: change of `pose` since the last tick [m, rad].
         loud: whether the wrench is large enough to count as contact.
         quiet: number of ticks since the last reading in contact.
-        tool: largest squared norm of the tool's part of a reading in this contact [N^2/kg].
-        has_flown: whether `lag` and `twist` contain a reading of free flight.
+        tool: largest squared norm of the tool's inertia force in a reading of this contact [N^2/kg].
+        has_flown: whether the means `lag` and `twist` include at least one tick of free flight.
         lag: mean of the model's pose minus `pose` in free flight [m, rad].
         twist: mean twist of the model in free flight [m/s, rad/s].
     """
@@ -112,7 +112,7 @@ class SixAxisReader:
 
     @property
     def has_flown(self) -> bool:
-        """Return whether `lag` and `twist` contain a reading of free flight."""
+        """Return whether the means `lag` and `twist` include at least one tick of free flight."""
         return self._flight_ticks > 0.0
 
     @property
@@ -170,7 +170,7 @@ class SixAxisReader:
         return self._force_variance * force + self._torque_variance * angular
 
     def weigh_tool(self) -> None:
-        """Update `tool` with the tool's part of this reading."""
+        """Update `tool`, a maximum, with the tool's inertia force in the current wrench."""
         share = subtract(product(self._tool_correction, self.wrench), self.wrench)
         self.tool = max(self.tool, dot(share, product(self._inverse, share)))
 
