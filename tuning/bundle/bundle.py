@@ -41,7 +41,7 @@ class Bundle(NamedTuple):
     ended: list[str | None]
     reasons: list[str]  # descriptions of the differences between runtime and simulation
     stop: ControllerStop | None  # first stop of the nominal run by a limit; None if no limit stops it
-    passing: dict[str, float] | None  # changed limits that do not stop the nominal run; None if not needed
+    passing: dict[str, float] | None  # changed limits that let the nominal run pass; None if `stop` is None
 
 
 def build_bundle(

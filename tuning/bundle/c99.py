@@ -249,7 +249,7 @@ def _generate_code(law: str, class_: type[Any], axes: int) -> tuple[CProgram, st
     defined = "\n".join(table.definitions for table in tables if table.definitions)
     if kind.constants is not None:
         defined = f"{defined}\n{constants_check()}"
-    has_status = "status" in program.fields.get(class_, {})  # else it is a constant
+    has_status = "status" in program.fields.get(class_, {})  # otherwise the status is a constant
     prototypes, init = _initialisation(kind, constructor.fails, guard.fails, has_status)
     definitions = f"{defined}\n{output.definitions}{init}"
     return program, f"{declared}{output.declarations}{prototypes}", definitions

@@ -84,7 +84,7 @@ def check_bundle_code(folder: Path, compensator: str, axes: int) -> None:
 
 
 def run_selftest(checked: BundleCheck, name: str) -> tuple[list[str], list[str]]:
-    """Run the self-test of a bundle that passed `check_bundle`; `name` is the folder's name in its output.
+    """Run the self-test of a bundle that passed `check_bundle`; its output calls the folder `name`.
 
     Return the lines of output, and the reasons for a failure (empty if the self-test passed).
     """

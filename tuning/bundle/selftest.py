@@ -58,7 +58,7 @@ def check_files(folder):
     reported = {}
     for name, text in problems:
         if name.endswith(PYTHON_CACHE):
-            print(f"note  {escape_unprintable(name)}: {text}")  # Python creates this when the controller runs
+            print(f"note  {escape_unprintable(name)}: {text}")  # running the controller creates the cache
             continue
         reported[name] = reported.get(name, 0) + 1
         if reported[name] <= MAX_REPORTED_DIFFERENCES:

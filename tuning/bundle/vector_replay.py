@@ -61,8 +61,9 @@ def read_vectors(text, layout=LAYOUTS["Controller"]):
 def replay_vectors(rows, gains, runtime):
     """Replay all rows of vectors.csv through the runtime's controller with the gain file `gains`.
 
-    Return a dictionary of lists of (line number, force command, simulated force command) for each run, each
-    command as a list of numbers, and descriptions of the differences from the recorded commands.
+    Return two results. The first is a dictionary: for each run, a list of (line number, force command,
+    simulated force command), where each command is a list of numbers. The second is a list of descriptions of
+    the differences from the recorded commands.
     """
     name = controller_name(runtime)
     layout, controller, runs, different = LAYOUTS[name], None, {}, []

@@ -1,9 +1,9 @@
 """Test vectors: inputs and commands of the runtime in each tick, to test other builds of the controller.
 
 `record_vectors` simulates the nominal run and random draws, and replays them through the runtime. The vectors
-contain the commands of both. `make_damaged_rows` adds segments of the nominal run with corrupted inputs:
-readings and model states that are infinite, NaN, huge or stuck, and clocks that jump or run backwards. The
-numerical model moves under the runtime's force command.
+contain the commands of the simulation and of the runtime. `make_damaged_rows` adds segments of the nominal
+run with corrupted inputs: readings and model states that are infinite, NaN, huge or stuck, and clocks that
+jump or run backwards. The numerical model moves under the runtime's force command.
 """
 
 import csv
@@ -86,7 +86,7 @@ class RecordedVectors(NamedTuple):
     ended: list[str | None]
     reasons: list[str]  # descriptions of the differences between runtime and simulation
     stop: ControllerStop | None  # first stop of the nominal run by a limit; None if no limit stops it
-    passing: dict[str, float] | None  # changed limits that do not stop the nominal run; None if not needed
+    passing: dict[str, float] | None  # changed limits that let the nominal run pass; None if `stop` is None
 
 
 def record_vectors(
@@ -245,8 +245,8 @@ def _run_controller(
         faults = controller.faults
         rows.append(VectorRow(*reading[:7], *motion, force, command, faults, reading.force_simulated))
         identified.append(controller.identified)
-        # The fault LAW_IN_DOUBT changes no command. The cause also contains a trip between two contacts,
-        # which the faults of a tick do not.
+        # The fault LAW_IN_DOUBT changes no command. A trip between two contacts is in `controller.cause`, but
+        # not in the faults of a tick.
         acting.append(faults & ~LAW_IN_DOUBT | controller.cause)
     return rows, identified, acting
 
@@ -285,7 +285,7 @@ def _compare_with_simulation(
     if reason is None and lane.sent is not None:
         positions = np.array([row.position_command for row in rows])[:end]
         reason = _disagreement("position command", "m", positions, np.asarray(lane.sent)[:end], end)
-    # The range of commands must come from the compared ticks, because the file contains no others.
+    # The range of commands must come from the compared ticks, the only simulated commands in vectors.csv.
     comparable = expected.copy()
     comparable[end:] = nan
     exceeding = np.flatnonzero(np.abs(forces - comparable) > REPLAY_LIMIT * compute_command_range(comparable))

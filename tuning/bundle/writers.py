@@ -170,7 +170,7 @@ def _fmu_files(document: Mapping[str, Any], fmi: int) -> dict[str, bytes]:
         f"fmi{fmi}/{TEST_FILE}": controller.fmu_test_program(document, fmi).encode("ascii"),
     }
     if kind_of(document) is ONE_AXIS:
-        with suppress(rig.UnsupportedRig):  # `describe_fmus` states it
+        with suppress(rig.UnsupportedRig):  # `describe_fmus` names the reason
             files[f"fmi{fmi}/{rig.IDENTIFIER}.fmu"] = rig.rig_fmu(document, fmi)
     return files
 

@@ -57,7 +57,7 @@ def build_fmu(
 
 
 def compile_library(archive: bytes) -> bytes | None:
-    """Compile the library of an FMU; return None if there is no C compiler, or if it fails."""
+    """Compile the library of an FMU; return None if there is no C compiler, or if the compilation fails."""
     compiler = find_compiler()
     if compiler is None:
         return None

@@ -1,4 +1,7 @@
-"""Closed loop of a bundle's FMUs: controller and rig under a sequential master, compared with `simulate`."""
+"""Closed loop of a bundle's FMUs, controller and rig, compared with `simulate`.
+
+A sequential master (co-simulation program) steps one FMU after the other.
+"""
 
 import math
 from collections.abc import Mapping
@@ -36,14 +39,15 @@ class FmuLoop(msgspec.Struct, frozen=True):
     fmi: int  # version of FMI
     command_latency: int  # periods, `rig.command_latency` of the simulation, with the period of the master
     contacts: tuple[FmuContact, ...]
-    reasons: tuple[str, ...]  # disagreements; empty if both agree
+    reasons: tuple[str, ...]  # differences between FMUs and simulation; empty if both agree
 
 
 def compare_fmu_loop(files: Mapping[str, bytes], loaded: Any) -> FmuLoop | None:
     """Close the loop through the FMUs of a checked bundle; compare the nominal contacts with the simulation.
 
     The libraries are compiled from the sources, which `check_bundle` has verified. The sequential master adds
-    one period. Noise and the controller's limits are left out, because the limits may stop this run.
+    one period to the command latency. Noise and the controller's limits are left out, because the limits may
+    stop this run.
 
     Args:
         files: content of the bundle's files.

@@ -1,4 +1,4 @@
-"""FMU of the controller: its C99 code of the bundle as a co-simulation FMU."""
+"""FMU of the controller: the C99 code of the bundle as a co-simulation FMU."""
 
 import copy
 import json
