@@ -21,10 +21,11 @@ MATH_DOMAIN_ERRORS = {
     "fmod": "isinf({0}) || {1} == 0.0",
     **dict.fromkeys(("atan", "atan2", "tanh", "fabs", "copysign", "isfinite", "isnan", "isinf"), ""),
 }
+# Sign of the operand for which a function does not raise.
 SAFE_SIGNS = {
     "sqrt": Sign.NONNEGATIVE,
     "log": Sign.POSITIVE,
-}  # of operands for which a function does not raise
+}
 INT_CONVERSIONS = {"floor": "floor({})", "ceil": "ceil({})", "round": "nearbyint({})"}
 # C cannot reproduce the rounding of these functions.
 IRREPRODUCIBLE = ("sum", "fsum", "hypot", "pow")

@@ -130,7 +130,8 @@ class BodyLowering(CallLowering):
     def replace(self, node: Any, keys: Locations, of_element: bool = False) -> None:
         """Record attributes to which an assignment gives a new list or object.
 
-        Raise SubsetError if a local name of the old one is used later: in Python it still means the old one.
+        Raise SubsetError if a local name of the old list or object is used later, because in Python this name
+        still refers to the old list or object.
         """
         self.function.replaced |= keys
         for name, value, last in self.aliases:

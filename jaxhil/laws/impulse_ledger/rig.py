@@ -19,7 +19,7 @@ unknown, and F_c is the measured force.
 
 If the force delay is uncertain (`delay_spread` > 0), the compensator estimates the delay when the hardware
 leaves the surface. The estimate corrects the speed at which this contact ends. In the following contacts the
-estimate also aligns positions with readings, so that D includes it.
+estimate also aligns positions with readings, so that D includes the estimate.
 """
 
 from collections.abc import Mapping
@@ -39,7 +39,7 @@ RELEASE_TIME = 0.03  # s; the compensator continues to act for this time after t
 MIN_MOMENTUM = 1e-9  # kg m/s; with less momentum, forces cannot be scaled
 MAX_LAG = 0.2  # s; upper bound of the lag D
 ONSET_PLACE = -0.5  # periods of travel; assumed depth of the hardware at the last reading of free flight
-MISFIT = 0.00315  # [1]; standard deviation of the contact model's relative error, averaged for `MISFIT_TIME`
+MISFIT = 0.00315  # [1]; standard deviation of the contact model's relative error, averaged over `MISFIT_TIME`
 MISFIT_TIME = 0.001  # s
 MIN_SCALED_SPEED = 1e-9  # [1]; speed / approach speed; a lower speed is a rounding error
 MIN_CONTACT_DEPTH = 0.001  # s; lower bound of the depth by which the secant stiffness is divided
@@ -50,7 +50,7 @@ UNCERTAIN = 0.006  # [1]; if the reference speed has a larger standard deviation
 MAX_GAIN = 0.01  # [1]; limit on the energy gain beyond the contact model, divided by M v^2
 MAX_LOSS = 0.014  # [1]; limit on the energy loss beyond the contact model, divided by M v^2
 USUAL_PRELOAD = 1.0  # 1/s; standard deviation of preload/(mass x approach speed), added to the specified one
-MAX_DELAY_SPREAD = 0.004  # s; limit, because a first-order correction of more is not accurate
+MAX_DELAY_SPREAD = 0.004  # s; upper limit; for more, a first-order correction is not accurate
 MAX_SPREADS = 3.0  # standard deviations; limit on the difference of estimated and specified delay
 ONSET_TICKS = 0.3  # periods; standard deviation of the time of the onset, 1/sqrt(12)
 ONSET_MEAN = 0.25  # [1]; mean force at the onset, divided by the force at which the onset is detected

@@ -3,7 +3,8 @@
 A wrench reading at time t is the wrench that should have acted on the numerical model at t - D, where D is
 the delay of the whole loop. The compensator credits the impulse of every reading to the model's time t - D,
 predicts the contact force from t - D to t with a scalar contact model, and commands the impulse that the
-model still owes. `six_axes/README.md` states the equations (a) to (e) to which the comments refer.
+model still owes: the credited and predicted impulse minus the impulse commanded so far. `six_axes/README.md`
+states the equations (a) to (e) to which the comments refer.
 """
 
 from collections.abc import Mapping
@@ -71,12 +72,12 @@ class ImpulseLedger(SixAxisCompensator):
 
     @property
     def loop_delay(self) -> float:
-        """Return the hardware's delay D [s] relative to the model in the last contact; 0 before the first."""
+        """Return the delay D [s] of hardware behind model in the last contact; 0 before the first contact."""
         return self._ledger.delay * self._period
 
     @property
     def unpaid_impulse(self) -> float:
-        """Return the impulse still owed after the last contact, divided by its impulse."""
+        """Return the impulse still owed after the last contact, divided by the contact's impulse."""
         return self._unpaid
 
     def step(self, wrench, pose_desired, twist_desired, pose_measured):

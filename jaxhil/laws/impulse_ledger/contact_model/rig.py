@@ -169,8 +169,8 @@ class ContactModel:
         mean = [self.mean[j] for j in DELAY_PARAMETERS]
         rows = [[self.covariance[i][j] for j in DELAY_PARAMETERS] for i in DELAY_PARAMETERS]
         last = len(DISSIPATIVE)  # index of the delay
-        # Replace the prior of the first slope: it reduces the slope of a stiff contact, which looks like
-        # damping.
+        # Replace the priors of first slope and preload: the old prior reduces the slope of a stiff contact,
+        # and the difference looks like damping.
         for index in range(last + 1, last + 3):
             j = DELAY_PARAMETERS[index]
             value = WIDE_STIFFNESS[0] if j == 0 else preload

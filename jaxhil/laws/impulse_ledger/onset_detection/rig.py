@@ -2,7 +2,7 @@
 
     S = max(0, S + (y - bias)/sigma - DRIFT),    contact is detected if S > LEVEL
 
-y is the force reading; the surface pushes in its positive direction. The readings of this run with S = 0 give
+y is the force reading, positive if the surface pushes. The readings of this run with S = 0 give
 the bias and the standard deviation sigma. The contact begins after the last reading with S = 0.
 
 Source: Page, "Continuous inspection schemes", Biometrika 41 (1954).

@@ -32,7 +32,7 @@ from jaxhil.laws.impulse_ledger.contact_model.rig import (
 )
 
 STEPS = 12  # number of integration steps from the last reading to the present
-MAX_SCALED_SPEED = 2.0  # [1]; speed / approach speed; at most 1 without added energy
+MAX_SCALED_SPEED = 2.0  # [1]; limit on speed / approach speed, a ratio that exceeds 1 only with added energy
 MAX_SCALED_DEPTH = 10.0  # s; limit on the depth, divided by the approach speed: 3 times the depth at 0.05 Hz
 
 

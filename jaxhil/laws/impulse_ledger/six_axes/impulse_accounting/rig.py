@@ -164,7 +164,7 @@ class Ledger:
         return min(tangent.force, HIGHEST * expected)
 
     def unpaid_share(self) -> float:
-        """Return the norm of the impulse still owed, divided by the norm of the reference's impulse."""
+        """Return the norm of the impulse still owed, divided by the norm of the reference's impulse I_r."""
         return self._size(self._unpaid) / self._size(self._impulse)
 
     def _turn(self, reader: SixAxisReader, begins: bool) -> None:

@@ -131,7 +131,8 @@ class SixAxisReader:
     ) -> None:
         """Process the inputs of a tick; arguments as in `SixAxisCompensator.step`.
 
-        `impulse` is the impulse commanded so far [N s, N m s]; `in_contact` is the state after the last tick.
+        `impulse` is the impulse commanded so far [N s, N m s]; `in_contact` is true if a contact was in
+        progress after the last tick.
         """
         begins = self._age == 0
         period = self._period
@@ -157,7 +158,7 @@ class SixAxisReader:
         self._age += 1
 
     def _noise_variance(self, pose: Vector) -> float:
-        """Return the mean |W|^2 of a corrected wrench W that is only noise; `pose` moves it to frame C."""
+        """Return the mean |W|^2 of a corrected wrench W that is only noise; `pose` is that of frame C."""
         metric, angular = self._metric, self._noise_angular
         x, y, z = pose[:3]
         coupling = (metric[2][4] - metric[1][5]) * x + (metric[0][5] - metric[2][3]) * y

@@ -79,14 +79,15 @@ def read(
 def _computed_once(components: tuple[Array, ...], tick: Int[Array, ""]) -> tuple[Array, ...]:
     """Return the components, which the compiler then computes once instead of for each use.
 
-    It would merge the force sensor, which has hundreds of operations, into each entry of a matrix product. It
-    does not merge operations across a condition, and cannot know that ticks are not negative.
+    Otherwise, the compiler would merge the force sensor, which has hundreds of operations, into each entry of
+    a matrix product. The compiler does not merge operations across a condition, and cannot know that ticks
+    are not negative.
     """
     return lax.cond(tick >= 0, lambda values: values, lambda values: tuple(-v for v in values), components)
 
 
 def noise_variance(prepared: PreparedLedger, pose: Six) -> Float[Array, "*batch"]:
-    """Return the mean |W|^2 of a corrected wrench W that is only noise; `pose` moves it to the frame C."""
+    """Return the mean |W|^2 of a corrected wrench W that is only noise; `pose` is that of frame C."""
     gains, metric, position = prepared.gains, prepared.noise_metric, pose[:3]
     linear, angular = (sum(metric[i, i] for i in part) for part in (range(3), range(3, 6)))
     coupling = jnp.stack(
