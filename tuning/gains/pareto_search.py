@@ -23,7 +23,7 @@ from tuning.gains.tune import TuneResult
 from tuning.gains.validation import Validation
 
 # Ends of a ladder: weight times second criterion of the accurate gains, divided by their error [1]. The first
-# ladder extends to a larger weight, since the solver otherwise finds no quiet, inaccurate gains.
+# ladder extends to a larger weight, because smaller weights lead to no quiet, inaccurate gains.
 LADDER_ENDS, FIRST_LADDER_ENDS = (0.5, 10.0), (1.0, 100.0)
 MAX_ACCURATE_ERROR_RATIO = 1.05  # largest error of accurate gains / least error
 MIN_NOISE_EXCESS = 0.1  # lower bound, in a ladder's scale, of the noise amplification minus 1
@@ -56,8 +56,9 @@ PARETO_CRITERIA = {axis.name: axis for axis in (NOISE_CRITERION, PEAK_CRITERION,
 def choose_default_criterion(compensator: str, axes: int = 1) -> ParetoCriterion | None:
     """Return the second criterion of a compensator's Pareto fronts if the user names none.
 
-    The criterion is noise amplification if it depends on the gains, otherwise the peak command for a
-    compensator that predicts contacts, and otherwise None. With six axes, the criterion is the peak command.
+    The criterion is noise amplification if the amplification depends on the gains. If it does not, the
+    criterion is the peak command for a compensator that predicts contacts, and None for any other. With six
+    axes, the criterion is the peak command.
     """
     if axes != 1:
         return PEAK_CRITERION

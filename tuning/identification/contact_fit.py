@@ -3,8 +3,8 @@
 A dead zone of the force sensor hides small forces. A reading is therefore used only if its predicted force is
 well above the dead zone. In such readings, the measured force is smaller than the predicted force by the dead
 zone. A surface that is further away reduces the force like a dead zone. The fit can distinguish the two only
-if the dead zone is known: specified, or estimated from noise at rest that exceeds it. If neither is the case
-and the user does not specify the surface position, it is assumed to be 0.
+if the dead zone is known: the user specifies it, or it is estimated from a noise at rest that exceeds it. If
+neither the dead zone nor the surface position is known, the surface position is assumed to be 0.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from scipy.signal import lfilter
 MAX_AUTOREGRESSION_ORDER = 8  # maximum order of the autoregression
 MIN_READINGS_BEYOND_DEAD_ZONE = 20  # minimum number of nonzero readings to estimate a dead zone
 MAX_DISTINCT_SHARE = 0.2  # maximum number of distinct values per reading in rounded readings
-MIN_EXCESS_ZERO_SHARE = 0.02  # minimum share of exact zeros, without those from rounding, with a dead zone
+MIN_EXCESS_ZERO_SHARE = 0.02  # minimum share of exact zeros, beyond those from rounding, for a dead zone
 # Maximum ratio of smallest to mean magnitude of nonzero readings with a dead zone that is subtracted.
 MAX_LEAST_TO_MEAN_RATIO = 0.3
 MIN_ZERO_SHARE = 0.5  # minimum share of exact zeros that indicates a dead zone without further tests

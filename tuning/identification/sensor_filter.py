@@ -36,8 +36,8 @@ def compute_lag_weights(rate: float) -> tuple[float, tuple[float, float, float]]
 def compute_onset_weights(rate: float, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of the forces just after an onset of contact and at the end of the control period.
 
-    They give the change of the reading during the period if the force is 0 before the onset and linear in
-    time after the onset.
+    The weighted sum of both forces is the change of the reading during the period, if the force is 0 before
+    the onset and linear in time after the onset.
 
     Args:
         rate: Control period divided by the time constant.

@@ -48,9 +48,10 @@ def choose_restitution_margin(
     """Choose the restitution margin.
 
     The margin is `USUAL_MARGIN_SHARE` times the limit. It is smaller if the sum of margin and error of the
-    expectation would exceed the limit, because an error e - e* beyond the limit might then be missed. It is
-    larger if it would otherwise stop more than the fraction `false_alarms` of good runs. Then every second
-    run is used in addition to the `fitted` runs, because the estimate of a small fraction needs many runs.
+    expectation would exceed the limit, because an error e - e* beyond the limit might then be missed. The
+    margin is larger if more than the fraction `false_alarms` of good runs would exceed this margin. In this
+    case, every second run is used in addition to the `fitted` runs, because the estimate of a small fraction
+    needs many runs.
 
     Args:
         runs: recorded runs.

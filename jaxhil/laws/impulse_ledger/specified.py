@@ -11,7 +11,7 @@ DELAY = "rig.force_sensor.delay"
 
 
 def delay_spread(mechanism: Mechanism) -> float:
-    """Return the force delay's standard deviation [s] in the file, at most 4 ms; 0 if it is certain."""
+    """Return the force delay's standard deviation [s] in the file, at most 4 ms; 0 for a certain delay."""
     uncertainty = mechanism.uncertainty.get(DELAY)
     is_range = uncertainty is not None and uncertainty.std is None
     spread = _spread(mechanism, DELAY)
@@ -19,12 +19,12 @@ def delay_spread(mechanism: Mechanism) -> float:
 
 
 def friction(mechanism: Mechanism) -> float:
-    """Return the file's largest dry friction, divided by mass and approach speed [1/s]."""
+    """Return the largest dry friction that the file permits, divided by mass and approach speed [1/s]."""
     return _scaled(mechanism, "contact.friction")
 
 
 def preload(mechanism: Mechanism) -> float:
-    """Return the file's largest preload, divided by mass and approach speed [1/s]."""
+    """Return the largest preload that the file permits, divided by mass and approach speed [1/s]."""
     return _scaled(mechanism, "contact.preload")
 
 
@@ -46,7 +46,7 @@ def _scaled(mechanism: Mechanism, path: str) -> float:
 
 
 def _spread(mechanism: Mechanism, path: str) -> float:
-    """Return a number's `std` in the file, or its distance from the farther bound; 0 if it is certain."""
+    """Return a number's `std` in the file, or its distance from the farther bound; 0 without uncertainty."""
     uncertainty = mechanism.uncertainty.get(path)
     if uncertainty is None:
         return 0.0

@@ -9,8 +9,8 @@
 
 The tables `[timing]`, `[text]` and `[[runs]]` are those of one axis (`mapping`). All columns have the time
 stamps of the rows, and each control period has one row. Wrenches are about the origin of target frame T.
-Poses and twists are those of chaser frame C relative to T. All are in T axes, as in the files of `jaxhil
-simulate --log`.
+Poses and twists are those of chaser frame C relative to T. Wrenches, poses and twists are in T axes, as in
+the files of `jaxhil simulate --log`.
 """
 
 from __future__ import annotations

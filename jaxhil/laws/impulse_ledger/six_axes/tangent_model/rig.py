@@ -128,7 +128,10 @@ class TangentModel:
         self.damping = min(max(damping, 0.0), self._most_damping)
 
     def compute_force_change(self, change: float) -> float:
-        """Return the change of the elastic force [m/s^2] for a change of the depth [m], with equal sign."""
+        """Return the change of the elastic force [m/s^2] for a `change` of the depth [m], or 0.
+
+        The result is 0 if the two changes have opposite signs.
+        """
         path, speed = self._path, self._speed
         later = path + change / speed
         bend = later * abs(later) - path * abs(path)

@@ -89,9 +89,10 @@ def learn(
 
 
 def compute_force_change(tangent: Tangent, change: Array) -> Float[Array, "*batch"]:
-    """Return the change of the tangent model's elastic force for a change of the depth.
+    """Return the change of the tangent model's elastic force for a `change` of the depth, or 0.
 
-    Both changes have the same sign. Otherwise, a negative curvature could push apart bodies that separate.
+    The result is 0 if the two changes have opposite signs, because a negative curvature could otherwise push
+    apart bodies that separate.
     """
     later = tangent.path + change / tangent.speed
     bend = later * jnp.abs(later) - tangent.path * jnp.abs(tangent.path)
