@@ -42,10 +42,7 @@ STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror"
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=() if name in ("none", "impulse_ledger") else pytest.mark.slow)
-        for name in LAWS
-    ],
+    [pytest.param(name, marks=() if name == "impulse_ledger" else pytest.mark.slow) for name in LAWS],
 )
 def test_six_axis_c99_sources_compile_without_warnings(name, compiler, tmp_path):
     if shutil.which(compiler) is None:
@@ -110,7 +107,7 @@ def test_six_axis_c99_sensor_conversion_equals_python_bit_for_bit(tmp_path):
         assert same_bits(*map(np.array, values)).all()
 
 
-@pytest.mark.parametrize("wide", [False, True], ids=["limited", "wide"])
+@pytest.mark.parametrize("wide", [pytest.param(False, marks=pytest.mark.slow), True], ids=["limited", "wide"])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", LAWS)
 def test_six_axis_c99_commands_equal_python_bit_for_bit(name, kind, wide):

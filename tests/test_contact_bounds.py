@@ -100,7 +100,7 @@ def test_verify_reports_excessive_peak_force_of_closed_loop(slow_simulator):
     assert not report.verdict and report.reasons[0].startswith(reason)
 
 
-@pytest.mark.parametrize("frequency", [0.2, 30.0])
+@pytest.mark.parametrize("frequency", [pytest.param(0.2, marks=pytest.mark.slow), 30.0])
 def test_simulate_command_checks_peak_force_and_duration(jaxhil, frequency):
     asked = ("simulate", "claw-350kg", "--compensator", LAW, "--set", f"{FREQUENCY}={frequency}")
     json_run = jaxhil(*asked, "--json")

@@ -180,6 +180,7 @@ def continue_contact(
     return result.restitution, abs(model.velocity) / velocity
 
 
+@pytest.mark.slow
 def test_exported_python_controller_has_mean_restitution_of_simulation():
     parsed, seeds = heavy_mechanisms(noise_std=1.0), 200
     gains = nominal_gains(parsed, "response_error", **SLOW_END)

@@ -41,7 +41,7 @@ ALWAYS = {
 UDP = ("udp_controller.py", "udp_protocol.py", "udp_task.py", "numerical_model.py", "flight_recorder.py")
 # Compensators whose exported files hardly differ from the files of other compensators.
 LIKE_OTHERS = {"dead_zone_observer", "multi_parameter_lead", "passivity", "phase_lead", "smith_hybrid"}
-LIKE_OTHERS |= {"smith_predictor", "virtual_contact"}
+LIKE_OTHERS |= {"none", "position_lead", "smith_predictor", "virtual_contact"}
 
 
 @pytest.fixture

@@ -57,7 +57,7 @@ FILE_FINDING = "a cut dead zone of 3 N, which `identify` does not model"
     [
         (True, "continuous", [DATA_FINDING]),
         pytest.param(True, "cut", [FILE_FINDING, DATA_FINDING], marks=pytest.mark.slow),
-        (False, "continuous", []),
+        pytest.param(False, "continuous", [], marks=pytest.mark.slow),
     ],
 )
 def test_identify_reports_dead_zone_that_sensor_does_not_subtract_as_defect(

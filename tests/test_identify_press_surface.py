@@ -44,7 +44,7 @@ def fit(run, noise):
     ("run", "noise", "bias"),
     [
         (multisine(), 1.0, 0.0),
-        (multisine(), 1.0, 7.0),
+        pytest.param(multisine(), 1.0, 7.0, marks=pytest.mark.slow),
         (multisine(noise=10.0), 10.0, -7.0),
         (ramp(2e-4), 1.0, 5.0),
     ],

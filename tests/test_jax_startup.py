@@ -82,6 +82,7 @@ def test_jax_debugging_modes_change_no_result(jaxhil, tmp_path):
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_xla_flags_are_tested_in_a_separate_process():
     jax_startup.check_xla_flags("--xla_cpu_ftz=true")
     for flags, reason in (

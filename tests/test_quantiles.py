@@ -66,7 +66,7 @@ def test_quantile_intervals_have_stated_coverage_over_repeated_sweeps(order, cap
     assert np.mean(exact) >= 0.935 and np.mean(binned) >= np.mean(exact)
 
 
-@pytest.mark.parametrize("order", (0.5, 0.99))
+@pytest.mark.parametrize("order", (0.5, pytest.param(0.99, marks=pytest.mark.slow)))
 @pytest.mark.parametrize("sampling", ("independent", "sobol"))
 def test_quantile_intervals_of_replicates_have_stated_coverage(order, sampling, capsys):
     """Draw |u_1 + u_2 - 1| for 16 replicates of 64 points.

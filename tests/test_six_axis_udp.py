@@ -129,6 +129,7 @@ def test_six_axis_rehearsal_gives_final_twists_and_errors_of_simulate(
         assert result["peak_force"] == pytest.approx(episode.peak_force, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_six_axis_rig_compensates_for_lost_packets():
     random, name = Random(3), "probe-drogue"
     whole = exchange(name, "impulse_ledger", 1)[0]

@@ -33,6 +33,7 @@ def gain_file(folder, compensator="response_error", limits=None, **values):
     return path
 
 
+@pytest.mark.slow
 def test_rig_command_rejects_bundle_with_modified_controller(jaxhil, tmp_path):
     """Only code exported by this version is run."""
     made = build_bundle(document(), [])
