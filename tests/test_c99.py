@@ -236,6 +236,7 @@ def test_c99_commands_equal_python_bit_for_bit(law, kind, batch):
         compare(batch(law), gain_file, drawn_rows(kind, 1000, rng, gain_file.control_period))
 
 
+@pytest.mark.slow
 def test_c99_impulse_ledger_contacts_equal_python_bit_for_bit(batch):
     law, statuses = "impulse_ledger", set()
     for n in range(12):

@@ -125,6 +125,7 @@ def of_records():
     return recorded(load_any("probe-drogue", changes).mechanism, "impulse_ledger", 3)
 
 
+@pytest.mark.slow
 def test_six_axis_c99_commands_equal_python_on_recorded_contacts():
     document, made = built("impulse_ledger")
     for record in of_records().lanes:

@@ -77,6 +77,7 @@ def test_independent_simulator_drive_has_response_of_its_transfer_function(windo
     assert position[2000:] == pytest.approx(np.imag(late)[2000:], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_independent_study_finds_no_error_in_true_mechanism_file_and_large_error_in_prior(tmp_path):
     campaign = write_campaign("plain", 0, tmp_path)
     rig, file = campaign.rig, tmp_path / "truth.toml"

@@ -101,6 +101,7 @@ def test_searches_for_quiet_gains_and_accurate_gains_share_one_program(quiet_gai
     assert quiet_gains[1] == 1
 
 
+@pytest.mark.slow
 def test_quiet_gains_have_least_noise_of_all_grid_points_within_tolerance(quiet_gains, validation):
     result = quiet_gains[0][0]
     accurate = most_accurate(result).gains

@@ -158,6 +158,7 @@ class Sleepy(EmptyTask):
             time.sleep(self.held)
 
 
+@pytest.mark.slow
 def test_udp_rig_schedule_is_shifted_after_a_stall():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
         nobody.bind(("127.0.0.1", 0))

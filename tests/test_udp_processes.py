@@ -111,6 +111,7 @@ def test_rig_verdict_is_bad_if_controller_trips_without_injected_fault(jaxhil, t
     assert "tripped: force_limit" in ran.out and "though no faults were injected" in ran.out
 
 
+@pytest.mark.slow
 def test_interrupted_rig_command_reports_measurements_so_far(tmp_path):
     path = gain_file(tmp_path)
     # Background jobs of a shell ignore interrupts, and so do their child processes.
