@@ -12,7 +12,7 @@ from fmus import RunningFmu, fmpy
 from test_fmu import folder_of
 
 import tuning
-from jaxhil.rig.flight_recorder import CHANNELS, FlightRecorder
+from jaxhil.rig.flight_recorder import CHANNELS, WRENCH, FlightRecorder
 
 INPUTS = ("force_measured", "position_desired", "velocity_desired", "position_measured")
 FAILED = pytest.raises(Exception, match="failed with status 3")
@@ -134,7 +134,7 @@ def test_log_of_the_six_axis_fmu_has_the_columns_of_the_flight_recorder(tmp_path
     assert heading.split(",") == ["time", *columns, "contact", "faults"]
     assert [float(value) for value in row.split(",")[:-1]] == [0.0, *inputs.values(), *commands.values(), 0.0]
     mapping = tomllib.loads((tmp_path / "session.toml").read_text())
-    assert mapping["channels"]["wrench_command"] == [f"command_{part}" for part in fmus.WRENCH_PARTS]
+    assert mapping["channels"]["wrench_command"] == [f"command_{part}" for part in WRENCH]
 
 
 def test_rig_fmu_has_no_flight_log():
