@@ -54,8 +54,8 @@ def _summary_lines(document: dict[str, Any]) -> list[str]:
     within = "infinite" if limit is None else f"{limit:g}"
     lines = [
         f"Failure probability {probability['value']:.4g}, 95 % interval {probability['low']:.3g} to "
-        f"{probability['high']:.3g} ({probability['method']}); {document['failed']} of {number} failed, "
-        f"{'twist' if document['axes'] == 6 else 'restitution'} error allowed {within}, "
+        f"{probability['high']:.3g} ({probability['method']}); {document['failed']} of {number} failed. "
+        f"Limits: {'twist' if document['axes'] == 6 else 'restitution'} error {within}; "
         f"real contact: {CONTACT_BOUNDS_SHORT_TEXT}."
     ]
     lines += _describe_interval_width(document)
