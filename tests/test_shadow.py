@@ -318,7 +318,7 @@ def test_shadow_mode_rejects_unusable_logs_with_one_line(jaxhil, tmp_path, mappi
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mechanism", ["varying", "rig-350kg"])
+@pytest.mark.parametrize("mechanism", ["varying", "claw-350kg"])
 @pytest.mark.parametrize(
     "compensator", ["response_error", "impulse_ledger", "smith_hybrid", "multi_parameter_lead"]
 )

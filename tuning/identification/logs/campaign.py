@@ -38,7 +38,8 @@ from tuning.identification.records import Campaign, CampaignTiming, LoggedRun, R
 KINDS_SPLIT_AT_CONTACTS = ("tap", "contact")
 MIN_SEGMENT_ROWS = 50  # minimum number of rows in a segment between gaps
 # A simulated contact begins with the rebound velocity of the contact before it, reversed. Minimum jump of the
-# velocity there, relative to the speed and to the velocity's change in the two periods before or after it.
+# velocity there, relative to the speed and to the velocity's change in as many ticks before or after it.
+RESTART_SPAN_TICKS = 5  # ticks between the two positions of a velocity, which may be rounded
 MIN_JUMP_PER_SPEED, MIN_JUMP_PER_CHANGE = 1.2, 3.0
 
 
@@ -347,10 +348,12 @@ def find_restarts(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
     if index is None:
         return np.empty(0, int)
     rows = np.flatnonzero(index[1:] != index[:-1]) + 1
-    rows = rows[(rows >= 4) & (rows < len(x) - 3)]
-    step = np.diff(x)
-    before, after = step[rows - 2], step[rows]
-    change = np.minimum(np.abs(before - step[rows - 4]), np.abs(step[rows + 2] - after))
+    span = RESTART_SPAN_TICKS
+    rows = rows[(rows > 2 * span) & (rows < len(x) - 2 * span)]
+    before, after = x[rows - 1] - x[rows - 1 - span], x[rows + span] - x[rows]
+    earlier = x[rows - 1 - span] - x[rows - 1 - 2 * span]
+    later = x[rows + 2 * span] - x[rows + span]
+    change = np.minimum(np.abs(before - earlier), np.abs(later - after))
     speed = np.maximum(np.abs(before), np.abs(after))
     jump = np.abs(after - before)
     return rows[(jump > MIN_JUMP_PER_SPEED * speed) & (jump > MIN_JUMP_PER_CHANGE * change)]
