@@ -3,6 +3,8 @@
 import contextlib
 import functools
 import io
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from jaxhil.laws.compensators import COMPENSATORS
@@ -26,6 +28,14 @@ def document(
     mechanism, sha256, _ = load(mechanism_name, overrides)
     gains = {gain.name: gain.nominal(mechanism) for gain in COMPENSATORS[compensator].gains}
     return build_document(compensator, {**gains, **changes}, mechanism, sha256, {}, {}, 0, {})
+
+
+def write_files(folder: Path, files: Mapping[str, bytes]) -> Path:
+    """Write the files of a bundle, given by their paths, into a folder; return the folder."""
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    return folder
 
 
 @functools.cache

@@ -14,7 +14,7 @@ import sys
 import time
 
 import pytest
-from bundles import run_selftest, signed, small_files
+from bundles import run_selftest, signed, small_files, write_files
 
 import tuning
 from jaxhil.errors import InputError
@@ -53,13 +53,6 @@ def _in_time():
     signal.signal(signal.SIGALRM, before)
 
 
-def placed(folder, files):
-    for name, content in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(content)
-    return folder
-
-
 def document_of(files):
     return json.loads(files["gains.json"])
 
@@ -82,7 +75,7 @@ def plain_manifest(files, **others):
 
 
 def test_bundle_check_accepts_exported_bundle(files, folder):
-    checked = check_bundle(placed(folder, files))
+    checked = check_bundle(write_files(folder, files))
     assert (checked.reasons, checked.signature) == ([], "not signed")
     assert checked.files == files and checked.document == document_of(files)
     assert find_code_differences(folder, "phase_lead") == []
@@ -93,7 +86,7 @@ def test_code_of_third_party_bundle_with_valid_checksums_is_not_run(files, folde
     """Add code that would leave a file if executed, and update the manifest."""
     trap = b"\nopen(%r, 'w')\n" % str(tmp_path / "ran").encode()
     signed_files = signed({**files, name: files[name] + trap}, document_of(files))
-    verdict = tuning.verify(placed(folder, signed_files))
+    verdict = tuning.verify(write_files(folder, signed_files))
     assert not verdict.good and verdict.document["self_test"] == []
     first, last = verdict.reasons
     assert first == f"{name}: differs from what this version exports"
@@ -105,7 +98,7 @@ def test_code_of_third_party_bundle_with_valid_checksums_is_not_run(files, folde
 def test_bundle_check_reports_missing_and_extra_files(files, folder):
     remaining = {name: content for name, content in files.items() if name != "udp_controller.py"}
     signed_files = signed({**remaining, "sitecustomize.py": b"open('ran', 'w')"}, document_of(files))
-    reasons = check_bundle(placed(folder, signed_files)).reasons
+    reasons = check_bundle(write_files(folder, signed_files)).reasons
     assert reasons[:2] == [
         "sitecustomize.py: this version does not export such a file",
         "udp_controller.py: is missing",
@@ -125,7 +118,7 @@ def test_bundle_check_rejects_modified_summary_page(files, folder, old, new):
     assert old in files["summary.html"]
     page = files["summary.html"].replace(old, new)
     signed_files = signed({**files, "summary.html": page}, document_of(files))
-    reason = check_bundle(placed(folder, signed_files)).reasons[0]
+    reason = check_bundle(write_files(folder, signed_files)).reasons[0]
     expected = "summary.html: differs from", "gains.json: this version cannot export it"
     assert reason.startswith(expected), reason
 
@@ -136,7 +129,7 @@ def test_bundle_check_names_version_that_wrote_bundle(files, folder):
         other.update(version=stated)
         if stated is None:
             del other["version"]
-        placed(folder, {**files, "manifest.json": resealed(other)})
+        write_files(folder, {**files, "manifest.json": resealed(other)})
         first, last = check_bundle(folder).reasons
         assert first == "manifest.json: differs from what this version exports for these files"
         assert words in last
@@ -152,12 +145,12 @@ def test_bundle_check_rejects_gain_file_with_other_formatting(files, folder):
         b"\xff",
     ):
         signed_files = signed({**files, "gains.json": text}, document_of(files))
-        reasons = check_bundle(placed(folder, signed_files)).reasons
+        reasons = check_bundle(write_files(folder, signed_files)).reasons
         assert reasons[0].startswith("gains.json: "), reasons
 
 
 def test_self_test_runs_checked_content_even_if_files_change_afterwards(files, folder, tmp_path):
-    checked = check_bundle(placed(folder, files))
+    checked = check_bundle(write_files(folder, files))
     for name in ("selftest.py", "jaxhil_runtime.py"):
         (folder / name).write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
     lines, reasons = run_checked(checked, "bundle")
@@ -166,7 +159,7 @@ def test_self_test_runs_checked_content_even_if_files_change_afterwards(files, f
 
 
 def test_bundle_check_reports_pycache_beside_sources(files, folder):
-    placed(folder, files)
+    write_files(folder, files)
     (folder / "__pycache__").mkdir()
     (folder / "__pycache__" / "jaxhil_runtime.cpython-311.pyc").write_bytes(b"who knows")
     [reason] = check_bundle(folder).reasons
@@ -187,7 +180,7 @@ def test_manifest_paths_outside_bundle_are_rejected(files, folder, path):
     (folder.parent / "secret").write_bytes(b"secret")
     hostile_files = {**files, "manifest.json": resealed(plain_manifest(files, **{path: entry(b"secret")}))}
     begun = time.monotonic()
-    checked = check_bundle(placed(folder, hostile_files))
+    checked = check_bundle(write_files(folder, hostile_files))
     good, out = run_selftest(folder)
     assert time.monotonic() - begun < SHORT
     assert not good and f"FAIL  {'c99' if path == 'c99' else 'manifest.json'}: cannot be read: " in out
@@ -200,7 +193,7 @@ def test_manifest_paths_outside_bundle_are_rejected(files, folder, path):
 def test_bundle_check_rejects_links_pipes_and_folders_without_blocking(
     files, folder, monkeypatch, name, kind
 ):
-    placed(folder, files)
+    write_files(folder, files)
     path = folder / name
     elsewhere = folder.parent / "elsewhere"
     path.rename(elsewhere) if path.exists() else elsewhere.write_bytes(bytes(64))
@@ -234,12 +227,12 @@ def test_bundle_check_rejects_links_pipes_and_folders_without_blocking(
 def test_bundle_check_rejects_oversized_manifest_entries(files, folder):
     many = {f"f{number}": entry(b"") for number in range(selftest.MAX_FILES + 1)}
     for others in (many, {"vast": entry(b"", bytes=1 << 60)}, {"odd": entry(b"", bytes=True)}):
-        placed(folder, {**files, "manifest.json": resealed(plain_manifest(files, **others))})
+        write_files(folder, {**files, "manifest.json": resealed(plain_manifest(files, **others))})
         [reason] = check_bundle(folder).reasons
         assert reason.startswith("manifest.json: cannot be read: ValueError: ")
     # The file's size differs from the stated one; its digest is as stated.
     wrong = plain_manifest(files, **{"ros2.yaml": entry(files["ros2.yaml"], bytes=3)})
-    placed(folder, {**files, "manifest.json": resealed(wrong)})
+    write_files(folder, {**files, "manifest.json": resealed(wrong)})
     [reason] = check_bundle(folder).reasons
     assert reason == f"ros2.yaml: differs from what was exported (found {len(files['ros2.yaml'])} bytes)"
 
@@ -252,7 +245,7 @@ def flipped(source, content):
 @pytest.mark.parametrize("flips", [100, pytest.param(1000, marks=pytest.mark.slow)])
 def test_bundle_check_detects_every_flipped_bit(files, folder, flips):
     source, names = random.Random(flips), sorted(files)
-    placed(folder, files)
+    write_files(folder, files)
     for turn in range(flips):
         name = names[turn % len(names)]
         (folder / name).write_bytes(flipped(source, files[name]))
@@ -262,8 +255,8 @@ def test_bundle_check_detects_every_flipped_bit(files, folder, flips):
     assert check_bundle(folder).reasons == []
 
 
-def test_only_an_unmodified_bundle_is_replaced(files, folder, tmp_path):
-    placed(folder, files)
+def test_only_an_unmodified_bundle_is_rewrite_files(files, folder, tmp_path):
+    write_files(folder, files)
     secret = tmp_path / "secret"
     secret.mkdir()
     (secret / "thesis.txt").write_text("years of work")
@@ -295,7 +288,7 @@ def test_only_an_unmodified_bundle_is_replaced(files, folder, tmp_path):
 
 
 def test_file_added_during_replacement_of_bundle_is_kept(files, folder, monkeypatch):
-    placed(folder, files)
+    write_files(folder, files)
 
     def late(new, target):
         if not (new / "thesis.txt").exists():

@@ -8,7 +8,7 @@ import re
 import shutil
 
 import pytest
-from bundles import document, run_selftest, signed, small_files
+from bundles import document, run_selftest, signed, small_files, write_files
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
@@ -55,13 +55,6 @@ def refused(ran, *words):
     assert ran.code == 2 and ran.out == ""
     last = ran.err.splitlines()[-1]
     assert last.startswith("jaxhil: ") and all(word in last for word in words), ran.err
-
-
-def placed(folder):
-    for name, content in small_files().items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(content)
-    return folder
 
 
 def files_of(folder):
@@ -229,7 +222,7 @@ def test_export_leaves_third_party_folder_unchanged(jaxhil, gains, tmp_path):
     (folder / "thesis.txt").write_text("years of work")
     refused(jaxhil("export", gains, "-o", folder), "mine", "'thesis.txt' and no bundle")
     refused(jaxhil("export", gains, "-o", folder / "thesis.txt"), "thesis.txt", "found a file")
-    placed(folder)
+    write_files(folder, small_files())
     refused(jaxhil("export", gains, "-o", folder), "thesis.txt: is not a file of this bundle")
     (folder / "thesis.txt").unlink()
     check_bundle_folder(folder)
@@ -247,7 +240,7 @@ def test_export_leaves_third_party_folder_unchanged(jaxhil, gains, tmp_path):
 def test_failed_write_of_bundle_keeps_the_old_bundle(tmp_path, monkeypatch, before):
     folder = tmp_path / "bundle"
     if before:
-        placed(folder)
+        write_files(folder, small_files())
     old_files = {name: (folder / name).read_bytes() for name in files_of(folder)}
     calls = []
 
@@ -286,7 +279,7 @@ def test_failed_write_of_bundle_keeps_the_old_bundle(tmp_path, monkeypatch, befo
 
 
 def test_bundle_is_replaced_in_one_step(tmp_path, monkeypatch):
-    folder = placed(tmp_path / "bundle")
+    folder = write_files(tmp_path / "bundle", small_files())
     monkeypatch.setattr(os, "replace", lambda *_: pytest.fail("a moment without a bundle"))
     write_bundle(folder, {**small_files(), "new": b"new"})
     assert (folder / "new").read_bytes() == b"new" and os.listdir(tmp_path) == ["bundle"]
@@ -303,7 +296,7 @@ def test_bundle_is_written_through_link_to_folder(tmp_path):
     "name", ["gains.json", "vectors.csv", "jaxhil_runtime.py", "selftest.py", "gains.mat"]
 )
 def test_verify_command_rejects_corrupt_bundle_without_running_it(jaxhil, tmp_path, name):
-    folder = placed(tmp_path / "bundle")
+    folder = write_files(tmp_path / "bundle", small_files())
     content = (folder / name).read_bytes()
     trap = f"\nopen({str(tmp_path / 'ran')!r}, 'w')\n".encode()
     (folder / name).write_bytes(content + trap)
@@ -315,7 +308,7 @@ def test_verify_command_rejects_corrupt_bundle_without_running_it(jaxhil, tmp_pa
 
 
 def test_verify_command_rejects_incomplete_and_missing_bundle(jaxhil, tmp_path):
-    folder = placed(tmp_path / "bundle")
+    folder = write_files(tmp_path / "bundle", small_files())
     (folder / "manifest.json").unlink()
     ran = jaxhil("verify", folder)
     assert ran.code == 1 and "Bad: manifest.json: cannot be read" in ran.out
@@ -332,7 +325,7 @@ def test_verify_command_reports_failed_self_test(jaxhil, tmp_path):
     fields[10] = b"1.5"
     lines[50] = b",".join(fields)
     wrong = signed({**files, "vectors.csv": b"\n".join(lines)}, json.loads(files["gains.json"]))
-    folder = placed(tmp_path / "bundle")
+    folder = write_files(tmp_path / "bundle", small_files())
     for name, content in wrong.items():
         (folder / name).write_bytes(content)
     ran = jaxhil("verify", folder, "--json")
@@ -360,7 +353,7 @@ def test_bundle_readme_escapes_mechanism_name():
 
 
 def test_export_rejects_folder_with_bundle_of_another_mechanism(tmp_path):
-    folder = placed(tmp_path / "bundle")
+    folder = write_files(tmp_path / "bundle", small_files())
     before = (folder / "gains.json").read_bytes()
     check_same_mechanism(folder, json.loads(before)["mechanism"]["name"])
     check_same_mechanism(tmp_path / "none", "another")

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from bundles import TICKS, run_selftest, signed, small_files
+from bundles import TICKS, run_selftest, signed, small_files, write_files
 
 from tuning.bundle import selftest, vector_replay
 from tuning.bundle.manifest import is_text
@@ -28,11 +28,7 @@ def files():
 @pytest.fixture
 def folder(files, tmp_path):
     """Return a copy of the small bundle."""
-    index = tmp_path / "bundle"
-    for name, content in files.items():
-        (index / name).parent.mkdir(parents=True, exist_ok=True)
-        (index / name).write_bytes(content)
-    return index
+    return write_files(tmp_path / "bundle", files)
 
 
 def in_a_bare_process(folder, *arguments, cwd="/", python=("-I", "-S")):

@@ -7,7 +7,7 @@ import zipfile
 
 import c99_cases
 import pytest
-from bundles import run_selftest, signed, small_files
+from bundles import run_selftest, signed, small_files, write_files
 from six_axis_documents import LIMITS, six_axis_document
 
 from jaxhil.simulation.jax_environment import jax_context
@@ -24,13 +24,6 @@ def files_of(name):
     files = {path: content for path, content in small_files().items() if not path.startswith("c99/")}
     document = json.loads(files["gains.json"])
     return signed({**files, **WRITERS[name](document)}, document)
-
-
-def placed(folder, files):
-    for name, content in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(content)
-    return folder
 
 
 def with_changed_digit(archive):
@@ -51,7 +44,7 @@ def with_changed_digit(archive):
 @pytest.mark.parametrize("name", ["fmi3", pytest.param("fmi2", marks=pytest.mark.slow)])
 def test_self_test_replays_vectors_through_the_fmu(name, tmp_path):
     files = files_of(name)
-    folder = placed(tmp_path, files)
+    folder = write_files(tmp_path, files)
     good, out = run_selftest(folder, "--c")
     assert good and re.search(rf"ok    {name}: vectors.csv: \d+ ticks, the same bit for bit", out), out
     assert "c99" not in out
@@ -61,28 +54,28 @@ def test_self_test_replays_vectors_through_the_fmu(name, tmp_path):
 @pytest.mark.parametrize("name", WRITERS)
 def test_self_test_detects_a_changed_digit_in_the_sources_of_an_fmu(name, tmp_path):
     files, path = files_of(name), f"{name}/{CONTROLLER}"
-    folder = placed(tmp_path, files)
+    folder = write_files(tmp_path, files)
     changed = with_changed_digit(files[path])
     (folder / path).write_bytes(changed)
     good, out = run_selftest(folder, "--c")
     assert not good and f"FAIL  {path}: differs from what was exported" in out
     assert f"FAIL  {name}: is not compiled, because a file is missing or differs" in out
     # With matching checksums, the results show the change.
-    placed(folder, signed({**files, path: changed}, json.loads(files["gains.json"])))
+    write_files(folder, signed({**files, path: changed}, json.loads(files["gains.json"])))
     good, out = run_selftest(folder, "--c")
     assert not good and re.search(rf"FAIL  {name}: vectors.csv:\d+: force_command: found", out), out
 
 
 def test_self_test_reports_an_unreadable_fmu_and_a_failing_compiler_in_one_line(tmp_path, monkeypatch):
     files = files_of("fmi3")
-    folder = placed(tmp_path, files)
+    folder = write_files(tmp_path, files)
     monkeypatch.setenv("CC", "false")
     assert "FAIL  fmi3: exit code 1" in run_selftest(folder, "--c")[1]
     garbage = signed({**files, f"fmi3/{CONTROLLER}": b"no archive"}, json.loads(files["gains.json"]))
-    _, out = run_selftest(placed(folder, garbage), "--c")
+    _, out = run_selftest(write_files(folder, garbage), "--c")
     assert "FAIL  fmi3: cannot be compiled and run: BadZipFile: File is not a zip file" in out
     monkeypatch.setenv("PATH", "")
-    assert "FAIL  fmi3: found no C compiler" in run_selftest(placed(folder, files), "--c")[1]
+    assert "FAIL  fmi3: found no C compiler" in run_selftest(write_files(folder, files), "--c")[1]
 
 
 @pytest.mark.slow

@@ -349,9 +349,9 @@ def _check_missed_ticks(mechanism: Mechanism, spans: Mapping[str, Span]) -> None
     """Raise `KeyProblem` if a mechanism has both two surfaces and missed ticks."""
     path = "rig.missed_tick_probability"
     if _is_used(mechanism, path) and math.isfinite(mechanism.contact.clearance):
-        found = format_value(_build_extreme_function(mechanism, spans)(path, 1))
+        largest = format_value(_build_extreme_function(mechanism, spans)(path, 1))
         raise KeyProblem(
-            tuple(path.split(".")), found, "0, because missed ticks are not supported with a clearance"
+            tuple(path.split(".")), largest, "0, because missed ticks are not supported with a clearance"
         )
 
 

@@ -27,7 +27,7 @@ def rt_loop_files(document: Mapping[str, Any]) -> dict[str, str]:
     model, sensor = NumericalModel(mechanism), mechanism["rig"].get("force_sensor", {})
     integrator = mechanism["rig"].get("integrator", "semi_implicit_euler")
     has_noise_or_bias = sensor.get("noise_std", 0.0) != 0.0 or sensor.get("bias", 0.0) != 0.0
-    mapping = FlightRecorder(period, ticks=1, equivalent_mass=model.mass).mapping("*")
+    recorder = FlightRecorder(period, ticks=1, equivalent_mass=model.mass)
     lines = [
         f"#define PERIOD {period!r} /* s */",
         f"#define EQUIVALENT_MASS {model.mass!r} /* kg, of the numerical model */",
@@ -36,9 +36,10 @@ def rt_loop_files(document: Mapping[str, Any]) -> dict[str, str]:
         f"#define HAS_NOISE_OR_BIAS {int(has_noise_or_bias)} /* of the force sensor */",
         "/* Displacement in a period, from the velocities before and after it, and the acceleration. */",
         f"#define MODEL_STEP(before, acceleration, after) {MODEL_STEPS[integrator]}",
-        "/* Mapping (jaxhil/log/1) of the log. */",
+        "/* Heading of the log, and its mapping (jaxhil/log/1). */",
+        f"#define HEADING {json.dumps(recorder.heading)}",
         "#define MAPPING \\",
-        *(f"    {json.dumps(line)} \\" for line in mapping.splitlines(keepends=True)),
+        *(f"    {json.dumps(line)} \\" for line in recorder.mapping("*").splitlines(keepends=True)),
         '    ""',
     ]
     folder = resources.files("tuning") / "bundle" / "rt"

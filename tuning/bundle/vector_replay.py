@@ -84,10 +84,10 @@ def replay_vectors(rows, gains, runtime):
         sent = getattr(controller, layout.method)(*quantities(row[time + 1 : after], width))
         command, sent = ([command], [sent]) if width == 1 else (command, sent)
         # The faults are integers in the file, and are compared as floats like all other columns.
-        found = [*command, *sent, float(controller.faults)]
+        values = [*command, *sent, float(controller.faults)]
         texts = [
             f"{column}: found {value!r}, expected {expected!r}"
-            for column, value, expected in zip(columns, found, row[after:], strict=False)
+            for column, value, expected in zip(columns, values, row[after:], strict=False)
             if not are_same_bits(value, expected)
         ]
         if texts:

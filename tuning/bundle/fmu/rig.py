@@ -52,8 +52,8 @@ def describe_unsupported(mechanism: Mechanism) -> str | None:
     """Describe the first property of the rig that its FMU cannot simulate; return None if there is none."""
     sensor = mechanism.rig.force_sensor
     if mechanism.contact.law not in LAWS:
-        found = format_value(mechanism.contact.law)
-        return f"contact.law: found {found}, expected one of {', '.join(LAWS)}"
+        law = format_value(mechanism.contact.law)
+        return f"contact.law: found {law}, expected one of {', '.join(LAWS)}"
     if sensor.filter is not None:
         return "rig.force_sensor.filter: found a filter, expected none"
     for key, value in {

@@ -18,9 +18,6 @@
 #define BATCH_ROWS 64u    /* largest number of rows that are written together */
 #define ROW_SIZE 192      /* bytes, more than the longest row */
 
-static const char heading[] =
-    "time,force_measured,position_desired,velocity_desired,position_measured,force_command,contact,faults\n";
-
 static struct {
     log_row rows[RING_ROWS];
     uint32_t added, taken; /* counters; each is written by one thread only */
@@ -126,7 +123,7 @@ bool create_log(const char *path) {
     }
     close(table);
     ring.path = path;
-    ring.file = create_file(path, heading);
+    ring.file = create_file(path, HEADING);
     if (ring.file < 0) {
         unlink(mapping);
     }

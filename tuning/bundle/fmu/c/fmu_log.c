@@ -82,12 +82,12 @@ const char *fmu_open_log(fmu_log *log) {
 static void write_number(FILE *file, double value) {
     const char *const point = localeconv()->decimal_point;
     char text[64];
-    char *found;
+    char *separator;
     snprintf(text, sizeof text, "%.17g", value);
-    found = strstr(text, point);
-    if (found != NULL) {
-        *found = '.';
-        memmove(found + 1, found + strlen(point), strlen(found + strlen(point)) + 1);
+    separator = strstr(text, point);
+    if (separator != NULL) {
+        *separator = '.';
+        memmove(separator + 1, separator + strlen(point), strlen(separator + strlen(point)) + 1);
     }
     fputs(value == value ? text : "nan", file);
 }
