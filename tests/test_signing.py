@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from bundles import document, run_selftest, signed, small_files
+from bundles import document, run_selftest, signed, small_files, write_files
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.rsa import generate_private_key
 from cryptography.hazmat.primitives.serialization import (
@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.serialization import (
     PrivateFormat,
     PublicFormat,
 )
-from test_bundle_checking import flipped, placed
+from test_bundle_checking import flipped
 
 import tuning
 from jaxhil.errors import InputError
@@ -49,7 +49,7 @@ def folder(key, tmp_path):
     """Return a signed bundle."""
     files = small_files()
     signature = load_signer(key[0])(files["manifest.json"])
-    return placed(tmp_path / "bundle", {**files, "manifest.sig": signature})
+    return write_files(tmp_path / "bundle", {**files, "manifest.sig": signature})
 
 
 def test_bundle_signature_matches_example_of_rfc_8032(tmp_path):
@@ -85,7 +85,7 @@ def test_verify_rejects_signature_of_another_key_or_manifest(key, folder, tmp_pa
     # Update all checksums after a change, as is possible without the key; only the signature is wrong.
     files = small_files()
     shorter = files["vectors.csv"].rpartition(b"\n1,")[0] + b"\n"
-    placed(folder, signed({**files, "vectors.csv": shorter}, json.loads(files["gains.json"])))
+    write_files(folder, signed({**files, "vectors.csv": shorter}, json.loads(files["gains.json"])))
     assert check_bundle(folder).reasons == []
     assert check_bundle(folder, by_key).reasons == [expected]
 
@@ -119,7 +119,7 @@ def test_openssl_creates_keys_and_verifies_bundle_signature(tmp_path):
         assert subprocess.run(command.split(), cwd=tmp_path, capture_output=True).returncode == 0
     files = small_files()
     signature = load_signer(tmp_path / "key.pem")(files["manifest.json"])
-    placed(tmp_path, {**files, "manifest.sig": signature})
+    write_files(tmp_path, {**files, "manifest.sig": signature})
     proof = "openssl pkeyutl -verify -pubin -inkey public.pem -rawin -in manifest.json -sigfile manifest.sig"
     assert subprocess.run(proof.split(), cwd=tmp_path, capture_output=True).returncode == 0
     (tmp_path / "manifest.json").write_bytes(files["manifest.json"] + b" ")
