@@ -62,6 +62,7 @@ def test_tune_function_gives_the_results_of_tune_command(jaxhil, tuned, tmp_path
     assert tuned.verdict == "bad" and tuned.figures["tuned"].rms < tuned.figures["before"].rms
 
 
+@pytest.mark.slow
 def test_sweep_function_without_folder_equals_stored_sweep(tuned, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     study = tuning.sweep(tuned, scenarios=40, chunk=32, limit=0.5)

@@ -79,6 +79,7 @@ class Known(NamedTuple):
     damping: Array
 
 
+@pytest.mark.slow
 def test_compensator_that_replays_ideal_contact_has_zero_transparency(monkeypatch):
     monkeypatch.setitem(compensators.COMPENSATORS, "played_back", PlayedBack())
 

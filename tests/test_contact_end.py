@@ -191,6 +191,7 @@ def test_exported_python_controller_has_mean_restitution_of_simulation():
     assert np.std(result) == pytest.approx(np.std(simulated), rel=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler")
 def test_exported_c_controller_has_restitution_of_simulation(tmp_path):
     parsed, seeds = heavy_mechanisms(noise_std=1.0), 16

@@ -41,6 +41,7 @@ def second_order(frequency):
     return {"model": "second_order", "natural_frequency": frequency, "damping_ratio": 0.8}
 
 
+@pytest.mark.slow
 def test_restitution_with_sensor_lag_converges_for_increasingly_fast_simulator():
     cases = [fast_mechanism(second_order(frequency)) for frequency in (300.0, 600.0, 1200.0)]
     parsed = [validated(case) for case in cases]
@@ -115,7 +116,7 @@ RUBBING = {"law": "preloaded", "stiffness": [8e5], "preload": 3.0, "friction": 2
 @pytest.mark.parametrize(
     ("contact", "frequency", "lag", "hold"),
     [
-        (DAMPED, 155.0, 0.0, "zoh"),
+        pytest.param(DAMPED, 155.0, 0.0, "zoh", marks=pytest.mark.slow),
         (DAMPED, 23.0, 2e-4, "zoh"),
         *(
             pytest.param(*case, hold, marks=pytest.mark.slow)

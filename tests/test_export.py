@@ -41,7 +41,7 @@ ALWAYS = {
 UDP = ("udp_controller.py", "udp_protocol.py", "udp_task.py", "numerical_model.py", "flight_recorder.py")
 # Compensators whose exported files hardly differ from the files of other compensators.
 LIKE_OTHERS = {"dead_zone_observer", "multi_parameter_lead", "passivity", "phase_lead", "smith_hybrid"}
-LIKE_OTHERS |= {"none", "position_lead", "smith_predictor", "virtual_contact"}
+LIKE_OTHERS |= {"none", "position_lead", "response_error", "smith_predictor", "virtual_contact"}
 
 
 @pytest.fixture
@@ -175,6 +175,7 @@ def test_export_takes_limits_from_the_specified_sweep(jaxhil, gains, tmp_path):
     assert limits["force_limit"]["value"] > 0 and "force_limit" in ran.out
 
 
+@pytest.mark.slow
 def test_export_verdict_is_bad_if_watchdog_stops_good_runs(jaxhil, gains, tmp_path):
     store, folder = tmp_path / "store", tmp_path / "bundle"
     assert jaxhil("sweep", gains, "--scenarios", "40", "--limit", "5", "-o", store).code == 0

@@ -93,7 +93,7 @@ def test_fmu_compiled_by_fmpy_reproduces_vectors_bit_for_bit(fmi, tmp_path):
     running.close()
 
 
-@pytest.mark.parametrize("fmi", [3, 2])
+@pytest.mark.parametrize("fmi", [3, pytest.param(2, marks=pytest.mark.slow)])
 def test_six_axis_fmu_equals_runtime_bit_for_bit(fmi):
     controller = Controller6.from_dict(six_axis_document("phase_lead", limits=LIMITS))
     running = RunningFmu(folder_of("six axes", fmi))
@@ -128,7 +128,7 @@ def test_six_axis_fmu_equals_runtime_bit_for_bit(fmi):
 
 
 @pytest.mark.parametrize("axes", DOCUMENTS)
-@pytest.mark.parametrize("fmi", [3, 2])
+@pytest.mark.parametrize("fmi", [3, pytest.param(2, marks=pytest.mark.slow)])
 def test_fmu_sources_compile_without_warning_as_c_and_as_cpp(axes, fmi):
     folder = folder_of(axes, fmi)
     assert compile_sources(folder, "gcc", "-std=c99", *PEDANTIC) == ""

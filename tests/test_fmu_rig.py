@@ -22,7 +22,7 @@ from tuning.rig.plant import RigHardware
 
 PEDANTIC = ("-pedantic", "-Wall", "-Wextra", "-Werror")
 NOISELESS = ("rig.force_sensor.noise_std=0", "rig.position_sensor.noise_std=0")
-EVERY_DAY = ("third order with latency", "rattling, lag", "velocity limit", "preloaded", "quantum")
+EVERY_DAY = ("rattling, lag", "velocity limit", "quantum")
 PLANTS = [
     name if name in EVERY_DAY else pytest.param(name, marks=pytest.mark.slow) for name in AGAINST_THE_ORACLE
 ]
@@ -118,7 +118,7 @@ def assert_same_contacts(contacts, expected):
         assert mine.restitution == pytest.approx(other.restitution, abs=1e-9)
 
 
-@pytest.mark.parametrize("fmi", [3, 2])
+@pytest.mark.parametrize("fmi", [3, pytest.param(2, marks=pytest.mark.slow)])
 def test_controller_and_rig_fmus_reproduce_simulation_with_one_more_period(fmi, tmp_path):
     contacts, expected = run_both("rig-300kg", "phase_lead", fmi, tmp_path)
     assert_same_contacts(contacts, expected)
@@ -126,7 +126,11 @@ def test_controller_and_rig_fmus_reproduce_simulation_with_one_more_period(fmi, 
     assert abs(contacts[0].restitution - without[0].restitution) > 1e-3
 
 
-@pytest.mark.parametrize("integrator", ["semi_implicit_euler", "zoh", "explicit_euler"])
+@pytest.mark.parametrize(
+    "integrator",
+    [pytest.param(name, marks=pytest.mark.slow) for name in ("semi_implicit_euler", "zoh")]
+    + ["explicit_euler"],
+)
 def test_parallel_master_adds_one_period_if_controller_integrates_model(integrator, tmp_path):
     overrides = (*NOISELESS, f"rig.integrator={integrator}")
     running = both("rig-300kg", "phase_lead", 3, tmp_path, overrides)

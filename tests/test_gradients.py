@@ -147,6 +147,7 @@ def disagreements(study):
     }
 
 
+@pytest.mark.slow
 def test_restitution_derivatives_for_gains_and_parameters_are_nonzero(study):
     exact = study[-1]
     assert np.all(np.isfinite(exact))

@@ -35,7 +35,9 @@ def test_independent_simulator_without_delays_conserves_energy():
     assert restitution(rig, 0.005, pass_on) == pytest.approx(1, abs=1e-3)
 
 
-@pytest.mark.parametrize(("phase", "expected"), [(0.1, 1.169561985550), (0.4, 1.827809059189)])
+@pytest.mark.parametrize(
+    ("phase", "expected"), [pytest.param(0.1, 1.169561985550, marks=pytest.mark.slow), (0.4, 1.827809059189)]
+)
 def test_independent_simulator_gains_energy_from_force_delay(phase, expected):
     rig = Rig(period=0.00025, mass=300.0, stiffness=1.1e5, window=1e-9)
     delay = phase * np.sqrt(rig.mass / rig.stiffness)

@@ -43,10 +43,10 @@ def fit(run, noise):
 @pytest.mark.parametrize(
     ("run", "noise", "bias"),
     [
-        (multisine(), 1.0, 0.0),
+        pytest.param(multisine(), 1.0, 0.0, marks=pytest.mark.slow),
         pytest.param(multisine(), 1.0, 7.0, marks=pytest.mark.slow),
         (multisine(noise=10.0), 10.0, -7.0),
-        (ramp(2e-4), 1.0, 5.0),
+        pytest.param(ramp(2e-4), 1.0, 5.0, marks=pytest.mark.slow),
     ],
     ids=["multisine", "biased", "ten times the noise", "slow"],
 )

@@ -75,6 +75,7 @@ def test_xla_flags_that_abort_the_process_raise_python_error():
     assert "InputError: XLA_FLAGS: found '--xla_nonsense=1'" in ran.stderr
 
 
+@pytest.mark.slow
 def test_jax_debugging_modes_change_no_result(jaxhil, tmp_path):
     ran = run("simulate", "rig-300kg", "--json", "--plot", str(tmp_path / "run.png"), **DEBUGGING)
     assert ran.returncode == 1, ran.stderr

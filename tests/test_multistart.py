@@ -63,7 +63,8 @@ def test_starting_gains_are_literature_gains_and_best_points_of_a_scan(tasks, va
         assert (apart >= 0.1 * np.sqrt(points.shape[1]) - 1e-12).all()
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_scan_of_starting_gains_on_few_scenarios_chooses_same_points_as_full_scan(seed, monkeypatch):
     runs = []
     work = SearchProgress()
@@ -95,6 +96,7 @@ def test_best_optimisation_result_is_refined_by_polishing_search(tasks, validati
     assert polish_best_starts(validation, failed, 64, seed=0) == [None] * 3
 
 
+@pytest.mark.slow
 def test_further_batches_of_starts_run_until_several_optima_agree(tasks, validation, monkeypatch):
     asked = []
 

@@ -87,6 +87,7 @@ def watch(limits, signals, rules, lane):
     return result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sided", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_calibration_audit_equals_watchdog_audit_bit_for_bit(sided):
     rules, _ = build_audit_rules({1: ONE_SIDED, 2: NOISY_GAP}[sided])
@@ -224,6 +225,7 @@ def test_watchdog_with_specified_damping_does_not_use_identified_damping(calibra
     assert rates["widened_from"] is None and rates["noticed_from"]["error"] < LIMIT
 
 
+@pytest.mark.slow
 def test_watchdog_without_specified_damping_cannot_distinguish_damping_from_delay():
     """The margin is widened until good runs pass, and the verdict states the missed alarms."""
     loaded = gains(uncertainty={**UNCERTAIN, **DAMPING})

@@ -84,6 +84,7 @@ def test_rollout_motion_agrees_with_oracle_in_every_contact(name):
         )
 
 
+@pytest.mark.slow
 def test_position_shortfall_is_zero_after_drives_have_caught_up():
     rattling, always = (
         [result["position_shortfall"] for result in cases.loop_contacts(name)]

@@ -93,6 +93,7 @@ def test_rig_rejects_controller_with_another_number_of_axes(gains):
         process.communicate()
 
 
+@pytest.mark.slow
 def test_killed_controller_ends_session_with_one_line_and_holds_the_command(gains, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "MAX_SILENCE", 0.2)
     mechanism, rig, commands = load_any(NAME).mechanism, copy.copy(simulated_rig(NAME)), []
