@@ -104,12 +104,12 @@ def test_c99_controller_raises_every_fault_on_its_tick(law):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", COMPENSATORS)
-def test_python_controller_raises_faults_over_ten_million_ticks(law):
+def test_python_controller_raises_every_fault_in_run_of_ten_million_ticks(law):
     python_runs(10_000_000 if law == "response_error" else 1_000_000, law, 1000)
 
 
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("law", COMPENSATORS)
-def test_c99_controller_raises_faults_over_a_hundred_million_ticks(law):
+def test_c99_controller_raises_every_fault_in_run_of_hundred_million_ticks(law):
     c_runs(100_000_000 if law == "response_error" else 10_000_000, law, 2000)

@@ -65,10 +65,10 @@ NO_COMMAND = {"force_command": None}
         ({"F": 1 / LBF}, NO_COMMAND, "force in lbf, read as N"),
         ({"F": LBF}, NO_COMMAND, "force in N, read as lbf"),
         ({"F": 1 / 9.80665}, NO_COMMAND, "force in kgf, read as N"),
-        ({"Fc": 1 / LBF}, {}, "0.2248 times the required force"),
-        ({"Fc": 1 / LBF}, {}, "within 1 % (force in lbf, read as N?); or omit force_command"),
-        ({"F": 1 / LBF, "Fc": 1 / LBF}, {}, "(nearest: 78.68 kg)"),
-        (dict.fromkeys(ALL, 1 / 2.54), {}, "2.54 times the required force"),
+        ({"Fc": 1 / LBF}, {}, "0.2248 times the force that moves"),
+        ({"Fc": 1 / LBF}, {}, "within 1 % (force in lbf, read as N?); correct unit or mass"),
+        ({"F": 1 / LBF, "Fc": 1 / LBF}, {}, "(it would move 78.68 kg)"),
+        (dict.fromkeys(ALL, 1 / 2.54), {}, "2.54 times the force that moves"),
         (dict.fromkeys(ALL, 1 / 2.54), {}, "(positions in in, read as cm?)"),
         (dict.fromkeys(ALL, 1 / 2.54), NO_COMMAND, "positions in in, read as cm"),
         (dict.fromkeys(ALL, 2.54), {}, "(positions in cm, read as in?)"),
@@ -91,7 +91,10 @@ def test_log_channel_in_wrong_unit_is_rejected_with_factor_and_unit(tmp_path, fa
 
 def test_mass_error_of_a_few_percent_is_detected_from_log(tmp_path):
     result = refused(tmp_path, scaled(LOG, Fc=1.03))
-    assert "(nearest: 360.5 kg): force_command is 1.03 times" in result
+    assert (
+        "found 1.03 times the force that moves 350 kg like position_desired (it would move 360.5 kg)"
+        in result
+    )
     assert read(write_csv(tmp_path / "b.csv", scaled(LOG, Fc=1.005))).notes == ()
 
 
@@ -115,7 +118,7 @@ def test_force_command_column_is_used_in_rounded_logs(tmp_path, name, without):
     result = read(write_csv(tmp_path / "a.csv", log), **gone)
     assert result.notes == () and all(run.force_command is not None for run in result.runs)
     assert 'expected "tick": only then' in refused(tmp_path, log, timing={"row": "sent"}, **gone)
-    assert "(nearest: 367.5 kg)" in refused(tmp_path, scaled(log, Fc=1.05), **gone)
+    assert "(it would move 367.5 kg)" in refused(tmp_path, scaled(log, Fc=1.05), **gone)
     assert "accelerate the approach" in refused(tmp_path, scaled(log, Fc=-1.0), **gone)
 
 
@@ -178,7 +181,7 @@ def test_force_command_column_is_read_correctly_or_rejected_in_any_log(factor, q
     try:
         holds, _ = check_command("a", stretch, contacts, PERIOD, MASS, "tick", "semi_implicit_euler")
     except InputError as error:
-        result = float(str(error).split("force_command is ")[1].split(" times")[0])
+        result = float(str(error).split("force_command: found ")[1].split(" times")[0])
         assert factor != 1.0 and result == pytest.approx(factor, rel=0.05)
         return
     assert factor == 1.0 or not holds

@@ -82,7 +82,7 @@ def test_mechanism_distance_is_symmetric_and_zero_for_identical_mechanisms():
         ("name='other'", 0.0),
     ],
 )
-def test_mechanism_distance_weights_properties_by_effect_on_restitution(override, expected):
+def test_properties_are_weighted_by_effect_on_restitution_in_mechanism_distance(override, expected):
     assert compute_mechanism_distance(claw(), claw(override)) == pytest.approx(expected, rel=2e-4, abs=1e-12)
 
 

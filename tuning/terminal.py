@@ -287,7 +287,7 @@ class _ActivityColumn(TextColumn):
     """Progress-bar column with rate and current activity; a narrow terminal truncates only this column."""
 
     def __init__(self) -> None:
-        # The table narrows this column first, because the column appears to allow line breaks.
+        # rich narrows columns that allow line breaks before all others; `render` then truncates the line.
         super().__init__("{task.fields[pace]}  {task.description}", markup=False, table_column=Column())
 
     def render(self, task: rich.progress.Task) -> Text:

@@ -78,7 +78,9 @@ class CProgram:
         self.bindings, self.enumerators = bindings or {}, enumerators or {}
         self.fields: dict[type, dict[str, ValueType]] = {}  # types of the attributes of each class
         self.changed_in_place: Locations = frozenset()  # locations of lists that change in place
-        self.shared: list[tuple[Locations, SubsetError]] = []  # locations of the same list, and its error
+        self.shared: list[
+            tuple[Locations, SubsetError]
+        ] = []  # locations that refer to one list, and the error if it changes
         self.under_way: list[Any] = []  # keys of the functions that are being lowered
         self.functions: dict[Any, CFunction] = {}
         self.constants: dict[str, tuple[str, str]] = {}  # C code and comment of each constant, by name

@@ -24,7 +24,9 @@ class CExpression(NamedTuple):
     writes: Locations = frozenset()  # variables and attributes that the evaluation changes
     fails: bool = False  # whether the error flag must be tested after the evaluation
     sign: int = 0
-    span: tuple[Any, Any] | None = None  # least and largest value, if known at export; then never NaN
+    span: tuple[Any, Any] | None = (
+        None  # least and largest value, if known at export; the value is then never NaN
+    )
     below: str = ""  # for the index of a loop: C code of the length that limits the index
     constant: Any = None  # value, if known at export
     is_pointer: bool = False  # for an object: whether `text` is a pointer

@@ -181,7 +181,7 @@ class ContactLaw(abc.ABC):
         """
         return damping / (2 * mass * frequency)
 
-    # Optional functions for other packages
+    # Functions that a user's contact law may leave out
 
     def perturb_damping(
         self, drawn: Callable[[str], np.ndarray], ratio: np.ndarray, mass: np.ndarray, velocity: np.ndarray

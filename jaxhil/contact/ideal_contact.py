@@ -218,7 +218,7 @@ def _hunt_crossley_shape_jvp(primals, tangents):
 
 
 def _shape_at_roots(half_span, at_peak, onset, exponent):
-    """Return the results of `_hunt_crossley_shape` from the roots S = `half_span` and u = `at_peak`."""
+    """Return the results of `_hunt_crossley_shape` from the solutions S and u of its two equations."""
     symmetry, _ = _langevin(half_span)
     exponent_ratio = exponent / (exponent + 1)
     # The peak force is stationary with respect to u = `at_peak`, so that u needs no derivative.

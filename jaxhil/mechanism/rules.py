@@ -228,11 +228,11 @@ def _check_keys(
 
 
 def is_damped(
-    path: KeyPath, contact: Any, uncertainties: Mapping[str, Uncertainty], by: str = "damping"
+    path: KeyPath, contact: Any, uncertainties: Mapping[str, Uncertainty], key: str = "damping"
 ) -> bool:
-    """Return whether the contact's key `by` is nonzero, or can be nonzero in a random draw."""
-    uncertain = uncertainties.get(".".join((*map(str, path), by)))
-    return bool(np.any(getattr(contact, by))) or (uncertain is not None and uncertain.factor is None)
+    """Return whether the contact's value of `key` is nonzero, or can be nonzero in a random draw."""
+    uncertain = uncertainties.get(".".join((*map(str, path), key)))
+    return bool(np.any(getattr(contact, key))) or (uncertain is not None and uncertain.factor is None)
 
 
 def check_simulator_model(simulator: Any) -> None:

@@ -141,7 +141,9 @@ def _check_start(mechanism: SixAxisMechanism) -> None:
     if approach is None:
         return
     if not mechanism.contact:
-        raise KeyProblem(("contact",), "nothing", "[contact.NAME]: an approach ends with the first contact")
+        raise KeyProblem(
+            ("contact",), "nothing", "[contact.NAME], because [approach] needs a contact that ends it"
+        )
     angle = float(np.linalg.norm(approach.attitude))
     if angle > MAX_ATTITUDE:
         expected = f"a rotation vector of at most {MAX_ATTITUDE:g} rad"

@@ -69,7 +69,11 @@ def _compute_span(
         raise KeyProblem(where, found, f"{needed} for {kind}")
     is_unscaled = uncertainty.independent or np.all(nominal == nominal.flat[0])
     if not is_unscaled and nominal.flat[0] == 0.0 and uncertainty.factor is None:
-        raise KeyProblem(where, f"{path} as a list that begins with 0", "factor, or independent = true")
+        raise KeyProblem(
+            where,
+            f"a list {path} that begins with 0, which no common factor can scale",
+            "`factor`, or independent = true",
+        )
     if kind == "normal":
         return np.full_like(nominal, allowed.low), np.full_like(nominal, allowed.high)
     bounds = uncertainty.factor or [uncertainty.low or 0.0, uncertainty.high or 0.0]

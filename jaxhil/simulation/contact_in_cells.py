@@ -139,7 +139,7 @@ def compute_jump_work(
     before: Float[Array, "*batch"],
     now: Float[Array, "*batch"],
 ) -> tuple[Array, Array]:
-    """Return the work done on the mechanism, and the work that it returns, if the position jumps [J].
+    """Return two works [J] of a jump in position: done on the mechanism, and given back by it.
 
     `before` and `now` are the positions before and after the jump [m].
     """

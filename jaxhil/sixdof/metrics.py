@@ -108,7 +108,7 @@ def compute_ideal_states(scenario: Scenario, time: Float[Array, "*batch"]) -> St
 
 
 def compare_with_ideal(bodies: Pair, episodes: EpisodeBatch) -> Metrics:
-    """Return the metrics of all episodes, (episodes, *batch); each run has its own `bodies`, (*batch)."""
+    """Return the metrics of all episodes (episodes, *batch) from the `bodies` of each run (*batch)."""
     bodies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, episodes.status.shape), bodies)
     summary, first_touch = episodes.summary, episodes.first_touch
     expected_states = states_at(bodies, summary, episodes.elapsed)

@@ -65,7 +65,7 @@ def test_cpp_baseline_contacts_agree_with_jax_simulation(baseline, compensator, 
         )
 
 
-def test_cpp_baseline_in_single_contact_mode_has_the_same_first_contact(baseline):
+def test_cpp_baseline_has_the_same_first_contact_in_modes_of_one_and_many_contacts(baseline):
     loop, gains, scenario, rig = case("response_error")
     contacts = baseline.run(loop, rig, gains, scenario, 3000)
     bare = baseline.run_ticks(loop, rig, gains, scenario, 3000)

@@ -9,7 +9,7 @@ SCRIPT = Path(__file__).with_name("gpu.sh")
 
 
 @pytest.mark.slow
-def test_gpu_script_fills_every_row_with_tiny_sizes():
+def test_gpu_script_run_with_tiny_sizes_fills_every_row():
     done = subprocess.run(["bash", str(SCRIPT), "--smoke"], capture_output=True, text=True, check=True)
     rows = [line for line in done.stdout.splitlines() if line.startswith("|")][2:]
     assert len(rows) == 10

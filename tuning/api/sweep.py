@@ -107,7 +107,7 @@ class SweepStudy:
 
     @contextmanager
     def store(self) -> Iterator["SweepStore"]:
-        """Provide the store with the rows: the one in the folder, or a temporary one for rows in memory."""
+        """Open the store that holds the rows: in the folder, or a temporary one for rows in memory."""
         from tuning.sweeps.chunk_file import from_table
         from tuning.sweeps.store import open_store, read_store, write_chunk
 

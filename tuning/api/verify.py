@@ -132,7 +132,7 @@ def _verify_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: 
 
 
 def _add_fmu_loop(document: dict[str, Any], files: Any, loaded: Any, progress: bool) -> dict[str, Any]:
-    """Close the loop through the FMUs of a bundle that has both; add the result to the document."""
+    """Simulate the loop with the bundle's two FMUs, if it has them; add the result to the document."""
     import msgspec
 
     from tuning.bundle.fmu.closed_loop import compare_fmu_loop

@@ -148,7 +148,7 @@ def c99_files(document: Mapping[str, Any]) -> dict[str, bytes]:
 
 
 def fmi3_files(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the FMUs of FMI 3.0 without library, in the folder `fmi3`.
+    """Return the FMUs of FMI 3.0 as source code without a compiled library, in the folder `fmi3`.
 
     These are the controller and, for one axis, the rig if its FMU can simulate it. A test program replays the
     test vectors through the controller's FMU.
@@ -157,7 +157,7 @@ def fmi3_files(document: Mapping[str, Any]) -> dict[str, bytes]:
 
 
 def fmi2_files(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the FMUs of FMI 2.0 without library, in the folder `fmi2`; see `fmi3_files`."""
+    """Return the FMUs of FMI 2.0 as source code, in the folder `fmi2`; see `fmi3_files`."""
     return _fmu_files(document, 2)
 
 

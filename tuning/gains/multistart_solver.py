@@ -105,7 +105,7 @@ def solve_tasks(
         for coordinates in points
     ]
     objectives = list_objectives(objective, len(tasks))
-    # All rounds use the call size of the first round, so that they use one compiled program.
+    # Every call has as many lanes as the first round needs, so that all rounds use one compiled program.
     advance = _build_stepper(tasks, names, bounds, objectives, len(tasks) * max(map(len, starts)), work)
     # After sorting by expected duration, the problems of one call take about equally long.
     order = np.argsort(

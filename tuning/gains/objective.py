@@ -319,9 +319,10 @@ def compute_contact_terms(
 
 
 def extract_scenario_metrics(outcome: Outcome, number: int, contacts: int, probed: bool) -> ScenarioMetrics:
-    """Return the metrics for a user's function, arrays (problems, contacts, scenarios) without probes.
+    """Return the metrics that a user's function receives, arrays (problems, contacts, scenarios).
 
-    The last axis of `outcome` joins the scenarios of `number` problems, which include probes if `probed`.
+    The last axis of `outcome` lists the scenarios of all problems one after the other. If `probed` is true,
+    it also has the probes of each scenario; the metrics omit them.
     """
 
     def by_problem(leaf):

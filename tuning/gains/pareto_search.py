@@ -25,7 +25,7 @@ from tuning.gains.validation import Validation
 # Ends of a ladder: weight times second criterion of the accurate gains, divided by their error [1]. The first
 # ladder extends to a larger weight, because smaller weights lead to no quiet, inaccurate gains.
 LADDER_ENDS, FIRST_LADDER_ENDS = (0.5, 10.0), (1.0, 100.0)
-MAX_ACCURATE_ERROR_RATIO = 1.05  # largest error of accurate gains / least error
+MAX_ACCURATE_ERROR_RATIO = 1.05  # largest error of accurate gains, divided by the least error
 MIN_NOISE_EXCESS = 0.1  # lower bound, in a ladder's scale, of the noise amplification minus 1
 MAX_NEIGHBOUR_SEARCHES = 4  # largest number of passes that start from the gains of neighbouring weights
 MIN_IMPROVEMENT = 1e-3  # minimum relative improvement of a point that leads to a further pass
@@ -76,9 +76,9 @@ def build_weight_ladder(
 ) -> np.ndarray:
     """Return a ladder (number,) of weights [1]: 0, then logarithmically spaced positive weights.
 
-    For accurate gains, `error` is the objective J and `excess` is the term of the second criterion, for
-    example the noise amplification minus 1. The smallest and largest positive weights times `excess` are
-    `ends` times `error`. A smaller `excess` than `least` counts as `least`.
+    The positive weights extend from `ends[0] * error / excess` to `ends[1] * error / excess`. At the gains
+    that minimise the objective J alone, `error` is J and `excess` is the second criterion, for example the
+    noise amplification minus 1. If `excess` is below `least`, `least` replaces it.
     """
     light, heavy = ends
     weights = np.geomspace(heavy, light, number - 1)[::-1] * error / max(excess, least)

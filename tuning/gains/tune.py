@@ -70,7 +70,7 @@ class TuneResult:
     mechanism: AnyMechanism  # mechanism for which the gains were tuned
     gains: dict[str, float]  # all gains of the compensator after tuning
     literature: dict[str, float]  # all gains by the literature's rule
-    # metrics, on the fresh scenarios, of the error that decides the verdict (`RigModel.verdict_error`)
+    # metrics of the verdict's error (`RigModel.verdict_error`) in scenarios that were not used for tuning
     figures: dict[str, ErrorMetrics]
     nominal: dict[str, ErrorMetrics]  # metrics of the nominal run
     starts: list[StartResult]  # results of all starts of the solver
@@ -201,7 +201,7 @@ def _count_evaluation_runs(tasks: list[TuneTask], settings: TuneSettings) -> flo
 
 
 def _count_baseline_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
-    """Return the number of runs that evaluate no compensation and the literature's gains."""
+    """Return the number of runs for both baselines: no compensation, and the literature's gains."""
     return 2 * len(tasks) * count_evaluated_runs(settings.validation, tasks[0].probed)
 
 

@@ -199,7 +199,7 @@ class Validation:
         return lru_cache(maxsize=4)(partial(_place_training_scenarios, model, loop, self.training))
 
     def gains(self, task: int, coordinates: Float[np.ndarray, "gains"]) -> dict[str, float]:
-        """Convert unit coordinates to all gains of the compensator."""
+        """Return all gains of the compensator for coordinates in [0, 1] of the tuned gains."""
         return {name: float(gain) for name, gain in self._gains(task, coordinates).items()}
 
     def _gains(

@@ -249,7 +249,7 @@ class ContactProblem:
 
         Args:
             tables: Regressors in the rows near contact, one array (surface positions, regressors, rows) for
-                each of the times `periods_before`; 0 out of contact.
+                each entry of `periods_before`, a time before the row. They are 0 out of contact.
             onsets: Onsets of contact, or None if the sensor has no lag.
             first: Regressors just after the onsets, shape (regressors, onsets), or None.
             whitening: Coefficients of the whitening filter.

@@ -42,7 +42,7 @@ class Posterior:
 
     names: list[str]  # "delay", "plane", then the coefficients
     draws: np.ndarray  # (draws, names)
-    delays: np.ndarray  # s, the final grid
+    delays: np.ndarray  # force delays of the final grid [s]
     log_posterior: np.ndarray  # log posterior at each of `delays`, minus its maximum
     best: tuple[float, float, CoefficientFit]  # delay, plane and fit with the greatest posterior density
     evidence: float = 0.0  # log evidence, up to a constant that is the same for all models of these readings

@@ -103,7 +103,7 @@ class SummarisedProblem(ContactProblem):
     def changed(self, law: Law, time_constant: float, delay: float | None = None) -> ContactProblem:
         """Return a copy of the problem with this contact law and this time constant of the sensor [s].
 
-        `delay` [s] is the approximate force delay of the later fits, or None if it is unknown.
+        The copy is fastest for fits with force delays near `delay` [s]; None keeps the present delay.
         """
         if delay is None:
             delay = self.delay + self.time_constant - time_constant
@@ -149,7 +149,7 @@ class SummarisedProblem(ContactProblem):
         return None
 
     def _build_table(self, delay: float, plane: float, count: int) -> _DesignTable:
-        """Compute a table around a delay and a surface position, with `count` surface positions as nodes."""
+        """Tabulate the regression near a delay [s] and a surface position [m], at `count` positions."""
         low = (
             self.delay + DELAY_RANGE * np.floor((delay - self.delay) / DELAY_RANGE + 0.5) - DELAY_RANGE / 2.0
         )

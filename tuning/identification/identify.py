@@ -243,7 +243,7 @@ def _fit_and_check_contact(
     options: IdentificationOptions,
     say: ReportProgress,
 ) -> tuple[ContactFit | None, list[validation.CheckResult]]:
-    """Fit the contact law to all contacts; check a second fit on the contacts that this fit omits.
+    """Fit the contact law to all contacts. Fit it again without some contacts, and check it on these.
 
     Returns:
         The fit to all contacts, or None if there are no contacts; and the checks of the second fit.

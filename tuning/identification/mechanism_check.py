@@ -49,8 +49,8 @@ def check_against_mechanism(
         campaign: The logs.
         mechanism: Mechanism that the logs are compared with.
         limit: Largest allowed effect of all defects on the restitution e, and on its error e - e*.
-        fitted: Motion simulator that was fitted to the free runs without a specified order, or None. Only
-            such a fit reveals a wrong command hold or latency for which the mechanism's delay compensates.
+        fitted: Motion simulator that was fitted, with any order, to the free runs; or None. Without this fit,
+            a wrong command hold or latency stays hidden if a wrong delay in the mechanism cancels it.
 
     Returns:
         An identification that contains checks and a verdict, but no estimates.

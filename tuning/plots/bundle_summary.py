@@ -46,7 +46,7 @@ def summary_png(document: Mapping[str, Any]) -> bytes:
 
 
 def _draw_errors(axes: Axes, document: Mapping[str, Any]) -> None:
-    """Draw bars of each set of gains' errors, in the nominal run and in scenarios that tuning did not use."""
+    """Draw, for each set of gains, bars of its errors in the nominal run and in fresh scenarios."""
     is_one_axis = document.get("axes", 1) == 1
     groups = _error_groups(document["figures"], "robust" if is_one_axis else "twist_error")
     title, label = ("Restitution error |e - e*|", "|e - e*| [1]") if is_one_axis else ("Twist error",) * 2

@@ -111,7 +111,7 @@ def _describe_contact_laws(mechanism: AnyMechanism) -> str:
 
 
 def gain_section(results: Results) -> Section | None:
-    """Return the report's section on the gains: values, bounds, limits on the rig, errors after tuning."""
+    """Return the report's section on gains: values, bounds, tuned errors, and the controller's limits."""
     subject = results.subject
     if subject is None:
         return None

@@ -80,7 +80,7 @@ def _line_integral(start: float, length: float, hold: str) -> tuple[float, float
 def _weights(
     entering: tuple[float, float], first: tuple[float, float], second: tuple[float, float], width: float
 ) -> ResponseRow:
-    """Return the weights of a, b, c and of the command at the interval's start and end."""
+    """Return the weights in the mean of the commands a, b, c (above), and of the commands at both ends."""
     leaving = first[0], first[1] + second[0], second[1]
     return (*(-weight / width for weight in leaving), *(weight / width for weight in entering))
 

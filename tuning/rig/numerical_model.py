@@ -102,7 +102,7 @@ class OneAxisModelInLoop:
         self._update_command()
 
     def tare(self, force: Sequence[float]) -> bool:
-        """Pass a reading out of contact to the controller; return True when its tare has ended."""
+        """Give the controller a reading taken without contact; return True once it has finished its tare."""
         return self._controller.tare(*force)
 
     def tick(self, tick: int, force: Sequence[float], position: Sequence[float], time: float) -> None:

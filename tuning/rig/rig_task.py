@@ -200,7 +200,7 @@ class RigTask:
         return _combine(min, _combine(max, command, low), high)
 
     def _largest_command_age(self) -> int:
-        """Return the largest command age [periods] in the current or, between runs, in the last contact."""
+        """Return the largest command age [periods] of the current contact; between runs, of the last one."""
         if self._tick < 0 and self._contacts:
             return self._contacts[-1].oldest_command
         return self._oldest

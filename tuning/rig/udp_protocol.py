@@ -124,7 +124,7 @@ def decode_reading(
     if mark != READING_MARK or version != VERSION or event not in EVENTS:
         raise PacketError("not a reading packet of this protocol version")
     if session is not None and packet_session != session:
-        raise PacketError("reading packet of another session")
+        raise PacketError("a packet with readings belongs to another session")
     if not math.isfinite(time):
         raise PacketError("the rig's time is not finite")
     force, position, start = _split(values, layout.axes, layout.axes, layout.start)
@@ -156,7 +156,7 @@ def decode_answer(packet: bytes, session: int | None, axes: int | None = None) -
     if mark != ANSWER_MARK or version != VERSION or flags & ~FLAGS:
         raise PacketError("not an answer packet of this protocol version")
     if session is not None and packet_session != session:
-        raise PacketError("answer packet of another session")
+        raise PacketError("an answer packet belongs to another session")
     text = trip_reason.rstrip(b"\0")
     if not all(32 <= byte < 127 for byte in text):
         raise PacketError("the reason for the trip has characters that are not printable")
@@ -212,7 +212,7 @@ class SessionNumbers:
     an answer is not longer than its request, so that forged requests cannot exhaust memory or network.
 
     Args:
-        axes: number of axes of the controller; None to repeat the number in each request.
+        axes: number of axes stated in the answers; None to state the number that the request states.
     """
 
     def __init__(self, axes: int | None = None) -> None:

@@ -273,9 +273,9 @@ def _build_contact_input(mechanism: AnyMechanism, path: str) -> PlotInput:
 
 
 def _build_scenario_input(mechanism: AnyMechanism, path: str, entry: int) -> PlotInput:
-    """Describe an input with one column per scenario, which holds entry `entry` of the input.
+    """Describe a plot's input that has one value in each scenario: the entry with index `entry`.
 
-    If all entries are drawn with a common factor, the plot shows this factor.
+    If all entries are drawn with a common factor, the values are this factor.
     """
     names, (nominal, low, high) = list_input_columns(mechanism, path), _find_input_range(mechanism, path)
     name = INPUT_LABELS.get(path, path)

@@ -4,7 +4,7 @@ A compensator that predicts the contact could be tuned to ignore the hardware. T
 choice if all contacts were alike. Therefore each scenario has three probes whose restitution the compensator
 cannot predict:
 
-    early, late   a push acts on the hardware, which no model contains (`tuning.transparency.pushes`)
+    early, late   a push that no model contains acts on the hardware (`tuning.transparency.pushes`)
     damped        the contact dissipates more energy (`tuning.transparency.damping_perturbations`)
 
 Each probe has its own e*, the restitution of the ideal contact with the same push or damping. A compensator

@@ -41,7 +41,7 @@ STATUS_NUMBERS = {status.name: status.number for status in STATUSES}
 
 
 class ControllerStop(msgspec.Struct, frozen=True, kw_only=True):
-    """First fault of a run on which the controller acts, by a trip or by changing a reading or a command."""
+    """First fault to which the controller reacts in a run: it trips, or it changes a reading or command."""
 
     fault: str  # name of the fault, as in `jaxhil.rig.faults`
     by: str  # part of the controller that raises the fault: "watchdog" or "guard"

@@ -209,7 +209,10 @@ class ImpulseLedger(Compensator):
         return contact_model.prior(gains["prior_stiffness"], spreads, variance)
 
     def _begin(self, gains, side, speed, origin, lag, depth, variance) -> LedgerContact:
-        """Return a contact before its first reading; arguments as in `LedgerContact`, `depth` [s] scaled."""
+        """Return a contact before its first reading.
+
+        The arguments are fields of `LedgerContact`, and `depth`, the present depth divided by `speed` [s].
+        """
         zeros, prior = jnp.zeros_like(speed), self._prior(gains, variance)
         return LedgerContact(
             side, speed, origin, lag, zeros, zeros + rig.MIN_PEAK, zeros, contact_model.begin(*prior),

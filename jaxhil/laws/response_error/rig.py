@@ -4,9 +4,9 @@
 
 y is the lead-filtered force, k and b are the identified contact stiffness and damping, and x_d - x_m is the
 distance by which the motion simulator lags behind the numerical model. The compensator needs no model of the
-simulator. The gate is open while the aligned position is in contact. It opens and closes smoothly within two
-periods, as a function of the time (between two ticks) at which the position crosses the surface. F_c is not
-clamped, because a clamp increases the divergence.
+simulator. The gate is open while the position, delayed like the force, is in contact. It opens and closes
+smoothly within two periods, as a function of the time (between two ticks) at which the position crosses the
+surface. F_c is not clamped, because a clamp increases the divergence.
 
 Source: Qi, Zhao, Gao, Ren, Hu, "Divergence compensation for hardware-in-the-loop simulation of
 stiffness-varying discrete contact in space", Acta Astronautica 2016, and later papers of that group.

@@ -9,11 +9,10 @@ b_hat are a recursive least-squares fit of the measured force to the measured po
 position is delayed like the force (`identification_delay`); without this alignment, k_hat and b_hat are
 biased (section 6, item 6). v_a is a filtered difference, s/(1 + T_v s) by Tustin's rule.
 
-`gate` is 1 while the aligned position is in contact and 0 outside. It opens and closes smoothly within two
-periods, as a function of the time (between two ticks) at which the position crosses the surface
-(`jaxhil.laws.shared.gates`). The weight of a reading in the identification is this gate times a gate of the
-force above `contact_threshold`. F_c is therefore a continuous function of the delays.
-"""
+`gate` is 1 while the position, delayed like the force, is in contact, and otherwise 0. It opens and closes
+smoothly within two periods, as a function of the time (between two ticks) at which the position crosses the
+surface (`jaxhil.laws.shared.gates`). The weight of a reading in the identification is this gate times a gate
+of the force above `contact_threshold`. F_c is therefore a continuous function of the delays."""
 
 from typing import ClassVar, NamedTuple
 

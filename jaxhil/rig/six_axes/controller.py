@@ -299,7 +299,7 @@ class Controller6(ControllerBase):
         return computed
 
     def _lead(self, pose: Vector, twist: Vector) -> bool:
-        """Compute the compensator's pose command. Return true to mark success."""
+        """Compute the compensator's pose command; return True, unless the compensator raises an exception."""
         self._sent = self._law.pose_command(pose, coordinate_rates(pose, twist))
         return True
 

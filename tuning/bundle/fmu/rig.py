@@ -79,7 +79,7 @@ def rig_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
     mechanism = _without_extra_periods(document)
     unsupported = describe_unsupported(mechanism)
     if unsupported is not None:
-        raise UnsupportedRig(f"fmu: {unsupported}; the rig has no FMU")
+        raise UnsupportedRig(f"fmu: {unsupported}; no FMU of the rig can be written")
     return build_fmu(
         identifier=IDENTIFIER,
         name=f"{IDENTIFIER}: {mechanism.name}",

@@ -197,7 +197,8 @@ def differentiate_error(
     slopes = np.concatenate(rows)
     slopes = slopes[np.all(np.isfinite(slopes), axis=1)]
     if not len(slopes):
-        raise InputError(f"{mechanism.name}: found no completed contact with {compensator}, expected one")
+        found = f"no simulated contact that ends with compensator {compensator}"
+        raise InputError(f"{mechanism.name}: found {found}, expected at least one")
     return slopes
 
 

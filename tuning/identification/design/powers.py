@@ -23,10 +23,10 @@ POWER_ITERATIONS = 400  # number of multiplicative updates
 
 @dataclass(frozen=True)
 class RunLines:
-    """Fisher information of each frequency line of one run, and the line's share of each limit."""
+    """Fisher information of each frequency line of one run, and the part of each limit that the line uses."""
 
     information: np.ndarray  # (lines, parameters, parameters), Fisher information M_l per unit power
-    use: np.ndarray  # (limits, lines), share g_il of each limit that a line uses per unit power
+    use: np.ndarray  # (limits, lines), part g_il of each limit that a line uses per unit power
 
 
 def optimise_powers(groups: Sequence[RunLines], weight: np.ndarray) -> list[np.ndarray]:

@@ -16,7 +16,7 @@ def detect_contacts(
     """Detect contacts: intervals in which the force exceeds its noise.
 
     Args:
-        force: Measured force [N]; NaN in lost rows. If `rest` is None, there is no contact in the first rows.
+        force: Measured force [N]; NaN in lost rows. Without `rest`, the first rows must be without contact.
         period: Control period [s].
         rest: Force reading without contact [N], or None to estimate it.
         apart: Minimum time between two contacts [s]; closer contacts are merged.

@@ -100,9 +100,9 @@ def _check_mass(label: str, fits: dict[int, FitsByConvention], mass: float) -> N
     if abs(factor - 1.0) > tolerance:
         units = ask_for_unit((factor,), tolerance)
         raise InputError(
-            f"{label}: position_desired: found a motion that force_command does not give with {mass:g} kg "
-            f"(nearest: {mass * factor:.4g} kg): force_command is {factor:.4g} times the required force, "
-            f"expected M x_d'' = -F_c within {100 * tolerance:.2g} %{units}; or omit force_command"
+            f"{label}: force_command: found {factor:.4g} times the force that moves {mass:g} kg like "
+            f"position_desired (it would move {mass * factor:.4g} kg), expected M x_d'' = -F_c within "
+            f"{100 * tolerance:.2g} %{units}; correct unit or mass, or leave force_command out"
         )
 
 
@@ -131,7 +131,7 @@ def _check_row(label: str, fits: dict[int, FitsByConvention], mass: float, row: 
 
 
 def _select_best_fit(fits: FitsByConvention) -> tuple[tuple[str, str], ScaleFit]:
-    """Return the row convention and integrator with the smallest residual, and their fit."""
+    """Return the fit with the smallest residual, after its row convention (`timing.row`) and integrator."""
     return min(fits.items(), key=lambda item: item[1].rms)
 
 

@@ -58,7 +58,7 @@ class ContactDeviation:
 
 @dataclass(frozen=True)
 class MetricChange:
-    """Change of a metric that raised an alarm, as the mean of the contacts since the change.
+    """Change of a metric that raised an alarm, averaged over the contacts since the change.
 
     Attributes:
         name: Name of the metric.

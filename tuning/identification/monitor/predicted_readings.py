@@ -82,7 +82,9 @@ def predict_readings(
     law = make_regression_law(mechanism.contact)
     if np.isfinite(mechanism.contact.clearance):
         finding = f"found {mechanism.contact.clearance:g}"
-        raise InputError(f"contact.clearance: {finding}, expected inf: one surface")
+        raise InputError(
+            f"contact.clearance: {finding}, expected inf (only contact with one surface is supported)"
+        )
     table = np.array(
         [get_regression_coefficients(mechanism.contact, find_contact_entry(run)) for run in runs]
     ).T
