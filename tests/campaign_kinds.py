@@ -13,10 +13,10 @@ class Kind:
     rig: dict[str, Any]
     contact: dict[str, Any]
     colour: float = 0.0  # pole of the noise filter
-    jitter: float = 0.0  # s, jitter of the time stamps
+    jitter: float = 0.0  # jitter of the time stamps [s]
     lost: float = 0.0  # share of rows lost
     block: int = 0  # consecutive rows lost in the middle of the free motion
-    amplitude: float = 0.0008  # m, rms of the multisine
+    amplitude: float = 0.0008  # rms of the multisine [m]
     drift: float = 0.0  # relative increase of the stiffness from first to last contact
     mass: float = 350.0
 

@@ -261,7 +261,7 @@ def _rest_run(kind, rng, seconds):
 def _free_run(kind, rng, seconds):
     command, actual = free(kind, int(rng.integers(1 << 30)), seconds)
     rig = kind.rig
-    offset = -0.05  # m, out of contact
+    offset = -0.05  # out of contact [m]
     force = _coloured(rng, len(command), rig["force_sensor"]["noise_std"], kind.colour)
     force = sense(force, rig["force_sensor"])
     run = _run(kind, "free", command + offset, _measured(kind, rng, actual + offset), force)

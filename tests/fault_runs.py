@@ -34,7 +34,7 @@ from jaxhil.rig.faults import (
 from jaxhil.rig.limits import LIMITS
 
 PERIOD = 1e-3
-CYCLE = 800  # ticks; a quarter of each cycle is in contact
+CYCLE = 800  # length of a cycle [ticks]; a quarter of it is in contact
 HELD, MISSED, CUT = 3, 4, 3
 LIMITED: dict[str, float] = {
     "force_range": 1e4,

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 HERE = Path(__file__).parent
 COMPILER = shutil.which("cc")
-LONGEST = 120.0  # s, timeout of a command
+LONGEST = 120.0  # timeout of a command [s]
 HANGS = "hangs"
 
 

@@ -19,8 +19,8 @@ RATES = (1000, 500, 2000)  # Hz
 DECIMALS = (3, 2, 1)  # decimals of forces in N; positions in m have six more
 REST, FREE, PRESS = 5.0, 60.0, 40.0  # s
 CLEARANCE = 0.03  # m between the surface and the middle of the free motion
-STROKE = 1.5e-3  # m, peak of the free motion
-JITTER = 50e-6  # s, standard deviation of stamps
+STROKE = 1.5e-3  # peak of the free motion [m]
+JITTER = 50e-6  # standard deviation of stamps [s]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Kind:
     unknown: tuple[str, ...] = ()  # keys that the prior lacks
     defect: tuple[str, ...] = ()  # a message must contain one of these words; empty for a kind without defect
     sweep: bool = False  # the free motion is a swept sine in place of a multisine
-    colour: float = 0.0  # N, standard deviation of low-frequency noise of the force
+    colour: float = 0.0  # standard deviation of low-frequency noise of the force [N]
     walk: float = 0.0  # N/sqrt(s), random walk of the force bias
     lost: float = 0.0  # share of lost rows; if positive, the time stamps also jitter
     force_clock: bool = False  # the force has its own time stamps and begins later
@@ -95,7 +95,7 @@ class Campaign:
     kind: str
     seed: int
     rig: Rig
-    speed: float  # m/s, speed of the slowest contacts
+    speed: float  # speed of the slowest contacts [m/s]
     logs: list[Path]
     mapping: Path
     prior: Path
@@ -261,7 +261,7 @@ class Form:
         velocity, command = rng.random() < 0.3, rng.random() < 0.7
         self.columns = ["x_cmd", "x", "F", *["F_cmd"] * command, *["v_cmd"] * velocity]
         self.sign = int(rng.choice([-1, 1]))  # sign of logged forces
-        self.offset = float(rng.choice([0.0, 0.25]))  # m, offset of logged positions
+        self.offset = float(rng.choice([0.0, 0.25]))  # offset of logged positions [m]
         rng.random()
 
     def write(self, path, rng, period, columns):

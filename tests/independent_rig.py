@@ -14,7 +14,7 @@ from scipy.signal import cont2discrete, lfilter
 POINTS = 40  # fine points per control period
 LOGGER = 15  # fine points by which a force logger with its own clock samples before the tick
 WARM_UP = 0.6  # s of uniform motion before the first tick, in which the slowest drive settles to 1e-9
-LONGEST = 1.5  # s; longer contacts count as never ending
+LONGEST = 1.5  # duration beyond which contacts count as never ending [s]
 
 
 @dataclass(frozen=True)

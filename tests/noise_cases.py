@@ -13,7 +13,7 @@ from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.laws.simulation_base import KnownConstants
 from jaxhil.rig import COMPENSATORS as ON_THE_RIG
 
-LONG = 4000  # ticks, so many that every filter has settled
+LONG = 4000  # so many that every filter has settled [ticks]
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=QUICK)

@@ -89,8 +89,8 @@ class _Contact:
     """State of the detection of the current contact."""
 
     first: int  # first tick at which the contact is searched for
-    before: float  # m/s, speed on the tick before the contact
-    floor: float  # N, threshold of the command that starts a contact
+    before: float  # speed on the tick before the contact [m/s]
+    floor: float  # threshold of the command that starts a contact [N]
     begin: int | None = None  # tick
     approach_velocity: float | None = None  # m/s
     waiting: int | None = None  # tick since which only the decay of the command is awaited

@@ -111,7 +111,7 @@ class Piece:
     length: float
     theta: tuple
     position: np.ndarray
-    velocity: np.ndarray  # m/s, coefficients in theta
+    velocity: np.ndarray  # coefficients in theta [m/s]
     side: int
     index: int
     deepest: float  # at the beginning of the segment

@@ -11,7 +11,7 @@ NAMES = (
     *("time", "force_measured", "force_command", "position_desired", "velocity_desired", "position_measured"),
     "contact",
 )
-STIFFNESS = 124355.0  # N/m, of `rig-300kg`
+STIFFNESS = 124355.0  # of `rig-300kg` [N/m]
 HARDWARE_LAG, FORCE_LAG = 12, 4  # periods: position behind the command, force behind the position
 
 

@@ -6,10 +6,10 @@ from jaxhil.mechanism.file import load_any
 
 WIDE = Path(__file__).parent / "data" / "wide_ranges"  # built-in mechanisms with wide ranges and noise
 
-OFFSETS = {"ring-capture": 0.01, "probe-drogue": 0.05}  # m; with larger offsets the ring misses the hooks
+OFFSETS = {"ring-capture": 0.01, "probe-drogue": 0.05}  # with larger offsets the ring misses the hooks [m]
 ATTITUDES = {"ring-capture": 0.005, "hydraulic-hexapod": 0.015}  # rad
-NOISE = {"force": 0.5, "torque": 0.05}  # N, N m
-POSE_NOISE = {"translation": 5e-6, "rotation": 1e-5}  # m, rad
+NOISE = {"force": 0.5, "torque": 0.05}  # N m [N]
+POSE_NOISE = {"translation": 5e-6, "rotation": 1e-5}  # rad [m]
 
 
 def load_wide(name):

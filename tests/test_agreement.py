@@ -38,9 +38,9 @@ from tuning.verification.runtime_replay import REPLAY_LIMIT, LaneReplay, replay_
 
 pytestmark = pytest.mark.users_options
 
-RING = 256  # samples, more than any identification delay at the shortest period
+RING = 256  # more than any identification delay at the shortest period [samples]
 RUNS = 6  # recorded runs of a mechanism
-RECORD = 3072  # ticks, longer than any record, so that all mechanisms share programs
+RECORD = 3072  # longer than any record, so that all mechanisms share programs [ticks]
 # Compare the compensators without the controller, also beyond the controller's limits.
 UNLIMITED = {
     name: limit.default if limit.default in (0.0, 0.5, 1.0) else math.copysign(math.inf, limit.default)

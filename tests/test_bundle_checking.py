@@ -26,7 +26,7 @@ from tuning.bundle.checking import run_selftest as run_checked
 
 UDP = ("udp_controller.py", "udp_protocol.py", "udp_task.py", "numerical_model.py", "flight_recorder.py")
 CODE = ("selftest.py", "vector_replay.py", "jaxhil_runtime.py", *UDP)
-SHORT = 10  # s, far more than any check takes
+SHORT = 10  # far more than any check takes [s]
 
 
 @pytest.fixture(scope="module")

@@ -36,7 +36,7 @@ COMPANIONS = {
     "rig.force_sensor.filter.cutoff": ["rig.force_sensor.filter={kind='bessel', order=2, cutoff=200.0}"]
 }
 SAMPLE = 11  # the daily run takes every 11th value
-LONGEST = 120.0  # s; on a busy machine most of it is compilation
+LONGEST = 120.0  # time limit [s]; on a busy machine most of it is compilation
 
 
 def overrides(others, key, value):

@@ -9,7 +9,7 @@ from tuning.identification import free_motion, validation
 from tuning.identification.records import CampaignTiming, LoggedRun
 
 PERIOD = 0.001
-PUBLISHED = 183.8, 48.6  # rad/s, poles of the model without delay that was published with the data
+PUBLISHED = 183.8, 48.6  # poles of the model without delay that was published with the data [rad/s]
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from tuning.identification.identify import IdentificationOptions, identify
 
 pytestmark = [pytest.mark.slow, pytest.mark.users_options]
 PHASES = 511
-MIN_DEVIATION = 1.02e-4  # s, standard deviation of the force delay on the lagging rig without press run
+MIN_DEVIATION = 1.02e-4  # standard deviation of the force delay on the lagging rig without press run [s]
 
 
 def error(mechanism, compensator, gains):

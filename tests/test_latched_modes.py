@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 BATCH, PERIOD, TICKS, DELAY = (1,), 5e-4, 4000, 6e-3
 UNEQUAL = [DELAY, 5e-3, 7e-3, 8e-3, 4e-3, 6.5e-3]
 MODES, APART = 12, 20  # complex modes; ticks between the fitted samples
-SMALL = 1e-7  # m/s, rad/s
+SMALL = 1e-7  # rad/s [m/s]
 STIFFNESS = np.diag([1e5, 1.3e5, 2e5, 5e3, 7e3, 4e3])
 STIFFNESS[0, 4] = STIFFNESS[4, 0] = 6e3
 

@@ -46,7 +46,7 @@ def test_log_readings_assigned_to_wrong_tick_are_detected_for_any_integrator(tmp
     assert read(path, timing={"row": row}).runs[0].kind == "contact"
     other = "tick" if row == "sent" else "sent"
     assert f'timing.row: found "{other}"' in (result := message(path, timing={"row": other}))
-    assert f'expected "{row}": ' in result and f"(integrator {integrator})" in result
+    assert f'expected "{row}", with which ' in result and f"(integrator {integrator})" in result
     if row == "tick":
         assert read(path, timing={"row": "after"}).notes == ()
 
@@ -63,7 +63,7 @@ def test_wrong_sign_or_mass_for_logged_force_command_is_detected(tmp_path):
     path = write_csv(tmp_path / "b.csv", coarse)
     assert read(path).notes == ()
     assert "(it would move 175 kg)" in message(path, force_command={"column": "Fc", "scale": 0.5})
-    assert 'expected "tick": only then' in message(path, timing={"row": "sent"})
+    assert 'expected "tick", with which force_command' in message(path, timing={"row": "sent"})
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ EYE = np.eye(3)
 MASSES = np.array([1050.0, 525.0])  # an equivalent mass of 350 kg
 MOMENTS = np.array([[900.0, 700.0, 500.0], [150.0, 180.0, 110.0]])
 OFFSETS = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-ARM = np.array([0.4, -0.3, 0.0])  # m, offset of the contact from the line through both centres of mass
+ARM = np.array([0.4, -0.3, 0.0])  # offset of the contact from the line through both centres of mass [m]
 STIFFNESS, DAMPING = 124355.0, 395.8
 
 

@@ -17,7 +17,7 @@ COMPENSATORS = (
     "impulse_ledger",
 )
 FREQUENCIES = (0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)  # Hz
-# Hz; at higher frequencies, all runs of this robot diverge alike, and metrics have no confidence interval
+# highest frequency [Hz]; beyond it all runs diverge alike, and metrics have no interval
 SLOW_FREQUENCIES = {"robot-150ms": (0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5)}
 LARGEST_RMS, LEAST_TRANSPARENCY = 0.01, 0.8
 SCENARIOS = 32

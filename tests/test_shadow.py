@@ -155,7 +155,9 @@ def test_shadow_mode_exits_with_1_if_the_controller_trips(jaxhil, tmp_path):
 
 
 @pytest.mark.parametrize("factor, is_limited", [(1.0, False), (0.8, True), (0.0, True)])
-def test_shadow_verdict_is_said_to_cover_only_trips_if_commands_differ(jaxhil, tmp_path, factor, is_limited):
+def test_shadow_reports_that_its_verdict_covers_only_trips_if_commands_differ(
+    jaxhil, tmp_path, factor, is_limited
+):
     log = write_columns(tmp_path / "log.csv", changed(force_command=factor * recorded()["force_command"]))
     (tmp_path / "gains.json").write_text(json.dumps(gains().document))
     ran = jaxhil("shadow", tmp_path, log)

@@ -29,8 +29,8 @@ LANES = 2 * DRAWS  # first the lanes with a probe, then those with a ring
 STEP = 2e-5  # relative step; so small that few touches move to another tick
 BY = ("stiffness", "dissipation", "friction", "force delay", "axes' delays", "axes' frequencies")
 POINTS = np.array([[1.0, -0.5, -0.5], [0.0, 0.866, -0.866], [0.0, 0.0, 0.0]])  # on the ring
-HALF_ANGLE = 0.75  # rad, half cone angle of the drogue
-AWAY = 10.0  # m, distance of shapes that are unused in a lane
+HALF_ANGLE = 0.75  # half cone angle of the drogue [rad]
+AWAY = 10.0  # distance of shapes that are unused in a lane [m]
 
 
 def contact(scales):

@@ -11,7 +11,7 @@ from six_axis_documents import six_axis_document
 from six_axis_ranges import NOISE, POSE_NOISE
 
 PERIOD, RUN = 1e-3, 120  # s
-POSE = np.array([0.05, -0.03, 0.5, 0.02, -0.01, 0.03])  # m, rad; pose before a contact
+POSE = np.array([0.05, -0.03, 0.5, 0.02, -0.01, 0.03])  # rad [m]; pose before a contact
 
 
 def white(rng, ticks, force, torque):

@@ -8,7 +8,7 @@ import jaxhil as package
 from jaxhil.mechanism.file import any_from_plain_data
 from jaxhil.sixdof.run import simulate_six_axes
 
-NAME, ARM = "claw-350kg", np.array([0.4, -0.3, 0.0])  # m, contact from the centre line
+NAME, ARM = "claw-350kg", np.array([0.4, -0.3, 0.0])  # contact from the centre line [m]
 INERTIA = np.array([300.0, 250.0, 200.0])  # kg m^2
 
 

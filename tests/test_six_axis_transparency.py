@@ -22,7 +22,7 @@ from jaxhil.sixdof.sensing import sense
 
 pytestmark = pytest.mark.slow
 NAME, LAW, LANES, TICKS = "probe-drogue", "impulse_ledger", 64, 700
-DURATION, SIZE = 0.02, 0.2  # s; peak of the push divided by the ideal contact's peak force
+DURATION, SIZE = 0.02, 0.2  # peak of the push divided by the ideal contact's peak force [s]
 IDEAL = {
     "uncertainty": {}, "rig.simulator": {"model": "ideal"}, "rig.force_sensor": {"delay": 0.0},
     "rig.position_sensor": {},

@@ -15,8 +15,8 @@ import jaxhil
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.gain_choice import choose_gains
 
-MASS, SPEED, VIRTUAL = 350.0, 5e-3, 1.2e5  # kg, m/s, N/m
-DEEPEST = SPEED * math.sqrt(MASS / VIRTUAL)  # m, depth at which the virtual spring alone reverses the model
+MASS, SPEED, VIRTUAL = 350.0, 5e-3, 1.2e5  # m/s, N/m [kg]
+DEEPEST = SPEED * math.sqrt(MASS / VIRTUAL)  # depth at which the virtual spring alone reverses the model [m]
 
 
 def rig(plane: float = 0.0, simulator: dict | None = None, **sensor: float) -> Mechanism:

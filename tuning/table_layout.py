@@ -5,8 +5,8 @@ import textwrap
 from rich.console import Console
 from rich.table import Column, Table
 
-MIN_WRAPPED_TEXT = 12  # characters; shorter texts are not wrapped in a narrow table
-MIN_BROKEN_NAME = 24  # characters; shorter dotted names are not broken in a narrow table
+MIN_WRAPPED_TEXT = 12  # length of the shortest text that a narrow table wraps [characters]
+MIN_BROKEN_NAME = 24  # length of the shortest dotted name that a narrow table breaks [characters]
 
 
 def fit_table(table: Table, console: Console) -> int:

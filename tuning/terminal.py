@@ -22,12 +22,12 @@ from rich.text import Text
 from jaxhil.errors import InputError, to_one_line
 from tuning.table_layout import fit_table
 
-DEFAULT_WIDTH = 110  # characters; width of lines if no stream is a terminal
+DEFAULT_WIDTH = 110  # width of lines if no stream is a terminal [characters]
 COLUMN_INDEX = re.compile(r"_(\d+)(?=_\d+|$)")  # one-based index in a sweep's column name, for example `_2`
 # Verdicts in JSON documents for exit codes 2 and 130.
 UNUSABLE_INPUT, INTERRUPTED = "unusable input", "interrupted"
-PROGRESS_INTERVAL = 10.0  # s; time between progress lines if the output is not a terminal
-MAX_SILENCE = 20.0  # s; after this time without a line, the progress is printed again
+PROGRESS_INTERVAL = 10.0  # time between progress lines if the output is not a terminal [s]
+MAX_SILENCE = 20.0  # time without a line after which the progress is printed again [s]
 MIN_SHARE_FOR_RATE = 0.05  # finished share of the work above which the rate is accurate enough to be shown
 
 

@@ -13,7 +13,7 @@ from jaxhil.contact.keys import EXPONENT, REFERENCE_DEPTH
 from jaxhil.contact.power_law import COMMON_EXPONENTS, PowerLaw
 from jaxhil.contact.regression import Regression, RegressionFamily
 
-DEFAULT_REFERENCE_DEPTH = 1e-3  # m; reference depth d_0 for which identification fits b
+DEFAULT_REFERENCE_DEPTH = 1e-3  # reference depth d_0 for which identification fits b [m]
 
 
 class DepthDamped(PowerLaw):

@@ -25,8 +25,8 @@ from jaxhil.contact.dormand_prince import StepEnd, interpolate_step, take_step
 from jaxhil.lanes import select_lanes
 
 STEP_TOLERANCE = 1e-10  # limit on a step's error, relative to approach velocity and deepest penetration
-FIRST_STEP = 1e-4  # s; first step that is tried
-MAX_CONTACT_DURATION = 10.0  # s; bodies in contact for longer count as sticking to each other
+FIRST_STEP = 1e-4  # first step that is tried [s]
+MAX_CONTACT_DURATION = 10.0  # duration of contact [s] beyond which the bodies count as sticking to each other
 MAX_STEPS = 1000  # limit on the number of steps, including rejected ones
 MAX_EVENT_ITERATIONS = 16  # limit on the iterations of the false position method (Illinois) for one event
 INWARD, OUTWARD, FREE, ENDED = range(4)  # phases of the motion; FREE occurs only with a push

@@ -29,7 +29,8 @@ from jaxhil.mechanism.structs import Correlation, Mechanism
 
 __all__ = ["check_correlation", "correlate", "find_correlated_groups", "fix_at_nominal", "remove_keys"]
 
-MIN_EIGENVALUE = 1e-10  # 1; smaller eigenvalues may prevent a Cholesky factor by rounding
+# minimum eigenvalue [1]; with a smaller one, rounding may make the Cholesky factorisation fail
+MIN_EIGENVALUE = 1e-10
 
 # Bounds of uniform numbers, so that normal numbers are finite.
 _MIN_UNIFORM, _MAX_UNIFORM = 2.0**-54, 1.0 - 2.0**-53

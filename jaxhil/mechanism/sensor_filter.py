@@ -24,8 +24,8 @@ class FilterModes(NamedTuple):
     The output is the sum of Re(weights[m] y_m), where y_m' = rates[m] (F - y_m).
     """
 
-    rates: tuple[complex, ...]  # [rad/s]; a pole is -rate
-    weights: tuple[complex, ...]  # [1]; doubled for a pair of poles
+    rates: tuple[complex, ...]  # rates of decay [rad/s]; a pole is -rate
+    weights: tuple[complex, ...]  # doubled for a pair of poles [1]
 
     @property
     def slowest(self) -> float:

@@ -23,10 +23,10 @@ from jaxhil.mechanism.uncertainty_rules import check_uncertainty
 
 __all__ = ["check_contact_names", "check_leg_values", "check_six_axes", "inertia_matrix"]
 
-MAX_ATTITUDE = 1.0  # rad; limit on the rotation of C relative to T at the start
-INERTIA_TOLERANCE = 1e-9  # 1; tolerance of the rule that no moment exceeds the sum of the others
-MIN_INERTIA_RATIO = 1e-6  # 1; lower limit on the ratio of the smallest to the largest moment of inertia
-QUATERNION_TOLERANCE = 1e-6  # 1; limit on the deviation of a quaternion's norm from 1
+MAX_ATTITUDE = 1.0  # limit on the rotation of C relative to T at the start [rad]
+INERTIA_TOLERANCE = 1e-9  # tolerance of the rule that no moment exceeds the sum of the others [1]
+MIN_INERTIA_RATIO = 1e-6  # lower limit on the ratio of the smallest to the largest moment of inertia [1]
+QUATERNION_TOLERANCE = 1e-6  # limit on the deviation of a quaternion's norm from 1 [1]
 # Required and optional keys of each kind of axes of the motion simulator.
 KEYS_OF_SPACES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "task": ((), ()),

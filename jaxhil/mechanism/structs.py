@@ -38,7 +38,7 @@ __all__ = [
 
 SCHEMA = "jaxhil/mechanism/1"
 MAX_CONTACTS = 1000
-MAX_LATENCY = 4  # [periods]; maximum command latency, including the periods that a co-simulation adds
+MAX_LATENCY = 4  # maximum command latency, including the periods that a co-simulation adds [periods]
 # limits on the magnitude of nonzero numbers; a product of three such numbers neither overflows nor underflows
 MAGNITUDE_LIMITS = 1e-100, 1e100
 NO_METADATA: Mapping[str, Any] = {}

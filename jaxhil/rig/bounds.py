@@ -28,7 +28,7 @@ or a command that changes faster than 10 m/s trips the controller.
 # Each pair below contains the lowest and the highest value.
 CONTROL_PERIODS = 1e-5, 0.1  # [s]
 TIMES = 0.0, 4.1  # [s]
-FILTER_TIMES = 1e-6, 2.1  # [s]; a filter with a time constant of 0 would divide by 0 or ring
+FILTER_TIMES = 1e-6, 2.1  # bounds of filters' time constants [s]; a filter with 0 would divide by 0 or ring
 FORCES = 0.0, 1e6  # [N]
 STIFFNESSES = 0.0, 1e12  # [N/m]
 DAMPINGS = 0.0, 1e11  # [N s/m]

@@ -5,10 +5,10 @@ from math import inf, isfinite
 from jaxhil.rig.faults import CLOCK, EARLY_TICK, LATE_TICK, MISSED_TICK
 from jaxhil.rig.types import Limits, NonNegative, Positive, SmallInt
 
-MAX_MISSED = 1_000_000  # periods; limits the missed ticks of one gap, because a clock may jump by any time
-MAX_GAP = 1.5  # periods; a longer gap means that at least one tick is missing
+MAX_MISSED = 1_000_000  # limit on the missed ticks of one gap [periods], because a clock may jump by any time
+MAX_GAP = 1.5  # longest gap between two ticks without a missing tick [periods]
 DRIFT_DECAY_FACTOR = 0.99  # per tick, so that past drift decays with a time constant of 100 ticks
-MAX_DRIFT = 1.5  # periods; a clock that is 1.5 % fast or slow reaches this drift, jitter does not
+MAX_DRIFT = 1.5  # drift [periods] that a clock 1.5 % fast or slow reaches, but jitter does not
 
 
 class Clock:

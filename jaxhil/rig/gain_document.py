@@ -19,7 +19,7 @@ from jaxhil.rig.limits import Limit
 from jaxhil.rig.registry import GainSpecification
 
 SCHEMA = "jaxhil/gains/1"
-MAX_FILE_BYTES = 4 * 1024 * 1024  # bytes; much larger than any gain file
+MAX_FILE_BYTES = 4 * 1024 * 1024  # much larger than any gain file [bytes]
 MAX_NESTING = 32  # levels of nested JSON objects and lists; keeps recursive code safe
 KEYS_OUTSIDE_DIGEST = ("created", "timings", "sha256")  # keys that the digest does not cover
 
@@ -62,23 +62,29 @@ def read_gain_document(path: str | os.PathLike[str]) -> dict[str, Any]:
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise make_gain_file_error(
-            source, "", f"bytes that are not UTF-8 at {error.start}", "UTF-8"
+            source, "", f"bytes that are not UTF-8 at byte {error.start}", "UTF-8"
         ) from None
     try:
         document = json.loads(text, parse_constant=_no_constant, object_pairs_hook=_unique_keys)
     except RecursionError:
         raise make_gain_file_error(source, "", "deeper nesting", f"at most {MAX_NESTING} levels") from None
     except ValueError as error:
-        raise make_gain_file_error(source, "", f"not JSON ({error})", f"a JSON object, {SCHEMA}") from None
+        raise make_gain_file_error(
+            source, "", f"not JSON ({error})", f"a JSON object with the schema {SCHEMA}"
+        ) from None
     if not isinstance(document, dict):
-        raise make_gain_file_error(source, "", format_value(document), f"a JSON object, {SCHEMA}")
+        raise make_gain_file_error(
+            source, "", format_value(document), f"a JSON object with the schema {SCHEMA}"
+        )
     return document
 
 
 def check_form(document: Mapping[str, Any], source: str) -> None:
     """Raise GainFileError if schema, nesting depth or digest of a gain document is wrong."""
     if not isinstance(document, Mapping):
-        raise make_gain_file_error(source, "", format_value(document), f"a JSON object, {SCHEMA}")
+        raise make_gain_file_error(
+            source, "", format_value(document), f"a JSON object with the schema {SCHEMA}"
+        )
     schema = read_entry(document, "schema", source, "")
     if schema != SCHEMA:
         raise make_gain_file_error(source, "schema", format_value(schema), f"'{SCHEMA}'")

@@ -22,11 +22,12 @@ from jaxhil.rig.bounds import (
 )
 
 HELD_READINGS = 0.0, 1000.0  # successive ticks
-TICK_COUNTS = 0.0, 1e6  # ticks; the upper bound exceeds the longest gap that the clock counts
-# [1]; ratios of energies or restitutions. No ratio reaches the upper bound, even in a very slow approach.
+# bounds of limits on numbers of ticks; the upper one exceeds the longest gap that the clock counts
+TICK_COUNTS = 0.0, 1e6
+# ratios of energies or restitutions [1]. No ratio reaches the upper bound, even in a very slow approach.
 RATIOS = 0.0, 1e300
-FEATURE_BOUNDS = -1e3, 1e3  # [1]; p, w and z of the expected restitution (`watchdog`)
-COEFFICIENTS = -1e9, 1e9  # [1]; coefficients of the polynomial in p, w and z
+FEATURE_BOUNDS = -1e3, 1e3  # p, w and z of the expected restitution (`watchdog`) [1]
+COEFFICIENTS = -1e9, 1e9  # coefficients of the polynomial in p, w and z [1]
 
 
 class Limit(NamedTuple):

@@ -45,8 +45,9 @@ from jaxhil.rig.law_status import (
 from jaxhil.rig.surfaces import deflection
 from jaxhil.rig.types import Limits, Positive
 
-MAX_DECAY_WAIT = 0.1  # s; longest wait for the force to decay
-FORCE_DECAY_RATIO = 1e-6  # [1]; force below this share of its peak or of momentum/MAX_DECAY_WAIT has decayed
+MAX_DECAY_WAIT = 0.1  # longest wait for the force to decay [s]
+# share of its peak, or of momentum/MAX_DECAY_WAIT, below which a force has decayed [1]
+FORCE_DECAY_RATIO = 1e-6
 
 
 class Watchdog:

@@ -28,9 +28,9 @@ MAX_POLE = 64.0
 # Degree of the power series for each maximum of cell length times fastest pole [rad]. The truncation error is
 # below 1e-13.
 SERIES_DEGREES = {0.0: 1, 0.12: 8, 1.0: 16}
-CELL_LENGTH_TOLERANCE = 1e-3  # [1]; relative amount by which a cell may exceed its maximum length
+CELL_LENGTH_TOLERANCE = 1e-3  # relative amount by which a cell may exceed its maximum length [1]
 LAG_WINDOW = 40.0  # time constants; older forces change a reading by exp(-40), which is below rounding
-MIN_LAG = 1e-12  # control periods; a force sensor with a shorter lag counts as a sensor without lag
+MIN_LAG = 1e-12  # lag below which a force sensor counts as a sensor without lag [control periods]
 
 
 class CellCounts(NamedTuple):
@@ -293,10 +293,10 @@ def _line_series(control_period, degree):
 
 
 def _series(generator, output, degree):
-    """Return row vectors that give the power series of y = output w, where w' = generator w.
+    """Return row vectors that give the power series of y = C w, where w' = A w.
 
-    Here w = (state, command, increase of the command in a period). Row j, multiplied by w, gives y^(j)/j!.
-    The result has the shape (degree + 1, columns, *batch).
+    C is `output`, A is `generator`, and w = (state, command, increase of the command in a period). Row j,
+    multiplied by w, gives y^(j)/j!. The result has the shape (degree + 1, columns, *batch).
     """
     order, columns = generator.shape[:2]
     zero = jnp.zeros_like(output[0])

@@ -14,8 +14,8 @@ notebooks/guide/model.md gives the reasons for these numbers.
 import math
 from typing import Any
 
-MAX_PEAK_FORCE_RATIO = 2.0  # [1]; maximum peak force, divided by the ideal contact's peak force
-MIN_DURATION_RATIO, MAX_DURATION_RATIO = 0.5, 2.0  # [1]; limits of duration divided by ideal duration
+MAX_PEAK_FORCE_RATIO = 2.0  # maximum peak force, divided by the ideal contact's peak force [1]
+MIN_DURATION_RATIO, MAX_DURATION_RATIO = 0.5, 2.0  # limits of duration divided by ideal duration [1]
 # Control periods; maximum rounding error of a measured duration: one period at each end of the contact.
 DURATION_ROUNDING = 2
 CONTACT_BOUNDS = {

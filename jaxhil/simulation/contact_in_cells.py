@@ -364,7 +364,7 @@ def _mode_contributions(rates, impulses, age):
 
 
 def _sum_by_part(values):
-    """Return the sum for the cells before, and the sum for the cells after, the sampling instant."""
+    """Sum the values of the cells before the sampling instant, and separately of the cells after it."""
     half = len(values) // 2
     return jnp.sum(values[:half], axis=0), jnp.sum(values[half:], axis=0)
 

@@ -16,9 +16,9 @@ from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.probe import Deviation, initial_deviation
 from jaxhil.simulation.scenario import Scenario
 
-MAX_DECAY_WAIT = 0.1  # s; longest wait for the force command to decay, because a noisy command never decays
-COMMAND_DECAY_RATIO = 1e-6  # [1]; a force command below this fraction of its peak has decayed
-DIVERGENCE_SPEED_RATIO = 1e3  # [1]; a run above this multiple of the first approach speed has diverged
+MAX_DECAY_WAIT = 0.1  # longest wait for the force command to decay, because a noisy command never decays [s]
+COMMAND_DECAY_RATIO = 1e-6  # fraction of its peak below which a force command has decayed [1]
+DIVERGENCE_SPEED_RATIO = 1e3  # multiple of the first approach speed above which a run has diverged [1]
 
 
 class CommandVariation(NamedTuple):

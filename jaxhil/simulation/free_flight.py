@@ -15,11 +15,11 @@ from jaxhil.simulation.loop import Loop, RigConstants, start_uniform_motion
 from jaxhil.simulation.loop_state import LoopState
 from jaxhil.simulation.motion_simulator import apply_row, steady_state
 
-APPROACH_TIME = 0.02  # s; duration of the approach before a contact, to which a part of a period is added
-# [1]; maximum deviation of a settled motion simulator from its steady state, divided by the travel in a
-# control period.
+APPROACH_TIME = 0.02  # duration of the approach before a contact, to which a part of a period is added [s]
+# maximum deviation of a settled motion simulator from its steady state, divided by the travel in a control
+# period [1].
 SETTLING_TOLERANCE = 1e-6
-# [1]; maximum change of a freely flying model's speed in a control period, divided by the speed.
+# maximum change of a freely flying model's speed in a control period, divided by the speed [1].
 FREE_FLIGHT_TOLERANCE = 1e-12
 
 

@@ -25,7 +25,7 @@ from jaxhil.rig.registry import GainSpecification
 from jaxhil.rig.six_axes import SIX_AXIS_COMPENSATORS as RUNTIME_SIX_AXIS_COMPENSATORS
 from jaxhil.rig.six_axes.gain_file import check_six_axis_document
 
-# [1]; relative tolerance of bounds, which other machines may round differently
+# relative tolerance of bounds, which other machines may round differently [1]
 BOUND_TOLERANCE = 1e-9
 
 

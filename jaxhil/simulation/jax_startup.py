@@ -15,7 +15,7 @@ from importlib.metadata import version
 from jaxhil.errors import InputError, format_value, to_one_line
 from jaxhil.files import open_input
 
-MAX_REASON_LENGTH = 300  # characters; longer texts of XLA and JAX are shortened in our messages
+MAX_REASON_LENGTH = 300  # longest quotation of XLA and JAX in our messages [characters]
 
 _FLAG_TEST_CODE = "import jax; jax.jit(lambda: 0)()"
 # Format of the message that XLA writes before it ends the process.

@@ -16,14 +16,14 @@ from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.moving_average import DEGREE
 from jaxhil.simulation.scenario import Scenario
 
-MIN_RING_LENGTH = 16  # samples; minimum length of a delay line
+MIN_RING_LENGTH = 16  # minimum length of a delay line [samples]
 # Maximum pole of the motion simulator and maximum contact frequency [rad per control period] for computing a
 # contact without cells. Up to these rates, the peak force is accurate to 2e-3.
 MAX_SAMPLED_RATES = (1.0, 0.1)
 # The same limits for a force sensor with a lag or a contact law with memory: up to these rates, the
 # restitution is accurate to 1e-5.
 MAX_SAMPLED_RATES_WITH_MEMORY = (0.15, 0.05)
-# [1]; factor by which the rate b/M of a damper is multiplied for the comparison with contact frequencies. It
+# factor by which the rate b/M of a damper is multiplied for the comparison with contact frequencies [1]. It
 # exceeds 1 because a damper's force jumps at the onset of contact.
 DAMPER_WEIGHT = 2.0
 

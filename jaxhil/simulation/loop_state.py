@@ -25,7 +25,7 @@ class PlantState(NamedTuple):
 
     @property
     def sent(self) -> Float[Array, "*batch"]:
-        """Return the compensator's unlimited position command for tick n [m]."""
+        """Return the compensator's position command for tick n [m], to which no limit is applied yet."""
         return self.commands[0] if self.unlimited_command is None else self.unlimited_command
 
     @property

@@ -8,12 +8,12 @@ from jaxhil.laws.shared.nominal_values import force_delay
 from jaxhil.mechanism.number_ranges import value_at
 from jaxhil.mechanism.structs import Mechanism
 
-PLAUSIBLE_FREQUENCIES = 0.15, 50.0  # Hz; lowest and highest plausible contact frequency
-MIN_FREQUENCY_RATIO = 1e-4  # [1]; lowest plausible contact frequency as a fraction of the control rate
-MAX_PLAUSIBLE_BANDWIDTH = 50.0  # Hz; highest plausible natural frequency of a motion simulator
-MAX_FREQUENCY_RATIO = 0.1  # [1]; highest plausible contact frequency as a fraction of the control rate
-MAX_PLAUSIBLE_VELOCITY = 1.0  # m/s; highest plausible approach velocity
-# m; largest plausible distances by key
+PLAUSIBLE_FREQUENCIES = 0.15, 50.0  # lowest and highest plausible contact frequency [Hz]
+MIN_FREQUENCY_RATIO = 1e-4  # lowest plausible contact frequency as a fraction of the control rate [1]
+MAX_PLAUSIBLE_BANDWIDTH = 50.0  # highest plausible natural frequency of a motion simulator [Hz]
+MAX_FREQUENCY_RATIO = 0.1  # highest plausible contact frequency as a fraction of the control rate [1]
+MAX_PLAUSIBLE_VELOCITY = 1.0  # highest plausible approach velocity [m/s]
+# largest plausible distances by key [m]
 MAX_PLAUSIBLE_DISTANCES = {"rig.contact_plane": 0.1, "contact.clearance": 1.0}
 
 

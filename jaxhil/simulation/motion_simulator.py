@@ -86,9 +86,9 @@ def discretise(
 ) -> Propagation:
     """Discretise the transfer function num(s)/den(s) of the motion simulator exactly.
 
-    With time in control periods, the state z follows z' = A z + B u. At the fraction s of an interval, the
-    state is z(s) = E(s) (z(0), u(0), u(1) - u(0)). Here E(s) consists of the first rows of the matrix
-    exponential of s [[A, B, 0], [0, 0, 1], [0, 0, 0]] (Van Loan 1978). The result is differentiable with
+    With time in control periods, the state z follows z' = A z + B u. At the time t in an interval, the
+    state is z(t) = E(t) (z(0), u(0), u(1) - u(0)). Here E(t) consists of the first rows of the matrix
+    exponential of t [[A, B, 0], [0, 0, 1], [0, 0, 0]] (Van Loan 1978). The result is differentiable with
     respect to every numeric argument.
 
     Args:

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxhil.laws.shared.ring_buffer import look_back
 from jaxhil.simulation.motion_simulator import Propagation, SimulatorState, SplitWindow
 
-# [periods]; a window within this distance of a whole number of periods counts as whole, as in `split_delay`.
+# distance from a whole number of periods [periods] within which a window counts as whole (`split_delay`)
 TOLERANCE = 1e-9
 DEGREE = 2  # degree of the position as a polynomial in time
 

@@ -29,11 +29,11 @@ from jaxhil.simulation.timing import MAX_SERIES_POLE
 MAX_CONTACT_TICKS = 1e7  # maximum number of ticks of a contact, including its approach
 MAX_RUN_TICKS = 1e9  # maximum number of ticks of a run; ticks are counted in 32 bits
 
-MOVING_AVERAGE_BANDWIDTH = 0.442946  # [1]; x with sin(pi x)/(pi x) = 1/sqrt(2): bandwidth times window
+MOVING_AVERAGE_BANDWIDTH = 0.442946  # x with sin(pi x)/(pi x) = 1/sqrt(2) [1]: bandwidth times window
 FAST_SIMULATOR = f"at most {MAX_POLE:g} / control_period; for a faster simulator use model = 'ideal'"
 MAX_LISTED_FREQUENCIES = 4  # a summary lists at most this number of contact frequencies, or only their range
 
-_TAIL_PROBABILITY = 1e-9  # [1]; probability of the values that are ignored at each end of a distribution
+_TAIL_PROBABILITY = 1e-9  # probability of the values that are ignored at each end of a distribution [1]
 # Prefixes of the keys that determine the number of ticks, the speed of the drives, and the motion simulator's
 # poles.
 _TICK_KEYS = ("bodies.", "approach.velocity", "contact.", "rig.contact_plane", "rig.control_period")

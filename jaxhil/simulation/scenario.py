@@ -24,7 +24,7 @@ from jaxhil.mechanism.sensor_filter import find_modes
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.probe import Probe
 
-MAX_CONTACT_DURATION = 10.0  # s; a longer contact is ended with the status "timeout"
+MAX_CONTACT_DURATION = 10.0  # longest contact [s]; a longer one ends with the status "timeout"
 
 
 class MotionSimulatorBatch(NamedTuple):

@@ -135,8 +135,8 @@ def cut_dead_zone(force: Float[Array, "*batch"], dead_zone: Array, step: Array) 
 
     The reading jumps at the first tick after the force crosses the edge of the dead zone. The phase of the
     contact in the control period determines this tick. Different phases therefore give different readings.
-    This function has the derivative of the mean reading. The mean assumes that the force is uniformly
-    distributed over its last change `step` [N]. With a `step` of 0, the derivative excludes the jumps.
+    The derivative of this function is therefore that of a mean reading, for a force that is uniformly
+    distributed over the interval of its last change `step` [N]. With a `step` of 0, it excludes the jumps.
     """
     return jnp.where(jnp.abs(force) > dead_zone, force, 0)
 

@@ -14,7 +14,7 @@ MEMORY_SHARE = 0.5  # share of an accelerator's memory for the tile; the rest is
 # Memory of a running tile, divided by the memory of its inputs and state [1]: each operation of a loop may
 # need a second copy of the state, and keeps its intermediate results.
 COPIES = 4
-UNKNOWN_MEMORY = 4 << 30  # bytes; assumed memory of an accelerator that does not report it
+UNKNOWN_MEMORY = 4 << 30  # assumed memory of an accelerator that does not report it [bytes]
 MAX_ACCELERATOR_LANES = 1 << 20  # maximum number of lanes per tile; more lanes are not faster
 
 

@@ -10,7 +10,7 @@ from jaxhil.sixdof.relative import Pair, Pose, States, Twist
 from jaxhil.sixdof.rotations import Quaternion, compose, identity, reverse, rotate, rotate_back
 from jaxhil.sixdof.vectors import Vector, cross
 
-SEARCH_HEIGHT = 10.0  # m; z coordinate in target frame T at which the search for the first touch begins
+SEARCH_HEIGHT = 10.0  # z coordinate in target frame T at which the search for the first touch begins [m]
 SEARCH_STEPS = 400  # number of search steps for the first touch
 NEWTON_STEPS = 3  # number of Newton steps after the search; enough for rounding accuracy
 FLIGHT_STEPS = 8  # number of integration steps of the free flight before the first touch

@@ -29,8 +29,8 @@ from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.stewart import Stewart
 from jaxhil.sixdof.vectors import Vector, vector
 
-APPROACH_DURATION = 0.02  # s; duration of the flight before the first touch, without the phase
-DEFAULT_DURATION = 10.0  # s; duration of a run if [start] does not specify a duration
+APPROACH_DURATION = 0.02  # duration of the flight before the first touch, without the phase [s]
+DEFAULT_DURATION = 10.0  # duration of a run if [start] does not specify a duration [s]
 
 
 def build_scenarios(

@@ -21,7 +21,7 @@ from jaxhil.sixdof.relative import States, relative
 from jaxhil.sixdof.sensor import Sensor
 from jaxhil.sixdof.vectors import dot, norm
 
-MIN_PAUSE = 0.06  # s; minimum time without any touch, after which an episode may end
+MIN_PAUSE = 0.06  # minimum time without any touch, after which an episode may end [s]
 
 
 class EpisodeStart(NamedTuple):

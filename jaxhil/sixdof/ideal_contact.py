@@ -27,8 +27,8 @@ from jaxhil.sixdof.peaks import Peak, update_peak, zero_peak
 from jaxhil.sixdof.relative import Pair, States, Twist, mass_matrix, relative
 from jaxhil.sixdof.vectors import norm
 
-FIRST_STEP = 1e-4  # s; length of the first integration step
-MAX_STEP_PERIODS = 2.0  # control periods; maximum length of an integration step near a touch
+FIRST_STEP = 1e-4  # length of the first integration step [s]
+MAX_STEP_PERIODS = 2.0  # maximum length of an integration step near a touch [control periods]
 MAX_GAPS = 4  # maximum number of recorded gaps between touches
 # Minimum change of the twist after which an episode may end, divided by the twist before the contact [1].
 MIN_CHANGE = 0.05

@@ -33,13 +33,13 @@ from jaxhil.sixdof.rotations import Quaternion, compose, normalise, rotate
 from jaxhil.sixdof.vectors import norm
 
 TOLERANCE = 1e-10  # maximum error of a step, divided by the relative speed (function `error_speed`)
-MIN_STEP = 1e-9  # s; steps up to this length are accepted with any error, so that the integration proceeds
-EVENT_ACCURACY = 1e-6  # s; accuracy of the time at which a touch begins or ends, or a latch catches
-MAX_STEP_WITH_MEMORY = 1e-4  # s; maximum length of a step for laws with memory
+MIN_STEP = 1e-9  # longest step that is accepted with any error [s], so that the integration proceeds
+EVENT_ACCURACY = 1e-6  # accuracy of the time at which a touch begins or ends, or a latch catches [s]
+MAX_STEP_WITH_MEMORY = 1e-4  # maximum length of a step for laws with memory [s]
 MAX_STEPS = 200_000  # maximum number of steps if the mean step is short
 MIN_STEP_RATIO, MAX_STEP_RATIO = 0.1, 4.0  # limits of the ratio of two successive step lengths
-NEAREST_POINT_MARGIN = 1.0  # m; margin added to the lever arm, because contact points move along the shapes
-MIN_SPEED = 1e-30  # m/s; avoids a division by zero
+NEAREST_POINT_MARGIN = 1.0  # margin added to the lever arm, because contact points move along the shapes [m]
+MIN_SPEED = 1e-30  # lower bound of speeds in divisions [m/s]
 
 
 class IdealContactModel(NamedTuple):

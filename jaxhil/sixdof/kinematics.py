@@ -42,7 +42,7 @@ class Kinematics(eqx.Module):
 
     @abc.abstractmethod
     def coordinates(self, motion: AxisMotion, near: Float[Array, "6 *batch"]) -> AxisMotion:
-        """Convert the motion of the axes to the motion of the coordinates.
+        """Convert the motion of the simulator's axes to the motion of the pose coordinates of C in T.
 
         `near` contains coordinates near the result, from which an iteration can start.
         """

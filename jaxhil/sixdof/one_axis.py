@@ -32,7 +32,7 @@ from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.vectors import components
 
 RIG_KEYS = ("control_period", "integrator", "command_latency", "command_hold")
-EQUAL_LAGS = 1e-9  # s; axes whose lags differ by less are equal
+EQUAL_LAGS = 1e-9  # difference of lags below which two axes are equal [s]
 
 
 class OneAxisContact(NamedTuple):

@@ -26,7 +26,7 @@ from jaxhil.sixdof.stewart import Stewart, condition
 from jaxhil.sixdof.vectors import dot
 
 MAX_TICKS = 1e7  # maximum number of ticks of a run
-MAX_ATTITUDE = 1.0  # rad; maximum angle between the frames of chaser and target at the start
+MAX_ATTITUDE = 1.0  # maximum angle between the frames of chaser and target at the start [rad]
 MAX_CONDITION_NUMBER = 100.0  # maximum condition number of a hexapod's Jacobian, with lengths in m
 # Number of control periods between checks of a run. In this time, shapes must not pass through each other.
 CHECK_PERIODS = SEGMENT_TICKS

@@ -40,7 +40,7 @@ from jaxhil.sixdof.relative import States
 from jaxhil.sixdof.scenario import Scenario
 
 SEGMENT_TICKS = 16  # number of ticks in a segment, after which the end of the runs is checked
-MIN_APPROACH_SPEED = 1e-3  # m/s; a slower approach counts as this speed in the test for divergence
+MIN_APPROACH_SPEED = 1e-3  # lower bound of the approach speed in the test for divergence [m/s]
 MISS, REBOUNDED, CAPTURED, JAMMED, TIMEOUT, DIVERGED, NON_FINITE, REACH = range(8)
 STATUS_NAMES = ("miss", "rebounded", "captured", "jammed", "timeout", "diverged", "non-finite", "reach")
 

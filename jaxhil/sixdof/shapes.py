@@ -15,7 +15,7 @@ from jaxhil.lanes import safe_sqrt
 from jaxhil.sixdof.rotations import Quaternion, rotate, rotate_back
 from jaxhil.sixdof.vectors import Vector, direction, dot, norm
 
-NEAR_AXIS = 1e-12  # m; distance from the axis below which the radial direction decreases smoothly to 0
+NEAR_AXIS = 1e-12  # distance from the axis below which the radial direction decreases smoothly to 0 [m]
 
 
 class Surface(NamedTuple):

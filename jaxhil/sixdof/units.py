@@ -8,11 +8,11 @@ from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.six_axes_rules import inertia_matrix
 
 # Maximum plausible values.
-MAX_VELOCITY = 1.0  # m/s; approach velocity
-MAX_ANGLE = 0.3  # rad; angle between the frames of chaser and target at the first touch
-MAX_RATE = 0.1  # rad/s; angular velocity of the chaser relative to the target
-MAX_GRAVITY = 10.0  # m/s^2; gravity on the ground
-MAX_TOOL_DISTANCE = 2.0  # m; distance from the origin of chaser frame C to the tool's centre of mass
+MAX_VELOCITY = 1.0  # approach velocity [m/s]
+MAX_ANGLE = 0.3  # angle between the frames of chaser and target at the first touch [rad]
+MAX_RATE = 0.1  # angular velocity of the chaser relative to the target [rad/s]
+MAX_GRAVITY = 10.0  # gravity on the ground [m/s^2]
+MAX_TOOL_DISTANCE = 2.0  # distance from the origin of chaser frame C to the tool's centre of mass [m]
 MAX_INTERFACE_RATIO = 20.0  # distance from centre of mass to interface, divided by radius of gyration [1]
 MAX_GYRATION_RATIO = 10.0  # radius of gyration, divided by interface distance or, if larger, 1 m [1]
 

@@ -25,7 +25,7 @@ from jaxhil.simulation.tile_size import DeviceDescription
 from tuning.gain_file import write_gain_file
 from tuning.sweeps.chunks import convert_precision
 
-LIMIT, SMOKE_LIMIT = 480.0, 3600.0  # s; maximum time for the table, with full and with tiny sizes
+LIMIT, SMOKE_LIMIT = 480.0, 3600.0  # maximum time for the table, with full and with tiny sizes [s]
 REPEATS = 3
 ROOT = Path(__file__).parents[2]
 

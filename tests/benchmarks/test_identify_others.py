@@ -23,7 +23,7 @@ from tuning.identification.rational import STRUCTURES, MotionModel
 pytestmark = pytest.mark.benchmark
 SCRIPT = Path(__file__).with_name("identify_others.py")
 TRUE = MotionModel(STRUCTURES[2], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
-CONTACT = 3.0  # Hz, frequency at which the lag is compared
+CONTACT = 3.0  # frequency at which the lag is compared [Hz]
 AT = np.concatenate([[CONTACT], np.linspace(5.0, 20.0, 301)])
 
 

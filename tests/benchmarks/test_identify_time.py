@@ -18,7 +18,7 @@ from tuning.identification.identify import IdentificationOptions, identify
 from tuning.identification.motion import MotionResponse
 
 pytestmark = pytest.mark.benchmark
-BAR = 10.0  # s, warm
+BAR = 10.0  # warm [s]
 PRESS_BAR = 15.0  # s
 TRUE = np.array([0.0037, 0.0, 1.2e5, 650.0])  # force delay, plane, stiffness, damping
 UNITS = np.array([1e-3, 1e-6, 1e5, 100.0])

@@ -29,7 +29,7 @@ REPEATS = 4
 # Variables of the test session that are removed: XLA flags, and the request to recompile every module.
 NOT_A_USERS = "XLA_FLAGS", "NPROC", "PYTHONDONTWRITEBYTECODE"
 COMMANDS = {"tune": (("tune", "varying"), 5.0), "simulate": (("simulate", "varying"), 1.2)}
-COMPILING = 15.0  # s, on two cores: limit for rollouts with derivatives, and for all programs of tuning
+COMPILING = 15.0  # on two cores [s]: limit for rollouts with derivatives, and for all programs of tuning
 # Compensators of thousands of equations exceed the limit; these are their measured times.
 REACHED = {"impulse_ledger": 40.0}
 KEEPING = "jax_enable_compilation_cache"

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 from jaxhil.errors import InputError, format_value, to_one_line
 from tuning.caches.worker import ProcessSetting, run_pickled_call
 
-SCHEDULER_TIMEOUT = 10  # s; a scheduler must answer within this time
-IDLE_TIMEOUT = 20.0  # s; waiting time for a finished unit, after which the workers are counted again
-WORKER_COUNT_INTERVAL = 2.0  # s; minimum time between two counts of the workers
+SCHEDULER_TIMEOUT = 10  # a scheduler must answer within this time [s]
+IDLE_TIMEOUT = 20.0  # waiting time for a finished unit, after which the workers are counted again [s]
+WORKER_COUNT_INTERVAL = 2.0  # minimum time between two counts of the workers [s]
 UNITS_PER_WORKER = 2  # submitted units per worker, so that a worker need not wait for the next unit
 
 

@@ -80,7 +80,7 @@ def _record_times(spans: dict[str, list[TimeInterval]]) -> Iterator[None]:
             return original_import(name, *arguments, **keywords)
         finally:
             ended = time.monotonic()
-            if ended - begun > 1e-4:  # s; a shorter time means that the module was already imported
+            if ended - begun > 1e-4:  # time of an import [s]; below it, the module was already imported
                 spans["importing"].append((begun, ended))
             listen()
 

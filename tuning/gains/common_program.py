@@ -118,7 +118,7 @@ class CommonProgram:
         return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (self.slots, *leaf.shape)), reference)
 
 
-UNREACHED_DEPTH = 1.0  # m; penetration that no contact reaches
+UNREACHED_DEPTH = 1.0  # penetration that no contact reaches [m]
 
 
 @partial(jax.jit, static_argnums=0)

@@ -142,7 +142,10 @@ class ObjectiveTerms(NamedTuple):
 
 
 class ObjectiveWeights(NamedTuple):
-    """Weights of the terms C, N, S and H of `Objective` for each problem: arguments of the program."""
+    """Weights of the terms C, N, S and H of `Objective` for each problem.
+
+    The compiled program takes them as arguments, so that it serves for all weights.
+    """
 
     divergence: Float[Array, "*problems"]  # weight of squared positive errors relative to negative ones [1]
     command: Float[Array, "*problems"]  # weight of the excess peak command C [1]
@@ -197,7 +200,7 @@ def compute_residuals(
     Their sum of squares is (J / `RESIDUAL_SCALE`)^2, where J is the objective with the smooth norm as its
     metric. Each contact of each scenario has one residual for its error, and one for each of the other terms
     of the objective (probes, command, chatter). The noise has a single residual. A failed contact has an
-    error, an excess and a chatter of `FAILED_CONTACT_ERROR`.
+    error, an excess peak command and a chatter of `FAILED_CONTACT_ERROR`.
 
     `static` holds the rig model, the loop, the names of the tuned gains and the objective's terms. All
     problems are simulated in one batch, whose lanes are their scenarios.

@@ -26,12 +26,12 @@ from tuning.identification.records import CampaignTiming, LoggedRun
 
 MIN_CONTACTS_FOR_DRIFT = 3  # contacts
 FORCE_DETECTION_SIGMAS = 5.0  # minimum force in contact, in standard deviations of the noise
-# s; the data are shifted to this delay, the middle of the search range, because the clock offset is
+# delay to which the data are shifted [s]: the middle of the search range, because the clock offset is
 # arbitrary.
 CENTRAL_DELAY = 0.5 * MAX_FORCE_DELAY
-DELAY_DIFFERENCE_STEP = 2.5e-4  # s, step of the finite differences with respect to the delay
+DELAY_DIFFERENCE_STEP = 2.5e-4  # step of the finite differences with respect to the delay [s]
 DRIFT_ITERATIONS = 6  # maximum number of alternating estimates of the contact law and of the drift
-DRIFT_TOLERANCE = 1e-6  # s; the iteration ends if the delays of all contacts change by less
+DRIFT_TOLERANCE = 1e-6  # change of all contacts' delays below which the iteration ends [s]
 SEPARATE_CLOCK_MESSAGE = (
     'timing.clock: found "separate", expected "stamps" or "index" to compare logs with a mechanism'
 )
@@ -43,7 +43,7 @@ class ClockDrift:
 
     rate: float  # s/s, time that the force clock gains per second
     std: float  # s/s, standard error of the rate
-    delays: np.ndarray  # s, (runs,), force delay of each run due to the drift, plus an unknown constant
+    delays: np.ndarray  # (runs,), force delay of each run due to the drift, plus an unknown constant [s]
 
 
 def reject_separate_clocks(timing: CampaignTiming) -> None:

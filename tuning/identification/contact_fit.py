@@ -35,7 +35,7 @@ from tuning.identification.sensor_lag import (
 )
 
 SPECIFIED_DEAD_ZONE_STD = 1e-3  # relative standard deviation of a specified dead zone
-UNKNOWN_SURFACE_STD = 5e-5  # m; standard deviation of a surface position that is assumed to be 0
+UNKNOWN_SURFACE_STD = 5e-5  # standard deviation of a surface position that is assumed to be 0 [m]
 DEAD_ZONE_MARGIN = 4.0  # minimum distance of a used force above the dead zone, in standard deviations
 COARSE_GRID_SIZE = 21, 5  # numbers of delays and of surface positions in the grid of bootstrap and test fits
 ASSUMED_NOISE_SHARE = 0.01  # standard deviation of unknown noise, relative to the largest force

@@ -36,9 +36,9 @@ from tuning.identification.sensor_filter import (
     compute_onset_weights,
 )
 
-MAX_FORCE_DELAY = 0.02  # s, longest force delay in the search range of a fit
-COARSE_DELAY_STEP = 0.0005  # s, step between the delays of a first search
-STEP = 1e-7  # m, step of finite differences with respect to the surface position
+MAX_FORCE_DELAY = 0.02  # longest force delay in the search range of a fit [s]
+COARSE_DELAY_STEP = 0.0005  # step between the delays of a first search [s]
+STEP = 1e-7  # step of finite differences with respect to the surface position [m]
 FILTER_MEMORY_TIME_CONSTANTS = 25.0  # time constants after which the response of a filter is below 1e-10
 Motion = list[tuple[np.ndarray, np.ndarray]]  # position [m] and velocity [m/s] at several times
 

@@ -22,7 +22,7 @@ from tuning.identification.contact_regression import CoefficientFit
 from tuning.identification.normal_draws import factorise_covariance
 from tuning.identification.surface_search import find_best_surface
 
-FINE_DELAY_STEP = 2e-5  # s, step between the delays of the second grid
+FINE_DELAY_STEP = 2e-5  # step between the delays of the second grid [s]
 SMOOTHING_DELAYS = 7  # number of adjacent delays of the second grid whose surface positions are averaged
 FINAL_GRID_DROP = 30.0  # twice the maximum drop of the log posterior from its peak in the final grid
 # Twice the maximum drop in the second grid; larger, because the coarse grid's log posterior is inaccurate.
@@ -31,7 +31,7 @@ SECOND_GRID_SURFACES = 15  # number of surface positions at each delay of the se
 MAX_CELL_EDGES = 1000  # maximum number of cell edges; an uncertain surface position would need more
 COARSE_STD_FACTOR = 2.0  # the coarse grid's standard deviation of the surface is multiplied by this factor
 FINAL_GRID_DELAYS, FINAL_GRID_SURFACES = 61, 13  # numbers of delays and surface positions of the final grid
-DELAY_SEARCH_HALF_WIDTH = 0.003  # s, half width of the search around an approximate delay
+DELAY_SEARCH_HALF_WIDTH = 0.003  # half width of the search around an approximate delay [s]
 SURFACE_HALF_WIDTH_SIGMAS = 3.2  # half width of the grid at a delay, in standard deviations of the surface
 POSTERIOR_DRAWS = 4000  # number of posterior draws
 

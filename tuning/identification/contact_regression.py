@@ -19,7 +19,7 @@ class CoefficientFit:
     slope: float = 0.0  # 1/m, derivative of misfit / 2 with respect to the surface position
     # 1/m^2, second derivative of misfit / 2, if the coefficients are fitted at every surface position
     curvature: float = 0.0
-    plane: float = 0.0  # m, surface position of the fit
+    plane: float = 0.0  # surface position of the fit [m]
     # derivative of the coefficients with respect to the surface position; None if the position is specified
     by_plane: np.ndarray | None = None
 

@@ -9,8 +9,8 @@ from tuning.identification.contact_problem import MAX_FORCE_DELAY
 from tuning.identification.rational import MotionModel
 from tuning.identification.records import LoggedRun
 
-SETTLING_TIME = 0.5  # s, settling time that is assumed for a motion simulator
-SEGMENT_LENGTH = 1.0  # s, length of the segments of a long run
+SETTLING_TIME = 0.5  # settling time that is assumed for a motion simulator [s]
+SEGMENT_LENGTH = 1.0  # length of the segments of a long run [s]
 MEMORY_TIME_CONSTANTS = 10.0  # time constants of the motion simulator; older commands have no effect
 SPEED_ROWS = 5  # a speed is the difference of two positions that are this many rows apart
 MAX_SPEED_CHANGE = 0.01  # maximum relative change of the speed in a motion that counts as uniform

@@ -23,7 +23,7 @@ from tuning.identification.contact_profile import Posterior
 from tuning.identification.law_choice import search_coarsely
 
 DAMPING_NAME, TIME_CONSTANT_NAME = "damping", "time_constant"
-MAX_DAMPING_OVER_STIFFNESS = 0.01  # s, upper bound of the ratio of damping to stiffness in the prior
+MAX_DAMPING_OVER_STIFFNESS = 0.01  # upper bound of the ratio of damping to stiffness in the prior [s]
 MIN_UNDAMPED_PROBABILITY = 1e-4  # minimum posterior probability of an undamped model that is not ignored
 # Upper bound of the gain in log evidence of the undamped model, which has one parameter less.
 MAX_OCCAM_GAIN = 7.0

@@ -27,8 +27,8 @@ from tuning.identification.surface_search import find_best_surface
 MIN_DEEP_LANES = 6  # minimum number of deep lanes for which pseudo-rows save time
 LANES_FOR_LAW_CHOICE = 8  # number of deep lanes that suffice to fit the shape of a contact law
 MIN_DEPTH_SHARE = 0.1  # minimum ratio of the smallest depth of a deep lane to its median depth
-DELAY_RANGE = 0.002  # s, range of delays that one table covers
-DELAY_TOLERANCE = 1e-9  # s; a table also covers delays that exceed its range by a rounding error
+DELAY_RANGE = 0.002  # range of delays that one table covers [s]
+DELAY_TOLERANCE = 1e-9  # a table also covers delays that exceed its range by a rounding error [s]
 DELAY_NODES = 8  # number of delays at which the interpolation is exact
 # numbers of surface positions at which the interpolation is exact: first for a linear force, then for others
 SURFACE_NODES = 2, 4
@@ -177,10 +177,10 @@ class SummarisedProblem(ContactProblem):
 class _DesignTable:
     """Table from which pseudo-rows are interpolated for any force delay and surface position in its range."""
 
-    delays: np.ndarray  # s, delays of the nodes
-    planes: np.ndarray  # m, surface positions of the nodes
-    ends: tuple[float, float]  # s, smallest and largest delay that the table covers
-    limit: tuple[float, float]  # m, smallest and largest surface position that the table covers
+    delays: np.ndarray  # delays of the nodes [s]
+    planes: np.ndarray  # surface positions of the nodes [m]
+    ends: tuple[float, float]  # smallest and largest delay that the table covers [s]
+    limit: tuple[float, float]  # smallest and largest surface position that the table covers [m]
     extreme: np.ndarray  # regressors of the law in the row whose force first becomes negative
     # (rows, delays x planes x regressors + 2), regressors of the law at all nodes, then bias and readings
     factor: np.ndarray

@@ -19,14 +19,14 @@ class ForceReadings:
     Arrays have the shape (rows, lanes), with one run per lane; shorter runs are padded.
     """
 
-    force: np.ndarray  # N; 0 if the reading is missing
+    force: np.ndarray  # force reading [N]; 0 if it is missing
     counts: np.ndarray  # bool, whether fits use the reading
     entry: np.ndarray  # int, index into the lists in `[contact]`
     entries: tuple[int, ...]  # indices that occur in `entry`
-    std: float  # N, standard deviation of the noise after whitening
+    std: float  # standard deviation of the noise after whitening [N]
     whitening: tuple[float, ...] = (1.0,)  # coefficients of the filter that whitens the noise
-    threshold: float = 0.0  # N, smallest predicted force of a used reading; a dead zone affects smaller ones
-    bias: tuple[float, float] | None = None  # N, prior mean and standard deviation of the sensor's bias
+    threshold: float = 0.0  # smallest predicted force of a used reading [N]; a dead zone affects smaller ones
+    bias: tuple[float, float] | None = None  # prior mean and standard deviation of the sensor's bias [N]
 
     @classmethod
     def of(

@@ -24,7 +24,7 @@ from tuning.identification.structure_choice import (
 )
 
 SETTLING_TIME_CONSTANTS = 10.0  # duration of a transient, in time constants
-ASSUMED_TIME_CONSTANT = 0.05  # s, time constant of the motion simulator that is assumed before the fit
+ASSUMED_TIME_CONSTANT = 0.05  # time constant of the motion simulator that is assumed before the fit [s]
 MAX_REDUCED_CHI_SQUARE = 1.3  # chi-squared per degree of freedom above which the intervals are widened
 # Minimum p-value of the residual without a model error. It is low, because a model error widens the
 # intervals.

@@ -30,13 +30,13 @@ MIN_AMPLITUDE_SHARE = 1e-3
 class Spectrum:
     """Spectra of command and position of one run, at the frequency lines that the command excites."""
 
-    frequency: np.ndarray  # Hz, excited lines
-    command: np.ndarray  # m, complex amplitude of the commanded position
-    output: np.ndarray  # m, complex amplitude of the measured position, without the transient
-    std: np.ndarray  # m, standard deviation of the complex noise of `output`
+    frequency: np.ndarray  # excited lines [Hz]
+    command: np.ndarray  # complex amplitude of the commanded position [m]
+    output: np.ndarray  # complex amplitude of the measured position, without the transient [m]
+    std: np.ndarray  # standard deviation of the complex noise of `output` [m]
     response: np.ndarray  # complex frequency response, smoothed if the command is not periodic
     coherence: np.ndarray  # 0..1, share of the output's power that the command causes
-    noise_std: float  # m, standard deviation of the noise of a single position reading
+    noise_std: float  # standard deviation of the noise of a single position reading [m]
     # odd distortion: ratio of the rms output at odd lines without excitation to that at excited lines
     odd: float | None
     # even distortion: ratio of the rms output at even lines without excitation to that at excited lines

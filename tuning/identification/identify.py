@@ -33,7 +33,7 @@ from tuning.identification.result_checks import check_result
 from tuning.identification.structure_choice import MAX_RELATIVE_STD
 
 MIN_REST_ROWS = 200  # minimum number of rows at rest for an estimate of the noise
-ASSUMED_CONTACT_FREQUENCY = 3.0  # Hz, contact frequency that is assumed if the logs have no contact
+ASSUMED_CONTACT_FREQUENCY = 3.0  # contact frequency that is assumed if the logs have no contact [Hz]
 STAGE_COUNT = 3  # number of progress messages without a bootstrap, which adds one per chunk of fits
 ReportProgress = Callable[[str], None]  # receives the name of each stage when it begins
 FORCE_DELAY_KEY, DEAD_ZONE_KEY = "rig.force_sensor.delay", "rig.force_sensor.dead_zone"

@@ -17,7 +17,7 @@ from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
 from tuning.identification.normal_draws import factorise_covariance
 from tuning.identification.surface_search import find_best_surface
 
-MAX_SURFACE_STD = 0.01  # m, upper limit of the surface position's standard deviation
+MAX_SURFACE_STD = 0.01  # upper limit of the surface position's standard deviation [m]
 MAX_REDRAWS = 50  # maximum number of repetitions of draws with a negative damping coefficient
 
 

@@ -36,7 +36,7 @@ MIN_CONTACTS_FOR_CROSS_VALIDATION = 4  # minimum number of contacts for cross-va
 # Maximum deficit of an acceptable law in log likelihood, in standard errors of the deficit.
 MAX_LIKELIHOOD_DEFICIT_ERRORS = 2.0
 ONSET_DAMPING_EXCLUSION_ERRORS = 4.0  # minimum deficit that excludes onset damping, in standard errors
-ONSET_MARGIN = 1e-3  # s; the evaluation omits rows within this time of an onset or a release
+ONSET_MARGIN = 1e-3  # the evaluation omits rows within this time of an onset or a release [s]
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class EvaluatedLaw:
     """Contact law with its best fit, and its log likelihood in the cross-validation."""
 
     law: Law
-    delay: float  # s, force delay of the best fit
-    plane: float  # m, surface position of the best fit
+    delay: float  # force delay of the best fit [s]
+    plane: float  # surface position of the best fit [m]
     misfit: float  # chi-squared of all contacts
     likelihood: np.ndarray  # log likelihood of each contact under a fit that does not use it
     # Total log likelihood of the best law minus that of this law, and the standard error of this difference.

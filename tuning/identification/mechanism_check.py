@@ -34,8 +34,8 @@ from tuning.identification.result import (
 from tuning.identification.uncertainty_effect import UncertaintyEffect, compute_uncertainty_effect
 from tuning.identification.unmodelled_effects import check_modelled_effects
 
-MIN_DELAY_STD = 2e-5  # s, minimum standard deviation of a delay
-ASSUMED_CONTACT_FREQUENCY = 3.0  # Hz, contact frequency that is assumed if the logs have no contact
+MIN_DELAY_STD = 2e-5  # minimum standard deviation of a delay [s]
+ASSUMED_CONTACT_FREQUENCY = 3.0  # contact frequency that is assumed if the logs have no contact [Hz]
 
 
 def check_against_mechanism(

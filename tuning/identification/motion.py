@@ -19,7 +19,7 @@ import numpy as np
 from tuning.identification.rational import MotionModel
 from tuning.identification.records import CampaignTiming, LoggedRun
 
-TICK_TOLERANCE = 1e-9  # periods; a time this close to a tick is treated as the tick
+TICK_TOLERANCE = 1e-9  # distance from a tick within which a time counts as the tick [periods]
 # Maximum size of the cached motions [bytes], and their minimum number. Fits of several contact laws repeat
 # the same delays.
 MAX_CACHED_BYTES, MIN_CACHED_MOTIONS = 3.2e7, 2

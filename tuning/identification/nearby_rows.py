@@ -9,9 +9,9 @@ class NearbyRows(NamedTuple):
     """Rows near contact for several surface positions, at one time."""
 
     rows: np.ndarray  # (rows,), flat indices into an array (rows, lanes); -1 after the end of a lane
-    position: np.ndarray  # m, (rows,), position of the mechanism
-    depth: np.ndarray  # m, (surface positions, rows), penetration; 0 out of contact
-    rate: np.ndarray  # m/s, (rows,), rate of the penetration
+    position: np.ndarray  # (rows,), position of the mechanism [m]
+    depth: np.ndarray  # (surface positions, rows), penetration [m]; 0 out of contact
+    rate: np.ndarray  # (rows,), rate of the penetration [m/s]
     columns: np.ndarray  # (surface positions, coefficients, rows), regressors of the law, without the bias
 
 

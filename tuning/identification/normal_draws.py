@@ -6,8 +6,9 @@ import numpy as np
 def factorise_covariance(covariance: np.ndarray) -> np.ndarray:
     """Return matrices L with L L^T = `covariance`, both of shape (..., n, n).
 
-    Negative eigenvalues of the correlation matrix, which result from rounding, are replaced by 0. Rounding
-    may also reverse the signs of eigenvectors. The symmetric root does not depend on these signs.
+    L is the symmetric square root of the correlation matrix, multiplied by the standard deviations. This root
+    does not depend on the signs of eigenvectors, which rounding may reverse. Negative eigenvalues, which
+    result from rounding, are replaced by 0.
     """
     deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
     scale = np.where(deviation > 0.0, deviation, 1.0)

@@ -26,7 +26,7 @@ class IdentificationOptions:
     bootstrap: int = 0  # number of bootstrap fits; 0: no bootstrap
     limit: float = 0.01  # largest allowed effect of all defects on the restitution
     calibration: float = 0.001  # relative standard uncertainty of the force sensor's scale
-    clock: float = 2e-5  # s, minimum standard uncertainty of a delay, because logs do not show clock errors
+    clock: float = 2e-5  # minimum standard uncertainty of a delay, because logs do not show clock errors [s]
     seed: int = 0  # seed of the random numbers
     scheduler: str | None = None  # address of a cluster's scheduler for the bootstrap
     checkpoints: Checkpoints = NO_CHECKPOINTS  # checkpoints of the bootstrap

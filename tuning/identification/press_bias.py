@@ -16,7 +16,7 @@ from tuning.identification.motion import MotionResponse
 from tuning.identification.noise import NoiseEstimate
 from tuning.identification.records import LoggedRun
 
-TYPICAL_FORCE_DELAY = 0.005  # s, assumed delay of the force sensor; accurate enough to detect a release
+TYPICAL_FORCE_DELAY = 0.005  # assumed delay of the force sensor [s]; accurate enough to detect a release
 SHALLOW_ROW_SHARE = 0.01  # share of the rows, those with the smallest depth, that may be out of contact
 MIN_MEAN_ROWS = 20  # minimum number of rows for a mean
 # Minimum excess of the force at small depths above the line through deeper readings that shows a release, as

@@ -21,7 +21,7 @@ from scipy import optimize
 
 from tuning.identification import hold as holds
 
-MIN_TIME_CONSTANT = 1e-6  # s, minimum time constant; logs cannot resolve faster poles
+MIN_TIME_CONSTANT = 1e-6  # minimum time constant [s]; logs cannot resolve faster poles
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ class SpectralLines:
     command: np.ndarray  # complex amplitude of the commanded position
     output: np.ndarray  # complex amplitude of the measured position, in the command's unit
     std: np.ndarray  # standard deviation of the output's complex noise n: E|n|^2 = std^2
-    period: float  # s, control period
+    period: float  # control period [s]
     hold: str  # "zoh" or "linear"
-    latency: int  # periods, latency of the command
+    latency: int  # latency of the command [periods]
     shift: int = 0  # periods by which the readings of a row are older than its command
 
     @cached_property
@@ -83,7 +83,8 @@ class SpectralLines:
 class MotionModel:
     """Model of the motion simulator: a structure with values of its parameters.
 
-    The parameters are [log T ..., log w, log zeta ..., c ..., delay], with T, 1/w and the delay in s.
+    The parameters are, in this order: log T of each first-order section, log w and log zeta of each
+    second-order section, the coefficients c of the numerator, and the delay; T, 1/w and the delay in s.
     """
 
     structure: SimulatorStructure

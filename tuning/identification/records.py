@@ -16,7 +16,7 @@ RunKind = Literal["free", "press", "tap", "contact", "rest"]
 CONTACT_KINDS: tuple[RunKind, ...] = "contact", "press", "tap"
 CommandHold = Literal["zoh", "linear"]
 RowConvention = Literal["tick", "sent", "after"]
-DEFAULT_MECHANISM_NAME = "identified"  # name of the mechanism if there is no prior
+DEFAULT_MECHANISM_NAME = "identified"  # default name of the mechanism, without a prior file
 # Number of ticks by which the readings of a row are older than its command. A "sent" row contains the command
 # of the next tick; an "after" row contains the readings of the next tick.
 ROW_SHIFT = {"tick": 0, "sent": 1, "after": -1}
@@ -26,9 +26,9 @@ ROW_SHIFT = {"tick": 0, "sent": 1, "after": -1}
 class StampClock:
     """Accuracy of the time stamps of a log; without time stamps, the clock is assumed to be perfect."""
 
-    period: float  # s, control period measured by the time stamps
+    period: float  # control period measured by the time stamps [s]
     drift: float  # ppm, relative difference of the measured period from the nominal control period
-    jitter: float  # s, standard deviation of the time stamps about the ticks
+    jitter: float  # standard deviation of the time stamps about the ticks [s]
     lost: int  # number of missing rows
 
 
@@ -42,7 +42,7 @@ class LoggedRun:
     kind: RunKind  # kind of experiment
     source: str  # name of the log file
     tick: np.ndarray  # int64, number of the control period of each row
-    time_stamp_error: float  # s, standard deviation of the time stamps about the ticks
+    time_stamp_error: float  # standard deviation of the time stamps about the ticks [s]
     position_desired: np.ndarray  # m
     position_measured: np.ndarray  # m
     force_measured: np.ndarray | None  # N
@@ -50,9 +50,9 @@ class LoggedRun:
     force_command: np.ndarray | None  # N
     valid: np.ndarray  # bool; False if the row was lost, or if fits must not use its readings
     contact_index: np.ndarray | None  # int64, index into the lists in `[contact]`; -1: no contact
-    speed: float | None  # m/s, approach speed; None if unknown
-    begin: float = 0.0  # s, time stamp of tick 0
-    force_late: np.ndarray | None = None  # s, time from each row to its force reading
+    speed: float | None  # approach speed [m/s]; None if unknown
+    begin: float = 0.0  # time stamp of tick 0 [s]
+    force_late: np.ndarray | None = None  # time from each row to its force reading [s]
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Campaign:
 
     runs: tuple[LoggedRun, ...]
     timing: CampaignTiming
-    equivalent_mass: float  # kg, equivalent mass of the numerical model
+    equivalent_mass: float  # equivalent mass of the numerical model [kg]
     sources: dict[str, str] = field(default_factory=dict)  # hexadecimal SHA-256 of each log, by file name
     notes: tuple[str, ...] = ()  # remarks of the reader on the logs
     integrator: str | None = None  # integrator of the numerical model, or None if unknown

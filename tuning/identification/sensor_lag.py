@@ -22,14 +22,14 @@ from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
 from tuning.identification.lag_profile import compute_posterior_near
 from tuning.identification.law_choice import CoarseFit, search_coarsely
 
-MAX_TIME_CONSTANT = 0.005  # s, longest time constant of a lag
-TRIAL_TIME_CONSTANTS = 0.0005, 0.0015, 0.004  # s, time constants of a first search
+MAX_TIME_CONSTANT = 0.005  # longest time constant of a lag [s]
+TRIAL_TIME_CONSTANTS = 0.0005, 0.0015, 0.004  # time constants of a first search [s]
 MIN_CRITERION_GAIN = 6.0  # minimum improvement of the Bayesian information criterion by a lag
 # Number of time constants in the grid, and half width of this grid in standard deviations.
 LAG_GRID_SIZE, LAG_HALF_WIDTH_SIGMAS = 9, 3.5
 # Number of delays at each time constant, and half width of this grid in standard deviations.
 DELAY_GRID_SIZE, DELAY_HALF_WIDTH_SIGMAS = 21, 5.0
-MIN_DELAY_STD = 5e-5  # s, minimum standard deviation of the delay that determines the width of the grid
+MIN_DELAY_STD = 5e-5  # minimum standard deviation of the delay that determines the width of the grid [s]
 SMALL_LAG_GRID_SIZE, SMALL_DELAY_GRID_SIZE = 7, 15  # sizes of both grids if the lag is uncertain
 PRIOR_LAG_PROBABILITY = 0.8  # prior probability of a lag: nearly every amplifier has a filter
 # Maximum drop of the log likelihood from its maximum; a lag with a larger drop is excluded.
@@ -43,7 +43,7 @@ FitAt = Callable[[float], tuple[ContactProblem, CoarseFit]]
 class SensorLag:
     """Estimate of the force sensor's lag, with the posterior of all contact parameters."""
 
-    value: float  # s, most probable time constant; 0 if the lag is treated as part of the delay
+    value: float  # most probable time constant [s]; 0 if the lag is treated as part of the delay
     # if value > 0, the last parameter is "time_constant", and `best` is the fit at `value`
     posterior: Posterior
     evidence: float  # log evidence of the average of the models with and without a lag

@@ -37,7 +37,7 @@ CONTACT_STEPS = 400  # number of integration steps in the estimated duration of 
 # maximum duration of a contact, divided by the estimate; a longer contact is assumed to have no rebound
 MAX_CONTACT_DURATION_RATIO = 4.0
 RELATIVE_DIFFERENCE_STEP = 1e-4  # relative step of finite differences for a parameter of the motion simulator
-MAX_DEPTH = 1.0  # m, maximum depth; a deeper contact is assumed to have no rebound
+MAX_DEPTH = 1.0  # maximum depth [m]; a deeper contact is assumed to have no rebound
 FORCE_DELAY_KEY, SIMULATOR_PREFIX = "rig.force_sensor.delay", "rig.simulator."
 IDENTIFIED_SOURCE_PREFIX = "identified from"  # beginning of the `source` of an identified file
 FORCE_DELAY_KEYS = (FORCE_DELAY_KEY, "rig.force_sensor.time_constant")
@@ -60,7 +60,7 @@ class _IdealContact(NamedTuple):
 
     restitution: float  # e*
     coefficient_sensitivity: np.ndarray  # derivatives of e* with respect to the coefficients of the law
-    delay_sensitivity: float  # 1/s, derivative of e - e* with respect to the force delay
+    delay_sensitivity: float  # derivative of e - e* with respect to the force delay [1/s]
 
 
 def compute_uncertainty_effect(mechanism: Mechanism) -> UncertaintyEffect:

@@ -145,7 +145,9 @@ def _with_jacobian(residuals, free, arguments, tile=None):
     @several.def_vmap
     def rule(axis_size, in_batched, free, arguments):
         if not all(jax.tree.leaves(in_batched)):
-            raise NotImplementedError("vmap: found an argument without a batch axis, expected one for each")
+            raise NotImplementedError(
+                "vmap: found an argument without a batch axis, expected a batch axis on each"
+            )
         return tuple(traced(*jax.tree.leaves((free, arguments)))), (True, True)
 
     @jax.custom_jvp

@@ -14,7 +14,7 @@ from jaxhil.sixdof.vectors import Vector
 
 Polyline = np.ndarray  # (points, 3) [m]
 
-CIRCLE_ANGLES = np.linspace(0, 2 * np.pi, 49)  # rad; angles of the points of a circle
+CIRCLE_ANGLES = np.linspace(0, 2 * np.pi, 49)  # angles of the points of a circle [rad]
 MERIDIAN_COUNT = 24  # number of meridians drawn on a surface of revolution
 DRAWN_CONE_SIZE = 3.0  # smallest drawn radius of a cone without a mouth, divided by its bottom radius [1]
 POINT_MARK_SIZE = 0.02  # half size of the cross that marks a point, divided by the size of the mechanism

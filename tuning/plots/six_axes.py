@@ -25,7 +25,7 @@ AXIS_NAMES = ("x", "y", "z")
 AXIS_COLOURS = (BLUE, VERMILION, GREEN)
 # Colours of the pairs of shapes that may touch; further pairs repeat the colours with dashed lines.
 CANDIDATE_COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY_BLUE, "0.35")
-TIME_MARGIN = 0.05  # s; time shown before the first and after the last contact
+TIME_MARGIN = 0.05  # time shown before the first and after the last contact [s]
 MIN_VIEW_RATIO = 0.3  # smallest ratio of a view's height to its width, so that force arrows have space
 MAX_LEGEND_ENTRIES = 12  # largest number of pairs of shapes in a legend
 VIEWS = ((0, 2), (1, 2))  # indices of the horizontal and the vertical axis of each view

@@ -27,7 +27,7 @@ from tuning.reporting.documents import (
 from tuning.sweeps.manifest import load_gains
 from tuning.sweeps.store import VERDICT_FILE, SweepStore, read_store
 
-MAX_DOCUMENT_BYTES = 200_000_000  # bytes; a larger file is not read
+MAX_DOCUMENT_BYTES = 200_000_000  # size of the largest file that is read [bytes]
 DOCUMENT_NAMES = ("manifest.json", "gains.json", "identification.json", "compare.json", "map.json")
 ALLOWED_RESULTS = (
     "a result of jaxhil identify, tune, sweep, compare, map or export (the folder, or the JSON file in it), "

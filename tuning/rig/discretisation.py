@@ -18,7 +18,8 @@ from jaxhil.mechanism.structs import Simulator
 # Coefficients of (state, command at the sampling interval's start, command at its end).
 ResponseRow = tuple[float, ...]
 SERIES_DEGREE = 16  # degree of the power series of the motion in an interval
-DELAY_ROUNDING_TOLERANCE = 1e-9  # [periods]; a delay this close to a whole number of periods is rounded to it
+# distance from a whole number of periods within which a delay is rounded [periods]
+DELAY_ROUNDING_TOLERANCE = 1e-9
 
 
 class MotionRows(NamedTuple):

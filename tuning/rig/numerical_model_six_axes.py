@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 BODY_NUMBERS = 13  # number of values in the state of a body
 MAX_NORM_ERROR = 1e-6  # largest difference of a start's quaternion from norm 1
-MAX_ANGLE = 1e6  # rad; larger rotations in a period are not computed, because sin(inf) is an error
+MAX_ANGLE = 1e6  # largest rotation in a period that is computed [rad], because sin(inf) is an error
 # Fraction of a period's velocity change that acts on the position in the same period.
 SHARES = {"semi_implicit_euler": 1.0, "zoh": 0.5, "explicit_euler": 0.0}
 

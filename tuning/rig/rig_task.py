@@ -25,7 +25,7 @@ from tuning.rig.udp_protocol import (
 )
 
 MAX_EXTRAPOLATED_PERIODS = 10  # number of periods after which a command is held instead of extrapolated
-MAX_COMMAND_AGE = 3  # [periods]; if a command is older, its effects are not the controller's fault
+MAX_COMMAND_AGE = 3  # age of a command beyond which its effects are not the controller's fault [periods]
 # Reasons for a trip that an old command can cause.
 TRIPS_BY_OLD_COMMANDS = ("tripped: restitution", "tripped: missed_tick")
 PAUSE_TICKS = 5  # number of ticks between two runs

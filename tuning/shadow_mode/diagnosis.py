@@ -19,13 +19,13 @@ SPEED_SPAN_ROWS = 8  # rows before and after a row, between which the model's ve
 MIN_FORCE_SHARE = 0.05  # minimum size of a force that is used, as a share of the largest one
 MAX_SIGN_AGREEMENT = -0.5  # below this agreement of force and motion (-1 to 1), the sign is flipped
 MIN_DIFFERENCE = 1e-3  # a smaller difference of commands, divided by their range, is not explained
-MAX_SHIFT = 20  # periods, largest shift of the commands in the search
-SHIFT_STEP = 0.05  # periods, resolution of the search
-MIN_SHIFT = 0.1  # periods, smallest shift that is reported
+MAX_SHIFT = 20  # largest shift of the commands in the search [periods]
+SHIFT_STEP = 0.05  # resolution of the search [periods]
+MIN_SHIFT = 0.1  # smallest shift that is reported [periods]
 MAX_REMAINING_SHARE = 0.25  # maximum rms difference after the shift, as a share of that before it
 MAX_UNEXPLAINED_SHARE = 0.2  # maximum rms difference after the shift, as a share of the rms command
 MIN_FIT_ROWS = 20  # minimum number of rows in contact for a fit
-MIN_DELAY_CHANGE = 5e-4  # s, smallest change of the force delay that is reported
+MIN_DELAY_CHANGE = 5e-4  # smallest change of the force delay that is reported [s]
 MIN_DELAY_SIGMAS = 5.0  # smallest change of the force delay that is reported, in standard errors
 MIN_DEPTH_SHARE = 0.1  # minimum depth of a row that is used, as a share of the run's largest depth
 

@@ -35,10 +35,10 @@ LINEAR_COMPENSATORS = (
     "none", "phase_lead", "multi_parameter_lead", "virtual_contact", "position_lead", "smith_predictor",
     "smith_hybrid",
 )  # fmt: skip
-MIN_LAG = 1e-3  # control periods; replaces a lag of 0 in a batch in which other lanes have a lag
+MIN_LAG = 1e-3  # replacement of a lag of 0 in a batch in which other lanes have a lag [control periods]
 # Squarings and terms of the matrix exponential; its errors are below 1e-12 for norms up to 1000.
 EXPONENTIAL_SQUARINGS, EXPONENTIAL_TERMS = 12, 12
-LINEARISATION_DEPTH = 1e-3  # m; penetration at which the loop is linearised
+LINEARISATION_DEPTH = 1e-3  # penetration at which the loop is linearised [m]
 MAX_CHUNK_ENTRIES = 4_000_000  # largest number of matrix entries that are computed together
 
 

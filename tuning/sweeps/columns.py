@@ -107,7 +107,7 @@ UNENDED_METRICS = (
 
 
 class ContactColumns(NamedTuple):
-    """Names of the error and status columns of a contact; for six axes, of one error of an episode."""
+    """Names of a contact's error and status columns; an episode in six axes has a pair for each error."""
 
     number: int  # number of the contact or episode, from 1
     error: str  # name of the error's column

@@ -49,7 +49,7 @@ class PrecisionComparison(NamedTuple):
 def run_sweep(
     store: SweepStore, found: ChunkProgress, computed: ChunkProgress, computer: ChunkComputer = run_chunks
 ) -> tuple[SweepProgram, Tally]:
-    """Compute and write all missing chunks of a sweep; return the sweep's program and tally.
+    """Compute and write all missing chunks of a sweep; return its compiled program and counts of outcomes.
 
     `found` is called for every stored chunk, `computed` for every new chunk. Raise `InputError` if a chunk
     cannot be written or a cluster cannot be reached.

@@ -136,7 +136,7 @@ def _restore_records(kind: Any, value: Any, null: float | None) -> Any:
     if hasattr(kind, "_fields"):
         hints, null = get_type_hints(kind), NULL_VALUES[kind]
         if value.keys() != hints.keys():
-            raise ValueError("other fields")
+            raise ValueError(f"found the fields {sorted(value)}, expected {sorted(hints)}")
         return kind(
             **{
                 name: _restore_records(hints[name], value[name], FIELD_NULL_VALUES.get(name, null))

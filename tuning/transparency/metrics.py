@@ -34,7 +34,7 @@ BEST_AT_ONE = ("early", "late", "slope")
 
 
 class PerturbedOutcomes(NamedTuple):
-    """Outcomes of one compensator with one set of gains, each (slots, scenarios)."""
+    """Outcomes of one compensator with one set of gains, each (contacts, scenarios)."""
 
     plain: Outcome  # scenarios without a perturbation
     early: Outcome  # the same scenarios with an early push on the first contact

@@ -1,12 +1,11 @@
 """Calibration of the limits of a six-axis gain file, and the watchdog's rates of false and missed alarms.
 
 Runs of drawn scenarios are recorded. A run is good if its contacts end well and its twist error is at most
-half of the limit. One part of the runs determines the limits: the extreme signals of its good runs times
-a margin. The other part is replayed through the rig's controller with these limits. An alarm in a good run is
-false. A missed alarm is a run without an alarm, although its error exceeds the limit or the mass of the
-numerical model is wrong. The runs with a wrong mass are repetitions of good runs.
-
-The limit is that of the sweep whose scenarios are recorded or, without a sweep, `ERROR_LIMIT`.
+half of the error limit. The error limit is that of the sweep whose scenarios are recorded or, without a
+sweep, `ERROR_LIMIT`. One part of the runs determines the watchdog's limits: the extreme signals of its good
+runs times a margin. The other part is replayed through the rig's controller with these limits. An alarm in a
+good run is false. A missed alarm is a run without an alarm, although its error exceeds the error limit or the
+mass of the numerical model is wrong. The runs with a wrong mass are repetitions of good runs.
 """
 
 from collections.abc import Callable, Mapping

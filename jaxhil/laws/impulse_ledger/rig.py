@@ -35,26 +35,26 @@ from jaxhil.rig.law_status import IDENTIFIED, NOISY, OUT_OF_CONTACT, SATURATED, 
 from jaxhil.rig.registry import Compensator, GainSpecification, register
 from jaxhil.rig.surfaces import deflection
 
-RELEASE_TIME = 0.03  # s; the compensator continues to act for this time after the hardware leaves the surface
-MIN_MOMENTUM = 1e-9  # kg m/s; with less momentum, forces cannot be scaled
-MAX_LAG = 0.2  # s; upper bound of the lag D
+RELEASE_TIME = 0.03  # time for which the compensator acts after the hardware has left the surface [s]
+MIN_MOMENTUM = 1e-9  # momentum below which forces cannot be scaled [kg m/s]
+MAX_LAG = 0.2  # upper bound of the lag D [s]
 ONSET_PLACE = -0.5  # periods of travel; assumed depth of the hardware at the last reading of free flight
-MISFIT = 0.00315  # [1]; standard deviation of the contact model's relative error, averaged over `MISFIT_TIME`
+MISFIT = 0.00315  # standard deviation of the contact model's relative error, averaged over `MISFIT_TIME` [1]
 MISFIT_TIME = 0.001  # s
-MIN_SCALED_SPEED = 1e-9  # [1]; speed / approach speed; a lower speed is a rounding error
-MIN_CONTACT_DEPTH = 0.001  # s; lower bound of the depth by which the secant stiffness is divided
-MIN_PEAK = 0.3  # 1/s; minimum of peak force / (mass x approach speed), for a contact at 0.05 Hz
+MIN_SCALED_SPEED = 1e-9  # speed / approach speed [1]; a lower speed is a rounding error
+MIN_CONTACT_DEPTH = 0.001  # lower bound of the depth by which the secant stiffness is divided [s]
+MIN_PEAK = 0.3  # minimum of peak force / (mass x approach speed), for a contact at 0.05 Hz [1/s]
 MIN_CONTACT_READINGS = 5  # readings in contact; with fewer readings the status is `unsure`
-LATE = 0.8  # [1]; if the lag D is a larger share of the contact's duration, the status is `too_short`
-UNCERTAIN = 0.006  # [1]; if the reference speed has a larger standard deviation, the status is `noisy`
-MAX_GAIN = 0.01  # [1]; limit on the energy gain beyond the contact model, divided by M v^2
-MAX_LOSS = 0.014  # [1]; limit on the energy loss beyond the contact model, divided by M v^2
-USUAL_PRELOAD = 1.0  # 1/s; standard deviation of preload/(mass x approach speed), added to the specified one
-MAX_DELAY_SPREAD = 0.004  # s; upper limit; for more, a first-order correction is not accurate
-MAX_SPREADS = 3.0  # standard deviations; limit on the difference of estimated and specified delay
-ONSET_TICKS = 0.3  # periods; standard deviation of the time of the onset, 1/sqrt(12)
-ONSET_MEAN = 0.25  # [1]; mean force at the onset, divided by the force at which the onset is detected
-ONSET_SPREAD = 0.4  # [1]; standard deviation of the force at the onset, divided by the same force
+LATE = 0.8  # limit on D divided by the contact's duration [1]; beyond it the status is `too_short`
+UNCERTAIN = 0.006  # limit on the reference speed's standard deviation [1]; beyond it the status is `noisy`
+MAX_GAIN = 0.01  # limit on the energy gain beyond the contact model, divided by M v^2 [1]
+MAX_LOSS = 0.014  # limit on the energy loss beyond the contact model, divided by M v^2 [1]
+USUAL_PRELOAD = 1.0  # standard deviation of preload/(mass x approach speed), added to the specified one [1/s]
+MAX_DELAY_SPREAD = 0.004  # limit [s]; beyond it a first-order correction is not accurate
+MAX_SPREADS = 3.0  # limit on the difference between estimated and specified delay [standard deviations]
+ONSET_TICKS = 0.3  # standard deviation of the time of the onset, 1/sqrt(12) [periods]
+ONSET_MEAN = 0.25  # mean force at the onset, divided by the force at which the onset is detected [1]
+ONSET_SPREAD = 0.4  # standard deviation of the force at the onset, divided by the same force [1]
 # Names of the gains that are the prior standard deviations of the contact model.
 SPREADS = (
     "prior_stiffness_spread",

@@ -72,7 +72,7 @@ class ImpulseLedger(SixAxisCompensator):
 
     @property
     def loop_delay(self) -> float:
-        """Return the delay D [s] of hardware behind model in the last contact; 0 before the first contact."""
+        """Return the delay D [s] of the hardware behind the model in the last contact; 0 before contacts."""
         return self._ledger.delay * self._period
 
     @property

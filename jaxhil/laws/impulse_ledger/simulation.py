@@ -28,8 +28,8 @@ from jaxhil.laws.shared.delay_line import (
 )
 from jaxhil.laws.simulation_base import Compensator, Gain, Gains, KnownConstants, clear_lanes, rig_gain
 
-USUAL_UNLOADING = 0.5  # 1/s^2; lower bound of the nominal `prior_unloading_spread`
-VELOCITY_GAIN = 105.0  # 1/s; nominal value, unless the control period requires a smaller gain
+USUAL_UNLOADING = 0.5  # lower bound of the nominal `prior_unloading_spread` [1/s^2]
+VELOCITY_GAIN = 105.0  # nominal value, unless the control period requires a smaller gain [1/s]
 
 
 def _from_file(name: str, upper, nominal, lower=lambda m: 0.0) -> Gain:

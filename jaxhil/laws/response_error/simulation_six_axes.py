@@ -34,8 +34,8 @@ from jaxhil.laws.simulation_base import Gain, Gains, Signals, rig_gain
 from jaxhil.laws.six_axis_base import COORDINATES, SixAxisCompensator, lag_leads
 
 AXIS = 2  # index of the docking axis z
-USUAL_SPEED = 0.02  # m/s; approach speed if the mechanism file has none
-FIRST_SAMPLE_DEPTH = 1e-3  # s; depth / approach speed at which a first sample has weight 1/2 in k_hat
+USUAL_SPEED = 0.02  # approach speed if the mechanism file has none [m/s]
+FIRST_SAMPLE_DEPTH = 1e-3  # depth / approach speed at which a first sample has weight 1/2 in k_hat [s]
 
 
 class ResponseErrorState(NamedTuple):

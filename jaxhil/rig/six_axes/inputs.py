@@ -135,7 +135,7 @@ class SixAxisInputGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget past readings and counts of bad readings, but keep `located`."""
+        """Forget past readings and counts of bad readings, but keep `located`, the last valid pose."""
         self._has_reading = False
         self._bad_forces = [0.0] * AXES
         self._bad_positions = [0.0] * AXES

@@ -13,7 +13,7 @@ from jaxhil.rig.limits import HELD_READINGS, LIMITS, RATIOS, TICK_COUNTS, Limit,
 from jaxhil.rig.six_axes.vectors import COORDINATES
 
 ANGLES = 0.0, 6.3  # [rad]
-ROTATIONS = -6.3, 6.3  # [rad]; a coordinate of a rotation vector
+ROTATIONS = -6.3, 6.3  # a coordinate of a rotation vector [rad]
 DURATIONS = 0.0, 1e5  # [s]
 
 

@@ -7,7 +7,7 @@ from jaxhil.rig.types import Index
 
 POINTS = 256  # stored points of the path, a power of two
 NEWEST_POINTS = POINTS - 1
-MIN_TURN = 0.002  # rad; lower bound of the rotation between two stored points
+MIN_TURN = 0.002  # lower bound of the rotation between two stored points [rad]
 
 
 class CommandPath:

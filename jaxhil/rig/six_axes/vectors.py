@@ -20,7 +20,7 @@ LAST_TERM = len(COTANGENT) - 1
 SINE = tuple((-1) ** k / factorial(2 * k + 1) for k in range(15))
 COSINE = tuple((-1) ** k / factorial(2 * k + 2) for k in range(15))
 LAST_SINE_TERM = len(SINE) - 1
-MAX_SQUARED_ANGLE = 10.0  # rad^2; larger arguments of the series are clamped; rotation vectors end at pi^2
+MAX_SQUARED_ANGLE = 10.0  # largest argument of the series [rad^2]; rotation vectors end at pi^2
 
 Triple = Annotated[list[float], 3]
 Vector = Annotated[list[float], AXES]

@@ -20,7 +20,7 @@ from tuning.bundle.fmu.variables import controller_variables
 from tuning.rig.contact_detector import ContactDetector
 
 FMU_LOOP_LIMIT = 1e-9  # largest difference of a contact's restitution [1]
-MAX_LATENCY = 4  # periods, largest `rig.command_latency`
+MAX_LATENCY = 4  # largest `rig.command_latency` [periods]
 READINGS = ("force_measured", "position_measured", "position", "velocity", "acceleration")
 
 
@@ -37,7 +37,7 @@ class FmuLoop(msgspec.Struct, frozen=True):
     """Comparison of the nominal contacts in the loop of both FMUs with the simulation."""
 
     fmi: int  # version of FMI
-    command_latency: int  # periods, `rig.command_latency` of the simulation, with the period of the master
+    command_latency: int  # `rig.command_latency` of the simulation, with the period of the master [periods]
     contacts: tuple[FmuContact, ...]
     reasons: tuple[str, ...]  # differences between FMUs and simulation; empty if both agree
 

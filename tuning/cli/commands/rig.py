@@ -13,10 +13,10 @@ from tuning.api import arguments
 from tuning.cli.commands import checks
 from tuning.cli.options_rig import RigOptions
 
-MAX_EMPTY_LOOP_DURATION = 30.0  # s; longest duration of the empty loop, which only exchanges packets
+MAX_EMPTY_LOOP_DURATION = 30.0  # longest duration of the empty loop, which only exchanges packets [s]
 EMPTY_LOOP_SHARE = 0.2  # duration of the empty loop, divided by the run's duration
 MAX_TICKS = 2_000_000  # largest number of ticks in a run
-MINIMUM_RATE = 1e-3  # [1]; at this rate, a run of 10 s takes almost 3 hours
+MINIMUM_RATE = 1e-3  # at this rate, a run of 10 s takes almost 3 hours [1]
 MIN_PACKETS = 10  # smallest number of packets in the time after which a running controller ends
 MAX_TABLE_ROWS = 12  # largest number of contacts in the printed table
 

@@ -10,7 +10,7 @@ from tuning.cli.commands import checks
 from tuning.cli.options_rig import Shadow
 
 MAX_TABLE_ROWS = 12  # largest number of contacts in the printed table
-MAX_ROUNDING_SHARE = 1e-3  # [1]; difference, divided by the range, that rounded logs can explain
+MAX_ROUNDING_SHARE = 1e-3  # difference, divided by the range, that rounded logs can explain [1]
 METRICS = "largest", "rms", "range"
 
 

@@ -28,10 +28,10 @@ from tuning.terminal import format_key
 
 MULTISINE_PERIOD = 5.0  # s
 MULTISINE_PERIODS = 12  # number of periods; the first period of the free run is not evaluated
-FADE_TIME = 1.0  # s, duration of the fade-in and of the fade-out
-APPROACH_TIME = 2.0  # s, duration of the approach to the preload of a press run, and of the retraction
-START_CLEARANCE = 0.001  # m, distance to the surface at the start of a press run
-MIN_TOP_FREQUENCY = 45.0  # Hz, minimum of the highest frequency line, which is usually 3 times the bandwidth
+FADE_TIME = 1.0  # duration of the fade-in and of the fade-out [s]
+APPROACH_TIME = 2.0  # duration of the approach to the preload of a press run, and of the retraction [s]
+START_CLEARANCE = 0.001  # distance to the surface at the start of a press run [m]
+MIN_TOP_FREQUENCY = 45.0  # minimum of the highest frequency line, which is usually 3 times the bandwidth [Hz]
 FLAT_POWER_SHARE = 0.2  # share of the power that is distributed evenly among the frequency lines
 ASSUMED_CREST_FACTOR = 1.6  # assumed crest factor for the comparison of powers with limits
 SWING_SHARE = 0.4  # amplitude of the force about its mean, as a share of the largest allowed force

@@ -23,7 +23,7 @@ POSITIONS = ("position_desired", "position_measured")
 NEEDED_CHANNELS = (*POSITIONS, "force_measured")  # channels that are listed as unknown if no name fits
 MIN_EVIDENCE_ROWS = 10  # minimum number of rows for guesses from values
 MAX_LISTED_COLUMNS = 12  # maximum number of columns in a list of candidates
-TYPICAL_STROKE = 0.5  # m; a larger stroke without a unit indicates mm or um
+TYPICAL_STROKE = 0.5  # a larger stroke without a unit indicates mm or um [m]
 MAX_EQUAL_UNIT_RATIO = 30.0  # maximum ratio of the strokes of two positions in the same unit
 
 

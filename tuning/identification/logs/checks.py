@@ -21,15 +21,15 @@ from tuning.identification.logs.scales import (
 )
 
 MIN_LOG_ROWS = 200  # minimum number of rows in a log
-MIN_FAR_SIDE_CONTACT_GAP = 0.01  # s, minimum time between two contacts at the second surface of a clearance
+MIN_FAR_SIDE_CONTACT_GAP = 0.01  # minimum time between two contacts at the second surface of a clearance [s]
 MIN_FAR_SIDE_IMPULSE_SHARE = 0.3  # minimum ratio of impulse to change of momentum at the second surface
 MIN_CLIPPED_READINGS = 10  # minimum number of successive readings at the maximum that shows clipping
 MAX_ABSOLUTE_VALUE = 1e30  # largest valid number; time stamps in nanoseconds are about 1e18
-USUAL_STROKE = 1.0  # m, largest range of positions without a note; for press runs, largest plausible range
-MAX_STROKE = 20.0  # m, largest plausible range of positions
-MIN_STROKE = 1e-5  # m, smallest plausible range of positions
-MAX_SPEED = 5.0  # m/s, largest plausible speed
-MAX_POSITION_LAG = 400  # ticks, longest delay between position command and reading in the search
+USUAL_STROKE = 1.0  # largest range of positions without a note [m]; for press runs, largest plausible range
+MAX_STROKE = 20.0  # largest plausible range of positions [m]
+MIN_STROKE = 1e-5  # smallest plausible range of positions [m]
+MAX_SPEED = 5.0  # largest plausible speed [m/s]
+MAX_POSITION_LAG = 400  # longest delay between position command and reading in the search [ticks]
 MAX_REPEATED_SHARE = 0.4  # maximum share of repeated readings without a note
 MAX_HOLD_ROWS = 20  # maximum number of rows for which a reading is held
 MIN_REGULAR_SHARE = 0.9  # minimum share of equal intervals between changes that shows held readings

@@ -21,16 +21,16 @@ from jaxhil.errors import InputError, format_value
 from tuning.identification.records import StampClock
 
 PHASE_CHUNK_ROWS = 256  # number of rows for one estimate of the phase
-MIN_ROW_DISTANCE = 1e-6  # periods, minimum valid time between rows
-MAX_LOG_PERIODS = 1e12  # periods, maximum length of a log; the ticks of a longer log would lose digits
+MIN_ROW_DISTANCE = 1e-6  # minimum valid time between rows [periods]
+MAX_LOG_PERIODS = 1e12  # maximum length of a log [periods]; the ticks of a longer log would lose digits
 MAX_RATE_ROWS = 20_000  # maximum number of rows for an estimate of the row rate; more are not needed
 MAX_RATE_ERROR = 0.1  # maximum relative difference between row rate and control rate
 # Maximum relative difference between mean row rate and control rate; above it, the phase changes too much per
 # chunk.
 MAX_MEAN_RATE_ERROR = 1.5e-3
-# periods, maximum scatter of the time between rows for an estimate of the row rate
+# maximum scatter of the time between rows for an estimate of the row rate [periods]
 MAX_STEP_SCATTER = 0.15
-MAX_STAMP_SCATTER = 0.25  # periods, maximum scatter of time stamps for an identification of ticks
+MAX_STAMP_SCATTER = 0.25  # maximum scatter of time stamps for an identification of ticks [periods]
 
 
 class RowTicks(NamedTuple):

@@ -6,7 +6,7 @@ import numpy as np
 
 CONTACT_THRESHOLD_SIGMAS = 5.0  # minimum force in contact, in standard deviations of the force noise
 MIN_CONTACT_TICKS = 3  # minimum number of successive ticks above the threshold at the beginning of a contact
-MIN_CONTACT_GAP = 0.1  # s, minimum time between two contacts
+MIN_CONTACT_GAP = 0.1  # minimum time between two contacts [s]
 MAX_REST_ROWS = 200  # maximum number of first rows that determine the force without contact
 
 

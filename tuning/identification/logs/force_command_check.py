@@ -23,7 +23,7 @@ MAX_UNEXPLAINED_SHARE = 0.1  # maximum share of the motion that the force comman
 MASS_TOLERANCE = 0.01  # relative tolerance of the mass
 MIN_ROW_ERROR_RATIO = 1.2  # minimum ratio of two row conventions' fit errors that rejects one of them
 MIN_LOG_LIKELIHOOD_RATIO = 10.0  # minimum log likelihood ratio that rejects one of two row conventions
-ROUNDING_ERROR = 1e-12  # m, rounding error in a log with all digits
+ROUNDING_ERROR = 1e-12  # rounding error in a log with all digits [m]
 ROW_CONVENTIONS = "tick", "sent"  # row conventions that the motion of the model distinguishes
 
 FitsByConvention = dict[tuple[str, str], ScaleFit]  # keys: row convention, integrator
@@ -123,8 +123,8 @@ def _check_row(label: str, fits: dict[int, FitsByConvention], mass: float, row: 
         best_row, integrator = choice
         if best_row != ("sent" if row == "sent" else "tick"):
             raise InputError(
-                f'{label}: timing.row: found "{row}", expected "{best_row}": only then does force_command '
-                f"move {mass:g} kg like position_desired (integrator {integrator})"
+                f'{label}: timing.row: found "{row}", expected "{best_row}", with which force_command '
+                f"moves {mass:g} kg like position_desired (integrator {integrator})"
             )
         return None
     return f"{label}: timing.row: not checked: force_command is too coarse, or its stamps scatter too much"

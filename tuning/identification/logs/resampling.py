@@ -18,13 +18,13 @@ from jaxhil.errors import InputError, format_value
 from tuning.identification.logs import clock
 
 MASTER_CHANNEL = "position_desired"  # channel whose times define the rows
-MAX_READING_PERIOD = 1.5  # control periods, maximum time between readings; a slower channel is rejected
+MAX_READING_PERIOD = 1.5  # maximum time between readings [control periods]; a slower channel is rejected
 MIN_GAP_RATIO = 1.5  # minimum ratio of the time between two readings to its median if a reading was lost
-SIMULTANEITY_TOLERANCE = 0.02  # periods, maximum time between a row and a reading that count as simultaneous
+SIMULTANEITY_TOLERANCE = 0.02  # maximum time between a row and a reading that count as simultaneous [periods]
 MIN_EMPTY_SHARE = 0.1  # minimum share of empty cells in a column if its log has rows of other topics
 HELD_CHANNELS = "contact_index", "mode"  # channels whose values are valid until the next reading
 NEAREST_READING_CHANNEL = "force_measured"  # channel with jumps, which is not interpolated
-FORCE_LATE_CHANNEL = "force_late"  # s, time from a row to the force reading that is used for it
+FORCE_LATE_CHANNEL = "force_late"  # time from a row to the force reading that is used for it [s]
 EQUAL_RATE_TOLERANCE = 0.01  # maximum relative difference of two rates that count as equal
 
 

@@ -37,7 +37,7 @@ MIN_AGREEING_SHARE = 0.7  # minimum share of the conclusive runs that must agree
 ROWS_BESIDE_CONTACT = 50  # number of rows before and after a contact that are included
 OUTLIER_ITERATIONS = 6  # maximum number of iterations that exclude rows
 MAX_RUNS = 50  # maximum number of evaluated runs
-MAX_COMPUTING_DELAY = 4  # ticks, longest computing delay
+MAX_COMPUTING_DELAY = 4  # longest computing delay [ticks]
 # Number of ticks by which the readings of a row are older than its command.
 ROW_SHIFT = {"sent": 1, "tick": 0, "after": -1}
 EXPLICIT_INTEGRATOR = "explicit_euler"  # integrator that responds to a reading one tick later than the others

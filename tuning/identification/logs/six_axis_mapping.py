@@ -138,7 +138,7 @@ def get_factors(channel: VectorChannel, name: str) -> list[float]:
 
 
 def _check_rows(mapping: SixAxisLogMapping) -> None:
-    """Raise `KeyProblem` for time stamps and rows that six-axis logs cannot have."""
+    """Raise `KeyProblem` for keys on time stamps and rows that do not apply to six-axis logs."""
     index, timing = mapping.channels.contact_index, mapping.timing
     if index is not None and index.time is not None:
         expected = "none, because six-axis logs have the time stamps of the rows"

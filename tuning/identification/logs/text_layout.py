@@ -19,7 +19,8 @@ from tuning.identification.logs.units import parse_unit
 BLANKS = " "  # delimiter that stands for one or more blanks or tabs
 DELIMITERS = "\t;," + BLANKS  # candidates, in the order of preference
 DIALECT_LINES = 20  # number of lines that show the delimiter and the decimal mark
-MIN_SHARE_OF_NUMBERS = 0.1  # with fewer numbers among the cells, the line of column names shows the delimiter
+# least share of numbers in cells [1]; below it, the column names show the delimiter
+MIN_SHARE_OF_NUMBERS = 0.1
 FIRST_DATA_LINES = 10  # number of successive lines of numbers that show where the data begin
 LABVIEW_UNITS = "Y_Unit_Label"  # first cell of the line of units in LabVIEW's measurement files
 

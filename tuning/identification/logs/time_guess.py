@@ -11,7 +11,7 @@ from tuning.identification.logs import clock
 from tuning.identification.logs.log_sample import MAX_SAMPLED_ROWS, ChannelGuess, LogSample
 from tuning.identification.logs.units import UNITS_OF_CHANNEL, parse_unit
 
-MAX_ROW_DISTANCE = 0.02  # s, longest plausible time between rows
+MAX_ROW_DISTANCE = 0.02  # longest plausible time between rows [s]
 NANOSECOND_NAME = re.compile(r"nano(sec(ond)?s?)?$|nsecs?$", re.IGNORECASE)
 TIME_FORMATS = (
     "%m/%d/%Y %I:%M:%S.%f %p",

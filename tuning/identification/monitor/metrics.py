@@ -57,11 +57,11 @@ class MetricWeights:
 class ForceSensorSpec:
     """Properties of the force sensor according to the mechanism file."""
 
-    std: float  # N, standard deviation of the noise
+    std: float  # standard deviation of the noise [N]
     quantum: float  # N
     dead_zone: float  # N
     range: float  # N
-    time_constant: float  # s, first-order lag
+    time_constant: float  # first-order lag [s]
 
 
 def compute_weights(

@@ -30,14 +30,14 @@ class PredictedReadings:
     Arrays have the shape (rows, lanes), with one run per lane; shorter runs are padded.
     """
 
-    force: np.ndarray  # N, force reading, including bias and dead zone
-    elastic: np.ndarray  # N, force reading for a depth with rate 0
-    rate: np.ndarray  # m/s, rate of the depth after the delay and lag of the force sensor; 0 out of contact
+    force: np.ndarray  # force reading, including bias and dead zone [N]
+    elastic: np.ndarray  # force reading for a depth with rate 0 [N]
+    rate: np.ndarray  # rate of the depth after the delay and lag of the force sensor [m/s]; 0 out of contact
     # 1 in contact, 0 out of contact; a lag of the sensor gives values between 0 and 1 at onset and release
     touching: np.ndarray
-    depth: np.ndarray  # m, penetration at the time of the force reading; negative out of contact
-    position: np.ndarray  # m, position reading
-    velocity: np.ndarray  # m/s, rate of the position reading
+    depth: np.ndarray  # penetration at the time of the force reading [m]; negative out of contact
+    position: np.ndarray  # position reading [m]
+    velocity: np.ndarray  # rate of the position reading [m/s]
 
 
 def simulate_motion(

@@ -28,25 +28,25 @@ from typing import Annotated
 
 from jaxhil.rig.types import Count, Positive
 
-KNOTS = (0.0, 0.003, 0.008, 0.015, 0.024, 0.034, 0.046, 0.06, 0.076, 0.1, 0.12)  # s; depths / approach speed
+KNOTS = (0.0, 0.003, 0.008, 0.015, 0.024, 0.034, 0.046, 0.06, 0.076, 0.1, 0.12)  # depths / approach speed [s]
 HINGES = len(KNOTS)
 PARAMETERS = HINGES + 6
 DAMPING, DEPTH_DAMPING, UNLOADING, FRICTION, PRELOAD, DELAY = range(HINGES, PARAMETERS)
 DISSIPATIVE = (DAMPING, DEPTH_DAMPING, UNLOADING)  # indices of parameters that are >= 0
 CONCLUDED = (*DISSIPATIVE, DELAY)  # indices of parameters that `conclude` constrains
 DELAY_PARAMETERS = (*CONCLUDED, 0, PRELOAD)  # indices of the parameters that `estimate_delay` uses
-WANDER = 0.03  # s; depth / approach speed in which the slope changes by one prior standard deviation
-REACH = 0.03  # s; depth / approach speed at which damping and an equal depth_damping have the same effect
-MIN_SLIDING_SPEED = 0.03  # [1]; speed / approach speed below which friction changes sign smoothly
+WANDER = 0.03  # depth / approach speed in which the slope changes by one prior standard deviation [s]
+REACH = 0.03  # depth / approach speed at which damping and an equal depth_damping have the same effect [s]
+MIN_SLIDING_SPEED = 0.03  # speed / approach speed below which friction changes sign smoothly [1]
 # The prior variance of a parameter (except the delay) is a squared entry of `Spreads`, selected by
 # `SPREAD_INDICES`, times the parameter's entry of `FACTORS`.
 SPREAD_INDICES = (0, *[1] * (HINGES - 1), 2, 3, 4, 5, 6)
 FACTORS = (1.0, *[(deeper - depth) / WANDER for depth, deeper in pairwise(KNOTS)], *[1.0] * 5)
-ZERO_PROBABILITY = 0.75  # [1]; prior probability that a dissipative parameter is zero
+ZERO_PROBABILITY = 0.75  # prior probability that a dissipative parameter is zero [1]
 ODDS = ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi)
-ELASTIC_ODDS = 19.0  # [1]; prior odds of a contact without dissipation
-WIDE_STIFFNESS = (200.0, 300.0)  # 1/s^2; prior mean and standard deviation of hinge 0 in `estimate_delay`
-SURPLUS = 1.4  # [1]; factor on the readings' variance, because the model's errors are correlated
+ELASTIC_ODDS = 19.0  # prior odds of a contact without dissipation [1]
+WIDE_STIFFNESS = (200.0, 300.0)  # prior mean and standard deviation of hinge 0 in `estimate_delay` [1/s^2]
+SURPLUS = 1.4  # factor on the readings' variance, because the model's errors are correlated [1]
 EXACT = 1e18  # 1/variance of a parameter that is known exactly
 MIN_VARIANCE = 1e-12  # lower bound of a parameter's variance, avoids division by 0
 Vector = Annotated[list[float], PARAMETERS]

@@ -10,10 +10,10 @@ Source: Page, "Continuous inspection schemes", Biometrika 41 (1954).
 
 from math import sqrt
 
-DRIFT = 2.0  # standard deviations; a reading increases S only if it exceeds the bias by more than this
-LEVEL = 8.0  # standard deviations; contact is detected if S exceeds this level
-SETTLING = 0.004  # s; no detection during this time after the start of a run
-MAX_MEAN = 2000.0  # readings; limits the memory of the bias, which may drift slowly
+DRIFT = 2.0  # excess over the bias [standard deviations] from which a reading increases S
+LEVEL = 8.0  # level of S at which contact is detected [standard deviations]
+SETTLING = 0.004  # time without detection after the start of a run [s]
+MAX_MEAN = 2000.0  # limit on the memory of the bias [readings], because the bias may drift slowly
 MIN_FLIGHT_READINGS = 9.0  # readings in free flight; with fewer, sigma is the specified noise
 
 

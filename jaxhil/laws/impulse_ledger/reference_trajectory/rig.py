@@ -32,8 +32,8 @@ from jaxhil.laws.impulse_ledger.contact_model.rig import (
 )
 
 STEPS = 12  # number of integration steps from the last reading to the present
-MAX_SCALED_SPEED = 2.0  # [1]; limit on speed / approach speed, a ratio that exceeds 1 only with added energy
-MAX_SCALED_DEPTH = 10.0  # s; limit on the depth, divided by the approach speed: 3 times the depth at 0.05 Hz
+MAX_SCALED_SPEED = 2.0  # limit on speed / approach speed, a ratio that exceeds 1 only with added energy [1]
+MAX_SCALED_DEPTH = 10.0  # limit on the depth, divided by the approach speed [s]: 3 times the depth at 0.05 Hz
 
 
 class ReferenceTrajectory:
@@ -53,7 +53,7 @@ class ReferenceTrajectory:
         self.begin(0.0, [0.0] * PARAMETERS)
 
     def begin(self, depth: float, theta: Vector) -> None:
-        """Start the trajectory at the onset, with the approach speed and `depth`/(approach speed) [s]."""
+        """Start the trajectory with the approach speed, at `depth`: the depth / approach speed [s]."""
         self.depth = depth
         self.speed = 1.0
         self.force = 0.0

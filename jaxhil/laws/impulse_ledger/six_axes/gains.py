@@ -12,7 +12,7 @@ from jaxhil.laws.shared.nominal_values import force_delay
 from jaxhil.laws.simulation_base import Gain
 from jaxhil.laws.six_axis_base import lag_leads
 
-POSE_FILTER = 3e-3  # s; lag of the pose filter if the position sensor has noise or a quantum
+POSE_FILTER = 3e-3  # lag of the pose filter if the position sensor has noise or a quantum [s]
 
 
 def _fixed(name: str, unit: str, lower: float, upper: float, nominal: float) -> Gain:

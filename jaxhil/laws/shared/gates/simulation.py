@@ -32,7 +32,9 @@ def share_beyond(
 
 
 def gate(share: Float[Array, "*batch"], share_before: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return the gate, from 0 to 1, for the last period's share s and the previous period's share l.
+    """Return the gate, from 0 to 1, for the shares s of the last period and l of the period before it.
+
+    The shares are those returned by `share_beyond`.
 
     The gate is (s^2 + l^2)/2 + s l (2 - s - l).
 

@@ -112,7 +112,7 @@ class SixAxisReader:
 
     @property
     def has_flown(self) -> bool:
-        """Return whether the means `lag` and `twist` include at least one tick of free flight."""
+        """Return whether the averages `lag` and `twist` include at least one tick of free flight."""
         return self._flight_ticks > 0.0
 
     @property

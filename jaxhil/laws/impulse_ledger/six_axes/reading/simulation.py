@@ -77,11 +77,11 @@ def read(
 
 
 def _computed_once(components: tuple[Array, ...], tick: Int[Array, ""]) -> tuple[Array, ...]:
-    """Return the components, which the compiler then computes once instead of for each use.
+    """Return the components inside the condition `tick >= 0`, so that they are computed only once.
 
-    Otherwise, the compiler would merge the force sensor, which has hundreds of operations, into each entry of
-    a matrix product. The compiler does not merge operations across a condition, and cannot know that ticks
-    are not negative.
+    The condition always holds, but the compiler cannot know it and does not merge operations across it.
+    Without the condition, it would repeat the hundreds of operations of the force sensor for each entry of a
+    matrix product.
     """
     return lax.cond(tick >= 0, lambda values: values, lambda values: tuple(-v for v in values), components)
 
