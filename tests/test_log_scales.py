@@ -117,7 +117,9 @@ def test_force_command_column_is_used_in_rounded_logs(tmp_path, name, without):
     log, gone = REAL[name](LOG), dict.fromkeys(without)
     result = read(write_csv(tmp_path / "a.csv", log), **gone)
     assert result.notes == () and all(run.force_command is not None for run in result.runs)
-    assert 'expected "tick", with which force_command' in refused(tmp_path, log, timing={"row": "sent"}, **gone)
+    assert 'expected "tick", with which force_command' in refused(
+        tmp_path, log, timing={"row": "sent"}, **gone
+    )
     assert "(it would move 367.5 kg)" in refused(tmp_path, scaled(log, Fc=1.05), **gone)
     assert "accelerate the approach" in refused(tmp_path, scaled(log, Fc=-1.0), **gone)
 

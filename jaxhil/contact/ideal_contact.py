@@ -232,7 +232,7 @@ def _shape_at_roots(half_span, at_peak, onset, exponent):
 
 
 def _solve_half_span(onset):
-    """Return the root S >= 0 of S + L(S) = q, with q = `onset` (`ideal_hunt_crossley`)."""
+    """Return the root S >= 0 of S + L(S) = `onset`; L is the Langevin function (`ideal_hunt_crossley`)."""
 
     def newton(_, s):
         symmetry, slope = _langevin(s)

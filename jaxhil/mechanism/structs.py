@@ -116,7 +116,7 @@ class Bodies(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Approach of the two bodies: speed, number of contacts, and phase of the first contact in its period."""
+    """Approach of the bodies: speed, number of contacts, and the first contact's time in a control period."""
 
     velocity: Annotated[float, key_metadata("speed of the first approach", "m/s", gt=0.0)]
     contacts: Annotated[

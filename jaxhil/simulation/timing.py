@@ -110,7 +110,7 @@ def read_force(
     jitter: Float[Array, "*batch"],
     probe: Probe | None,
 ) -> Float[Array, "*batch"]:
-    """Return the real force [N] that the sensor reads at tick `now`; 0 if it acts before the run.
+    """Return the real force [N] that the sensor reads at tick `now`; 0 if that force precedes the run.
 
     This is the force at the instant that precedes the tick by the delays and the jitter.
 

@@ -1,4 +1,4 @@
-"""Function `tuning.map`, which computes the error of a contact as a function of two keys, and margins."""
+"""Function `tuning.map`: a contact's error as a function of two keys, and the margins of both keys."""
 
 import os
 from collections.abc import Mapping

@@ -94,7 +94,7 @@ def build_scenario_set(mechanism: Mechanism, common: CommonProgram, scenarios: i
 def _run_scenarios(
     scene: ScenarioSet, law: str, gains: Mapping[str, float], ideal_contacts: IdealContacts
 ) -> PerturbedOutcomes:
-    """Simulate the scenarios without perturbation, with both pushes and with damping, as one batch."""
+    """Simulate each scenario four times in one batch: unperturbed, with either push, and with damping."""
     plain, damped = (add_probe(scenarios, ideal_contacts) for scenarios in (scene.plain, scene.damped))
     early = add_probe(scene.plain, ideal_contacts, EARLY_PUSH_CENTRE)
     late = add_probe(scene.plain, ideal_contacts, LATE_PUSH_CENTRE)

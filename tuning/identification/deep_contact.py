@@ -64,7 +64,7 @@ def summarise_deep_lanes(problem: ContactProblem, near: tuple[float, float] | No
 
 
 def select_representative_lanes(problem: ContactProblem) -> np.ndarray:
-    """Return all lanes that are not deep, and `LANES_FOR_LAW_CHOICE` of the deep lanes."""
+    """Return all lanes except those in deep contact, and `LANES_FOR_LAW_CHOICE` of the latter."""
     deep = np.flatnonzero(find_deep_lanes(problem.motion, _approximate_surface(problem)))
     dropped = np.delete(
         deep, np.linspace(0, len(deep) - 1, min(LANES_FOR_LAW_CHOICE, len(deep))).round().astype(int)
@@ -243,10 +243,10 @@ def _split_into_blocks(problem: ContactProblem, lanes: np.ndarray) -> list[Conta
 def _factorise_columns(
     blocks: list[ContactProblem], delays: np.ndarray, planes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute pseudo-rows from the regressors of the law in all rows.
+    """Factorise the regressors of all rows into few pseudo-rows with the same normal equations.
 
     Return two arrays with one row per pseudo-row. The first contains the regressors at the nodes, the bias
-    and the readings; the second contains the regressors between the nodes.
+    and the readings. The second contains the regressors at a delay and a surface position between the nodes.
     """
     total, count = 0.0, 0
     delay, plane = _point_between_nodes(delays, planes)

@@ -1,4 +1,4 @@
-"""Rows near contact for several assumed surface positions, and contact onsets between rows."""
+"""For several assumed surface positions: the rows near contact, and the onsets of contact between rows."""
 
 from typing import NamedTuple
 

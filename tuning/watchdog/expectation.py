@@ -33,7 +33,7 @@ class ExpectationFit(NamedTuple):
     loss: tuple[float, float]  # range of z in which the polynomial is valid [1]
 
     def limits(self) -> dict[str, float]:
-        """Return coefficients, reference values and ranges as entries of the gain file's `limits`."""
+        """Return all fields of this fit as entries of the gain file's `limits`."""
         ranges = {"softness": self.softness, "speed": self.speed, "loss": self.loss}
         return {
             "reference_stiffness": self.stiffness,

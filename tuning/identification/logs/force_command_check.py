@@ -163,7 +163,7 @@ def _interpolate_gaps(values: np.ndarray) -> np.ndarray:
 def _fit_conventions(
     moves: list[tuple[np.ndarray, np.ndarray, np.ndarray]], width: int, ways: list[tuple[str, str]]
 ) -> FitsByConvention:
-    """Fit the second differences of the positions as a multiple of those that the force command causes.
+    """Fit the ratio of the positions' second differences to those that the force command causes.
 
     Args:
         moves: For each contact: the positions, the second differences that the forces of the rows cause, and

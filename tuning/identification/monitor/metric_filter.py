@@ -59,7 +59,7 @@ class MetricFilter:
         self.covariance = remainder @ self.covariance @ remainder.T + gain @ noise @ gain.T
 
     def covers(self, value: np.ndarray, slopes: np.ndarray, noise: np.ndarray) -> bool:
-        """Return whether the initial uncertainty (that in the mechanism file) explains the metrics."""
+        """Return whether the metrics lie within the uncertainty that the mechanism file states."""
         finite, slopes = np.isfinite(value), _append_sensor_columns(slopes)
         slopes, noise = slopes[finite], noise[np.ix_(finite, finite)]
         spread = slopes @ self.initial_covariance @ slopes.T + noise

@@ -9,10 +9,10 @@ from jaxhil.laws.simulation_base import Signals
 
 
 class Aligned(NamedTuple):
-    """State of the alignment: two delayed positions. tau is the force delay."""
+    """State of the alignment: positions measured before the next tick, with the force delay tau."""
 
-    middle: Float[Array, "*batch"]  # on the next tick, the position measured tau ago [m]
-    last: Float[Array, "*batch"]  # on the next tick, the position measured tau + T ago [m]
+    middle: Float[Array, "*batch"]  # position measured tau before the next tick [m]
+    last: Float[Array, "*batch"]  # position measured tau + T before the next tick [m]
 
 
 def align(

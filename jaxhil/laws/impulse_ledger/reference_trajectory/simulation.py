@@ -24,7 +24,10 @@ class ReferenceTrajectory(NamedTuple):
 
 
 def begin(depth: Array, like: Array) -> ReferenceTrajectory:
-    """Return the trajectory at the onset, with a scaled depth [s] and sensitivities shaped like `like`."""
+    """Return the trajectory at the onset, at `depth`: the depth divided by the approach speed [s].
+
+    The sensitivities are 0 and have the shape of `like`.
+    """
     zeros = jnp.zeros_like(depth)
     return ReferenceTrajectory(
         depth, zeros + 1, zeros, depth, zeros > 0, jnp.zeros_like(like), jnp.zeros_like(like)

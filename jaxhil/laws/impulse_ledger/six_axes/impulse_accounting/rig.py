@@ -1,4 +1,4 @@
-"""Balance of impulses: onset of contact, reference trajectory, prediction to the present, and command."""
+"""Balance of impulses: detects contact, predicts the reference to the present, computes the command."""
 
 from math import sqrt
 
