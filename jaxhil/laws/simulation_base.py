@@ -103,6 +103,8 @@ class Compensator(eqx.Module):
         anticipates: whether the compensator computes a reference motion that it could follow without any
             regard to the hardware.
         is_large: whether `step` is so large that solvers are compiled separately from runs.
+        tuned_without_derivatives: whether tuning uses a search without derivatives, because the program with
+            derivatives takes too long to compile.
     """
 
     name: eqx.AbstractClassVar[str]
@@ -114,6 +116,7 @@ class Compensator(eqx.Module):
     waits_for_contact: ClassVar[bool] = False
     anticipates: ClassVar[bool] = False
     is_large: ClassVar[bool] = False
+    tuned_without_derivatives: ClassVar[bool] = False
 
     def prepare(self, gains: Gains, constants: KnownConstants) -> Any:
         """Return the values that `step` needs, computed from the gains once per run; by default the gains."""

@@ -64,6 +64,7 @@ class SixAxisCompensator(eqx.Module):
     reads_pose: ClassVar[bool] = False
     anticipates: ClassVar[bool] = False
     is_large: ClassVar[bool] = False
+    tuned_without_derivatives: ClassVar[bool] = False
 
     def prepare(self, gains: Gains, constants: SixAxisConstants) -> Any:
         """Return the values that `step` needs, computed once per run; by default the gains."""

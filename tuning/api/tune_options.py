@@ -56,7 +56,10 @@ class TuneOptions:
     ] = None
     starts: Annotated[
         int,
-        number_option("Number of starts of the solver, and of starts added each time if results disagree."),
+        number_option(
+            "Number of starts of the solver, and of starts added each time if results disagree; without "
+            "effect for impulse_ledger with one axis."
+        ),
         CountRange,
     ] = 4
     start: Annotated[
@@ -67,7 +70,14 @@ class TuneOptions:
             "file whose mechanism is most similar.",
         ),
     ] = ()
-    steps: Annotated[int, number_option("Largest number of solver steps from each start."), CountRange] = 25
+    steps: Annotated[
+        int,
+        number_option(
+            "Largest number of solver steps from each start; for impulse_ledger with one axis, number of "
+            "generations of the search."
+        ),
+        CountRange,
+    ] = 25
     validation: Annotated[
         int, number_option("Fresh scenarios for the evaluation.", name="evaluated"), CountRange
     ] = 511
@@ -188,6 +198,7 @@ class TuneOptions:
             global_search=self.global_search,
             setting=self.setting,
             quiet=self.wants_quiet,
+            bounded=self._has_default_objective,
             evaluate_transparency=self.pareto_against == "transparency",
         )
 
@@ -199,9 +210,12 @@ class TuneOptions:
         least and cause the smallest peaks of the force command. The options ask for quiet gains if the limit
         is positive and finite, and all options of the objective have their default values.
         """
+        return self._has_default_objective and self._has_finite_limit
+
+    @property
+    def _has_default_objective(self) -> bool:
         weights = self.command_weight, self.noise_weight, self.chatter_weight, self.transparency_weight
-        is_default = self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4
-        return is_default and self._has_finite_limit
+        return self.objective == "rms" and self.divergence_weight == 1 and weights == (None,) * 4
 
     @property
     def _has_finite_limit(self) -> bool:

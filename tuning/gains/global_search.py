@@ -44,7 +44,7 @@ def compare_with_global_search(
 
     def losses(points):
         return validation.losses(
-            found.quiet or settings.objective, [task], points[None], lanes=MIN_LANES_PER_CALL
+            found.objective or settings.objective, [task], points[None], lanes=MIN_LANES_PER_CALL
         )[0]
 
     budget = factor * found.evaluations

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from jaxhil.errors import InputError
 from jaxhil.simulation.jax_environment import program_folder, use_float64
+from tuning.gains.direct_search import estimate_direct_runs, is_search_direct, search_directly
 from tuning.gains.metrics_function import FUNCTION_REQUIREMENT
 from tuning.gains.multistart_solver import (
     StartResult,
@@ -66,7 +67,8 @@ class MultistartResult(NamedTuple):
     # Number of evaluations of the objective. A Jacobian with respect to P gains counts as 1 + P. A point of a
     # scan, which uses only some of the scenarios, counts as their share.
     evaluations: int
-    quiet: Objective | None = None  # objective of the search for quieter gains; None if there was no search
+    objective: Objective | None = None  # objective of the last search, if it is not that of the settings
+    quiet: bool = False  # whether the last search was for quieter gains
 
 
 @dataclass
@@ -96,6 +98,8 @@ def find_gains(
     agreed = PROBED_AGREEMENT_TOLERANCE if probed else AGREEMENT_TOLERANCE
     searches = [_SearchState() for _ in tasks]
     _check_function(validation, objective)
+    if is_search_direct(tasks[0]) and not quiet:
+        return _search_without_derivatives(validation, settings, first, meanwhile)
     unfinished = _solve_batches(validation, settings, first, agreed, searches, meanwhile)
     if probed or objective.function is not None:
         for i, search in enumerate(searches):
@@ -122,8 +126,22 @@ def find_gains(
             search.starts,
             search.evaluations + (polishing if top else 0),
             objectives[i] if i in quieter else None,
+            quiet=i in quieter,
         )
         for i, (top, search) in enumerate(zip(best, searches, strict=True))
+    ]
+
+
+def _search_without_derivatives(
+    validation: Validation,
+    settings: TuneSettings,
+    first: Sequence[Sequence[Mapping[str, float]]] | None,
+    meanwhile: Callable[[], object],
+) -> list[MultistartResult]:
+    meanwhile()
+    return [
+        MultistartResult(next(iter(_rank_starts(starts)), None), starts, evaluations, objective)
+        for starts, objective, evaluations in search_directly(validation, settings, first)
     ]
 
 
@@ -167,6 +185,8 @@ def _count_batch_starts(settings: TuneSettings, first: Sequence[Sequence[Mapping
 
 def estimate_search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
     """Return the number of simulated runs of a search that needs one batch and all steps of every start."""
+    if is_search_direct(tasks[0]):
+        return estimate_direct_runs(tasks, settings.steps)
     names, lanes = list_tuned_gains(tasks), tasks[0].lanes
     scanning = settings.scanned * min(SCAN_SCENARIOS, lanes) if settings.starts > 1 else 0
     solve = settings.starts * settings.steps * count_step_runs(tasks, names)

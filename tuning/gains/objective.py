@@ -54,6 +54,8 @@ LIMIT_SCALED_WEIGHTS = "command_weight", "noise_weight", "chatter_weight"  # in 
 # Factor on an error within the tolerance [1]; above 0, so that the search prefers the most accurate of
 # equally quiet gains.
 TOLERATED_ERROR_FACTOR = 0.02
+# Penalty of a metric above its bound, divided by the excess [1]; large, so that no other term outweighs it.
+BOUND_PENALTY = 100.0
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,9 @@ class Objective:
     in multiples of the limit, on every rig.
 
     With a `tolerance`, max(metric - tolerance, `TOLERATED_ERROR_FACTOR` metric) replaces the metric, so that
-    the penalties decide between gains whose error is within the tolerance.
+    the penalties decide between gains whose error is within the tolerance. With an `error_bound`, a search
+    without derivatives minimises J + `BOUND_PENALTY` max(0, metric - error_bound), an exact penalty function
+    (Nocedal and Wright 2006, section 17.2).
 
     Raises:
         InputError: If `name` is unknown, a weight is negative or not finite, or `divergence_weight` is 0.
@@ -96,6 +100,7 @@ class Objective:
     function: MetricsFunction | None = None
     limit: float = 0.01  # limit of the error [1], the unit of the weights of command, noise and chatter
     tolerance: float | None = None  # metric [1] below which mainly the penalties count; None: no tolerance
+    error_bound: float | None = None  # largest acceptable metric [1], ignored by the solver; None: no bound
 
     def __post_init__(self):
         if self.name not in OBJECTIVE_NAMES:
@@ -265,13 +270,10 @@ def weight_residuals(
         probe_errors = _compute_norm_residuals(jnp.where(probes, error, 0), counted(is_scheduled & probes), 2)
         transparency = [weights.transparency[:, None] * probe_errors]
         error, plain = jnp.where(probes, 0, error), counted(is_scheduled & ~probes)
-    diverging = jnp.sqrt(weights.divergence)[:, None] * error
+    weighted = jnp.where(error > 0, jnp.sqrt(weights.divergence)[:, None] * error, error)
     number = {"rms": plain, "cvar": _count_tail_contacts(plain), "worst": jnp.ones_like(plain)}[terms.name]
-    if metric is None:
-        errors = _compute_norm_residuals(
-            jnp.where(error > 0, diverging, error), number, NORM_POWERS[terms.name]
-        )
-    else:
+    errors = _compute_norm_residuals(weighted, number, NORM_POWERS[terms.name])
+    if metric is not None:
         errors = metric[:, None]
     if terms.tolerance:
         errors = errors * _compute_untolerated_share(errors, weights.tolerance[:, None])
@@ -313,12 +315,8 @@ def compute_contact_terms(
     beyond = xp.where(usable, outcome.peak_ratio, 1 + FAILED_CONTACT_ERROR) - 1
     excess = xp.where(beyond > 0, beyond, 0)
     chatter = xp.where(usable, outcome.chatter, FAILED_CONTACT_ERROR)
-    is_scheduled = outcome.is_scheduled
-    return (
-        xp.where(is_scheduled, error, 0),
-        xp.where(is_scheduled, excess, 0),
-        xp.where(is_scheduled, chatter, 0),
-    )
+    error, excess, chatter = (xp.where(outcome.is_scheduled, x, 0) for x in (error, excess, chatter))
+    return error, excess, chatter
 
 
 def extract_scenario_metrics(outcome: Outcome, number: int, contacts: int, probed: bool) -> ScenarioMetrics:
@@ -357,6 +355,7 @@ def evaluate_objective(
         for term in (np.zeros(1) if term is None else term for term in terms)
     )
     metric = _compute_metric(objective, error) if value is None else value
+    beyond = 0.0 if objective.error_bound is None else np.maximum(0.0, metric - objective.error_bound)
     if objective.tolerance:
         metric = np.maximum(metric - objective.tolerance, TOLERATED_ERROR_FACTOR * metric)
     parts = (
@@ -366,7 +365,7 @@ def evaluate_objective(
         objective.limit * objective.noise_weight * np.maximum(0.0, np.asarray(amplification) - 1),
         objective.transparency_weight * _compute_rms(transparency),
     )
-    return np.sqrt(sum(part**2 for part in parts))
+    return np.sqrt(sum(part**2 for part in parts)) + BOUND_PENALTY * beyond
 
 
 def _compute_metric(

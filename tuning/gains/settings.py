@@ -13,7 +13,8 @@ class TuneSettings:
     scenarios: int | None = None
     # number of starts of the solver in a batch (`tuning.gains.multistart`)
     starts: int = 4
-    steps: int = 25  # largest number of solver steps from each start
+    # largest number of solver steps from each start, or of generations of a search without derivatives
+    steps: int = 25
     validation: int = 511  # number of fresh scenarios that evaluate the tuned gains
     seed: int = 0  # seed of scenarios and starts
     objective: Objective = RMS_OBJECTIVE  # objective to minimise
@@ -25,6 +26,8 @@ class TuneSettings:
     setting: str | None = None
     # whether to search for the quietest gains within the objective's limit if a sensor has noise
     quiet: bool = False
+    # whether a search without derivatives rejects gains whose error exceeds that of the literature's gains
+    bounded: bool = False
     # whether to evaluate transparency even if its weight in the objective is 0
     evaluate_transparency: bool = False
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxhil.laws.compensators import get_compensator
+from jaxhil.laws.compensators import axes_of, get_compensator
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.rig_models import choose_rig_model
 from jaxhil.simulation.outcome import Outcome
@@ -91,6 +91,8 @@ class TuneResult:
     @property
     def usual_starts(self) -> int:
         """Return the number of starts of the first batch that are not earlier gains (`first`)."""
+        if get_compensator(self.compensator, axes_of(self.mechanism)).tuned_without_derivatives:
+            return 1
         return max(self.settings.starts, 1 + len(self.first)) - len(self.first)
 
 
@@ -154,7 +156,7 @@ def tune_group(
             without_noise=compute_error_metrics(select(split_nominal(noiseless[i][0])[0]))
             if noisy[i]
             else None,
-            quiet=searched[i].quiet is not None,
+            quiet=searched[i].quiet,
         )
         results.append(result)
     return results
@@ -255,9 +257,9 @@ def _compute_transparency(
 def _compute_tolerances(
     task: TuneTask, names: tuple[str, ...], best: StartResult | None
 ) -> dict[str, GainTolerance]:
-    """Return the tolerance of each tuned gain, from the solver's final J^T J; empty if the solver failed."""
+    """Return the tolerance of each tuned gain, from the solver's final J^T J; empty without J^T J."""
     moved = [i for i, name in enumerate(names) if name in {gain.name for gain in task.tuned}]
-    if best is None or not moved or not np.all(np.isfinite(best.curvature)):
+    if best is None or not moved or not best.curvature.size or not np.all(np.isfinite(best.curvature)):
         return {}
     values, vectors = np.linalg.eigh(best.curvature[np.ix_(moved, moved)])
     root = np.sqrt(np.maximum(values, 0))[:, None] * vectors.T

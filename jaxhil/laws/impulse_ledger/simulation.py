@@ -128,6 +128,7 @@ class ImpulseLedger(Compensator):
     anticipates: ClassVar[bool] = True
     estimates_delay: ClassVar[bool] = True
     is_large: ClassVar[bool] = True
+    tuned_without_derivatives: ClassVar[bool] = True
     gains: ClassVar[tuple[Gain, ...]] = GAINS
 
     def prepare(self, gains, constants):

@@ -117,17 +117,21 @@ def _gain_tables(options: Tune, result: Any) -> list[Any]:
     from jaxhil.laws.compensators import axes_of, get_compensator
 
     mechanism = result.mechanism
+    columns = ["alone [%]", "together [%]"] if result.tolerances else []
     rows = [
         (
             *(gain.name, gain.unit),
             *(_format_compactly(float(bound(mechanism))) for bound in (gain.lower, gain.upper)),
             _format_compactly(result.literature[gain.name]),
             _format_compactly(result.gains[gain.name], 4) if gain.tuned(mechanism) else "fixed",
-            *([f"{100 * share:.1f}" for share in result.tolerances.get(gain.name, ())] or ["", ""]),
+            *(
+                [f"{100 * share:.1f}" for share in result.tolerances.get(gain.name, ())]
+                or [""] * len(columns)
+            ),
         )
         for gain in get_compensator(options.compensator, axes_of(mechanism)).gains
     ]
-    headings = ["gain", "unit", "lower", "upper", "by rule", "tuned", "alone [%]", "together [%]"]
+    headings = ["gain", "unit", "lower", "upper", "by rule", "tuned", *columns]
     return (
         [terminal.build_table(f"Gains of {options.compensator}", headings, rows, texts=(0, 1))]
         if rows
@@ -146,7 +150,10 @@ def _describe_aim(limit: float, result: Any) -> list[str]:
 
     The list is empty if the user's options determine the aim.
     """
-    if not result.settings.quiet or result.without_noise is None or not result.starts:
+    from tuning.gains.noise import has_noise_trade_off
+
+    is_sought = result.settings.quiet and has_noise_trade_off(result.compensator)
+    if not is_sought or result.without_noise is None or not result.starts:
         return []
     if result.quiet:
         return [f"Quietest gains found within {limit:g}; of least error: --noise-weight 0."]
