@@ -5,6 +5,7 @@ import numpy as np
 
 from jaxhil.contact.laws import CONTACT_KEYS, CONTACT_LAWS, ContactParameters
 from jaxhil.simulation.scenario import MotionSimulatorBatch
+from jaxhil.simulation.timing import draw_timing
 from jaxhil.sixdof.approach import begin
 from jaxhil.sixdof.bodies import build_body
 from jaxhil.sixdof.candidates import ChaserSpheres
@@ -93,3 +94,14 @@ def spheres(centres, radii, shape, law, parameters, friction=None):
     """Return a group of spheres of the chaser, centres (3, candidates, *batch)."""
     candidates = ChaserSpheres(vector(centres), radii, shape)
     return ContactGroup(candidates, CONTACT_LAWS[law], parameters, friction or Frictionless())
+
+
+def drawn_timing(scenario, ticks):
+    """Return jitter [s], lost ticks and missed ticks of a scenario, as arguments of `on_the_rig`."""
+    age = jnp.arange(ticks, dtype=jnp.int32)[:, None]
+    draws = draw_timing(scenario.timing, scenario.key, jnp.zeros(1, jnp.int32), age)
+    jitter, lost, missed = (None if effect is None else np.asarray(effect)[:, 0] for effect in draws)
+    sets = {"lost": lost, "missed": missed}
+    return {"jitter": jitter} | {
+        name: set() if ticks is None else set(np.flatnonzero(ticks).tolist()) for name, ticks in sets.items()
+    }

@@ -158,13 +158,14 @@ class Axis:
         return np.array([state[0], state[1], (self.flow @ state)[1]])
 
 
-def on_the_rig(case, ticks, controller=None, leads=0.0):
+def on_the_rig(case, ticks, controller=None, leads=0.0, jitter=None, lost=(), missed=()):
     """Return the states of the numerical model's bodies after the given number of ticks.
 
     A controller's `from_sensor(reading, measured)` converts the sensor's reading, its
     `step(wrench, pose, twist, measured)` changes the wrench, and its `pose_command(pose, twist)` changes the
     command. `leads` are the times by which the controller leads the coordinates before
-    the first tick.
+    the first tick. `jitter` is the deviation of the force's delay [s] at every tick; `lost` and `missed` are
+    the ticks whose frame is lost, and at which the controller does not run.
     """
     bodies, period = case["start"], case["period"]
     at, rates = command(case, bodies)
@@ -179,14 +180,24 @@ def on_the_rig(case, ticks, controller=None, leads=0.0):
         each = zip(axes, case["delays"], strict=True)
         return np.array([axis.response(now - delay - own) for axis, own in each]).T
 
+    reading = np.zeros(3), np.zeros(3)
     for tick in range(ticks):
-        x, rate, bend = seen(tick * period, case["force_delay"])
+        late = case["force_delay"] + (0.0 if jitter is None else jitter[tick])
+        x, rate, bend = seen(tick * period, late)
         theta, slopes = x[3:], jacobian(x[3:])
         rotation, w = Rotation.from_rotvec(theta).as_matrix(), slopes @ rate[3:]
         force, moment = wrench(case, x[:3], rotation, rate[:3], w)
         measured, *_ = seen(tick * period, case["position_delay"])
+        frame = force, moment
         if case["tool"] is not None:
-            reading = sensor_reading(case, x, rotation, w, rate, bend, force, moment)
+            frame = sensor_reading(case, x, rotation, w, rate, bend, force, moment)
+        reading = reading if tick in lost else frame
+        if tick in missed:
+            for axis in axes:
+                axis.send(axis.sent)
+            continue
+        force, moment = reading
+        if case["tool"] is not None:
             if controller is None:
                 force, moment = without_tool(case, reading, measured)
             else:

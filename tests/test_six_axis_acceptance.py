@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from gain_documents import sign
 from scipy.spatial.transform import Rotation
+from six_axes import drawn_timing
 from six_axis_c99 import ControllerInC, controller_of_bundle
 from six_axis_documents import six_axis_document
 from six_axis_oracle import on_the_rig, relative
 
+import jaxhil
 from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load_any
 from jaxhil.simulation.jax_environment import jax_context
@@ -94,3 +96,28 @@ def test_exported_controller_on_independent_rig_gives_simulated_final_twist(name
                 error = np.max(np.abs(part - expected)) / np.max(np.abs(expected))
                 print(name, offset, type(controller).__name__, error)
                 assert error <= 1e-8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["none", "phase_lead", "response_error", "impulse_ledger"])
+def test_controller_on_independent_rig_with_timing_effects_gives_simulated_final_twist(name):
+    """The controller does not run at missed ticks, and converts a repeated frame with the present pose."""
+    overrides = {
+        "rig.force_sensor.jitter": 0.0021,
+        "rig.force_sensor.loss_probability": 0.1,
+        "rig.missed_tick_probability": 0.1,
+    }
+    mechanism = load_any("probe-drogue", overrides).mechanism
+    gains = literature_gains(mechanism, name)
+    run = jaxhil.simulate(mechanism, name, gains=gains)
+    case, controller = case_of(mechanism, build_scenarios(mechanism)), None
+    leads = 0.0
+    if name != "none":
+        controller = controller_of_bundle(sign(six_axis_document(name, **gains)))
+        leads = np.array([gains[lead] for lead in LEADS])
+    ticks = round(run.final.time / mechanism.rig.control_period)
+    timing = drawn_timing(build_scenarios(mechanism), ticks)
+    *_, v, w, _, _ = relative(case, on_the_rig(case, ticks, controller, leads, **timing))
+    error = np.max(np.abs([*v, *w] - np.array(run.final.twist))) / np.max(np.abs(run.final.twist))
+    print(name, error)
+    assert error <= 1e-8

@@ -4,6 +4,8 @@ Off-centre and oblique contacts with friction and unequal delays: a probe in a d
 on a plane, and the probe on a sensor that carries its tool.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from six_axes import (
     FULL,
+    drawn_timing,
     ideal_sensor,
     lanes,
     place,
@@ -21,6 +24,7 @@ from six_axes import (
 )
 from six_axis_oracle import command, ideal_motion, on_the_rig, relative
 
+from jaxhil.simulation.scenario import TimingBatch
 from jaxhil.sixdof.bodies import build_state
 from jaxhil.sixdof.friction import Regularised
 from jaxhil.sixdof.kinematics import TaskSpace
@@ -58,6 +62,13 @@ CASES = {
         "assumed": (11.8, np.array([0.012, 0.02, 0.14])), "gravity": np.array([0.3, -0.2, -9.8]),
     },
 }  # fmt: skip
+
+EFFECTS = {
+    "jitter": TimingBatch(lanes(3.1e-3, BATCH), None, None),
+    "lost frames": TimingBatch(None, lanes(0.2, BATCH), None),
+    "missed ticks": TimingBatch(None, None, lanes(0.1, BATCH)),
+    "all": TimingBatch(lanes(1.7e-3, BATCH), lanes(0.1, BATCH), lanes(0.05, BATCH)),
+}
 
 
 def initial_bodies(case):
@@ -134,6 +145,27 @@ def test_six_axis_rig_agrees_with_independent_implementation(name):
     spins = [np.asarray(components(state.spin))[:, 0] for state in end.states]
     for spin, (_, _, attitude, w), inertia in zip(spins, expected, case["inertias"], strict=True):
         np.testing.assert_allclose(spin, attitude @ inertia @ w, atol=1e-9)
+
+
+@functools.cache
+def undisturbed(name):
+    """Return the independent implementation's final states without timing effects."""
+    return on_the_rig(initial_bodies(CASES[name]), TICKS)
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_six_axis_rig_with_timing_effects_agrees_with_independent_implementation(name, effect):
+    case, timing = initial_bodies(CASES[name]), EFFECTS[effect]
+    case_scenario = as_scenario(case)._replace(timing=timing, key=jnp.array([[5], [7]], jnp.uint32))
+    loop = build_loop(
+        case_scenario, integrator="semi_implicit_euler", hold="linear", latency=0,
+        side="fixed" if case["tool"] is None else "moving",
+    )  # fmt: skip
+    end, _ = jax.jit(run, static_argnums=(0, 3))(loop, {}, case_scenario, TICKS)
+    expected = on_the_rig(case, TICKS, **drawn_timing(case_scenario, TICKS))
+    close(end.states, expected, 1e-10)
+    assert np.linalg.norm(expected[1][1] - undisturbed(name)[1][1]) > 1e-6
 
 
 @pytest.mark.parametrize("name", ["probe", "ring"])

@@ -56,9 +56,9 @@ CASES = list(itertools.product(MECHANISMS, SIX_AXIS_COMPENSATORS, CONTROLLERS))
 
 
 @functools.cache
-def simulated_rig(mechanism):
+def simulated_rig(mechanism, changes=()):
     """Return a simulated rig, whose programs take seconds to compile."""
-    return SixAxisRig(load_any(mechanism).mechanism)
+    return SixAxisRig(load_any(mechanism, dict(changes)).mechanism)
 
 
 @functools.cache
@@ -76,15 +76,16 @@ def exchange(
     limits=None,
     ticks=20_000,
     build=Controller6.from_dict,
+    changes=(),
 ):
     """Exchange packets until this many runs have ended; return rig, controller's task and answers.
 
     `delivered(way, packet)` returns the packets that arrive when `packet` is sent "there" or "back".
-    `build(document)` returns the controller.
+    `build(document)` returns the controller. `changes` contains paths and values of keys of the mechanism.
     """
     document = six_axis_document(compensator, mechanism, limits)
     controller = build(document)
-    rig = RigTask(copy.copy(simulated_rig(mechanism)), controller.control_period)
+    rig = RigTask(copy.copy(simulated_rig(mechanism, changes)), controller.control_period)
     task = ControllerTask(controller, SixAxisModelInLoop(controller, document["mechanism"]))
     answers = []
     for _ in range(ticks):
@@ -127,6 +128,21 @@ def test_six_axis_rehearsal_gives_final_twists_and_errors_of_simulate(
         assert result["twist_error"] == pytest.approx(episode.twist_error, abs=1e-7)
         assert result["energy_error"] == pytest.approx(episode.energy_error, abs=1e-6)
         assert result["peak_force"] == pytest.approx(episode.peak_force, rel=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("compensator", ["phase_lead", "impulse_ledger"])
+def test_six_axis_rehearsal_with_jitter_and_lost_frames_gives_final_twist_of_simulate(compensator):
+    name = "probe-drogue"
+    changes = (("rig.force_sensor.jitter", 0.002), ("rig.force_sensor.loss_probability", 0.1))
+    rig, task, _ = exchange(name, compensator, 1, changes=changes)
+    assert task.status == "ok" and task.interpolated == task.stale == 0
+    (result,) = simulated_rig(name, changes).evaluate(rig.contacts)
+    run = simulate_six_axes(load_any(name, dict(changes)).mechanism, compensator)
+    final, without = np.array(run.final.twist), np.array(simulated_run(name, compensator).final.twist)
+    error = np.max(np.abs(result["final_twist"] - final)) / np.max(np.abs(final))
+    print(compensator, error)
+    assert error <= STATE_TOLERANCE < 1e-4 < np.max(np.abs(without - final)) / np.max(np.abs(final))
 
 
 @pytest.mark.slow

@@ -57,7 +57,7 @@ def effects(parsed, contact=0, seed=0, ticks=4000):
     """Return jitter [s], lost ticks and missed ticks of a contact."""
     scenario = jax.tree.map(jnp.asarray, build_scenarios(parsed, seed=seed))
     age = jnp.arange(ticks, dtype=jnp.int32)[:, None]
-    draws = draw_timing(scenario, jnp.array([contact], jnp.int32), age)
+    draws = draw_timing(scenario.timing, scenario.key, jnp.array([contact], jnp.int32), age)
     assert draws is not None
     sets = [set() if kind is None else set(np.flatnonzero(kind).tolist()) for kind in draws[1:]]
     jitter = None if draws.jitter is None else np.asarray(draws.jitter)[:, 0]

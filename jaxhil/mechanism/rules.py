@@ -21,8 +21,8 @@ from jaxhil.contact.laws import CONTACT_KEYS, ContactLaw, find_contact_law, laws
 from jaxhil.errors import format_value
 from jaxhil.mechanism.conversion import KeyPath, KeyProblem, describe_allowed_at, run_checks
 from jaxhil.mechanism.correlation import check_correlation
-from jaxhil.mechanism.number_ranges import value_at
 from jaxhil.mechanism.structs import DAMPING_RATIO_LAWS, Contact, Mechanism, Simulator, Uncertainty
+from jaxhil.mechanism.timing_rules import build_extreme_function, check_jitter, check_missed_ticks
 from jaxhil.mechanism.uncertainty_rules import Span, check_uncertainty
 
 __all__ = [
@@ -77,8 +77,8 @@ def check_mechanism_rules(mechanism: Mechanism) -> None:
         [
             lambda: _check_velocity_limit(mechanism, spans),
             lambda: _check_gap(mechanism, spans),
-            lambda: _check_jitter(mechanism, spans),
-            lambda: _check_missed_ticks(mechanism, spans),
+            lambda: check_jitter(mechanism, spans),
+            lambda: check_missed_ticks(mechanism, spans),
         ]
     )
 
@@ -297,25 +297,10 @@ def _check_hold(mechanism: Mechanism) -> None:
         raise KeyProblem(("rig", "command_hold"), format_value(rig.command_hold), expected)
 
 
-def _build_extreme_function(mechanism: Mechanism, spans: Mapping[str, Span]) -> Callable[[str, int], Any]:
-    """Return a function `extreme(path, end)` that returns a key's smallest or largest possible draw.
-
-    `end` is 0 for the smallest draw and 1 for the largest. If the key is not uncertain, or has a normal
-    distribution, which may have no bounds, `extreme` returns the nominal value.
-    """
-
-    def extreme(path: str, end: int) -> Any:
-        uncertainty = mechanism.uncertainty.get(path)
-        is_bounded = uncertainty is not None and uncertainty.distribution != "normal"
-        return spans[path][end] if is_bounded else value_at(mechanism, path)
-
-    return extreme
-
-
 def _check_velocity_limit(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
     """Raise `KeyProblem` unless the velocity limit of the drives is at least the approach speed."""
     # Drives that are slower than the approach have no steady state from which a run could start.
-    extreme, path = _build_extreme_function(mechanism, spans), "rig.simulator.velocity_limit"
+    extreme, path = build_extreme_function(mechanism, spans), "rig.simulator.velocity_limit"
     fastest, limit = float(extreme("approach.velocity", 1)), float(extreme(path, 0))
     if limit < fastest:
         raise KeyProblem(tuple(path.split(".")), format_value(limit), format_allowed_velocity_limit(fastest))
@@ -326,45 +311,11 @@ def format_allowed_velocity_limit(approach: float) -> str:
     return f"a number >= {approach:g} m/s, the approach speed: slower drives cannot follow the approach"
 
 
-def _check_jitter(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    """Raise `KeyProblem` if a force sensor has jitter in a mechanism that does not support jitter."""
-    path, extreme = "rig.force_sensor.jitter", _build_extreme_function(mechanism, spans)
-    if not _is_used(mechanism, path):
-        return
-    key, found = tuple(path.split(".")), format_value(extreme(path, 1))
-    shortest = extreme("rig.force_sensor.delay", 0)
-    if not extreme(path, 1) <= shortest:
-        raise KeyProblem(key, found, f"at most {shortest:g} s, the smallest rig.force_sensor.delay")
-    reasons = {
-        "a time_constant": _is_used(mechanism, "rig.force_sensor.time_constant"),
-        "a filter": mechanism.rig.force_sensor.filter is not None,
-        f"the contact law {mechanism.contact.law}": find_contact_law(mechanism.contact.law).has_memory,
-        "a clearance": math.isfinite(mechanism.contact.clearance),
-    }
-    for reason in (reason for reason, is_true in reasons.items() if is_true):
-        raise KeyProblem(key, found, f"0, because jitter is not supported with {reason}")
-
-
-def _check_missed_ticks(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    """Raise `KeyProblem` if a mechanism has both two surfaces and missed ticks."""
-    path = "rig.missed_tick_probability"
-    if _is_used(mechanism, path) and math.isfinite(mechanism.contact.clearance):
-        largest = format_value(_build_extreme_function(mechanism, spans)(path, 1))
-        raise KeyProblem(
-            tuple(path.split(".")), largest, "0, because missed ticks are not supported with a clearance"
-        )
-
-
-def _is_used(mechanism: Mechanism, path: str) -> bool:
-    """Return whether the number at `path` is uncertain or not 0."""
-    return bool(value_at(mechanism, path)) or path in mechanism.uncertainty
-
-
 def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
     """Raise `KeyProblem` unless the start of the approach lies between the two surfaces."""
     # The model starts at min(plane, 0) - v (0.02 s + phase T). The hardware lags behind the model by
     # the motion simulator's delay and lag, and by the command latency.
-    extreme = _build_extreme_function(mechanism, spans)
+    extreme = build_extreme_function(mechanism, spans)
     clearance = float(extreme("contact.clearance", 0))
     period = extreme("rig.control_period", 1)
     delay = extreme("rig.simulator.delay", 1) + mechanism.rig.command_latency * period

@@ -16,6 +16,9 @@ from jaxhil.mechanism.structs import (
     DeadZoneKind,
     Denominator,
     Integrator,
+    Jitter,
+    LossProbability,
+    MissedTickProbability,
     Numerator,
     SensorFilter,
     SimulatorModel,
@@ -180,6 +183,8 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         Literal["fixed", "moving"], key_metadata("location: under the target's mechanism, or on the flange")
     ] = "fixed"
     delay: Annotated[float, key_metadata("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
+    jitter: Jitter = 0.0
+    loss_probability: LossProbability = 0.0
     time_constant: Annotated[
         float, key_metadata("time constant of the reading's first-order lag", "s", ge=0.0)
     ] = 0.0
@@ -234,6 +239,7 @@ class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         int, key_metadata("periods until a command reaches the drives", "1", ge=0, le=MAX_LATENCY)
     ] = 0
     command_hold: Annotated[CommandHold, key_metadata("hold of the command within a period")] = "linear"
+    missed_tick_probability: MissedTickProbability = 0.0
     simulator: Annotated[Simulator, key_metadata("the motion simulator")]
     force_sensor: Annotated[ForceSensor, key_metadata("the force sensor")] = field(
         default_factory=ForceSensor

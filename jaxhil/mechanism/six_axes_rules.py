@@ -19,7 +19,8 @@ from jaxhil.mechanism.rules import KEYS_OF_MODELS, check_sensor_filter, check_si
 from jaxhil.mechanism.six_axes import Contact, Latch, RigidBody, SixAxisMechanism, Start
 from jaxhil.mechanism.six_axes_contacts import check_contact, check_latch
 from jaxhil.mechanism.six_axes_rig import PER_AXIS_KEYS, Inertia, Rig, Simulator
-from jaxhil.mechanism.uncertainty_rules import check_uncertainty
+from jaxhil.mechanism.timing_rules import check_six_axis_jitter
+from jaxhil.mechanism.uncertainty_rules import Span, check_uncertainty
 
 __all__ = ["check_contact_names", "check_leg_values", "check_six_axes", "inertia_matrix"]
 
@@ -55,9 +56,9 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
     _check_space(mechanism.rig.simulator)
     _check_hold(mechanism)
     _check_sensor(mechanism.rig, mechanism.uncertainty)
-    for path in mechanism.uncertainty:
-        _check_uncertainty(mechanism, path)
+    spans = {path: _check_uncertainty(mechanism, path) for path in mechanism.uncertainty}
     check_correlation(mechanism)
+    check_six_axis_jitter(mechanism, spans)
 
 
 def check_contact_names(raw: Mapping[str, Any]) -> None:
@@ -241,8 +242,8 @@ def _check_sensor(rig: Rig, uncertain: Collection[str]) -> None:
             _check_inertia((*path, "tool", key), entry, massless=True)
 
 
-def _check_uncertainty(mechanism: SixAxisMechanism, path: str) -> None:
-    """Raise `KeyProblem` unless all draws of an uncertain key are valid."""
+def _check_uncertainty(mechanism: SixAxisMechanism, path: str) -> Span:
+    """Return the smallest and largest draw of an uncertain key; raise `KeyProblem` if a draw is invalid."""
     low, high = check_uncertainty(mechanism, path)
     where, uncertainty = ("uncertainty", path), mechanism.uncertainty[path]
     if path.endswith((".inertia", ".inertia_assumed")) and uncertainty.independent and low.ndim == 2:
@@ -254,3 +255,4 @@ def _check_uncertainty(mechanism: SixAxisMechanism, path: str) -> None:
         raise KeyProblem((*where, "independent"), "true", "false (draws may reverse the strokes' order)")
     if path == "approach.velocity" and uncertainty.distribution != "normal" and not high[2] < 0:
         raise KeyProblem(where, f"a z component of up to {high[2]:g} m/s", "only draws < 0 m/s")
+    return low, high

@@ -87,6 +87,16 @@ Polynomial = Annotated[
 ]
 Numerator = Annotated[Polynomial, Meta(description="numerator of G(s), in descending powers of s")]
 Denominator = Annotated[Polynomial, Meta(description="denominator of G(s), in descending powers of s")]
+# Timing effects (`jaxhil.simulation.timing`).
+Jitter = Annotated[
+    float, key_metadata("largest deviation of the delay, uniform for each tick", "s", ge=0.0, le=1.0)
+]
+LossProbability = Annotated[
+    float, key_metadata("probability that a reading is lost; the last one is repeated", "1", ge=0.0, le=0.9)
+]
+MissedTickProbability = Annotated[
+    float, key_metadata("probability that the controller does not run at a tick", "1", ge=0.0, le=0.5)
+]
 UncertainKey = Annotated[str, Meta(min_length=1, max_length=100)]
 CorrelationRow = Annotated[
     list[Annotated[float, key_metadata("correlation of two keys' normal numbers", "1", ge=-1.0, le=1.0)]],
@@ -226,13 +236,8 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """Force sensor. Its effects, in order: delay, lag, noise and bias, rounding, dead zone, saturation."""
 
     delay: Annotated[float, key_metadata("transport delay of the reading", "s", ge=0.0, le=1.0)] = 0.0
-    jitter: Annotated[
-        float, key_metadata("largest deviation of the delay, uniform for each tick", "s", ge=0.0, le=1.0)
-    ] = 0.0
-    loss_probability: Annotated[
-        float,
-        key_metadata("probability that a reading is lost; the last one is repeated", "1", ge=0.0, le=0.9),
-    ] = 0.0
+    jitter: Jitter = 0.0
+    loss_probability: LossProbability = 0.0
     time_constant: Annotated[
         float, key_metadata("time constant of the reading's first-order lag", "s", ge=0.0)
     ] = 0.0
@@ -266,9 +271,7 @@ class Rig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         int, key_metadata("periods until a command reaches the drives", "1", ge=0, le=MAX_LATENCY)
     ] = 0
     command_hold: Annotated[CommandHold, key_metadata("hold of the command within a period")] = "linear"
-    missed_tick_probability: Annotated[
-        float, key_metadata("probability that the controller does not run at a tick", "1", ge=0.0, le=0.5)
-    ] = 0.0
+    missed_tick_probability: MissedTickProbability = 0.0
     contact_plane: Annotated[
         float, key_metadata("position of the hardware's surface; the controller assumes 0", "m")
     ] = 0.0

@@ -203,18 +203,19 @@ def build_series(
 
 def horner_series(
     series: Float[Array, "powers columns *batch"], drive: tuple[Array, ...], s: Float[Array, "*batch"]
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Evaluate a series of `build_series` at the time `s` [periods].
 
-    Return position [m] and velocity [m per period]. `drive` contains the state, the command, and the increase
-    of the command in a period.
+    Return position [m] and its first two time derivatives; time is in periods. `drive` contains the state,
+    the command, and the increase of the command in a period.
     """
     coefficients = [sum(row[i] * value for i, value in enumerate(drive)) for row in series]
-    position = rate = 0 * s
+    position = rate = half_bend = 0 * s
     for power in range(len(coefficients) - 1, -1, -1):
+        half_bend = rate + s * half_bend
         rate = position + s * rate
         position = coefficients[power] + s * position
-    return position, rate
+    return position, rate, 2 * half_bend
 
 
 @jax.numpy_rank_promotion("allow")

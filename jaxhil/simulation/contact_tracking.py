@@ -14,7 +14,7 @@ from jaxhil.laws.simulation_base import Signals
 from jaxhil.simulation.contact_force import PlantSignals
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.probe import Deviation, initial_deviation
-from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.scenario import Scenario, add_jitter
 
 MAX_DECAY_WAIT = 0.1  # longest wait for the force command to decay, because a noisy command never decays [s]
 COMMAND_DECAY_RATIO = 1e-6  # fraction of its peak below which a force command has decayed [1]
@@ -73,9 +73,7 @@ def build_end_conditions(scenario: Scenario) -> ContactEndConditions:
     when the force command has decayed, but at most 0.1 s later.
     """
     sensor, period = scenario.force_sensor, scenario.control_period
-    delay = sensor.delay + 20 * sensor.time_constant
-    if scenario.timing is not None and scenario.timing.jitter is not None:
-        delay = delay + scenario.timing.jitter
+    delay = add_jitter(sensor.delay + 20 * sensor.time_constant, scenario.timing)
     force_free_ticks = jnp.floor(delay / period + (2 + 1e-9)) + 1
     return ContactEndConditions(
         force_free_ticks=force_free_ticks,

@@ -14,7 +14,7 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.cells import MAX_POLE, NO_CELLS, CellCounts, count_cells, fastest_pole
 from jaxhil.simulation.loop import Loop
 from jaxhil.simulation.moving_average import DEGREE
-from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.scenario import Scenario, add_jitter
 
 MIN_RING_LENGTH = 16  # minimum length of a delay line [samples]
 # Maximum pole of the motion simulator and maximum contact frequency [rad per control period] for computing a
@@ -51,9 +51,7 @@ def build_loop(
     rig, force, position = mechanism.rig, scenarios.force_sensor, scenarios.position_sensor
     simulator, sensor_filter = scenarios.simulator, rig.force_sensor.filter
     law = COMPENSATORS[compensator]
-    sensed, timing = np.maximum(force.delay, position.delay) + simulator.delay, scenarios.timing
-    if timing is not None and timing.jitter is not None:
-        sensed = sensed + timing.jitter
+    sensed = add_jitter(np.maximum(force.delay, position.delay) + simulator.delay, scenarios.timing)
     aligned = [g.upper(mechanism) for g in law.gains if g.name == "identification_delay"]
 
     def samples(delay) -> int:
@@ -92,7 +90,7 @@ def build_loop(
         energies=energies,
         probed=scenarios.probe is not None,
         chatter=chatter,
-        has_timing=timing is not None,
+        has_timing=scenarios.timing is not None,
     )
 
 

@@ -23,7 +23,13 @@ from jaxhil.simulation.free_flight import APPROACH_TIME
 from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.simulation.mechanism_warnings import ContactSummary, find_warnings
 from jaxhil.simulation.outcome import parameters_by_slot
-from jaxhil.simulation.scenario import MAX_CONTACT_DURATION, MotionSimulatorBatch, Scenario, build_scenarios
+from jaxhil.simulation.scenario import (
+    MAX_CONTACT_DURATION,
+    MotionSimulatorBatch,
+    Scenario,
+    TimingBatch,
+    build_scenarios,
+)
 from jaxhil.simulation.timing import MAX_SERIES_POLE
 
 MAX_CONTACT_TICKS = 1e7  # maximum number of ticks of a contact, including its approach
@@ -116,15 +122,23 @@ def check_run(mechanism: Mechanism, label: str | None = None, drawn: bool = Fals
     name = label or mechanism.name
     lanes = build_scenarios(mechanism, _extreme_draws(mechanism, _POLE_KEYS) if drawn else None)
     check_poles(name, lanes.simulator.denominator, lanes.control_period)
-    if lanes.timing is not None and lanes.timing.jitter is not None:
-        allowed = "at most 1 / control_period for rig.force_sensor.jitter"
-        check_poles(name, lanes.simulator.denominator, lanes.control_period, MAX_SERIES_POLE, allowed)
+    check_jitter_poles(name, lanes.timing, lanes.simulator.denominator, lanes.control_period)
     _check_velocity_limit(
         name, build_scenarios(mechanism, _extreme_draws(mechanism, _SPEED_KEYS) if drawn else None)
     )
     _check_ticks(
         name, mechanism, build_scenarios(mechanism, _extreme_draws(mechanism, _TICK_KEYS) if drawn else None)
     )
+
+
+def check_jitter_poles(name: str, timing: TimingBatch | None, denominator: Any, control_period: Any) -> None:
+    """Raise `InputError` if a pole of the motion simulator is too fast for readings with jitter.
+
+    See `check_poles` for the arguments; `timing` contains the timing effects of the scenarios.
+    """
+    if timing is not None and timing.jitter is not None:
+        allowed = "at most 1 / control_period for rig.force_sensor.jitter"
+        check_poles(name, denominator, control_period, MAX_SERIES_POLE, allowed)
 
 
 def _check_velocity_limit(name: str, scenarios: Scenario) -> None:

@@ -25,6 +25,7 @@ from jaxhil.simulation.metrics import Metrics
 from jaxhil.simulation.rollout import begin_next_contacts, run_segment, segment_length, start_rollout
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 from jaxhil.simulation.tick import RunState, Tick
+from jaxhil.simulation.timing import without_missed_ticks
 
 TICKS_PER_CALL = 512  # number of ticks that one call of the compiled program simulates
 
@@ -56,10 +57,7 @@ def nominal_and_draws(mechanism: Mechanism, number: int, seed: int) -> Scenario:
     for path, drawn in draw(mechanism, number - 1, seed).items():
         nominal = np.broadcast_to(np.asarray(value_at(mechanism, path), float), drawn.shape[1:])
         draws[path] = np.concatenate([nominal[None], drawn])
-    scenarios = build_scenarios(mechanism, draws, seed=seed)
-    # The rig's controller is compared tick by tick and must therefore run at every tick.
-    timing = scenarios.timing
-    return scenarios if timing is None else scenarios._replace(timing=timing._replace(missed=None))
+    return without_missed_ticks(build_scenarios(mechanism, draws, seed=seed))
 
 
 def record_lanes(loaded: LoadedGains, batch: Scenario) -> tuple[Metrics, list[LaneRecord]]:

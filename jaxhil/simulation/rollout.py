@@ -168,7 +168,7 @@ def draw_segment_noise(
     ahead = jnp.arange(ticks, dtype=jnp.int32).reshape(-1, *[1] * run.index.ndim)
     age = run.tick + ahead - run.state.onset_tick[None]
     noise = draw_noise(loop.has_force_noise, loop.has_position_noise, rig.scenario, run.index, age)
-    return noise, draw_timing(rig.scenario, run.index, age)
+    return noise, draw_timing(rig.scenario.timing, rig.scenario.key, run.index, age)
 
 
 def begin_next_contacts(

@@ -8,7 +8,7 @@ The batch is the last axis. Axes for contacts, segments of a contact law and pol
 before it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -144,8 +144,23 @@ def build_scenarios(
         ),
         time_limit=table.constant(MAX_CONTACT_DURATION),
         key=key,
-        timing=_build_timing(mechanism, table),
+        timing=build_timing(table.optional),
     )
+
+
+def build_timing(optional: Callable[[str], Any]) -> TimingBatch | None:
+    """Return the timing effects of a mechanism with one axis or six axes; None if it has none.
+
+    `optional` returns a parameter as an array (lanes,), or None if it is 0 in every draw.
+    """
+    paths = "rig.force_sensor.jitter", "rig.force_sensor.loss_probability", "rig.missed_tick_probability"
+    timing = TimingBatch(*map(optional, paths))
+    return None if all(effect is None for effect in timing) else timing
+
+
+def add_jitter(delay: Any, timing: TimingBatch | None) -> Any:
+    """Return the longest `delay` [s] that a force reading with the nominal `delay` may have."""
+    return delay if timing is None or timing.jitter is None else delay + timing.jitter
 
 
 class _MechanismNumbers:
@@ -216,13 +231,6 @@ def _build_mass(mechanism, table) -> Any:
         return table.scalar("bodies.equivalent_mass")
     chaser, target = table.scalar("bodies.chaser_mass"), table.scalar("bodies.target_mass")
     return chaser * target / (chaser + target)
-
-
-def _build_timing(mechanism, table) -> TimingBatch | None:
-    """Return the timing effects that the mechanism has; None if it has none."""
-    paths = "rig.force_sensor.jitter", "rig.force_sensor.loss_probability", "rig.missed_tick_probability"
-    timing = TimingBatch(*map(table.optional, paths))
-    return None if all(effect is None for effect in timing) else timing
 
 
 def _build_force_sensor(sensor, table) -> ForceSensorBatch:

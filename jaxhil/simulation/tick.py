@@ -44,7 +44,7 @@ from jaxhil.simulation.probe import Probe
 from jaxhil.simulation.probed_tick import apply_probe
 from jaxhil.simulation.rate_limits import apply_limits
 from jaxhil.simulation.sensors import SensorNoise, quantise, sample_force
-from jaxhil.simulation.timing import HeldValues, TimingDraws, hold_compensator, read_force
+from jaxhil.simulation.timing import TimingDraws, hold_compensator, read_force, update_held_values
 
 
 class RunState(NamedTuple):
@@ -140,9 +140,7 @@ def tick(
             loop.sensor_filter,
         )
     state = update_state(state, now, plant_signals, model, actuated, contact)
-    if state.held is not None:
-        count = state.held.missed if missed is None else state.held.missed + missed.astype(jnp.int32)
-        state = state._replace(held=HeldValues(signals.force_measured, force, count))
+    state = state._replace(held=update_held_values(state.held, signals.force_measured, force, missed))
     record = Tick(
         signals,
         force,

@@ -14,16 +14,16 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxhil.lanes import select_lanes
 from jaxhil.laws.shared.ring_buffer import look_back
-from jaxhil.simulation.cells import horner_series
+from jaxhil.simulation.cells import IntervalInputs, horner_series
 from jaxhil.simulation.contact_force import MotionSample, Surfaces
 from jaxhil.simulation.motion_simulator import apply_row, split_delay
 from jaxhil.simulation.moving_average import is_before_kink, motion_rows
 from jaxhil.simulation.probe import Probe
-from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.scenario import TimingBatch
 from jaxhil.simulation.sensors import uniform_noise
 
 TIMING_STREAM = 0x40000000  # offset of the contact's index, which separates these numbers from the noise
@@ -43,8 +43,8 @@ class TimingDraws(NamedTuple):
 class HeldValues(NamedTuple):
     """Values that lost frames and missed ticks repeat, and the number of missed ticks."""
 
-    reading: Float[Array, "*batch"]  # force reading [N]
-    command: Float[Array, "*batch"]  # force command [N]
+    reading: Any  # force reading [N], (*batch); with six axes, reading of the sensor's channels
+    command: Any  # force command [N], (*batch); with six axes, the wrench command
     missed: Int[Array, "*batch"]  # number of missed ticks since the run began
 
 
@@ -53,29 +53,54 @@ def no_held_values(like: Float[Array, "*batch"]) -> HeldValues:
     return HeldValues(0 * like, 0 * like, jnp.zeros(like.shape, jnp.int32))
 
 
+def update_held_values(
+    before: HeldValues | None, reading: Any, command: Any, missed: Bool[Array, "*batch"] | None
+) -> HeldValues | None:
+    """Return the values after a tick with this reading and command; None without timing effects."""
+    if before is None:
+        return None
+    count = before.missed if missed is None else before.missed + missed.astype(jnp.int32)
+    return HeldValues(reading, command, count)
+
+
 def draw_timing(
-    scenario: Scenario, contact: Int[Array, "*batch"], age: Int[Array, "ticks *batch"]
+    timing: TimingBatch | None,
+    key: UInt32[Array, "2 *batch"],
+    contact: Int[Array, "*batch"],
+    age: Int[Array, "ticks *batch"],
 ) -> TimingDraws | None:
     """Return the timing effects of scenarios; None if they have none.
 
     Args:
-        scenario: Scenarios whose timing effects are drawn.
-        contact: Index of the current contact.
+        timing: Timing effects of the scenarios.
+        key: Noise keys of the scenarios.
+        contact: Index of the current contact; 0 with six axes.
         age: Number of ticks since the run began.
     """
-    timing = scenario.timing
     if timing is None:
         return None
 
-    def share(stream):
-        dtype = scenario.velocity.dtype
-        return uniform_noise(scenario.key, contact + TIMING_STREAM, 4 * age + stream, dtype)
+    def share(stream, dtype):
+        return uniform_noise(key, contact + TIMING_STREAM, 4 * age + stream, dtype)
 
     def occurs(stream, probability):
-        return None if probability is None else (share(stream) < probability[None]) & (age > 0)
+        if probability is None:
+            return None
+        return (share(stream, probability.dtype) < probability[None]) & (age > 0)
 
-    jitter = None if timing.jitter is None else timing.jitter[None] * (2 * share(0) - 1)
+    jitter = timing.jitter
+    if jitter is not None:
+        jitter = jnp.where(age > 0, jitter[None] * (2 * share(0, jitter.dtype) - 1), 0)
     return TimingDraws(jitter, occurs(1, timing.loss), occurs(2, timing.missed))
+
+
+def without_missed_ticks(scenarios: Any) -> Any:
+    """Return a copy of scenarios, with one axis or six axes, without missed ticks.
+
+    The rig's controller is compared with the simulation tick by tick and must therefore run at every tick.
+    """
+    timing = scenarios.timing
+    return scenarios if timing is None else scenarios._replace(timing=timing._replace(missed=None))
 
 
 def hold_compensator(missed: Bool[Array, "*batch"], before: Any, after: Any, ring: int) -> Any:
@@ -91,7 +116,7 @@ def hold_compensator(missed: Bool[Array, "*batch"], before: Any, after: Any, rin
     def unchanged(leaf):
         # The number of the tick, which is common to all lanes, determines the position in a delay line. The
         # samples of a lane that keeps its state must therefore move on by one position.
-        is_ring = leaf.ndim == missed.ndim + 1 and leaf.shape[0] == ring
+        is_ring = leaf.ndim > missed.ndim and leaf.shape[0] == ring
         return jnp.roll(leaf, 1, axis=0) if is_ring else leaf
 
     return jax.lax.cond(
@@ -99,6 +124,34 @@ def hold_compensator(missed: Bool[Array, "*batch"], before: Any, after: Any, rin
         lambda: select_lanes(missed, jax.tree.map(unchanged, before), after),
         lambda: after,
     )
+
+
+def motion_in_interval(
+    series: Float[Array, "powers columns *batch"] | None,
+    window: Float[Array, "*batch"] | None,
+    period: Float[Array, "*batch"],
+    hold: str,
+    inputs: IntervalInputs,
+    s: Float[Array, "*batch"],
+) -> tuple[Array, Array, Array]:
+    """Return the exact position at any instant of a sampling interval, and its first two time derivatives.
+
+    Time is in control periods.
+
+    Args:
+        series: Power series of the motion (`build_series`); unused for a moving average.
+        window: Window of a moving average [s]; None for a transfer function.
+        period: Control period [s].
+        hold: Hold of the position command.
+        inputs: Inputs of the interval.
+        s: Fraction of the interval.
+    """
+    if window is not None:
+        rows = motion_rows(window, period, s, is_before_kink(window, period, s), hold)
+        position, rate, bend = (apply_row(row, inputs.state, inputs.start, inputs.end) for row in rows)
+        return position, rate, bend
+    assert series is not None
+    return horner_series(series, (*inputs.state, inputs.start, inputs.end - inputs.start), s)
 
 
 def read_force(
@@ -131,13 +184,9 @@ def read_force(
     inputs = jax.tree.map(
         lambda leaf: look_back(leaf, now - 1, delay.intervals, is_available), state.sensed.rings.inputs
     )
-    if simulator.window is None:
-        drive = (*inputs.state, inputs.start, inputs.end - inputs.start)
-        position, rate = horner_series(rig.series, drive, delay.fraction)
-    else:
-        is_before = is_before_kink(simulator.window, period, delay.fraction)
-        rows = motion_rows(simulator.window, period, delay.fraction, is_before, loop.hold)
-        position, rate = (apply_row(row, inputs.state, inputs.start, inputs.end) for row in rows[:2])
+    position, rate, _ = motion_in_interval(
+        rig.series, simulator.window, period, loop.hold, inputs, delay.fraction
+    )
     motion = MotionSample(position - scenario.contact_plane, rate / period)
     surfaces = Surfaces(loop.law, state.parameters, state.law, None)
     force = jnp.where(is_available, surfaces.force(motion)[0], 0)

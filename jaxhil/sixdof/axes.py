@@ -15,7 +15,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxhil.laws.shared.ring_buffer import write_sample
+from jaxhil.laws.shared.ring_buffer import look_back, write_sample, write_samples
+from jaxhil.simulation.cells import IntervalInputs, build_series
 from jaxhil.simulation.motion_simulator import (
     Propagation,
     SplitDelay,
@@ -34,6 +35,19 @@ from jaxhil.simulation.moving_average import (
     read_leaving_commands,
 )
 from jaxhil.simulation.scenario import MotionSimulatorBatch
+from jaxhil.simulation.timing import SERIES_DEGREE, motion_in_interval
+
+
+class LateSampling(NamedTuple):
+    """Constants of force readings whose delay varies from tick to tick (jitter)."""
+
+    axis_delay: Float[Array, "axes *batch"]  # delay of each axis [s]
+    sensor_delay: Float[Array, "*batch"]  # nominal delay of the force sensor [s]
+    period: Float[Array, "axes *batch"]  # control period [s]
+    # power series of the motion in a sampling interval (`build_series`), and window of a moving average [s];
+    # one of both is None
+    series: Float[Array, "powers columns axes *batch"] | None
+    window: Float[Array, "axes *batch"] | None
 
 
 class Axes(NamedTuple):
@@ -44,6 +58,7 @@ class Axes(NamedTuple):
     acceleration: Float[Array, "columns axes *batch"] | None
     force: SplitDelay  # sum of the delays of each axis and of the force sensor, (axes, *batch)
     position: SplitDelay  # sum of the delays of each axis and of the position sensor, (axes, *batch)
+    late: LateSampling | None = None  # constants of readings with jitter; None without jitter
 
 
 class AxisMotion(NamedTuple):
@@ -69,6 +84,8 @@ class Hardware(NamedTuple):
     ring: Float[Array, "rows *batch"]  # delay line of the samples, (intervals x quantities x axes, *batch)
     # delay line of the commands at the end of each interval; None unless the axes are moving averages
     past: Float[Array, "intervals axes *batch"] | None = None
+    # delay line of the inputs of each interval, (intervals, axes, *batch); None without jitter
+    inputs: IntervalInputs | None = None
 
 
 def build_axes(
@@ -79,22 +96,33 @@ def build_axes(
     hold: str,
     has_tool: bool = False,
     measured: bool = False,
+    has_jitter: bool = False,
 ) -> Axes:
     """Discretise the axes of a motion simulator without limits, for sensors with the given delays [s].
 
     `has_tool` adds the accelerations, which cause the inertia force of a tool. `measured` adds the positions
-    at the position sensor's sampling instant.
+    at the position sensor's sampling instant. `has_jitter` adds the constants for `read_late_motion`.
     """
     period = jnp.broadcast_to(control_period[None], simulator.delay.shape)
     force, position = (
         split_delay(simulator.delay + delay[None], period) for delay in (force_delay, position_delay)
     )
     instant = position.fraction if measured else None
+    late = _build_late_sampling(simulator, force_delay, period) if has_jitter else None
     if simulator.window is not None:
-        return _build_averages(simulator.window, period, force, position, instant, hold, has_tool)
+        averages = _build_averages(simulator.window, period, force, position, instant, hold, has_tool)
+        return averages._replace(late=late)
     exact = discretise(simulator.numerator, simulator.denominator, period, force.fraction, instant, hold)
     acceleration = rate_row(exact.velocity, simulator.denominator, period) if has_tool else None
-    return Axes(exact, acceleration, force, position)
+    return Axes(exact, acceleration, force, position, late)
+
+
+def _build_late_sampling(simulator, force_delay, period) -> LateSampling:
+    """Return the constants of readings with jitter."""
+    series = None
+    if simulator.window is None:
+        series = build_series(simulator.numerator, simulator.denominator, period, SERIES_DEGREE)
+    return LateSampling(simulator.delay, force_delay, period, series, simulator.window)
 
 
 def _build_averages(window, period, force, position, instant, hold, has_tool) -> Axes:
@@ -147,11 +175,20 @@ def start_uniform_motion(
     # The delay line starts with the samples of the past uniform motion.
     back = jnp.arange(1 - ring, 1, dtype=jnp.int32).astype(stride.dtype).reshape(-1, 1, *[1] * stride.ndim)
     newest, growth = (jnp.stack(jax.tree.leaves(samples))[None] for samples in (newest, growth))
+    inputs = None
+    if axes.late is not None:
+        changes = IntervalInputs(steady_state(rows, stride, 0 * stride), stride, stride, None)
+        inputs = jax.tree.map(
+            lambda last, change: last[None] + back[:, 0] * change[None],
+            IntervalInputs(settled, start, end, None),
+            changes,
+        )
     return Hardware(
         commands,
         steady_state(rows, drive, stride),
         (newest + back * growth).reshape(-1, *period.shape),
         None if rows.window is None else commands[-1][None] + back[:, 0] * stride[None],
+        inputs,
     )
 
 
@@ -171,6 +208,26 @@ def read_samples(axes: Axes, hardware: Hardware, tick: Int[Array, ""]) -> Sample
     return structure.unflatten(samples)
 
 
+def read_late_motion(
+    axes: Axes, hardware: Hardware, tick: Int[Array, ""], jitter: Float[Array, "*batch"], hold: str
+) -> AxisMotion:
+    """Return the motion of the axes that the force sensor reads at a tick, from the exact motion.
+
+    The sampling instant precedes the tick by each axis' delay, the sensor's delay, and the `jitter` [s].
+    """
+    late, inputs = axes.late, hardware.inputs
+    assert late is not None and inputs is not None
+    # A drawn jitter may exceed the drawn delay.
+    sensor_delay = jnp.maximum(late.sensor_delay + jitter, 0)
+    delay = split_delay(late.axis_delay + sensor_delay[None], late.period)
+    chosen = jax.tree.map(lambda ring: look_back(ring, tick - 1, delay.intervals), inputs)
+    position, rate, bend = motion_in_interval(
+        late.series, late.window, late.period, hold, chosen, delay.fraction
+    )
+    acceleration = None if axes.acceleration is None else bend / late.period**2
+    return AxisMotion(position, rate / late.period, acceleration)
+
+
 def actuate(
     axes: Axes, hardware: Hardware, tick: Int[Array, ""], command: Array, hold: str, latency: int
 ) -> Hardware:
@@ -179,6 +236,7 @@ def actuate(
     end = commands[latency]
     start = commands[latency + 1] if hold == "linear" else end
     exact, state, ring, past = axes.propagation, hardware.state, hardware.ring, hardware.past
+    inputs = hardware.inputs
     if past is not None and exact.window is not None:
         past = write_sample(past, tick, end)
         state = read_leaving_commands(past, tick, exact.window, state)
@@ -188,7 +246,10 @@ def actuate(
     for kind, row in enumerate(kinds):
         index = ((tick & last) * len(kinds) + kind) * len(command)
         ring = lax.dynamic_update_slice_in_dim(ring, apply_row(row, state, start, end), index, 0)
-    return Hardware(commands[: latency + 1], advance_state(exact.transition, state, start, end), ring, past)
+    if inputs is not None:
+        inputs = write_samples(inputs, tick, IntervalInputs(state, start, end, None))
+    state = advance_state(exact.transition, state, start, end)
+    return Hardware(commands[: latency + 1], state, ring, past, inputs)
 
 
 def _samples(axes: Axes, position: Any, rate: Any, acceleration: Any, measured: Any) -> Samples:

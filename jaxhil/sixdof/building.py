@@ -13,7 +13,7 @@ import numpy as np
 from jaxhil.mechanism.sensor_filter import find_modes
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.six_axes_rig import Tool
-from jaxhil.simulation.scenario import MotionSimulatorBatch
+from jaxhil.simulation.scenario import MotionSimulatorBatch, build_timing
 from jaxhil.sixdof import sensor
 from jaxhil.sixdof.approach import begin, find_touching_height
 from jaxhil.sixdof.bodies import Body, build_body, build_state
@@ -72,6 +72,7 @@ def build_scenarios(
         control_period=period,
         duration=duration,
         key=key,
+        timing=build_timing(numbers.optional),
     ))  # fmt: skip
 
 

@@ -47,6 +47,11 @@ class DrawnValues:
         """Return whether the value is 0 in all scenarios: 0 in the file, and not drawn."""
         return not self.is_drawn(path) and not np.any(np.asarray(value_at(self._mechanism, path), float))
 
+    def optional(self, path: str) -> Any:
+        """Return the values of a parameter; None if it is 0 in every draw."""
+        is_used = path in self._draws or path in self._mechanism.uncertainty
+        return self(path) if is_used or value_at(self._mechanism, path) else None
+
     def constant(self, value: float) -> Any:
         """Return an array (lanes,) with the same number in every lane."""
         return np.full(self.number, value)

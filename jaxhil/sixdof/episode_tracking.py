@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.lanes import select_lanes
 from jaxhil.simulation.contact_tracking import COMMAND_DECAY_RATIO, MAX_DECAY_WAIT
+from jaxhil.simulation.scenario import TimingBatch, add_jitter
 from jaxhil.sixdof.forces import deepest
 from jaxhil.sixdof.ideal_contact import IdealContactRecord, is_in_gap
 from jaxhil.sixdof.loop_state import RigConstants, Tick
@@ -102,7 +103,7 @@ def track_tick(
     """
     tracker = _updated(rig, tracker, seen)
     time = (ticks - episode_start.tick).astype(rig.period.dtype) * rig.period
-    is_free = is_in_gap(episode_start.reference, time, required_pause(rig.sensor, rig.period))
+    is_free = is_in_gap(episode_start.reference, time, required_pause(rig.sensor, rig.period, rig.timing))
     pauses = tracker.has_touched & has_rig_settled(rig, tracker) & is_free & ~tracker.has_ended
 
     def are_free() -> Array:
@@ -117,13 +118,14 @@ def track_tick(
     )
 
 
-def required_pause(sensor: Sensor, period: Array) -> Array:
+def required_pause(sensor: Sensor, period: Array, timing: TimingBatch | None) -> Array:
     """Return the pause [s] (time without a touch) after which an episode may end.
 
-    The pause is `MIN_PAUSE` or, if longer, the time that the force sensor needs to settle: its delay, 20 of
-    its time constants, and two control periods.
+    The pause is `MIN_PAUSE` or, if longer, the time that the force sensor needs to settle: its delay with its
+    jitter, 20 of its time constants, and two control periods.
     """
-    return jnp.maximum(MIN_PAUSE, sensor.delay + 20 * sensor.time_constant + 2 * period)
+    delay = add_jitter(sensor.delay + 20 * sensor.time_constant, timing)
+    return jnp.maximum(MIN_PAUSE, delay + 2 * period)
 
 
 def has_rig_settled(rig: RigConstants, tracker: EpisodeTracker) -> Array:
@@ -137,7 +139,8 @@ def has_rig_settled(rig: RigConstants, tracker: EpisodeTracker) -> Array:
 
 def required_pause_ticks(rig: RigConstants) -> Array:
     """Return the pause of `required_pause` as a number of ticks."""
-    return jnp.floor(required_pause(rig.sensor, rig.period) / rig.period + 1e-9).astype(jnp.int32) + 1
+    pause = required_pause(rig.sensor, rig.period, rig.timing)
+    return jnp.floor(pause / rig.period + 1e-9).astype(jnp.int32) + 1
 
 
 def relative_energy(rig: RigConstants, states: States) -> Array:

@@ -88,7 +88,7 @@ def _ideal_metrics(scenario: Scenario) -> Metrics:
     """Return metrics whose fields of the ideal contact are valid; the fields of the rig are meaningless."""
     period = scenario.control_period
     until = jnp.round(scenario.duration / period) * period
-    pause = required_pause(scenario.sensor, period)
+    pause = required_pause(scenario.sensor, period, scenario.timing)
     reference = compute_ideal_contact(scenario)
     first = reference.gaps.begin.time[0]
     elapsed = jnp.minimum(first + pause, until)

@@ -14,11 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from jaxhil.lanes import select_lanes
 from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.laws.six_axis_base import SixAxisSignals
+from jaxhil.simulation.scenario import add_jitter
+from jaxhil.simulation.timing import HeldValues, hold_compensator, update_held_values
 from jaxhil.sixdof.axes import actuate, build_axes, start_uniform_motion, static_lags
 from jaxhil.sixdof.bodies import SHARES
 from jaxhil.sixdof.latch import init_latch
@@ -47,7 +50,8 @@ def build_loop(scenario: Scenario, **static: Any) -> Loop:
     """Build the loop for a batch of scenarios; `static` sets the fields that scenarios do not determine."""
     sensor, period = scenario.sensor, np.asarray(scenario.control_period)
     errors = sensor.errors
-    slowest = np.maximum(sensor.delay, sensor.position_delay)[None] + np.asarray(scenario.simulator.delay)
+    force_delay = np.asarray(add_jitter(sensor.delay, scenario.timing))
+    slowest = np.maximum(force_delay, sensor.position_delay)[None] + np.asarray(scenario.simulator.delay)
     window = scenario.simulator.window
     longest = slowest if window is None else np.maximum(slowest, np.asarray(window))
     intervals = int(np.max(longest / period[None])) + 2
@@ -80,6 +84,7 @@ def build_rig_constants(loop: Loop, gains: Gains, scenario: Scenario) -> RigCons
         loop.hold,
         has_tool,
         has_tool or law.reads_pose or loop.measures_pose,
+        scenario.timing is not None and scenario.timing.jitter is not None,
     )
     full = {name: jnp.zeros_like(period) + value for name, value in gains.items()}
     constants = controller_constants(scenario, has_tool)
@@ -95,6 +100,7 @@ def build_rig_constants(loop: Loop, gains: Gains, scenario: Scenario) -> RigCons
         gains=full,
         constants=constants,
         prepared=law.prepare(full, constants),
+        timing=scenario.timing,
     )
 
 
@@ -141,6 +147,7 @@ def begin(
         controller=NumericalController(
             (nothing, start_filter(loop.sensor_filter, nothing)) if loop.has_lag else None,
             law.init(rig.prepared, rig.constants, start, loop.controller_ring),
+            None if rig.timing is None else HeldValues(nothing, nothing, start.age),
         ),
         tick=jnp.array(0, jnp.int32),
     )
@@ -159,19 +166,35 @@ def tick(loop: Loop, rig: RigConstants, state: RunState) -> tuple[RunState, Tick
     # A compensator that does not use the measured pose does not get it.
     signals = sensed.signals
     signals = signals if law.reads_pose else signals._replace(pose_measured=None)
-    commands, law_state = law.step(rig.prepared, state.controller.law, signals, state.tick)
+    before, missed = state.controller, sensed.missed
+    if before.held is not None:
+        # As on the rig, the compensator counts only the ticks at which it runs, not the missed ticks.
+        signals = signals._replace(age=signals.age - before.held.missed)
+    commands, law_state = law.step(rig.prepared, before.law, signals, state.tick)
     command = jax.tree.unflatten(jax.tree.structure(sensed.contact), commands)
-    states, position, rates, twist = integrate(loop, rig, state, command)
+    if missed is not None and before.held is not None:
+        command = select_lanes(missed, before.held.command, command)
+        law_state = hold_compensator(missed, before.law, law_state, loop.controller_ring)
+    states, position, rates, twist = integrate(loop, rig, state, command, missed)
     sent = law.pose_command(rig.gains, position, rates)
     after, seen = complete_tick(loop, rig, state, sensed, command, (states, position, twist), sent)
     return after._replace(controller=after.controller._replace(law=law_state)), seen
 
 
 def integrate(
-    loop: Loop, rig: RigConstants, state: RunState, command: Wrench
+    loop: Loop,
+    rig: RigConstants,
+    state: RunState,
+    command: Wrench,
+    missed: Bool[Array, "*batch"] | None = None,
 ) -> tuple[States, Array, Array, Array]:
-    """Return the numerical model's next states, and its next coordinates, rates and twist (6, *batch)."""
+    """Return the numerical model's next states, and its next coordinates, rates and twist (6, *batch).
+
+    In lanes that `missed` the tick, the numerical model keeps its states.
+    """
     states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
+    if missed is not None:
+        states = select_lanes(missed, state.states, states)
     return states, *model_motion(rig.bodies, states)
 
 
@@ -196,6 +219,10 @@ def complete_tick(
         sent: pose command [m, rad].
     """
     states, position, twist = model
+    controller = state.controller._replace(
+        lag=sensed.lag,
+        held=update_held_values(state.controller.held, sensed.reading, command, sensed.missed),
+    )
     hardware = actuate(
         rig.axes, state.hardware, state.tick, rig.kinematics.command(sent), loop.hold, loop.latency
     )
@@ -206,7 +233,7 @@ def complete_tick(
         hardware=hardware,
         memories=sensed.memories,
         latch_states=sensed.latch_states,
-        controller=state.controller._replace(lag=sensed.lag),
+        controller=controller,
         tick=state.tick + 1,
     )
     seen = Tick(

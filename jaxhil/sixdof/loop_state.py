@@ -3,11 +3,13 @@
 from typing import Any, NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.laws.six_axis_base import SixAxisConstants, SixAxisSignals
 from jaxhil.mechanism.sensor_filter import FilterModes
+from jaxhil.simulation.scenario import TimingBatch
+from jaxhil.simulation.timing import HeldValues
 from jaxhil.sixdof.axes import Axes, Hardware
 from jaxhil.sixdof.forces import ContactGroup, Forces, Memory
 from jaxhil.sixdof.kinematics import Kinematics, RigidMotion
@@ -64,14 +66,16 @@ class RigConstants(NamedTuple):
     gains: Gains  # gains of the compensator, (*batch)
     constants: SixAxisConstants  # constants of the rig that the compensator knows
     prepared: Any  # constants that the compensator's `prepare` computes
+    timing: TimingBatch | None  # timing effects of the rig; None if there are none
 
 
 class NumericalController(NamedTuple):
-    """States of the force sensor's lag and of the compensator."""
+    """States of the force sensor's lag and of the compensator, and values that timing effects repeat."""
 
     # last input and last output of the lag, or of each mode of the filter; None without either
     lag: tuple[Wrench, Any] | None
     law: Any  # state of the compensator
+    held: HeldValues | None = None  # values of the last tick; None without timing effects
 
 
 class RunState(NamedTuple):
@@ -111,3 +115,5 @@ class Sensed(NamedTuple):
     latch_states: tuple[LatchState, ...]  # next states of the latches
     lag: tuple[Wrench, Any] | None  # next state of the force sensor's lag or filter
     signals: SixAxisSignals  # inputs of the compensator
+    reading: Wrench | None  # reading of the force sensor's channels; None without timing effects
+    missed: Bool[Array, "*batch"] | None  # whether the controller misses the tick; None if it misses none

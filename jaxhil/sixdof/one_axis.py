@@ -31,7 +31,7 @@ from jaxhil.sixdof.run import Episode
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.vectors import components
 
-RIG_KEYS = ("control_period", "integrator", "command_latency", "command_hold")
+RIG_KEYS = ("control_period", "integrator", "command_latency", "command_hold", "missed_tick_probability")
 EQUAL_LAGS = 1e-9  # difference of lags below which two axes are equal [s]
 
 
@@ -179,8 +179,7 @@ def _convert_force_sensor(mechanism: SixAxisMechanism, normal: np.ndarray) -> di
         return float(np.linalg.norm(normal * np.array(values[:3])))
 
     return {
-        "delay": sensor.delay,
-        "time_constant": sensor.time_constant,
+        **{key: getattr(sensor, key) for key in ("delay", "jitter", "loss_probability", "time_constant")},
         "bias": float(np.dot(normal, sensor.bias[:3])),
         "range": min(sensor.range[:3]),
         **{key: along(getattr(sensor, key)) for key in ("noise_std", "quantum", "dead_zone")},

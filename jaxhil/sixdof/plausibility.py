@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from jaxhil.errors import InputError
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.simulation.jax_environment import SINGLE_RUN_OPTIONS, supported_options
-from jaxhil.simulation.plausibility import check_poles
+from jaxhil.simulation.plausibility import check_jitter_poles, check_poles
 from jaxhil.sixdof.approach import SEARCH_HEIGHT
 from jaxhil.sixdof.building_contacts import candidate_names
 from jaxhil.sixdof.candidates import motion_at
@@ -57,7 +57,9 @@ def check_scenario(mechanism: SixAxisMechanism, scenario: Scenario) -> None:
         found = f"{where}.duration: found {scenario.duration[0]:g} s, {ticks:.2g} control periods"
         raise InputError(f"{mechanism.name}: {found}, expected at most {MAX_TICKS:.0e} periods")
     denominator = np.asarray(scenario.simulator.denominator)[..., 0]
-    check_poles(mechanism.name, denominator, np.full(denominator.shape[1], scenario.control_period[0]))
+    period = np.full(denominator.shape[1], scenario.control_period[0])
+    check_poles(mechanism.name, denominator, period)
+    check_jitter_poles(mechanism.name, scenario.timing, denominator, period)
     start: StartValues = jax.tree.map(np.asarray, _compiled()(scenario))
     at = start.coordinates[:, 0]
     if not np.all(np.isfinite(at)):

@@ -109,7 +109,7 @@ def compute_ideal_contact(scenario: Scenario) -> IdealContactRecord:
     until = jnp.round(scenario.duration / period) * period
     contact_model = IdealContactModel(scenario.bodies, scenario.groups, scenario.latches)
     return integrate_ideal_contact(
-        contact_model, scenario.start, required_pause(scenario.sensor, period), until, period
+        contact_model, scenario.start, required_pause(scenario.sensor, period, scenario.timing), until, period
     )
 
 
@@ -247,7 +247,7 @@ def _begin_next(rig: RigConstants, last: Array, progress: EpisodeProgress, begin
         contact_model = IdealContactModel(rig.bodies, rig.groups, rig.latches)
         until = jnp.where(begins, last - age, 0).astype(rig.period.dtype) * rig.period
         reference = integrate_ideal_contact(
-            contact_model, states, required_pause(rig.sensor, rig.period), until, rig.period
+            contact_model, states, required_pause(rig.sensor, rig.period, rig.timing), until, rig.period
         )
         following = EpisodeStart(states, age, relative_energy(rig, states), reference)
         return select_lanes(begins, following, episode_start)

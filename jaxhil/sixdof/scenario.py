@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Float, UInt32
 
-from jaxhil.simulation.scenario import MotionSimulatorBatch
+from jaxhil.simulation.scenario import MotionSimulatorBatch, TimingBatch
 from jaxhil.sixdof.forces import ContactGroup
 from jaxhil.sixdof.ideal_contact import IdealContactRecord
 from jaxhil.sixdof.kinematics import Kinematics
@@ -30,5 +30,6 @@ class Scenario(NamedTuple):
     control_period: Float[Array, "*batch"]  # control period T [s]
     duration: Float[Array, "*batch"]  # maximum duration of the run [s], which is rounded to ticks
     key: UInt32[Array, "2 *batch"]  # key of the sensors' noise
+    timing: TimingBatch | None = None  # timing effects of the rig; None if there are none
     # ideal contact from `start`; None: every run computes the ideal contact
     ideal_contact: IdealContactRecord | None = None

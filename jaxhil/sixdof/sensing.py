@@ -7,18 +7,28 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxhil.lanes import as_complex
+from jaxhil.lanes import as_complex, select_lanes
 from jaxhil.laws.six_axis_base import SixAxisSignals
 from jaxhil.mechanism.sensor_filter import FilterModes
 from jaxhil.simulation.sensors import apply_lag, follow_ramp, quantise, white_noise
-from jaxhil.sixdof.axes import AxisMotion, read_samples
+from jaxhil.simulation.timing import TimingDraws, draw_timing
+from jaxhil.sixdof.axes import AxisMotion, read_late_motion, read_samples
 from jaxhil.sixdof.forces import contact_wrench
 from jaxhil.sixdof.kinematics import RigidMotion, to_rigid_motion
 from jaxhil.sixdof.latch import latch_wrench
 from jaxhil.sixdof.loop_state import Loop, RigConstants, RunState, Sensed
 from jaxhil.sixdof.relative import Pose, Wrench
 from jaxhil.sixdof.rotations import exponential
-from jaxhil.sixdof.sensor import read_fixed, read_moving, sample, tool_load, undo_fixed, undo_moving, weight
+from jaxhil.sixdof.sensor import (
+    Sensor,
+    read_fixed,
+    read_moving,
+    sample,
+    tool_load,
+    undo_fixed,
+    undo_moving,
+    weight,
+)
 from jaxhil.sixdof.vectors import vector
 
 
@@ -34,7 +44,18 @@ def sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
         contact = jax.tree.map(jnp.add, contact, latch_force)
         latched.append(latch_state)
     measured = None if samples.measured is None else _measured_pose(loop, rig, state, samples.measured)
-    wrench, lag = _measured_wrench(loop, rig, state, contact, motion, measured)
+    timing, read_contact, read_motion = _draw_timing(rig, state.tick), contact, motion
+    if timing is not None and timing.jitter is not None:
+        late = read_late_motion(rig.axes, state.hardware, state.tick, timing.jitter, loop.hold)
+        read_motion = to_rigid_motion(rig.kinematics.coordinates(late, state.near))
+        # The contact and friction laws have no memory.
+        read_contact, _, _ = contact_wrench(
+            rig.groups, state.memories, read_motion.pose, read_motion.twist, rig.period
+        )
+    reading, lag = _read_sensor(loop, rig, state, read_contact, read_motion)
+    if timing is not None and timing.is_lost is not None and state.controller.held is not None:
+        reading = select_lanes(timing.is_lost, state.controller.held.reading, reading)
+    wrench = _undo_mounting(loop, rig.sensor, reading, measured)
     signals = SixAxisSignals(
         wrench=tuple(jax.tree.leaves(wrench)),
         pose_desired=state.near,
@@ -42,7 +63,17 @@ def sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
         pose_measured=measured,
         age=jnp.broadcast_to(state.tick, rig.period.shape),
     )
-    return Sensed(motion, contact, forces, memories, tuple(latched), lag, signals)
+    return Sensed(
+        motion=motion,
+        contact=contact,
+        forces=forces,
+        memories=memories,
+        latch_states=tuple(latched),
+        lag=lag,
+        signals=signals,
+        reading=None if timing is None else reading,
+        missed=None if timing is None else timing.is_missed,
+    )
 
 
 def start_filter(modes: FilterModes | None, nothing: Wrench) -> Any:
@@ -50,6 +81,14 @@ def start_filter(modes: FilterModes | None, nothing: Wrench) -> Any:
     if modes is None:
         return nothing
     return (jax.tree.map(as_complex, nothing),) * len(modes.rates)
+
+
+def _draw_timing(rig: RigConstants, now: Array) -> TimingDraws | None:
+    """Return the timing effects at tick `now`, (*batch); None if there are none."""
+    if rig.timing is None:
+        return None
+    age = jnp.broadcast_to(now, (1, *rig.period.shape))
+    return jax.tree.map(lambda leaf: leaf[0], draw_timing(rig.timing, rig.key, jnp.zeros_like(age[0]), age))
 
 
 def _measured_pose(loop: Loop, rig: RigConstants, state: RunState, measured: Array) -> Array:
@@ -62,15 +101,10 @@ def _measured_pose(loop: Loop, rig: RigConstants, state: RunState, measured: Arr
     return quantise(noisy, rig.sensor.position_quantum)
 
 
-def _measured_wrench(
-    loop: Loop,
-    rig: RigConstants,
-    state: RunState,
-    contact: Wrench,
-    motion: RigidMotion,
-    measured: Array | None,
+def _read_sensor(
+    loop: Loop, rig: RigConstants, state: RunState, contact: Wrench, motion: RigidMotion
 ) -> tuple[Wrench, tuple[Wrench, Any] | None]:
-    """Return the measured wrench about T's origin, and the next state of the sensor's lag or filter."""
+    """Return the reading of the sensor's channels, and the next state of the sensor's lag or filter."""
     sensor, last = rig.sensor, state.controller
     if motion.acceleration is None:
         raw = read_fixed(contact, sensor.mounting)
@@ -81,15 +115,18 @@ def _measured_wrench(
     reading = _read_filter(loop.sensor_filter, lagged)
     noise = sensor.noise_std * _noise(rig, state.tick, 0) if loop.has_noise else None
     reading = sample(reading, sensor.errors, noise, loop.has_sample_effects, loop.cuts_dead_zone)
+    return reading, None if last.lag is None else (raw, lagged)
+
+
+def _undo_mounting(loop: Loop, sensor: Sensor, reading: Wrench, measured: Array | None) -> Wrench:
+    """Return the wrench about T's origin that the controller reconstructs from the sensor's channels."""
     unbiased: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
-    if motion.acceleration is None:
-        wrench = undo_fixed(unbiased, sensor.mounting)
-    else:
-        assert measured is not None
-        pose = Pose(vector(measured[:3]), exponential(vector(measured[3:])))
-        load = weight(sensor.assumed_tool, pose.attitude, sensor.assumed_gravity)
-        wrench = undo_moving(unbiased, load, pose)
-    return wrench, None if last.lag is None else (raw, lagged)
+    if loop.side == "fixed":
+        return undo_fixed(unbiased, sensor.mounting)
+    assert measured is not None
+    pose = Pose(vector(measured[:3]), exponential(vector(measured[3:])))
+    load = weight(sensor.assumed_tool, pose.attitude, sensor.assumed_gravity)
+    return undo_moving(unbiased, load, pose)
 
 
 def _advance_filter(loop: Loop, rig: RigConstants, now: Array, raw: Wrench, last: Wrench, state: Any) -> Any:

@@ -60,11 +60,11 @@ def build_simulated_rig(mechanism: AnyMechanism, seed: int = 0) -> SimulatedRig:
         mechanism: mechanism and rig to simulate.
         seed: seed of the sensor noise and of the phases.
     """
+    if mechanism.rig.missed_tick_probability:
+        found = format_value(mechanism.rig.missed_tick_probability)
+        expected = "0 for a rehearsal; lost packets (--drops) make the controller miss ticks"
+        raise InputError(f"rig.missed_tick_probability: found {found}, expected {expected}")
     if isinstance(mechanism, Mechanism):
-        if mechanism.rig.missed_tick_probability:
-            found = format_value(mechanism.rig.missed_tick_probability)
-            expected = "0 for a rehearsal; lost packets (--drops) make the controller miss ticks"
-            raise InputError(f"rig.missed_tick_probability: found {found}, expected {expected}")
         from tuning.rig.one_axis_rig import OneAxisRig
 
         return OneAxisRig(mechanism, seed)

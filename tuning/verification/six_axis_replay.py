@@ -12,6 +12,7 @@ import numpy as np
 from jaxhil.mechanism.six_axes import SixAxisMechanism
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.rig.six_axes import Controller6
+from jaxhil.simulation.timing import without_missed_ticks
 from jaxhil.sixdof.building import build_scenarios, make_loop
 from jaxhil.sixdof.controller_record import ControllerRecord, record_controller
 from jaxhil.sixdof.loop_state import Loop
@@ -39,16 +40,19 @@ def six_axis_loop(mechanism: SixAxisMechanism, compensator: str, scenario: Scena
 def draw_scenarios(mechanism: SixAxisMechanism, number: int, seed: int) -> Scenario:
     """Draw `number` scenarios with the nominal control period; return the nominal scenario for 0."""
     if not number:
-        return build_scenarios(mechanism, seed=seed)
+        return build_drawn_scenarios(mechanism, {}, seed)
     return build_drawn_scenarios(mechanism, draw(mechanism, number, seed), seed)
 
 
 def build_drawn_scenarios(
     mechanism: SixAxisMechanism, draws: Mapping[str, Any], seed: int, first: int = 0
 ) -> Scenario:
-    """Build scenarios with drawn values, but with the nominal control period, which the gain file fixes."""
+    """Build scenarios with drawn values, but with the nominal control period, which the gain file fixes.
+
+    The scenarios have no missed ticks.
+    """
     drawn = {path: values for path, values in draws.items() if path != "rig.control_period"}
-    return build_scenarios(mechanism, drawn, seed, first)
+    return without_missed_ticks(build_scenarios(mechanism, drawn, seed, first))
 
 
 def record_runs(
