@@ -15,7 +15,6 @@ import jaxhil
 import tuning
 from jaxhil import InputError
 from jaxhil.mechanism.file import load_any
-from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.simulation.timing import hold_compensator
 from jaxhil.sixdof.building import build_scenarios
@@ -128,11 +127,10 @@ def test_six_axis_derivatives_with_timing_effects_equal_central_differences():
 def test_six_axis_sweep_with_timing_effects_states_that_the_rig_is_unsafe():
     uncertain = {MISSED: {"distribution": "uniform", "low": 0.0, "high": 0.5}}
     mechanism = load_any("probe-drogue", ALL | {"uncertainty": uncertain}).mechanism
-    result = tuning.tune(mechanism, "impulse_ledger", scenarios=4, starts=1, validation=4, seed=0)
-    study = tuning.sweep(result, scenarios=32, limit=0.05)
+    result = tuning.tune(mechanism, "phase_lead", scenarios=2, starts=1, steps=1, validation=2, seed=0)
+    study = tuning.sweep(result, scenarios=16, limit=0.05)
     assert study.failure_probability > 0.1
-    again = tuning.sweep(result, scenarios=32, limit=0.05)
+    again = tuning.sweep(result, scenarios=16, limit=0.05)
     assert again.table.equals(study.table)
-    assert draw(mechanism, 4, 0)[MISSED].max() < 0.5
     # The controller is compared with the simulation without missed ticks.
     assert tuning.verify(result).good
