@@ -4,22 +4,26 @@
 `test_six_axis_udp.py` the rehearsal with `simulate`.
 """
 
+import json
 import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gain_documents import sign
 
 import jaxhil
 import tuning
 from jaxhil import InputError
+from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load_any
 from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.simulation.timing import hold_compensator
 from jaxhil.sixdof.building import build_scenarios
 from jaxhil.sixdof.plausibility import check_scenario
 from jaxhil.sixdof.six_axes import SIX_AXES
+from tuning.gain_file import build_document
 from tuning.rig.rig_task import build_simulated_rig
 
 JITTER, LOSS = "rig.force_sensor.jitter", "rig.force_sensor.loss_probability"
@@ -122,9 +126,6 @@ def test_six_axis_derivatives_with_timing_effects_equal_central_differences():
             print(names[index], slope, (steps[0] - steps[1]) / 2e-5)
             np.testing.assert_allclose(slope, (steps[0] - steps[1]) / 2e-5, rtol=1e-4, atol=1e-6)
 
-
-@pytest.mark.slow
-def test_six_axis_sweep_with_timing_effects_states_that_the_rig_is_unsafe():
     uncertain = {MISSED: {"distribution": "uniform", "low": 0.0, "high": 0.5}}
     mechanism = load_any("probe-drogue", ALL | {"uncertainty": uncertain}).mechanism
     result = tuning.tune(mechanism, "phase_lead", scenarios=2, starts=1, steps=1, validation=2, seed=0)
@@ -134,3 +135,27 @@ def test_six_axis_sweep_with_timing_effects_states_that_the_rig_is_unsafe():
     assert again.table.equals(study.table)
     # The controller is compared with the simulation without missed ticks.
     assert tuning.verify(result).good
+
+
+def save_gains(folder, compensator, overrides):
+    """Write a gain file with the literature's gains; return its path."""
+    loaded = load_any("probe-drogue", overrides)
+    gains = literature_gains(loaded.mechanism, compensator)
+    document = sign(build_document(compensator, gains, loaded.mechanism, loaded.sha256, {}, {}, 0, {}))
+    (folder / "gains.json").write_text(json.dumps(document))
+    return str(folder / "gains.json")
+
+
+@pytest.mark.slow
+def test_six_axis_sweep_with_timing_effects_states_that_the_rig_is_unsafe(tmp_path):
+    uncertain = {MISSED: {"distribution": "uniform", "low": 0.0, "high": 0.5}}
+    gains = save_gains(tmp_path, "impulse_ledger", ALL | {"uncertainty": uncertain})
+    study = tuning.sweep(gains, scenarios=16, limit=0.05)
+    assert study.failure_probability > 0.1
+    assert tuning.sweep(gains, scenarios=16, limit=0.05).table.equals(study.table)
+
+
+@pytest.mark.slow
+def test_six_axis_gains_of_rig_with_timing_effects_are_verified(tmp_path):
+    """The controller is compared with the simulation without missed ticks."""
+    assert tuning.verify(save_gains(tmp_path, "phase_lead", ALL)).good
