@@ -63,7 +63,7 @@ static bool read_plant(void *plant, readings *now) {
     now->run = 1;
     now->time = seconds(CLOCK_MONOTONIC) - begin;
     now->tick = (uint32_t)(now->time / PERIOD);
-    now->position = now->start_position = -1.0;
+    now->position[0] = now->start[0] = -1.0;
     return true;
 }
 

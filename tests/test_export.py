@@ -378,4 +378,7 @@ def test_each_export_format_writes_its_own_files():
 
 C_FILES = ("jaxhil_controller.h", "jaxhil_controller.c", "jaxhil_gains.h", "test_vectors.c")
 FMU_FILES = ("jaxhil_controller.fmu", "jaxhil_rig.fmu", "test_vectors.c")
-LOOP_FILES = ("rt_loop.h", "rt_loop.c", "rt_log.h", "rt_log.c", "rt_plant_udp.c")
+LOOP_FILES = (
+    *("rt_loop.h", "rt_loop.c", "rt_task.h", "rt_task.c", "rt_model.h", "rt_model.c"),
+    *("rt_log.h", "rt_log.c", "rt_plant_udp.c"),
+)

@@ -11,7 +11,11 @@ from gain_documents import sign
 
 import tuning
 from jaxhil.mechanism.file import from_plain_data
+from jaxhil.rig import Controller
 from jaxhil.rig.faults import FAULTS
+from tuning.rig.numerical_model import OneAxisModelInLoop
+from tuning.rig.one_axis_rig import OneAxisRig
+from tuning.rig.rig_task import RigTask
 
 pytestmark = pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler")
 
@@ -31,6 +35,7 @@ class Result:
 
 
 MECHANISM = from_plain_data(Result.document["mechanism"], "gains")
+PERIOD = MECHANISM.rig.control_period
 
 
 @pytest.fixture(scope="module")
@@ -64,13 +69,27 @@ def check_shadow(ran):
     assert {contact["share"] for contact in document["contacts"]} == {0.0}
 
 
+def rig():
+    """Return a simulated rig."""
+    return RigTask(OneAxisRig(MECHANISM, 0), PERIOD)
+
+
+def test_loop_in_c_gives_answers_of_python_process(folder):
+    controller = Controller.from_dict(Result.document)
+    model = OneAxisModelInLoop(controller, Result.document["mechanism"])
+    ran = rt_loops.check_answers_of_python_process(folder, controller, model, (-0.05, 0.008))
+    trips = {answer.trip_reason for answer in ran.answers}
+    assert trips == {"", "tripped: velocity_limit", "tripped: force_not_finite"}
+
+
 def test_loop_in_c_stops_on_sigterm_with_the_drives_at_rest(folder):
-    ran = rt_loops.run_on_rig(folder, MECHANISM, 1.5, stop_at=120)
+    task = rig()
+    ran = rt_loops.run_in_lock_step(folder, rt_loops.readings_of(task), 1, task.take, stop_at=120)
     assert ran.code == 0 and ran.report["at_rest"] == [1]
-    assert ran.task.tripped == "tripped: emergency_stop"
+    assert task.tripped == "tripped: emergency_stop"
     rows = read_log(ran)
     stopped = int(np.argmax(rows[:, 7].astype(int) & EMERGENCY_STOP > 0))
-    assert 50 < stopped < 120 and np.max(rows[:stopped, 5]) > 1.0 and rows[-1, 5] == 0.0
+    assert 100 < stopped < 120 and np.max(rows[:stopped, 5]) > 1.0 and rows[-1, 5] == 0.0
     lines = ran.log.read_text().splitlines(keepends=True)
     ran.log.write_text("".join(lines[: stopped + 1]))
     check_shadow(ran)
@@ -78,7 +97,7 @@ def test_loop_in_c_stops_on_sigterm_with_the_drives_at_rest(folder):
 
 @pytest.mark.slow
 def test_loop_in_c_exits_with_1_if_it_loses_the_plant(folder):
-    ran = rt_loops.run_on_rig(folder, MECHANISM, 0.1, vanishes=True)
+    ran = rt_loops.run_on_rig(folder, OneAxisRig(MECHANISM, 0), PERIOD, 0.1, vanishes=True)
     assert ran.code == 1
     assert ran.errors.splitlines()[-1] == "rt_loop: plant: found no readings for 2 s, expected some"
 
@@ -97,7 +116,7 @@ def test_loop_in_c_rejects_wrong_options(program, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("seconds", [60, 600])
 def test_loop_in_c_completes_run_of_several_minutes(folder, seconds):
-    ran = rt_loops.run_on_rig(folder, MECHANISM, float(seconds), priority=80)
+    ran = rt_loops.run_on_rig(folder, OneAxisRig(MECHANISM, 0), PERIOD, float(seconds), priority=80)
     print("\n", {name: values for name, values in ran.report.items()}, "rig's packets late by up to",
           1e-9 * max(ran.timing.late), "s")  # fmt: skip
     assert ran.code == 0 and ran.task.tripped == ""
@@ -105,7 +124,7 @@ def test_loop_in_c_completes_run_of_several_minutes(folder, seconds):
     contacts = [contact for contact in ran.task.contacts if contact.status == "ok"]
     assert len(contacts) > seconds and np.max(rows[:, 6]) + 1 >= len(contacts)
     if ran.timing.clock_shift == 0:
-        assert len(rows) >= 0.9 * seconds / MECHANISM.rig.control_period
+        assert len(rows) >= 0.9 * seconds / PERIOD
 
 
 @pytest.mark.slow
@@ -114,6 +133,6 @@ def test_loop_in_c_completes_run_of_several_minutes(folder, seconds):
 )
 def test_loop_in_c_has_no_undefined_behaviour_under_sanitizers(tmp_path, options):
     program = rt_loops.compile_loop(c99_cases.COMPILER, Result.document, tmp_path, *options)
-    ran = rt_loops.run_on_rig(program, MECHANISM, 3.0)
+    ran = rt_loops.run_on_rig(program, OneAxisRig(MECHANISM, 0), PERIOD, 3.0)
     assert ran.code == 0
     check_log(ran)

@@ -15,6 +15,7 @@ from tuning.bundle.controller_kind import ONE_AXIS, kind_of
 
 TEMPLATE = Path(__file__).parent / "bundle_readme.md"
 SIX_AXIS_TEMPLATE = Path(__file__).parent / "bundle_readme_six_axes.md"
+LOOP_SECTION = Path(__file__).parent / "bundle_readme_loop.md"
 
 # Purpose of each file and folder in a bundle.
 FILE_DESCRIPTIONS = {
@@ -30,7 +31,7 @@ FILE_DESCRIPTIONS = {
     "udp_task.py": "computation of this process's answers",
     "numerical_model.py": "numerical model of the docking for this process",
     "numerical_model_six_axes.py": "numerical model of the docking for this process",
-    "c99": "controller in C99, its gains, its test program and, for one axis, a real-time loop",
+    "c99": "controller in C99, its gains, its test program, and a real-time loop for Linux",
     "fmi3": "FMUs of FMI 3.0 with sources: the controller and, for one axis, the simulated rig",
     "fmi2": "FMUs of FMI 2.0 with sources: the controller and, for one axis, the simulated rig",
     "ros2.yaml": "gains as ROS 2 parameters",
@@ -55,6 +56,7 @@ def readme_text(document: Mapping[str, Any], files: Collection[str]) -> str:
         side="moving" if document.get("constants", {}).get("sensor_sign") == 1.0 else "fixed",
         statuses=status_table(),
         faults=fault_table(kind.faults),
+        loop=LOOP_SECTION.read_text(encoding="utf-8").rstrip(),
         **({"model": describe_numerical_model(document["mechanism"])} if kind is ONE_AXIS else {}),
         outermost=f"forces to {FORCES[1]:g} N, positions to {POSITIONS[1]:g} m either way, position commands "
         f"that change by up to {SPEEDS[1]:g} m/s",

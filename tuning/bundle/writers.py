@@ -136,14 +136,14 @@ def csv_files(document: Mapping[str, Any]) -> dict[str, bytes]:
 
 
 def c99_files(document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the controller's C99 files and, for one axis, a real-time loop, in the folder `c99`.
+    """Return the controller's C99 files and a real-time loop, in the folder `c99`.
 
     Raise `InputError` if the compensator cannot be translated to C.
     """
     from tuning.bundle.c99 import generate_c99
     from tuning.bundle.rt_loop import rt_loop_files
 
-    files = generate_c99(document) | (rt_loop_files(document) if kind_of(document) is ONE_AXIS else {})
+    files = generate_c99(document) | rt_loop_files(document)
     return {f"c99/{name}": text.encode("ascii") for name, text in files.items()}
 
 

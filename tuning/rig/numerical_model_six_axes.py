@@ -7,7 +7,7 @@ quaternion (w, x, y, z) of the rotation from body axes, and angular momentum abo
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 BODY_NUMBERS = 13  # number of values in the state of a body
@@ -58,7 +58,7 @@ class SixAxisModelInLoop:
     def __init__(self, controller: Any, mechanism: dict[str, Any]) -> None:
         self._controller, self._period = controller, float(mechanism["rig"]["control_period"])
         self._share = SHARES[mechanism["rig"].get("integrator", "semi_implicit_euler")]
-        self._bodies = tuple(_build_body(mechanism[name]) for name in ("target", "chaser"))
+        self._bodies = tuple(build_body(mechanism[name]) for name in ("target", "chaser"))
         self._states: tuple[BodyMotion, ...] = ()
         zero = (0.0,) * self.axes
         self.command: tuple[float, ...] = zero
@@ -137,7 +137,9 @@ class SixAxisModelInLoop:
             return _compose(state.attitude, _exponential([duration * value for value in angular]))
 
         attitude = turned(turned(state.attitude, period / 2), period)
-        norm = math.sqrt(sum(part * part for part in attitude)) or math.nan
+        w, x, y, z = attitude
+        # Versions of Python differ in the rounding of `sum`.
+        norm = math.sqrt(w * w + x * x + y * y + z * z) or math.nan
         w, x, y, z = (part / norm for part in attitude)
         positions = zip(state.position, state.velocity, kick, strict=True)
         a, b, c = (at + period * (rate + share * more) for at, rate, more in positions)
@@ -158,14 +160,15 @@ class SixAxisModelInLoop:
         self.command = tuple(self._controller.pose_command(*self.motion))
 
 
-def _build_body(table: dict[str, Any]) -> FreeBody:
+def build_body(table: Mapping[str, Any]) -> FreeBody:
     """Build a body from a table of the mechanism file."""
     inertia = table["inertia"]
     if not isinstance(inertia[0], (list, tuple)):
         inertia = [[value if i == j else 0.0 for j in range(3)] for i, value in enumerate(inertia)]
     x, y, z = inertia
     columns = _cross(y, z), _cross(z, x), _cross(x, y)
-    determinant = sum(a * b for a, b in zip(x, columns[0], strict=True))
+    (a, b, c), (u, v, w) = x, columns[0]
+    determinant = a * u + b * v + c * w
     a, b, c = zip(*columns, strict=True)
     inverse = [(row[0] / determinant, row[1] / determinant, row[2] / determinant) for row in (a, b, c)]
     rotation = _exponential(table.get("interface_rotation", (0.0, 0.0, 0.0)))

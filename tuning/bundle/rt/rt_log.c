@@ -12,11 +12,9 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "rt_loop.h"
-
 #define RING_ROWS 8192u   /* rows between both threads, a power of 2 */
 #define BATCH_ROWS 64u    /* largest number of rows that are written together */
-#define ROW_SIZE 192      /* bytes, more than the longest row */
+#define ROW_SIZE (32 * ROW_VALUES) /* bytes, more than the longest row */
 
 static struct {
     log_row rows[RING_ROWS];
@@ -57,7 +55,7 @@ static bool write_text(int file, const char *text, size_t size) {
 
 /* Append a row to the text; return its new end. */
 static char *format_row(const log_row *row, char *text) {
-    for (int n = 0; n < 6; n++) {
+    for (int n = 0; n < ROW_VALUES; n++) {
         const double value = row->values[n];
         text += value == value ? sprintf(text, "%.17g,", value) : sprintf(text, "nan,");
     }

@@ -5,8 +5,12 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "rt_loop.h"
+
+enum { ROW_VALUES = 1 + 5 * AXES };
+
 typedef struct {
-    double values[6]; /* time, force reading without bias, model's position and velocity, position, force */
+    double values[ROW_VALUES]; /* time, force reading without bias, model's position and velocity, position, force */
     uint32_t contact, faults;
 } log_row;
 

@@ -1,7 +1,6 @@
-/* Real-time loop of the controller and the numerical model on Linux, with one axis.
+/* Real-time loop of the controller and the numerical model on Linux, with one axis or six axes.
  *
- *     cc -std=c99 -O2 -ffp-contract=off -pthread -o rt_loop rt_loop.c rt_log.c rt_plant_udp.c \
- *         jaxhil_controller.c -lm
+ *     cc -std=c99 -O2 -ffp-contract=off -pthread -o rt_loop rt_*.c jaxhil_controller.c -lm
  *     ./rt_loop [--log session.csv] [--cpu N] [--priority 80] [--seconds S] [--port 0]
  *
  * The plant (sensors and drives) is behind the four functions of `plant_io` in rt_loop.h. After the start, the
@@ -25,133 +24,20 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "jaxhil_controller.h"
-#include "jaxhil_gains.h"
 #include "rt_log.h"
 #include "rt_loop.h"
+#include "rt_model.h"
+#include "rt_task.h"
 
 #define START_GRACE 0.1   /* s; overruns before this time are not counted */
 #define LATE_SHARE 0.25   /* periods; if the loop wakes up later than this, it was woken too late */
 #define BUDGET_SHARE 0.8  /* periods; computation, or plant, that takes longer is an overrun */
 #define SILENCE 2.0       /* s; the loop ends if there are no readings for this time */
 #define STOP_TIME 5.0     /* s; longest time until the drives are at rest */
-#define MAX_INTERPOLATED 10.0 /* ticks without readings in a row that are interpolated */
 #define LATENCIES 100000u /* us; length of the histograms */
 
 volatile sig_atomic_t stop_requested = 0;
 
-/* ---- One tick of controller and numerical model ---- */
-static struct {
-    jaxhil_controller controller;
-    double position, velocity, acceleration, force, command;
-    uint32_t run, tick, contact;
-    readings last; /* of the last tick */
-    bool has_run, is_tared;
-} loop;
-
-static void move_model(void) {
-    const double acceleration = -loop.force / EQUIVALENT_MASS;
-    const double before = loop.velocity, after = before + PERIOD * acceleration;
-    loop.position += MODEL_STEP(before, acceleration, after);
-    loop.velocity = after;
-    loop.acceleration = acceleration;
-}
-
-static void command_position(void) {
-    loop.command =
-        jaxhil_position_command(&loop.controller, loop.position, loop.velocity, loop.acceleration);
-}
-
-/* Tare the sensor while the drives wait, then place the model at the start of the run. */
-static unsigned prepare(const readings *now) {
-    if (now->event == RESET && (!loop.has_run || now->run != loop.run)) {
-        jaxhil_reset(&loop.controller);
-    }
-    if (loop.has_run && now->run == loop.run) {
-        return READY;
-    }
-    loop.is_tared = loop.is_tared || jaxhil_tare(&loop.controller, now->force);
-    if (!loop.is_tared) {
-        return TARING;
-    }
-    if (loop.has_run) {
-        jaxhil_next_contact(&loop.controller);
-        loop.contact++;
-    }
-    const bool is_given = isfinite(now->start_position) && isfinite(now->start_velocity);
-    loop.position = is_given ? now->start_position : START_POSITION;
-    loop.velocity = is_given ? now->start_velocity : START_VELOCITY;
-    loop.acceleration = loop.force = 0.0;
-    loop.has_run = true;
-    loop.run = now->run;
-    loop.tick = UINT32_MAX; /* the tick before tick 0 */
-    command_position();
-    return READY;
-}
-
-/* Step controller and model by one tick; add a row to the log. */
-static void tick(double force, double position, double time, bool is_first) {
-    log_row row = {{time, force - jaxhil_bias(&loop.controller), loop.position, loop.velocity, position, 0.0},
-                   loop.contact, 0};
-    loop.force = jaxhil_step(&loop.controller, force, loop.position, loop.velocity, position, &time);
-    if (HAS_NOISE_OR_BIAS && is_first) {
-        loop.force = 0.0; /* the mechanism is free: noise must not act on the model */
-    }
-    move_model();
-    command_position();
-    row.values[5] = loop.force;
-    row.faults = loop.controller.faults | loop.controller.cause;
-    add_row(&row);
-}
-
-/* Make up for ticks whose readings are missing. Execute a few ticks with interpolated readings. If more ticks
- * are missing, only the model moves, under the last force, and the controller detects the gap in the time. */
-static void catch_up(const readings *now, uint32_t missed) {
-    const double most = jaxhil_exported_limits.missed_in_a_row;
-    if ((double)missed > (most < MAX_INTERPOLATED ? most : MAX_INTERPOLATED)) {
-        for (uint32_t n = 0; n < missed && n < 10000; n++) {
-            move_model();
-        }
-        return;
-    }
-    const bool has_last = loop.tick != UINT32_MAX;
-    for (uint32_t n = 0; n < missed; n++) {
-        const double weight = has_last ? (double)(n + 1) / (double)(missed + 1) : 1.0;
-        tick(loop.last.force + weight * (now->force - loop.last.force),
-             loop.last.position + weight * (now->position - loop.last.position),
-             now->time - (double)(missed - n) * PERIOD, loop.tick + 1 + n == 0);
-    }
-}
-
-/* Compute the commands for these readings; return false if they belong to no prepared run. */
-static bool compute(const readings *now, commands *answer) {
-    if (now->event != TICK) {
-        answer->flags = prepare(now);
-        answer->model_position = loop.position;
-        answer->model_velocity = answer->rate = loop.velocity;
-        answer->force = 0.0;
-    } else if (!loop.has_run || now->run != loop.run || (int32_t)(now->tick - loop.tick) <= 0) {
-        return false;
-    } else {
-        catch_up(now, now->tick - loop.tick - 1);
-        const double before = loop.command;
-        answer->flags = 0;
-        answer->model_position = loop.position;
-        answer->model_velocity = loop.velocity;
-        tick(now->force, now->position, now->time, now->tick == 0);
-        loop.tick = now->tick;
-        loop.last = *now;
-        answer->rate = jaxhil_tripped(&loop.controller) ? (loop.command - before) / PERIOD : loop.velocity;
-        answer->force = loop.force;
-    }
-    answer->position = loop.command;
-    answer->faults = loop.controller.faults;
-    answer->cause = loop.controller.cause;
-    answer->flags |= jaxhil_tripped(&loop.controller) ? TRIPPED : 0;
-    return true;
-}
-
-/* ---- Loop with absolute deadlines ---- */
 enum { WAKING, PLANT, COMPUTING, INTERRUPTION, CAUSES }; /* causes of a missed deadline */
 
 static struct {
@@ -178,7 +64,7 @@ static void count_latency(uint32_t *histogram, int64_t ns) {
 /* Compute the commands; measure the processor time, and the time during which other work had the processor. */
 static bool compute_timed(const readings *now, commands *answer, int64_t *spent) {
     const int64_t started = now_ns(), processor = read_clock(CLOCK_THREAD_CPUTIME_ID);
-    const bool has_answer = compute(now, answer);
+    const bool has_answer = rt_answer(now, answer);
     spent[COMPUTING] = read_clock(CLOCK_THREAD_CPUTIME_ID) - processor;
     spent[INTERRUPTION] = now_ns() - started - spent[COMPUTING];
     return has_answer;
@@ -218,10 +104,9 @@ static bool run_loop(const plant_io *io, double seconds) {
         report.periods++;
         if ((stop_requested || woken > end) && stopped == 0) {
             stopped = woken;
-            jaxhil_emergency_stop(&loop.controller, true); /* the force fades, the drives come to rest */
+            jaxhil_emergency_stop(&rt_controller, true); /* the force fades, the drives come to rest */
         }
-        if (stopped != 0 && (!loop.has_run || (jaxhil_at_rest(&loop.controller) && loop.force == 0.0) ||
-                             (double)(woken - stopped) > 1e9 * STOP_TIME)) {
+        if (stopped != 0 && (rt_is_at_rest() || (double)(woken - stopped) > 1e9 * STOP_TIME)) {
             return true;
         }
         const bool has_readings = io->read(io->plant, &now);
@@ -284,8 +169,8 @@ static void print_counts(const char *name, const uint64_t *counts, int number) {
 
 /* Print all numbers of the session; return false if they cannot be written. */
 static bool print_report(void) {
-    const uint64_t lost = lost_rows(), faults = loop.controller.seen;
-    const uint64_t at_rest = !loop.has_run || jaxhil_at_rest(&loop.controller);
+    const uint64_t lost = lost_rows(), faults = rt_controller.seen;
+    const uint64_t at_rest = rt_is_at_rest();
     print_counts("periods", &report.periods, 1);
     print_counts("ticks", &report.ticks, 1);
     print_counts("without_readings", &report.without_readings, 1);
@@ -367,7 +252,7 @@ int main(int count, char **arguments) {
             return 2;
         }
     }
-    if (!jaxhil_init(&loop.controller, &jaxhil_exported_gains, &jaxhil_exported_limits)) {
+    if (!rt_init()) {
         fprintf(stderr, "rt_loop: jaxhil_gains.h: a gain or limit is out of its range\n");
         return 2;
     }
@@ -378,8 +263,9 @@ int main(int count, char **arguments) {
     if (!start_log()) { /* before the priority is raised, which the thread therefore does not inherit */
         return 2;
     }
-    bool is_complete = io->open(io->plant);
-    if (is_complete) {
+    const bool is_open = io->open(io->plant);
+    bool is_complete = is_open || stop_requested;
+    if (is_open) {
         request_real_time(cpu, (int)priority);
         is_complete = run_loop(io, seconds);
         io->close(io->plant);

@@ -1,4 +1,4 @@
-/* Interface between the real-time loop (rt_loop.c) and the plant: sensors and drives with one axis. */
+/* Interface between the real-time loop (rt_loop.c) and the plant: sensors and drives. */
 #ifndef RT_LOOP_H
 #define RT_LOOP_H
 
@@ -15,16 +15,19 @@ typedef struct {
     int event;             /* PREPARE: the drives wait for the run with this number; TICK: a run goes on */
     uint32_t run, tick;    /* number of the run, number of the tick in the run */
     double time;           /* of the tick, from a steady clock [s] */
-    double force, position;                   /* readings [N], [m] */
-    double start_position, start_velocity;    /* of the model at tick 0 [m], [m/s]; NaN for the default */
+    double force[AXES];    /* reading [N]; six axes: wrench on the chaser about T's origin, in T axes [N, N m] */
+    double position[AXES]; /* reading [m]; six axes: pose of C relative to T [m, rad] */
+    /* Model at tick 0. One axis: position [m] and velocity [m/s], or NaN for the default. Six axes: position
+     * and velocity of the centre of mass, quaternion and angular momentum of target and chaser, in world axes. */
+    double start[START_VALUES];
     double shift; /* added to the next deadline, to follow the clock of the plant [s]; or 0 */
 } readings;
 
 typedef struct {
     unsigned flags;
-    double position, rate;                    /* commands to the drives [m], [m/s] */
-    double model_position, model_velocity;    /* of the model at this tick */
-    double force;                             /* force on the model [N] */
+    double position[AXES], rate[AXES];        /* commands to the drives [m, rad], [m/s, rad/s] */
+    double model_position[AXES], model_velocity[AXES]; /* of the model at this tick */
+    double force[AXES];                       /* on the model [N, N m] */
     uint32_t faults, cause;                   /* bits of the faults: of the tick, of the trip */
 } commands;
 

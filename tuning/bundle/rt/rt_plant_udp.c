@@ -13,25 +13,22 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "jaxhil_controller.h"
-#include "rt_loop.h"
+#include "rt_model.h"
+
+enum { BODY_VALUES = AXES == 6 ? START_VALUES : 0, BODIES_AT = 32 + 5 * 8 * AXES }; /* states of the bodies */
+enum { READING_SIZE = 40 + 8 * (2 * AXES + START_VALUES), ANSWER_SIZE = BODIES_AT + 8 * BODY_VALUES + 104 };
 
 typedef struct {
     int socket;
     struct sockaddr_in peer;
-    bool has_peer, is_open;
+    bool has_peer, is_open, has_first;
+    readings first; /* of the packet with which the session begins */
     uint64_t session;
     uint32_t sequence, run, tick;
-    unsigned char packet[512], answer[176];
+    unsigned char packet[READING_SIZE + 1], answer[ANSWER_SIZE];
 } udp_plant;
 
 static udp_plant the_plant;
-
-static double get_double(const unsigned char *from) {
-    double value;
-    memcpy(&value, from, sizeof value);
-    return value;
-}
 
 static uint32_t get_uint32(const unsigned char *from) {
     uint32_t value;
@@ -51,14 +48,15 @@ static bool take_packet(udp_plant *udp, size_t size, const struct sockaddr_in *s
     const bool is_peer = udp->has_peer && sender->sin_port == udp->peer.sin_port &&
                          sender->sin_addr.s_addr == udp->peer.sin_addr.s_addr;
     if (size == 24 && memcmp(packet, "JHas\3", 5) == 0 && (is_peer || !udp->is_open)) {
-        memcpy(packet, "JHop\3\1", 6);
+        memcpy(packet, "JHop\3", 5);
+        packet[5] = AXES;
         memcpy(packet + 16, &udp->session, 8);
         udp->peer = *sender;
         udp->has_peer = true;
         sendto(udp->socket, packet, 24, 0, (const struct sockaddr *)sender, sizeof *sender);
         return false;
     }
-    if (!is_peer || size != 72 || memcmp(packet, "JHrd\3", 5) != 0 || packet[6] != 1 ||
+    if (!is_peer || size != READING_SIZE || memcmp(packet, "JHrd\3", 5) != 0 || packet[6] != AXES ||
         memcmp(packet + 8, &udp->session, 8) != 0) {
         return false;
     }
@@ -71,11 +69,10 @@ static bool take_packet(udp_plant *udp, size_t size, const struct sockaddr_in *s
     now->event = packet[5];
     now->run = udp->run = get_uint32(packet + 20);
     now->tick = udp->tick = get_uint32(packet + 24);
-    now->time = get_double(packet + 32);
-    now->force = get_double(packet + 40);
-    now->position = get_double(packet + 48);
-    now->start_position = get_double(packet + 56);
-    now->start_velocity = get_double(packet + 64);
+    memcpy(&now->time, packet + 32, 8);
+    memcpy(now->force, packet + 40, sizeof now->force);
+    memcpy(now->position, packet + 40 + 8 * AXES, sizeof now->position);
+    memcpy(now->start, packet + 40 + 16 * AXES, sizeof now->start);
     return true;
 }
 
@@ -110,7 +107,6 @@ static bool udp_open(void *plant) {
     struct sockaddr_in address = udp->peer; /* with the port of the option --port */
     socklen_t length = sizeof address;
     struct timespec now;
-    readings first;
     address.sin_family = AF_INET;
     address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
     clock_gettime(CLOCK_REALTIME, &now);
@@ -124,8 +120,9 @@ static bool udp_open(void *plant) {
     printf("port %d\n", ntohs(address.sin_port));
     fflush(stdout);
     for (int number = 0; number < 300 && !stop_requested; number++) {
-        if (udp_receive(udp, &first, 100000)) {
-            return true; /* the loop begins in phase with the first packet; the rig repeats its tick */
+        udp->has_first = udp_receive(udp, &udp->first, 100000);
+        if (udp->has_first) {
+            return true; /* the loop begins in phase with the first packet */
         }
     }
     return false;
@@ -133,12 +130,18 @@ static bool udp_open(void *plant) {
 
 /* Wait up to half a period. Shift the loop so that it wakes up shortly before the packet of the rig arrives. */
 static bool udp_read(void *plant, readings *now) {
+    udp_plant *const udp = (udp_plant *)plant;
+    const bool has_newer = udp_receive(udp, now, 0);
+    if (udp->has_first && !has_newer) {
+        *now = udp->first;
+    }
     now->shift = -PERIOD / 50.0;
-    if (udp_receive((udp_plant *)plant, now, 0)) {
+    if (udp->has_first || has_newer) {
+        udp->has_first = false;
         return true;
     }
     const double begin = seconds_now();
-    const bool has_readings = udp_receive((udp_plant *)plant, now, (long)(5e5 * PERIOD));
+    const bool has_readings = udp_receive(udp, now, (long)(5e5 * PERIOD));
     now->shift = has_readings ? (seconds_now() - begin - PERIOD / 20.0) / 8.0 : 0.0;
     return has_readings;
 }
@@ -165,17 +168,22 @@ static bool udp_write(void *plant, const commands *answer) {
     memset(packet, 0, sizeof udp->answer);
     memcpy(packet, "JHan\3", 5);
     packet[5] = (unsigned char)answer->flags;
-    packet[6] = 1;
+    packet[6] = AXES;
     memcpy(packet + 8, &udp->session, 8);
     memcpy(packet + 16, &udp->sequence, 4);
     memcpy(packet + 20, &udp->run, 4);
     memcpy(packet + 24, &udp->tick, 4);
-    const double values[5] = {answer->position, answer->rate, answer->model_position, answer->model_velocity,
-                              answer->force};
-    memcpy(packet + 32, values, sizeof values);
-    memcpy(packet + 72, &faults, 8);
+    const double *const vectors[5] = {answer->position, answer->rate, answer->model_position,
+                                      answer->model_velocity, answer->force};
+    for (int n = 0; n < 5; n++) {
+        memcpy(packet + 32 + n * 8 * AXES, vectors[n], 8 * AXES);
+    }
+    double bodies[START_VALUES];
+    const size_t count = rt_bodies(bodies);
+    memcpy(packet + BODIES_AT, bodies, 8 * count);
+    memcpy(packet + ANSWER_SIZE - 104, &faults, 8);
     if (answer->flags & TRIPPED) {
-        describe_trip(answer->cause, (char *)packet + 80);
+        describe_trip(answer->cause, (char *)packet + ANSWER_SIZE - 96);
     }
     return sendto(udp->socket, packet, sizeof udp->answer, 0, (const struct sockaddr *)&udp->peer,
                   sizeof udp->peer) == (ssize_t)sizeof udp->answer;
