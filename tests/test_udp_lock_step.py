@@ -120,6 +120,27 @@ def test_readings_of_a_long_gap_are_not_interpolated(varying):
     assert math.isfinite(*tripped.position_command) and math.isfinite(*tripped.command_rate)
 
 
+@pytest.mark.parametrize(
+    ("velocity_limit", "limited_in_a_row", "missed", "trips"),
+    [
+        (0.0076, 0.0, MAX_INTERPOLATED_TICKS, False),
+        (0.0076, 0.0, MAX_INTERPOLATED_TICKS + 1, True),
+        (0.1001, 0.0, 19, False),
+        (0.1001, 0.0, 20, True),
+        (0.0301, 3.0, 20, False),
+        (0.0301, 3.0, 21, True),
+    ],
+)
+def test_velocity_limit_trips_after_a_gap_that_the_drives_cannot_follow(
+    varying, velocity_limit, limited_in_a_row, missed, trips
+):
+    """Expect a trip if (n + m) v > m V for n missing ticks at the speed v = 5 mm/s, with m limited ticks."""
+    task = prepared(varying[0], velocity_limit=velocity_limit, limited_in_a_row=limited_in_a_row)
+    ticks = (0, 1, 2, *range(3 + missed, 11 + missed))
+    answers = [task.answer(a_reading(tick)) for tick in ticks]
+    assert answers[-1].trip_reason == ("tripped: velocity_limit" if trips else "")
+
+
 def test_outdated_packets_are_dropped_and_counted(varying):
     task = prepared(varying[0])
     assert task.answer(a_reading(3)) is not None
