@@ -176,17 +176,19 @@ def _fmu_files(document: Mapping[str, Any], fmi: int) -> dict[str, bytes]:
 
 
 def describe_fmus(document: Mapping[str, Any], files: Mapping[str, bytes]) -> list[str]:
-    """Describe what the FMUs in a bundle lack: a library for Linux, or the rig on one axis."""
+    """Describe what the FMUs in a bundle lack: the rig, or a library for Linux."""
     from jaxhil.mechanism.file import from_plain_data
     from tuning.bundle.fmu import rig
     from tuning.bundle.fmu.archive import find_library
 
     archives = [content for name, content in files.items() if name.endswith(".fmu")]
     notes = []
-    if archives and kind_of(document) is ONE_AXIS:
-        unsupported = rig.describe_unsupported(
-            from_plain_data(copy.deepcopy(document["mechanism"]), "gain document")
-        )
+    if archives:
+        unsupported = f"mechanism: found {kind_of(document).axes} axes, expected 1"
+        if kind_of(document) is ONE_AXIS:
+            unsupported = rig.describe_unsupported(
+                from_plain_data(copy.deepcopy(document["mechanism"]), "gain document")
+            )
         notes += [f"The rig has no FMU: {unsupported}."] if unsupported else []
     if any(find_library(archive) is None for archive in archives):
         notes.append(
