@@ -1,5 +1,6 @@
 """Real-time loop in C: complete log, equal commands in shadow mode, and force command 0 after SIGTERM."""
 
+import signal
 import subprocess
 
 import bundles
@@ -93,6 +94,13 @@ def test_loop_in_c_stops_on_sigterm_with_the_drives_at_rest(folder):
     lines = ran.log.read_text().splitlines(keepends=True)
     ran.log.write_text("".join(lines[: stopped + 1]))
     check_shadow(ran)
+
+
+def test_loop_in_c_exits_with_0_if_sigterm_arrives_before_the_rig(folder):
+    with rt_loops.started_loop(folder) as (process, _, _):
+        process.send_signal(signal.SIGTERM)
+        output, errors = process.communicate(timeout=20)
+    assert process.returncode == 0 and errors == "" and rt_loops.read_report(output)["at_rest"] == [1]
 
 
 @pytest.mark.slow
