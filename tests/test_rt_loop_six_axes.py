@@ -41,7 +41,7 @@ RESULT = Result()
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory):
-    return rt_loops.compile_loop(c99_cases.COMPILER, RESULT.document, tmp_path_factory.mktemp("loop"), "-O1")
+    return rt_loops.compile_loop(c99_cases.COMPILER, RESULT.document, tmp_path_factory.mktemp("loop"), "-O0")
 
 
 @pytest.fixture
