@@ -9,11 +9,23 @@ import numpy as np
 import pytest
 
 from jaxhil.mechanism.file import from_plain_data, to_plain_data
+from tuning.identification.edge_check import check_force_smoothing
 from tuning.identification.identify import identify
 from tuning.identification.mechanism_check import check_against_mechanism
 from tuning.identification.motion import MotionResponse
 from tuning.identification.noise import estimate_noise
 from tuning.identification.rational import STRUCTURES, MotionModel
+from tuning.identification.uncertainty_effect import UncertaintyEffect
+
+
+def zoned(campaign, size, is_cut):
+    """Return the campaign of a force sensor with a dead zone [N], which is cut or continuous."""
+    runs = []
+    for run in campaign.runs:
+        force = np.nan_to_num(np.asarray(run.force_measured, float))
+        less = 0.0 if is_cut else size * np.sign(force)
+        runs.append(replace(run, force_measured=np.where(np.abs(force) > size, force - less, 0.0)))
+    return replace(campaign, runs=tuple(runs))
 
 
 def checked(monkeypatch, lag):
@@ -63,13 +75,7 @@ FILE_FINDING = "a cut dead zone of 3 N, which `identify` does not model"
 def test_identify_reports_dead_zone_that_sensor_does_not_subtract_as_defect(
     monkeypatch, is_cut, kind, expected
 ):
-    campaign = ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0)
-    runs = []
-    for run in campaign.runs:
-        force = np.nan_to_num(np.asarray(run.force_measured, float))
-        less = 0.0 if is_cut else 3.0 * np.sign(force)
-        runs.append(replace(run, force_measured=np.where(np.abs(force) > 3.0, force - less, 0.0)))
-    campaign = replace(campaign, runs=tuple(runs))
+    campaign = zoned(ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0), 3.0, is_cut)
     prior: dict[str, Any] = to_plain_data(ambiguous.prior("plain"))
     prior["rig"]["force_sensor"] |= {"dead_zone": 3.0, "dead_zone_kind": kind}
     result = identify(campaign, from_plain_data(prior, "prior"))
@@ -78,6 +84,29 @@ def test_identify_reports_dead_zone_that_sensor_does_not_subtract_as_defect(
     assert not (is_cut and result.good)
     assert result.mechanism is not None
     assert (result.mechanism["rig"]["force_sensor"].get("dead_zone_kind") == "cut") == (kind == "cut")
+
+
+@pytest.mark.parametrize("is_cut", [True, False])
+def test_cut_dead_zone_that_the_noise_exceeds_is_detected(monkeypatch, is_cut):
+    campaign = zoned(ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0), 1.0, is_cut)
+    raw = to_plain_data(ambiguous.truth("plain"))
+    raw["rig"]["force_sensor"] |= {"dead_zone": 1.0, "noise_std": 0.5}
+    result = check_against_mechanism(campaign, from_plain_data(raw, "truth"))
+    findings = [line.finding for line in result.lines if line.name == "dead zone of the force sensor"]
+    assert (
+        findings == ["no reading lies between 0 and 1 N, as with a dead zone that is not subtracted"] * is_cut
+    )
+
+
+@pytest.mark.parametrize(
+    ("response", "expected"), [((0.6, 0.4), 1), ((1.0,), 0), (0.8 ** np.arange(40), 0)], ids=str
+)
+def test_noise_at_rest_shows_interpolated_force(response, expected):
+    readings = np.convolve(np.random.default_rng(3).standard_normal(5000), response)
+    effect = UncertaintyEffect(0.002, 0.006, {"contact.damping": 0.002})
+    lines = check_force_smoothing(estimate_noise(readings), effect, 3.0, 0.002)
+    assert len(lines) == expected
+    assert all(line.is_significant and 0.006 < line.error_in_verdict < 0.012 for line in lines)
 
 
 def test_contact_motion_is_evaluated_at_the_times_of_force_readings():

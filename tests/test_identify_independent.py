@@ -98,6 +98,16 @@ def test_identify_verdict_is_good_for_campaign_of_independent_simulator(tmp_path
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "seed", "word"),
+    [("cut_dead_zone", 6050, "dead zone"), ("resampled_force", 6004, "interpolated")],
+)
+def test_identify_names_defect_of_sensor_that_residuals_hardly_show(kind, seed, word, tmp_path):
+    outcome = evaluate_identification(kind, seed, tmp_path)
+    assert (outcome.verdict, outcome.check) == ("bad", "bad") and word in outcome.message
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_identify_on_independent_simulator_never_calls_inaccurate_file_good(kind):
     outcomes = [evaluate(kind, seed) for seed in range(CAMPAIGNS)]

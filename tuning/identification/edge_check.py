@@ -5,6 +5,10 @@ resampled force changes the readings for some milliseconds after a jump of the f
 noise hides this change. The mean residual of all contacts, in rows at the same distance from the edge and
 weighted with the approach speeds, reveals it. If the mean is n standard deviations from 0, the estimates are
 assumed to be wrong by n standard deviations, too.
+
+In these residuals, a short smoothing of the readings, such as an interpolation between two samples, hardly
+differs from the lag of a sensor. A lag in its place gives a wrong damping and a wrong delay. The smoothing
+also correlates the noise of successive readings at rest, which reveals it.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ import numpy as np
 from scipy import special, stats
 
 from tuning.identification.contact_fit import ContactFit
+from tuning.identification.noise import NoiseEstimate, autocorrelate
 from tuning.identification.records import LoggedRun
 from tuning.identification.uncertainty_effect import EFFECT_PROBABILITY, UncertaintyEffect
 from tuning.identification.validation import DEFECT_P_VALUE, CheckResult, flag_certain_rows
@@ -22,6 +27,12 @@ from tuning.identification.validation import DEFECT_P_VALUE, CheckResult, flag_c
 # numbers of evaluated rows outside and inside the contact at each edge
 ROWS_OUTSIDE_CONTACT, ROWS_INSIDE_CONTACT = 3, 15
 MIN_CONTACTS_FOR_MEAN = 3  # minimum number of contacts for a mean
+MIN_CORRELATION_ERRORS = 4.0  # minimum correlation of successive readings, in standard errors
+MAX_CORRELATION_RATIO = 1 / 3  # maximum correlation of every other reading divided by that of successive ones
+# Error of the estimated delay, divided by the standard deviation of the smoothing: measured with interpolated
+# readings of contacts whose fits have a lag.
+SMOOTHING_DELAY_SHARE = 0.3
+MAX_SMOOTHING_ERROR_RATIO = 2.0  # maximum effect of a smoothing, divided by that of the uncertain parameters
 
 
 def check_contact_edges(
@@ -52,6 +63,35 @@ def check_contact_edges(
             "edges of contact", finding, is_present, times * effect.restitution, on_error=times * effect.error
         )
     ]
+
+
+def check_force_smoothing(
+    noise: NoiseEstimate | None, effect: UncertaintyEffect, frequency: float, period: float
+) -> list[CheckResult]:
+    """Check that the noise at rest does not show a smoothing over two readings, such as an interpolation.
+
+    Linear interpolation with the shares a and 1 - a correlates only successive readings. Its impulse response
+    has the standard deviation sqrt(a (1 - a)) periods. Slower noise can have other causes and passes.
+
+    Args:
+        noise: Noise of the force at rest, or None if it is unknown.
+        effect: Effect of the parameters' uncertainty on e and on e - e*.
+        frequency: Contact frequency [Hz].
+        period: Control period [s].
+
+    Returns:
+        A list with one failed check, or an empty list if the noise shows no smoothing.
+    """
+    if noise is None or noise.silent or len(noise.filter) == 1 or not effect.parts:
+        return []
+    first, second = autocorrelate(noise.filter)[:2]
+    if first < MIN_CORRELATION_ERRORS / np.sqrt(noise.number) or second > MAX_CORRELATION_RATIO * first:
+        return []
+    smoothing = period * float(np.sqrt(min(first / (1.0 + 2.0 * first), 0.25)))
+    error = np.pi**2 * frequency * SMOOTHING_DELAY_SHARE * smoothing
+    finding = f"successive readings at rest have a correlation of {first:.2g}, as if they were interpolated"
+    on_error = min(error, MAX_SMOOTHING_ERROR_RATIO * effect.error)
+    return [CheckResult("noise of the force", finding, True, 0.0, on_error=on_error)]
 
 
 def average_edge_residuals(contact: ContactFit, runs: Sequence[LoggedRun]) -> np.ndarray:

@@ -18,7 +18,7 @@ from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProble
 from tuning.identification.contact_profile import Posterior
 from tuning.identification.contact_regression import CoefficientFit
 from tuning.identification.contact_runs import exclude_rows_after_gaps, split_long_run
-from tuning.identification.edge_check import check_contact_edges
+from tuning.identification.edge_check import check_contact_edges, check_force_smoothing
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.motion import MotionResponse
@@ -91,6 +91,8 @@ def check_against_mechanism(
     effect = compute_uncertainty_effect(mechanism)
     if contact is not None and not _has_uncertain_dead_zone(mechanism):
         lines += check_contact_edges(contact, touching, effect)
+    if contact is not None:
+        lines += check_force_smoothing(_estimate_force_noise(campaign.runs), effect, frequency, period)
     lines += check_file_uncertainty(effect, any(run.kind == "press" for run in campaign.runs))
     return Identification(
         estimates=(),

@@ -64,7 +64,7 @@ def estimate_noise(readings: np.ndarray) -> NoiseEstimate:
     whitening = fit_whitening_filter(readings - mean)
     # The standard error of the mean of correlated readings follows from the noise spectrum at 0 Hz.
     at_zero = np.sqrt(compute_whitened_share(whitening)) / abs(np.sum(whitening))
-    effective = 1.0 + 2.0 * np.sum(_autocorrelate(whitening) ** 2)
+    effective = 1.0 + 2.0 * np.sum(autocorrelate(whitening) ** 2)
     # Rounding increases the scatter of the readings.
     width = np.hypot(std, quantum / np.sqrt(12.0))
     return NoiseEstimate(
@@ -190,7 +190,7 @@ def fit_whitening_filter(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(value) for value in chosen)
 
 
-def _autocorrelate(whitening: tuple[float, ...], longest: int = 200) -> np.ndarray:
+def autocorrelate(whitening: tuple[float, ...], longest: int = 200) -> np.ndarray:
     """Return the autocorrelation, at lags 1 to `longest`, of the noise that this filter whitens."""
     if len(whitening) == 1:
         return np.zeros(1)
@@ -206,5 +206,5 @@ def compute_whitened_share(whitening: tuple[float, ...]) -> float:
     """Return the variance of the noise after whitening, divided by the variance before whitening."""
     if len(whitening) == 1:
         return 1.0
-    rho = np.concatenate([[1.0], _autocorrelate(whitening)])[: len(whitening)]
+    rho = np.concatenate([[1.0], autocorrelate(whitening)])[: len(whitening)]
     return float(1.0 + np.asarray(whitening[1:]) @ rho[1:])

@@ -29,7 +29,7 @@ MAX_DELAY_SHARE = 0.93  # maximum force delay that passes the check, as a share 
 MIN_CONTACTS_FOR_DEAD_ZONE = 5  # minimum number of contacts for the check of small readings
 MAX_NONZERO_SHARE = 0.8  # maximum share of nonzero readings with a dead zone
 CUTTING_DEAD_ZONE_P_VALUE = 0.01  # maximum p-value that shows a dead zone which is not subtracted
-# minimum size of the smallest reading with a dead zone that is not subtracted, in standard deviations
+# A dead zone hides the noise out of contact if it is larger than this number of standard deviations.
 MIN_SMALL_READING_SIGMAS = 3.0
 MISFIT_SMOOTHING_LINES = 5  # number of adjacent frequency lines whose misfit is averaged
 
@@ -263,21 +263,28 @@ def _check_cutting_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list
     sensor replaces small forces by 0. The dead zone in mechanism files is another kind: it is also subtracted
     from larger forces.
     """
-    smallest, steps, peaks = [], [], []
+    delay, plane, coefficient_fit = contact.posterior.best
+    touching = contact.problem.touching(delay, plane, coefficient_fit.coefficients)
+    steps, peaks, sizes, outside = [], [], [], []
     for lane, run in enumerate(runs):
         force = np.abs(contact.readings.force[: len(run.tick), lane])
         (nonzero,) = np.nonzero(force)
         if run.kind == "contact" and len(nonzero) > 1 and len(nonzero) < MAX_NONZERO_SHARE * len(force):
-            smallest.append(force[nonzero].min())
             steps.append(abs(force[nonzero[-1]] - force[nonzero[-2]]))
             peaks.append(force.max())
-    if len(smallest) < MIN_CONTACTS_FOR_DEAD_ZONE:
+            sizes.append(force[nonzero])
+            outside.append(force[nonzero[~touching[nonzero, lane]]])
+    if len(peaks) < MIN_CONTACTS_FOR_DEAD_ZONE:
         return []
-    least, std = min(smallest), contact.readings.std
+    least, std = min(size.min() for size in sizes), contact.readings.std
     quantum = np.diff(np.unique(contact.readings.force)).min(initial=np.inf)
     # In a smooth release, the last reading is assumed to be uniform between 0 and the last step.
     probability = np.prod(np.maximum(1.0 - least / (np.array(steps) + 2.0 * std + 1e-300), 0.0))
-    if least <= max(MIN_SMALL_READING_SIGMAS * std, 2.5 * quantum) or probability > CUTTING_DEAD_ZONE_P_VALUE:
+    if least <= MIN_SMALL_READING_SIGMAS * std:
+        # Beyond a zone that is subtracted, the noise becomes rarer with size. Each reading of at most twice
+        # the smallest one then has a probability of at least 1/2 to be smaller than the smallest one.
+        probability = 0.5 ** np.count_nonzero(np.concatenate(outside) <= 2.0 * least)
+    if least <= 2.5 * quantum or probability > CUTTING_DEAD_ZONE_P_VALUE:
         return []
     finding = f"no reading lies between 0 and {least:.2g} N, as with a dead zone that is not subtracted"
     return [CheckResult("dead zone of the force sensor", finding, True, float(least / np.median(peaks)))]
