@@ -30,6 +30,7 @@ class Kind:
     rig: Callable[[np.random.Generator, Rig], dict[str, Any]] = lambda rng, rig: {}
     unknown: tuple[str, ...] = ()  # keys that the prior lacks
     defect: tuple[str, ...] = ()  # a message must contain one of these words; empty for a kind without defect
+    states_filter: bool = False  # the prior states kind and order of the filter, and a cutoff
     sweep: bool = False  # the free motion is a swept sine in place of a multisine
     colour: float = 0.0  # standard deviation of low-frequency noise of the force [N]
     walk: float = 0.0  # N/sqrt(s), random walk of the force bias
@@ -68,6 +69,8 @@ KINDS = {
     "late_position": Kind(late=20),
     "butterworth_2": Kind(_butterworth(2), defect=FILTER),
     "butterworth_4": Kind(_butterworth(4), defect=FILTER),
+    "butterworth_2_stated": Kind(_butterworth(2), states_filter=True),
+    "butterworth_4_stated": Kind(_butterworth(4), states_filter=True),
     "cut_dead_zone": Kind(
         lambda rng, rig: {"dead_zone": rng.uniform(1.0, 6.0), "cut": True}, defect=("dead zone",)
     ),
@@ -347,5 +350,9 @@ def mechanism_file(rig, speed, kind, factors):
         "rig.force_sensor.time_constant": 1 / (2 * np.pi * rig.cutoff) if rig.filter_order == 1 else 0.0,
         "rig.force_sensor.dead_zone": rig.dead_zone,
     }
+    if kind.states_filter:
+        cutoff = rig.cutoff * factors[2]
+        low_pass = f'{{ kind = "butterworth", order = {rig.filter_order}, cutoff = {cutoff} }}'
+        values["rig.force_sensor.filter"] = low_pass
     lines = ['schema = "jaxhil/mechanism/1"', 'name = "afternoon"']
     return "\n".join(lines + [f"{key} = {value}" for key, value in values.items() if key not in kind.unknown])

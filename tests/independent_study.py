@@ -120,9 +120,14 @@ def check_intervals(rig, document):
     items = {item["key"]: item for item in (*document["estimates"], *document["combinations"])}
     # Only the sum of the delays of motion and position sensor is determined.
     share = items.get("rig.position_sensor.delay", {"value": 0.0})["value"]
-    age = rig.force_delay + share + (1 / (2 * np.pi * rig.cutoff) if rig.filter_order == 1 else 0.0)
-    lagging = "rig.force_sensor.time_constant" in items
+    age = rig.force_delay + share
+    lagging = {"rig.force_sensor.time_constant", "rig.force_sensor.filter.cutoff"} & set(items)
+    if rig.filter_order and (rig.filter_order == 1 or "rig.force_sensor.filter.cutoff" in items):
+        # At low frequencies, the filter acts like a delay.
+        sines = np.sin(np.pi * (2 * np.arange(rig.filter_order) + 1) / (2 * rig.filter_order))
+        age += sines.sum() / (2 * np.pi * rig.cutoff)
     true = {
+        "rig.force_sensor.filter.cutoff": rig.cutoff,
         "contact.stiffness.0": rig.stiffness,
         "contact.damping.0": rig.damping,
         "rig.contact_plane": rig.plane,

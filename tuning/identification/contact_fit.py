@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaxhil.mechanism.structs import ForceSensor
 from tuning.identification import clock_drift, damping_average
 from tuning.identification.clock_drift import ClockDrift
 from tuning.identification.contact_laws import Law, kelvin_voigt
@@ -33,6 +34,7 @@ from tuning.identification.sensor_lag import (
     compute_posterior_at_lag,
     estimate_sensor_lag,
 )
+from tuning.identification.stated_filter import estimate_stated_filter
 
 SPECIFIED_DEAD_ZONE_STD = 1e-3  # relative standard deviation of a specified dead zone
 UNKNOWN_SURFACE_STD = 5e-5  # standard deviation of a surface position that is assumed to be 0 [m]
@@ -85,7 +87,7 @@ def fit_contact(
     law: Law | str | None = None,
     plane: float | None = None,
     seed: int = 0,
-    dead_zone: float = 0.0,
+    sensor: ForceSensor | None = None,
 ) -> ContactFit:
     """Fit a contact law, the surface position and the force delay to all runs in contact together.
 
@@ -97,14 +99,16 @@ def fit_contact(
         law: Contact law; or name of a law whose shape parameters are fitted, too; or None to choose a law.
         plane: Position of the surface [m], or None to estimate it.
         seed: Seed of the random numbers.
-        dead_zone: Specified dead zone [N], or 0. It is ignored if readings at rest do not show one.
+        sensor: Specified force sensor, or None. Its filter is ignored if a dead zone hides the noise, and its
+            dead zone if readings at rest do not show one.
     """
+    sensor = sensor or ForceSensor()
     drift = _estimate_clock_drift(runs, model, timing, noise, law, plane) if timing.two_clocks else None
     motion = MotionResponse(
         model, runs, timing, MAX_FORCE_DELAY + timing.control_period, drift and drift.delays
     )
     plane_option = plane
-    readings, plane = _prepare_readings(runs, motion, noise, plane, dead_zone)
+    readings, plane = _prepare_readings(runs, motion, noise, plane, sensor)
     noise_is_hidden = noise is not None and noise.silent
     evaluated: tuple[EvaluatedLaw, ...] = ()
     near = None
@@ -116,7 +120,7 @@ def fit_contact(
     law = problem.law
     if noise_is_hidden and not _has_dead_zone(posterior) and not _is_silent_outside(runs, problem, posterior):
         # Without a dead zone, readings of 0 at rest hide the noise: estimate it from the contacts.
-        return fit_contact(runs, model, timing, None, law, plane_option, seed)
+        return fit_contact(runs, model, timing, None, law, plane_option, seed, sensor)
     if noise_is_hidden and readings.bias is None and plane_option is None:
         # The surface position is only an assumption, so readings near onset and release must not determine
         # delay and damping.
@@ -144,7 +148,7 @@ def _prepare_readings(
     motion: MotionResponse,
     noise: NoiseEstimate | None,
     plane: float | None,
-    dead_zone: float,
+    sensor: ForceSensor,
 ) -> tuple[ForceReadings, float | None]:
     """Return the readings with their noise and bias prior, and the surface position [m] for the fit.
 
@@ -152,14 +156,17 @@ def _prepare_readings(
     """
     prior, noise_is_hidden = None, noise is not None and noise.silent
     if noise is not None and noise_is_hidden:
-        prior = (dead_zone, SPECIFIED_DEAD_ZONE_STD * dead_zone) if dead_zone else noise.dead_zone
+        zone = sensor.dead_zone
+        prior = (zone, SPECIFIED_DEAD_ZONE_STD * zone) if zone else noise.dead_zone
+    low_pass = None if noise_is_hidden else sensor.filter
     if noise is None or noise_is_hidden:
         readings = ForceReadings.of(runs, 1.0, threshold=1.0 if noise_is_hidden else 0.0)
+        readings = replace(readings, low_pass=low_pass)
         usual = 0.0 if noise_is_hidden and plane is None else plane
         readings = _estimate_noise_from_contact(motion, readings, usual, 0.0 if noise is None else noise.std)
         plane = plane if prior else usual
     else:
-        readings = _make_readings(runs, noise)
+        readings = replace(_make_readings(runs, noise), low_pass=low_pass)
     # If there is a dead zone, the parameter "bias" represents the force that the dead zone removes.
     bias = (
         find_bias_prior(runs, motion, noise, plane)
@@ -242,8 +249,11 @@ def _fit_law(
     noise_is_hidden: bool,
     seed: int,
 ) -> tuple[ContactProblem, Posterior, SensorLag | None, float]:
-    """Fit one law, with a sensor lag unless a dead zone hides the onset of contact."""
+    """Fit one law with the stated filter, or with a lag unless a dead zone hides the onset of contact."""
     problem = summarise_deep_lanes(ContactProblem(motion, readings, law, plane), near)
+    if readings.time_constant:
+        lag = estimate_stated_filter(problem, near, seed)
+        return problem, lag.posterior, lag, lag.evidence
     posterior = compute_posterior(problem, seed, near)
     lag = None if noise_is_hidden else estimate_sensor_lag(problem, posterior, seed)
     return (
@@ -372,7 +382,8 @@ def refit_without(fit: ContactFit, held_out: np.ndarray, seed: int = 0) -> Conta
     rest = summarise_deep_lanes(rest, (delay, plane))
     if rest.time_constant:
         best = search_coarsely(rest, (delay, plane, inner.misfit), 2)
-        posterior = compute_posterior_at_lag(rest, best, fit.posterior, seed)
+        delay_std = float(fit.posterior.draws[:, 0].std())
+        posterior = compute_posterior_at_lag(rest, best, delay_std, seed)
     else:
         posterior = compute_posterior(rest, seed, (delay, plane), COARSE_GRID_SIZE)
     return replace(fit, posterior=posterior, degrees_of_freedom=degrees_of_freedom)

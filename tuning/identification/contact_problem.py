@@ -10,11 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy import special
-from scipy.signal import lfilter
 
 from tuning.identification.contact_laws import Law
 from tuning.identification.contact_regression import (
@@ -30,11 +28,7 @@ from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
 from tuning.identification.nearby_rows import NearbyRows, Onsets
 from tuning.identification.packed_rows import pack_rows
-from tuning.identification.sensor_filter import (
-    compute_lag_weights,
-    compute_onset_shares,
-    compute_onset_weights,
-)
+from tuning.identification.sensor_filter import apply_filter, compute_onset_shares
 
 MAX_FORCE_DELAY = 0.02  # longest force delay in the search range of a fit [s]
 COARSE_DELAY_STEP = 0.0005  # step between the delays of a first search [s]
@@ -48,8 +42,9 @@ class ContactProblem:
 
     The surface position `plane` [m] is None if the fit estimates it. Readings out of contact depend only on
     the bias. Their number, sum and sum of squares therefore represent them, and the regressors of the law are
-    computed only near contact. If the sensor has a lag (`time_constant` [s]), the regressors pass through the
-    same lag. If its noise is coloured, regressors and readings are whitened.
+    computed only near contact. If the sensor has a lag or another filter (`time_constant` [s], the inverse of
+    its angular cutoff frequency), the regressors pass through the same filter. If its noise is coloured,
+    regressors and readings are whitened.
     """
 
     def __init__(
@@ -58,9 +53,11 @@ class ContactProblem:
         readings: ForceReadings,
         law: Law,
         plane: float | None,
-        time_constant: float = 0.0,
+        time_constant: float | None = None,
     ):
+        """Prepare the fits; without a `time_constant`, the filter is that of the prior."""
         self.motion, self.readings, self.law, self.plane = motion, readings, law, plane
+        time_constant = readings.time_constant if time_constant is None else time_constant
         self.time_constant = time_constant
         # The force delay is relative to the delay of the position sensor, so it may be negative.
         self.min_delay = -COARSE_DELAY_STEP * float(np.floor(max(motion.delay, 0.0) / COARSE_DELAY_STEP))
@@ -78,12 +75,17 @@ class ContactProblem:
         self.bias_alone = 0.0 if self.has_dead_zone else float(np.sum(readings.whitening)) / readings.std
         self.sums = sum_and_squares(self.target)
         self.memory = len(readings.whitening) + int(
-            np.ceil(FILTER_MEMORY_TIME_CONSTANTS * time_constant / motion.period)
+            np.ceil(FILTER_MEMORY_TIME_CONSTANTS * time_constant / motion.period / readings.modes.slowest)
         )
         # Times at which the force is computed, in periods before a row. A lag integrates the force between
         # two rows, so it also needs the force in the middle.
         self.periods_before = (0.0,) if time_constant == 0.0 else (0.0, 0.5)
         self._guess: np.ndarray | None = None
+
+    @property
+    def filter_rate(self) -> float:
+        """Return the control period multiplied by the angular cutoff frequency of the sensor's filter."""
+        return self.motion.period / self.time_constant
 
     @cached_property
     def names(self) -> list[str]:
@@ -241,11 +243,10 @@ class ContactProblem:
         plane, row = np.nonzero((last <= planes[:, None]) & (near.position > planes[:, None]))
         left = compute_onset_shares(last[row], half[near.rows[row]], near.position[row], planes[plane])
         columns = self._tabulate(np.zeros((1, len(row))), near.rate[row], near.rows[row])[0]
-        rate = self.motion.period / self.time_constant
-        return Onsets(plane, row, columns, *compute_onset_weights(rate, left))
+        return Onsets(plane, row, columns, left)
 
     def _filter(self, tables: list[np.ndarray], onsets: Onsets | None, first, whitening) -> np.ndarray:
-        """Apply the sensor's lag and the whitening filter to the regressors in the rows near contact.
+        """Apply the sensor's filter and the whitening filter to the regressors in the rows near contact.
 
         Args:
             tables: Regressors in the rows near contact, one array (surface positions, regressors, rows) for
@@ -256,13 +257,7 @@ class ContactProblem:
         """
         if onsets is None or not tables[0].size:
             return _whiten(tables[0], whitening)
-        pole, (now, half, last) = compute_lag_weights(self.motion.period / self.time_constant)
-        drive = now * tables[0] + half * tables[1]
-        drive[:, :, 1:] += last * tables[0][:, :, :-1]
-        then = tables[0][onsets.plane, :, onsets.row].T
-        drive[onsets.plane, :, onsets.row] = (onsets.after * first + onsets.end * then).T
-        lagged: Any = lfilter(whitening, [1.0, -pole], drive)
-        return lagged
+        return apply_filter(self.readings.modes, self.filter_rate, tables, whitening, onsets, first)
 
     def inside(self, delay: float, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return design matrix and readings of lanes that are always in contact, in the order of the lanes.
@@ -277,12 +272,8 @@ class ContactProblem:
         ]
         tables = [table.reshape(*table.shape[:2], lanes, length) for table in tables]
         if self.time_constant:
-            pole, weights = compute_lag_weights(self.motion.period / self.time_constant)
-            now, half, last = np.array(weights) / self.readings.std
-            drive = now * tables[0]
-            drive[..., 1:] += last * tables[0][..., :-1]
-            drive += np.multiply(half, tables[1], out=tables[1])
-            drive = np.asarray(lfilter(self.readings.whitening, [1.0, -pole], drive))
+            drive = apply_filter(self.readings.modes, self.filter_rate, tables, self.readings.whitening)
+            drive /= self.readings.std
         else:
             drive = _whiten(tables[0] / self.readings.std, self.readings.whitening)
         used = self.is_used[rows]

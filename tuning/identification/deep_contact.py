@@ -106,7 +106,7 @@ class SummarisedProblem(ContactProblem):
         The copy is fastest for fits with force delays near `delay` [s]; None keeps the present delay.
         """
         if delay is None:
-            delay = self.delay + self.time_constant - time_constant
+            delay = self.delay + (self.time_constant - time_constant) * self.readings.modes.delay
         return SummarisedProblem(super().changed(law, time_constant), self.deep, delay)
 
     def at(self, delay: float, plane: float, pseudo: PseudoRows | None = None) -> CoefficientFit:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.number_ranges import numeric_keys
 from tuning.identification.contact_fit import ContactFit
+from tuning.identification.parameters import CUTOFF_KEY
 from tuning.identification.result import ParameterEstimate
 
 DAMPING_KEY, FORCE_DELAY_KEY = "contact.damping", "rig.force_sensor.delay"
@@ -143,6 +144,8 @@ def estimate_combinations(
     combined, at_bound = [], select_dampings_at_zero(draws_by_key)
     motion, force = (draws_by_key.get(key) for key in ("rig.simulator.delay", "rig.force_sensor.delay"))
     lag = draws_by_key.get("rig.force_sensor.time_constant")
+    if (cutoff := draws_by_key.get(CUTOFF_KEY)) is not None and contact is not None:
+        lag = contact.readings.modes.delay / (2.0 * np.pi * cutoff)
     if force is not None and lag is not None:
         force = force + lag
         combined.append(

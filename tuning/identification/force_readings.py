@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
+from jaxhil.mechanism.sensor_filter import FilterModes, find_modes
+from jaxhil.mechanism.structs import SensorFilter
 from tuning.identification.records import LoggedRun
 
 
@@ -27,6 +29,7 @@ class ForceReadings:
     whitening: tuple[float, ...] = (1.0,)  # coefficients of the filter that whitens the noise
     threshold: float = 0.0  # smallest predicted force of a used reading [N]; a dead zone affects smaller ones
     bias: tuple[float, float] | None = None  # prior mean and standard deviation of the sensor's bias [N]
+    low_pass: SensorFilter | None = None  # filter of the sensor in the prior, or None
 
     @classmethod
     def of(
@@ -60,6 +63,19 @@ class ForceReadings:
             counts[: len(whitening) - 1] = False
         entries = tuple(int(number) for number in np.unique(entry[counts])) or (0,)
         return cls(force, counts, entry, entries, std, tuple(whitening), threshold)
+
+    @property
+    def modes(self) -> FilterModes:
+        """Return kind and order of the sensor's filter: those of the prior, or a first-order lag."""
+        kind, order = (
+            ("butterworth", 1) if self.low_pass is None else (self.low_pass.kind, self.low_pass.order)
+        )
+        return find_modes(kind, order)
+
+    @property
+    def time_constant(self) -> float:
+        """Return the inverse of the prior's angular cutoff frequency [s]; 0 if the prior has no filter."""
+        return 0.0 if self.low_pass is None else 0.5 / (np.pi * self.low_pass.cutoff)
 
     def select_lanes(self, lanes: np.ndarray, begin: int = 0) -> ForceReadings:
         """Return the readings of the given lanes, which may repeat, from row `begin` on."""

@@ -84,6 +84,8 @@ def make_mechanism(
         if section == "force_sensor" and contact is not None:
             # The estimated delay includes a sensor lag that the contacts do not determine.
             sensor.pop("time_constant", None)
+        if "filter.cutoff" in estimated:
+            sensor["filter"] = {**sensor["filter"], "cutoff": estimated.pop("filter.cutoff")}
         sensor |= estimated
         rig[section] = {**sensor, "delay": max(sensor.get("delay", 0.0), 0.0)}
     if "rig.contact_plane" in values:

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
+import msgspec
 import numpy as np
 
-from jaxhil.mechanism.structs import Mechanism
+from jaxhil.mechanism.structs import ForceSensor, Mechanism
 from tuning.identification import conditioning, free_motion, mechanism_models, parameters, validation
 from tuning.identification import contact_fit as contacts
 from tuning.identification.bootstrap import bootstrap
@@ -75,9 +76,9 @@ def identify(
     say("fitting the motion simulator")
     motion = free_motion.fit_free_motion(runs["free"], campaign.timing, options.order)
     model = _make_prior_model(prior) if motion is None else motion.model
-    dead_zone = options.fixed.get(DEAD_ZONE_KEY, 0.0 if prior is None else prior.rig.force_sensor.dead_zone)
+    sensor = _specify_sensor(prior, options)
     touching = [] if model is None else _select_runs_in_contact(campaign, model)
-    contact, left_out = _fit_and_check_contact(touching, model, campaign, force, dead_zone, options, say)
+    contact, left_out = _fit_and_check_contact(touching, model, campaign, force, sensor, options, say)
     frequency = _estimate_frequency(contact, campaign.equivalent_mass)
     clock_drift = None if contact is None else contact.drift
     share = _choose_position_delay(motion, None if clock_drift else contact, prior, options)
@@ -106,7 +107,7 @@ def identify(
         limit=options.limit,
         notes=(
             *collect_notes(motion, contact, used, force, vague),
-            *note_absent_dead_zone(contact, dead_zone),
+            *note_absent_dead_zone(contact, sensor.dead_zone),
             *(*_note_shifted_delay(fixed, options), *_note_clipped_values(draws), *contradictions),
         ),
         missing=missing,
@@ -115,6 +116,12 @@ def identify(
         force_noise=force,
         position_noise=position,
     )
+
+
+def _specify_sensor(prior: Mechanism | None, options: IdentificationOptions) -> ForceSensor:
+    """Return the force sensor of the prior, with the fixed dead zone."""
+    sensor = ForceSensor() if prior is None else prior.rig.force_sensor
+    return msgspec.structs.replace(sensor, dead_zone=options.fixed.get(DEAD_ZONE_KEY, sensor.dead_zone))
 
 
 def _select_runs_in_contact(campaign: Campaign, model: MotionModel) -> list[LoggedRun]:
@@ -239,7 +246,7 @@ def _fit_and_check_contact(
     model: MotionModel | None,
     campaign: Campaign,
     force: NoiseEstimate | None,
-    dead_zone: float,
+    sensor: ForceSensor,
     options: IdentificationOptions,
     say: ReportProgress,
 ) -> tuple[ContactFit | None, list[validation.CheckResult]]:
@@ -252,9 +259,7 @@ def _fit_and_check_contact(
         return None, []
     plane = options.fixed.get("rig.contact_plane")
     say(f"fitting the contact to {len(runs)} runs")
-    fit = contacts.fit_contact(
-        runs, model, campaign.timing, force, options.law, plane, options.seed, dead_zone
-    )
+    fit = contacts.fit_contact(runs, model, campaign.timing, force, options.law, plane, options.seed, sensor)
     if options.bootstrap:
         say(f"fitting {options.bootstrap} bootstrap samples of the contacts")
         fit = bootstrap(fit, options.bootstrap, options.seed, options.scheduler, options.checkpoints, say)

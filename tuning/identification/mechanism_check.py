@@ -147,7 +147,8 @@ def _make_contact_fit(
     rig, contact, period = mechanism.rig, mechanism.contact, campaign.timing.control_period
     law = mechanism_models.make_regression_law(contact)
     delay = rig.force_sensor.delay - rig.position_sensor.delay
-    plane, lag = rig.contact_plane, rig.force_sensor.time_constant
+    plane = rig.contact_plane
+    lag = rig.force_sensor.time_constant if rig.force_sensor.filter is None else None
     motion = MotionResponse(model, runs, campaign.timing, max(MAX_FORCE_DELAY, delay) + period)
     noise = _estimate_force_noise(campaign.runs)
     has_dead_zone = rig.force_sensor.dead_zone > 0.0
@@ -157,6 +158,7 @@ def _make_contact_fit(
     if has_dead_zone or not std:
         whitening = (1.0,)
     readings = ForceReadings.of(runs, std or 1.0, whitening, std if has_dead_zone else 0.0)
+    readings = replace(readings, low_pass=rig.force_sensor.filter)
     coefficients = [
         coefficient
         for entry in readings.entries
@@ -166,7 +168,7 @@ def _make_contact_fit(
     values = np.array(coefficients)
     if not std:
         std = _estimate_row_noise(ContactProblem(motion, readings, law, plane, lag), delay, plane, values)
-        readings = ForceReadings.of(runs, std)
+        readings = replace(readings, std=std)
     if has_dead_zone:
         predicted = ContactProblem(motion, readings, law, plane, lag).force(delay, plane, values)
         readings = replace(readings, counts=readings.counts & (predicted > contacts.DEAD_ZONE_MARGIN * std))

@@ -16,10 +16,9 @@ class NearbyRows(NamedTuple):
 
 
 class Onsets(NamedTuple):
-    """Onsets of contact between two rows, and the weights of the force in the next, lagged reading."""
+    """Onsets of contact between two rows."""
 
     plane: np.ndarray  # (onsets,), index of the surface position
     row: np.ndarray  # (onsets,), index into `NearbyRows.rows` of the row after the onset
     columns: np.ndarray  # (coefficients, onsets), regressors of the law just after the onset
-    after: np.ndarray  # (onsets,), weight of the force just after the onset (`compute_onset_weights`)
-    end: np.ndarray  # (onsets,), weight of the force at the end of the period
+    share: np.ndarray  # (onsets,), share of the period that lies after the onset

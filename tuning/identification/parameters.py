@@ -12,7 +12,7 @@ from tuning.identification.contact_laws import Law
 from tuning.identification.normal_draws import factorise_covariance
 from tuning.identification.rational import MotionModel
 
-SIMULATOR_PREFIX = "rig.simulator."
+SIMULATOR_PREFIX, CUTOFF_KEY = "rig.simulator.", "rig.force_sensor.filter.cutoff"
 
 
 def make_simulator_section(model: MotionModel) -> dict[str, Any]:
@@ -86,7 +86,11 @@ def convert_contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
     draws_by_name = dict(zip(contact.posterior.names, draws.T, strict=True))
     result = {"rig.force_sensor.delay": draws_by_name["delay"]}
     if "time_constant" in draws_by_name:
-        result["rig.force_sensor.time_constant"] = draws_by_name["time_constant"]
+        time_constants = draws_by_name["time_constant"]
+        if not contact.readings.time_constant:
+            result["rig.force_sensor.time_constant"] = time_constants
+        elif np.ptp(time_constants) > 0.0:  # otherwise, the cutoff is that of the prior
+            result[CUTOFF_KEY] = 0.5 / (np.pi * time_constants)
     if contact.problem.plane is None:
         result["rig.contact_plane"] = draws_by_name["plane"]
     law = find_contact_law(contact.law.name)

@@ -22,6 +22,8 @@ EXPERIMENTS = {
     ("rig.force_sensor.delay", "contact.damping"): PRESS_EXPERIMENT,
     ("rig.force_sensor.time_constant", "contact.damping"): PRESS_EXPERIMENT,
     ("rig.force_sensor.time_constant", "rig.force_sensor.delay"): PRESS_EXPERIMENT,
+    ("rig.force_sensor.filter.cutoff", "contact.damping"): PRESS_EXPERIMENT,
+    ("rig.force_sensor.filter.cutoff", "rig.force_sensor.delay"): PRESS_EXPERIMENT,
     ("rig.contact_plane", "rig.force_sensor.delay"): "touches at speeds in the ratio 1:2:4, or a slow press",
     ("contact.stiffness", "rig.contact_plane"): "touches at speeds in the ratio 1:2:4, or a slow press",
     ("rig.simulator.damping_ratio", "rig.simulator.delay"): WIDER_MULTISINE,

@@ -83,19 +83,38 @@ def estimate_sensor_lag(problem: ContactProblem, posterior: Posterior, seed: int
     )  # fmt: skip
     if inner.misfit - float(optimum.fun) < needed:
         return _average_over_lag(problem, posterior, at, seed)
-    value, step = float(optimum.x), 0.1 * float(optimum.x)
+    nodes = place_nodes(fit, float(optimum.x), float(optimum.fun), 0.1 * period)
+    posteriors = _compute_posteriors(posterior, at, nodes, DELAY_GRID_SIZE, seed)
+    lag = join_posteriors(nodes, posteriors, seed)
+    return replace(lag, evidence=_weigh_lag(posterior, posteriors, nodes[1] - nodes[0])[1])
+
+
+def place_nodes(fit: Callable[[float], CoarseFit], value: float, misfit: float, least: float) -> np.ndarray:
+    """Return evenly spaced time constants [s] around the best one, over some standard deviations.
+
+    Args:
+        fit: Function that returns the best fit with a time constant.
+        value: Best time constant [s].
+        misfit: Chi-squared of the best fit.
+        least: Smallest time constant [s] of the result.
+    """
+    step, std = 0.1 * value, 0.0
     for _ in range(2):
-        rise = np.mean([fit(value + side * step)[2] for side in (-1.0, 1.0)]) - optimum.fun
+        rise = np.mean([fit(value + side * step)[2] for side in (-1.0, 1.0)]) - misfit
         std = step / np.sqrt(max(rise, 0.1))
         step = min(2.0 * std, 0.5 * value)
     nodes = value + std * np.linspace(-LAG_HALF_WIDTH_SIGMAS, LAG_HALF_WIDTH_SIGMAS, LAG_GRID_SIZE)
-    nodes = nodes[nodes > 0.1 * period]
-    posteriors = _compute_posteriors(posterior, at, nodes, DELAY_GRID_SIZE, seed)
+    return nodes[nodes > least]
+
+
+def join_posteriors(nodes: np.ndarray, posteriors: list[Posterior], seed: int) -> SensorLag:
+    """Return the lag whose posterior joins those at evenly spaced time constants `nodes` [s]."""
     draws, picked = _draw_between_lags(nodes, posteriors, seed)
+    evidence: Any = special.logsumexp([node.evidence for node in posteriors])
     best = int(np.argmax([node.evidence for node in posteriors]))
     names = [*posteriors[best].names, "time_constant"]
     joined = replace(posteriors[best], names=names, draws=np.column_stack([draws, picked]))
-    return SensorLag(float(nodes[best]), joined, _weigh_lag(posterior, posteriors, nodes[1] - nodes[0])[1])
+    return SensorLag(float(nodes[best]), joined, float(evidence + np.log(nodes[1] - nodes[0])))
 
 
 def _average_over_lag(
@@ -144,22 +163,23 @@ def _compute_posteriors(
     posterior: Posterior, at: FitAt, nodes: np.ndarray, count: int, seed: int
 ) -> list[Posterior]:
     """Return the posterior at each time constant in `nodes`, on a grid of `count` delays."""
-    return [compute_posterior_at_lag(*at(lag), posterior, seed, count) for lag in nodes]
+    delay_std = float(posterior.draws[:, 0].std())
+    return [compute_posterior_at_lag(*at(lag), delay_std, seed, count) for lag in nodes]
 
 
 def compute_posterior_at_lag(
-    problem: ContactProblem, best: CoarseFit, like: Posterior, seed: int, count: int = SMALL_DELAY_GRID_SIZE
+    problem: ContactProblem, best: CoarseFit, delay_std: float, seed: int, count: int = SMALL_DELAY_GRID_SIZE
 ) -> Posterior:
     """Compute the posterior for a given lag, on a grid of delays around the best fit.
 
     Args:
         problem: Contact problem with the lag.
         best: Best fit with this lag.
-        like: Posterior of a similar problem; the scatter of its delay determines the width of the grid.
+        delay_std: Expected standard deviation of the delay [s], which determines the width of the grid.
         seed: Seed of the random numbers.
         count: Number of delays in the grid.
     """
-    reach = DELAY_HALF_WIDTH_SIGMAS * max(float(like.draws[:, 0].std()), MIN_DELAY_STD)
+    reach = DELAY_HALF_WIDTH_SIGMAS * max(delay_std, MIN_DELAY_STD)
     low, high = np.clip([best[0] - reach, best[0] + reach], problem.min_delay, MAX_FORCE_DELAY)
     return compute_posterior_near(problem, np.linspace(low, high, count), best[1], seed)
 

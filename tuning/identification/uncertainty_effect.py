@@ -26,10 +26,12 @@ import numpy as np
 
 from jaxhil.contact.laws import CONTACT_KEYS
 from jaxhil.errors import InputError
+from jaxhil.mechanism.sensor_filter import low_frequency_delay
 from jaxhil.mechanism.structs import Contact, Mechanism
 from jaxhil.mechanism.uncertainty import draw
 from tuning.identification import mechanism_models
 from tuning.identification.contact_laws import Law
+from tuning.identification.parameters import CUTOFF_KEY
 
 EFFECT_DRAWS = 1024  # number of draws from the uncertainty of the file
 EFFECT_PROBABILITY = 0.99  # probability that an effect is below its bound
@@ -40,7 +42,7 @@ RELATIVE_DIFFERENCE_STEP = 1e-4  # relative step of finite differences for a par
 MAX_DEPTH = 1.0  # maximum depth [m]; a deeper contact is assumed to have no rebound
 FORCE_DELAY_KEY, SIMULATOR_PREFIX = "rig.force_sensor.delay", "rig.simulator."
 IDENTIFIED_SOURCE_PREFIX = "identified from"  # beginning of the `source` of an identified file
-FORCE_DELAY_KEYS = (FORCE_DELAY_KEY, "rig.force_sensor.time_constant")
+FORCE_DELAY_KEYS = (FORCE_DELAY_KEY, "rig.force_sensor.time_constant", CUTOFF_KEY)
 CONTACT_KEYS = (
     *("contact.stiffness", "contact.damping"),
     *(f"contact.{key.name}" for key in CONTACT_KEYS.values() if key.default is None),
@@ -141,6 +143,10 @@ def _compute_change(
             [mechanism_models.get_regression_coefficients(contact_entry, entry) for contact_entry in contacts]
         )
         return (moved - nominal) @ contact.coefficient_sensitivity, no_change
+    if key == CUTOFF_KEY:
+        low_pass = mechanism.rig.force_sensor.filter
+        added_delay = low_frequency_delay(low_pass) * (low_pass.cutoff / values - 1.0) if low_pass else 0.0
+        return no_change, no_change + added_delay * contact.delay_sensitivity
     if key in FORCE_DELAY_KEYS:
         added_delay = values - getattr(mechanism.rig.force_sensor, key.rpartition(".")[2])
         return no_change, added_delay * contact.delay_sensitivity
@@ -178,6 +184,7 @@ def _compute_total_force_delay(mechanism: Mechanism, frequency: float) -> float:
     """Return the total delay [s] from the command to the force reading at a frequency [Hz]."""
     sensor = mechanism.rig.force_sensor
     total = _compute_motion_lag(mechanism, frequency) + sensor.delay + sensor.time_constant
+    total += low_frequency_delay(sensor.filter)
     return max(total - mechanism.rig.position_sensor.delay, 0.0)
 
 

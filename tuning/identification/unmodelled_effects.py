@@ -1,10 +1,12 @@
-"""Effects of a mechanism file that neither `identify` nor `monitor` models."""
+"""Effects of a mechanism file that `monitor` does not model; `identify` models only the filter."""
 
 from __future__ import annotations
 
 from jaxhil.errors import InputError
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification.validation import CheckResult
+
+FILTER_KEY = "rig.force_sensor.filter"
 
 
 def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
@@ -18,7 +20,7 @@ def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
         effects["rig.force_sensor.dead_zone_kind"] = "dead zone of the force sensor", text
     if sensor.filter is not None:
         text = f"a {sensor.filter.kind} filter of order {sensor.filter.order}"
-        effects["rig.force_sensor.filter"] = "filter of the force sensor", text
+        effects[FILTER_KEY] = "filter of the force sensor", text
     for key, name, value, unit in (
         ("rig.force_sensor.jitter", "jitter of the force sensor", sensor.jitter, " s"),
         ("rig.force_sensor.loss_probability", "lost frames of the force sensor", sensor.loss_probability, ""),
@@ -32,10 +34,16 @@ def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
 
 
 def check_modelled_effects(mechanism: Mechanism) -> list[CheckResult]:
-    """Return a failed check for each effect in a mechanism file that `identify` does not model."""
+    """Return a failed check for each effect in a mechanism file that `identify` does not model.
+
+    `identify` models a filter of the force sensor unless a dead zone hides the onset of contact.
+    """
+    effects = list_unmodelled_effects(mechanism)
+    if mechanism.rig.force_sensor.dead_zone == 0.0:
+        effects.pop(FILTER_KEY, None)
     return [
         CheckResult(name, f"{text}, which `identify` does not model", True, 1.0)
-        for name, text in list_unmodelled_effects(mechanism).values()
+        for name, text in effects.values()
     ]
 
 
