@@ -31,6 +31,7 @@ class Kind:
     unknown: tuple[str, ...] = ()  # keys that the prior lacks
     defect: tuple[str, ...] = ()  # a message must contain one of these words; empty for a kind without defect
     states_filter: bool = False  # the prior states kind and order of the filter, and a cutoff
+    states_cut: bool = False  # the prior states that the dead zone is cut
     sweep: bool = False  # the free motion is a swept sine in place of a multisine
     colour: float = 0.0  # standard deviation of low-frequency noise of the force [N]
     walk: float = 0.0  # N/sqrt(s), random walk of the force bias
@@ -73,6 +74,9 @@ KINDS = {
     "butterworth_4_stated": Kind(_butterworth(4), states_filter=True),
     "cut_dead_zone": Kind(
         lambda rng, rig: {"dead_zone": rng.uniform(1.0, 6.0), "cut": True}, defect=("dead zone",)
+    ),
+    "cut_dead_zone_stated": Kind(
+        lambda rng, rig: {"dead_zone": rng.uniform(1.0, 6.0), "cut": True}, states_cut=True
     ),
     "bias_walk": Kind(walk=0.7, defect=("bias", "drift", "noise")),
     "mode": Kind(
@@ -354,5 +358,10 @@ def mechanism_file(rig, speed, kind, factors):
         cutoff = rig.cutoff * factors[2]
         low_pass = f'{{ kind = "butterworth", order = {rig.filter_order}, cutoff = {cutoff} }}'
         values["rig.force_sensor.filter"] = low_pass
+    if kind.states_cut:
+        values |= {
+            "rig.force_sensor.dead_zone_kind": '"cut"',
+            "rig.force_sensor.dead_zone": rig.dead_zone * factors[2],
+        }
     lines = ['schema = "jaxhil/mechanism/1"', 'name = "afternoon"']
     return "\n".join(lines + [f"{key} = {value}" for key, value in values.items() if key not in kind.unknown])

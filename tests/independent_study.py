@@ -128,6 +128,7 @@ def check_intervals(rig, document):
         age += sines.sum() / (2 * np.pi * rig.cutoff)
     true = {
         "rig.force_sensor.filter.cutoff": rig.cutoff,
+        "rig.force_sensor.dead_zone": rig.dead_zone,
         "contact.stiffness.0": rig.stiffness,
         "contact.damping.0": rig.damping,
         "rig.contact_plane": rig.plane,

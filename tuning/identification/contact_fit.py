@@ -20,6 +20,7 @@ from tuning.identification.clock_drift import ClockDrift
 from tuning.identification.contact_laws import Law, kelvin_voigt
 from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProblem
 from tuning.identification.contact_profile import Posterior, compute_posterior
+from tuning.identification.cut_zone import estimate_hidden_bias, find_largest_size
 from tuning.identification.deep_contact import summarise_deep_lanes
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.law_choice import EvaluatedLaw, choose_contact_law, search_coarsely
@@ -40,6 +41,7 @@ SPECIFIED_DEAD_ZONE_STD = 1e-3  # relative standard deviation of a specified dea
 UNKNOWN_SURFACE_STD = 5e-5  # standard deviation of a surface position that is assumed to be 0 [m]
 DEAD_ZONE_MARGIN = 4.0  # minimum distance of a used force above the dead zone, in standard deviations
 COARSE_GRID_SIZE = 21, 5  # numbers of delays and of surface positions in the grid of bootstrap and test fits
+ASSUMED_BIAS_SHARE = 0.2  # standard deviation of a bias that a cut dead zone hides, divided by the zone
 ASSUMED_NOISE_SHARE = 0.01  # standard deviation of unknown noise, relative to the largest force
 MIN_NOISE_SHARE = 1e-6  # minimum noise as a share of the largest force; simulated logs may be noise-free
 MIN_DEAD_ZONE_SIGMAS = 3.0  # minimum size of a significant dead zone, in standard deviations
@@ -118,7 +120,8 @@ def fit_contact(
     laws = (law, kelvin_voigt()) if evaluated and law.pulls else (law,)
     problem, posterior = _fit_laws(motion, readings, laws, plane, near, noise_is_hidden, seed)
     law = problem.law
-    if noise_is_hidden and not _has_dead_zone(posterior) and not _is_silent_outside(runs, problem, posterior):
+    is_visible = not (readings.zone or _has_dead_zone(posterior))
+    if noise_is_hidden and is_visible and not _is_silent_outside(runs, problem, posterior):
         # Without a dead zone, readings of 0 at rest hide the noise: estimate it from the contacts.
         return fit_contact(runs, model, timing, None, law, plane_option, seed, sensor)
     if noise_is_hidden and readings.bias is None and plane_option is None:
@@ -155,13 +158,18 @@ def _prepare_readings(
     The surface position is None if the fit must estimate it.
     """
     prior, noise_is_hidden = None, noise is not None and noise.silent
+    zone = sensor.dead_zone
+    cut = find_largest_size(runs) if noise_is_hidden and zone and sensor.dead_zone_kind == "cut" else 0.0
     if noise is not None and noise_is_hidden:
-        zone = sensor.dead_zone
         prior = (zone, SPECIFIED_DEAD_ZONE_STD * zone) if zone else noise.dead_zone
     low_pass = None if noise_is_hidden else sensor.filter
     if noise is None or noise_is_hidden:
         readings = ForceReadings.of(runs, 1.0, threshold=1.0 if noise_is_hidden else 0.0)
-        readings = replace(readings, low_pass=low_pass)
+        readings = replace(readings, low_pass=low_pass, zone=cut)
+        if cut:
+            bias = estimate_hidden_bias(runs, cut)
+            readings = replace(readings, bias=bias or (0.0, ASSUMED_BIAS_SHARE * cut))
+            return _estimate_noise_from_contact(motion, readings, plane, 0.0), plane
         usual = 0.0 if noise_is_hidden and plane is None else plane
         readings = _estimate_noise_from_contact(motion, readings, usual, 0.0 if noise is None else noise.std)
         plane = plane if prior else usual
@@ -328,7 +336,8 @@ def _estimate_noise_from_contact(
     """
     counts = readings.counts
     if readings.threshold:
-        counts = counts & (readings.force != 0.0) & (np.abs(readings.force) > DEAD_ZONE_MARGIN * at_rest)
+        least = max(DEAD_ZONE_MARGIN * at_rest, 2.0 * readings.zone)
+        counts = counts & (readings.force != 0.0) & (np.abs(readings.force) > least)
     peak = np.abs(readings.force[counts]).max()
     result = replace(
         readings, counts=counts, std=0.01 * peak, threshold=0.02 * peak * (readings.threshold > 0)
@@ -341,7 +350,7 @@ def _estimate_noise_from_contact(
         counts = readings.counts
         if readings.threshold:
             predicted = problem.force(delay, at, problem.at(delay, at).coefficients)
-            counts = counts & (predicted > DEAD_ZONE_MARGIN * std)
+            counts = counts & (predicted > readings.zone + DEAD_ZONE_MARGIN * std)
         result = replace(
             result, counts=counts, std=float(std), threshold=float(std) if readings.threshold else 0.0
         )

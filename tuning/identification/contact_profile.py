@@ -28,6 +28,7 @@ FINAL_GRID_DROP = 30.0  # twice the maximum drop of the log posterior from its p
 # Twice the maximum drop in the second grid; larger, because the coarse grid's log posterior is inaccurate.
 COARSE_GRID_DROP = 400.0
 SECOND_GRID_SURFACES = 15  # number of surface positions at each delay of the second grid
+MAX_CELL_WIDTH_RATIO = 3.0  # maximum width of a cell, divided by the mean width
 MAX_CELL_EDGES = 1000  # maximum number of cell edges; an uncertain surface position would need more
 COARSE_STD_FACTOR = 2.0  # the coarse grid's standard deviation of the surface is multiplied by this factor
 FINAL_GRID_DELAYS, FINAL_GRID_SURFACES = 61, 13  # numbers of delays and surface positions of the final grid
@@ -195,7 +196,8 @@ def divide_into_cells(low: float, high: float, at: np.ndarray, number: int) -> n
     if len(at) > MAX_CELL_EDGES:
         at = at[np.linspace(0, len(at) - 1, MAX_CELL_EDGES).astype(int)]
     edges = [low, *at, high]
-    while len(edges) <= number:
+    # Where a dead zone hides the onsets, no position divides the interval.
+    while len(edges) <= number or np.max(np.diff(edges)) > MAX_CELL_WIDTH_RATIO * (high - low) / number:
         widest = int(np.argmax(np.diff(edges)))
         edges.insert(widest + 1, (edges[widest] + edges[widest + 1]) / 2.0)
     while len(edges) > number + 1:

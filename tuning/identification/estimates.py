@@ -42,7 +42,7 @@ def make_estimates(draws_by_key, motion, contact, force, position, fixed) -> tup
                 "rig.force_sensor.noise_std", std, std / np.sqrt(2.0 * contact.degrees_of_freedom)
             )
         )
-        if force is None:
+        if force is None or contact.readings.zone:
             bias = contact.posterior.draws[:, contact.posterior.names.index("bias")]
             direct.append(
                 _make_normal_estimate("rig.force_sensor.bias", float(bias.mean()), float(bias.std()))

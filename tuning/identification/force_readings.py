@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,8 @@ class ForceReadings:
     whitening: tuple[float, ...] = (1.0,)  # coefficients of the filter that whitens the noise
     threshold: float = 0.0  # smallest predicted force of a used reading [N]; a dead zone affects smaller ones
     bias: tuple[float, float] | None = None  # prior mean and standard deviation of the sensor's bias [N]
+    zone: float = 0.0  # largest possible size of a cut dead zone [N]; 0 if the dead zone is not cut
+    is_valid: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), bool))  # whether a reading exists
     low_pass: SensorFilter | None = None  # filter of the sensor in the prior, or None
 
     @classmethod
@@ -53,7 +55,7 @@ class ForceReadings:
 
         forces = [np.asarray(run.force_measured, float) for run in runs]
         valid = [run.valid & np.isfinite(force) for run, force in zip(runs, forces, strict=True)]
-        counts = padded(valid, False, bool)
+        counts = is_valid = padded(valid, False, bool)
         force = padded([np.nan_to_num(force_column) for force_column in forces], 0.0, float)
         entry = padded([_assign_contact_entries(run) for run in runs], 0, int)
         if len(whitening) > 1:
@@ -62,7 +64,7 @@ class ForceReadings:
             counts = counts & (gap < 0.5)
             counts[: len(whitening) - 1] = False
         entries = tuple(int(number) for number in np.unique(entry[counts])) or (0,)
-        return cls(force, counts, entry, entries, std, tuple(whitening), threshold)
+        return cls(force, counts, entry, entries, std, tuple(whitening), threshold, is_valid=is_valid)
 
     @property
     def modes(self) -> FilterModes:
@@ -79,8 +81,8 @@ class ForceReadings:
 
     def select_lanes(self, lanes: np.ndarray, begin: int = 0) -> ForceReadings:
         """Return the readings of the given lanes, which may repeat, from row `begin` on."""
-        force, counts, entry = (array[begin:, lanes] for array in (self.force, self.counts, self.entry))
-        return replace(self, force=force, counts=counts, entry=entry)
+        names = ("force", "counts", "entry", "is_valid")
+        return replace(self, **{name: getattr(self, name)[begin:, lanes] for name in names})
 
 
 def _assign_contact_entries(run: LoggedRun) -> np.ndarray:

@@ -77,9 +77,7 @@ def make_mechanism(
         sensor = {**rig.get(section, {})}
         prefix = f"rig.{section}."
         estimated = {key[len(prefix) :]: value for key, value in values.items() if key.startswith(prefix)}
-        if sensor.get("dead_zone_kind") == "cut":
-            estimated.pop("dead_zone", None)  # the estimate is that of a continuous dead zone
-        elif section == "force_sensor" and contact is not None:
+        if section == "force_sensor" and contact is not None:
             sensor.pop("dead_zone", None)
         if section == "force_sensor" and contact is not None:
             # The estimated delay includes a sensor lag that the contacts do not determine.

@@ -18,6 +18,7 @@ from tuning.identification.contact_problem import MAX_FORCE_DELAY, ContactProble
 from tuning.identification.contact_profile import Posterior
 from tuning.identification.contact_regression import CoefficientFit
 from tuning.identification.contact_runs import exclude_rows_after_gaps, split_long_run
+from tuning.identification.dead_zone_check import check_cut_dead_zone, check_zone_sampling
 from tuning.identification.edge_check import check_contact_edges, check_force_smoothing
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.free_motion import FreeMotion
@@ -88,6 +89,7 @@ def check_against_mechanism(
         lag = contacts.compute_force_lag(contact, model, frequency)
         flags = np.ones(len(touching), bool)
         lines += validation.check_contact_model(contact, touching, mass, frequency, lag, flags)
+        lines += [*check_cut_dead_zone(contact, touching), *check_zone_sampling(mechanism)]
     effect = compute_uncertainty_effect(mechanism)
     if contact is not None and not _has_uncertain_dead_zone(mechanism):
         lines += check_contact_edges(contact, touching, effect)
@@ -164,14 +166,18 @@ def _make_contact_fit(
         for entry in readings.entries
         for coefficient in mechanism_models.get_regression_coefficients(contact, entry)
     ]
-    coefficients.append(-rig.force_sensor.dead_zone if has_dead_zone else rig.force_sensor.bias)
+    is_cut = rig.force_sensor.dead_zone_kind == "cut"
+    readings = replace(readings, zone=rig.force_sensor.dead_zone if is_cut else 0.0)
+    subtracts = has_dead_zone and not is_cut
+    coefficients.append(-rig.force_sensor.dead_zone if subtracts else rig.force_sensor.bias)
     values = np.array(coefficients)
     if not std:
         std = _estimate_row_noise(ContactProblem(motion, readings, law, plane, lag), delay, plane, values)
         readings = replace(readings, std=std)
     if has_dead_zone:
         predicted = ContactProblem(motion, readings, law, plane, lag).force(delay, plane, values)
-        readings = replace(readings, counts=readings.counts & (predicted > contacts.DEAD_ZONE_MARGIN * std))
+        least = readings.zone + contacts.DEAD_ZONE_MARGIN * std
+        readings = replace(readings, counts=readings.counts & (predicted > least))
     problem = ContactProblem(motion, readings, law, plane, lag)
     inner = CoefficientFit(values, np.zeros((len(values), len(values))), 0.0, 0.0, 0.0, 0.0)
     delays, planes = _draw_delay_and_surface(mechanism)

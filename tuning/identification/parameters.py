@@ -9,6 +9,7 @@ import numpy as np
 from jaxhil.contact.laws import CONTACT_KEYS, find_contact_law
 from tuning.identification.contact_fit import ContactFit
 from tuning.identification.contact_laws import Law
+from tuning.identification.cut_zone import draw_zone
 from tuning.identification.normal_draws import factorise_covariance
 from tuning.identification.rational import MotionModel
 
@@ -101,7 +102,9 @@ def convert_contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
         result |= law.file_values(fitted, i)
     if "damping" in draws_by_name:
         result["contact.damping.0"] = draws_by_name["damping"]
-    if contact.dead_zone:
+    if contact.readings.zone:
+        result["rig.force_sensor.dead_zone"] = draw_zone(contact.problem, contact.posterior)
+    elif contact.dead_zone:
         # Adding 0.0 changes -0.0, which would be printed with its sign, to 0.0.
         result["rig.force_sensor.dead_zone"] = np.maximum(-draws_by_name["bias"], 0.0) + 0.0
     return result

@@ -12,6 +12,7 @@ from jaxhil.mechanism.file import from_plain_data
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification import contact_fit, validation
 from tuning.identification.contact_fit import ContactFit
+from tuning.identification.dead_zone_check import check_cut_dead_zone
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.mechanism_check import check_against_mechanism, check_file_uncertainty
 from tuning.identification.mechanism_file import to_toml
@@ -104,6 +105,7 @@ def _check_fits(
         lines += [
             validation.check_stiffness_sign(contact),
             *validation.check_contact_model(contact, touching, mass, frequency, lag, all_touches),
+            *check_cut_dead_zone(contact, touching),
         ]
     if written is not None:
         lines += check_file_uncertainty(

@@ -1,4 +1,4 @@
-"""Effects of a mechanism file that `monitor` does not model; `identify` models only the filter."""
+"""Effects of a mechanism file that `monitor` does not model; `identify` models some of them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from jaxhil.errors import InputError
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification.validation import CheckResult
 
-FILTER_KEY = "rig.force_sensor.filter"
+FILTER_KEY, CUT_ZONE_KEY = "rig.force_sensor.filter", "rig.force_sensor.dead_zone_kind"
 
 
 def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
@@ -17,7 +17,7 @@ def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
     rig, sensor, effects = mechanism.rig, mechanism.rig.force_sensor, {}
     if sensor.dead_zone_kind == "cut" and sensor.dead_zone > 0.0:
         text = f"a cut dead zone of {sensor.dead_zone:g} N"
-        effects["rig.force_sensor.dead_zone_kind"] = "dead zone of the force sensor", text
+        effects[CUT_ZONE_KEY] = "dead zone of the force sensor", text
     if sensor.filter is not None:
         text = f"a {sensor.filter.kind} filter of order {sensor.filter.order}"
         effects[FILTER_KEY] = "filter of the force sensor", text
@@ -39,6 +39,7 @@ def check_modelled_effects(mechanism: Mechanism) -> list[CheckResult]:
     `identify` models a filter of the force sensor unless a dead zone hides the onset of contact.
     """
     effects = list_unmodelled_effects(mechanism)
+    effects.pop(CUT_ZONE_KEY, None)
     if mechanism.rig.force_sensor.dead_zone == 0.0:
         effects.pop(FILTER_KEY, None)
     return [

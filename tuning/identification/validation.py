@@ -26,11 +26,6 @@ DEFECT_P_VALUE = 1e-3  # maximum p-value of a significant defect
 MAX_FREQUENCY_RATIO = 4.0  # highest evaluated frequency, divided by the contact frequency
 CONTACT_STATE_DRAWS = 40  # number of posterior draws that must agree whether a row is in contact
 MAX_DELAY_SHARE = 0.93  # maximum force delay that passes the check, as a share of the longest delay searched
-MIN_CONTACTS_FOR_DEAD_ZONE = 5  # minimum number of contacts for the check of small readings
-MAX_NONZERO_SHARE = 0.8  # maximum share of nonzero readings with a dead zone
-CUTTING_DEAD_ZONE_P_VALUE = 0.01  # maximum p-value that shows a dead zone which is not subtracted
-# A dead zone hides the noise out of contact if it is larger than this number of standard deviations.
-MIN_SMALL_READING_SIGMAS = 3.0
 MISFIT_SMOOTHING_LINES = 5  # number of adjacent frequency lines whose misfit is averaged
 
 
@@ -168,7 +163,6 @@ def check_contact_model(
     lines = [
         _check_law_residual(contact, runs, flags),
         *_check_delay_in_search_range(contact),
-        *_check_cutting_dead_zone(contact, runs),
     ]
     if contact.drift is None:
         errors, stds = estimate_restitution_errors(contact, runs, mass)
@@ -254,40 +248,6 @@ def _check_delay_in_search_range(contact: ContactFit) -> list[CheckResult]:
         return []
     finding = f"{1e3 * delay:.4g} ms: at the upper end of the search range"
     return [CheckResult("force delay", finding, True, 1.0)]
-
-
-def _check_cutting_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list[CheckResult]:
-    """Check for a dead zone of the force sensor that does not change large forces.
-
-    Only runs with readings of 0 out of contact are evaluated. If all their other readings are large, the
-    sensor replaces small forces by 0. The dead zone in mechanism files is another kind: it is also subtracted
-    from larger forces.
-    """
-    delay, plane, coefficient_fit = contact.posterior.best
-    touching = contact.problem.touching(delay, plane, coefficient_fit.coefficients)
-    steps, peaks, sizes, outside = [], [], [], []
-    for lane, run in enumerate(runs):
-        force = np.abs(contact.readings.force[: len(run.tick), lane])
-        (nonzero,) = np.nonzero(force)
-        if run.kind == "contact" and len(nonzero) > 1 and len(nonzero) < MAX_NONZERO_SHARE * len(force):
-            steps.append(abs(force[nonzero[-1]] - force[nonzero[-2]]))
-            peaks.append(force.max())
-            sizes.append(force[nonzero])
-            outside.append(force[nonzero[~touching[nonzero, lane]]])
-    if len(peaks) < MIN_CONTACTS_FOR_DEAD_ZONE:
-        return []
-    least, std = min(size.min() for size in sizes), contact.readings.std
-    quantum = np.diff(np.unique(contact.readings.force)).min(initial=np.inf)
-    # In a smooth release, the last reading is assumed to be uniform between 0 and the last step.
-    probability = np.prod(np.maximum(1.0 - least / (np.array(steps) + 2.0 * std + 1e-300), 0.0))
-    if least <= MIN_SMALL_READING_SIGMAS * std:
-        # Beyond a zone that is subtracted, the noise becomes rarer with size. Each reading of at most twice
-        # the smallest one then has a probability of at least 1/2 to be smaller than the smallest one.
-        probability = 0.5 ** np.count_nonzero(np.concatenate(outside) <= 2.0 * least)
-    if least <= 2.5 * quantum or probability > CUTTING_DEAD_ZONE_P_VALUE:
-        return []
-    finding = f"no reading lies between 0 and {least:.2g} N, as with a dead zone that is not subtracted"
-    return [CheckResult("dead zone of the force sensor", finding, True, float(least / np.median(peaks)))]
 
 
 def estimate_restitution_errors(

@@ -1,4 +1,6 @@
-"""Identification of a force sensor's filter whose kind and order the prior states."""
+"""Identification of a filter or a cut dead zone of the force sensor that the prior states."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,9 +8,11 @@ from scipy import signal
 
 import jaxhil
 from jaxhil.mechanism.sensor_filter import find_modes
+from tuning.identification.cut_zone import estimate_hidden_bias, find_largest_size
 from tuning.identification.identify import IdentificationOptions, identify
 from tuning.identification.logs.campaign import read_campaign
 from tuning.identification.nearby_rows import Onsets
+from tuning.identification.records import LoggedRun
 from tuning.identification.sensor_filter import apply_filter
 
 FILTERS = [(kind, order) for kind in ("butterworth", "bessel") for order in (1, 2, 3, 4)]
@@ -84,4 +88,53 @@ def test_intervals_cover_cutoff_of_stated_filter_in_logs_of_simulate(tmp_path, k
         np.sqrt(np.mean(np.square(errors))),
     )
     # If 95 % of the intervals cover, 32 intervals miss more than five values in 0.5 % of all studies.
+    assert np.sum(~np.array(covered)) <= 5
+
+
+def runs_at_rest(values, count=4):
+    """Return runs of 500 readings before a large force."""
+    parts = np.split(values, count)
+    rows = np.arange(len(parts[0]) + 500)
+    blank = np.zeros(len(rows))
+    force = [np.append(part, np.full(500, 100.0)) for part in parts]
+    return [
+        LoggedRun("contact", "", rows, 0.0, blank, blank, one, None, None, blank == 0.0, None, 0.005)
+        for one in force
+    ]
+
+
+def test_bias_and_largest_size_of_cut_zone_are_estimated_from_noise():
+    readings = 0.2 + 0.5 * np.random.default_rng(0).standard_normal(8000)
+    runs = runs_at_rest(np.where(np.abs(readings) > 0.9, readings, 0.0))
+    assert 0.9 < find_largest_size(runs) < 0.91
+    bias = estimate_hidden_bias(runs, 0.9)
+    assert bias is not None and abs(bias[0] - 0.2) < 3.0 * bias[1] < 0.06
+    assert estimate_hidden_bias(runs_at_rest(np.zeros(8000)), 0.9) is None
+
+
+@pytest.mark.slow
+def test_intervals_cover_stated_cut_zone_in_logs_of_simulate(tmp_path):
+    sensor = {"rig.force_sensor.noise_std": 0.5, "rig.force_sensor.dead_zone_kind": "cut"}
+    true = {
+        "rig.force_sensor.dead_zone": 4.0,
+        "rig.force_sensor.delay": jaxhil.load("rig-300kg").rig.force_sensor.delay,
+        "contact.damping.0": DAMPING,
+        "contact.stiffness.0": jaxhil.load("rig-300kg").contact.stiffness[0],
+    }
+    prior = jaxhil.load(
+        "rig-300kg", {**sensor, "rig.force_sensor.dead_zone": 6.0, "contact.stiffness": [9e4]}
+    )
+    (rest,) = runs_at_rest(np.zeros(2000), 1)
+    rest = replace(rest, kind="rest", valid=rest.force_measured == 0.0)
+    covered = []
+    for seed in range(CAMPAIGNS):
+        logs = simulated_logs(tmp_path, {**sensor, "rig.force_sensor.dead_zone": 4.0}, seed)
+        campaign = read_campaign(logs, None, prior)
+        campaign = replace(campaign, runs=(*campaign.runs, rest))
+        result = identify(campaign, prior, IdentificationOptions(seed=seed))
+        covered += [result[key].low <= value <= result[key].high for key, value in true.items()]
+        assert result.mechanism is not None
+        assert result.mechanism["rig"]["force_sensor"]["dead_zone_kind"] == "cut"
+        assert not [line for line in result.lines if line.name == "dead zone of the force sensor"]
+    print("covered", np.mean(covered))
     assert np.sum(~np.array(covered)) <= 5

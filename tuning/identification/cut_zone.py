@@ -1,0 +1,105 @@
+"""Cut dead zone of a force sensor: its size, and the bias that it hides.
+
+The sensor reads 0 if the force with bias and noise is smaller than the zone, and does not change larger
+forces. No reading is therefore between 0 and the size of the zone. The smallest reading is an upper bound of
+the size. Readings of 0 at a predicted force give lower bounds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import optimize, special
+
+from tuning.identification.contact_problem import ContactProblem
+from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
+from tuning.identification.noise import MIN_READINGS_BEYOND_DEAD_ZONE, detect_quantum
+from tuning.identification.records import LoggedRun
+
+ZONE_GRID_SIZE = 400  # number of sizes from 0 to the smallest reading
+PARAMETER_DRAWS = 40  # number of posterior draws of the contact for which the size is drawn
+MIN_LOUD_SHARE = 0.1  # share of the peak force that shows a contact
+
+
+def find_largest_size(runs: Sequence[LoggedRun]) -> float:
+    """Return the largest possible size of the zone [N]: that of the smallest reading other than 0.
+
+    If the readings are rounded, the result is larger by half a quantum. It is 0 if all readings are 0.
+    """
+    readings = np.concatenate([_take_readings(run) for run in runs])
+    sizes = np.abs(readings[readings != 0.0])
+    return float(sizes.min()) + 0.5 * detect_quantum(readings) if len(sizes) else 0.0
+
+
+def estimate_hidden_bias(runs: Sequence[LoggedRun], zone: float) -> tuple[float, float] | None:
+    """Estimate the bias of readings before contact, of which a cut dead zone hides most.
+
+    The noise is assumed to be normally distributed.
+
+    Args:
+        runs: Runs that begin before contact.
+        zone: Size of the zone [N].
+
+    Returns:
+        Mean and standard deviation of the bias [N], or None if too few readings exceed the zone.
+    """
+    before = np.concatenate([_take_readings_before_contact(run) for run in runs])
+    values = before[before != 0.0]
+    if len(values) < MIN_READINGS_BEYOND_DEAD_ZONE:
+        return None
+
+    def cost(parameters):
+        bias, std = parameters[0], np.exp(parameters[1])
+        inside = _log_probability_of_zero(bias, std, zone)
+        left = 0.5 * np.sum(((values - bias) / std) ** 2) + len(values) * np.log(std)
+        return float(left - (len(before) - len(values)) * inside)
+
+    start = [0.0, np.log(0.5 * float(np.abs(values).mean()))]
+    optimum = optimize.minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-8})
+    step = 0.01 * np.exp(optimum.x[1])
+    shift = np.array([step, 0.0])
+    rise = cost(optimum.x + shift) + cost(optimum.x - shift) - 2.0 * optimum.fun
+    return float(optimum.x[0]), float(step / np.sqrt(max(rise, 1e-12)))
+
+
+def draw_zone(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> np.ndarray:
+    """Return posterior draws of the size of the zone [N]; the prior is uniform up to the largest size.
+
+    Args:
+        problem: Contact problem; its readings have the largest possible size.
+        posterior: Posterior of the contact parameters.
+        seed: Seed of the random numbers.
+    """
+    readings, count = problem.readings, len(problem.names)
+    sizes = readings.zone * (np.arange(ZONE_GRID_SIZE) + 1.0) / ZONE_GRID_SIZE
+    heights = []
+    is_zero = readings.is_valid & (readings.force == 0.0)
+    for draw in posterior.draws[:PARAMETER_DRAWS]:
+        predicted = problem.force(draw[0], draw[1], draw[2 : 2 + count])[is_zero]
+        # Forces far inside the zone do not bound its size.
+        predicted = predicted[predicted > 0.0]
+        heights.append([_log_probability_of_zero(predicted, readings.std, size).sum() for size in sizes])
+    # The readings of 0 also select the draws of the contact that agree with them.
+    share = np.cumsum(np.exp(np.array(heights) - np.max(heights)).sum(axis=0))
+    uniform = np.random.default_rng([seed, 5]).uniform(size=POSTERIOR_DRAWS)
+    return np.interp(uniform, np.append(0.0, share / share[-1]), np.append(0.0, sizes))
+
+
+def _log_probability_of_zero(force, std: float, zone: float):
+    """Return the log probability that a force [N] with noise is inside the zone."""
+    force = np.abs(force)
+    high, low = special.log_ndtr((zone - force) / std), special.log_ndtr((-zone - force) / std)
+    return high + np.log1p(-np.exp(np.minimum(low - high, -1e-15)))
+
+
+def _take_readings(run: LoggedRun) -> np.ndarray:
+    force = np.asarray(run.force_measured, float)
+    return force[run.valid & np.isfinite(force)]
+
+
+def _take_readings_before_contact(run: LoggedRun) -> np.ndarray:
+    """Return the readings in the first half of the rows before the first large force."""
+    force = _take_readings(run)
+    loud = np.abs(force) > MIN_LOUD_SHARE * np.abs(force).max(initial=0.0)
+    return force[: int(np.argmax(loud)) // 2]
