@@ -63,7 +63,9 @@ hypothesis.settings.register_profile("jaxhil", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("jaxhil")
 
 KEPT = 1_000_000_000  # bytes of cached programs
-LONG = ("test_notebooks", "test_rollout")
+# Modules that take longest; each worker begins with them, so that all workers end together.
+LONG = ("test_notebooks", "test_rollout", "test_export", "test_c99", "test_cli", "test_identify")
+LONG += ("test_sweep_commands", "test_six_axis_bundle", "test_bundle_checking", "test_c99_six_axes")
 
 
 def pytest_configure(config):
@@ -72,9 +74,9 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(items):
-    """Sort the tests: longest modules first, so that all workers end together; then similar modules."""
+    """Sort the tests: modules with the same compiler options together, and the longest of these first."""
     items.sort(
-        key=lambda item: (item.path.stem not in LONG, item.get_closest_marker("users_options") is None)
+        key=lambda item: (item.get_closest_marker("users_options") is None, item.path.stem not in LONG)
     )
 
 

@@ -320,11 +320,12 @@ def central_difference(law, of, key, step):
     return (figures[0] - figures[1]) / (2 * step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "of"),
     [
         ("phase_lead", "restitution"),
-        pytest.param("response_error", "peak_force", marks=pytest.mark.slow),
+        ("response_error", "peak_force"),
     ],
 )
 def test_jacobian_matches_finite_differences(law, of):

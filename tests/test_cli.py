@@ -146,6 +146,7 @@ def test_last_line_of_command_output_suggests_the_next_command(jaxhil, table, tm
         assert ran.out.splitlines()[-1] == f"Next: jaxhil {words}"
 
 
+@pytest.mark.slow
 def test_json_output_of_tune_states_sensor_noise(jaxhil, tmp_path):
     ran = jaxhil("tune", "suite-noisy", "--compensator", "none", "-o", tmp_path, "--json", *TINY)
     (entry,) = ran.document["mechanisms"]

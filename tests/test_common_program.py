@@ -90,7 +90,8 @@ def test_common_program_gives_the_same_results_as_separate_programs():
             )
 
 
-@pytest.mark.parametrize("exact", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("exact", [True, False])
 def test_common_program_simulates_force_sensors_with_and_without_lag(exact):
     lagging = mechanism(
         {"law": "kelvin_voigt"}, SECOND_ORDER, period=1e-3, force_sensor={"time_constant": 2e-4}

@@ -43,6 +43,7 @@ def evaluate_compensator(raw, law, gains=None, number=LANES):
     return scene.evaluate(law, gains or {}, LIMIT, SEED)
 
 
+@pytest.mark.slow
 def test_ideal_rig_has_zero_error_and_full_transparency():
     """Expect error 0, and transparency, slope and peak ratio 1, without delay and for a small period."""
     figures = evaluate_compensator(mechanism({}, IDEAL, 0.0, period=5e-5), "none")

@@ -53,6 +53,7 @@ WORK_ACCURACY = {
 SELDOM = ("depth-damped", "layers", "damped layers")
 SELDOM += ("transfer function with latency", "third order with latency", "position lead", "first order")
 SELDOM += ("hardening", "damped hardening", "elastoplastic", "cut dead zone")
+SELDOM += ("lag", "damped, lag", "stiff, damped, lag", "no lag beside")
 SELDOM += ("rattling",)  # test_plant.py compares these cases with the oracle every day
 slow_if_seldom = [
     pytest.param(name, marks=pytest.mark.slow if name.startswith(SELDOM) else ()) for name in CASES

@@ -72,7 +72,8 @@ def case_of(mechanism, scenario):
 
 
 @pytest.mark.skipif(c99_cases.COMPILER is None, reason="no C compiler (cc) on this machine")
-@pytest.mark.parametrize("name", ["impulse_ledger", pytest.param("phase_lead", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["impulse_ledger", "phase_lead"])
 def test_exported_controller_on_independent_rig_gives_simulated_final_twist(name, tmp_path):
     for offset in OFFSETS:
         mechanism = load_any("probe-drogue", {"approach.offset": list(offset)}).mechanism

@@ -27,7 +27,8 @@ def noisy_rows(rng):
     return rows_of((wrench, desired, np.zeros_like(measured), measured), PERIOD)
 
 
-@pytest.mark.parametrize("hours", [0.2, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("hours", [0.2, 5])
 def test_noise_causes_at_most_one_false_onset_per_hour_in_six_axis_ledger(hours):
     noise = {"force_noise": NOISE["force"], "torque_noise": NOISE["torque"], "pose_filter": 3e-3}
     document = six_axis_document(limits={}, **noise)

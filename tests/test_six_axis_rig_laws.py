@@ -74,9 +74,8 @@ def check_agreement(name, gains, constants, period, readings, expected):
     return True
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == NOISY else pytest.mark.slow) for name in MECHANISMS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MECHANISMS)
 def test_rig_and_jax_commands_agree_on_recorded_readings(name):
     """Compare the ledger with its record, and each rig compensator with JAX for the same readings."""
     records = of_ledger(name)
