@@ -54,7 +54,8 @@ class CallLowering(ListLowering):
     def field(self, owner: CExpression, name: str, node: ast.AST, new_type: Any = None) -> CExpression:
         """Return the C expression for an attribute.
 
-        Raise SubsetError if the attribute has no known type. For an assignment, `new_type` returns the type.
+        Raise SubsetError if the attribute has no known type. An assignment passes `new_type`, a function that
+        returns the type of the assigned value.
         """
         class_, plain, keys = owner.type.of, name.lstrip("_"), frozenset({(owner.type.of, name)})
         is_object = owner.type.kind == "object" or new_type is None

@@ -100,7 +100,7 @@ class _State(NamedTuple):
 
 
 class _SegmentPassage(NamedTuple):
-    """Motion of the bodies through one segment, inward or outward."""
+    """Motion of the bodies, inward or outward, through one segment of the piecewise-linear force."""
 
     spring: Array  # spring force at the start, divided by mass [m/s^2]
     velocity: Array  # velocity at the start [m/s]

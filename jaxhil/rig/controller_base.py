@@ -120,7 +120,7 @@ class ControllerBase:
         return contact_record(self._last_count())
 
     def _last_count(self) -> ContactCount:
-        """Return the compensator's status in the last audited contact; `reset` keeps this record."""
+        """Return the record of the last audited contact: its number, and the compensator's status."""
         return self._watchdog.record
 
     def emergency_stop(self, active: bool) -> None:

@@ -101,7 +101,7 @@ def count_cells(fastest: float, lags: Any) -> CellCounts:
 
 
 def merge_cell_counts(counts: Sequence[CellCounts]) -> CellCounts:
-    """Return numbers of cells that suffice for several mechanisms in a common program."""
+    """Return the numbers of cells of a common program, large enough for each of its mechanisms."""
     used = [count for count in counts if count.part]
     if not used:
         return NO_CELLS

@@ -22,7 +22,7 @@ DIVERGENCE_SPEED_RATIO = 1e3  # multiple of the first approach speed above which
 
 
 class CommandVariation(NamedTuple):
-    """Variation of the force command F_c in the current contact so far, starting from F_c = 0."""
+    """Range and total variation of the force command F_c since the contact's start, where F_c is 0."""
 
     last: Float[Array, "*batch"]  # last value [N]
     highest: Float[Array, "*batch"]  # highest value so far [N]

@@ -19,7 +19,7 @@ MAX_ACCELERATOR_LANES = 1 << 20  # maximum number of lanes per tile; more lanes 
 
 
 class DeviceDescription(NamedTuple):
-    """Properties of JAX's devices that determine the size of a tile."""
+    """Properties of JAX's devices that determine how many lanes run together in a tile."""
 
     is_cpu: bool  # whether the devices are cores of the processor
     memory: int = UNKNOWN_MEMORY  # memory of one device that JAX may use [bytes]

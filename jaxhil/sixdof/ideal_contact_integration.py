@@ -279,7 +279,7 @@ def error_speed(contact_model: IdealContactModel, states: States) -> Float[Array
 
 
 def _end_tolerance(until: Array) -> Array:
-    """Return the remaining time [s] below which an integration up to `until` [s] has ended."""
+    """Return the tolerance [s] with which an integration must reach the time `until` [s]."""
     return 1e-14 + 1e-13 * until
 
 

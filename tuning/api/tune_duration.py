@@ -40,7 +40,7 @@ def describe_expected_duration(mechanisms: Sequence[AnyMechanism], compensator: 
 def record_duration(
     mechanisms: Sequence[AnyMechanism], compensator: str, runs: float, seconds: float
 ) -> None:
-    """Store the time of a finished tuning with this number of simulated runs; ignore a missing cache."""
+    """Store how long a tuning with this number of simulated runs took; without a cache, do nothing."""
     folder = cache_folder()
     if folder is None or runs <= 0:
         return

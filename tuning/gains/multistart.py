@@ -73,7 +73,7 @@ class MultistartResult(NamedTuple):
 
 @dataclass
 class _SearchState:
-    """Starts of one task that have ended, and the number of objective evaluations they took."""
+    """Finished solver runs of one task, one per start, and their number of objective evaluations."""
 
     starts: list[StartResult] = field(default_factory=list)
     evaluations: int = 0

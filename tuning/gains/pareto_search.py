@@ -86,7 +86,7 @@ def build_weight_ladder(
 
 
 class _LadderCandidate(NamedTuple):
-    """Candidate gains for one mechanism, with both criteria on its training scenarios."""
+    """Candidate gains for one mechanism, with error and second criterion on its training scenarios."""
 
     gains: dict[str, float]
     error: float  # objective J without the second criterion's term [1]

@@ -132,7 +132,7 @@ def _build_tasks(
 
 
 def _group_tasks(tasks: list[TuneTask], settings: TuneSettings) -> list[list[int]]:
-    """Group the tasks by compiled program and, if there is a user's function, by number of contacts."""
+    """Group the tasks by compiled program and, for a user's objective, also by number of contacts."""
     groups = group_by_program([task.loop for task in tasks], [task.scenarios for task in tasks])
     if settings.objective.function is None:
         return groups

@@ -71,7 +71,7 @@ class Identification:
             separates the parameters.
         lines: Results of the checks.
         mechanism: Content of a mechanism file, or None if a value is missing or invalid.
-        limit: Largest allowed sum of the defects' effects on the restitution e, and on its error e - e*.
+        limit: Limit on the sum of the defects' effects, for the restitution e and for its error e - e* alike.
         notes: Further remarks.
         missing: Parameters that neither the logs nor the prior determine, each with advice.
         motion: Fit of the motion simulator, or None.

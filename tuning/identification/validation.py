@@ -64,7 +64,7 @@ class CheckResult:
 
 
 def check_motion_model(motion: FreeMotion, frequency: float) -> list[CheckResult]:
-    """Check the model of the motion simulator for defects that affect contacts of a frequency [Hz]."""
+    """Check the model of the motion simulator for defects that affect contacts with this frequency [Hz]."""
     lines = [
         _check_motion_misfit(motion, frequency),
         _check_position_gain(motion),

@@ -65,7 +65,7 @@ class SixAxisRig:
 
     Args:
         mechanism: mechanism and rig to simulate.
-        seed: seed of the sensor noise and of the phases.
+        seed: seed of the sensor noise and of the phases of contacts in a control period.
     """
 
     axes = 6

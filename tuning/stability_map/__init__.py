@@ -1,1 +1,1 @@
-"""Stability maps: restitution error on a grid of two keys, theory, spectral radii, nominal margins."""
+"""Stability maps: a contact's simulated and theoretical error on a grid of two keys, and margins."""

@@ -239,10 +239,11 @@ def _run_chains(
     worst: _WorstScenarios,
     rng: np.random.Generator,
 ) -> tuple[_SubsetState, _WorstScenarios]:
-    """Run the Markov chains of the next level, which stay above the threshold of their replicate.
+    """Run the Markov chains of the next level of a subset simulation, above each replicate's threshold.
 
     The step size sigma of a replicate is adapted to the acceptance rate of its chains, as in Papaioannou et
-    al. 2015. Replicates that have ended are computed with the others, but their results are not used.
+    al. 2015. A replicate is an independent repetition of the estimate. Replicates that have ended are
+    computed with the others, but their results are not used.
     """
     steps, replicates, _, inputs = state.points.shape
     seeds = np.stack([_choose_chain_starts(state.values[:, r], threshold[r], rng) for r in range(replicates)])

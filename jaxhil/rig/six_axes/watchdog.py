@@ -165,7 +165,7 @@ class SixAxisWatchdog:
         Args:
             previous: wrench W_c of the last tick [N, N m].
             status: the compensator's status at that wrench.
-            unpaid: uncorrected impulse error after the last contact, divided by the contact's impulse [1].
+            unpaid: impulse error left uncorrected by this contact, divided by the contact's impulse [1].
         """
         if not self._open:
             return 0

@@ -30,10 +30,12 @@ class RunLines:
 
 
 def optimise_powers(groups: Sequence[RunLines], weight: np.ndarray) -> list[np.ndarray]:
-    """Return the powers that minimise trace(A I^-1), with the Fisher information I, within the limits.
+    """Return the powers of the excitation's frequency lines that minimise trace(A I^-1) within the limits.
+
+    I is the Fisher information.
 
     Args:
-        groups: Lines of each run.
+        groups: Frequency lines of each run.
         weight: Matrix A, shape (parameters, parameters).
     """
     powers = [make_flat_powers(group) for group in groups]

@@ -174,7 +174,7 @@ def _check_stamps_in_groups(log: OpenLog, mapping: LogMapping, wanted: Mapping[s
 
 
 def _find_other_stamps(column: str, time: str, names: Sequence[str]) -> list[str]:
-    """Return the time-stamp columns of every group that contains `column` but not `time` (column names)."""
+    """Return the time-stamp columns of the channel groups that contain column `column` but not `time`."""
     result = []
     for candidate in names:
         name = re.split(r"[/.]", candidate)[-1]

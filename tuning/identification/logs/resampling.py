@@ -86,8 +86,8 @@ def resample_to_rows(
         period: Control period [s].
 
     Returns:
-        The values of each channel, with `FORCE_LATE_CHANNEL` if the nearest force readings are used; the time
-        stamps of the rows [s]; and notes.
+        The values of each channel; the time stamps of the rows [s]; and notes. If the force readings nearest
+        to the rows are used, the further channel `FORCE_LATE_CHANNEL` states how late they are [s].
 
     Raises:
         InputError: If a channel has no valid time stamps, or no row has readings of all channels.
