@@ -88,5 +88,5 @@ def _reject(path: str, found: float, expected: str) -> None:
 
 
 def _is_used(mechanism: AnyMechanism, path: str) -> bool:
-    """Return whether the number at `path` is uncertain or not 0."""
+    """Return whether the number at `path` is nonzero or uncertain."""
     return bool(value_at(mechanism, path)) or path in mechanism.uncertainty

@@ -211,9 +211,9 @@ def read_samples(axes: Axes, hardware: Hardware, tick: Int[Array, ""]) -> Sample
 def read_late_motion(
     axes: Axes, hardware: Hardware, tick: Int[Array, ""], jitter: Float[Array, "*batch"], hold: str
 ) -> AxisMotion:
-    """Return the motion of the axes that the force sensor reads at a tick, from the exact motion.
+    """Return the exact motion of the axes at the instant to which the force reading of a tick belongs.
 
-    The sampling instant precedes the tick by each axis' delay, the sensor's delay, and the `jitter` [s].
+    This instant precedes the tick by the sum of the axis' delay, the sensor's delay and the `jitter` [s].
     """
     late, inputs = axes.late, hardware.inputs
     assert late is not None and inputs is not None

@@ -38,7 +38,7 @@ def is_search_direct(task: TuneTask) -> bool:
 
 
 def estimate_direct_runs(tasks: Sequence[TuneTask], steps: int) -> int:
-    """Return the number of simulated runs of `search_directly` without earlier gains."""
+    """Return the number of simulated runs that `search_directly` needs if `first` is empty."""
     return len(tasks) * steps * CANDIDATES_PER_GENERATION * tasks[0].lanes
 
 
@@ -48,8 +48,8 @@ def search_directly(
     """Search for the best gains of every task, from the literature's gains and from the gains in `first`.
 
     `settings.steps` is the number of generations of a search. If `settings.bounded`, the metric of the errors
-    on the training scenarios is bounded by that of the literature's gains. Without this bound, the probes'
-    errors, which are much larger, could outweigh the errors of the scenarios.
+    on the training scenarios is bounded by that of the literature's gains. Without this bound, the errors
+    of the transparency probes, which are much larger, could outweigh the errors of the scenarios.
     """
     return [
         _search_task(validation, i, settings, [task.literature, *(first[i] if first else ())])
@@ -70,7 +70,7 @@ def _search_task(
 def _bound_error(
     validation: Validation, task: int, objective: Objective, literature: Float[np.ndarray, "1 gains"]
 ) -> Objective:
-    """Return the objective with the metric of the literature's gains as its bound."""
+    """Return the objective with `error_bound` set to the metric of the literature's gains."""
     metric = replace(
         objective, command_weight=0.0, noise_weight=0.0, chatter_weight=0.0, transparency_weight=0.0
     )

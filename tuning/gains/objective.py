@@ -65,6 +65,8 @@ class Objective:
         J^2 = metric(E)^2 + (transparency_weight rms(H))^2
           + limit^2 ((command_weight rms(C))^2 + (chatter_weight rms(S))^2 + (noise_weight N)^2)
 
+        metric  norm of the errors, chosen by `name`
+        limit   limit of the error [1], the unit of three weights
         E  restitution error e - e* of each contact [1]; positive errors times sqrt(divergence_weight)
         H  restitution error e - e* of each contact of the transparency probes [1]
            (`tuning.transparency.probes`)

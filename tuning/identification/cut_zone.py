@@ -67,7 +67,7 @@ def draw_zone(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> n
     """Return posterior draws of the size of the zone [N]; the prior is uniform up to the largest size.
 
     Args:
-        problem: Contact problem; its readings have the largest possible size.
+        problem: Contact problem, in which the zone has its largest possible size.
         posterior: Posterior of the contact parameters.
         seed: Seed of the random numbers.
     """

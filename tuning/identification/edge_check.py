@@ -2,13 +2,13 @@
 
 These readings distinguish damping from force delay. An unmodelled sensor filter, an unmodelled dead zone or a
 resampled force changes the readings for some milliseconds after a jump of the force. In one contact, the
-noise hides this change. The mean residual of all contacts, in rows at the same distance from the edge and
+noise hides this change. The mean over all contacts of the residuals at the same distance from the edge,
 weighted with the approach speeds, reveals it. If the mean is n standard deviations from 0, the estimates are
 assumed to be wrong by n standard deviations, too.
 
 In these residuals, a short smoothing of the readings, such as an interpolation between two samples, hardly
-differs from the lag of a sensor. A lag in its place gives a wrong damping and a wrong delay. The smoothing
-also correlates the noise of successive readings at rest, which reveals it.
+differs from the lag of a sensor. If a lag is fitted instead, damping and delay are wrong. The smoothing also
+correlates the noise of successive readings at rest; this correlation reveals it.
 """
 
 from __future__ import annotations

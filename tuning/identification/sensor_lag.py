@@ -108,7 +108,7 @@ def place_nodes(fit: Callable[[float], CoarseFit], value: float, misfit: float, 
 
 
 def join_posteriors(nodes: np.ndarray, posteriors: list[Posterior], seed: int) -> SensorLag:
-    """Return the lag whose posterior joins those at evenly spaced time constants `nodes` [s]."""
+    """Return the lag with its posterior, combined from those at evenly spaced time constants `nodes` [s]."""
     draws, picked = _draw_between_lags(nodes, posteriors, seed)
     evidence: Any = special.logsumexp([node.evidence for node in posteriors])
     best = int(np.argmax([node.evidence for node in posteriors]))
