@@ -158,6 +158,7 @@ def test_best_start_is_selected_by_true_objective_instead_of_surrogate_norm(task
         assert one.best.rms <= min(values)
 
 
+@pytest.mark.slow
 def test_failed_tuning_task_does_not_affect_best_gains_of_other_tasks(tasks, validation):
     broken = tasks[1].scenarios._replace(equivalent_mass=np.full(8, np.nan))
     sick = build_validation([tasks[0], dataclasses.replace(tasks[1], scenarios=broken), tasks[2]], 15, 0)

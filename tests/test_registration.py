@@ -133,6 +133,7 @@ def test_unusable_compensator_or_contact_law_is_not_registered(registered):
     jaxhil.register(ScaledLead())
 
 
+@pytest.mark.slow
 def test_redefined_compensator_replaces_the_earlier_definition():
     def defined(share):
         class Share(ScaledLead):

@@ -65,6 +65,7 @@ def test_contact_with_probe_push_has_restitution_of_pushed_ideal_contact():
             assert abs(expected[lane] - probed.plain[lane]) > 0.01
 
 
+@pytest.mark.slow
 def test_transparency_probes_have_zero_error_on_an_ideal_rig():
     spread = {"contact.stiffness": {"distribution": "loguniform", "factor": [0.5, 2.0]}}
     made = validated({**mechanism({}, IDEAL, 0.0, period=5e-5), "uncertainty": spread})
