@@ -60,7 +60,9 @@ def test_commands_in_guide_print_the_output_shown(tmp_path):
                     [*names[first], *others], cwd=tmp_path, env=environment, capture_output=True, text=True,
                     check=False,
                 )  # fmt: skip
-                assert ran.returncode == ("Bad:" in lines), ran.stderr
+                # A command without shown output may have any verdict.
+                allowed = (int("Bad:" in lines),) if lines.strip() else (0, 1)
+                assert ran.returncode in allowed, ran.stderr
                 printed[command] = [line.rstrip() for line in ran.stdout.splitlines()]
             result = {words_of(line) for line in printed[command]}
             missing = [line for line in lines.splitlines() if words_of(line) not in result]
