@@ -10,7 +10,7 @@ from jaxhil.laws.compensators import COMPENSATORS
 from tuning.gains import multistart, multistart_solver
 from tuning.gains.direct_search import CANDIDATES_PER_GENERATION, estimate_direct_runs
 from tuning.gains.multistart import estimate_search_runs, find_gains
-from tuning.gains.objective import Objective
+from tuning.gains.objective import BOUND_PENALTY, Objective, evaluate_objective
 from tuning.gains.settings import TuneSettings
 from tuning.gains.validation import build_validation
 
@@ -75,3 +75,14 @@ def test_bounded_direct_search_keeps_error_of_initial_gains(validation, direct):
         ]
         assert errors[1] <= 1.001 * largest < errors[0]
         assert bounded[index].objective.error_bound == pytest.approx(largest, rel=1e-12)
+
+
+def test_objective_above_its_error_bound_has_a_penalty():
+    errors, excess = np.array([[0.003, -0.004], [0.03, -0.04]]), np.full((2, 2), 0.5)
+    plain = Objective(command_weight=0.3)
+    free, bounded = (
+        evaluate_objective(objective, errors, excess)
+        for objective in (plain, replace(plain, error_bound=0.02))
+    )
+    beyond = np.sqrt((0.03**2 + 0.04**2) / 2) - 0.02
+    np.testing.assert_allclose(bounded - free, [0, BOUND_PENALTY * beyond], rtol=1e-12)

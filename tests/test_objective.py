@@ -17,9 +17,8 @@ from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import ONE_AXIS, evaluate
 from jaxhil.simulation.scenario import build_scenarios
+from tuning.gains.contact_terms import FAILED_CONTACT_ERROR, compute_contact_terms
 from tuning.gains.objective import (
-    BOUND_PENALTY,
-    FAILED_CONTACT_ERROR,
     NORM_POWERS,
     OBJECTIVE_NAMES,
     RESIDUAL_SCALE,
@@ -28,7 +27,6 @@ from tuning.gains.objective import (
     ObjectiveTerms,
     ObjectiveWeights,
     SolverProblem,
-    compute_contact_terms,
     compute_residuals,
     evaluate_objective,
     join_terms,
@@ -192,17 +190,6 @@ def test_errors_within_tolerance_hardly_affect_objective(tolerance):
     values, _ = single_residuals(objective, errors, excesses, 3.0)
     grown = counted if counted <= TOLERATED_ERROR_FACTOR * size or tolerance == 0 else size
     assert RESIDUAL_SCALE**2 * np.sum(values * slopes) == pytest.approx(counted * grown, rel=1e-12)
-
-
-def test_objective_above_its_error_bound_has_a_penalty():
-    errors, excess = np.array([[0.003, -0.004], [0.03, -0.04]]), np.full((2, 2), 0.5)
-    plain = Objective(command_weight=0.3)
-    free, bounded = (
-        evaluate_objective(objective, errors, excess)
-        for objective in (plain, replace(plain, error_bound=0.02))
-    )
-    beyond = np.sqrt((0.03**2 + 0.04**2) / 2) - 0.02
-    np.testing.assert_allclose(bounded - free, [0, BOUND_PENALTY * beyond], rtol=1e-12)
 
 
 def test_error_tolerance_of_zero_does_not_change_objective_in_shared_program():

@@ -14,8 +14,9 @@ from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import evaluate
 from tuning.gains import pareto_search
+from tuning.gains.contact_terms import compute_contact_terms
 from tuning.gains.multistart_solver import solve_tasks
-from tuning.gains.objective import Objective, compute_contact_terms, evaluate_objective
+from tuning.gains.objective import Objective, evaluate_objective
 from tuning.gains.pareto import compute_fronts
 from tuning.gains.pareto_search import PEAK_CRITERION, TRANSPARENCY_CRITERION, choose_default_criterion
 from tuning.gains.settings import TuneSettings

@@ -35,15 +35,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxhil.errors import InputError, format_value
 from jaxhil.simulation.evaluation import RigModel
-from jaxhil.simulation.outcome import Outcome
+from tuning.gains.contact_terms import FAILED_CONTACT_ERROR, compute_contact_terms, extract_scenario_metrics
 from tuning.gains.lane_tiles import flatten_lanes, map_over_tiles
-from tuning.gains.metrics_function import MetricsFunction, ScenarioMetrics, build_scenario_metrics
+from tuning.gains.metrics_function import MetricsFunction
 from tuning.transparency.probes import mask_probes
 
 # error [1] that gives a residual of 1; the solver's initial damping suits residuals of about 1
 RESIDUAL_SCALE = 0.01
-# error e - e* [1] that is assigned to a contact that does not end or does not occur: a strong divergence
-FAILED_CONTACT_ERROR = 3.0
 CVAR_TAIL_DIVISOR = 20  # cvar is the mean of the worst 1/20 of the contacts, at least of one contact
 NORM_POWERS = {"rms": 2, "cvar": 6, "worst": 8}  # even exponents p of the norm in the residuals
 OBJECTIVE_NAMES = tuple(NORM_POWERS)
@@ -272,10 +270,14 @@ def weight_residuals(
         probe_errors = _compute_norm_residuals(jnp.where(probes, error, 0), counted(is_scheduled & probes), 2)
         transparency = [weights.transparency[:, None] * probe_errors]
         error, plain = jnp.where(probes, 0, error), counted(is_scheduled & ~probes)
-    weighted = jnp.where(error > 0, jnp.sqrt(weights.divergence)[:, None] * error, error)
     number = {"rms": plain, "cvar": _count_tail_contacts(plain), "worst": jnp.ones_like(plain)}[terms.name]
-    errors = _compute_norm_residuals(weighted, number, NORM_POWERS[terms.name])
-    if metric is not None:
+    if metric is None:
+        weighted = jnp.where(error > 0, jnp.sqrt(weights.divergence)[:, None] * error, error)
+        number = {"rms": plain, "cvar": _count_tail_contacts(plain), "worst": jnp.ones_like(plain)}[
+            terms.name
+        ]
+        errors = _compute_norm_residuals(weighted, number, NORM_POWERS[terms.name])
+    else:
         errors = metric[:, None]
     if terms.tolerance:
         errors = errors * _compute_untolerated_share(errors, weights.tolerance[:, None])
@@ -297,42 +299,6 @@ def _compute_untolerated_share(
     square = jnp.sum(terms**2, axis=1, keepdims=True)
     norm = jnp.sqrt(jnp.where(square > 0, square, 1))
     return jnp.where(tolerance > 0, jnp.maximum(1 - tolerance / norm, TOLERATED_ERROR_FACTOR), 1)
-
-
-def compute_contact_terms(
-    outcome: Outcome,
-) -> tuple[Float[Any, "slots *batch"], Float[Any, "slots *batch"], Float[Any, "slots *batch"]]:
-    """Return the restitution error, the excess of the peak command and the chatter of every contact, all [1].
-
-    The excess is max(0, peak command / peak force of the ideal contact - 1). All three are
-    `FAILED_CONTACT_ERROR` for failed contacts, and 0 for rows that are no contact of the scenario
-    (`is_scheduled` is false). The results are NumPy arrays if the outcome holds NumPy arrays, otherwise JAX
-    arrays.
-    """
-    xp = jnp if isinstance(outcome.error, jax.Array) else np
-    # Without the inner `where`, non-finite numbers of failed contacts would make the derivative NaN.
-    usable = outcome.good & xp.isfinite(outcome.error) & xp.isfinite(outcome.peak_ratio)
-    usable = usable & xp.isfinite(outcome.chatter)
-    error = xp.where(usable, outcome.error, FAILED_CONTACT_ERROR)
-    beyond = xp.where(usable, outcome.peak_ratio, 1 + FAILED_CONTACT_ERROR) - 1
-    excess = xp.where(beyond > 0, beyond, 0)
-    chatter = xp.where(usable, outcome.chatter, FAILED_CONTACT_ERROR)
-    error, excess, chatter = (xp.where(outcome.is_scheduled, x, 0) for x in (error, excess, chatter))
-    return error, excess, chatter
-
-
-def extract_scenario_metrics(outcome: Outcome, number: int, contacts: int, probed: bool) -> ScenarioMetrics:
-    """Return the metrics that a user's function receives, arrays (problems, contacts, scenarios).
-
-    The last axis of `outcome` lists the scenarios of all problems one after the other. If `probed` is true,
-    it also has the probes of each scenario; the metrics omit them.
-    """
-
-    def by_problem(leaf):
-        several = leaf[:contacts].reshape(contacts, number, -1)
-        return jnp.moveaxis(several[..., ~(mask_probes(several.shape[-1]) & probed)], 1, 0)
-
-    return jax.tree.map(by_problem, build_scenario_metrics(outcome, FAILED_CONTACT_ERROR))
 
 
 def evaluate_objective(

@@ -21,7 +21,8 @@ from jaxhil.simulation.outcome import Outcome
 from tuning.caches.checkpoints import NO_CHECKPOINTS, Checkpoints, compute_digest, decode_value, encode_value
 from tuning.caches.cluster import WorkUnit, run_on_workers
 from tuning.caches.worker import get_process_setting
-from tuning.gains.objective import Objective, compute_contact_terms, evaluate_objective
+from tuning.gains.contact_terms import compute_contact_terms
+from tuning.gains.objective import Objective, evaluate_objective
 from tuning.gains.pareto_search import (
     NOISE_CRITERION,
     PEAK_CRITERION,

@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxhil.laws.compensators import COMPENSATORS
+from tuning.gains.contact_terms import FAILED_CONTACT_ERROR
 from tuning.gains.multistart import choose_starts
 from tuning.gains.multistart_solver import StartResult, count_step_runs, solve_tasks
 from tuning.gains.noise import compute_noise_amplification, has_noise_trade_off
-from tuning.gains.objective import FAILED_CONTACT_ERROR, Objective
+from tuning.gains.objective import Objective
 from tuning.gains.settings import TuneSettings
 from tuning.gains.tasks import TuneTask, list_tuned_gains
 from tuning.gains.tune import TuneResult

@@ -19,11 +19,10 @@ from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.evaluation import Batch, RigModel, count_lanes
 from jaxhil.simulation.outcome import Outcome
 from tuning.batches import join_batches, split_batch
+from tuning.gains.contact_terms import compute_contact_terms, extract_scenario_metrics
 from tuning.gains.objective import (
     Objective,
-    compute_contact_terms,
     evaluate_objective,
-    extract_scenario_metrics,
     list_objectives,
 )
 from tuning.gains.search_progress import SearchProgress

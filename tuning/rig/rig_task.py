@@ -58,12 +58,14 @@ def build_simulated_rig(mechanism: AnyMechanism, seed: int = 0) -> SimulatedRig:
 
     Args:
         mechanism: mechanism and rig to simulate.
-        seed: seed of the sensor noise and of the phases.
+        seed: seed of the sensor noise and of the phases of contacts in a control period.
     """
-    if mechanism.rig.missed_tick_probability:
-        found = format_value(mechanism.rig.missed_tick_probability)
-        expected = "0 for a rehearsal; lost packets (--drops) make the controller miss ticks"
-        raise InputError(f"rig.missed_tick_probability: found {found}, expected {expected}")
+    probability = mechanism.rig.missed_tick_probability
+    if probability:
+        raise InputError(
+            f"rig.missed_tick_probability: found {format_value(probability)}, expected 0 for a rehearsal; "
+            "lost packets (--drops) make the controller miss ticks"
+        )
     if isinstance(mechanism, Mechanism):
         from tuning.rig.one_axis_rig import OneAxisRig
 

@@ -197,8 +197,10 @@ def differentiate_error(
     slopes = np.concatenate(rows)
     slopes = slopes[np.all(np.isfinite(slopes), axis=1)]
     if not len(slopes):
-        found = f"no simulated contact that ends with compensator {compensator}"
-        raise InputError(f"{mechanism.name}: found {found}, expected at least one")
+        raise InputError(
+            f"{mechanism.name}: found no simulated contact that ends with compensator {compensator}, "
+            "expected at least one"
+        )
     return slopes
 
 
