@@ -22,7 +22,7 @@ from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.file import load, load_any
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation import cached_programs, one_axis, source_fingerprint
-from jaxhil.simulation.cached_programs import load_or_compile
+from jaxhil.simulation.cached_programs import load_or_lower
 from jaxhil.simulation.compile_cache import EXECUTABLE_SUFFIX
 from jaxhil.simulation.jax_environment import CACHE_VARIABLE, TICK_OPTIONS, program_folder
 from jaxhil.simulation.loop_construction import build_loop
@@ -64,7 +64,7 @@ VALUES = np.array([1.0, 2.0, 4.0, 8.0])
 
 @pytest.fixture(autouse=True)
 def as_for_users(monkeypatch):
-    monkeypatch.setattr(cached_programs, "load_or_compile", load_or_compile)
+    monkeypatch.setattr(cached_programs, "load_or_lower", load_or_lower)
     monkeypatch.setattr(cached_programs, "program_folder", program_folder)
     traced.clear()
     yield

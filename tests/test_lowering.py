@@ -13,7 +13,7 @@ from jaxhil.rig_models import choose_rig_model
 from jaxhil.simulation import cached_programs, jax_environment, tile_size
 from jaxhil.simulation.evaluation import place_gains, run_tiles
 from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS, build_xla_flags, supported_options
-from tuning.gains.multistart_solver import MIN_PROBLEMS_PER_CALL, compile_solver
+from tuning.gains.multistart_solver import MIN_PROBLEMS_PER_CALL, lower_solver
 from tuning.gains.tasks import build_task
 
 LEVEL = "--xla_backend_optimization_level"
@@ -76,8 +76,8 @@ def test_rollout_batch_lowers_for_cuda_without_external_calls():
 
 def test_tuning_program_lowers_for_cuda(monkeypatch):
     programs = []
-    monkeypatch.setattr(cached_programs, "compile_cached", lambda *program, options: programs.append(program))
-    compile_solver([build_task(load_any("varying").mechanism, "phase_lead", 4, 0)], starts=1)
+    monkeypatch.setattr(cached_programs, "lower_cached", lambda *program, options: programs.append(program))
+    lower_solver([build_task(load_any("varying").mechanism, "phase_lead", 4, 0)], starts=1)
     ((function, static, arguments),) = programs
     assert static[-1] == MIN_PROBLEMS_PER_CALL  # all problems of the call in one tile
     result = calls(lambda arguments: tuple(function(static, arguments)), arguments)

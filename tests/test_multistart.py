@@ -141,7 +141,7 @@ def test_single_start_uses_literature_gains_and_polishing_search(tasks, validati
 def test_callback_runs_once_while_the_solver_compiles(validation, monkeypatch):
     done = []
     monkeypatch.setattr(multistart, "solve_tasks", lambda *_: done.append("round") or [[], [], []])
-    monkeypatch.setattr(multistart, "compile_solver", lambda *_: None)
+    monkeypatch.setattr(multistart, "lower_solver", lambda *_: lambda: None)
     monkeypatch.setattr(multistart, "program_folder", lambda: "somewhere")
     find_gains(validation, searched(1, 2, 0), meanwhile=lambda: done.append("other"))
     assert done == ["other", "round"]

@@ -21,7 +21,7 @@ from jaxhil.simulation.tile_size import (
     choose_tile_size,
     describe_devices,
 )
-from tuning.gains.multistart_solver import compile_solver, solve_tasks
+from tuning.gains.multistart_solver import lower_solver, solve_tasks
 from tuning.gains.objective import Objective
 from tuning.gains.tasks import build_task, list_tuned_gains
 from tuning.stability_map import grid
@@ -147,12 +147,12 @@ def test_solver_runs_as_many_problems_together_as_memory_allows(monkeypatch):
     state = task.model.count_lane_bytes(task.loop, task.scenarios) * (1 + len(task.tuned))
     tiles = []
     monkeypatch.setattr(
-        "jaxhil.simulation.cached_programs.compile_cached",
+        "jaxhil.simulation.cached_programs.lower_cached",
         lambda function, static, *arguments, options: tiles.append(static[-1]),
     )
     for device in (CPU, LARGE, DeviceDescription(False, round(128 * COPIES * state / MEMORY_SHARE))):
         use(monkeypatch, device)
-        compile_solver([task], starts=30)
+        lower_solver([task], starts=30)
     assert tiles == [4, 32, 8]
 
 

@@ -22,6 +22,7 @@ import io
 import os
 import pickle
 import re
+import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -54,6 +55,8 @@ Options = Mapping[str, int | str]  # compiler options by name
 NO_OPTIONS: Options = MappingProxyType({})
 
 _programs: dict[Any, Any] = {}  # compiled programs that this process has used
+# Threads lower one program at a time. Lowering is Python code, so that two at once would delay each other.
+_lowering = threading.RLock()
 
 
 def run_cached(
@@ -74,50 +77,70 @@ def run_cached(
     return program(*leaves)
 
 
-def compile_cached(
+def lower_cached(
     function: Callable[..., Any], static: Any, *arguments: Any, options: Options = NO_OPTIONS
-) -> None:
-    """Compile the program that `run_cached` will use for these arguments."""
-    program, leaves = _find_program(function, static, arguments, options)
-    if not isinstance(program, jax.stages.Compiled):
-        program.lower(*leaves).compile()
+) -> Callable[[], None]:
+    """Lower the program that `run_cached` will use for these arguments; return a function that compiles it.
+
+    Lowering holds Python's lock, compiling does not: another thread can compile while this one continues.
+    """
+    key, leaves, prepare = _identify_program(function, static, arguments, options)
+    program = _programs.get(key)
+    finish = prepare() if program is None else lambda: program
+
+    def compile_program() -> None:
+        _programs[key] = compiled = finish()
+        if not isinstance(compiled, jax.stages.Compiled):
+            compiled.lower(*leaves).compile()
+
+    return compile_program
 
 
 def _find_program(function, static, arguments, options):
     """Return the compiled program for these arguments, and the arrays to pass to this program."""
+    key, leaves, prepare = _identify_program(function, static, arguments, options)
+    program = _programs.get(key)
+    if program is None:
+        _programs[key] = program = prepare()()
+    return program, leaves
+
+
+def _identify_program(function, static, arguments, options):
+    """Return key and arguments of a program, and a function that calls `load_or_lower` for it."""
     leaves, structure = jax.tree.flatten(arguments)
     folder = program_folder()
     shapes = tuple([(leaf.shape, leaf.dtype) for leaf in leaves])
     key = function, static, structure, shapes, frozenset(options.items()), folder, _read_jax_settings()
-    program = _programs.get(key)
-    if program is None:
 
-        def flat(*leaves):
-            return function(static, *jax.tree.unflatten(structure, leaves))
+    def flat(*leaves):
+        return function(static, *jax.tree.unflatten(structure, leaves))
 
-        def jitted():
-            flat.__name__ = function.__name__
-            return jax.jit(flat, compiler_options=supported_options(options))
+    def jitted():
+        flat.__name__ = function.__name__
+        return jax.jit(flat, compiler_options=supported_options(options))
 
+    def prepare():
         placed = [(leaf.shape, str(leaf.dtype), str(getattr(leaf, "sharding", None))) for leaf in leaves]
         name = function.__module__, function.__qualname__
         identity = (*name, static, structure, placed, sorted(options.items()))
         # The static argument and the tree structure of the array arguments may contain user-registered laws.
         is_uncacheable = has_user_objects((static, jax.tree.unflatten(structure, [None] * len(leaves))))
-        program = load_or_compile(identity, jitted, leaves, None if is_uncacheable else folder)
-        _programs[key] = program
-    return program, leaves
+        return load_or_lower(identity, jitted, leaves, None if is_uncacheable else folder)
+
+    return key, leaves, prepare
 
 
-def load_or_compile(
+def load_or_lower(
     identity: Any,
     build: Callable[[], Any],
     arguments: Iterable[Any],
     folder: str | os.PathLike[str] | None,
-) -> Callable[..., Any]:
-    """Load a compiled program from the cache folder, or compile and store the program.
+) -> Callable[[], Callable[..., Any]]:
+    """Load a compiled program from the cache folder, or lower it.
 
-    Without a folder, or on a graphics card, return the jitted program, which JAX compiles at its first call.
+    Return a function without arguments that returns the program. If the program was lowered, this function
+    compiles and stores it. Without a folder, or on a graphics card, the program is the jitted one, which JAX
+    compiles at its first call.
 
     Args:
         identity: Object whose `repr` describes completely how the program is built.
@@ -126,19 +149,25 @@ def load_or_compile(
         folder: Folder of cached programs; None to cache nothing.
     """
     if folder is None or jax.default_backend() != "cpu":
-        return build()
+        return build
     try:
         path = Path(folder) / f"{_hash_program(identity)}{PROGRAM_SUFFIX}"
     except Exception:
         # This version of JAX does not provide all data for the hash, so that nothing can be cached.
-        return build()
+        return build
     program = _read_program(path)
-    if program is None:
+    if program is not None:
+        return lambda: program
+    with _lowering:
         lowered = build().lower(*arguments)
+
+    def compile_program():
         program, key = compile_cache.compile_with_key(lowered)
         if key is not None:
             _write_program(path, program, key, find_calls(lowered.as_text()))
-    return program
+        return program
+
+    return compile_program
 
 
 def find_calls(text: str) -> set[str]:

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from jaxhil.laws.compensators import get_compensator
 from jaxhil.laws.simulation_base import Gains
 from jaxhil.simulation import cached_programs
-from jaxhil.simulation.jax_environment import ROLLOUT_OPTIONS, TICK_OPTIONS
+from jaxhil.simulation.jax_environment import DERIVATIVE_OPTIONS, ROLLOUT_OPTIONS
 from jaxhil.simulation.outcome import Outcome
 from jaxhil.simulation.tile_size import count_bytes, find_tile_size
 
@@ -60,7 +60,7 @@ class RigModel(abc.ABC):
     errors: ClassVar[tuple[str, ...]]
     verdict_error: ClassVar[str]  # name of the error that tuning minimises and to which limits apply
     compiler_options: ClassVar[Mapping[str, int | str]] = ROLLOUT_OPTIONS  # compiler options for batches
-    derivative_options: ClassVar[Mapping[str, int | str]] = TICK_OPTIONS  # the same with derivatives
+    derivative_options: ClassVar[Mapping[str, int | str]] = DERIVATIVE_OPTIONS  # the same with derivatives
 
     @abc.abstractmethod
     def scenarios(

@@ -44,8 +44,8 @@ TICK_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_copy_insertion_use_
 ROLLOUT_OPTIONS = {**TICK_OPTIONS, "xla_disable_hlo_passes": "cpu_multi_output_fusion"}
 # Compiler options for six axes: with hundreds of arrays, loops of XLA's older code generator are faster.
 SIX_AXIS_OPTIONS = {**ROLLOUT_OPTIONS, "xla_cpu_use_fusion_emitters": False}
-# The same with derivatives; the older code generator also compiles them faster.
-SIX_AXIS_DERIVATIVE_OPTIONS = {**TICK_OPTIONS, "xla_cpu_use_fusion_emitters": False}
+# Compiler options of programs with derivatives: the older code generator compiles them faster.
+DERIVATIVE_OPTIONS = {**TICK_OPTIONS, "xla_cpu_use_fusion_emitters": False}
 # Compiler options of short programs that run only once: these options reduce the compile time.
 SINGLE_RUN_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 # Option of LLVM to unroll loops completely or not at all, and versions of jaxlib for which the option was

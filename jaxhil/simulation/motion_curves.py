@@ -14,7 +14,7 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation import cached_programs
 from jaxhil.simulation.free_flight import APPROACH_TIME
 from jaxhil.simulation.gain_file import LoadedGains
-from jaxhil.simulation.recording import LaneRecord, prepare_recording, record_lanes
+from jaxhil.simulation.recording import LaneRecord, record_lanes
 from jaxhil.simulation.scenario import Scenario, build_scenarios
 
 INTEGRATION_STEPS = 8000  # number of steps in the integration of the ideal contact
@@ -62,12 +62,6 @@ def compute_nominal_motion(mechanism: Mechanism, laws: NamedCompensators, seed: 
 def compute_scenario_motion(loaded: LoadedGains, scenarios: Scenario) -> list[RunMotion]:
     """Simulate one scenario; return the curves of each run."""
     return _build_run_motions(loaded.mechanism, scenarios, _compute_run_curves(loaded, scenarios, ["rig"]))
-
-
-def prepare_motion(mechanism: Mechanism, laws: NamedCompensators) -> None:
-    """Compile the programs that `compute_nominal_motion` needs for these compensators."""
-    for _, loaded, scenarios in _scenarios_by_compensator(mechanism, laws, 0):
-        prepare_recording(loaded, scenarios)
 
 
 def _scenarios_by_compensator(

@@ -86,13 +86,6 @@ def record_ticks(loop: Loop, gains: Mapping[str, Any], batch: Scenario) -> tuple
     return jax.device_get(run.metrics), jax.tree.map(lambda *parts: np.concatenate(parts), *chunks)
 
 
-def prepare_recording(loaded: LoadedGains, batch: Scenario) -> None:
-    """Compile the programs that `record_lanes` needs for these arguments."""
-    loop, gains = build_loop(loaded.mechanism, loaded.compensator, batch), convert_gains(loaded.gains)
-    rig, run = start_batch(loop, gains, batch)
-    cached_programs.compile_cached(_record_segment, loop, rig, gains, run)
-
-
 def start_batch(loop: Loop, gains: Gains, batch: Scenario) -> tuple[RigConstants, RunState]:
     """Return constants and initial state of the loop for a batch of scenarios, from a cached program."""
     return cached_programs.run_cached(_start_loop, loop, gains, batch)

@@ -57,7 +57,6 @@ class SixAxes(RigModel):
     errors: ClassVar[tuple[str, ...]] = ("energy_error", "twist_error")
     verdict_error: ClassVar[str] = "twist_error"  # an episode without twist error has no energy error
     compiler_options: ClassVar[Mapping[str, int | str]] = jax_environment.SIX_AXIS_OPTIONS
-    derivative_options: ClassVar[Mapping[str, int | str]] = jax_environment.SIX_AXIS_DERIVATIVE_OPTIONS
 
     def scenarios(
         self,

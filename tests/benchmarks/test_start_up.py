@@ -20,7 +20,7 @@ from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from test_throughput import PROCESSOR, best, case
 
 from jaxhil.laws.compensators import COMPENSATORS
-from jaxhil.simulation.jax_environment import TICK_OPTIONS, supported_options
+from jaxhil.simulation.jax_environment import DERIVATIVE_OPTIONS, supported_options
 from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.rollout import run_contacts
 from tuning.gains.multistart_solver import LANES_PER_TILE
@@ -76,7 +76,7 @@ def test_first_tune_of_impulse_ledger_needs_little_processor_time(tmp_path, caps
 
 def compile_seconds(traced, values):
     """Return the compile time [s] of a new program that calls the function `traced` once."""
-    program = jax.jit(lambda values: traced(values), compiler_options=supported_options(TICK_OPTIONS))
+    program = jax.jit(lambda values: traced(values), compiler_options=supported_options(DERIVATIVE_OPTIONS))
     lowered = program.lower(values)
     begin = time.perf_counter()
     lowered.compile()

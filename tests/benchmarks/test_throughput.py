@@ -18,7 +18,7 @@ from jaxhil.laws.compensators import COMPENSATORS
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation import evaluation
-from jaxhil.simulation.jax_environment import TICK_OPTIONS, supported_options
+from jaxhil.simulation.jax_environment import DERIVATIVE_OPTIONS, supported_options
 from jaxhil.simulation.loop import build_rig_constants
 from jaxhil.simulation.loop_construction import build_loop
 from jaxhil.simulation.one_axis import ONE_AXIS
@@ -150,8 +150,8 @@ def jacobian(lanes, options):
 
 def test_jacobian_is_faster_with_compiler_options_and_default_tile_size(capsys):
     tuned = best(
-        jacobian(LANES_PER_TILE, supported_options(TICK_OPTIONS)),
-        jacobian(2 * LANES_PER_TILE, supported_options(TICK_OPTIONS)),
+        jacobian(LANES_PER_TILE, supported_options(DERIVATIVE_OPTIONS)),
+        jacobian(2 * LANES_PER_TILE, supported_options(DERIVATIVE_OPTIONS)),
         jacobian(2 * LANES_PER_TILE, {}),
     )
     ours, wide, plain = (

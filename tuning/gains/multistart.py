@@ -24,9 +24,9 @@ from tuning.gains.direct_search import estimate_direct_runs, is_search_direct, s
 from tuning.gains.metrics_function import FUNCTION_REQUIREMENT
 from tuning.gains.multistart_solver import (
     StartResult,
-    compile_solver,
     compute_inverse_hessian,
     count_step_runs,
+    lower_solver,
     solve_tasks,
 )
 from tuning.gains.objective import RMS_OBJECTIVE, Objective, list_objectives
@@ -345,22 +345,24 @@ def _run_while_compiling(
 ):
     """Call `work`, then `more`, while a second thread compiles the solver; return the result of `work`.
 
-    The second thread runs no program, because concurrent programs on several devices could deadlock.
+    The second thread runs no program, because concurrent programs on several devices could deadlock. The
+    solver takes longest to compile, so that it is lowered before anything else.
     """
     if program_folder() is None:
         return work()
+    compile_solver = lower_solver(validation.tasks, number, objective)
     with ThreadPoolExecutor(1) as compiler:
-        ready = compiler.submit(_compile_in_thread, validation, number, objective)
+        ready = compiler.submit(_call_with_float64, compile_solver)
         result = work()
         more()
         ready.result()
         return result
 
 
-def _compile_in_thread(validation: Validation, number: int, objective: Objectives) -> None:
+def _call_with_float64(function: Callable[[], None]) -> None:
     # A new thread starts with the process's JAX settings, without the float64 setting of the calling thread.
     with use_float64():
-        compile_solver(validation.tasks, number, objective)
+        function()
 
 
 def _move_start(

@@ -7,7 +7,7 @@ delay fast ones. After the first, short round only the best starts of each task 
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -185,17 +185,17 @@ def _build_result(
     )
 
 
-def compile_solver(
+def lower_solver(
     tasks: list[TuneTask], starts: int, objective: Objective | Sequence[Objective] = RMS_OBJECTIVE
-) -> None:
-    """Compile the program of `solve_tasks`, and store it in the cache of compiled programs."""
+) -> Callable[[], None]:
+    """Lower the program of `solve_tasks`; return a function that compiles and caches it."""
     names = list_tuned_gains(tasks)
     bounds = [build_gain_bounds(task, names) for task in tasks]
     nothing = np.zeros(len(names))
     problems = [_StartState(index, nothing, nothing) for index in range(len(tasks)) for _ in range(starts)]
     static, call = _build_call(tasks, names, bounds, list_objectives(objective, len(tasks)), len(problems))
     first = problems[: _choose_call_size(len(problems))]
-    cached_programs.compile_cached(
+    return cached_programs.lower_cached(
         _solve_call, static, call(first, 1), options=tasks[0].model.derivative_options
     )
 

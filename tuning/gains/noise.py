@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-import jax.numpy as jnp
+import numpy as np
 
 from jaxhil.laws.compensators import COMPENSATORS, axes_of
 from jaxhil.laws.simulation_base import Compensator, KnownConstants
@@ -20,6 +20,8 @@ def compute_noise_amplification(mechanism: Any, compensator: str, gains: Mapping
     if axes_of(mechanism) != 1:
         return 1.0
     period, clearance = mechanism.rig.control_period, mechanism.contact.clearance
-    constants = KnownConstants(jnp.asarray(period), jnp.asarray(clearance))
-    values = {name: jnp.asarray(value) for name, value in gains.items()}
+    # With NumPy's numbers, JAX need not compile a program for each operation.
+    numbers: Any = np.asarray(period), np.asarray(clearance)
+    constants = KnownConstants(*numbers)
+    values: Any = {name: np.asarray(value) for name, value in gains.items()}
     return float(COMPENSATORS[compensator].noise_amplification(values, constants))

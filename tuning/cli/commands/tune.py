@@ -326,14 +326,17 @@ def _starts_from_earlier_gains(result) -> list[dict[str, Any]]:
 
 
 def _prepare_drawing(mechanism, compensator: str) -> None:
-    """Import and compile the code for the plots, in parallel with the compilation of the solver."""
+    """Import and compile the code for the plots while the solver is compiled.
+
+    The motion itself is discarded: its gains are not tuned yet.
+    """
     from jaxhil.laws.compensators import literature_gains
-    from jaxhil.simulation.motion_curves import prepare_motion
+    from jaxhil.simulation.motion_curves import compute_nominal_motion
     from tuning.gains.tune import remove_compensation
     from tuning.plots import tuning_results  # noqa: F401
 
     gains = literature_gains(mechanism, compensator)
-    prepare_motion(
+    compute_nominal_motion(
         mechanism, {"before": remove_compensation(compensator, gains), "tuned": (compensator, gains)}
     )
 
