@@ -188,7 +188,7 @@ class ListLowering(ExpressionLowering):
         return LoopRange(start.text, stop.text, values, count, step)
 
     def at(self, value: CExpression, index: str) -> CExpression:
-        """Return the C expression for the element of a list at an index that needs no test."""
+        """Return the C expression for a list element whose index is certainly in range."""
         of, numbers = value.type.of, value.constant
         span = (min(numbers), max(numbers)) if isinstance(numbers, tuple) and of.kind == "int" else None
         sign = Sign.NONNEGATIVE if span and span[0] >= 0 else of.sign

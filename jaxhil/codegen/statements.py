@@ -128,7 +128,7 @@ class BodyLowering(CallLowering):
         self.names[target.id] = value
 
     def replace(self, node: Any, keys: Locations, of_element: bool = False) -> None:
-        """Note that an assignment gives new lists or objects to the attributes `keys`.
+        """Record that an assignment has replaced the lists or objects of the attributes `keys`.
 
         Raise SubsetError if a local name of the old list or object is used later, because in Python this name
         still refers to the old list or object.

@@ -86,7 +86,7 @@ class Push(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """Push on the hardware, and reference trajectory, for each contact."""
+    """Push that tests transparency, and the ideal contact for comparison, for each contact."""
 
     push: Push  # push on the hardware, (contacts, *batch)
     # penetration in the ideal contact [m] at evenly spaced times, from 0 to `span` after the first touch

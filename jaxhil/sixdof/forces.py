@@ -19,7 +19,10 @@ from jaxhil.sixdof.vectors import Vector, cross
 
 
 class ContactGroup(eqx.Module):
-    """Pairs of shapes that may touch (candidates), with equal kinds of shapes and of laws."""
+    """Pairs of shapes that may touch (candidates).
+
+    All pairs have the same two kinds of shapes and the same contact law.
+    """
 
     candidates: Candidates  # pairs of shapes
     law: ContactLaw = eqx.field(static=True)  # contact law of the normal force

@@ -77,7 +77,7 @@ class MetricsFunction:
             )
 
     def values(self, metrics: ScenarioMetrics) -> Float[Array, "several"]:
-        """Compute the function of each of several sets of metrics, arrays (sets, contacts, scenarios)."""
+        """Evaluate the user's function for several sets of metrics, arrays (sets, contacts, scenarios)."""
         return jax.vmap(self._value)(metrics)
 
     def numbers(self, metrics: ScenarioMetrics) -> Float[np.ndarray, "several"]:

@@ -55,7 +55,7 @@ class ContactProblem:
         plane: float | None,
         time_constant: float | None = None,
     ):
-        """Prepare the fits; without a `time_constant`, the filter is that of the prior."""
+        """Prepare the fits; if `time_constant` is None, use the prior's time constant of the force filter."""
         self.motion, self.readings, self.law, self.plane = motion, readings, law, plane
         time_constant = readings.time_constant if time_constant is None else time_constant
         self.time_constant = time_constant
@@ -206,7 +206,7 @@ class ContactProblem:
         return [self._move_surface(rows, *motion, planes) for motion in gathered]
 
     def _move_surface(self, rows, position, rate, planes: np.ndarray) -> NearbyRows:
-        """Return the given rows for the surface positions `planes` [m]."""
+        """Compute depth and regressors of `rows` for each of the surface positions `planes` [m]."""
         depth = np.maximum(position - planes[:, None], 0.0)
         return NearbyRows(rows, position, depth, rate, self._tabulate(depth, rate, rows))
 

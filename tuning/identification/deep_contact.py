@@ -201,7 +201,12 @@ class _DesignTable:
         return distance <= DELAY_TOLERANCE and low <= planes.min() and planes.max() < high
 
     def rows(self, delay: float, planes: np.ndarray) -> PseudoRows:
-        """Interpolate the rows that replace the readings, for a force delay [s] and surface positions [m]."""
+        """Interpolate the pseudo-rows, which replace all readings in deep contact.
+
+        Args:
+            delay: Force delay [s].
+            planes: Positions of the surface [m].
+        """
         by_delay = self.by_delay(delay)
         nodes = self.factor[:, :-2].reshape(len(self.factor), len(self.delays), len(self.planes), -1)
         columns = np.einsum("rdpc,d->rpc", nodes, by_delay)

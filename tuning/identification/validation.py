@@ -58,7 +58,10 @@ class CheckResult:
 
     @property
     def error_in_verdict(self) -> float:
-        """Return the effect on e - e* for the verdict: 0 if the defect is absent or not in the verdict."""
+        """Return this defect's effect on e - e* as the verdict counts it.
+
+        The effect is 0 if the defect is not significant, or if the verdict ignores this defect.
+        """
         effect = self.effect if self.on_error is None else self.on_error
         return effect if self.is_significant and self.is_in_verdict else 0.0
 

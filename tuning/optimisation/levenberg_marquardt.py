@@ -250,7 +250,7 @@ class _LossRecordingSolver(optx.AbstractLeastSquaresSolver):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         inner = self.inner.init(fn, y, args, options, f_struct, aux_struct, tags)
         history = jnp.full(self.longest, jnp.inf, y.dtype)
-        return inner, history, jnp.array(0)
+        return inner, history, jnp.zeros_like(self.steps)
 
     def step(self, fn, y, args, options, state, tags):
         inner, history, count = state

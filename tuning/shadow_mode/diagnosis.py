@@ -153,7 +153,7 @@ def _get_fit_rows(ticks: LoggedTicks, run: ReplayedRun) -> tuple[CubicSpline, np
 
 
 def describe_force_delay(ticks: LoggedTicks, mechanism: Any) -> str | None:
-    """Return a line if the force reading is later, or earlier, than the mechanism of the gains states.
+    """Return a message if the force delay differs from that of the mechanism for which the gains were tuned.
 
     In slow contacts, a delayed reading of the force F = k d + b d' is k d + (b - k delay) d'. To find the
     delay, the function assumes the damping b of the mechanism. Return None on six axes and for other contact

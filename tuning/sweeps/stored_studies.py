@@ -79,7 +79,10 @@ def read_study(store: SweepStore, request: StudyRequest) -> Any:
 
 
 def encode_study(manifest: Manifest, request: StudyRequest, found: StudyResult) -> bytes:
-    """Encode the result of a study as JSON; raise ValueError if null cannot represent a non-finite value."""
+    """Encode the result of a study as JSON; raise ValueError if a number is not finite.
+
+    `NULL_VALUES` and `FIELD_NULL_VALUES` list the exceptions, which become null.
+    """
     document = {**_describe_study(manifest, request), "result": _convert_to_plain(found, None)}
     document["sha256"] = digest(document)
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode("ascii")

@@ -55,7 +55,7 @@ def compute_ideal_contacts(
 ) -> IdealContacts:
     """Compute the first `contacts` ideal contacts of every scenario, with and without pushes.
 
-    `velocity` contains the approach speeds [m/s]. Later slots repeat the last computed contact.
+    `velocity` contains the approach speeds [m/s]. Slots after the first `contacts` repeat the last contact.
     """
     slots, number = velocity.shape
     contact = jax.tree.map(lambda leaf: np.asarray(leaf)[:contacts], scenarios.contact)

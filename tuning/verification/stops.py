@@ -210,9 +210,9 @@ class RecordingController:
         return sent if fault == faults.STROKE else abs(sent - before) / period
 
     def _compute_start_distance(self) -> float:
-        """Return the distance [m] between the last recorded position command and the measured position.
+        """Return the distance [m] between measured position and position command at the first tick of a run.
 
-        Return NaN unless this command is the first command of its run.
+        Return NaN if the last recorded tick is a later tick of its run.
         """
         _, before, sent = self._compute_unlimited_commands()
         return math.nan if math.isfinite(before) else abs(sent - self._ticks[-1].measured)

@@ -64,7 +64,7 @@ def find_reached_contacts(runs: EvaluatedRuns, limit: float) -> Bool[np.ndarray,
 
 
 def extract_features(audited: AuditedContacts) -> ContactFeatures:
-    """Return stiffness, damping and approach speed from the audits; a missing estimate becomes 0."""
+    """Return stiffness, damping and approach speed of audited contacts; a missing estimate becomes 0."""
     return ContactFeatures(
         np.nan_to_num(audited.stiffness), np.nan_to_num(audited.damping), np.nan_to_num(audited.approach)
     )

@@ -38,7 +38,7 @@ DEEP_CONTACT_SHARE = 0.1  # maximum depth of omitted rows as a share of the larg
 
 @dataclass(frozen=True)
 class MetricWeights:
-    """Weights of the readings of one contact in the weighted sums that are its metrics."""
+    """Weights of one contact's readings; each metric is a weighted sum of these readings."""
 
     # (metrics, rows), weights of the force readings in the first five metrics; NaN for a missing metric
     force: np.ndarray

@@ -135,7 +135,10 @@ class Ledger:
         return add_multiple(self._command, 1.0, self._correction(pulled, stiffness))
 
     def _book(self, reader: SixAxisReader, recalled: ModelRows, force: float) -> None:
-        """Update the tangent model, and advance the reference, which is at the time t - D (equation c)."""
+        """Update the tangent model, and advance the reference to the time t - D (equation c).
+
+        D is the delay between model and readings.
+        """
         period, direction, tangent = self._period, self._direction, self.tangent
         rate = -dot(direction, reader.moved) / period
         if reader.loud:
@@ -154,7 +157,10 @@ class Ledger:
         self._impulse = add_multiple(self._impulse, period * (self._corrected - force), direction)
 
     def _bridge(self, recalled: ModelRows, least: float, stiffness: float, ahead: float) -> float:
-        """Predict from t - D to the middle of the command's period (equation d); return the last force."""
+        """Predict from t - D to the middle of the period in which the command acts (equation d).
+
+        Return the force at the end of the prediction.
+        """
         direction, tangent = self._direction, self.tangent
         missing = product(self._inverse, subtract(recalled[12:18], self._impulse))
         velocity = dot(direction, missing) - dot(direction, recalled[6:12])

@@ -171,7 +171,7 @@ class SixAxisReader:
         return self._force_variance * force + self._torque_variance * angular
 
     def weigh_tool(self) -> None:
-        """Update `tool`, a maximum, with the tool's inertia force in the current wrench."""
+        """Update `tool`, the largest inertia force of the tool so far, with the current wrench."""
         share = subtract(product(self._tool_correction, self.wrench), self.wrench)
         self.tool = max(self.tool, dot(share, product(self._inverse, share)))
 
