@@ -3,6 +3,7 @@
 A lane is one element of a batch, such as one scenario. The last axes of every array are the lanes.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,6 +25,19 @@ def select_lanes(condition: Bool[Array, "*batch"], when_true: Any, when_false: A
         return jnp.where(jnp.expand_dims(condition, range(jnp.ndim(new) - condition.ndim)), new, old)
 
     return jax.tree.map(select, when_true, when_false)
+
+
+def update_lanes(condition: Bool[Array, "*batch"], compute: Callable[[], Any], old: Any) -> Any:
+    """Return `compute()` in lanes that satisfy the condition, else `old`; if no lane does, skip `compute`.
+
+    Args:
+        condition: Whether each lane takes its new values.
+        compute: Function without arguments that returns the new values of all lanes.
+        old: Pytree of the same structure and shapes as the new values; its last axes are the lanes.
+    """
+    return lax.cond(
+        jnp.any(condition), lambda old: select_lanes(condition, compute(), old), lambda old: old, old
+    )
 
 
 def safe_sqrt(square: Float[Array, "..."]) -> Float[Array, "..."]:

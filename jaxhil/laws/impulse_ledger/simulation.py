@@ -1,13 +1,13 @@
 """Impulse ledger in JAX: batched version of `rig.py` in this folder, which states the equations."""
 
+from functools import partial
 from typing import ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxhil.contact.laws import deflection
-from jaxhil.lanes import safe_sqrt, select_lanes
+from jaxhil.lanes import safe_sqrt, select_lanes, update_lanes
 from jaxhil.laws.impulse_ledger import rig, specified
 from jaxhil.laws.impulse_ledger.alignment.simulation import Aligned, align
 from jaxhil.laws.impulse_ledger.contact_model import simulation as contact_model
@@ -179,16 +179,8 @@ class ImpulseLedger(Compensator):
         acts = in_contact | (flight.total > LEVEL)
         follows = (in_contact | (flight.total > 0)) & ~passes
         # All lanes of a tile have contact at about the same time: on most ticks, no lane needs `_follow`.
-        command, contact = jax.lax.cond(
-            jnp.any(follows),
-            lambda old: select_lanes(
-                follows,
-                self._follow(prepared, old, signals, position, velocity, flight, state.variance),
-                (jnp.zeros_like(position), old),
-            ),
-            lambda old: (jnp.zeros_like(position), old),
-            contact,
-        )
+        follow = partial(self._follow, prepared, contact, signals, position, velocity, flight, state.variance)
+        command, contact = update_lanes(follows, follow, (jnp.zeros_like(position), contact))
         over = acts & follows & contact.reference.released & (contact.outside * period > rig.RELEASE_TIME)
         limit = rig.MAX_SPREADS * gains["delay_spread"]
         shifted = jnp.clip(state.delay + contact.delay, -limit, limit)
@@ -242,8 +234,8 @@ class ImpulseLedger(Compensator):
         origin = side * position - rig.ONSET_PLACE * (period * speed)
         lag = jnp.clip(side * (signals.position_desired - position) / divisor, 0, rig.MAX_LAG)
         depth = (side * position - origin) / divisor
-        fresh = self._begin(gains, side, speed, origin, lag, depth, state.variance)
-        contact = select_lanes(free & approaches, fresh, contact)
+        begin = partial(self._begin, gains, side, speed, origin, lag, depth, state.variance)
+        contact = update_lanes(free & approaches, begin, contact)
         contact = contact._replace(
             side=jnp.where(free, side, contact.side), speed=jnp.where(free & ~approaches, 0, contact.speed)
         )
@@ -271,10 +263,13 @@ class ImpulseLedger(Compensator):
         onset = onset + gains["force_noise_floor"] + safe_sqrt(noise)
         spread = jnp.sqrt(gains["prior_preload_spread"] ** 2 + (rig.ONSET_SPREAD * onset) ** 2)
         is_outside = ~(depth > 0)
-        delay = contact_model.estimate_delay(
-            estimate, prior_mean, prior_variances, rig.ONSET_MEAN * onset, spread
+        estimate_delay = partial(
+            contact_model.estimate_delay,
+            *(estimate, prior_mean, prior_variances, rig.ONSET_MEAN * onset, spread),
         )
-        mean, variance = select_lanes(is_outside, delay, (contact.delay, contact.variance))
+        mean, variance = update_lanes(
+            is_outside & (delay_variance > 0), estimate_delay, (contact.delay, contact.variance)
+        )
         ended = is_outside & (rate < 0)
         theta = contact_model.conclude(estimate, prior_variances, jnp.where(ended, mean, 0))
         theta = jnp.where((learns | ended)[None], theta, estimate.theta)
