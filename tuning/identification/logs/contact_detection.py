@@ -6,6 +6,8 @@ import numpy as np
 
 CONTACT_THRESHOLD_SIGMAS = 5.0  # minimum force in contact, in standard deviations of the force noise
 MIN_CONTACT_TICKS = 3  # minimum number of successive ticks above the threshold at the beginning of a contact
+WEAK_CONTACT_RATIO = 3.0  # largest force, divided by the threshold, below which readings are averaged
+AVERAGED_ROWS = 9  # odd number of successive readings whose mean replaces a reading of a weak contact
 MIN_CONTACT_GAP = 0.1  # minimum time between two contacts [s]
 MAX_REST_ROWS = 200  # maximum number of first rows that determine the force without contact
 
@@ -14,6 +16,8 @@ def detect_contacts(
     force: np.ndarray, period: float, rest: float | None = None, apart: float = MIN_CONTACT_GAP
 ) -> list[tuple[int, int]]:
     """Detect contacts: intervals in which the force exceeds its noise.
+
+    If `rest` is None and noise nearly hides the contacts, means of successive readings replace the readings.
 
     Args:
         force: Measured force [N]; NaN in lost rows. Without `rest`, the first rows must be without contact.
@@ -24,9 +28,14 @@ def detect_contacts(
     Returns:
         For each contact, its first row and the row after its last row.
     """
-    is_above = np.abs(
-        force - (estimate_resting_force(force) if rest is None else rest)
-    ) > estimate_contact_threshold(force)
+    level = estimate_resting_force(force) if rest is None else rest
+    size, threshold = np.abs(force - level), estimate_contact_threshold(force)
+    is_weak = len(force) > AVERAGED_ROWS and float(np.nanmax(size)) < WEAK_CONTACT_RATIO * threshold
+    if rest is None and is_weak:
+        mean = _average_readings(force)
+        # Means of separate readings determine the threshold, so that the filter does not correlate them.
+        size, threshold = np.abs(mean - level), estimate_contact_threshold(mean[::AVERAGED_ROWS])
+    is_above = size > threshold
     is_sustained = is_above.copy()
     for ticks in range(1, MIN_CONTACT_TICKS):
         is_sustained[: len(force) - ticks] &= is_above[ticks:]
@@ -55,6 +64,14 @@ def estimate_contact_threshold(force: np.ndarray) -> float:
         1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2), float(np.nanstd(_select_first_readings(force)))
     )
     return max(CONTACT_THRESHOLD_SIGMAS * sigma, 1e-6 * float(np.nanmax(np.abs(force))))
+
+
+def _average_readings(force: np.ndarray) -> np.ndarray:
+    """Return the mean of the existing readings around each row; NaN where there are none."""
+    exists, window = np.isfinite(force), np.ones(AVERAGED_ROWS)
+    number = np.convolve(exists, window, "same")
+    total = np.convolve(np.where(exists, force, 0.0), window, "same")
+    return np.where(number > 0.5, total / np.maximum(number, 1.0), np.nan)
 
 
 def _select_first_readings(force: np.ndarray) -> np.ndarray:
