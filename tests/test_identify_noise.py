@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from tuning.identification.noise import detect_quantum, estimate_noise, fit_whitening_filter
+from tuning.identification.estimates import make_estimates
+from tuning.identification.logs.contact_detection import detect_contacts
+from tuning.identification.noise import (
+    detect_quantum,
+    estimate_noise,
+    fit_whitening_filter,
+    recognise_noise_free_readings,
+)
 
 
 @pytest.mark.parametrize("quantum", (0.0, 0.5, 3.0, 8.0))
@@ -55,3 +62,33 @@ def test_noise_at_rest_is_unknown_for_mostly_zero_readings():
     result = estimate_noise(dead)
     assert result.silent and result.std_std == np.inf and result.filter == (1.0,)
     assert not estimate_noise(signal).silent
+
+
+@pytest.mark.parametrize(("quantum", "noise"), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.3), (0.1, 0.3)])
+def test_readings_in_contact_distinguish_missing_noise_from_dead_zone(quantum, noise):
+    force = 80.0 * np.sin(np.linspace(0.0, np.pi, 200)) + noise * np.random.default_rng(0).normal(size=200)
+    contacts = [quantum * np.round(force / quantum) if quantum else force] * 9
+    result = recognise_noise_free_readings(estimate_noise(np.zeros(1000)), contacts)
+    assert result.silent == (noise > 0.0)
+    assert noise > 0.0 or (result.quantum == pytest.approx(quantum) and 0.0 < result.mean_std < 0.05)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.04, 0.3, 1.0])
+@pytest.mark.parametrize("key", ["contact.damping.0", "rig.force_sensor.delay", "contact.stiffness.0"])
+def test_interval_includes_estimate_for_draws_that_accumulate_at_zero(share, key):
+    rng = np.random.default_rng(0)
+    damping = np.where(rng.uniform(size=1000) < share, rng.exponential(size=1000), 0.0)
+    draws = {"contact.damping.0": damping}
+    draws[key] = damping**3
+    for estimate in make_estimates(draws, None, None, None, None, {}):
+        assert estimate.low <= estimate.value <= estimate.high
+
+
+@pytest.mark.parametrize("peak", [0.0, 15.0, 40.0, 400.0])
+def test_contact_of_small_force_is_detected_in_noise(peak):
+    force = 1.0 + 2.7 * np.random.default_rng(4).standard_normal(420)
+    force[100:220] += peak * np.sin(np.linspace(0.0, np.pi, 120))
+    force[::50] = np.nan
+    contacts = detect_contacts(force, 0.001)
+    assert len(contacts) == (peak > 0.0)
+    assert all(abs(first - 100) < 30 and abs(last - 220) < 30 for first, last in contacts)

@@ -103,13 +103,15 @@ def runs_at_rest(values, count=4):
     ]
 
 
-def test_bias_and_largest_size_of_cut_zone_are_estimated_from_noise():
+def test_hidden_bias_and_largest_size_of_cut_zone_are_estimated_from_noise():
     readings = 0.2 + 0.5 * np.random.default_rng(0).standard_normal(8000)
     runs = runs_at_rest(np.where(np.abs(readings) > 0.9, readings, 0.0))
     assert 0.9 < find_largest_size(runs) < 0.91
     bias = estimate_hidden_bias(runs, 0.9)
-    assert bias is not None and abs(bias[0] - 0.2) < 3.0 * bias[1] < 0.06
-    assert estimate_hidden_bias(runs_at_rest(np.zeros(8000)), 0.9) is None
+    assert abs(bias[0] - 0.2) < 3.0 * bias[1] < 0.06
+    continuous = np.sign(readings) * np.maximum(np.abs(readings) - 0.9, 0.0)
+    assert estimate_hidden_bias(runs_at_rest(continuous), 0.9, 0.9) == pytest.approx(bias, abs=1e-5)
+    assert estimate_hidden_bias(runs_at_rest(np.zeros(8000)), 0.9) == (0.0, pytest.approx(0.18))
 
 
 @pytest.mark.slow

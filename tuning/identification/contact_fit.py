@@ -41,7 +41,6 @@ SPECIFIED_DEAD_ZONE_STD = 1e-3  # relative standard deviation of a specified dea
 UNKNOWN_SURFACE_STD = 5e-5  # standard deviation of a surface position that is assumed to be 0 [m]
 DEAD_ZONE_MARGIN = 4.0  # minimum distance of a used force above the dead zone, in standard deviations
 COARSE_GRID_SIZE = 21, 5  # numbers of delays and of surface positions in the grid of bootstrap and test fits
-ASSUMED_BIAS_SHARE = 0.2  # standard deviation of a bias that a cut dead zone hides, divided by the zone
 ASSUMED_NOISE_SHARE = 0.01  # standard deviation of unknown noise, relative to the largest force
 MIN_NOISE_SHARE = 1e-6  # minimum noise as a share of the largest force; simulated logs may be noise-free
 MIN_DEAD_ZONE_SIGMAS = 3.0  # minimum size of a significant dead zone, in standard deviations
@@ -161,14 +160,17 @@ def _prepare_readings(
     zone = sensor.dead_zone
     cut = find_largest_size(runs) if noise_is_hidden and zone and sensor.dead_zone_kind == "cut" else 0.0
     if noise is not None and noise_is_hidden:
-        prior = (zone, SPECIFIED_DEAD_ZONE_STD * zone) if zone else noise.dead_zone
+        prior = noise.dead_zone
+    if noise_is_hidden and zone and not cut:
+        hidden, std = estimate_hidden_bias(runs, zone, zone)
+        prior = zone - hidden, float(np.hypot(std, SPECIFIED_DEAD_ZONE_STD * zone))
     low_pass = None if noise_is_hidden else sensor.filter
-    if noise is None or noise_is_hidden:
+    if noise is None or noise_is_hidden or noise.std == 0.0:
         readings = ForceReadings.of(runs, 1.0, threshold=1.0 if noise_is_hidden else 0.0)
-        readings = replace(readings, low_pass=low_pass, zone=cut)
+        subtracted = zone if noise_is_hidden and not cut else 0.0
+        readings = replace(readings, low_pass=low_pass, zone=cut, subtracted=subtracted)
         if cut:
-            bias = estimate_hidden_bias(runs, cut)
-            readings = replace(readings, bias=bias or (0.0, ASSUMED_BIAS_SHARE * cut))
+            readings = replace(readings, bias=estimate_hidden_bias(runs, cut))
             return _estimate_noise_from_contact(motion, readings, plane, 0.0), plane
         usual = 0.0 if noise_is_hidden and plane is None else plane
         readings = _estimate_noise_from_contact(motion, readings, usual, 0.0 if noise is None else noise.std)
@@ -287,7 +289,7 @@ def _estimate_clock_drift(
     plane,
 ) -> ClockDrift:
     """Estimate the drift of the force clock; assume unknown noise to be a share of the largest force."""
-    if noise is None or noise.silent:
+    if noise is None or noise.silent or noise.std == 0.0:
         readings = ForceReadings.of(runs, 1.0)
         readings = replace(readings, std=ASSUMED_NOISE_SHARE * float(np.abs(readings.force).max()))
     else:

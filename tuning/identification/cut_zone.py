@@ -1,8 +1,8 @@
-"""Cut dead zone of a force sensor: its size, and the bias that it hides.
+"""Size of a cut dead zone of a force sensor, and the bias that a dead zone of any kind hides.
 
-The sensor reads 0 if the force with bias and noise is smaller than the zone, and does not change larger
-forces. No reading is therefore between 0 and the size of the zone. The smallest reading is an upper bound of
-the size. Readings of 0 at a predicted force give lower bounds.
+A sensor with a cut dead zone reads 0 if the force with bias and noise is smaller than the zone, and does not
+change larger forces. No reading is therefore between 0 and the size of the zone. The smallest reading is an
+upper bound of the size. Readings of 0 at a predicted force give lower bounds.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from tuning.identification.records import LoggedRun
 
 ZONE_GRID_SIZE = 400  # number of sizes from 0 to the smallest reading
 PARAMETER_DRAWS = 40  # number of posterior draws of the contact for which the size is drawn
+ASSUMED_BIAS_SHARE = 0.2  # standard deviation of a bias that a dead zone hides, divided by the zone
 MIN_LOUD_SHARE = 0.1  # share of the peak force that shows a contact
 
 
@@ -27,27 +28,31 @@ def find_largest_size(runs: Sequence[LoggedRun]) -> float:
 
     If the readings are rounded, the result is larger by half a quantum. It is 0 if all readings are 0.
     """
-    readings = np.concatenate([_take_readings(run) for run in runs])
+    readings = np.concatenate([run.valid_forces for run in runs])
     sizes = np.abs(readings[readings != 0.0])
     return float(sizes.min()) + 0.5 * detect_quantum(readings) if len(sizes) else 0.0
 
 
-def estimate_hidden_bias(runs: Sequence[LoggedRun], zone: float) -> tuple[float, float] | None:
-    """Estimate the bias of readings before contact, of which a cut dead zone hides most.
+def estimate_hidden_bias(
+    runs: Sequence[LoggedRun], zone: float, subtracted: float = 0.0
+) -> tuple[float, float]:
+    """Estimate the bias of readings before contact, of which a dead zone hides most.
 
     The noise is assumed to be normally distributed.
 
     Args:
         runs: Runs that begin before contact.
         zone: Size of the zone [N].
+        subtracted: Force that the zone subtracts from larger forces [N]; 0 for a cut zone.
 
     Returns:
-        Mean and standard deviation of the bias [N], or None if too few readings exceed the zone.
+        Mean and standard deviation of the bias [N]; both are assumed if too few readings exceed the zone.
     """
     before = np.concatenate([_take_readings_before_contact(run) for run in runs])
     values = before[before != 0.0]
     if len(values) < MIN_READINGS_BEYOND_DEAD_ZONE:
-        return None
+        return 0.0, ASSUMED_BIAS_SHARE * zone
+    values = values + subtracted * np.sign(values)
 
     def cost(parameters):
         bias, std = parameters[0], np.exp(parameters[1])
@@ -93,13 +98,8 @@ def _log_probability_of_zero(force, std: float, zone: float):
     return high + np.log1p(-np.exp(np.minimum(low - high, -1e-15)))
 
 
-def _take_readings(run: LoggedRun) -> np.ndarray:
-    force = np.asarray(run.force_measured, float)
-    return force[run.valid & np.isfinite(force)]
-
-
 def _take_readings_before_contact(run: LoggedRun) -> np.ndarray:
     """Return the readings in the first half of the rows before the first large force."""
-    force = _take_readings(run)
+    force = run.valid_forces
     loud = np.abs(force) > MIN_LOUD_SHARE * np.abs(force).max(initial=0.0)
     return force[: int(np.argmax(loud)) // 2]

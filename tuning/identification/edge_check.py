@@ -32,6 +32,7 @@ MAX_CORRELATION_RATIO = 1 / 3  # maximum correlation of every other reading divi
 # Error of the estimated delay, divided by the standard deviation of the smoothing: measured with interpolated
 # readings of contacts whose fits have a lag.
 SMOOTHING_DELAY_SHARE = 0.3
+CLOCK_STD = 2e-5  # s, standard deviation of a delay because of clock errors, which logs do not show
 MAX_SMOOTHING_ERROR_RATIO = 2.0  # maximum effect of a smoothing, divided by that of the uncertain parameters
 
 
@@ -95,11 +96,15 @@ def check_force_smoothing(
 
 
 def average_edge_residuals(contact: ContactFit, runs: Sequence[LoggedRun]) -> np.ndarray:
-    """Return the weighted mean residual at each row near the two edges, divided by its standard deviation."""
+    """Return the weighted mean residual at each row near the two edges, divided by its standard deviation.
+
+    The standard deviation includes the noise and an error of all readings' times, which the file allows.
+    """
     delay, plane, coefficient_fit = contact.posterior.best
     problem, readings = contact.problem, contact.readings
     predicted = problem.force(delay, plane, coefficient_fit.coefficients)
     residual = problem.whiten(readings.force - predicted) / readings.std
+    late = problem.whiten(np.gradient(predicted, axis=0)) * CLOCK_STD / problem.motion.period / readings.std
     counts = readings.counts & flag_certain_rows(contact)
     inside = problem.motion.at(delay)[0] > plane
     speed = np.array([(run.speed or 0.0) if run.kind == "contact" else 0.0 for run in runs])
@@ -120,6 +125,7 @@ def average_edge_residuals(contact: ContactFit, runs: Sequence[LoggedRun]) -> np
             row = np.clip(edge + outward * row_offset, 0, len(inside) - 1)
             lanes = np.flatnonzero(has_both_edges & counts[row, np.arange(len(row))] & (row > 0))
             if len(lanes):
-                weight = speed[lanes]
-                means.append(float(weight @ residual[row[lanes], lanes] / np.linalg.norm(weight)))
+                weight = speed[lanes] / np.linalg.norm(speed[lanes])
+                mean, error = (float(weight @ values[row[lanes], lanes]) for values in (residual, late))
+                means.append(mean / float(np.hypot(1.0, error)))
     return np.array(means)

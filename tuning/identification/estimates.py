@@ -49,7 +49,7 @@ def make_estimates(draws_by_key, motion, contact, force, position, fixed) -> tup
             )
     if force is not None and force.quantum:
         direct.append(_make_normal_estimate("rig.force_sensor.quantum", force.quantum, 0.0))
-    if position is not None:
+    if position is not None and not position.silent:
         direct.append(_make_normal_estimate("rig.position_sensor.noise_std", position.std, position.std_std))
         if position.quantum:
             direct.append(_make_normal_estimate("rig.position_sensor.quantum", position.quantum, 0.0))
@@ -107,8 +107,10 @@ def _estimate_from_draws(
 
     `at_bound` contains the damping coefficients whose draws accumulate at 0. The interval of such a
     coefficient is one-sided. The logs hardly distinguish damping from force delay. The interval of the force
-    delay therefore also includes the delays that zero damping would imply.
+    delay therefore also includes the delays that zero damping would imply. Every interval includes the
+    estimate, which may exceed a quantile if nearly all draws are 0.
     """
+    value = float(values.mean())
     low, high = np.quantile(values, (0.025, 0.975))
     if key in at_bound:
         low, high = 0.0, np.quantile(values, 0.95)
@@ -117,9 +119,8 @@ def _estimate_from_draws(
     if at_bound and key.startswith(FORCE_DELAY_KEY):
         ends = np.quantile(shift_to_zero_damping(values, at_bound), (0.025, 0.975))
         low, high = min(low, ends[0]), max(high, ends[1])
-    return ParameterEstimate(
-        key, float(values.mean()), float(values.std(ddof=1)), float(low), float(high), get_unit(key)
-    )
+    low, high = min(float(low), value), max(float(high), value)
+    return ParameterEstimate(key, value, float(values.std(ddof=1)), low, high, get_unit(key))
 
 
 def _make_normal_estimate(key: str, value: float, std: float) -> ParameterEstimate:

@@ -29,6 +29,7 @@ class ForceReadings:
     whitening: tuple[float, ...] = (1.0,)  # coefficients of the filter that whitens the noise
     threshold: float = 0.0  # smallest predicted force of a used reading [N]; a dead zone affects smaller ones
     bias: tuple[float, float] | None = None  # prior mean and standard deviation of the sensor's bias [N]
+    subtracted: float = 0.0  # specified size of a continuous dead zone that hides the noise [N]
     zone: float = 0.0  # largest possible size of a cut dead zone [N]; 0 if the dead zone is not cut
     is_valid: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), bool))  # whether a reading exists
     low_pass: SensorFilter | None = None  # filter of the sensor in the prior, or None

@@ -23,7 +23,7 @@ from tuning.identification.contact_runs import exclude_rows_after_gaps, split_lo
 from tuning.identification.estimates import estimate_combinations, get_unit, make_estimates
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.identified_mechanism import compute_bound_excess, make_mechanism
-from tuning.identification.noise import NoiseEstimate, estimate_noise
+from tuning.identification.noise import NoiseEstimate, estimate_noise, recognise_noise_free_readings
 from tuning.identification.notes import collect_notes, note_absent_dead_zone
 from tuning.identification.options import KEYS_FIXED_BEFORE_FIT, IdentificationOptions, check_options
 from tuning.identification.parameters import SIMULATOR_PREFIX
@@ -78,6 +78,8 @@ def identify(
     model = _make_prior_model(prior) if motion is None else motion.model
     sensor = _specify_sensor(prior, options)
     touching = [] if model is None else _select_runs_in_contact(campaign, model)
+    if force is not None and not sensor.dead_zone:
+        force = recognise_noise_free_readings(force, [run.valid_forces for run in touching])
     contact, left_out = _fit_and_check_contact(touching, model, campaign, force, sensor, options, say)
     frequency = _estimate_frequency(contact, campaign.equivalent_mass)
     clock_drift = None if contact is None else contact.drift
@@ -229,7 +231,7 @@ def _estimate_sensor_noise(
         if run.valid.sum() < MIN_REST_ROWS:
             continue
         if force is None and run.force_measured is not None:
-            force = estimate_noise(_select_finite(run.force_measured, run.valid))
+            force = estimate_noise(run.valid_forces)
         if position is None and run.kind == "rest":
             position = estimate_noise(
                 _select_finite(run.position_measured - run.position_desired[0], run.valid)

@@ -110,12 +110,13 @@ def check_against_mechanism(
 
 
 def _has_uncertain_dead_zone(mechanism: Mechanism) -> bool:
-    """Return whether the dead zone's standard deviation exceeds the noise of the force sensor.
+    """Return whether a dead zone, or the bias that it hides, is less certain than a single reading.
 
     The readings at the onset and release of contact are then unpredictable.
     """
-    stated = mechanism.uncertainty.get("rig.force_sensor.dead_zone")
-    return stated is not None and (stated.std or 0.0) > mechanism.rig.force_sensor.noise_std
+    stated = (mechanism.uncertainty.get(f"rig.force_sensor.{key}") for key in ("dead_zone", "bias"))
+    std = max((entry.std or 0.0) if entry else 0.0 for entry in stated)
+    return mechanism.rig.force_sensor.dead_zone > 0.0 and std > mechanism.rig.force_sensor.noise_std
 
 
 def check_file_uncertainty(effect: UncertaintyEffect, pressed: bool) -> list[validation.CheckResult]:
@@ -154,7 +155,8 @@ def _make_contact_fit(
     motion = MotionResponse(model, runs, campaign.timing, max(MAX_FORCE_DELAY, delay) + period)
     noise = _estimate_force_noise(campaign.runs)
     has_dead_zone = rig.force_sensor.dead_zone > 0.0
-    std, whitening = rig.force_sensor.noise_std, (1.0,)
+    std = float(np.hypot(rig.force_sensor.noise_std, rig.force_sensor.quantum / np.sqrt(12.0)))
+    whitening = (1.0,)
     if noise is not None and not noise.silent:
         std, whitening = float(np.hypot(noise.innovation, noise.quantum / np.sqrt(12.0))), noise.filter
     if has_dead_zone or not std:
@@ -169,7 +171,7 @@ def _make_contact_fit(
     is_cut = rig.force_sensor.dead_zone_kind == "cut"
     readings = replace(readings, zone=rig.force_sensor.dead_zone if is_cut else 0.0)
     subtracts = has_dead_zone and not is_cut
-    coefficients.append(-rig.force_sensor.dead_zone if subtracts else rig.force_sensor.bias)
+    coefficients.append(rig.force_sensor.bias - (rig.force_sensor.dead_zone if subtracts else 0.0))
     values = np.array(coefficients)
     if not std:
         std = _estimate_row_noise(ContactProblem(motion, readings, law, plane, lag), delay, plane, values)
@@ -202,9 +204,8 @@ def _estimate_force_noise(runs: Sequence[LoggedRun]) -> NoiseEstimate | None:
     for kind in ("rest", "free"):
         for run in runs:
             if run.kind == kind and run.force_measured is not None:
-                readings = run.force_measured[run.valid & np.isfinite(run.force_measured)]
-                if len(readings) >= 200:
-                    return estimate_noise(readings)
+                if len(run.valid_forces) >= 200:
+                    return estimate_noise(run.valid_forces)
     return None
 
 
@@ -212,7 +213,8 @@ def _estimate_row_noise(problem: ContactProblem, delay: float, plane: float, val
     """Estimate the noise of the force readings [N] from the differences of successive residuals."""
     residual = problem.readings.force - problem.force(delay, plane, values)
     steps = np.diff(residual, axis=0)[problem.readings.counts[1:] & problem.readings.counts[:-1]]
-    return max(1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0), 1e-9)
+    peak = float(np.abs(problem.readings.force).max())
+    return max(1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0), contacts.MIN_NOISE_SHARE * peak, 1e-9)
 
 
 def _draw_delay_and_surface(mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,8 @@ whitens the residuals.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg, optimize, special
@@ -21,6 +22,10 @@ MAX_DISTINCT_SHARE = 0.2  # maximum number of distinct values per reading in rou
 MIN_EXCESS_ZERO_SHARE = 0.02  # minimum share of exact zeros, beyond those from rounding, for a dead zone
 # Maximum ratio of smallest to mean magnitude of nonzero readings with a dead zone that is subtracted.
 MAX_LEAST_TO_MEAN_RATIO = 0.3
+# Maximum scatter of readings in contact that shows no noise, divided by the scatter from rounding, and by the
+# largest reading.
+MAX_ROUNDING_RATIO, MAX_SCATTER_SHARE = 2.0, 1e-4
+MIN_LOUD_SHARE = 0.1  # share of the largest reading above which a reading is in contact
 MIN_ZERO_SHARE = 0.5  # minimum share of exact zeros that indicates a dead zone without further tests
 
 
@@ -78,6 +83,32 @@ def estimate_noise(readings: np.ndarray) -> NoiseEstimate:
         number,
         drift,
     )
+
+
+def recognise_noise_free_readings(noise: NoiseEstimate, contacts: Sequence[np.ndarray]) -> NoiseEstimate:
+    """Return the noise of a sensor whose constant readings at rest show a dead zone, or that it has no noise.
+
+    The scatter of readings in contact tells both apart, because a dead zone hides the noise only at rest.
+
+    Args:
+        noise: Noise at rest.
+        contacts: Readings of each run in contact at successive ticks.
+
+    Returns:
+        The noise at rest without a dead zone if the readings in contact show no noise; otherwise, `noise`.
+    """
+    if noise.std > 0.0 or not contacts:
+        return noise
+    readings = np.concatenate(contacts)
+    quantum, largest = detect_quantum(readings), float(np.abs(readings).max(initial=0.0))
+    steps = [np.diff(force, 3)[np.abs(force[3:]) > MIN_LOUD_SHARE * largest] for force in contacts]
+    # A smooth force hardly changes third differences; white noise multiplies its variance by 20.
+    scatter = 1.4826 * float(np.median(np.abs(np.concatenate(steps)))) / np.sqrt(20.0)
+    rounding = max(quantum, noise.quantum) / np.sqrt(12.0)
+    if noise.silent and not scatter <= max(MAX_ROUNDING_RATIO * rounding, MAX_SCATTER_SHARE * largest):
+        return noise
+    error = max(rounding, MAX_SCATTER_SHARE * largest)
+    return replace(noise, silent=False, quantum=max(quantum, noise.quantum), mean_std=error, std_std=0.0)
 
 
 def _has_excess_zeros(readings: np.ndarray, quantum: float) -> bool:

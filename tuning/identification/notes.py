@@ -11,6 +11,7 @@ from tuning.identification.noise import NoiseEstimate
 from tuning.identification.structure_choice import MAX_RELATIVE_STD
 
 FORCE_DELAY_KEY, DEAD_ZONE_KEY = "rig.force_sensor.delay", "rig.force_sensor.dead_zone"
+BIAS_KEY = "rig.force_sensor.bias"
 
 
 def collect_notes(
@@ -62,6 +63,10 @@ def collect_notes(
         assumed = f"assumed at 0 +- {spread:g} mm; --fix rig.contact_plane=VALUE specifies it"
         taken = "as specified" if contact.has_specified_surface else assumed
         notes.append(f"the force has a dead zone: the contact plane is {taken}")
+    if contact is not None and contact.readings.subtracted and contact.readings.bias is not None:
+        bias, std = contact.readings.subtracted + contact.readings.bias[0], contact.readings.bias[1]
+        prior = f"estimated at {bias:.2g} +- {std:.2g} N before the contacts are fitted"
+        notes.append(f"{BIAS_KEY}: the dead zone hides it: {prior}; --fix {BIAS_KEY}=VALUE specifies it")
     return notes
 
 

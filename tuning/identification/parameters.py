@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from jaxhil.contact.laws import CONTACT_KEYS, find_contact_law
-from tuning.identification.contact_fit import ContactFit
+from tuning.identification.contact_fit import SPECIFIED_DEAD_ZONE_STD, ContactFit
 from tuning.identification.contact_laws import Law
 from tuning.identification.cut_zone import draw_zone
 from tuning.identification.normal_draws import factorise_covariance
 from tuning.identification.rational import MotionModel
 
 SIMULATOR_PREFIX, CUTOFF_KEY = "rig.simulator.", "rig.force_sensor.filter.cutoff"
+DEAD_ZONE_KEY = "rig.force_sensor.dead_zone"
 
 
 def make_simulator_section(model: MotionModel) -> dict[str, Any]:
@@ -103,10 +104,14 @@ def convert_contact_draws(contact: ContactFit) -> dict[str, np.ndarray]:
     if "damping" in draws_by_name:
         result["contact.damping.0"] = draws_by_name["damping"]
     if contact.readings.zone:
-        result["rig.force_sensor.dead_zone"] = draw_zone(contact.problem, contact.posterior)
+        result[DEAD_ZONE_KEY] = draw_zone(contact.problem, contact.posterior)
+    elif contact.dead_zone and (stated := contact.readings.subtracted):
+        deviations = np.random.default_rng(0).standard_normal(len(draws))
+        size = stated * (1.0 + SPECIFIED_DEAD_ZONE_STD * deviations)
+        result |= {DEAD_ZONE_KEY: size, "rig.force_sensor.bias": draws_by_name["bias"] + size}
     elif contact.dead_zone:
         # Adding 0.0 changes -0.0, which would be printed with its sign, to 0.0.
-        result["rig.force_sensor.dead_zone"] = np.maximum(-draws_by_name["bias"], 0.0) + 0.0
+        result[DEAD_ZONE_KEY] = np.maximum(-draws_by_name["bias"], 0.0) + 0.0
     return result
 
 

@@ -54,6 +54,14 @@ class LoggedRun:
     begin: float = 0.0  # time stamp of tick 0 [s]
     force_late: np.ndarray | None = None  # time from each row to its force reading [s]
 
+    @property
+    def valid_forces(self) -> np.ndarray:
+        """Return the valid force readings [N]; the array is empty without a measured force."""
+        if self.force_measured is None:
+            return np.zeros(0)
+        force = np.asarray(self.force_measured, float)
+        return force[self.valid & np.isfinite(force)]
+
 
 @dataclass(frozen=True)
 class CampaignTiming:

@@ -128,7 +128,7 @@ def _find_latest_reading(commands: np.ndarray, columns: np.ndarray) -> int | Non
     variance = float(error[used] @ error[used]) / degrees_of_freedom * np.diag(inverse)
     lags = slice(0, ROWS_AFTER_COMMAND + ROWS_BEFORE_COMMAND + 1)
     size = np.abs(solution[lags])
-    is_significant = (size > MIN_COEFFICIENT_SIGMAS * np.sqrt(variance[lags])) & (
+    is_significant = (size > MIN_COEFFICIENT_SIGMAS * np.sqrt(np.maximum(variance[lags], 0.0))) & (
         size > MIN_COEFFICIENT_SHARE * np.max(size)
     )
     first = int(np.argmax(is_significant))
