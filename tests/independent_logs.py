@@ -32,6 +32,7 @@ class Kind:
     defect: tuple[str, ...] = ()  # a message must contain one of these words; empty for a kind without defect
     states_filter: bool = False  # the prior states kind and order of the filter, and a cutoff
     states_cut: bool = False  # the prior states that the dead zone is cut
+    states_window: bool = False  # the prior states a moving average, and a window
     sweep: bool = False  # the free motion is a swept sine in place of a multisine
     colour: float = 0.0  # standard deviation of low-frequency noise of the force [N]
     walk: float = 0.0  # N/sqrt(s), random walk of the force bias
@@ -48,6 +49,10 @@ def _lag(rng, rig):
 
 def _dead_zone(rng, rig):
     return {"dead_zone": rng.uniform(0.5, 3.0)}
+
+
+def _moving_average(rng, rig):
+    return {"window": rng.uniform(0.034, 0.050)}
 
 
 def _butterworth(order):
@@ -89,9 +94,8 @@ KINDS = {
     "resampled_force": Kind(
         force_clock=True, resampled=True, defect=("noise", "contact law", "interpolated", "lag")
     ),
-    "moving_average": Kind(
-        lambda rng, rig: {"window": rng.uniform(0.034, 0.050)}, defect=("motion", "order")
-    ),
+    "moving_average": Kind(_moving_average, defect=("motion", "order")),
+    "moving_average_stated": Kind(_moving_average, states_window=True),
 }
 
 
@@ -358,6 +362,13 @@ def mechanism_file(rig, speed, kind, factors):
         cutoff = rig.cutoff * factors[2]
         low_pass = f'{{ kind = "butterworth", order = {rig.filter_order}, cutoff = {cutoff} }}'
         values["rig.force_sensor.filter"] = low_pass
+    if kind.states_window:
+        second_order = ("rig.simulator.natural_frequency", "rig.simulator.damping_ratio")
+        values = {key: value for key, value in values.items() if key not in second_order}
+        values |= {
+            "rig.simulator.model": '"moving_average"',
+            "rig.simulator.window": rig.window * factors[2],
+        }
     if kind.states_cut:
         values |= {
             "rig.force_sensor.dead_zone_kind": '"cut"',

@@ -135,6 +135,7 @@ def check_intervals(rig, document):
         "rig.simulator.natural_frequency": rig.frequency,
         "rig.simulator.damping_ratio": rig.ratio,
         "rig.simulator.delay": rig.drive_delay - share,
+        "rig.simulator.window": rig.window,
         "delay and lag of force" if lagging else "rig.force_sensor.delay": age,
     }
     return {

@@ -1,16 +1,21 @@
 """Motion simulator from free motion: spectra, hold, orders, and errors relative to Cramer-Rao bounds."""
 
+from dataclasses import replace
+
 import campaigns
 import numpy as np
 import pytest
 
 from tuning.identification import free_motion, frf, hold, rational
+from tuning.identification.motion import MotionResponse
+from tuning.identification.moving_average_model import MOVING_AVERAGE
 from tuning.identification.rational import STRUCTURES, MotionModel, SpectralLines, fit_structure
 from tuning.identification.structure_choice import choose_structure
 
 BY_NAME = {structure.name: structure for structure in STRUCTURES}
 SECOND = MotionModel(BY_NAME["second_order"], np.array([np.log(2.0 * np.pi * 12.0), np.log(0.8), 0.0043]))
 THIRD = MotionModel(BY_NAME["third_order"], np.array([np.log(0.008), np.log(110.0), np.log(0.5), 0.0031]))
+AVERAGE = MOVING_AVERAGE.make_model(np.array([np.log(0.0373), 0.0043]))
 
 
 def lines_of(model, hold="linear", latency=0, period=0.001, shift=0, std=5e-7):
@@ -54,14 +59,14 @@ def test_command_hold_response_is_a_delay_of_whole_and_half_periods(kind, latenc
     assert np.all(np.diff(np.abs(response)) < 0.0) and abs(response[0]) > 0.9999
 
 
-@pytest.mark.parametrize("model", (SECOND, THIRD), ids=("second", "third"))
+@pytest.mark.parametrize("model", (SECOND, THIRD, AVERAGE), ids=("second", "third", "average"))
 def test_motion_model_derivatives_match_finite_differences(model):
     s = 2j * np.pi * np.array([0.3, 3.0, 30.0])
     for i, slope in enumerate(model.slopes(s)):
         step = np.zeros(len(model.parameters))
         step[i] = 1e-6
         up, down = (
-            np.log(MotionModel(model.structure, model.parameters + d).response(s)) for d in (step, -step)
+            np.log(model.structure.make_model(model.parameters + d).response(s)) for d in (step, -step)
         )
         np.testing.assert_allclose(slope, (up - down) / 2e-6, rtol=1e-6, atol=1e-8)
 
@@ -71,6 +76,35 @@ def test_motion_model_bandwidth_matches_closed_form():
     ratio = np.sqrt(1.0 - 2.0 * zeta**2 + np.sqrt((1.0 - 2.0 * zeta**2) ** 2 + 1.0))
     assert SECOND.bandwidth() == pytest.approx(12.0 * ratio, rel=1e-9)
     assert MotionModel(BY_NAME["ideal"], np.array([0.01])).bandwidth() == np.inf
+    assert abs(AVERAGE.response(2j * np.pi * AVERAGE.bandwidth())) == pytest.approx(np.sqrt(0.5), rel=1e-6)
+
+
+@pytest.mark.parametrize("hold_name", ("linear", "zoh"))
+def test_window_of_moving_average_is_fitted_to_spectra(hold_name):
+    lines = lines_of(AVERAGE, hold_name)
+    for structure in (MOVING_AVERAGE, BY_NAME["second_order"]):
+        result = fit_structure(structure, lines)
+        explains = structure is MOVING_AVERAGE
+        assert (result.chi2 < 1e-6) == explains
+        assert not explains or result.model.parameters == pytest.approx(AVERAGE.parameters, rel=1e-9)
+
+
+@pytest.mark.parametrize("hold_name", ("linear", "zoh"))
+def test_motion_of_moving_average_is_the_mean_of_the_delayed_command(hold_name):
+    campaign = campaigns.campaign("clean", 0, speeds=(0.006,), seconds=0, rest=0)
+    (run,), delay, period = campaign.runs, 0.0031, campaign.timing.control_period
+    motion = MotionResponse(AVERAGE, [run], replace(campaign.timing, command_hold=hold_name), 0.02)
+    command, ticks = run.position_desired, np.arange(-100, len(run.position_desired))
+    command = np.append(command[0] + (command[1] - command[0]) * ticks[:100], command)
+    rows = np.arange(0, len(run.tick), 20)
+    age = AVERAGE.delay + delay + AVERAGE.window * (np.arange(20_000) + 0.5) / 20_000
+    times = rows[:, None] - age / period
+    held = command[np.ceil(times).astype(int) + 100]
+    values = held if hold_name == "zoh" else np.interp(times, ticks, command)
+    position, velocity = motion.at(delay)
+    np.testing.assert_allclose(position[rows, 0], values.mean(axis=1), rtol=0.0, atol=1e-9)
+    later = (motion.at(delay - 1e-6)[0] - motion.at(delay + 1e-6)[0]) / 2e-6
+    np.testing.assert_allclose(velocity[rows], later[rows], rtol=0.0, atol=2e-6)
 
 
 @pytest.mark.parametrize("name", ("ideal", "first_order", "second_order", "third_order"))

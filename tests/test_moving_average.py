@@ -13,7 +13,7 @@ import tuning
 from jaxhil import InputError
 from jaxhil.mechanism.file import from_plain_data, to_plain_data
 from tuning.bundle.fmu.rig import rig_fmu
-from tuning.identification.mechanism_models import make_motion_model
+from tuning.identification.unmodelled_effects import reject_unmodelled_effects
 from tuning.rig.plant import RigHardware
 
 AVERAGE = {"model": "moving_average", "window": 0.0344, "delay": 0.0021}
@@ -111,9 +111,9 @@ def test_mechanism_file_rejects_window_of_wrong_model(simulator, message):
     assert "\n" not in str(caught.value)
 
 
-def test_identification_rejects_moving_average_in_one_line():
-    with pytest.raises(InputError, match="model: found moving_average, expected another"):
-        make_motion_model(validated(CASES["linear hold"].mechanism))
+def test_monitor_rejects_moving_average_in_one_line():
+    with pytest.raises(InputError, match=r"simulator\.model: found a moving average over 0\.0344 s"):
+        reject_unmodelled_effects(validated(CASES["linear hold"].mechanism))
 
 
 @pytest.mark.slow

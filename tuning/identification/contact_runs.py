@@ -11,7 +11,6 @@ from tuning.identification.records import LoggedRun
 
 SETTLING_TIME = 0.5  # settling time that is assumed for a motion simulator [s]
 SEGMENT_LENGTH = 1.0  # length of the segments of a long run [s]
-MEMORY_TIME_CONSTANTS = 10.0  # time constants of the motion simulator; older commands have no effect
 SPEED_ROWS = 5  # a speed is the difference of two positions that are this many rows apart
 MAX_SPEED_CHANGE = 0.01  # maximum relative change of the speed in a motion that counts as uniform
 
@@ -39,14 +38,11 @@ def split_long_run(run: LoggedRun, period: float) -> list[LoggedRun]:
 def exclude_rows_after_gaps(runs: Sequence[LoggedRun], model: MotionModel, period: float) -> list[LoggedRun]:
     """Mark the rows after a gap in the log as not valid if the lost commands affect the motion in these rows.
 
-    The lost commands affect the motion for ten time constants of the motion simulator plus all delays. If a
-    run begins in uniform motion, the motion is assumed to have been uniform during the gap, and all rows
-    remain valid.
+    The lost commands affect the motion for the memory of the motion simulator plus all delays. If a run
+    begins in uniform motion, the motion is assumed to have been uniform during the gap, and all rows remain
+    valid.
     """
-    slowest = max((-1.0 / pole.real for pole in np.roots(model.fraction[1])), default=0.0)
-    settling = int(
-        np.ceil((MEMORY_TIME_CONSTANTS * slowest + max(model.delay, 0.0) + MAX_FORCE_DELAY) / period)
-    )
+    settling = int(np.ceil((model.memory + max(model.delay, 0.0) + MAX_FORCE_DELAY) / period))
     result, ends = [], {}
     for run in runs:
         lost = ends.get(run.source, run.tick[0]) + 1 < run.tick[0]

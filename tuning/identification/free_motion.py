@@ -14,7 +14,14 @@ import numpy as np
 from scipy import optimize, stats
 
 from tuning.identification.frf import Spectrum, compute_spectrum
-from tuning.identification.rational import MotionModel, SpectralLines, SpectrumFit, fit_structure
+from tuning.identification.rational import (
+    STRUCTURES,
+    MotionModel,
+    SimulatorStructure,
+    SpectralLines,
+    SpectrumFit,
+    fit_structure,
+)
 from tuning.identification.records import CampaignTiming, LoggedRun
 from tuning.identification.structure_choice import (
     StructureCandidate,
@@ -85,7 +92,10 @@ class FreeMotion:
 
 
 def fit_free_motion(
-    runs: Sequence[LoggedRun], timing: CampaignTiming, order: int | None = None
+    runs: Sequence[LoggedRun],
+    timing: CampaignTiming,
+    order: int | None = None,
+    structures: Sequence[SimulatorStructure] = STRUCTURES,
 ) -> FreeMotion | None:
     """Fit the motion simulator to all free runs together.
 
@@ -93,6 +103,7 @@ def fit_free_motion(
         runs: Runs in free motion.
         timing: Timing of commands and readings.
         order: Order of the model, or None to choose the smallest order that explains the spectra.
+        structures: Structures of the model to choose from.
 
     Returns:
         The fit, or None if no run is long enough.
@@ -101,12 +112,13 @@ def fit_free_motion(
     if not spectra:
         return None
     lines = concatenate_lines(spectra, timing)
-    chosen, candidates = choose_structure(lines, order)
+    chosen, candidates = choose_structure(lines, order, structures=structures)
     # A model whose order is higher by one can compensate for a wrong command hold.
     highest = chosen.fit.model.structure.order + 1
     lines_with_other_hold = replace(lines, hold="linear" if lines.hold == "zoh" else "zoh")
     other_hold = chosen.criterion - compute_criterion(
-        choose_structure(lines_with_other_hold, order, highest)[0].fit, compute_residual_ratio(candidates)
+        choose_structure(lines_with_other_hold, order, highest, structures)[0].fit,
+        compute_residual_ratio(candidates),
     )
     model_error, weighted = 0.0, lines
     for _ in range(MODEL_ERROR_ITERATIONS):

@@ -74,7 +74,8 @@ def identify(
     }
     force, position = _estimate_sensor_noise(runs)
     say("fitting the motion simulator")
-    motion = free_motion.fit_free_motion(runs["free"], campaign.timing, options.order)
+    structures = mechanism_models.list_structures(prior if options.order is None else None)
+    motion = free_motion.fit_free_motion(runs["free"], campaign.timing, options.order, structures)
     model = _make_prior_model(prior) if motion is None else motion.model
     sensor = _specify_sensor(prior, options)
     touching = [] if model is None else _select_runs_in_contact(campaign, model)

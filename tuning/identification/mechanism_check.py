@@ -78,7 +78,8 @@ def check_against_mechanism(
     )
     lines = check_modelled_effects(mechanism)
     if motion is not None:
-        fitted = fitted or free_motion.fit_free_motion(free, campaign.timing)
+        structures = mechanism_models.list_structures(mechanism)
+        fitted = fitted or free_motion.fit_free_motion(free, campaign.timing, None, structures)
         assert fitted is not None
         motion = replace(motion, other_hold_gain=max(motion.other_hold_gain, fitted.other_hold_gain))
         lines += [

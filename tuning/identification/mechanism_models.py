@@ -11,21 +11,19 @@ from jaxhil.contact.base import ContactLaw
 from jaxhil.errors import InputError, format_value
 from jaxhil.mechanism.structs import Contact, Mechanism, Simulator
 from tuning.identification.contact_laws import Law
-from tuning.identification.rational import MotionModel, SimulatorStructure
+from tuning.identification.moving_average_model import MOVING_AVERAGE
+from tuning.identification.rational import STRUCTURES, MotionModel, SimulatorStructure
 
 # minimum ratio of imaginary part to magnitude of a complex pole; other poles are real except for rounding
 REAL_POLE_TOLERANCE = 1e-9
 
 
 def make_motion_model(mechanism: Mechanism) -> MotionModel:
-    """Return the model from commanded to measured position, with the delay of the position sensor.
-
-    Raise `InputError` for a moving average.
-    """
-    simulator, delay = mechanism.rig.simulator, mechanism.rig.simulator.delay
-    if simulator.model == "moving_average":
-        expected = "another model: logs are not compared with a moving average"
-        raise InputError(f"{mechanism.name}: rig.simulator.model: found moving_average, expected {expected}")
+    """Return the model from commanded to measured position, with the delay of the position sensor."""
+    simulator, total_delay = mechanism.rig.simulator, mechanism.rig.simulator.delay
+    total_delay += mechanism.rig.position_sensor.delay
+    if simulator.window is not None:
+        return MOVING_AVERAGE.make_model(np.array([np.log(simulator.window), total_delay]))
     numerator, denominator = _get_transfer_function(simulator)
     poles = np.roots(denominator)
     real = np.abs(poles.imag) <= REAL_POLE_TOLERANCE * np.abs(poles)
@@ -34,8 +32,13 @@ def make_motion_model(mechanism: Mechanism) -> MotionModel:
     sections = np.column_stack([np.abs(pairs), -pairs.real / np.abs(pairs)]).ravel()
     above = (np.asarray(numerator) / numerator[-1])[-2::-1]
     structure = SimulatorStructure(simulator.model, len(times), len(pairs), len(above))
-    total_delay = delay + mechanism.rig.position_sensor.delay
     return MotionModel(structure, np.concatenate([np.log(times), np.log(sections), above, [total_delay]]))
+
+
+def list_structures(mechanism: Mechanism | None) -> tuple[SimulatorStructure, ...]:
+    """Return the structures to fit to free motion: the moving average if the mechanism states it."""
+    is_average = mechanism is not None and mechanism.rig.simulator.window is not None
+    return (MOVING_AVERAGE,) if is_average else STRUCTURES
 
 
 def _get_transfer_function(simulator: Simulator) -> tuple[list[float], list[float]]:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from tuning.identification.moving_average_model import MovingAverageModel
 from tuning.identification.rational import MotionModel
 from tuning.identification.records import CampaignTiming, LoggedRun
 
@@ -54,10 +55,12 @@ class MotionResponse:
         least, most = (0.0, 0.0) if late is None else (min(late.min(), 0.0), max(late.max(), 0.0))
         self.shift = timing.shift
         self.rows = max(len(run.tick) for run in runs)
-        numerator, denominator = model.fraction
+        self.window = model.window if isinstance(model, MovingAverageModel) else 0.0
+        # A moving average is the difference of two values of the input's integral.
+        numerator, denominator = (np.ones(1), np.array([self.period, 0.0])) if self.window else model.fraction
         self.order = len(denominator) - 1
         self.A, self.B, self.C = _make_companion_form(numerator, denominator, self.period)
-        longest = max(self.delay, 0.0) + longest + most
+        longest = max(self.delay, 0.0) + longest + most + self.window
         self.history = int(np.ceil(longest / self.period)) + timing.command_latency + 4
         # If readings in a row belong to later ticks, or a delay is negative, commands of later ticks are
         # needed.
@@ -96,6 +99,13 @@ class MotionResponse:
         return position, velocity
 
     def _at(self, delay: float, lanes: slice) -> tuple[np.ndarray, np.ndarray]:
+        if not self.window:
+            return self._compute_output(delay, lanes)
+        now, before = (self._compute_output(delay + age, lanes) for age in (0.0, self.window))
+        position, rate = (self.period / self.window * (a - b) for a, b in zip(now, before, strict=True))
+        return position, rate
+
+    def _compute_output(self, delay: float, lanes: slice) -> tuple[np.ndarray, np.ndarray]:
         lag = (self.delay + delay) / self.period + self.shift
         whole_periods = int(np.floor(lag + TICK_TOLERANCE))
         fraction = min(1.0, 1.0 - (lag - whole_periods))
@@ -172,6 +182,10 @@ class MotionResponse:
         if not self.order:
             return states.swapaxes(0, 1)
         drive = from_start[:, None] * self.start[:, None] + from_end[:, None] * self.end[:, None]
+        if self.window:
+            states[0] = 0.0
+            np.cumsum(drive, axis=0, out=states[1:])
+            return np.ascontiguousarray(states.swapaxes(0, 1))
         closed = np.eye(self.order) - state
         from_both = from_start + from_end
         # In uniform motion, the input increases by the same step in each period n, and the state is alpha +

@@ -21,6 +21,8 @@ def make_simulator_section(model: MotionModel) -> dict[str, Any]:
     """Return the section `rig.simulator` of a mechanism file that describes the model."""
     structure, values = model.structure, np.exp(model.parameters[: model.structure.order])
     delay = {"delay": float(max(model.delay, 0.0))}
+    if structure.name == "moving_average":
+        return {"model": "moving_average", "window": float(values[0]), **delay}
     if structure.order == 0:
         return {"model": "ideal", **delay}
     if structure.name == "first_order":
@@ -49,8 +51,9 @@ def draw_simulator_parameters(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Draw the parameters of the motion simulator from a normal distribution.
 
-    The draws of a first- or second-order model contain all its parameters. Those of other models contain only
-    the delay, which then includes the whole deviation of the phase delay at the contact frequency.
+    The draws of a moving average or a first- or second-order model contain all its parameters. Those of other
+    models contain only the delay, which then includes the whole deviation of the phase delay at the contact
+    frequency.
 
     Args:
         model: Fitted model.
@@ -68,9 +71,9 @@ def draw_simulator_parameters(
     lag = deviations @ slopes
     values = model.parameters + deviations
     name = model.structure.name
-    if name == "first_order":
+    if name in ("first_order", "moving_average"):
         return {
-            SIMULATOR_PREFIX + "time_constant": np.exp(values[:, 0]),
+            SIMULATOR_PREFIX + model.names[0]: np.exp(values[:, 0]),
             SIMULATOR_PREFIX + "delay": values[:, 1],
         }, lag
     if name == "second_order":

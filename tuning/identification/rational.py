@@ -21,6 +21,7 @@ from scipy import optimize
 
 from tuning.identification import hold as holds
 
+MEMORY_TIME_CONSTANTS = 10.0  # time constants after which a command has no effect
 MIN_TIME_CONSTANT = 1e-6  # minimum time constant [s]; logs cannot resolve faster poles
 
 
@@ -41,6 +42,14 @@ class SimulatorStructure:
     def size(self) -> int:
         """Return the number of parameters, including the delay."""
         return self.order + self.zeros + 1
+
+    def make_model(self, parameters: np.ndarray) -> MotionModel:
+        """Return the model with these parameters."""
+        return MotionModel(self, parameters)
+
+    def make_starts(self, lines: SpectralLines) -> list[tuple[float, np.ndarray]]:
+        """Return chi-squared and parameters of linear fits at several delays."""
+        return [_fit_linear_start(self, lines, delay) for delay in _make_delay_grid(lines)]
 
 
 STRUCTURES = (
@@ -94,6 +103,12 @@ class MotionModel:
     def delay(self) -> float:
         """Return the transport delay [s]."""
         return float(self.parameters[-1])
+
+    @property
+    def memory(self) -> float:
+        """Return the time for which a command affects the motion, without the delay [s]."""
+        slowest = max((-1.0 / pole.real for pole in np.roots(self.fraction[1])), default=0.0)
+        return MEMORY_TIME_CONSTANTS * slowest
 
     @property
     def names(self) -> list[str]:
@@ -185,9 +200,7 @@ class SpectrumFit:
 
 def fit_structure(structure: SimulatorStructure, lines: SpectralLines) -> SpectrumFit:
     """Fit a structure to spectra by maximum likelihood (Levenberg-Marquardt method)."""
-    candidates = sorted(
-        (_fit_linear_start(structure, lines, delay) for delay in _make_delay_grid(lines)), key=lambda c: c[0]
-    )
+    candidates = sorted(structure.make_starts(lines), key=lambda c: c[0])
     # Fits from similar delays converge to the same minimum, so the second fit starts from a distant delay.
     fits = [_refine_fit(structure, candidates[0][1], lines)]
     for _, start in candidates[1:]:
@@ -206,10 +219,10 @@ def _refine_fit(structure: SimulatorStructure, start: np.ndarray, lines: Spectra
         return np.concatenate([values.real, values.imag], axis=-1)
 
     def residual(parameters):
-        return split((MotionModel(structure, parameters).predict(lines) - lines.output) * scale)
+        return split((structure.make_model(parameters).predict(lines) - lines.output) * scale)
 
     def jacobian(parameters):
-        model = MotionModel(structure, parameters)
+        model = structure.make_model(parameters)
         slopes = np.sum(model.slopes(s) * model.response(s) * command, axis=1) * scale
         return split(slopes).T
 
@@ -224,7 +237,7 @@ def _refine_fit(structure: SimulatorStructure, start: np.ndarray, lines: Spectra
     half, parameters = len(lines), _limit_fast_poles(structure, result.x)
     left = residual(parameters)
     return SpectrumFit(
-        MotionModel(structure, parameters), covariance, (left[:half] + 1j * left[half:]) / np.sqrt(2.0)
+        structure.make_model(parameters), covariance, (left[:half] + 1j * left[half:]) / np.sqrt(2.0)
     )
 
 
@@ -245,16 +258,20 @@ def _limit_fast_poles(structure: SimulatorStructure, parameters: np.ndarray) -> 
     return np.array([*times, *sections, *parameters[order:]])
 
 
-def _make_delay_grid(lines: SpectralLines) -> np.ndarray:
-    """Return a grid of delays [s] from 0 to the largest delay that the phase at low frequencies allows."""
+def estimate_low_frequency_delay(lines: SpectralLines) -> float:
+    """Return the delay from the drives' input to the reading [s], from the phase at low frequencies."""
     s, command = lines.images
     middle = len(s) // 2
     phase = np.unwrap(np.angle(lines.output / command[middle]))
     lowest = slice(0, max(3, len(lines) // 8))
     weight = np.abs(command[middle][lowest]) / lines.std[lowest]
     f = lines.frequency[lowest]
-    slope = -np.sum(weight**2 * f * phase[lowest]) / np.sum(weight**2 * f**2) / (2.0 * np.pi)
-    longest = max(slope, lines.period)
+    return float(-np.sum(weight**2 * f * phase[lowest]) / np.sum(weight**2 * f**2) / (2.0 * np.pi))
+
+
+def _make_delay_grid(lines: SpectralLines) -> np.ndarray:
+    """Return a grid of delays [s] from 0 to the largest delay that the phase at low frequencies allows."""
+    longest = max(estimate_low_frequency_delay(lines), lines.period)
     return np.linspace(0.0, longest, int(np.clip(4.0 * longest / lines.period, 8, 40)))
 
 

@@ -32,6 +32,7 @@ EXPERIMENTS = {
         "rig.simulator.natural_frequency",
     ): WIDER_MULTISINE,
     ("rig.simulator.delay", "rig.simulator.time_constant"): WIDER_MULTISINE,
+    ("rig.simulator.delay", "rig.simulator.window"): WIDER_MULTISINE,
 }
 
 

@@ -9,12 +9,19 @@ determine a parameter.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
-from tuning.identification.rational import STRUCTURES, SpectralLines, SpectrumFit, fit_structure
+from tuning.identification.rational import (
+    STRUCTURES,
+    SimulatorStructure,
+    SpectralLines,
+    SpectrumFit,
+    fit_structure,
+)
 
 POLE_ZERO_TOLERANCE = 0.05  # maximum distance of a zero that cancels a pole, divided by the pole's magnitude
 MAX_RELATIVE_STD = 0.3  # maximum relative standard deviation of a parameter that the spectra determine
@@ -35,7 +42,10 @@ class StructureCandidate:
 
 
 def choose_structure(
-    lines: SpectralLines, order: int | None = None, highest: int | None = None
+    lines: SpectralLines,
+    order: int | None = None,
+    highest: int | None = None,
+    structures: Sequence[SimulatorStructure] = STRUCTURES,
 ) -> tuple[StructureCandidate, list[StructureCandidate]]:
     """Fit model structures of the motion simulator and choose the smallest one that explains the spectra.
 
@@ -43,12 +53,13 @@ def choose_structure(
         lines: Measured spectra.
         order: Order of the structures to fit, or None for all orders.
         highest: Highest order to fit if `order` is None; None for no limit.
+        structures: Structures to choose from.
 
     Returns:
         The chosen candidate, and all candidates.
     """
     fits = []
-    for structure in STRUCTURES:
+    for structure in structures:
         if structure.order == order or (order is None and (highest is None or structure.order <= highest)):
             fits.append(fit_structure(structure, lines))
             if (

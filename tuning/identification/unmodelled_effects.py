@@ -6,6 +6,7 @@ from jaxhil.errors import InputError
 from jaxhil.mechanism.structs import Mechanism
 from tuning.identification.validation import CheckResult
 
+AVERAGE_KEY = "rig.simulator.model"
 FILTER_KEY, CUT_ZONE_KEY = "rig.force_sensor.filter", "rig.force_sensor.dead_zone_kind"
 
 
@@ -15,6 +16,8 @@ def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
     An effect that only the table `[uncertainty]` contains counts too.
     """
     rig, sensor, effects = mechanism.rig, mechanism.rig.force_sensor, {}
+    if rig.simulator.window is not None:
+        effects[AVERAGE_KEY] = "motion simulator", f"a moving average over {rig.simulator.window:g} s"
     if sensor.dead_zone_kind == "cut" and sensor.dead_zone > 0.0:
         text = f"a cut dead zone of {sensor.dead_zone:g} N"
         effects[CUT_ZONE_KEY] = "dead zone of the force sensor", text
@@ -39,7 +42,8 @@ def check_modelled_effects(mechanism: Mechanism) -> list[CheckResult]:
     `identify` models a filter of the force sensor unless a dead zone hides the onset of contact.
     """
     effects = list_unmodelled_effects(mechanism)
-    effects.pop(CUT_ZONE_KEY, None)
+    for key in (AVERAGE_KEY, CUT_ZONE_KEY):
+        effects.pop(key, None)
     if mechanism.rig.force_sensor.dead_zone == 0.0:
         effects.pop(FILTER_KEY, None)
     return [

@@ -45,6 +45,7 @@ SIMULATOR_KEYS = {
     "ideal": (),
     "first_order": ("time_constant",),
     "second_order": ("natural_frequency", "damping_ratio"),
+    "moving_average": ("window",),
     "third_order": ("coefficients.0", "coefficients.1", "coefficients.2"),
 }
 
