@@ -33,6 +33,7 @@ class Kind:
     states_filter: bool = False  # the prior states kind and order of the filter, and a cutoff
     states_cut: bool = False  # the prior states that the dead zone is cut
     states_window: bool = False  # the prior states a moving average, and a window
+    noiseless: bool = False  # only rounding disturbs the readings
     sweep: bool = False  # the free motion is a swept sine in place of a multisine
     colour: float = 0.0  # standard deviation of low-frequency noise of the force [N]
     walk: float = 0.0  # N/sqrt(s), random walk of the force bias
@@ -63,6 +64,7 @@ FILTER = ("lag", "filter", "delay", "contact law")
 KINDS = {
     "plain": Kind(),
     "sweep": Kind(sweep=True),
+    "noiseless": Kind(noiseless=True),
     "lag": Kind(_lag),
     "dead_zone": Kind(_dead_zone),
     "damping_unknown": Kind(unknown=("contact.damping",)),
@@ -140,6 +142,8 @@ class Noise:
     def __init__(self, rng, kind, period):
         self.rng, self.kind, self.period = rng, kind, period
         self.force_noise, self.position_noise = rng.uniform(0.1, 0.5), rng.uniform(1e-6, 5e-6)
+        if kind.noiseless:
+            self.force_noise = self.position_noise = 0.0
         self.bias = rng.uniform(-0.4, 0.4)
 
     def draw(self, ticks, runs=1):

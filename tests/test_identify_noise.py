@@ -68,6 +68,8 @@ def test_noise_at_rest_is_unknown_for_mostly_zero_readings():
 def test_readings_in_contact_distinguish_missing_noise_from_dead_zone(quantum, noise):
     force = 80.0 * np.sin(np.linspace(0.0, np.pi, 200)) + noise * np.random.default_rng(0).normal(size=200)
     contacts = [quantum * np.round(force / quantum) if quantum else force] * 9
+    constant = estimate_noise(np.full(1000, 0.1))
+    assert (constant.std, constant.filter, constant.silent) == (0.0, (1.0,), False)
     result = recognise_noise_free_readings(estimate_noise(np.zeros(1000)), contacts)
     assert result.silent == (noise > 0.0)
     assert noise > 0.0 or (result.quantum == pytest.approx(quantum) and 0.0 < result.mean_std < 0.05)

@@ -62,6 +62,8 @@ def estimate_noise(readings: np.ndarray) -> NoiseEstimate:
     if _has_excess_zeros(readings, quantum):
         std, dead_zone = _fit_dead_zone(readings)
         return NoiseEstimate(0.0, std, np.inf, np.inf, quantum, True, (1.0,), number, 0.0, dead_zone)
+    if np.ptp(readings) == 0.0:
+        return NoiseEstimate(float(readings[0]), 0.0, 0.0, 0.0, quantum, False, (1.0,), number)
     drift = _estimate_drift(readings)
     readings = readings - drift * (np.arange(number) / (number - 1.0) - 0.5)
     rounded = quantum and not drift
