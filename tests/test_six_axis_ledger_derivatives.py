@@ -1,7 +1,8 @@
 """Derivatives through the six-axis loop with the impulse ledger, compared with central differences.
 
 Derivatives of the energy error and the twist error with respect to the tuned gains, the delays, stiffness and
-friction are finite in all lanes, and agree with central differences in nearly all lanes.
+friction are finite in all lanes, and agree with central differences in nearly all lanes. In each of the other
+lanes, the difference is uncertain, or the probe passes between the drogue's cone and its rounded bottom.
 """
 
 from dataclasses import replace
@@ -17,28 +18,37 @@ from jaxhil.laws.compensators import literature_gains
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.jax_environment import jax_context
 from jaxhil.sixdof.building import build_scenarios, make_loop
+from jaxhil.sixdof.ideal_contact_integration import IdealContactModel, sample_ideal_contact
 from jaxhil.sixdof.metrics import evaluate
 
 pytestmark = pytest.mark.slow
 LAW, LANES, TILE = "impulse_ledger", 256, 64
 GAINS = "velocity_gain", "position_gain", "identification_delay"
-# Smallest relative step of each parameter. The steps of parameters with a small effect are larger, because
-# rounding, and the integration of the ideal contact, have errors.
+RATIO = 4  # ratio of successive steps
+
+
+def build_steps(smallest, number=4):
+    """Return relative steps of a parameter, from the smallest one up."""
+    return smallest * RATIO ** np.arange(number)
+
+
+# Parameters with a small effect have larger steps, because rounding and the integration of the ideal contact
+# have errors.
 STEPS = {
-    "velocity_gain": 1.6e-5,
-    "position_gain": 1.6e-5,
-    "identification_delay": 2.5e-7,
-    "force delay": 1e-6,
-    "axes' delays": 1.6e-5,
-    "stiffness": 1e-6,
-    "friction": 1.6e-5,
+    "velocity_gain": build_steps(1.6e-5),
+    "position_gain": build_steps(1.6e-5),
+    "identification_delay": build_steps(2.5e-7),
+    "force delay": build_steps(1e-6),
+    "axes' delays": build_steps(4e-6),
+    "stiffness": build_steps(1e-6),
+    "friction": build_steps(4e-6, 5),
 }
-RATIO, LEVELS = 4, 4  # ratio of successive steps, and their number
+VALUE_ERROR = 1e-11  # error of the energy error and of the twist error, from rounding and integration [1]
 TOLERANCE = 1e-4  # of the derivative or, where it is small, of 0.01 times the error
 SHARE = 0.95  # smallest share of the lanes that agree
-# Rounding and the integration of the ideal contact limit the differences with respect to friction, whose
-# effect on the errors is small.
+# The effect of friction on the errors is small, so more of its differences are uncertain.
 SHARES = dict.fromkeys(STEPS, SHARE) | {"friction": 0.93}
+PERIODS = 1024  # duration of a run [control periods]
 
 
 def scaled(scenarios, scales):
@@ -69,10 +79,27 @@ def best_difference(runs, steps):
     """
     plain = (runs[:, 1] - runs[:, 0]) / (2 * steps[:, None, None])
     extrapolated = (RATIO**2 * plain[:-1] - plain[1:]) / (RATIO**2 - 1)
-    gaps = np.abs(np.diff(extrapolated, axis=0))
+    gaps = np.abs(np.diff(extrapolated, axis=0)) + VALUE_ERROR / steps[:-2, None, None]
     best = np.argmin(gaps, axis=0)[None]
     pick = np.take_along_axis
     return pick(extrapolated, best + 1, axis=0)[0], pick(gaps, best, axis=0)[0]
+
+
+def changes_surface(scenarios):
+    """Return whether the probe touches both the cone and the rounded bottom in the ideal contact, (lanes,).
+
+    The surface's curvature jumps between them. A step of the integration across this jump is accurate, but
+    its derivative is less accurate.
+    """
+    contact_model = IdealContactModel(scenarios.bodies, scenarios.groups, scenarios.latches)
+    period = jnp.full(LANES, 1e-3)
+    sample = jax.jit(sample_ideal_contact, static_argnums=3, compiler_options=QUICK)
+    _, instants = sample(contact_model, scenarios.start, period, PERIODS, 2 * period)
+    [group], (x, y, z) = scenarios.groups, jax.tree.leaves(instants.pose.position)
+    angle = group.candidates.shape.half_angle
+    is_on_cone = jnp.hypot(x, y) * jnp.sin(angle) + z * jnp.cos(angle) > 0
+    touches = instants.forces[0].touch.depth[:, 0] > 0
+    return np.asarray((touches & is_on_cone).any(axis=0) & (touches & ~is_on_cone).any(axis=0))
 
 
 def test_ledger_derivatives_are_finite_and_agree_with_central_differences():
@@ -105,17 +132,19 @@ def test_ledger_derivatives_are_finite_and_agree_with_central_differences():
         assert np.isfinite(middle).all(), "in some lanes nothing touches"
         slopes = on_all_lanes(jax.jit(jax.jacfwd(errors), compiler_options=QUICK), ones)
         assert np.isfinite(slopes).all()
-        agreeing = {}
-        for index, (name, smallest) in enumerate(STEPS.items()):
-            steps = smallest * RATIO ** np.arange(LEVELS)
+        is_named, agreeing, unnamed = changes_surface(scenarios), {}, {}
+        for index, (name, steps) in enumerate(STEPS.items()):
             moved = [[on_all_lanes(values, ones.at[index].add(k * h)) for k in (-1, 1)] for h in steps]
             expected, uncertainty = best_difference(np.array(moved), steps)
             scale = np.maximum(np.abs(expected), 0.01 * np.abs(middle))
             is_close = (np.abs(slopes[..., index] - expected) < TOLERANCE * scale).all(axis=0)
             is_certain = (uncertainty < TOLERANCE * scale).all(axis=0)
             agreeing[name] = np.mean(is_close)
+            unnamed[name] = np.flatnonzero(~is_close & is_certain & ~is_named)
             print(
-                f"{name}: {agreeing[name]:.3f} of the lanes agree; among the others, "
-                f"{np.sum(~is_close & ~is_certain)} differences are uncertain"
+                f"{name}: {agreeing[name]:.3f} of the lanes agree; of the {np.sum(~is_close)} others, "
+                f"{np.sum(~is_close & ~is_certain)} differences are uncertain, and the probe passes between "
+                f"cone and bottom in {np.sum(~is_close & is_named)}"
             )
     assert all(agreeing[name] >= share for name, share in SHARES.items()), agreeing
+    assert not any(lanes.size for lanes in unnamed.values()), unnamed
