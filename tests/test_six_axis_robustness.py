@@ -7,11 +7,12 @@ import functools
 
 import jax.numpy as jnp
 import pytest
-from six_axis_ranges import load_wide
+from six_axis_ranges import WIDE, load_wide
 from test_six_axis_ledger import LAW, check_good, evaluated, rms
 
 from jaxhil.laws.compensators import SIX_AXIS_COMPENSATORS, literature_gains
 from jaxhil.laws.impulse_ledger.simulation_six_axes import ImpulseLedger
+from jaxhil.mechanism.file import load_any
 from jaxhil.sixdof.equations import solve
 
 WRONG_MASS = "impulse_ledger_with_wrong_mass"
@@ -22,6 +23,7 @@ LIMITS = {
     "ring-capture": {"bias": 1.3, "mass": 1.5, "delay": 4.0},
     "hydraulic-hexapod": {"bias": 1.3, "mass": 1.5, "delay": 4.6},
 }
+WRONG_DELAY = 1e-3  # true force delay minus the specified force delay [s]
 # Largest undisturbed twist error of the scenarios that count. The only larger error, 0.99 in `ring-capture`,
 # would hide the effect of the wrong parameter.
 LARGEST_USUAL_ERROR = 0.3
@@ -60,7 +62,9 @@ def simulated(name, wrong):
     scenario = {"bias": biased, "tool": light_tool}.get(wrong)
     change = {}
     if wrong == "delay":
-        change["identification_delay"] = literature_gains(mechanism, LAW)["identification_delay"] - 1e-3
+        change["identification_delay"] = (
+            literature_gains(mechanism, LAW)["identification_delay"] - WRONG_DELAY
+        )
     law = WRONG_MASS if wrong == "mass" else LAW
     [metrics] = evaluated(mechanism, law, change, scenario=scenario)
     check_good(metrics)
@@ -80,3 +84,35 @@ def test_ledger_errors_stay_small_if_one_rig_parameter_is_wrong(name, wrong, mon
     error, undisturbed = energy_error(name, wrong), energy_error(name, None)
     print(f"{name}, {wrong}: energy error {error:.4f}, undisturbed {undisturbed:.4f}")
     assert error <= LIMITS[name][wrong] * (1 if name == "probe-drogue" else undisturbed)
+
+
+def delayed(delay):
+    """Return a function that sets the force delay [s] of scenarios."""
+
+    def change(scenarios):
+        sensor = scenarios.sensor
+        return scenarios._replace(sensor=sensor._replace(delay=0 * sensor.delay + delay))
+
+    return change
+
+
+@pytest.mark.slow
+def test_wrong_force_delay_costs_the_energy_that_a_perfect_rig_with_this_delay_costs():
+    """Compare with a rig whose only defect is the wrong part of the delay.
+
+    A force that is read too late looks like a contact with less damping, so no compensator can correct it.
+    """
+    name = "hydraulic-hexapod"
+    perfect = {f'uncertainty."{key}"': None for key in load_wide(name).uncertainty if key.startswith("rig.")}
+    perfect |= {"rig.simulator": {"model": "ideal"}, "rig.force_sensor.delay": WRONG_DELAY}
+    perfect |= dict.fromkeys(("rig.force_sensor.noise_std", "rig.position_sensor.noise_std"), 0.0)
+    mechanism = load_any(WIDE / f"{name}.toml", perfect).mechanism
+    late, undelayed = (
+        evaluated(mechanism, "none", scenario=delayed(delay))[0]["energy_error"]
+        for delay in (WRONG_DELAY, 0.0)
+    )
+    change = simulated(name, "delay")["energy_error"] - simulated(name, None)["energy_error"]
+    print(f"{name}: rms change of energy error {rms(change):.4f}, perfect rig {rms(late - undelayed):.4f}")
+    assert rms(undelayed) < 0.01 * rms(late)
+    assert 0.9 * rms(late - undelayed) < rms(change) < 1.15 * rms(late - undelayed)
+    assert rms(change - (late - undelayed)) < 0.25 * rms(late)
