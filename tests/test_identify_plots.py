@@ -48,7 +48,7 @@ def test_contact_plots_show_contacts_and_residuals(identified):
     assert profile[1].max() == 1.0 and abs(profile[0][np.argmax(profile[1])] - 3.7) < 0.5
     assert line(left_axes, "prior")[0][0] == pytest.approx(3.7) and "correlation 0." in right_axes.get_title()
     panels = plot_contacts(identified.contact).axes
-    assert len(panels) == 6 and panels[0].get_title() == "contact 0" and panels[2].get_title() == "contact 2"
+    assert len(panels) == 6 and panels[0].get_title() == "contact 1" and panels[2].get_title() == "contact 3"
     for axes, speed in zip(panels[:3], (0.003, 0.006, 0.012), strict=True):
         measured, model = line(axes, "measured")[1], line(axes, "model")[1]
         assert np.nanstd(measured - model) < 0.7 and model.max() > 3e3 * speed

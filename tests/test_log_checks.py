@@ -70,6 +70,11 @@ def test_wrong_sign_or_mass_for_logged_force_command_is_detected(tmp_path):
     ("channels", "reason"),
     [
         ({"force_measured": {"column": "F", "sign": -1}}, "found F < 0 in contacts that push"),
+        (
+            {name: {"column": column, "sign": -1} for name, column in
+             (("force_measured", "F"), ("position_desired", "xd"), ("position_measured", "xm"))},
+            "with one surface: sign = -1 in the channels of force, position",
+        ),
         ({"force_measured": {"column": "F", "unit": "kN"}}, "times the impulse that reverses 350 kg"),
         ({"force_measured": {"column": "F", "unit": "mN"}}, "found 0.001 times the impulse"),
         ({"position_measured": {"column": "xm", "unit": "mm"}}, "found a stroke of 1.3e-06 m"),

@@ -106,6 +106,7 @@ def test_mechanism_path_is_never_mistaken_for_builtin_name(tmp_path, monkeypatch
         (b"\x00\x01\x02", "not valid TOML"),
         (b"\x89PNG\r\n\x1a\n", "not UTF-8"),
         (b"name = ", "not valid TOML"),
+        (b"a = 1\nkind = bessel", "(at line 2, column 8): found 'kind = bessel'; texts need quotes"),
         (b"a = 1\na = 2", "not valid TOML"),
         (b"x = " + b"9" * 5000, "not valid TOML"),
         (b"x = " + b"[" * 5000, "nested too deeply"),

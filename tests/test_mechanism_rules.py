@@ -17,7 +17,8 @@ from mechanism_table import (
     refusal,
 )
 
-from jaxhil.mechanism.file import from_plain_data, to_plain_data
+from jaxhil.errors import InputError
+from jaxhil.mechanism.file import from_plain_data, load, to_plain_data
 from jaxhil.mechanism.number_ranges import value_at
 from jaxhil.mechanism.rules import is_hurwitz
 
@@ -101,6 +102,17 @@ def test_mechanism_keys_of_other_contact_laws_and_simulator_models_are_rejected(
     assert f": {path}: found {OF_OTHERS[path]}, expected nothing (" in message
     uncertain = {path: {"distribution": "uniform", "factor": [0.5, 1.5]}}
     assert f': uncertainty."{path}": found ' in refusal(changed({"uncertainty": uncertain}))
+
+
+def test_all_keys_that_another_law_and_model_do_not_use_are_rejected_at_once():
+    changes = ["contact.law=hardening", "contact.exponent=2.0", "rig.simulator.model=moving_average"]
+    keys = "contact.exponent", "contact.reference_depth", "damping_ratio", "natural_frequency", "window"
+    with pytest.raises(InputError) as caught:
+        load("varying", changes)
+    lines = str(caught.value).splitlines()
+    for line, key in zip(lines, keys, strict=True):
+        assert f"{key}: found " in line
+    assert lines[3].endswith("(moving_average does not use it: unset it, also in [uncertainty])")
 
 
 def test_keys_that_contact_law_does_not_use_may_only_have_default_value():

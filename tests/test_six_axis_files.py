@@ -32,7 +32,7 @@ def refusal(*overrides, name="probe-drogue", unset=()):
     with pytest.raises(InputError) as caught:
         load_any(name, arguments, unset)
     message = str(caught.value)
-    assert message.isprintable() and message.startswith(f"{name}: ")
+    assert all(line.isprintable() and line.startswith(f"{name}: ") for line in message.splitlines())
     return message
 
 

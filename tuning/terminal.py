@@ -22,7 +22,7 @@ from rich.text import Text
 from jaxhil.errors import InputError, to_one_line
 from tuning.table_layout import fit_table
 
-DEFAULT_WIDTH = 110  # width of lines if no stream is a terminal [characters]
+DEFAULT_WIDTH = 80  # width of lines if no stream is a terminal [characters]
 COLUMN_INDEX = re.compile(r"_(\d+)(?=_\d+|$)")  # one-based index in a sweep's column name, for example `_2`
 # Verdicts in JSON documents for exit codes 2 and 130.
 UNUSABLE_INPUT, INTERRUPTED = "unusable input", "interrupted"

@@ -59,7 +59,7 @@ def check_mechanism_rules(mechanism: Mechanism) -> None:
             lambda: _check_damping_ratio(contact),
             lambda: _check_bodies(mechanism),
             lambda: check_contact_law(("contact",), contact, uncertainty, CONTACT_KEYS.values()),
-            lambda: check_simulator_model(mechanism.rig.simulator),
+            lambda: check_simulator_model(mechanism.rig.simulator, uncertainty),
             lambda: check_sensor_filter(mechanism.rig.force_sensor, uncertainty),
         ]
     )
@@ -188,7 +188,7 @@ def check_contact_law(
             raise KeyProblem(where, format_value(entry), expected)
         if isinstance(entry, list) and not law.is_segmented:
             raise KeyProblem(where, format_value(entry), f"a number > 0 N/m (law {law.name})")
-    _check_keys(path, law, contact, uncertainties, keys)
+    run_checks([lambda key=key: _check_law_key(path, law, contact, uncertainties, key) for key in keys])
     if law.dissipation_process and is_damped(path, contact, uncertainties):
         damping = format_value(contact.damping) if np.any(contact.damping) else "an uncertain damping"
         raise KeyProblem(
@@ -208,23 +208,21 @@ def _check_depths(path: KeyPath, law: ContactLaw, depths: Sequence[float]) -> No
             )
 
 
-def _check_keys(
-    path: KeyPath, law: ContactLaw, contact: Any, uncertain: Collection[str], keys: Collection[ContactKey]
+def _check_law_key(
+    path: KeyPath, law: ContactLaw, contact: Any, uncertain: Collection[str], key: ContactKey
 ) -> None:
-    """Raise `KeyProblem` unless a contact has the `keys` of its law and no `keys` of other laws."""
-    for key in keys:
-        value = getattr(contact, key.name)
-        laws = laws_with_key(key)
-        if law.name in laws and value is None:
-            expected = f"{describe_allowed_at(type(contact), key.name)} (law {law.name} needs it)"
-            raise KeyProblem((*path, key.name), "nothing", expected)
-        if law.keys is not None and law.name not in laws:
-            only = f"only for law {' or '.join(laws)}"
-            if value != key.default:
-                raise KeyProblem((*path, key.name), format_value(value), f"nothing ({only})")
-            dotted = ".".join((*map(str, path), key.name))
-            if dotted in uncertain and value not in (None, []):
-                raise KeyProblem(("uncertainty", dotted), f"a key {only}", "keys that the law uses")
+    """Raise `KeyProblem` unless a contact has `key` if and only if its law uses the key."""
+    value, laws = getattr(contact, key.name), laws_with_key(key)
+    if law.name in laws and value is None:
+        expected = f"{describe_allowed_at(type(contact), key.name)} (law {law.name} needs it)"
+        raise KeyProblem((*path, key.name), "nothing", expected)
+    if law.keys is not None and law.name not in laws:
+        only = f"only for law {' or '.join(laws)}"
+        if value != key.default:
+            raise KeyProblem((*path, key.name), format_value(value), f"nothing ({only})")
+        dotted = ".".join((*map(str, path), key.name))
+        if dotted in uncertain and value not in (None, []):
+            raise KeyProblem(("uncertainty", dotted), f"a key {only}", "keys that the law uses")
 
 
 def is_damped(
@@ -235,18 +233,10 @@ def is_damped(
     return bool(np.any(getattr(contact, key))) or (uncertain is not None and uncertain.factor is None)
 
 
-def check_simulator_model(simulator: Any) -> None:
+def check_simulator_model(simulator: Any, uncertain: Collection[str]) -> None:
     """Raise `KeyProblem` unless the motion simulator has the keys of its model, and is stable."""
     path = ("rig", "simulator")
-    for key in KEYS_OF_MODELS[simulator.model]:
-        if getattr(simulator, key) is None:
-            expected = f"{describe_allowed_at(type(simulator), key)} ({simulator.model} needs it)"
-            raise KeyProblem((*path, key), "nothing", expected)
-    for key in _ALL_MODEL_KEYS:
-        value = getattr(simulator, key)
-        if value is not None and key not in KEYS_OF_MODELS[simulator.model]:
-            expected = f"nothing ({simulator.model} does not use it: unset it)"
-            raise KeyProblem((*path, key), format_value(value), expected)
+    run_checks([lambda key=key: _check_model_key(simulator, uncertain, key) for key in _ALL_MODEL_KEYS])
     if simulator.model == "first_order" and not np.all(simulator.time_constant):
         raise KeyProblem((*path, "time_constant"), "0.0", 'a number > 0, or model = "ideal"')
     if simulator.model == "third_order" and simulator.coefficients is not None:
@@ -255,6 +245,19 @@ def check_simulator_model(simulator: Any) -> None:
             raise KeyProblem((*path, "coefficients"), format_value(simulator.coefficients), expected)
     if simulator.model == "transfer_function":
         _check_transfer_function(simulator.numerator or [], simulator.denominator or [])
+
+
+def _check_model_key(simulator: Any, uncertain: Collection[str], key: str) -> None:
+    """Raise `KeyProblem` unless the motion simulator has `key` if and only if its model uses it."""
+    path, value = ("rig", "simulator", key), getattr(simulator, key)
+    is_used = key in KEYS_OF_MODELS[simulator.model]
+    if is_used and value is None:
+        expected = f"{describe_allowed_at(type(simulator), key)} ({simulator.model} needs it)"
+        raise KeyProblem(path, "nothing", expected)
+    if not is_used and value is not None:
+        also = ", also in [uncertainty]" if ".".join(path) in uncertain else ""
+        expected = f"nothing ({simulator.model} does not use it: unset it{also})"
+        raise KeyProblem(path, format_value(value), expected)
 
 
 def check_sensor_filter(sensor: Any, uncertain: Collection[str]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.errors import format_value
-from jaxhil.mechanism.conversion import KeyPath, KeyProblem, describe_allowed_at
+from jaxhil.mechanism.conversion import KeyPath, KeyProblem, describe_allowed_at, raise_problems
 from jaxhil.mechanism.rules import check_contact_law
 from jaxhil.mechanism.six_axes import (
     KEYS_IN_SIX_AXES,
@@ -82,14 +82,15 @@ def check_latch(mechanism: SixAxisMechanism, name: str, latch: Latch) -> None:
 def _check_shape(path: KeyPath, shape: Shape) -> None:
     """Raise `KeyProblem` unless a shape has the keys of its kind, with valid values."""
     required, optional = KEYS_OF_SHAPES[shape.shape]
+    problems = []
     for key, value in _file_values(shape).items():
         if key in required and value is None:
             expected = f"{describe_allowed_at(Shape, key)} ({shape.shape} needs it)"
-            raise KeyProblem((*path, key), "nothing", expected)
+            problems.append(KeyProblem((*path, key), "nothing", expected))
         if key not in (*required, *optional) and value not in (None, False):
-            raise KeyProblem(
-                (*path, key), format_value(value), f"nothing ({shape.shape} does not use it: unset it)"
-            )
+            expected = f"nothing ({shape.shape} does not use it: unset it)"
+            problems.append(KeyProblem((*path, key), format_value(value), expected))
+    raise_problems(problems)
     if shape.shape == "plane" and not np.any(shape.normal):
         raise KeyProblem((*path, "normal"), format_value(shape.normal), "a nonzero outward vector")
     if shape.shape == "capsule" and shape.start == shape.end:

@@ -52,7 +52,7 @@ def check_six_axes(mechanism: SixAxisMechanism) -> None:
         check_contact(mechanism, name, contact)
     for name, latch in mechanism.latch.items():
         check_latch(mechanism, name, latch)
-    check_simulator_model(mechanism.rig.simulator)
+    check_simulator_model(mechanism.rig.simulator, mechanism.uncertainty)
     _check_space(mechanism.rig.simulator)
     _check_hold(mechanism)
     _check_sensor(mechanism.rig, mechanism.uncertainty)

@@ -65,7 +65,15 @@ def parse_toml(data: bytes, label: str, content: str) -> dict[str, Any]:
     except ValueError as error:
         # An integer with thousands of digits raises a ValueError instead of a TOMLDecodeError.
         reason = to_one_line(str(error).split(";")[0], 120)
-        raise InputError(f"{label}: not valid TOML: {reason}") from None
+        raise InputError(f"{label}: not valid TOML: {reason}{_quote_line(text, reason)}") from None
+
+
+def _quote_line(text: str, reason: str) -> str:
+    """Return the line of `text` to which an error of the parser refers, as the end of a message."""
+    match = re.search(r"at line (\d+)", reason)
+    lines = text.split("\n")[int(match[1]) - 1 :] if match else []
+    line = to_one_line(lines[0].strip(), 60) if lines else ""
+    return f": found {line!r}; texts need quotes, numbers a decimal point" if line else ""
 
 
 def _longest_key(text: str) -> int:

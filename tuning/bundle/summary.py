@@ -286,7 +286,10 @@ def _describe_noticed_errors(noticed: Mapping[str, Any], rates: Mapping[str, Any
         yield f"errors above {_format_number(noticed['error'], 2)} are detected in 95 % of contacts"
     elif noticed.get("largest") is not None:
         largest = _format_number(noticed["largest"], 2)
-        yield f"no error in these runs (at most {largest}) is detected in 95 % of contacts"
+        yield (
+            "the smallest error that is detected in 95 % of contacts is above "
+            f"{largest}, the largest error of these runs"
+        )
 
 
 def _html_table(

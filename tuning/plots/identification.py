@@ -157,7 +157,7 @@ def plot_contacts(contact: ContactFit) -> Figure:
             axes.plot(abscissa, predicted[shown, lane], color=BLACK, linewidth=1.2, label="model")
             finish_axes(axes, None)
         grid[0, column].set_xlabel("time since the onset [ms]")
-        grid[0, column].set_title(f"contact {lane}", fontsize=10)
+        grid[0, column].set_title(f"contact {lane + 1}", fontsize=10)
         grid[1, column].set_xlabel("penetration at the time of the force [mm]")
     for axes in grid[:, 0]:
         axes.set_ylabel("force [N]")
@@ -219,16 +219,15 @@ def plot_estimates(entries: Sequence[Mapping[str, Any]]) -> Figure:
         for entry in entries
         if entry["std"] and abs(entry["value"]) > MIN_ESTIMATE_SIGMAS * entry["std"]
     ]
-    figure = create_figure(
-        (9, 1.7 + 0.3 * max(len(plotted), 1)), "Estimates, compared with the prior", above=0.9
-    )
+    with_prior = [(row, entry) for row, entry in enumerate(plotted) if entry["prior"] is not None]
+    title = "Estimates, compared with the prior" if with_prior else "Estimates"
+    figure = create_figure((9, 1.7 + 0.3 * max(len(plotted), 1)), title, above=0.9)
     figure.subplots_adjust(left=0.34)
     axes = figure.subplots()
     for row, estimate in enumerate(plotted):
         share = [100.0 * (estimate[name] / estimate["value"] - 1.0) for name in ("low", "high")]
         axes.plot(share, [row, row], color=BLUE, linewidth=3, label="estimate, 95 %" if row == 0 else None)
         axes.plot([0.0], [row], color=BLUE, marker="o", markersize=5)
-    with_prior = [(row, entry) for row, entry in enumerate(plotted) if entry["prior"] is not None]
     if with_prior:
         shares = [100.0 * (entry["prior"] / entry["value"] - 1.0) for _, entry in with_prior]
         style: dict[str, Any] = {"linestyle": "none", "marker": "D", "markersize": 5, "color": VERMILION}

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxhil.contact.laws import CONTACT_KEYS, find_contact_law, laws_with_key
 from jaxhil.errors import to_one_line
 from jaxhil.mechanism.file import AnyMechanism
 from jaxhil.mechanism.number_ranges import numeric_keys, value_at
@@ -22,6 +23,7 @@ from tuning.sweeps.columns import find_key_unit
 
 GOOD, BAD, UNKNOWN = "good", "bad", "unknown"
 UNKNOWN_NAME = "(not known)"
+FILE_PRECISION = 1e-11  # relative precision of numbers in an identified mechanism file, with 12 digits [1]
 
 
 @dataclass(frozen=True)
@@ -77,12 +79,13 @@ def assumption_section(results: Results) -> Section | None:
     if subject is None:
         return None
     mechanism, origins = subject.mechanism, _identified_origins(results)
+    unused = _unused_keys(mechanism)
     rows = []
     for path in numeric_keys_of(mechanism):
         if path.startswith("uncertainty"):
             continue
         value = value_at(mechanism, path)
-        if value is None or value == [] or np.all(np.isinf(value)):
+        if value is None or value == [] or np.all(np.isinf(value)) or path in unused:
             continue
         unit = find_key_unit(mechanism, path)
         uncertain = mechanism.uncertainty.get(path)
@@ -93,13 +96,31 @@ def assumption_section(results: Results) -> Section | None:
         rows.append((path, _format_value(value), unit, varies, origins.get(path, "the file")))
     texts = [
         f"{_describe_contact_laws(mechanism)}; motion simulator: {mechanism.rig.simulator.model}; "
-        f"integrator: {mechanism.rig.integrator}; command hold: {mechanism.rig.command_hold}.",
+        f"integrator: {mechanism.rig.integrator}; command hold: {mechanism.rig.command_hold}; command "
+        f"latency: {mechanism.rig.command_latency} periods{_describe_filter(mechanism)}.",
         f"Source of the file: {to_one_line(mechanism.source, 1000) or UNKNOWN_NAME}",
     ]
     if mechanism.correlation is not None:
         texts.append("Some of these parameters are correlated, as [correlation] in the file states.")
     headings = ("key", "value", "unit", "variation", "source")
     return Section("assumptions", "Assumptions and their sources", texts, [ReportTable(headings, rows, 9)])
+
+
+def _unused_keys(mechanism: AnyMechanism) -> list[str]:
+    """Return the keys with a default value that the contact law of a one-axis mechanism does not use."""
+    if not isinstance(mechanism, Mechanism):
+        return []
+    law = find_contact_law(mechanism.contact.law)
+    keys = CONTACT_KEYS.values() if law.keys is not None else ()
+    return [f"contact.{key.name}" for key in keys if law.name not in laws_with_key(key)]
+
+
+def _describe_filter(mechanism: AnyMechanism) -> str:
+    """Return a text with kind and order of the force sensor's filter, or an empty text without a filter."""
+    sensor_filter = mechanism.rig.force_sensor.filter
+    return (
+        f"; filter of the force: {sensor_filter.kind} of order {sensor_filter.order}" if sensor_filter else ""
+    )
 
 
 def _describe_contact_laws(mechanism: AnyMechanism) -> str:
@@ -127,7 +148,7 @@ def gain_section(results: Results) -> Section | None:
     ]
     tables = [ReportTable(("gain", "value", "unit", "bounds"), rows)] if rows else []
     limits = [
-        (name, *describe_limit(limit.value, limit.unit))
+        (name, *describe_limit(document["limits"][name]["value"], limit.unit))
         for name, limit in limit_entries(document).items()
         if is_user_limit(name)
     ]
@@ -308,7 +329,9 @@ def is_identified(results: Results) -> bool:
         if value is not None and not path.startswith("uncertainty"):
             nominal = value_at(subject.mechanism, path)
             try:
-                if not np.array_equal(np.asarray(nominal, float), np.asarray(value, float)):
+                if not np.allclose(
+                    np.asarray(nominal, float), np.asarray(value, float), rtol=FILE_PRECISION, atol=0.0
+                ):
                     return False
             except (TypeError, ValueError):
                 return False

@@ -156,10 +156,13 @@ def _describe_aim(limit: float, result: Any) -> list[str]:
     if not is_sought or result.without_noise is None or not result.starts:
         return []
     if result.quiet:
-        return [f"Quietest gains found within {limit:g}; of least error: --noise-weight 0."]
+        return [
+            f"These are the quietest gains within the limit {limit:g}. For the gains with the smallest "
+            "error: --noise-weight 0."
+        ]
     return [
-        f"Gains of least error: no gains were found well within {limit:g}, among which the quietest "
-        "would be chosen."
+        f"These are the gains with the smallest error: no gains are clearly within the limit {limit:g}, so "
+        "that none could be chosen for little noise."
     ]
 
 

@@ -166,7 +166,7 @@ def _check_one_side(label: str, pull: np.ndarray, x: np.ndarray, period: float, 
             raise InputError(
                 f"{label}: row {begin + SPEED_SPAN_TICKS + 1}: found a contact at the second surface of a "
                 "clearance (F < 0 reverses a retraction), expected only contacts that reverse an approach "
-                "(F > 0)"
+                "(F > 0); with one surface: sign = -1 in the channels of force, position and velocity"
             )
 
 
