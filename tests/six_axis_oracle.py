@@ -131,26 +131,34 @@ def command(case, bodies):
 
 
 class Axis:
-    """Motion simulator axis y'' + 2 zeta w y' + w^2 y = w^2 u with linear hold, first in steady motion."""
+    """Motion simulator axis y'' + 2 zeta w y' + w^2 y = w^2 u, first in steady motion.
 
-    def __init__(self, frequency, ratio, period, at, rate):
+    With the hold "zoh", the motion before the first tick is that of one second of uniform commands.
+    """
+
+    def __init__(self, frequency, ratio, period, at, rate, hold="linear"):
         w = 2 * np.pi * frequency
         self.flow = np.zeros((4, 4))
         self.flow[0, 1] = self.flow[2, 3] = 1
         self.flow[1] = [-(w**2), -2 * ratio * w, w**2, 0]
         self.period, self.late = period, 2 * ratio / w * rate
-        self.at, self.rate = at, rate
+        self.is_held, self.history = hold == "zoh", 0 if hold == "linear" else round(1 / period)
+        self.at, self.rate = at - self.history * period * rate, rate
         self.starts = []
-        self.state, self.sent = np.array([at - self.late, rate]), at
+        self.state, self.sent = np.array([self.at - self.late, rate]), self.at
+        for back in range(self.history - 1, -1, -1):
+            self.send(at - back * period * rate)
 
     def send(self, value):
         """Set the command at the next tick."""
-        start = np.array([*self.state, self.sent, (value - self.sent) / self.period])
+        slope = (value - self.sent) / self.period
+        start = np.array([*self.state, value, 0] if self.is_held else [*self.state, self.sent, slope])
         self.starts.append(start)
         self.state, self.sent = (expm(self.flow * self.period) @ start)[:2], value
 
     def response(self, time):
         """Return y, y', y'' at a time after the first tick."""
+        time += self.history * self.period
         if time <= 1e-9 * self.period:
             return np.array([self.at - self.late + self.rate * time, self.rate, 0.0])
         index = min(int(np.ceil(time / self.period - 1e-9)) - 1, len(self.starts) - 1)
@@ -172,7 +180,7 @@ def on_the_rig(case, ticks, controller=None, leads=0.0, jitter=None, lost=(), mi
     if controller is not None:
         at = at + leads * rates
     axes = [
-        Axis(*numbers, period, x, rate)
+        Axis(*numbers, period, x, rate, case["hold"])
         for *numbers, x, rate in zip(case["frequency"], case["ratio"], at, rates, strict=True)
     ]
 

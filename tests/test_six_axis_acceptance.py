@@ -65,6 +65,7 @@ def case_of(mechanism, scenario):
         "delays": simulator.delay,
         "force_delay": sensor.delay,
         "position_delay": mechanism.rig.position_sensor.delay,
+        "hold": mechanism.rig.command_hold,
         "tool": (tool.mass, np.array(tool.com), np.diag(tool.inertia)),
         "assumed": (tool.mass, np.array(tool.com)),
         "gravity": np.array(sensor.gravity),

@@ -106,3 +106,32 @@ def test_two_equal_robots_move_like_a_single_robot():
     result = np.asarray(jax.jit(lambda share: oscillate(TwoRobots(share), slow, 0.01))(share))
     apart = np.max(np.abs(result - expected), axis=(0, 2))
     assert apart[2] < 1e-14 and np.all(apart[[0, 1, 3, 4, 5]] > 1e-5)
+
+
+@pytest.mark.parametrize("hold", ["linear", "zoh"])
+@pytest.mark.parametrize("has_window", [False, True])
+def test_readings_before_the_first_tick_include_the_ripple_of_held_commands(hold, has_window):
+    """The filled delay line equals the one that uniform commands write; 4.4 ms and 7.3 ms of delays."""
+    late = lanes([4.4e-3, 7.3e-3, 1e-3, 0.0, 2.5e-3, 3.7e-3], BATCH)
+    zero, period = jnp.zeros(BATCH), PERIOD + jnp.zeros(BATCH)
+    simulator = second_order(12.0 + 0 * late, 0.8 + 0 * late, late)
+    if has_window:
+        one = jnp.ones((1, *late.shape))
+        simulator = simulator._replace(numerator=one, denominator=one, window=0.0124 + 0 * late)
+    plant = build_axes(simulator, 2.3e-3 + zero, zero, period, hold, True, True)
+    at, stride = lanes([1e-3] * 6, BATCH), lanes([1e-5, -2e-5, 5e-5, 1e-4, -3e-5, 4e-5], BATCH)
+
+    def body(hardware, tick):
+        seen = read_samples(plant, hardware, tick)
+        return actuate(plant, hardware, tick, at + (tick + 1).astype(float) * stride, hold, 1), seen
+
+    first = start_uniform_motion(plant, at, stride, period, hold, 1, RING)
+    ticks = jnp.arange(2 * RING, dtype=jnp.int32)
+    seen = jax.jit(lambda: lax.scan(body, first, ticks)[1])()
+    for part in (seen.motion.rate, seen.motion.acceleration):
+        scale = 1e-9 * max(np.max(np.abs(part)), 1e-3)
+        np.testing.assert_allclose(part, np.broadcast_to(part[-1], part.shape), atol=scale)
+    steps = np.diff(seen.motion.position, axis=0)
+    np.testing.assert_allclose(steps, np.broadcast_to(stride, steps.shape), atol=1e-15)
+    ripple = np.max(np.abs(np.asarray(seen.motion.rate) - np.asarray(stride) / PERIOD))
+    assert (ripple > 1e-5) == (hold == "zoh")

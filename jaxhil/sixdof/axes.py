@@ -170,7 +170,12 @@ def start_uniform_motion(
         apply_row(rows.position, settled, start, end),
         read_measured_position(rows, settled, start, end),
     )
-    newest = _samples(axes, position, stride / period[None], 0 * stride, measured)
+    rate, acceleration = stride / period[None], 0 * stride
+    if hold == "zoh":  # Drives that hold each command do not move evenly within a period.
+        rate = apply_row(rows.velocity, settled, start, end)
+        if axes.acceleration is not None:
+            acceleration = apply_row(axes.acceleration, settled, start, end)
+    newest = _samples(axes, position, rate, acceleration, measured)
     growth = _samples(axes, stride, 0 * stride, 0 * stride, stride)
     # The delay line starts with the samples of the past uniform motion.
     back = jnp.arange(1 - ring, 1, dtype=jnp.int32).astype(stride.dtype).reshape(-1, 1, *[1] * stride.ndim)
