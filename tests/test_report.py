@@ -1,5 +1,6 @@
 """Report page for a review board: rejected results, escaped names, and behaviour in a browser."""
 
+import copy
 import html
 import json
 import re
@@ -7,11 +8,14 @@ from pathlib import Path
 
 import pytest
 from browser import LAYOUT
+from gain_documents import gain_document, sign
 
 import jaxhil
 import tuning
 from jaxhil.rig import digest
 from tuning.cli.commands.identify_tables import SCHEMA
+from tuning.reporting.result_files import read_results
+from tuning.reporting.verdict_sections import collect_requirements
 
 SCRIPT = "<script>window.hurt = 1</script>"
 HOSTILE = f'x"\'>{SCRIPT}<img src=x onerror="window.hurt=1"> {{{{ 9**9 }}}} $\\frac$ &amp;'
@@ -108,6 +112,16 @@ def test_report_verdict_follows_from_all_requirements(put):
     assert tuning.report(put(write_comparison(), "compare.json", "c")).verdict == "unknown"
     made = tuning.report(put(write_monitor(state="bad", since=4), "monitor.json", "d") / "monitor.json")
     assert made.verdict == "bad" and made.requirements[0]["result"] == "bad since contact 4 of 80 contacts"
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(1 + 4e-12, "good"), (1 + 1e-9, "unknown")])
+def test_identification_supports_gains_for_mechanism_file_with_12_digits(put, factor, verdict):
+    gains = sign(gain_document("none") | {"envelope": {}})
+    mechanism = copy.deepcopy(gains["mechanism"])
+    mechanism["contact"]["stiffness"][0] *= factor
+    paths = [put(write_identification(mechanism=mechanism)), put(gains, "gains.json", "tuned")]
+    [requirement] = collect_requirements(read_results(paths))
+    assert requirement.verdict == verdict
 
 
 @pytest.mark.parametrize(

@@ -162,6 +162,7 @@ def test_shadow_reports_that_its_verdict_covers_only_trips_if_commands_differ(
     (tmp_path / "gains.json").write_text(json.dumps(gains().document))
     ran = jaxhil("shadow", tmp_path, log)
     assert ran.code == 0 and "Good: the controller would not have tripped." in ran.out
+    assert ran.out.splitlines()[-1] == f"Next: jaxhil export {tmp_path} -o bundle"
     assert ("This verdict is about trips only" in ran.out) == is_limited
     assert ("has no such range" in ran.out) == (factor == 0.0)
 

@@ -28,6 +28,7 @@ from tuning.bundle.bundle import build_bundle, write_bundle
 from tuning.bundle.summary import summary_html
 from tuning.bundle.vector_replay import SIX_AXIS_VECTOR_COLUMNS
 from tuning.bundle.vectors_six_axes import compare_with_record, record_inputs, run_controller
+from tuning.reporting.result_files import read_results
 from tuning.sweeps.draws import draw_scenarios
 from tuning.sweeps.manifest import ManifestOptions, build_manifest
 from tuning.sweeps.store import SweepStore
@@ -68,6 +69,11 @@ def test_six_axis_bundle_is_complete_and_its_vectors_agree_with_simulation(built
     assert all(f"`{fault.name}`" in readme for fault in SIX_AXIS_FAULTS) and "Controller6" in readme
     assert "Six axes: target of 1800 kg" in summary and "momentum_error" in summary
     assert len(built.files["vectors.csv"]) < 8e6
+
+
+def test_report_reads_six_axis_bundle(folder):
+    results = read_results([folder])
+    assert results.axes == 6 and [source.command for source in results.sources] == ["export"]
 
 
 def test_six_axis_selftest_passes_in_isolated_python_and_in_c(folder):

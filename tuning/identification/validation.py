@@ -249,7 +249,10 @@ def _check_delay_in_search_range(contact: ContactFit) -> list[CheckResult]:
     delay = contact.posterior.mean[0]
     if delay < MAX_DELAY_SHARE * MAX_FORCE_DELAY:
         return []
-    finding = f"{1e3 * delay:.4g} ms: at the upper end of the search range"
+    end = f"{1e3 * MAX_FORCE_DELAY:g} ms"
+    finding = (
+        f"{1e3 * delay:.4g} ms: at the upper end of the search range, {end}: is a column of the log late?"
+    )
     return [CheckResult("force delay", finding, True, 1.0)]
 
 

@@ -137,5 +137,5 @@ def _estimate_row(entry: dict[str, Any]) -> list[Any]:
         *(terminal.format_number(float(entry[name]), digits) for name in ("value", "low", "high")),
         entry["unit"],
         entry["prior"],
-        "-" if change is None else f"{100.0 * change:+.2g}",
+        "-" if change is None else f"{round(100.0 * change, 4):+.2g}",
     ]

@@ -1,6 +1,7 @@
 """Command `jaxhil shadow`: shows what a controller would have commanded on the readings of a rig's logs."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from jaxhil.errors import to_one_line
@@ -31,6 +32,10 @@ def run(options: Shadow) -> int:
         terminal.emit_json("shadow", document)
     else:
         _print(document)
+        if result.good and (Path(options.path) / "manifest.json").is_file():
+            terminal.suggest("rig", options.path)
+        elif result.good:
+            terminal.suggest("export", options.path, "-o", "bundle")
     return 0 if result.good else 1
 
 
