@@ -58,7 +58,7 @@ def test_compare_command_is_reproducible_from_seed(tmp_path):
     documents = [json.loads(run_result.stdout) for run_result in (first, second)]
     for name, document in zip("ab", documents, strict=True):
         assert json.loads((tmp_path / name / "compare.json").read_text()) == document
-        assert (tmp_path / name / "errors.png").exists() and (tmp_path / name / "honesty.png").exists()
+        assert (tmp_path / name / "errors.png").exists() and (tmp_path / name / "transparency.png").exists()
         costs = document.pop("timings")["microseconds_per_tick"]
         assert set(costs) == {"none", "passivity"} and all(cost > 0 for cost in costs.values())
     assert documents[0] == documents[1]
@@ -136,8 +136,8 @@ def test_compare_tables_have_no_rows_for_tuned_gains_without_tuning(capsys):
 def test_compare_plots_are_written(tmp_path):
     both = {"m": FOUND, "n": FOUND}
     save_figure(plot_errors(["m", "n"], both, 0.01), tmp_path / "errors.png")
-    save_figure(plot_transparency(["m", "n"], both), tmp_path / "honesty.png")
-    assert all((tmp_path / name).stat().st_size > 10_000 for name in ("errors.png", "honesty.png"))
+    save_figure(plot_transparency(["m", "n"], both), tmp_path / "transparency.png")
+    assert all((tmp_path / name).stat().st_size > 10_000 for name in ("errors.png", "transparency.png"))
 
 
 def test_compare_reports_positive_computing_time_per_tick():

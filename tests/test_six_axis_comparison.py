@@ -129,7 +129,7 @@ def test_six_axis_compare_tunes_and_evaluates_on_equal_draws(jaxhil, tmp_path):
     after, before = lead["tuned"]["rms"], lead["literature"]["rms"]
     assert after["high"] < before["low"] < none["literature"]["rms"]["value"]
     assert mechanism["winners"]["rms"] == "phase_lead" and lead["tuned"]["not_ended"]["value"] == 0
-    assert (tmp_path / "errors.png").exists() and not (tmp_path / "honesty.png").exists()
+    assert (tmp_path / "errors.png").exists() and not (tmp_path / "transparency.png").exists()
     # A set that is built again has the same scenarios and ideal contacts as the comparison.
     scene = build_six_axis_scenario_set(package.load(FILE), 16, 0xFA1)
     again = scene.evaluate("none", {}, 0.05, 0)

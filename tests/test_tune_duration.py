@@ -20,6 +20,9 @@ def test_expected_duration_is_proportional_to_the_last_tuning(monkeypatch, tmp_p
         assert "the time is unknown" in describe_expected_duration(mechanisms, "phase_lead", 1000)
         record_duration(mechanisms, "phase_lead", 1000, 30.0)
         assert "about 0:01:00 as measured" in describe_expected_duration(mechanisms, "phase_lead", 2000)
+        assert "0:00:03 to 0:00:30, the time of a longer" in describe_expected_duration(
+            mechanisms, "phase_lead", 100
+        )
     assert "the time is unknown" in describe_expected_duration(one, "response_error", 1000)
     (tmp_path / RECORD_FILE).write_text("no JSON")
     assert "the time is unknown" in describe_expected_duration(one, "phase_lead", 1000)

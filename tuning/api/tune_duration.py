@@ -1,7 +1,8 @@
 """Estimate of the time that a tuning takes, from the last tuning of the same compensator on this computer.
 
-The time of a tuning is roughly proportional to its simulated ticks. After each tuning, its time per tick is
-stored in the cache folder, with the axes and the compensator.
+After each tuning, its time and its simulated ticks are stored in the cache folder, with the axes and the
+compensator. The time of a longer tuning is roughly proportional to its ticks. A shorter tuning takes more
+time per tick: it compiles the same programs, and its smaller batches use the processor less well.
 """
 
 import contextlib
@@ -16,7 +17,8 @@ from jaxhil.mechanism.structs import Mechanism
 from jaxhil.simulation.jax_environment import cache_folder
 from tuning.terminal import format_duration
 
-RECORD_FILE = "tune-times.json"  # time per simulated tick [s], by axes and compensator
+RECORD_FILE = "tune-times.json"  # time [s] and simulated ticks of the last tuning, by axes and compensator
+MIN_TICK_SHARE = 0.5  # smallest ratio of the ticks to those of the last tuning for a proportional time [1]
 # largest ratio of the time if the starts disagree to the time with a single batch of starts [1]
 MAX_BATCH_FACTOR = 4
 
@@ -24,16 +26,21 @@ MAX_BATCH_FACTOR = 4
 def describe_expected_duration(mechanisms: Sequence[AnyMechanism], compensator: str, runs: float) -> str:
     """Return a text on the time that a tuning will take, for the estimated number of simulated runs."""
     work = f"about {float(f'{runs:.2g}'):,.0f} simulated runs"
-    seconds = _read_times().get(_name(mechanisms[0], compensator), math.nan)
-    expected = seconds * runs * _count_ticks(mechanisms)
-    if not math.isfinite(expected):
+    seconds, ticks = _read_times().get(_name(mechanisms[0], compensator), (math.nan, math.nan))
+    share = runs * _count_ticks(mechanisms) / ticks
+    if not math.isfinite(seconds * share):
         return (
             f"tuning {compensator}: {work}; the time is unknown, because no tuning of {compensator} was "
             "measured on this computer. The progress shows the time left"
         )
+    expected = f"about {format_duration(seconds * share)} as measured in the last tuning"
+    if share < MIN_TICK_SHARE:
+        expected = (
+            f"{format_duration(seconds * share)} to {format_duration(seconds)}, the time of a longer tuning"
+        )
     return (
-        f"tuning {compensator}: {work}, about {format_duration(expected)} as measured in the last tuning on "
-        f"this computer; up to {MAX_BATCH_FACTOR} times as long if the starts disagree"
+        f"tuning {compensator}: {work}, {expected} on this computer; up to {MAX_BATCH_FACTOR} times as long "
+        "if the starts disagree"
     )
 
 
@@ -44,13 +51,14 @@ def record_duration(
     folder = cache_folder()
     if folder is None or runs <= 0:
         return
-    times = {**_read_times(), _name(mechanisms[0], compensator): seconds / (runs * _count_ticks(mechanisms))}
+    ticks = runs * _count_ticks(mechanisms)
+    times = {**_read_times(), _name(mechanisms[0], compensator): (seconds, ticks)}
     with contextlib.suppress(OSError):
         write_atomically(folder / RECORD_FILE, json.dumps(times).encode("ascii"))
 
 
-def _read_times() -> dict[str, float]:
-    """Return the stored times per tick [s]; an empty dictionary if there are none."""
+def _read_times() -> dict[str, tuple[float, float]]:
+    """Return the stored times [s] and ticks; an empty dictionary if there are none."""
     folder = cache_folder()
     try:
         times = json.loads((Path(folder or ".") / RECORD_FILE).read_bytes())
@@ -58,7 +66,11 @@ def _read_times() -> dict[str, float]:
         return {}
     if folder is None or not isinstance(times, dict):
         return {}
-    return {name: value for name, value in times.items() if isinstance(value, float)}
+    return {
+        name: (values[0], values[1])
+        for name, values in times.items()
+        if isinstance(values, list) and [type(value) for value in values] == [float, float] and values[1] > 0
+    }
 
 
 def _name(mechanism: AnyMechanism, compensator: str) -> str:

@@ -25,7 +25,7 @@ TRANSPARENCY_TITLES = {
     "early": "transparency, push at 25 % [1]",
     "late": "transparency, push at 75 % [1]",
     "slope": "slope of e against e* [1]",
-    "peak": "peak command / reference's peak [1]",
+    "peak": "peak command / ideal peak [1]",
 }
 
 

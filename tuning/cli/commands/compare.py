@@ -17,7 +17,7 @@ from tuning.cli.commands import checks
 from tuning.cli.commands.checkpoints import open_checkpoints, warn_about_checkpoints
 from tuning.cli.options import Compare
 
-PLOTS = ("errors.png", "honesty.png")  # for six axes, only the first plot exists
+PLOTS = ("errors.png", "transparency.png")  # for six axes, only the first plot exists
 
 
 def run(options: Compare) -> int:
@@ -162,7 +162,8 @@ def _print(
             texts=(0, 1),
         ),
         *_explain_columns(document),
-        "*: better than every other tuned compensator by more than the 95 % intervals.",
+        f"*: better than every other{' tuned' * document['tuned']} compensator by more than the 95 % "
+        "intervals.",
         f"wrote {options.output}/compare.json" + (" and plots" if names else ""),
         "",
     )
