@@ -98,7 +98,7 @@ def describe_numerical_model(mechanism: Mapping[str, Any]) -> str:
         "`-force`. In every tick, between `step` and `position_command`, in Python",
         "", *python, "", "and in C", "", *c99, "",
         f"Command hold `{rig.get('command_hold', 'linear')}`: {HOLDS[rig.get('command_hold', 'linear')]}. "
-        f"Command latency: {latency} periods from a command to its effect.",
+        f"Command latency: {latency} {'period' if latency == 1 else 'periods'} from a command to its effect.",
     ))  # fmt: skip
 
 

@@ -79,6 +79,7 @@ def assumption_section(results: Results) -> Section | None:
     if subject is None:
         return None
     mechanism, origins = subject.mechanism, _identified_origins(results)
+    latency = mechanism.rig.command_latency
     unused = _unused_keys(mechanism)
     rows = []
     for path in numeric_keys_of(mechanism):
@@ -96,8 +97,8 @@ def assumption_section(results: Results) -> Section | None:
         rows.append((path, _format_value(value), unit, varies, origins.get(path, "the file")))
     texts = [
         f"{_describe_contact_laws(mechanism)}; motion simulator: {mechanism.rig.simulator.model}; "
-        f"integrator: {mechanism.rig.integrator}; command hold: {mechanism.rig.command_hold}; command "
-        f"latency: {mechanism.rig.command_latency} periods{_describe_filter(mechanism)}.",
+        f"integrator: {mechanism.rig.integrator}; command hold: {mechanism.rig.command_hold}; "
+        f"command latency: {latency} {'period' if latency == 1 else 'periods'}{_describe_filter(mechanism)}.",
         f"Source of the file: {to_one_line(mechanism.source, 1000) or UNKNOWN_NAME}",
     ]
     if mechanism.correlation is not None:
