@@ -129,7 +129,7 @@ def test_readings_before_the_first_tick_include_the_ripple_of_held_commands(hold
     ticks = jnp.arange(2 * RING, dtype=jnp.int32)
     seen = jax.jit(lambda: lax.scan(body, first, ticks)[1])()
     for part in (seen.motion.rate, seen.motion.acceleration):
-        scale = 1e-9 * max(np.max(np.abs(part)), 1e-3)
+        scale = 1e-9 * max(float(np.max(np.abs(part))), 1e-3)
         np.testing.assert_allclose(part, np.broadcast_to(part[-1], part.shape), atol=scale)
     steps = np.diff(seen.motion.position, axis=0)
     np.testing.assert_allclose(steps, np.broadcast_to(stride, steps.shape), atol=1e-15)
