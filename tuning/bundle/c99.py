@@ -16,6 +16,7 @@ from jaxhil.codegen import CProgram, SubsetError
 from jaxhil.errors import InputError, to_one_line
 from jaxhil.rig.law_status import STATUSES, ContactCount
 from tuning.bundle.c99_tables import (
+    NO_CONTRACTION,
     UNUSABLE,
     constants_check,
     faults_fragment,
@@ -89,15 +90,7 @@ _SOURCE_TEMPLATE = """\
 /* See jaxhil_controller.h. */
 #include "jaxhil_controller.h"
 
-/* Forbid fused operations, which compute a * b + c with one rounding. GCC does not support the C99 pragma. */
-#if defined(_MSC_VER) && !defined(__clang__)
-#pragma fp_contract(off)
-#elif defined(__GNUC__) && !defined(__clang__)
-#pragma GCC optimize("fp-contract=off")
-#else
-#pragma STDC FP_CONTRACT OFF
-#endif
-
+{contraction}
 {definitions}"""
 
 _GAINS_TEMPLATE = """\
@@ -198,7 +191,7 @@ def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> 
             declarations=declarations,
             exported="" if kind is ONE_AXIS else ",\n *                 &jaxhil_exported_constants",
         ),
-        SOURCE_FILE: _SOURCE_TEMPLATE.format(definitions=definitions),
+        SOURCE_FILE: _SOURCE_TEMPLATE.format(contraction=NO_CONTRACTION, definitions=definitions),
         GAINS_FILE: _GAINS_TEMPLATE.format(
             law=law, digest=document["sha256"], constants=gain_file_constants(gain_file, kind)
         ),

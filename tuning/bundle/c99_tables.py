@@ -21,6 +21,17 @@ from tuning.bundle.controller_kind import ControllerKind
 MAX_LINE_WIDTH = 110
 CLEARANCE_ENTRY = f"m, {format_range(*DISTANCES)}, between two surfaces; infinite for one surface"
 
+NO_CONTRACTION = """\
+/* Forbid fused operations, which compute a * b + c with one rounding. GCC does not support the C99 pragma. */
+#if defined(_MSC_VER) && !defined(__clang__)
+#pragma fp_contract(off)
+#elif defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize("fp-contract=off")
+#else
+#pragma STDC FP_CONTRACT OFF
+#endif
+"""
+
 
 class CFragment(NamedTuple):
     """C code of one table, divided by the files that contain it."""

@@ -102,10 +102,13 @@ def bundle_files(
 
 def find_formats(names: Collection[str], document: Mapping[str, Any]) -> list[str]:
     """Return the names of the additional formats that a bundle contains, from the names of its files."""
-    from tuning.bundle.writers import WRITERS
+    from tuning.bundle.writers import ON_REQUEST, WRITERS
 
     formats = []
     for name, write in WRITERS.items():
+        # To generate an FMU takes seconds.
+        if name in ON_REQUEST and not any(path.startswith(ON_REQUEST[name]) for path in names):
+            continue
         try:
             content = write(document)
         except InputError:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxhil.errors import InputError, format_value
-from tuning.bundle.controller_kind import ONE_AXIS, kind_of
+from tuning.bundle.controller_kind import kind_of
 
 ROS2_NODE = "/jaxhil_controller"
 MAX_MATLAB_NAME_LENGTH = 63  # longest name of a struct's field in MATLAB [characters]
@@ -150,8 +150,8 @@ def c99_files(document: Mapping[str, Any]) -> dict[str, bytes]:
 def fmi3_files(document: Mapping[str, Any]) -> dict[str, bytes]:
     """Return the FMUs of FMI 3.0 as source code without a compiled library, in the folder `fmi3`.
 
-    These are the controller and, for one axis, the rig if its FMU can simulate it. A test program replays the
-    test vectors through the controller's FMU.
+    These are the controller and the rig, if its FMU can simulate it. A test program replays the test vectors
+    through the controller's FMU.
     """
     return _fmu_files(document, 3)
 
@@ -169,26 +169,22 @@ def _fmu_files(document: Mapping[str, Any], fmi: int) -> dict[str, bytes]:
         f"fmi{fmi}/{controller.IDENTIFIER}.fmu": controller.controller_fmu(document, fmi),
         f"fmi{fmi}/{TEST_FILE}": controller.fmu_test_program(document, fmi).encode("ascii"),
     }
-    if kind_of(document) is ONE_AXIS:
-        with suppress(rig.UnsupportedRig):  # `describe_fmus` names the reason
-            files[f"fmi{fmi}/{rig.IDENTIFIER}.fmu"] = rig.rig_fmu(document, fmi)
+    with suppress(rig.UnsupportedRig):  # `describe_fmus` names the reason
+        files[f"fmi{fmi}/{rig.IDENTIFIER}.fmu"] = rig.rig_fmu(document, fmi)
     return files
 
 
 def describe_fmus(document: Mapping[str, Any], files: Mapping[str, bytes]) -> list[str]:
     """Describe what the FMUs in a bundle lack: the rig, or a library for Linux."""
-    from jaxhil.mechanism.file import from_plain_data
+    from jaxhil.mechanism.file import any_from_plain_data
     from tuning.bundle.fmu import rig
     from tuning.bundle.fmu.archive import find_library
 
     archives = [content for name, content in files.items() if name.endswith(".fmu")]
     notes = []
     if archives:
-        unsupported = f"mechanism: found {kind_of(document).axes} axes, expected 1"
-        if kind_of(document) is ONE_AXIS:
-            unsupported = rig.describe_unsupported(
-                from_plain_data(copy.deepcopy(document["mechanism"]), "gain document")
-            )
+        mechanism = any_from_plain_data(copy.deepcopy(document["mechanism"]), "gain document")
+        unsupported = rig.describe_unsupported(mechanism)
         notes += [f"The rig has no FMU: {unsupported}."] if unsupported else []
     if any(find_library(archive) is None for archive in archives):
         notes.append(
@@ -205,8 +201,8 @@ WRITERS: dict[str, Callable[[Mapping[str, Any]], dict[str, bytes]]] = {
     "fmu": fmi3_files,
     "fmu2": fmi2_files,
 }
-# Formats that are written only on request: FMUs contain a library of this computer's compiler.
-ON_REQUEST = ("fmu", "fmu2")
+# Folder of each format that is written only on request: FMUs contain a library of this computer's compiler.
+ON_REQUEST = {"fmu": "fmi3/", "fmu2": "fmi2/"}
 
 
 def _format_cell(value: float | str | None) -> str:

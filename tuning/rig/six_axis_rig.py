@@ -198,18 +198,18 @@ class _Programs:
     def __init__(self, loop: Loop, scenario: Scenario, reference: IdealContactRecord) -> None:
         jit = partial(jax.jit, compiler_options=supported_options(SINGLE_RUN_OPTIONS))
         rig = jax.jit(partial(build_rig_constants, loop, {}))(scenario)
-        numbers, unpack_rig = jax.jit(_pack)(rig), _unpacker(rig)
+        numbers, unpack_rig = jax.jit(pack)(rig), build_unpacker(rig)
         enter, start = jax.jit(partial(begin, loop)), jax.jit(partial(_start, loop))
         run = enter(rig, scenario.start)
         self.command = tuple(np.asarray(run.near)[:, 0].tolist())
-        unpack = _unpacker(start(rig, run, reference, scenario.key))
-        pack, read = jax.jit(_packed), jax.jit(partial(_read, loop))
+        unpack = build_unpacker(start(rig, run, reference, scenario.key))
+        packed, read = jax.jit(_packed), jax.jit(partial(_read, loop))
 
         def start_run(
             states: States, reference: IdealContactRecord, key: Any, command: Any
         ) -> tuple[Array, Array]:
             """Return state and readings at the start of a run with the pose command (6, 1) of tick 0."""
-            return pack(start(rig, enter(rig, states, command), reference, key))
+            return packed(start(rig, enter(rig, states, command), reference, key))
 
         def compiled(function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
             return partial(jit(lambda rig, *rest: function(*static, unpack_rig(rig), *rest)), numbers)
@@ -287,13 +287,13 @@ def _evaluate(unpack: Unpack, rig: RigConstants, state: Array) -> tuple[Any, ...
     return compare_with_ideal(rig.bodies, progress.episodes), progress.elapsed, twist
 
 
-def _pack(tree: Any) -> Array:
+def pack(tree: Any) -> Array:
     """Return the numbers of all arrays in a tree as one array."""
     return jnp.concatenate([jnp.ravel(leaf).astype(float) for leaf in jax.tree.leaves(tree)])
 
 
-def _unpacker(tree: Any) -> Callable[[Array], Any]:
-    """Return the inverse of `_pack` for trees with the structure, shapes and types of this tree."""
+def build_unpacker(tree: Any) -> Callable[[Array], Any]:
+    """Return the inverse of `pack` for trees with the structure, shapes and types of this tree."""
     leaves, structure = jax.tree.flatten(tree)
     ends = np.cumsum([leaf.size for leaf in leaves])
 
@@ -308,7 +308,7 @@ def _unpacker(tree: Any) -> Callable[[Array], Any]:
 
 def _packed(run: RunProgress) -> tuple[Array, Array]:
     """Return the state of a run as one array, and the readings."""
-    return _pack(run), _readings(run.sensed)
+    return pack(run), _readings(run.sensed)
 
 
 def _readings(sensed: Sensed) -> Array:

@@ -127,12 +127,17 @@ def run_six_axis_loop(
         state = _advance(loop, rig, state, sensed, column, next_model, np.array(sent)[:, None])
     controller.next_contact()
     found = np.asarray(state.twist)[:, 0]
+    return compare_final_twists(found, simulated, ticks, controller.status)
+
+
+def compare_final_twists(found: np.ndarray, simulated: np.ndarray, ticks: int, status: str) -> FinalTwist:
+    """Compare the final twist of a run (6,) [m/s, rad/s] with that of the simulation."""
     worst = 0.0
     for part in (slice(0, 3), slice(3, 6)):
         size = float(np.max(np.abs(simulated[part])))
         error = float(np.max(np.abs(found[part] - simulated[part])))
         worst = max(worst, error / size if size > 0 else error)
-    return FinalTwist(found.tolist(), simulated.tolist(), worst, ticks, controller.status)
+    return FinalTwist(found.tolist(), simulated.tolist(), worst, ticks, status)
 
 
 @partial(jax.jit, static_argnums=0)

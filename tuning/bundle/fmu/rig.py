@@ -1,6 +1,7 @@
-"""FMU of the rig: numerical model, motion simulator, contact and sensors of a mechanism with one axis.
+"""FMU of the rig: numerical model, motion simulator, contact and sensors of a mechanism.
 
-The C code has the equations of `tuning.rig.plant`; this module generates its constants.
+On one axis, the C code has the equations of `tuning.rig.plant`, and this module generates its constants. With
+six axes, `tuning.bundle.fmu.rig_six_axes` generates the C code.
 """
 
 import copy
@@ -11,12 +12,12 @@ from typing import Any
 from msgspec import structs
 
 from jaxhil.errors import InputError, format_value
-from jaxhil.mechanism.file import from_plain_data
+from jaxhil.mechanism.file import AnyMechanism, any_from_plain_data
 from jaxhil.mechanism.structs import Contact, Mechanism
 from tuning.bundle.c99_tables import format_double
 from tuning.bundle.fmu.archive import build_fmu
 from tuning.bundle.fmu.sources import read_source
-from tuning.bundle.fmu.variables import MODEL_MASSES, TIME, Variable
+from tuning.bundle.fmu.variables import MODEL_MASSES, SEED, TIME, Variable, six_axis_vector
 from tuning.rig.plant import PlantConstants, compute_plant_constants
 
 IDENTIFIER = "jaxhil_rig"
@@ -24,7 +25,6 @@ LAWS = (
     *("linear", "kelvin_voigt", "hunt_crossley", "piecewise_linear"),
     *("hardening", "depth_damped", "elastoplastic", "preloaded"),
 )
-MAX_SEED = 2**31 - 1
 # Bounds of the parameters: values from which a simulation remains finite.
 SPEEDS, FORCES, DISTANCES = (1e-9, 1e3), (0.0, 1e9), (0.0, 1e3)
 SOURCE_FILES = ("numerical_model.h", "contact_law.h", "contact_law.c", "sensor_lag.h", "sensor_lag.c")
@@ -48,19 +48,22 @@ class UnsupportedRig(InputError):
     """Rig with a property that its FMU cannot simulate."""
 
 
-def describe_unsupported(mechanism: Mechanism) -> str | None:
+def describe_unsupported(mechanism: AnyMechanism) -> str | None:
     """Describe the first property of the rig that its FMU cannot simulate; return None if there is none."""
     sensor = mechanism.rig.force_sensor
-    if mechanism.contact.law not in LAWS:
-        law = format_value(mechanism.contact.law)
-        return f"contact.law: found {law}, expected one of {', '.join(LAWS)}"
+    effects = {"missed_tick_probability": mechanism.rig.missed_tick_probability}
+    if isinstance(mechanism, Mechanism):
+        if mechanism.contact.law not in LAWS:
+            law = format_value(mechanism.contact.law)
+            return f"contact.law: found {law}, expected one of {', '.join(LAWS)}"
+        effects = {
+            "force_sensor.jitter": sensor.jitter,
+            "force_sensor.loss_probability": sensor.loss_probability,
+            **effects,
+        }
     if sensor.filter is not None:
         return "rig.force_sensor.filter: found a filter, expected none"
-    for key, value in {
-        "force_sensor.jitter": sensor.jitter,
-        "force_sensor.loss_probability": sensor.loss_probability,
-        "missed_tick_probability": mechanism.rig.missed_tick_probability,
-    }.items():
+    for key, value in effects.items():
         if value:
             return f"rig.{key}: found {value:g}, expected 0"
     return None
@@ -70,11 +73,12 @@ def rig_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
     """Return the archive of the rig's FMU, without library, for the mechanism of a gain document.
 
     Args:
-        document: gain document of one axis.
+        document: gain document.
         fmi: version of FMI, 2 or 3.
 
     Raises:
         UnsupportedRig: If the rig's FMU cannot simulate the rig, see `describe_unsupported`.
+        InputError: If a user's contact law has an operation that the generator of C code does not know.
     """
     mechanism = _without_extra_periods(document)
     unsupported = describe_unsupported(mechanism)
@@ -86,20 +90,33 @@ def rig_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
         description="Simulated docking rig: numerical model, motion simulator, contact and sensors",
         period=mechanism.rig.control_period,
         variables=rig_variables(mechanism),
-        files={
-            **{name: read_source(name) for name in SOURCE_FILES},
-            "fmu_model.h": read_source("rig.h"),
-            "fmu_model.c": read_source("rig.c"),
-            "rig_constants.h": rig_constants(mechanism),
-        },
+        files=_model_files(document, mechanism),
         constants={},
         fmi=fmi,
     )
 
 
-def _without_extra_periods(document: Mapping[str, Any]) -> Mechanism:
+def _model_files(document: Mapping[str, Any], mechanism: AnyMechanism) -> dict[str, str]:
+    """Return the C files of the rig's model."""
+    if isinstance(mechanism, Mechanism):
+        return {
+            **{name: read_source(name) for name in SOURCE_FILES},
+            "fmu_model.h": read_source("rig.h"),
+            "fmu_model.c": read_source("rig.c"),
+            "rig_constants.h": rig_constants(mechanism),
+        }
+    from tuning.bundle.fmu.rig_six_axes import rig_program
+
+    return {
+        "fmu_model.h": read_source("rig_six_axes.h"),
+        "fmu_model.c": read_source("rig_six_axes.c"),
+        **rig_program(document, mechanism),
+    }
+
+
+def _without_extra_periods(document: Mapping[str, Any]) -> AnyMechanism:
     """Return the mechanism without the command latency that the co-simulation itself adds."""
-    mechanism = from_plain_data(copy.deepcopy(document["mechanism"]), "gain document")
+    mechanism = any_from_plain_data(copy.deepcopy(document["mechanism"]), "gain document")
     extra = document.get("figures", {}).get("co_simulation", {}).get("extra_periods", 0)
     if not 0 <= extra <= mechanism.rig.command_latency:
         expected = f"0 to {mechanism.rig.command_latency}, the rig.command_latency"
@@ -110,8 +127,27 @@ def _without_extra_periods(document: Mapping[str, Any]) -> Mechanism:
     return structs.replace(mechanism, rig=structs.replace(mechanism.rig, command_latency=latency))
 
 
-def rig_variables(mechanism: Mechanism) -> list[Variable]:
-    """Return the variables of the rig's FMU."""
+def rig_variables(mechanism: AnyMechanism) -> list[Variable]:
+    """Return the variables of the rig's FMU, in the order of their value references."""
+    return _one_axis_variables(mechanism) if isinstance(mechanism, Mechanism) else _six_axis_variables()
+
+
+def _six_axis_variables() -> list[Variable]:
+    """Return the variables of the FMU of a rig with six axes."""
+    return [
+        TIME,
+        *six_axis_vector("wrench_command", "wrench", "input", "wrench of the controller about T's origin"),
+        *six_axis_vector("pose_command", "pose", "input", "pose command to the motion simulator"),
+        *six_axis_vector("wrench_measured", "wrench", "output", "measured wrench about T's origin"),
+        *six_axis_vector("pose_measured", "pose", "output", "measured pose of C relative to T"),
+        *six_axis_vector("pose", "pose", "output", "pose of C relative to T in the numerical model"),
+        *six_axis_vector("twist", "twist", "output", "twist of C relative to T in the numerical model"),
+        *six_axis_vector("contact_wrench", "wrench", "output", "real wrench without effects of the sensor"),
+        SEED,
+    ]
+
+
+def _one_axis_variables(mechanism: Mechanism) -> list[Variable]:
     rig, approach = mechanism.rig, mechanism.approach
     force, position = rig.force_sensor, rig.position_sensor
 
@@ -139,7 +175,7 @@ def rig_variables(mechanism: Mechanism) -> list[Variable]:
         parameter("approach_phase", "1", "phase of the first touch in a period", approach.phase, 0.0, 1.0),
         parameter("force_noise", "N", "standard deviation of the noise", force.noise_std, *FORCES),
         parameter("position_noise", "m", "standard deviation of the noise", position.noise_std, *DISTANCES),
-        Variable("seed", "parameter", "integer", "seed of the sensor noise", lowest=0, highest=MAX_SEED),
+        SEED,
     ]  # fmt: skip
 
 

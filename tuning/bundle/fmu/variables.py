@@ -37,6 +37,13 @@ class Variable(NamedTuple):
 
 MODEL_MASSES = 1e-9, 1e12  # [kg]; bounds of the equivalent mass
 TIME = Variable("time", "independent", "real", "time of the communication point", "s")
+MAX_SEED = 2**31 - 1  # largest seed that a 32-bit integer can hold
+SEED = Variable("seed", "parameter", "integer", "seed of the sensor noise", lowest=0, highest=MAX_SEED)
+VECTORS = {  # names and units of the components of a vector of six axes
+    "wrench": (WRENCH, ("N", "N m")),
+    "pose": (COORDINATES, ("m", "rad")),
+    "twist": (TWIST, ("m/s", "rad/s")),
+}
 FLIGHT_LOG = Variable(
     "flight_log", "parameter", "string", "path of the flight log, which ends in .csv; empty for no log"
 )
@@ -89,6 +96,20 @@ def c_names(variables: Iterable[Variable]) -> list[str]:
     return [variable.c_name for variable in variables]
 
 
+def six_axis_vector(name: str, quantity: str, causality: Any, description: str) -> list[Variable]:
+    """Return the variables of a vector of six axes; the quantity is "wrench", "pose" or "twist"."""
+    names, units = VECTORS[quantity]
+    return [
+        Variable(f"{name}.{part}", causality, "real", description, units[axis // 3])
+        for axis, part in enumerate(names)
+    ]
+
+
+def six_axis_names(name: str) -> list[str]:
+    """Return the names of the variables of a vector of six axes, whose name begins with its quantity."""
+    return [f"{name}.{part}" for part in VECTORS[name.partition("_")[0]][0]]
+
+
 def _one_axis_signals(document: Mapping[str, Any]) -> list[Variable]:
     mass = from_plain_data(copy.deepcopy(document["mechanism"]), "gain document").bodies.mass
 
@@ -123,19 +144,7 @@ def _one_axis_signals(document: Mapping[str, Any]) -> list[Variable]:
 
 
 def _six_axis_signals() -> list[Variable]:
-    parts = {
-        "wrench": (WRENCH, ("N", "N m")),
-        "pose": (COORDINATES, ("m", "rad")),
-        "twist": (TWIST, ("m/s", "rad/s")),
-    }
-
-    def vector(name: str, quantity: str, causality: Any, description: str) -> list[Variable]:
-        names, units = parts[quantity]
-        return [
-            Variable(f"{name}.{part}", causality, "real", description, units[axis // 3])
-            for axis, part in enumerate(names)
-        ]
-
+    vector = six_axis_vector
     return [
         *vector("wrench_measured", "wrench", "input", "measured wrench on the chaser about T's origin"),
         *vector("pose_desired", "pose", "input", "pose of C relative to T in the numerical model"),

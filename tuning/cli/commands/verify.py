@@ -44,7 +44,6 @@ def _format_exponential(value: float | None) -> str:
 def _six_axis_tables(document: dict[str, Any]) -> list[Any]:
     """Return the tables of the replayed runs and the closed loop of a six-axis verification."""
     closed = document["closed_loop"]
-    twists = zip(("vx", "vy", "vz", "wx", "wy", "wz"), closed["found"], closed["simulated"], strict=True)
     return [
         terminal.build_table(
             f"{document['mechanism']}, {document['compensator']}: recorded runs through the runtime",
@@ -57,16 +56,27 @@ def _six_axis_tables(document: dict[str, Any]) -> list[Any]:
                 for number, lane in enumerate(document["replay"])
             ],
         ),
-        terminal.build_table(
-            f"Final twist of the nominal run with the runtime in the loop ({closed['status']})",
-            ["", "found", "simulated"],
-            [(name, *(terminal.format_number(value, 9) for value in values)) for name, *values in twists],
+        _twist_table(
+            f"Final twist of the nominal run with the runtime in the loop ({closed['status']})", closed
         ),
     ]
 
 
+def _twist_table(title: str, final: dict[str, Any]) -> Any:
+    """Return the table of a final twist and of that in the simulation."""
+    twists = zip(("vx", "vy", "vz", "wx", "wy", "wz"), final["found"], final["simulated"], strict=True)
+    rows = [(name, *(terminal.format_number(value, 9) for value in values)) for name, *values in twists]
+    return terminal.build_table(title, ["", "found", "simulated"], rows)
+
+
 def _fmu_table(loop: dict[str, Any]) -> Any:
-    """Return the table of the nominal contacts in the loop of both FMUs."""
+    """Return the table of the nominal contacts, or of the final twist, in the loop of both FMUs."""
+    if loop["final_twist"] is not None:
+        return _twist_table(
+            f"Final twist of the nominal run with the FMUs of FMI {loop['fmi']}, rig.command_latency = "
+            f"{loop['command_latency']}",
+            loop["final_twist"],
+        )
     return terminal.build_table(
         f"Nominal contacts with the FMUs of FMI {loop['fmi']}, rig.command_latency = "
         f"{loop['command_latency']}",
