@@ -177,11 +177,6 @@ def test_export_writes_the_controller_fmu_alone_if_the_rig_has_effects_that_its_
     assert describe_fmus(made, {}) == []
 
 
-def test_export_states_that_the_rig_has_no_fmu_on_six_axes():
-    notes = describe_fmus({"axes": 6}, fmi3_files(document()))
-    assert notes[0] == "The rig has no FMU: mechanism: found 6 axes, expected 1."
-
-
 def test_rig_fmu_rejects_user_registered_contact_law(monkeypatch):
     monkeypatch.setattr("tuning.bundle.fmu.rig.LAWS", ("hardening",))
     message = "fmu: contact.law: found 'kelvin_voigt', expected one of hardening"

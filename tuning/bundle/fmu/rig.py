@@ -142,7 +142,7 @@ def _six_axis_variables() -> list[Variable]:
         *six_axis_vector("pose_measured", "pose", "output", "measured pose of C relative to T"),
         *six_axis_vector("pose", "pose", "output", "pose of C relative to T in the numerical model"),
         *six_axis_vector("twist", "twist", "output", "twist of C relative to T in the numerical model"),
-        *six_axis_vector("contact_wrench", "wrench", "output", "real wrench without effects of the sensor"),
+        *six_axis_vector("wrench_contact", "wrench", "output", "real wrench without effects of the sensor"),
         SEED,
     ]
 
