@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,12 +83,12 @@ def test_both_fmus_with_six_axes_reproduce_simulation_with_one_more_period(
     mechanism = load_any(name, overrides).mechanism
     late = structs.replace(mechanism.rig, command_latency=mechanism.rig.command_latency + 1)
     gains = {name: gain["value"] for name, gain in made["gains"].items()}
-    run = jaxhil.simulate(structs.replace(mechanism, rig=late), compensator, gains)
+    run: Any = jaxhil.simulate(structs.replace(mechanism, rig=late), compensator, gains)
     found = run_loop(controller, rig, round(run.final.time / mechanism.rig.control_period))
     difference = float(np.max(np.abs(found - run.final.twist)))
     print(f"{name} {compensator} {' '.join(overrides)} FMI {fmi}: {difference:.1e}")
     assert difference < 1e-9 < np.max(np.abs(found))
-    without = jaxhil.simulate(mechanism, compensator, gains)
+    without: Any = jaxhil.simulate(mechanism, compensator, gains)
     assert np.max(np.abs(found - without.final.twist)) > 1e-6
     controller.close()
     rig.close()
@@ -148,7 +149,9 @@ def test_fmu_loop_with_six_axes_reproduces_simulation_and_detects_another_delay(
     assert result.final_twist is not None and result.final_twist.difference < 1e-9
     other = document_of("probe-drogue", "phase_lead", ("rig.force_sensor.delay=0.005",))
     [path] = [path for path in files if path.endswith("jaxhil_rig.fmu")]
-    [reason] = compare_fmu_loop({**files, path: write(other)[path]}, made).reasons
+    different = compare_fmu_loop({**files, path: write(other)[path]}, made)
+    assert different is not None
+    [reason] = different.reasons
     assert "final twist: found a difference of" in reason
 
 

@@ -131,8 +131,8 @@ def _start(
     full = {name: jnp.full_like(rig.period, value) for name, value in gains.items()}
     command = law.pose_command(full, position, rates) - rates * rig.period[None]
     run = begin(loop, rig, scenario.start, command)
-    held = run.controller.held
-    return RigState(run, None if held is None else held.reading)
+    repeated = run.controller.held
+    return RigState(run, None if repeated is None else repeated.reading)
 
 
 def _move(
@@ -142,14 +142,15 @@ def _move(
     run = state.run
     command = Wrench(vector(wrench[:3]), vector(wrench[3:]))
     states, position, _, twist = integrate(loop, rig, run, command)
+    unused: Any = None
     sensed = Sensed(
-        motion=RigidMotion(None, None, None),
-        contact=None,
+        motion=RigidMotion(unused, unused, unused),
+        contact=unused,
         forces=(),
         memories=run.memories,
         latch_states=run.latch_states,
         lag=run.controller.lag,
-        signals=None,
+        signals=unused,
         reading=state.reading,
         missed=None,
     )

@@ -42,24 +42,24 @@ def add_while(
 def add_scan(
     add: AddFunction, statements: Statements, params: dict[str, Any], values: Values, results: Values
 ) -> None:
-    """Add a loop with a fixed number of steps."""
+    """Add a loop with a constant_count number of steps."""
     body, count = add(params["jaxpr"]), params["length"]
-    fixed, carried = params["num_consts"], params["num_carry"]
-    carry, stacked = results[:carried], results[carried:]
+    constant_count, carry_count = params["num_consts"], params["num_carry"]
+    carry, stacked = results[:carry_count], results[carry_count:]
     following = [statements.variable(value.shape, value.type) for value in carry]
     step = f"({count - 1} - n)" if params["reverse"] else "n"
-    rows = [statements.contiguous(value) for value in values[fixed + carried :]]
+    rows = [statements.contiguous(value) for value in values[constant_count + carry_count :]]
     call = ", ".join([
-        *(_argument(statements, value) for value in values[:fixed]),
+        *(_argument(statements, value) for value in values[:constant_count]),
         *map(_passed, carry),
         *(_row(value, count, step) for value in rows),
         *map(_target, following),
         *(_row_target(value, count, step) for value in stacked),
     ])  # fmt: skip
+    start = _assign(carry, values[constant_count : constant_count + carry_count])
     statements.add(
         [*results, *following],
-        f"{_assign(carry, values[fixed : fixed + carried])} for (int n = 0; n < {count}; n++) "
-        f"{{ {body}({call}); {_assign(carry, following)} }}",
+        f"{start} for (int n = 0; n < {count}; n++) {{ {body}({call}); {_assign(carry, following)} }}",
     )
 
 

@@ -178,21 +178,21 @@ def expression(name: str, params: dict[str, Any], values: Sequence[Value]) -> Ex
 
 def _integer(name: str, type_name: str) -> Expression | None:
     bits, is_signed = int(type_name[-2:]), type_name[0] == "i"
-    own, unsigned = C_TYPES[type_name], f"uint{bits}_t"
+    signed, unsigned = C_TYPES[type_name], f"uint{bits}_t"
     words: dict[str, Any] = {
         "bits": bits,
-        "type": own,
+        "type": signed,
         "unsigned": unsigned,
         "minus_one": "",
         "minus_one_zero": "",
     }
     if is_signed:
-        words["minus_one"] = f"{{1}} == -1 ? ({own})(0u - ({unsigned}){{0}}) : "
+        words["minus_one"] = f"{{1}} == -1 ? ({signed})(0u - ({unsigned}){{0}}) : "
         words["minus_one_zero"] = "{1} == -1 ? 0 : "
     if is_signed and name in WRAPPED:
         template = UNSIGNED[name]
         return lambda *parts: (
-            f"({own})({template.format(*(f'({unsigned}){part}' for part in parts), **words)})"
+            f"({signed})({template.format(*(f'({unsigned}){part}' for part in parts), **words)})"
         )
     template = ORDERED.get(name) or (SIGNED if is_signed else UNSIGNED).get(name)
     if template is None:

@@ -68,18 +68,23 @@ class Program:
 
     def text(self, names: Sequence[str]) -> str:
         """Return the C code of functions, and of everything that they use."""
-        functions = {own: text.replace("@", own, 1) for text, own in self._functions.items()}
+        functions = {
+            function_name: text.replace("@", function_name, 1)
+            for text, function_name in self._functions.items()
+        }
         used, pending = {*names}, [*names]
         while pending:
             called = {*PART.findall(functions[pending.pop()].partition("{")[2])} - used
             used |= called
             pending += called
-        body = "\n".join(text for own, text in functions.items() if own in used)
-        helpers = [text for own, text in HELPERS.items() if re.search(rf"\b{own}\b", body)]
+        body = "\n".join(text for function_name, text in functions.items() if function_name in used)
+        helpers = [
+            text for function_name, text in HELPERS.items() if re.search(rf"\b{function_name}\b", body)
+        ]
         tables = [
-            _wrap(f"static const {definition.replace('{}', own, 1)}")
-            for definition, own in self.tables.items()
-            if re.search(rf"\b{own}\b", body)
+            _wrap(f"static const {definition.replace('{}', function_name, 1)}")
+            for definition, function_name in self.tables.items()
+            if re.search(rf"\b{function_name}\b", body)
         ]
         return "\n".join([*tables, *([""] if tables else []), *helpers, body])
 
@@ -92,17 +97,17 @@ class Translator:
 
     def translate(self, jaxpr: Any, constants: Sequence[Any], arguments: Sequence[Value]) -> list[Value]:
         """Add the statements of a jaxpr; return the values of its results."""
-        known: dict[Any, Value] = dict(zip(jaxpr.invars, arguments, strict=True))
+        environment: dict[Any, Value] = dict(zip(jaxpr.invars, arguments, strict=True))
         for variable, constant in zip(jaxpr.constvars, constants, strict=True):
-            known[variable] = self._constant(constant, variable.aval)
+            environment[variable] = self._constant(constant, variable.aval)
 
         def read(atom: Any) -> Value:
-            return self._constant(atom.val, atom.aval) if isinstance(atom, Literal) else known[atom]
+            return self._constant(atom.val, atom.aval) if isinstance(atom, Literal) else environment[atom]
 
         for equation in _used_equations(jaxpr):
             values = [read(atom) for atom in equation.invars]
             results = self._apply(equation, values)
-            known |= dict(zip(equation.outvars, results, strict=True))
+            environment |= dict(zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
     def _constant(self, array: Any, aval: Any) -> Value:
@@ -161,12 +166,12 @@ class Translator:
 
 def _used_equations(jaxpr: Any) -> list[Any]:
     """Return the equations whose results are used, in their order."""
-    used, kept = {id(atom) for atom in jaxpr.outvars}, []
+    used, used_equations = {id(atom) for atom in jaxpr.outvars}, []
     for equation in reversed(jaxpr.eqns):
         if any(id(variable) in used for variable in equation.outvars):
-            kept.append(equation)
+            used_equations.append(equation)
             used |= {id(atom) for atom in equation.invars}
-    return kept[::-1]
+    return used_equations[::-1]
 
 
 def _wrap(line: str) -> str:

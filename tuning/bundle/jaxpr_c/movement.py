@@ -1,4 +1,4 @@
-"""Primitives that move elements: static selections, slices at computed places, and gathers.
+"""Primitives that move elements: static selections, slices at computed positions, and gathers.
 
 A static selection becomes a view of its operand if the elements have a constant stride, and a copy otherwise.
 """
@@ -19,8 +19,8 @@ Parameters = dict[str, Any]
 
 def _broadcast(array: np.ndarray, p: Parameters) -> np.ndarray:
     shape = [1] * len(p["shape"])
-    for axis, place in enumerate(p["broadcast_dimensions"]):
-        shape[place] = array.shape[axis]
+    for axis, position in enumerate(p["broadcast_dimensions"]):
+        shape[position] = array.shape[axis]
     return np.broadcast_to(array.reshape(shape), p["shape"])
 
 
@@ -63,7 +63,7 @@ def select_elements(
         rows = np.moveaxis(numbers[0], params["axis"], 0)
         return [_view_or_copy(statements, values[0], row) for row in rows]
     if name in JOINING:
-        starts = np.cumsum([0, *(value.size for value in values)])
+        starts = np.cumsum([0, *(value.size for value in values)]).tolist()
         shifted = [part + start for part, start in zip(numbers, starts, strict=False)]
         return [_join(statements, values, starts, JOINING[name](shifted, params))]
     if name == "iota":
@@ -132,7 +132,7 @@ def _copy_runs(
         ]
     text = []
     for first, last, step in runs:
-        source = values[owners[first]].view((last - first,), int(numbers[first]), step)
+        source = values[int(owners[first])].view((last - first,), int(numbers[first]), step)
         goal = result.view((last - first,), first, 1)
         text.append(
             loops(
@@ -152,8 +152,8 @@ def slice_at(statements: Statements, params: Parameters, values: Sequence[Value]
     strides = strides_of(array.shape)
 
     def move(*indices: str) -> str:
-        place = index_of(strides, [*map(_shifted, names, indices)])
-        return f"{result.element(index_of(strides_of(sizes), indices))} = {array.element(place)};"
+        position = index_of(strides, [*map(_shifted, names, indices)])
+        return f"{result.element(index_of(strides_of(sizes), indices))} = {array.element(position)};"
 
     statements.add([result], f"{{ {begin} {loops(sizes, move)} }}")
     return result
@@ -167,9 +167,9 @@ def update_at(statements: Statements, values: Sequence[Value]) -> Value:
     strides = strides_of(array.shape)
 
     def move(*indices: str) -> str:
-        place = index_of(strides, [*map(_shifted, names, indices)])
+        position = index_of(strides, [*map(_shifted, names, indices)])
         source = part.element(index_of(strides_of(part.shape), indices))
-        return f"{result.element(place)} = {source};"
+        return f"{result.element(position)} = {source};"
 
     copy = loops([array.size], lambda i: f"{result.element(i)} = {array.element(i)};")
     statements.add([result], f"{copy} {{ {begin} {loops(part.shape, move)} }}")
@@ -203,26 +203,28 @@ def gather(
     dimensions, sizes = params["dimension_numbers"], params["slice_sizes"]
     offsets, batching = dimensions.offset_dims, tuple(dimensions.operand_batching_dims)
     fills = params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP
-    kept = [axis for axis in range(len(sizes)) if axis not in (*dimensions.collapsed_slice_dims, *batching)]
+    window_axes = [
+        axis for axis in range(len(sizes)) if axis not in (*dimensions.collapsed_slice_dims, *batching)
+    ]
     result, array = statements.variable(shape, array.type), statements.contiguous(array)
     index_strides = strides_of(indices.shape)
 
     def move(*loop: str) -> str:
         batch = [index for axis, index in enumerate(loop) if axis not in offsets]
-        window = dict(zip(kept, (loop[axis] for axis in offsets), strict=True))
-        begin, places, inside = [], [], []
+        window = dict(zip(window_axes, (loop[axis] for axis in offsets), strict=True))
+        begin, positions, inside = [], [], []
         for axis, (length, size) in enumerate(zip(array.shape, sizes, strict=True)):
-            place = window.get(axis, "0")
+            position = window.get(axis, "0")
             if axis in dimensions.start_index_map:
                 at = index_of(index_strides, [*batch, str(dimensions.start_index_map.index(axis))])
                 start, highest = f"(int64_t){indices.element(at)}", length - size
                 inside.append(f"{start} >= 0 && {start} <= {highest}")
                 begin.append(f"const int64_t s{axis} = clamp_index({start}, {highest});")
-                place = _shifted(f"s{axis}", place)
+                position = _shifted(f"s{axis}", position)
             elif axis in batching:
-                place = batch[dimensions.start_indices_batching_dims[batching.index(axis)]]
-            places.append(place)
-        element = array.element(index_of(strides_of(array.shape), places))
+                position = batch[dimensions.start_indices_batching_dims[batching.index(axis)]]
+            positions.append(position)
+        element = array.element(index_of(strides_of(array.shape), positions))
         if fills and inside:
             element = f"{' && '.join(inside)} ? {element} : {_fill_value(params, array.type)}"
         goal = result.element(index_of(strides_of(shape), loop))

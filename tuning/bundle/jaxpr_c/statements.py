@@ -75,15 +75,15 @@ class Statements:
 
     def text(self, end: str) -> list[str]:
         """Return the lines of the function's body: declarations, used statements, and the lines `end`."""
-        used, kept = {*NAME.findall(end)}, []
+        used, used_statements = {*NAME.findall(end)}, []
         for statement in reversed(self._statements):
             if any(value.name in used for value in statement.results):
-                kept.append(statement)
+                used_statements.append(statement)
                 used.update(NAME.findall(statement.text))
-        kept.reverse()
-        memory, declarations = _share_memory(kept, end)
+        used_statements.reverse()
+        memory, declarations = _share_memory(used_statements, end)
         lines = [*declarations]
-        for results, text in kept:
+        for results, text in used_statements:
             lines += _declare_scalars(results, text)
         return [
             NAME.sub(lambda match: memory.get(match[0], match[0]), line)

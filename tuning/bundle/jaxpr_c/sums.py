@@ -26,13 +26,15 @@ def fold(statements: Statements, name: str, axes: Sequence[int], value: Value) -
     if value.type not in (("bool",) if isinstance(first_value, bool) else ("float64",)):
         raise UnsupportedProgram(f"{name}: found {value.type}, expected float64, or bool for `and` and `or`")
     start = literal(first_value, value.type)
-    kept = [n for n in range(len(value.shape)) if n not in axes]
-    shape = [value.shape[n] for n in kept]
+    free_axes = [n for n in range(len(value.shape)) if n not in axes]
+    shape = [value.shape[n] for n in free_axes]
     result = statements.variable(shape, value.type)
 
     def combine(*indices: str) -> str:
-        place = index_of(strides_of(shape), [indices[n] for n in kept])
-        return step.format(result.element(place), value.element(index_of(strides_of(value.shape), indices)))
+        position = index_of(strides_of(shape), [indices[n] for n in free_axes])
+        return step.format(
+            result.element(position), value.element(index_of(strides_of(value.shape), indices))
+        )
 
     first = loops([math.prod(shape)], lambda i: f"{result.element(i)} = {start};")
     statements.add([result], f"{first} {loops(value.shape, combine)}")
