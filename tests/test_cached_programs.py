@@ -272,6 +272,7 @@ print(cached_programs.run_cached(solved, 1, np.diag([4.0, 0.5])))
 """
 
 
+@pytest.mark.slow
 @where_kept
 def test_cached_linear_solve_runs_in_process_that_traces_nothing(tmp_path):
     script = tmp_path / "solves.py"

@@ -140,6 +140,7 @@ def test_compare_plots_are_written(tmp_path):
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("errors.png", "transparency.png"))
 
 
+@pytest.mark.slow
 def test_compare_reports_positive_computing_time_per_tick():
     for name in ("rig-300kg", "probe-drogue"):
         mechanism = load_any(name).mechanism

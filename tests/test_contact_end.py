@@ -136,6 +136,7 @@ def check_means(parsed: Mechanism, name: str, shares: tuple[float, ...], seeds: 
         assert abs(np.mean(later - over)) <= BIAS + 3 * np.std(later - over) / math.sqrt(seeds), (name, share)
 
 
+@pytest.mark.slow
 def test_mean_restitution_does_not_depend_on_noise():
     check_means(jaxhil.load("suite-noisy"), "response_error", (0.003, 0.03, 0.1), 1000)
 

@@ -58,6 +58,7 @@ def test_restitution_with_sensor_lag_converges_for_increasingly_fast_simulator()
     )
 
 
+@pytest.mark.slow
 def test_derivatives_of_contact_with_sensor_lag_match_finite_differences():
     parsed = validated(fast_mechanism(second_order(60.0), law="kelvin_voigt", damping=[300.0]))
     loop = build_loop(parsed, "none", join([build_scenarios(parsed)]), energies=True)

@@ -141,6 +141,7 @@ def test_export_rejects_controller_that_differs_from_simulation(jaxhil, gains, t
     assert not (tmp_path / "bundle").exists()
 
 
+@pytest.mark.slow
 def test_export_reports_limits_that_stop_the_nominal_run(jaxhil, gains, tmp_path):
     ran = jaxhil("export", gains, "-o", tmp_path / "bundle", "--set", "force_limit=1")
     output = " ".join(ran.out.split())

@@ -49,6 +49,7 @@ def test_identify_estimates_clock_rate_and_contact(constant, rate, every):
     assert f"gains {1e6 * drift.rate:.3g}" in " ".join(result.notes)
 
 
+@pytest.mark.slow
 def test_identify_cannot_estimate_constant_clock_offset():
     campaign = contacts_with_clock_error(speeds=(0.012, 0.006, 0.012))
     result = identify(campaign, options=IdentificationOptions(law="linear", hold_out=0.0))

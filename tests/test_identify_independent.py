@@ -92,6 +92,7 @@ def test_independent_study_finds_no_error_in_true_mechanism_file_and_large_error
     assert max(abs(error), abs(difference)) > LIMIT
 
 
+@pytest.mark.slow
 def test_identify_verdict_is_good_for_campaign_of_independent_simulator(tmp_path):
     outcome = evaluate_identification("plain", 4, tmp_path)
     assert (outcome.verdict, outcome.check, outcome.wrong, outcome.trouble) == ("good", "good", False, "")

@@ -41,6 +41,7 @@ def validation(tasks):
     return build_validation(tasks, 15, 0)
 
 
+@pytest.mark.slow
 def test_every_optimisation_start_has_history_and_status(solved):
     for starts in solved:
         assert len(starts) == STARTS

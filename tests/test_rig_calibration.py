@@ -269,6 +269,7 @@ def test_calibration_recovers_a_known_restitution_polynomial():
     assert np.sum(inside) > 300 and np.max(np.abs(again - expected[inside])) < 1e-9
 
 
+@pytest.mark.slow
 def test_calibration_repeats_the_runs_of_a_stored_sweep(tmp_path):
     document = case(2, "response_error")
     manifest = sweep_manifest(document, scenarios=LANES, limit=LIMIT)

@@ -21,6 +21,7 @@ BARS = {
 SEARCH = {"scenarios": 32, "starts": 2, "steps": 12, "validation": 511}
 
 
+@pytest.mark.slow
 def test_nominal_ledger_errors_are_small_with_wide_ranges():
     [metrics] = evaluated(load_wide("probe-drogue"), "impulse_ledger", lanes=16)
     check_good(metrics)

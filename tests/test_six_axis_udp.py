@@ -162,6 +162,7 @@ def test_six_axis_rig_compensates_for_lost_packets():
     assert rig.commanded.not_finite == rig.commanded.beyond_limits == 0
 
 
+@pytest.mark.slow
 def test_failed_channel_trips_six_axis_controller_and_rig_stays_safe():
     count, name = 0, "probe-drogue"
 

@@ -42,6 +42,7 @@ def lanes_of_kind(scenarios, number):
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., number::LANES_PER_SCENARIO], scenarios)
 
 
+@pytest.mark.slow
 def test_contact_with_probe_push_has_restitution_of_pushed_ideal_contact():
     probed = build_probed_scenarios(DAMPED, draw(DAMPED, 3, 0))
     for number, expected in ((1, probed.early), (2, probed.late)):

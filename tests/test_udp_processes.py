@@ -87,6 +87,7 @@ def test_rig_command_reports_results_of_a_short_run(jaxhil, tmp_path):
     assert ran.code == (0 if result["verdict"] == "good" else 1)
 
 
+@pytest.mark.slow
 def test_rig_command_with_injected_faults_ends_safely(jaxhil, tmp_path):
     limits = {"command_lowest": -0.01, "command_highest": 0.01, "velocity_limit": 0.05, "deceleration": 1.0}
     limits |= {"held_readings": 3.0, "missed_in_a_row": 5.0, "retreat_velocity": 0.01}
