@@ -131,9 +131,9 @@ def command(case, bodies):
 
 
 class Axis:
-    """Motion simulator axis y'' + 2 zeta w y' + w^2 y = w^2 u, first in steady motion.
+    """Motion simulator axis y'' + 2 zeta w y' + w^2 y = w^2 u, which starts in steady motion.
 
-    With the hold "zoh", the motion before the first tick is that of one second of uniform commands.
+    With the hold "zoh", steady motion is the motion after one second of uniform commands.
     """
 
     def __init__(self, frequency, ratio, period, at, rate, hold="linear"):

@@ -52,7 +52,7 @@ def names_of(*vectors):
 
 
 def run_loop(controller, rig, ticks):
-    """Run both FMUs as a sequential master; return the final twist (6,)."""
+    """Run both FMUs as a sequential master does; return the final twist (6,)."""
     for _ in range(ticks):
         sensed = rig.get(*names_of(*READINGS))
         desired = {

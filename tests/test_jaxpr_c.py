@@ -104,7 +104,7 @@ NUMBERS = {
     "signs": lambda a, b, i, j, t: [lax.abs(i), lax.neg(i), lax.sign(i), lax.bitwise_not(i)],
     "conditions": lambda a, b, i, j, t: [(a > 0) & (b > 0), (a > 0) | (b > 0), (a > 0) ^ (b > 0), ~(a > 0)],
 }  # fmt: skip
-# Relative tolerances above rounding: near 1, the approximation of XLA loses digits.
+# Relative tolerances larger than rounding: for arguments near 1, XLA's approximation loses digits.
 TOLERANCES = {"inverse erf near 1": 1e-9}
 ARGUMENTS = (FIRST, SECOND, LEFT, RIGHT, TABLE)
 

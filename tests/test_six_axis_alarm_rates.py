@@ -69,7 +69,7 @@ def wrong_mass(document):
 
 
 def stuck(record, channel, rng, limits):
-    """Hold a channel from a random tick in the first half of the contact on.
+    """Hold a channel constant, starting at a random tick in the first half of the contact.
 
     Return the record, and whether the motion after this tick suffices to notice the fault.
     """

@@ -111,7 +111,7 @@ def test_two_equal_robots_move_like_a_single_robot():
 @pytest.mark.parametrize("hold", ["linear", "zoh"])
 @pytest.mark.parametrize("has_window", [False, True])
 def test_readings_before_the_first_tick_include_the_ripple_of_held_commands(hold, has_window):
-    """The filled delay line equals the one that uniform commands write; 4.4 ms and 7.3 ms of delays."""
+    """The delays are 4.4 ms and 7.3 ms; uniform commands must write the same delay line."""
     late = lanes([4.4e-3, 7.3e-3, 1e-3, 0.0, 2.5e-3, 3.7e-3], BATCH)
     zero, period = jnp.zeros(BATCH), PERIOD + jnp.zeros(BATCH)
     simulator = second_order(12.0 + 0 * late, 0.8 + 0 * late, late)

@@ -199,7 +199,7 @@ class ContactLaw(abc.ABC):
             The key of `[contact]` that sets the dissipation, and its increased values.
 
         Raises:
-            InputError: if the law does not define this method.
+            InputError: if the law has no parameter that increases its energy loss.
         """
         raise self._missing_method_error("perturb_damping")
 

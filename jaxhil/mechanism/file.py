@@ -293,7 +293,7 @@ def _format_changes(all_changes: Mapping[str, Sequence[Any]]) -> str:
 
 
 def _format_change(change: object) -> str:
-    """Format a change for a message: its text, or the key of a (key, value) pair."""
+    """Return a change as text for a message: the change itself or, for a pair (key, value), the key."""
     text = change[0] if isinstance(change, tuple) else change
     return to_one_line(text, 60) if isinstance(text, str) else format_value(text)
 

@@ -191,10 +191,10 @@ def build_series(
     control_period: Float[Array, "*batch"],
     degree: int,
 ) -> Float[Array, "powers columns *batch"]:
-    """Return the matrix from (state, command, increase of the command in a period) to series coefficients.
+    """Return the matrix that maps (state, command, increase of the command in a period) to coefficients.
 
-    The power series gives the position [m] as a function of the time since the instant of the state
-    [periods].
+    They are the coefficients of a power series, which gives the position [m] as a function of the time since
+    the instant of the state [periods].
     """
     if denominator.shape[0] > 1:
         return _series(*generator_rows(numerator, denominator, control_period), degree)

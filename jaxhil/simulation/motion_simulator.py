@@ -178,7 +178,7 @@ def matrix_exponential(
         return units[order] + units[order + 1] * ramp[None]
 
     def product(left, right, ramp):
-        """Return left @ right without its last row; `ramp` is the element r in the last row of `right`."""
+        """Return the product left @ right without its last row; `ramp` is r in the last row of `right`."""
         total = _matrix_product(left[:, :order], right)
         driven = left[:, order, None] * ramp_row(ramp)[None]
         return total + driven + left[:, order + 1, None] * units[None, order + 1]

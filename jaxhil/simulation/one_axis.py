@@ -99,7 +99,7 @@ class OneAxis(RigModel):
         return build_rig_constants(loop, scenarios, measured=loop.compensator.reads_position)
 
     def outcome(self, loop: Loop, gains: Gains, rig: RigConstants) -> Outcome:
-        """Run the scenarios that `prepared` received. The outcome is differentiable with respect to gains."""
+        """Run the scenarios from which `prepared` made `rig`; the outcome is differentiable by the gains."""
         if loop.compensator.is_large:
             rig = _separate_loops(rig)
         return compare_with_ideal(loop, rig.scenario, run_contacts(loop, gains, rig))

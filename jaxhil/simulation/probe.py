@@ -86,7 +86,7 @@ class Push(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """Push that tests transparency, and the ideal contact for comparison, for each contact."""
+    """For each contact, the push that tests transparency and the ideal contact with which it is compared."""
 
     push: Push  # push on the hardware, (contacts, *batch)
     # penetration in the ideal contact [m] at evenly spaced times, from 0 to `span` after the first touch

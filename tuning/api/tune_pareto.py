@@ -37,7 +37,7 @@ def check_pareto_options(number: Any, against: Any, compensator: str) -> None:
 
 
 def check_six_axis_cost(against: Any) -> None:
-    """Raise `InputError` if six axes do not have the second criterion of a Pareto front, its cost."""
+    """Raise `InputError` if `against`, the cost of a Pareto front, does not exist for six axes."""
     if against not in (None, "peak"):
         raise ArgumentError("pareto_against", str(against), "peak, the only cost in six axes")
 

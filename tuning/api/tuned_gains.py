@@ -87,8 +87,8 @@ class TunedGains:
         """Return the verdict, "good" or "bad".
 
         The verdict is "good" if three conditions hold with and without sensor noise: every contact ended; the
-        rms error is within the limit; at most 1 % of the real contacts have a peak force above 2 times, or a
-        duration outside 0.5 to 2 times, that of the ideal contact.
+        rms error is within the limit; at most 1 % of the real contacts have more than twice the peak force of
+        the ideal contact, or less than half or more than twice its duration.
         """
         return "good" if tune_verdict.is_good(self.tune_result, self.limit) else "bad"
 

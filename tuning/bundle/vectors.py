@@ -42,7 +42,7 @@ EXTREME_VALUES = (nan, inf, -inf, 1e308, -1e308, 1e30, -1e200, 5e-324, -0.0)  # 
 
 
 class ControllerInputs(NamedTuple):
-    """Inputs of the controller in one tick, and the command of the simulation."""
+    """Inputs of the controller in one tick, and the command that the simulation computed for this tick."""
 
     run: int  # number of the run
     event: int  # `RUN_START`, `NEXT_CONTACT`, or 0

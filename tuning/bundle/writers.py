@@ -201,7 +201,7 @@ WRITERS: dict[str, Callable[[Mapping[str, Any]], dict[str, bytes]]] = {
     "fmu": fmi3_files,
     "fmu2": fmi2_files,
 }
-# Folder of each format that is written only on request: FMUs contain a library of this computer's compiler.
+# Folder of each format that is written only on request: FMUs contain a library built by this computer.
 ON_REQUEST = {"fmu": "fmi3/", "fmu2": "fmi2/"}
 
 

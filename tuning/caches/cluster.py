@@ -71,7 +71,7 @@ def connect_workers(address: str) -> Iterator["ClusterWorkers"]:
 async def _check_answer(address: str) -> None:
     """Raise OSError or ValueError if no scheduler answers at `address` within `SCHEDULER_TIMEOUT`.
 
-    A client would wait for the answer without a time limit.
+    This check is needed because a client itself would wait forever.
     """
     from distributed import Security  # pyright: ignore[reportMissingImports]
     from distributed.comm.core import connect  # pyright: ignore[reportMissingImports]

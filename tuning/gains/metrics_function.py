@@ -77,7 +77,7 @@ class MetricsFunction:
             )
 
     def values(self, metrics: ScenarioMetrics) -> Float[Array, "several"]:
-        """Evaluate the user's function for several sets of metrics, arrays (sets, contacts, scenarios)."""
+        """Evaluate the function for several sets; each metric is an array (sets, contacts, scenarios)."""
         return jax.vmap(self._value)(metrics)
 
     def numbers(self, metrics: ScenarioMetrics) -> Float[np.ndarray, "several"]:

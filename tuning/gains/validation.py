@@ -96,8 +96,8 @@ class Validation:
         """Evaluate the objective at points in unit coordinates, on training scenarios of the tasks `which`.
 
         `objective` is common to all tasks, or a list with one per task. Only the first `scenarios` training
-        scenarios of each task are used, where probes count as scenarios. A call computes at least `lanes`
-        lanes.
+        scenarios of each task are used, and probes count towards this number. The batch is padded to at least
+        `lanes` lanes.
         """
         objectives = list_objectives(objective, len(self.tasks))
         noise = any(objectives[task].noise_weight > 0 for task in which)
@@ -198,7 +198,7 @@ class Validation:
         return lru_cache(maxsize=4)(partial(_place_training_scenarios, model, loop, self.training))
 
     def gains(self, task: int, coordinates: Float[np.ndarray, "gains"]) -> dict[str, float]:
-        """Return all gains of the compensator for coordinates in [0, 1] of the tuned gains."""
+        """Return all gains of the compensator; `coordinates` are the tuned gains as unit coordinates."""
         return {name: float(gain) for name, gain in self._gains(task, coordinates).items()}
 
     def _gains(

@@ -108,8 +108,8 @@ class ContactProblem:
     def at(self, delay: float, plane: float, pseudo: PseudoRows | None = None) -> CoefficientFit:
         """Fit the coefficients at one force delay [s] and surface position [m].
 
-        `pseudo` adds rows that replace the readings of other runs. Rows in which the force of the law would
-        be negative are treated as out of contact.
+        `pseudo` adds rows that replace the readings of runs in deep contact. Rows in which the force of the
+        law would be negative are treated as out of contact.
         """
         near, flags, fit = self._fit_until_consistent(delay, np.array([plane]), pseudo)
         (inner,) = self._make_fits(fit)

@@ -46,7 +46,7 @@ def estimate_hidden_bias(
         subtracted: Force that the zone subtracts from larger forces [N]; 0 for a cut zone.
 
     Returns:
-        Mean and standard deviation of the bias [N]; both are assumed if too few readings exceed the zone.
+        Mean and standard deviation of the bias [N]; assumed values if too few readings exceed the zone.
     """
     before = np.concatenate([_take_readings_before_contact(run) for run in runs])
     values = before[before != 0.0]

@@ -74,7 +74,10 @@ def check_zone_sampling(mechanism: Mechanism) -> list[CheckResult]:
 
 
 def _check_stated_cut_zone(contact: ContactFit, touching: np.ndarray) -> list[CheckResult]:
-    """Check that a stated cut dead zone hides all forces inside it, but not the noise that exceeds it."""
+    """Check that no reading lies inside the dead zone that the prior states as cut.
+
+    Noise beyond the zone is not hidden, and must occur in contact.
+    """
     readings, name = contact.readings, "dead zone of the force sensor"
     outside = readings.force[readings.is_valid & ~touching]
     expected = 2.0 * special.ndtr(-readings.zone / readings.std) * len(outside)

@@ -98,7 +98,8 @@ def check_force_smoothing(
 def average_edge_residuals(contact: ContactFit, runs: Sequence[LoggedRun]) -> np.ndarray:
     """Return the weighted mean residual at each row near the two edges, divided by its standard deviation.
 
-    The standard deviation includes the noise and an error of all readings' times, which the file allows.
+    The standard deviation includes the noise, and the largest common time error of all readings that the file
+    allows.
     """
     delay, plane, coefficient_fit = contact.posterior.best
     problem, readings = contact.problem, contact.readings

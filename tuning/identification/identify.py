@@ -320,7 +320,7 @@ def _draw_parameters(
         contact: Fit of the contact, or None.
         model: Model of the motion simulator, or None.
         frequency: Contact frequency [Hz].
-        share: Delay of the position sensor [s], which the fitted delays include.
+        share: Part of the fitted delays that is the delay of the position sensor [s].
         seed: Seed of the random numbers.
     """
     result, lag = {}, np.zeros(POSTERIOR_DRAWS)

@@ -111,7 +111,7 @@ def check_against_mechanism(
 
 
 def _has_uncertain_dead_zone(mechanism: Mechanism) -> bool:
-    """Return whether a dead zone, or the bias that it hides, is less certain than a single reading.
+    """Return whether the standard deviation of a dead zone, or of the hidden bias, exceeds that of a reading.
 
     The readings at the onset and release of contact are then unpredictable.
     """

@@ -35,9 +35,9 @@ class MovingAverageStructure(SimulatorStructure):
         return MovingAverageModel(self, parameters)
 
     def make_starts(self, lines: SpectralLines) -> list[tuple[float, np.ndarray]]:
-        """Return chi-squared and parameters of models with several windows.
+        """Return chi-squared and parameters of one model for each of several windows.
 
-        The sum of delay and half the window is that of the phase at low frequencies.
+        The delay plus half the window equals the delay that the phase shows at low frequencies.
         """
         total = estimate_low_frequency_delay(lines)
         longest = MAX_WINDOW_RATIO * max(2.0 * total, 2.0 * MIN_WINDOW_PERIODS * lines.period)
@@ -67,7 +67,7 @@ class MovingAverageModel(MotionModel):
 
     @cached_property
     def fraction(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return 1 / 1: a moving average has neither poles nor zeros of a rational function."""
+        """Return 1 / 1, because a moving average has no rational factor."""
         return np.ones(1), np.ones(1)
 
     def response(self, s: np.ndarray) -> np.ndarray:

@@ -88,9 +88,10 @@ def estimate_noise(readings: np.ndarray) -> NoiseEstimate:
 
 
 def recognise_noise_free_readings(noise: NoiseEstimate, contacts: Sequence[np.ndarray]) -> NoiseEstimate:
-    """Return the noise of a sensor whose constant readings at rest show a dead zone, or that it has no noise.
+    """Return the noise of a sensor with constant readings at rest.
 
-    The scatter of readings in contact tells both apart, because a dead zone hides the noise only at rest.
+    Either a dead zone hides the noise at rest, or there is no noise. The scatter of the readings in contact
+    distinguishes these cases.
 
     Args:
         noise: Noise at rest.
@@ -104,7 +105,7 @@ def recognise_noise_free_readings(noise: NoiseEstimate, contacts: Sequence[np.nd
     readings = np.concatenate(contacts)
     quantum, largest = detect_quantum(readings), float(np.abs(readings).max(initial=0.0))
     steps = [np.diff(force, 3)[np.abs(force[3:]) > MIN_LOUD_SHARE * largest] for force in contacts]
-    # A smooth force hardly changes third differences; white noise multiplies its variance by 20.
+    # Third differences nearly remove a smooth force, and multiply the variance of white noise by 20.
     scatter = 1.4826 * float(np.median(np.abs(np.concatenate(steps)))) / np.sqrt(20.0)
     rounding = max(quantum, noise.quantum) / np.sqrt(12.0)
     if noise.silent and not scatter <= max(MAX_ROUNDING_RATIO * rounding, MAX_SCATTER_SHARE * largest):

@@ -89,7 +89,7 @@ def _find_forces(
     duration: float,
     deepest: float,
 ) -> tuple[float, float, list[float]]:
-    """Return start, end and nodes of the force in a segment (`_ContactInterval`); no nodes without force."""
+    """Return start, end and values of the force in a segment; without force, the list of values is empty."""
     side, surface = _reached_surface(start.position, end.position, clearance)
     if duration <= 0.0 or side == 0.0:
         return 1.0, 0.0, []
@@ -99,7 +99,7 @@ def _find_forces(
 def _respond(
     reading: Number, interval: tuple[float, float, list[float]], duration: float, time_constant: Number
 ) -> Number:
-    """Return the output of a lag [N] at the end of a segment, from its output at the start."""
+    """Return the output [N] of a first-order lag at the end of a segment, from its output at the start."""
     if duration <= 0.0:
         return reading
     first, last, forces = interval

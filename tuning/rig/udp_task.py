@@ -83,7 +83,10 @@ class ControllerTask:
         return str(self._controller.status)
 
     def answer(self, reading: udp.ReadingPacket) -> udp.AnswerPacket | None:
-        """Return the answer to a reading; None if the reading is old, or its run not prepared or invalid."""
+        """Return the answer to a reading.
+
+        Return None if the reading is old, or if its run is invalid or has not been prepared.
+        """
         unprepared = reading.event == udp.TICK and reading.run != self._run
         if unprepared or not self._sequence.is_newer(reading.sequence):
             self.stale += 1

@@ -212,7 +212,7 @@ class RecordingController:
     def _compute_start_distance(self) -> float:
         """Return the distance [m] between measured position and position command at the first tick of a run.
 
-        Return NaN if the last recorded tick is a later tick of its run.
+        Return NaN if the last recorded tick is not the first tick of its run.
         """
         _, before, sent = self._compute_unlimited_commands()
         return math.nan if math.isfinite(before) else abs(sent - self._ticks[-1].measured)

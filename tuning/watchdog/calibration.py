@@ -186,7 +186,7 @@ def compute_guard_limits(
     rules: AuditRules,
     free_distance: float,
 ) -> dict[str, float | None]:
-    """Return limits of readings and commands: extreme values of the signals in the runs `used`, widened."""
+    """Return limits of readings and commands: the signals' extremes in the runs `used`, plus a margin."""
     extent = SignalExtremes(*(leaf[used] for leaf in runs.extent))
     rig, period = loaded.mechanism.rig, rules.period
     most = {name: float(np.max(getattr(extent, name))) for name in SignalExtremes._fields}

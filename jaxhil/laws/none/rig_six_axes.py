@@ -10,7 +10,10 @@ from jaxhil.rig.types import Gains, Positive
 
 @register_six_axes("none")
 class NoCompensation(SixAxisCompensator):
-    """Baseline W_c = W without compensation; the loop's delay adds energy in every contact."""
+    """Baseline without compensation: the wrench command W_c is the measured wrench W.
+
+    The loop's delay adds energy in every contact.
+    """
 
     __slots__ = ()
 

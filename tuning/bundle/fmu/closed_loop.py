@@ -178,7 +178,7 @@ def _run_six_axis_loop(
 
 
 def _run_loop(files: Mapping[str, bytes], fmi: int, document: Mapping[str, Any], mechanism: Mechanism):
-    """Run the nominal contacts as a sequential master, the controller first; return the contacts.
+    """Run the nominal contacts like a sequential master, with the controller before the rig; return them.
 
     Each run begins at the speed of the previous rebound.
     """

@@ -70,7 +70,10 @@ const double rig_start[RIG_NUMBERS] = {start};
 
 
 class RigState(NamedTuple):
-    """State of the rig after the sensors were read; before it, the contact has its last state."""
+    """State of the rig after the sensors were read.
+
+    Until they are read, the state of the contact is that of the previous tick.
+    """
 
     run: RunState
     reading: Wrench | None  # last reading of the force sensor's channels; None without timing effects
@@ -124,7 +127,8 @@ def _start(
 ) -> RigState:
     """Return the state before the sensors are read at tick 0.
 
-    The hardware has the last pose command before tick 0, which the master delays by one period.
+    The hardware still follows the last pose command before tick 0, because the master delays commands by one
+    period.
     """
     position, rates, _ = model_motion(rig.bodies, scenario.start)
     law = SIX_AXIS_COMPENSATORS[compensator]

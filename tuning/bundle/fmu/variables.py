@@ -106,7 +106,7 @@ def six_axis_vector(name: str, quantity: str, causality: Any, description: str) 
 
 
 def six_axis_names(name: str) -> list[str]:
-    """Return the names of the variables of a vector of six axes, whose name begins with its quantity."""
+    """Return the names of the variables of a vector with six axes, such as `wrench_command`."""
     return [f"{name}.{part}" for part in VECTORS[name.partition("_")[0]][0]]
 
 

@@ -1,4 +1,4 @@
-"""Branches and loops: calls of functions in C with the results as further arguments."""
+"""Branches and loops: their bodies become C functions, which receive pointers to their results."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -42,7 +42,7 @@ def add_while(
 def add_scan(
     add: AddFunction, statements: Statements, params: dict[str, Any], values: Values, results: Values
 ) -> None:
-    """Add a loop with a constant_count number of steps."""
+    """Add a loop with a constant number of steps."""
     body, count = add(params["jaxpr"]), params["length"]
     constant_count, carry_count = params["num_consts"], params["num_carry"]
     carry, stacked = results[:carry_count], results[carry_count:]

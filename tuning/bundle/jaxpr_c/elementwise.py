@@ -148,7 +148,7 @@ static int64_t clamp_index(int64_t index, int64_t highest) {
 
 
 def expression(name: str, params: dict[str, Any], values: Sequence[Value]) -> Expression | None:
-    """Return the function from the operands' elements to the C expression of an element of the result.
+    """Return a function that converts the operands' elements to the C expression of the result's element.
 
     Args:
         name: name of the primitive.

@@ -41,7 +41,7 @@ class Program:
         parameters, arguments = [], []
         for n, variable in enumerate(jaxpr.jaxpr.invars):
             shape, kind = variable.aval.shape, type_of(variable.aval)
-            # The function with a name is called from other files, with arrays only.
+            # Only a function with a given name is called from other files; all its arguments are arrays.
             is_array = int(np.prod(shape)) != 1
             pointer = is_array or name is not None
             parameters.append(f"const {C_TYPES[kind]} {'*' if pointer else ''}a{n}")

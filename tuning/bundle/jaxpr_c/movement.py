@@ -92,7 +92,7 @@ def _view_or_copy(statements: Statements, value: Value, chosen: np.ndarray) -> V
 def _join(
     statements: Statements, values: Sequence[Value], starts: Sequence[int], chosen: np.ndarray
 ) -> Value:
-    """Copy elements of several operands; `chosen` numbers the elements of all operands in their order."""
+    """Copy elements of several operands; `chosen` contains indices into their concatenated elements."""
     flat = chosen.ravel()
     owners = np.searchsorted(starts, flat, side="right") - 1
     parts = [

@@ -51,7 +51,7 @@ class Statements:
         return Value(array.shape, type_name, self.table(flat, type_name))
 
     def table(self, array: np.ndarray, type_name: str) -> str:
-        """Return the name of a constant array of the file."""
+        """Return the name of a constant array in the generated C file."""
         definition = f"{C_TYPES[type_name]} {{}}[{max(1, array.size)}] = {initialiser(array, type_name)};"
         return self._tables.setdefault(definition, f"table_{len(self._tables) + 1}")
 
@@ -74,7 +74,7 @@ class Statements:
         return result
 
     def text(self, end: str) -> list[str]:
-        """Return the lines of the function's body: declarations, used statements, and the lines `end`."""
+        """Return the lines of the function's body: declarations, used statements, then the lines `end`."""
         used, used_statements = {*NAME.findall(end)}, []
         for statement in reversed(self._statements):
             if any(value.name in used for value in statement.results):
@@ -100,9 +100,9 @@ def _declare_scalars(results: Sequence[Value], text: str) -> list[str]:
 
 
 def _share_memory(statements: Sequence[Statement], end: str) -> tuple[dict[str, str], list[str]]:
-    """Return the C array of each array's name, and the declarations of the C arrays.
+    """Return the C array that stores each array, by the array's name, and the declarations of the C arrays.
 
-    Arrays of the same type and size share memory if the one is no longer used when the other one begins.
+    Arrays of the same type and size share memory if one is no longer used when the other is first written.
     """
     last = {name: n for n, (_, text) in enumerate(statements) for name in NAME.findall(text)}
     last |= dict.fromkeys(NAME.findall(end), len(statements))

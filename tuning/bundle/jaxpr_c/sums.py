@@ -69,6 +69,6 @@ def multiply(statements: Statements, params: dict[str, Any], values: Sequence[Va
 
 
 def _element(value: Value, axes: Sequence[int], indices: Sequence[str]) -> str:
-    """Return the C expression of an element; the indices belong to these axes."""
+    """Return the C expression of an element; `indices` are its indices along `axes`."""
     index = dict(zip(axes, indices, strict=True))
     return value.element(index_of(strides_of(value.shape), [index[n] for n in range(len(value.shape))]))

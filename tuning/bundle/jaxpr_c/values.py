@@ -50,7 +50,7 @@ class Value(NamedTuple):
         return self.stride is None
 
     def element(self, index: int | str = 0) -> str:
-        """Return the C expression of an element, for a number or for the C expression of an index."""
+        """Return the C expression of the element at an index, which is a number or a C expression."""
         if self.stride is None:
             return self.name
         if isinstance(index, int):
@@ -78,7 +78,7 @@ def type_of(aval: Any) -> str:
 
 
 def literal(number: Any, type_name: str) -> str:
-    """Return the C literal of a number, which can follow an operator."""
+    """Return the C literal of a number, in parentheses if it could not follow an operator otherwise."""
     if type_name == "bool":
         return "true" if number else "false"
     if type_name == "float64":

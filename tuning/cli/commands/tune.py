@@ -328,7 +328,7 @@ def _starts_from_earlier_gains(result) -> list[dict[str, Any]]:
 def _prepare_drawing(mechanism, compensator: str) -> None:
     """Import and compile the code for the plots while the solver is compiled.
 
-    The motion itself is discarded: its gains are not tuned yet.
+    The function simulates one motion and discards it, because the gains are not tuned yet.
     """
     from jaxhil.laws.compensators import literature_gains
     from jaxhil.simulation.motion_curves import compute_nominal_motion

@@ -63,7 +63,7 @@ def _six_axis_tables(document: dict[str, Any]) -> list[Any]:
 
 
 def _twist_table(title: str, final: dict[str, Any]) -> Any:
-    """Return the table of a final twist and of that in the simulation."""
+    """Return a table that compares a final twist with the final twist of the simulation."""
     twists = zip(("vx", "vy", "vz", "wx", "wy", "wz"), final["found"], final["simulated"], strict=True)
     rows = [(name, *(terminal.format_number(value, 9) for value in values)) for name, *values in twists]
     return terminal.build_table(title, ["", "found", "simulated"], rows)

@@ -33,7 +33,7 @@ def detect_contacts(
     is_weak = len(force) > AVERAGED_ROWS and float(np.nanmax(size)) < WEAK_CONTACT_RATIO * threshold
     if rest is None and is_weak:
         mean = _average_readings(force)
-        # Means of separate readings determine the threshold, so that the filter does not correlate them.
+        # Means of disjoint groups of readings determine the threshold; overlapping means are correlated.
         size, threshold = np.abs(mean - level), estimate_contact_threshold(mean[::AVERAGED_ROWS])
     is_above = size > threshold
     is_sustained = is_above.copy()

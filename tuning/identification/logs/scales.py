@@ -78,7 +78,7 @@ def ask_for_unit(factors: tuple[float, ...], tolerance: float, momentum: bool = 
 
 
 def ask_for_length_unit(factor: float, tolerance: float) -> str:
-    """Return a question that names confusions of length units that may explain wrong lengths."""
+    """Return a question whether lengths have a wrong unit, with the likely mistakes, such as mm for m."""
     return _ask_for_units(list(_LENGTH_FACTORS.items()), (factor,), tolerance)
 
 

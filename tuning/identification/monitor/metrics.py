@@ -188,9 +188,9 @@ def compute_metrics(
 def _compute_noise_metric(
     rest: np.ndarray, sensors: ForceSensorSpec, colour: NoiseColour
 ) -> tuple[float, float, float]:
-    """Return the noise metric, its standard deviation, and the noise [N] of the other force metrics.
+    """Return the noise metric, its standard deviation, and the noise level [N] for the other force metrics.
 
-    This noise is the standard deviation of a reading times the factor of `NoiseColour.extend`.
+    The noise level is the standard deviation of a reading times the factor of `NoiseColour.extend`.
     """
     stated = float(np.hypot(sensors.std, sensors.quantum / np.sqrt(12.0)))
     if len(rest) < MIN_METRIC_ROWS:

@@ -7,8 +7,8 @@ def share_beyond(excess: float, excess_before: float, moved: float) -> float:
     The reading is assumed to be linear in time between two ticks.
 
     Args:
-        excess: reading minus threshold if the reading exceeds the threshold, else 0. For a reading below a
-            lower threshold, the excess is negative.
+        excess: reading minus threshold if the reading exceeds the threshold, else 0. If there is also a lower
+            threshold and the reading is below it, reading minus lower threshold, which is negative.
         excess_before: excess on the previous tick.
         moved: change of the reading since the previous tick, in the unit of `excess`.
     """
