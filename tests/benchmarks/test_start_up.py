@@ -29,7 +29,8 @@ pytestmark = pytest.mark.benchmark
 REPEATS = 4
 # Variables of the test session that are removed: XLA flags, and the request to recompile every module.
 NOT_A_USERS = "XLA_FLAGS", "NPROC", "PYTHONDONTWRITEBYTECODE"
-COMMANDS = {"tune": (("tune", "varying"), 5.0), "simulate": (("simulate", "varying"), 1.2)}
+# Commands, and the limits on their first and later times on two idle cores [s].
+COMMANDS = {"tune": (("tune", "varying"), 10.0, 4.0), "simulate": (("simulate", "varying"), 9.0, 1.0)}
 COMPILING = 15.0  # on two cores [s]: limit for rollouts with derivatives, and for all programs of tuning
 # Compensators of thousands of equations exceed the limit; these are their measured times.
 REACHED = {"impulse_ledger": 40.0}
@@ -52,13 +53,13 @@ def run(arguments, folder, programs):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_repeated_command_finishes_within_time_limit(name, tmp_path, capsys):
-    arguments, most = COMMANDS[name]
+def test_command_finishes_within_time_limits(name, tmp_path, capsys):
+    arguments, first_limit, limit = COMMANDS[name]
     first, *others = (run(arguments, tmp_path, tmp_path / "programs") for _ in range(1 + REPEATS))
     took, timings = min(others)
     with capsys.disabled():
         print(f"\njaxhil {' '.join(arguments)}: at first {first[0]:.1f} s, then {took:.2f} s ({timings})")
-    assert took <= most
+    assert first[0] <= first_limit and took <= limit
 
 
 def test_first_tune_of_impulse_ledger_needs_little_processor_time(tmp_path, capsys):
