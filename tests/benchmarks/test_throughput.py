@@ -35,7 +35,7 @@ INFORMATION = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists(
 PROCESSOR = next((row.split(":")[1].strip() for row in INFORMATION.splitlines() if "model name" in row), "?")
 INTEL = "GenuineIntel" in INFORMATION
 # Required speed relative to the C++ loop at its best width, at 16 lanes per block, and for a fixed horizon.
-LANE_STEPS = {"none": 0.33, "response_error": 0.4} if INTEL else {"none": 0.5, "response_error": 0.5}
+LANE_STEPS = {"none": 0.5, "response_error": 0.5}
 LANE_STEPS_16 = {"none": 0.33, "response_error": 0.43} if INTEL else {"none": 0.65, "response_error": 0.65}
 JACOBIAN = 0.85  # largest time, divided by the time without compiler options
 SCENARIOS = {"none": 0.4, "response_error": 0.45} if INTEL else {"none": 1.0, "response_error": 0.95}
