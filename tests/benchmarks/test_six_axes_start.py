@@ -60,10 +60,12 @@ def test_six_axis_program_of_twelve_shape_pairs_compiles_within_time_limit(capsy
     mechanism = load_any("petals", []).mechanism
     scenario = build_scenarios(mechanism)
     assert sum(group.parameters.damping.shape[0] for group in scenario.groups) == 12
-    loop = make_loop(mechanism, "phase_lead", scenario)
+    loop = make_loop(mechanism, "phase_lead_per_axis", scenario)
 
     def errors(leads):
-        gains = {"phase_lead": leads[:, None], "lead_filter": jnp.array(1e-3)}
+        axes = ("x", "y", "z", "rx", "ry", "rz")
+        gains = {f"phase_lead_{axis}": leads[index] for index, axis in enumerate(axes)}
+        gains |= {f"lag_lead_{axis}": jnp.array(0.0) for axis in axes} | {"lead_filter": jnp.array(1e-3)}
         metrics = evaluate(loop, gains, scenario).metrics
         return jnp.stack([metrics.energy_error, metrics.twist_error])
 
