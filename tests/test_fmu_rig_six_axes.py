@@ -84,12 +84,12 @@ def test_both_fmus_with_six_axes_reproduce_simulation_with_one_more_period(
     late = structs.replace(mechanism.rig, command_latency=mechanism.rig.command_latency + 1)
     gains = {name: gain["value"] for name, gain in made["gains"].items()}
     run: Any = jaxhil.simulate(structs.replace(mechanism, rig=late), compensator, gains)
-    found = run_loop(controller, rig, round(run.final.time / mechanism.rig.control_period))
-    difference = float(np.max(np.abs(found - run.final.twist)))
+    final_twist = run_loop(controller, rig, round(run.final.time / mechanism.rig.control_period))
+    difference = float(np.max(np.abs(final_twist - run.final.twist)))
     print(f"{name} {compensator} {' '.join(overrides)} FMI {fmi}: {difference:.1e}")
-    assert difference < 1e-9 < np.max(np.abs(found))
+    assert difference < 1e-9 < np.max(np.abs(final_twist))
     without: Any = jaxhil.simulate(mechanism, compensator, gains)
-    assert np.max(np.abs(found - without.final.twist)) > 1e-6
+    assert np.max(np.abs(final_twist - without.final.twist)) > 1e-6
     controller.close()
     rig.close()
 

@@ -99,8 +99,8 @@ def test_motion_of_moving_average_is_the_mean_of_the_delayed_command(hold_name):
     rows = np.arange(0, len(run.tick), 20)
     age = AVERAGE.delay + delay + AVERAGE.window * (np.arange(20_000) + 0.5) / 20_000
     times = rows[:, None] - age / period
-    held = command[np.ceil(times).astype(int) + 100]
-    values = held if hold_name == "zoh" else np.interp(times, ticks, command)
+    held_command = command[np.ceil(times).astype(int) + 100]
+    values = held_command if hold_name == "zoh" else np.interp(times, ticks, command)
     position, velocity = motion.at(delay)
     np.testing.assert_allclose(position[rows, 0], values.mean(axis=1), rtol=0.0, atol=1e-9)
     later = (motion.at(delay - 1e-6)[0] - motion.at(delay + 1e-6)[0]) / 2e-6

@@ -116,8 +116,8 @@ def test_readings_before_the_first_tick_include_the_ripple_of_held_commands(hold
     zero, period = jnp.zeros(BATCH), PERIOD + jnp.zeros(BATCH)
     simulator = second_order(12.0 + 0 * late, 0.8 + 0 * late, late)
     if has_window:
-        one = jnp.ones((1, *late.shape))
-        simulator = simulator._replace(numerator=one, denominator=one, window=0.0124 + 0 * late)
+        unity = jnp.ones((1, *late.shape))
+        simulator = simulator._replace(numerator=unity, denominator=unity, window=0.0124 + 0 * late)
     plant = build_axes(simulator, 2.3e-3 + zero, zero, period, hold, True, True)
     at, stride = lanes([1e-3] * 6, BATCH), lanes([1e-5, -2e-5, 5e-5, 1e-4, -3e-5, 4e-5], BATCH)
 

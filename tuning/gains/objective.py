@@ -270,13 +270,10 @@ def weight_residuals(
         probe_errors = _compute_norm_residuals(jnp.where(probes, error, 0), counted(is_scheduled & probes), 2)
         transparency = [weights.transparency[:, None] * probe_errors]
         error, plain = jnp.where(probes, 0, error), counted(is_scheduled & ~probes)
-    number = {"rms": plain, "cvar": _count_tail_contacts(plain), "worst": jnp.ones_like(plain)}[terms.name]
     if metric is None:
         weighted = jnp.where(error > 0, jnp.sqrt(weights.divergence)[:, None] * error, error)
-        number = {"rms": plain, "cvar": _count_tail_contacts(plain), "worst": jnp.ones_like(plain)}[
-            terms.name
-        ]
-        errors = _compute_norm_residuals(weighted, number, NORM_POWERS[terms.name])
+        numbers = {"rms": plain, "cvar": _count_tail_contacts(plain), "worst": jnp.ones_like(plain)}
+        errors = _compute_norm_residuals(weighted, numbers[terms.name], NORM_POWERS[terms.name])
     else:
         errors = metric[:, None]
     if terms.tolerance:

@@ -105,8 +105,8 @@ def _compare_final_twist(files: Mapping[str, bytes], fmi: int, loaded: Any, mech
     latency, period = mechanism.rig.command_latency, mechanism.rig.control_period
     final = simulate_six_axes(mechanism, loaded.compensator, loaded.gains).final
     ticks = round(final.time / period)
-    found = _run_six_axis_loop(files, fmi, loaded.document, mechanism, ticks)
-    compared = compare_final_twists(found, np.array(final.twist), ticks, "ok")
+    final_twist = _run_six_axis_loop(files, fmi, loaded.document, mechanism, ticks)
+    compared = compare_final_twists(final_twist, np.array(final.twist), ticks, "ok")
     reasons = ()
     if not compared.difference <= FMU_LOOP_LIMIT:
         reasons = (
