@@ -1,11 +1,13 @@
 """Terminal output: tables without lost digits or broken names at any width, and JSON."""
 
 import json
+import math
 
 import numpy as np
 import pytest
 
 from tuning import terminal
+from tuning.number_format import format_number
 
 LAW = "multi_parameter_lead"
 FIGURES = [12.34, 20.15, 200.2, 0.1041, 0.5123, 0.9252, 1.443, 4.125]
@@ -38,16 +40,33 @@ def test_terminal_table_wraps_long_texts_between_words(monkeypatch, capsys):
 
 
 def test_narrow_table_breaks_long_keys_before_their_last_part(monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("COLUMNS", "76")
     keys = "rig.simulator.natural_frequency", "rig.force_sensor.time_constant", "contact.damping[0]"
     rows = [[key, 0.0043028, 0.0043001, 0.0043056, "N s/m", 124355.1234, "+848 %"] for key in keys]
     heads = ["number", "estimate", "95 % from", "to", "unit", "prior", "change"]
     terminal.emit(terminal.build_table("Identified", heads, rows, texts=(0, 4)))
     lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 80
+    assert max(map(len, lines)) <= 76
     assert {line.split()[0] for line in lines[5:-1]} == {
         *("rig.simulator.", "natural_frequency", "rig.force_sensor.", "time_constant", keys[2])
     }
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (124355.1, "124400"),
+        (-9999.6, "-10000"),
+        (99_996_000.0, "100000000"),
+        (1.0e8, "1e+08"),
+        (0.00003, "3e-05"),
+        (3.14159, "3.142"),
+        (123456, "123456"),
+        *((value, "-") for value in (math.nan, math.inf, None, True)),
+    ],
+)
+def test_numbers_below_a_hundred_million_have_no_exponent(value, text):
+    assert format_number(value) == text
 
 
 def test_piped_output_is_wrapped_to_environment_variable_columns(monkeypatch, capsys):

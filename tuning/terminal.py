@@ -20,6 +20,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from jaxhil.errors import InputError, to_one_line
+from tuning.number_format import format_number
 from tuning.table_layout import fit_table
 
 DEFAULT_WIDTH = 80  # width of lines if no stream is a terminal [characters]
@@ -107,13 +108,6 @@ def build_table(
     for row in rows:
         result.add_row(*(value if isinstance(value, str) else format_number(value) for value in row))
     return result
-
-
-def format_number(value: Any, digits: int = 4) -> str:
-    """Return a number as text with `digits` significant digits, or a dash if it is None or not finite."""
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
-        return "-"
-    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 def format_error(value: float | None) -> str:

@@ -34,8 +34,7 @@ def tune(
     Args:
         mechanism: result of `jaxhil.load`, or a name or path that `jaxhil.load` accepts; or a list of these,
             whose mechanisms are tuned together.
-        compensator: name of a built-in or registered compensator; for six axes, "none", "phase_lead" or
-            "phase_lead_per_axis".
+        compensator: name of a built-in or registered compensator that supports the mechanism's axes.
         progress: report the progress on standard error.
         **options: see `TuneOptions`.
 

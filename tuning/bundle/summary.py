@@ -13,6 +13,7 @@ from jaxhil.mechanism.sensor_filter import low_frequency_delay
 from jaxhil.mechanism.structs import SensorFilter
 from jaxhil.simulation.contact_plot import CURVE_LABELS
 from tuning.bundle.writers import GainOrLimit, gain_entries, limit_entries
+from tuning.number_format import format_number
 from tuning.plots.bundle_summary import ERROR_STATISTICS, summary_png
 
 # Prefixes of those limits that are fitted coefficients of the watchdog's expected restitution.
@@ -58,7 +59,7 @@ def summary_html(document: Mapping[str, Any], drawn: bytes | None = None) -> byt
         f"<style>{PAGE_STYLE}</style></head><body>",
         f"<h1>{name}: compensator {escape(document['compensator'])}</h1>",
         f"<p>{escape(describe_mechanism(mechanism, document.get('axes', 1)))}</p>",
-        f"<p>Control period {_format_number(1e3 * document['control_period'])} ms. "
+        f"<p>Control period {format_number(1e3 * document['control_period'])} ms. "
         f"Tuned {escape(to_one_line(document['created'], 40))}; seed {document['seed']}; "
         f"{escape(to_one_line(versions, 200))}.<br>",
         f"SHA-256 of the gains' content <code>{escape(document['sha256'])}</code></p>",
@@ -82,17 +83,17 @@ def describe_mechanism(mechanism: Mapping[str, Any], axes: int = 1) -> str:
         return _describe_six_axes(mechanism)
     bodies, contact, rig = mechanism["bodies"], mechanism["contact"], mechanism["rig"]
     mass = bodies.get("equivalent_mass")
-    text = f"{_format_number(mass)} kg" if mass else f"bodies of {_format_list(bodies.values())} kg"
+    text = f"{format_number(mass)} kg" if mass else f"bodies of {_format_list(bodies.values())} kg"
     approach = mechanism["approach"]
     number = approach["contacts"]
     stiffness = _format_list(_flatten(contact["stiffness"]))
     return (
-        f"{text} at {_format_number(1e3 * approach['velocity'])} mm/s, {number} "
+        f"{text} at {format_number(1e3 * approach['velocity'])} mm/s, {number} "
         f"contact{'s' if number > 1 else ''}, "
         f"{contact['law'].replace('_', ' ')} contact of stiffness {stiffness} (SI units); motion simulator "
         f"{rig['simulator']['model'].replace('_', ' ')}, delay "
-        f"{_format_number(1e3 * rig['simulator'].get('delay', 0.0))} ms; force sensor delay "
-        f"{_format_number(1e3 * rig['force_sensor'].get('delay', 0.0))} ms{_describe_filter(rig)}."
+        f"{format_number(1e3 * rig['simulator'].get('delay', 0.0))} ms; force sensor delay "
+        f"{format_number(1e3 * rig['force_sensor'].get('delay', 0.0))} ms{_describe_filter(rig)}."
     )
 
 
@@ -101,8 +102,8 @@ def _describe_filter(rig: Mapping[str, Any]) -> str:
     stated = rig["force_sensor"].get("filter")
     if stated is None:
         return ""
-    delay = _format_number(1e3 * low_frequency_delay(SensorFilter(**stated)))
-    name = f"{stated['kind']} filter of order {stated['order']} at {_format_number(stated['cutoff'])} Hz"
+    delay = format_number(1e3 * low_frequency_delay(SensorFilter(**stated)))
+    name = f"{stated['kind']} filter of order {stated['order']} at {format_number(stated['cutoff'])} Hz"
     return f", {name} (another {delay} ms)"
 
 
@@ -117,11 +118,11 @@ def _describe_six_axes(mechanism: Mapping[str, Any]) -> str:
         for name, contact in (mechanism.get("contact") or {}).items()
     )
     return (
-        f"Six axes: target of {_format_number(mechanism['target']['mass'])} kg, chaser of "
-        f"{_format_number(mechanism['chaser']['mass'])} kg{speed}; contacts {contacts or 'none'}; motion "
+        f"Six axes: target of {format_number(mechanism['target']['mass'])} kg, chaser of "
+        f"{format_number(mechanism['chaser']['mass'])} kg{speed}; contacts {contacts or 'none'}; motion "
         f"simulator {rig['simulator']['model'].replace('_', ' ')}, delays {delays} ms; force sensor on the "
         f"{rig['force_sensor'].get('side', 'fixed')} side, delay "
-        f"{_format_number(1e3 * rig['force_sensor'].get('delay', 0.0))} ms{_describe_filter(rig)}."
+        f"{format_number(1e3 * rig['force_sensor'].get('delay', 0.0))} ms{_describe_filter(rig)}."
     )
 
 
@@ -135,7 +136,7 @@ def _error_table(document: Mapping[str, Any], key: str, title: str) -> Iterator[
                 *(errors.get(key) for key in (*ERROR_STATISTICS, "mean", "peak_ratio")),
                 errors.get("failed"),
             ]
-            rows.append((CURVE_LABELS[name], *(_format_number(value) for value in cells)))
+            rows.append((CURVE_LABELS[name], *(format_number(value) for value in cells)))
     if rows:
         heads = (
             "fresh scenarios",
@@ -158,10 +159,10 @@ def describe_sweep(sweep: Any, error_name: str) -> Iterator[str]:
     """
     if isinstance(sweep, Mapping) and isinstance(sweep.get("failure_probability"), Mapping):
         value, low, high = (sweep["failure_probability"].get(key) for key in ("value", "low", "high"))
-        interval = f"95 %: {_format_number(low, 3)} to {_format_number(high, 3)}"
-        limit = f"{error_name.removesuffix(' [1]').lower()} {_format_number(sweep.get('limit'))}"
+        interval = f"95 %: {format_number(low, 3)} to {format_number(high, 3)}"
+        limit = f"{error_name.removesuffix(' [1]').lower()} {format_number(sweep.get('limit'))}"
         yield (
-            f"Sweep: failure probability {_format_number(value)} ({interval}). {sweep.get('failed')} of "
+            f"Sweep: failure probability {format_number(value)} ({interval}). {sweep.get('failed')} of "
             f"{sweep.get('scenarios')} scenarios failed; limit of the {limit}."
         )
 
@@ -170,9 +171,9 @@ def _gain_table(document: Mapping[str, Any]) -> Iterator[str]:
     rows = [
         (
             name,
-            _format_number(gain.value, 6),
+            format_number(gain.value, 6),
             gain.unit,
-            f"{_format_number(gain.lower, 3)} to {_format_number(gain.upper, 3)}",
+            f"{format_number(gain.lower, 3)} to {format_number(gain.upper, 3)}",
         )
         for name, gain in gain_entries(document).items()
     ]
@@ -232,8 +233,8 @@ def _active_limits(document: Mapping[str, Any]) -> dict[str, GainOrLimit]:
 def describe_limit(value: float | None, unit: str) -> tuple[str, str]:
     """Return a limit as text and its unit, with lengths in mm, speeds in mm/s and times in ms."""
     if unit not in RIG_UNITS:
-        return _format_number(value), unit
-    return _format_number(None if value is None else 1e3 * value), RIG_UNITS[unit]
+        return format_number(value), unit
+    return format_number(None if value is None else 1e3 * value), RIG_UNITS[unit]
 
 
 def is_user_limit(limit: str) -> bool:
@@ -246,8 +247,8 @@ def describe_alarm_rates(rates: Mapping[str, Any]) -> Iterator[str]:
     for name, runs in (("false_alarms", "good runs"), ("missed_alarms", "runs to be stopped")):
         rate = rates.get(name)
         if isinstance(rate, Mapping) and {"runs", "alarms", "low", "high"} <= rate.keys():
-            allowed = f", limit {_format_number(rate['allowed'], 2)}" if "allowed" in rate else ""
-            interval = f"95 %: {_format_number(rate['low'], 2)} to {_format_number(rate['high'], 2)}{allowed}"
+            allowed = f", limit {format_number(rate['allowed'], 2)}" if "allowed" in rate else ""
+            interval = f"95 %: {format_number(rate['low'], 2)} to {format_number(rate['high'], 2)}{allowed}"
             yield f"{name.replace('_', ' ')} {rate['alarms']} of {rate['runs']} {runs} ({interval})"
     for rate in rates.get("fault_runs", ()):
         if isinstance(rate, Mapping) and {"counted", "runs", "alarms", "low", "high", "error"} <= rate.keys():
@@ -264,12 +265,12 @@ def _describe_missed_faults(runs: Mapping[str, Any]) -> str:
     """Return a text on how often the watchdog misses an injected fault of known size."""
     unit = "" if runs["unit"] == "1" else f" {runs['unit']}"
     if not runs["counted"]:
-        most = f"up to {_format_number(runs['largest_size'], 2)}{unit}"
+        most = f"up to {format_number(runs['largest_size'], 2)}{unit}"
         usable = f"only {runs['runs']} of {runs['scenarios']} runs are good without and bad with the fault"
         return f"{runs['meaning']}, {most}: not counted, {usable}"
-    interval = f"95 %: {_format_number(runs['low'], 2)} to {_format_number(runs['high'], 2)}"
-    interval += f", limit {_format_number(runs['allowed'], 2)}"
-    size = f"size {_format_number(runs['size'], 2)}{unit}, error {_format_number(runs['error'], 2)}"
+    interval = f"95 %: {format_number(runs['low'], 2)} to {format_number(runs['high'], 2)}"
+    interval += f", limit {format_number(runs['allowed'], 2)}"
+    size = f"size {format_number(runs['size'], 2)}{unit}, error {format_number(runs['error'], 2)}"
     return (
         f"missed alarms {runs['alarms']} of {runs['runs']} runs with {runs['meaning']}, {size} ({interval})"
     )
@@ -279,13 +280,13 @@ def _describe_noticed_errors(noticed: Mapping[str, Any], rates: Mapping[str, Any
     """Yield texts on the smallest error that the watchdog detects in 95 % of contacts."""
     if rates.get("widened_from") is not None:
         widened = (
-            f"{_format_number(rates['widened_from'], 2)} to {_format_number(rates['restitution_margin'], 2)}"
+            f"{format_number(rates['widened_from'], 2)} to {format_number(rates['restitution_margin'], 2)}"
         )
         yield f"restitution_margin widened from {widened}, because too many good runs would be stopped"
     if noticed.get("error") is not None:
-        yield f"errors above {_format_number(noticed['error'], 2)} are detected in 95 % of contacts"
+        yield f"errors above {format_number(noticed['error'], 2)} are detected in 95 % of contacts"
     elif noticed.get("largest") is not None:
-        largest = _format_number(noticed["largest"], 2)
+        largest = format_number(noticed["largest"], 2)
         yield (
             "the smallest error that is detected in 95 % of contacts is above "
             f"{largest}, the largest error of these runs"
@@ -314,14 +315,9 @@ def _html_table(
     yield "</table>"
 
 
-def _format_number(value: Any, digits: int = 4) -> str:
-    """Return a number as text; "-" for any other value."""
-    return f"{value:.{digits}g}" if isinstance(value, (int, float)) else "-"
-
-
 def _format_list(values: Any, most: int = 4) -> str:
     """Return the first `most` numbers as text, followed by "..." if there are more."""
-    texts = [_format_number(value) for value in values]
+    texts = [format_number(value) for value in values]
     return ", ".join(texts[:most]) + (", ..." if len(texts) > most else "")
 
 

@@ -22,6 +22,7 @@ from jaxhil.simulation.contact_plot import (
 from tuning.identification.contact_fit import ContactFit
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.result import Identification
+from tuning.number_format import format_number
 from tuning.plots.parts import INTERVAL_SIGMAS, legend_above
 from tuning.terminal import format_key
 
@@ -233,7 +234,7 @@ def plot_estimates(entries: Sequence[Mapping[str, Any]]) -> Figure:
         style: dict[str, Any] = {"linestyle": "none", "marker": "D", "markersize": 5, "color": VERMILION}
         axes.plot(shares, [row for row, _ in with_prior], label="prior", **style)
     names = [
-        f"{format_key(entry['key'])}\n{entry['value']:.4g} {entry['unit']}".removesuffix(" 1")
+        f"{format_key(entry['key'])}\n{format_number(entry['value'])} {entry['unit']}".removesuffix(" 1")
         for entry in plotted
     ]
     # Matplotlib would read text between dollar signs as a formula.

@@ -4,13 +4,13 @@ import math
 
 from jaxhil.errors import to_one_line
 from tuning.identification.monitor.metrics import METRICS
+from tuning.number_format import format_number
 from tuning.reporting.documents import EstimateEntry, MonitoredMetric
 from tuning.reporting.drawings import draw_estimates, monitor_drawing
 from tuning.reporting.result_files import Results
 from tuning.reporting.verdict_sections import (
     ReportTable,
     Section,
-    format_number,
     is_identified,
     is_other_file_monitored,
 )

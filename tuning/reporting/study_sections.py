@@ -5,10 +5,11 @@ from collections.abc import Callable, Iterator, Mapping
 
 from jaxhil.errors import to_one_line
 from jaxhil.simulation.contact_bounds import CONTACT_BOUNDS_TEXT
+from tuning.number_format import format_number
 from tuning.reporting.documents import MarginOfMap, MetricEntry
 from tuning.reporting.drawings import TYPICAL_SCENARIOS, draw_map, draw_nominal_run, draw_sweep
 from tuning.reporting.result_files import Results
-from tuning.reporting.verdict_sections import ReportTable, Section, format_number
+from tuning.reporting.verdict_sections import ReportTable, Section
 
 METRIC_HEADINGS = {  # headings of the comparison's table by name of the metric
     "rms": "rms |e - e*|", "p99": "99th percentile", "worst": "worst", "failures": "failures",

@@ -1,6 +1,5 @@
 """Requirements and verdict of a report, and its sections on assumptions, gains and watchdog."""
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,6 +16,7 @@ from jaxhil.mechanism.uncertainty import PHASE_KEY
 from jaxhil.simulation.contact_plot import CURVE_LABELS
 from tuning.bundle.summary import describe_alarm_rates, describe_limit, is_user_limit
 from tuning.bundle.writers import gain_entries, limit_entries
+from tuning.number_format import format_number
 from tuning.reporting.drawings import ScenarioPlot, SvgPlot
 from tuning.reporting.result_files import Results
 from tuning.sweeps.columns import find_key_unit
@@ -165,12 +165,6 @@ def gain_section(results: Results) -> Section | None:
         tables += [ReportTable((f"{name} on fresh scenarios", *headings), error_rows)] if error_rows else []
     texts = () if rows else (f"{subject.compensator} has no gains.",)
     return Section("gains", f"Gains of {subject.compensator}", texts, tables)
-
-
-def format_number(value: Any, digits: int = 4) -> str:
-    """Return a number as text with `digits` significant digits; a dash for None or a non-finite number."""
-    is_finite = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    return f"{value:.{digits}g}" if is_finite else "–"  # noqa: RUF001
 
 
 def _sweep_requirement(results: Results) -> Iterator[Requirement]:

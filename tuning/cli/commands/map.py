@@ -100,9 +100,9 @@ def _describe_margins(document: Mapping[str, Any], margins: Mapping[str, Any]) -
     for axis in "xy":
         margin, values = margins[axis], document[axis]["values"]
         ends = [
-            f"{document[axis]['values'][index]:.4g} (the map's end)"
+            f"{terminal.format_number(values[index])} (the map's end)"
             if margin[end] is None
-            else f"{margin[end]:.4g}"
+            else terminal.format_number(margin[end])
             for end, index in (("low", 0), ("high", len(values) - 1))
         ]
         yield f"{document[axis]['key']}: from {ends[0]} to {ends[1]} {document[axis]['unit']}"

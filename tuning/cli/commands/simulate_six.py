@@ -73,7 +73,7 @@ def run(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
     else:
         terminal.emit(result.summary.line(mechanism.name))
         _print(options, limit, result, good)
-        suggest_next(options, "phase_lead" if result.compensator == "none" else result.compensator)
+        suggest_next(options, "impulse_ledger" if result.compensator == "none" else result.compensator)
     return 0 if good else 1
 
 
@@ -222,7 +222,8 @@ def _describe_twist_error(number: int, episode: "Episode") -> str:
     """Return a sentence with the parts of an episode's twist error and the metrics of the ideal contact."""
     parts = f"normal {episode.normal_part:+.3f}, lateral {episode.lateral_part:.3f}"
     parts += f", rotational {episode.rotational_part:.3f}"
-    space = f"{episode.reference_peak_force:.4g} N, {episode.reference_peak_moment:.3g} N m"
+    space = f"{terminal.format_number(episode.reference_peak_force)} N, "
+    space += f"{terminal.format_number(episode.reference_peak_moment, 3)} N m"
     space += f", {1e3 * episode.reference_duration:.4g} ms"
     touches = f"touches: {episode.touches}, ideal contact {episode.reference_touches}"
     return f"Episode {number}: twist error {parts}; ideal contact {space}; {touches}."
