@@ -120,7 +120,8 @@ def _describe_six_axes(mechanism: Mapping[str, Any]) -> str:
     return (
         f"Six axes: target of {format_number(mechanism['target']['mass'])} kg, chaser of "
         f"{format_number(mechanism['chaser']['mass'])} kg{speed}; contacts {contacts or 'none'}; motion "
-        f"simulator {rig['simulator']['model'].replace('_', ' ')}, delays {delays} ms; force sensor on the "
+        f"simulator {rig['simulator']['model'].replace('_', ' ')}, axes "
+        f"{rig['simulator'].get('space', 'task').replace('_', ' ')}, delays {delays} ms; force sensor on the "
         f"{rig['force_sensor'].get('side', 'fixed')} side, delay "
         f"{format_number(1e3 * rig['force_sensor'].get('delay', 0.0))} ms{_describe_filter(rig)}."
     )

@@ -96,7 +96,8 @@ def assumption_section(results: Results) -> Section | None:
         varies = varies if uncertain is None else _describe_distribution(uncertain, unit)
         rows.append((path, _format_value(value), unit, varies, origins.get(path, "the file")))
     texts = [
-        f"{_describe_contact_laws(mechanism)}; motion simulator: {mechanism.rig.simulator.model}; "
+        f"{_describe_contact_laws(mechanism)}; motion simulator: {mechanism.rig.simulator.model}"
+        f"{_describe_six_axis_rig(mechanism)}; "
         f"integrator: {mechanism.rig.integrator}; command hold: {mechanism.rig.command_hold}; "
         f"command latency: {latency} {'period' if latency == 1 else 'periods'}{_describe_filter(mechanism)}.",
         f"Source of the file: {to_one_line(mechanism.source, 1000) or UNKNOWN_NAME}",
@@ -114,6 +115,13 @@ def _unused_keys(mechanism: AnyMechanism) -> list[str]:
     law = find_contact_law(mechanism.contact.law)
     keys = CONTACT_KEYS.values() if law.keys is not None else ()
     return [f"contact.{key.name}" for key in keys if law.name not in laws_with_key(key)]
+
+
+def _describe_six_axis_rig(mechanism: AnyMechanism) -> str:
+    """Return a text with the simulator's axes and the sensor's side in six axes; empty for one axis."""
+    if isinstance(mechanism, Mechanism):
+        return ""
+    return f", axes: {mechanism.rig.simulator.space}; side of the sensor: {mechanism.rig.force_sensor.side}"
 
 
 def _describe_filter(mechanism: AnyMechanism) -> str:
