@@ -114,11 +114,11 @@ class Tune(TuneOptions):
 
     Example: jaxhil tune rig-300kg varying --output study --starts 16
 
-    Writes DIR/NAME/gains.json and plots for each mechanism NAME. The exit code is 1 if, with or without
-    sensor noise, a contact does not end, the rms error exceeds the limit, or more than 1 % of the real
-    contacts have a peak force above 2 times or a duration outside 0.5 to 2 times the ideal contact's. Warns
-    if the force command exceeds 1.5 times the ideal peak force, or amplifies the sensor noise by more than a
-    factor of 2.
+    Writes DIR/NAME/gains.json and plots for each mechanism NAME. The exit code is 1 if a contact does not
+    end, the rms error exceeds the limit, or more than 1 % of the real contacts violate a bound: peak force at
+    most 2 times, and duration 0.5 to 2 times, the ideal contact's. All this is checked with and without
+    sensor noise. Warns if the force command exceeds 1.5 times the ideal peak force, or amplifies the sensor
+    noise by more than a factor of 2.
     """
 
     files: Files = ()
@@ -183,7 +183,7 @@ class Compare(CompareOptions):
 
     Example: jaxhil compare rig-300kg varying --compensators phase_lead response_error
 
-    Writes DIR/compare.json, which contains all metrics with confidence intervals and all gains, and plots.
+    Writes plots, and DIR/compare.json with all gains, metrics and confidence intervals.
     All files must have the same number of axes.
     """
 

@@ -28,8 +28,8 @@ class Map(MapOptions):
 
     Example: jaxhil map rig-300kg --x contact.stiffness=5e4:5e5 --y rig.force_sensor.delay
 
-    Writes DIR/map.json and DIR/map.png. The gains are those of the nominal mechanism at every point. The
-    error is the restitution error or, for six axes, the twist error, without closed-form predictions.
+    Writes DIR/map.json and DIR/map.png. The gains at every point are those of the nominal mechanism. The
+    error is the restitution error. For six axes, it is the twist error, and there are no predictions.
     """
 
     x: Annotated[

@@ -59,8 +59,9 @@ class Verify(VerifyOptions):
 
     Example: jaxhil verify jaxhil-out/varying/gains.json
 
-    The self-test of a bundle runs first. The exit code is 1 if the commands differ, or if a file of the
-    bundle is corrupt or differs from what this version exports. Code of such a bundle is not run.
+    The files of a bundle are checked first. If a file is corrupt or differs from what this version exports,
+    the exit code is 1 and no code of the bundle runs. Otherwise the bundle's self-test runs next. The exit
+    code is also 1 if the self-test fails or the commands differ.
     """
 
     path: Annotated[
@@ -109,8 +110,8 @@ class RigOptions:
     Example: jaxhil rig jaxhil-out/varying/gains.json --duration 600 --plot
 
     First, an empty loop, which only exchanges packets, runs for comparison. The exit code is 1 if the
-    controller causes a missed tick, a restitution error (six axes: twist error) exceeds the limit, or the
-    controller trips although no faults are injected.
+    controller causes a missed tick, if a restitution error (six axes: twist error) exceeds the limit, or if
+    the controller trips although no faults are injected.
     """
 
     path: Annotated[

@@ -58,20 +58,20 @@ class CommonProgram:
     precomputed: bool  # whether ideal contacts without a closed form are integrated before the simulation
 
     def law(self, precomputed: bool | None = None) -> LawMixture:
-        """Return a contact law that applies the law of each lane's mechanism.
+        """Return a contact law that applies to each lane the law of the lane's mechanism.
 
-        If `precomputed` is true, the scenarios must contain the ideal contacts of laws without a closed form;
-        otherwise the law computes them.
+        For some laws, the ideal contact has no closed form. If `precomputed` is true, the scenarios must
+        contain these ideal contacts; otherwise the returned law integrates them. None: `self.precomputed`.
         """
         return LawMixture(self._kinds, self.precomputed if precomputed is None else precomputed)
 
     @property
     def _kinds(self) -> tuple[ContactLaw, ...]:
-        """Return the contact laws that the simulation uses; laws with several names occur once."""
+        """Return the distinct contact laws to simulate; several names in `laws` can lead to the same law."""
         return tuple(dict.fromkeys(find_contact_law(name).simulation_law for name in self.laws))
 
     def loop(self, loop: Loop) -> Loop:
-        """Adapt the loop of one mechanism to the static properties of this program."""
+        """Set the static (compile-time) properties of one mechanism's loop to those of this program."""
         parts = {name: name in self.parts for name in _OPTIONAL_FLAGS}
         return dataclasses.replace(
             loop,
@@ -110,7 +110,7 @@ class CommonProgram:
         return batch._replace(contact=contact, phase=by_slot(batch.phase), reference=reference)
 
     def _first(self, law: ContactLaw, batch: Scenario) -> Any:
-        """Compute the ideal first contact of every scenario, and use it for every contact of the run."""
+        """Compute the first ideal contact of every scenario; repeat it for all contacts of the scenario."""
         contact: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[0], batch.contact)
         reference = jax.device_get(
             _compute_ideal_contact(law, contact, batch.equivalent_mass, batch.velocity)
@@ -161,7 +161,7 @@ def _group_one_axis(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Co
 
 
 def _needs_simulated_speeds(mechanism: Mechanism) -> bool:
-    """Return whether ideal contacts are integrated from speeds that only the simulation determines."""
+    """Return whether ideal contacts must be integrated from approach speeds that the simulation yields."""
     return mechanism.approach.contacts > 1 and not find_contact_law(mechanism.contact.law).has_closed_form
 
 
@@ -181,7 +181,7 @@ def _build_common_program(mechanisms, group, loops, batches) -> CommonProgram:
 
 
 def _join_cell_counts(mechanisms, loops, batches) -> CellCounts:
-    """Return how many integration cells suffice for all mechanisms; `NO_CELLS` if none uses cells."""
+    """Return how many cells of a control period suffice for all mechanisms; `NO_CELLS` if none uses cells."""
     if not any(loop.has_cells for loop in loops):
         return NO_CELLS
     exact = [build_loop(m, "none", batch, exact=True) for m, batch in zip(mechanisms, batches, strict=True)]

@@ -45,7 +45,7 @@ def extract_scenario_metrics(outcome: Outcome, number: int, contacts: int, probe
     """Return the metrics that a user's function receives, arrays (problems, contacts, scenarios).
 
     The last axis of `outcome` lists the scenarios of all problems one after the other. If `probed` is true,
-    it also has the probes of each scenario; the metrics omit them.
+    this axis also contains the transparency probes of each scenario, which the metrics omit.
     """
 
     def by_problem(leaf):

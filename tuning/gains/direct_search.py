@@ -47,9 +47,9 @@ def search_directly(
 ) -> list[DirectSearchResult]:
     """Search for the best gains of every task, from the literature's gains and from the gains in `first`.
 
-    `settings.steps` is the number of generations of a search. If `settings.bounded`, the metric of the errors
-    on the training scenarios is bounded by that of the literature's gains. Without this bound, the errors
-    of the transparency probes, which are much larger, could outweigh the errors of the scenarios.
+    A search has `settings.steps` generations. If `settings.bounded` is true, the search penalises gains whose
+    metric on the training scenarios exceeds that of the literature's gains. Without this penalty, the much
+    larger errors of the transparency probes could outweigh the errors of the scenarios.
     """
     return [
         _search_task(validation, i, settings, [task.literature, *(first[i] if first else ())])

@@ -53,7 +53,7 @@ class MetricsFunction:
         self._vectorised = jax.jit(jax.vmap(self._value))
 
     def check(self, contacts: int, scenarios: int) -> None:
-        """Raise `InputError` unless the function returns one number for metrics (contacts, scenarios)."""
+        """Raise `InputError` unless the function turns metrics (contacts, scenarios) into one real number."""
         like: Any = jax.ShapeDtypeStruct((contacts, scenarios), jnp.result_type(float))
         count: Any = jax.ShapeDtypeStruct((contacts, scenarios), jnp.int32)
         metrics = ScenarioMetrics(*[like] * 7, status=count)
@@ -77,11 +77,11 @@ class MetricsFunction:
             )
 
     def values(self, metrics: ScenarioMetrics) -> Float[Array, "several"]:
-        """Evaluate the function for several sets; each metric is an array (sets, contacts, scenarios)."""
+        """Return the function's value for each set of metrics, arrays (sets, contacts, scenarios)."""
         return jax.vmap(self._value)(metrics)
 
     def numbers(self, metrics: ScenarioMetrics) -> Float[np.ndarray, "several"]:
-        """Return `values` as a NumPy array in which NaN replaces infinity.
+        """Evaluate the function like `values`; return a NumPy array in which NaN replaces infinity.
 
         Raise `InputError` if a value is negative.
         """

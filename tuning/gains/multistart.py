@@ -73,7 +73,7 @@ class MultistartResult(NamedTuple):
 
 @dataclass
 class _SearchState:
-    """Finished solver runs of one task, one per start, and their number of objective evaluations."""
+    """Results of a task's finished starts, and the number of evaluations of the objective so far."""
 
     starts: list[StartResult] = field(default_factory=list)
     evaluations: int = 0
@@ -151,10 +151,11 @@ def _search_quieter_gains(
     first: Sequence[Sequence[Mapping[str, float]]] | None,
     searches: list[_SearchState],
 ) -> dict[int, tuple[Objective, list[StartResult]]]:
-    """Search for quieter gains, starting from the most accurate gains.
+    """Search for quieter gains, starting from the most accurate gains of each task.
 
-    Tasks whose error exceeds the limit are skipped. The number of starts equals that of the first batch, so
-    that the program is reused. Return, by task index, the objective and the point that each start reached.
+    Tasks whose least error exceeds the limit are skipped. There are at most as many starts as in the first
+    batch, so that the compiled program is reused. The keys of the result are indices of tasks. Its values
+    are the objective for quiet gains, and the results of the starts.
     """
     tasks, objective = validation.tasks, settings.objective
     best = [ranked[0] if (ranked := _rank_starts(search.starts)) else None for search in searches]
@@ -179,12 +180,12 @@ def _search_quieter_gains(
 
 
 def _count_batch_starts(settings: TuneSettings, first: Sequence[Sequence[Mapping[str, float]]] | None) -> int:
-    """Return the number of starting points in a batch: at least one more than the gains in `first`."""
+    """Return the number of starts in a batch, at least one more than any task has gains in `first`."""
     return max(settings.starts, 1 + max(map(len, first))) if first else settings.starts
 
 
 def estimate_search_runs(tasks: list[TuneTask], settings: TuneSettings) -> int:
-    """Return the number of simulated runs of a search that needs one batch and all steps of every start."""
+    """Return the number of simulated runs if one batch of starts suffices and every start makes all steps."""
     if is_search_direct(tasks[0]):
         return estimate_direct_runs(tasks, settings.steps)
     names, lanes = list_tuned_gains(tasks), tasks[0].lanes
@@ -307,10 +308,11 @@ def _restart_stuck_starts(
     seed: int,
     objective: Objectives,
 ) -> tuple[list[StartResult], int]:
-    """Use a derivative-free search to improve every solver result that is worse than the best one.
+    """Improve every solver result that is worse than the best one, by a derivative-free search.
 
-    The solver can get stuck at the kink of the objective where the compensator's correction reaches its
-    limit. Return all results, and the number of evaluations of the search.
+    A result is worse if its objective is larger by more than the fraction `agreed`. The solver can get stuck
+    at the kink of the objective where the compensator's correction reaches its limit. Return all results,
+    and the number of evaluations of the search.
     """
     ranked = _rank_starts(starts)
     stuck = [i for i, start in enumerate(starts) if ranked and start.rms > (1 + agreed) * ranked[0].rms]
@@ -333,7 +335,7 @@ def _restart_stuck_starts(
 def _recompute_exact_values(
     validation: Validation, task: int, starts: list[StartResult], objective: Objective
 ) -> list[StartResult]:
-    """Replace the smooth norm in each solver result by the exact objective."""
+    """Replace the objective in each solver result, which contains the smooth norm, by the exact objective."""
     if objective.name == "rms" or not starts:
         return starts
     values = validation.losses(objective, [task], np.stack([start.coordinates for start in starts])[None])[0]
@@ -345,8 +347,9 @@ def _run_while_compiling(
 ):
     """Call `work`, then `more`, while a second thread compiles the solver; return the result of `work`.
 
-    The second thread runs no program, because concurrent programs on several devices could deadlock. The
-    solver takes longest to compile, so that it is lowered before anything else.
+    The second thread only compiles: running programs on several devices from two threads could deadlock.
+    The solver takes longest to compile. It is therefore lowered, which prepares compilation, before `work`
+    begins. Without a folder for compiled programs, call only `work`.
     """
     if program_folder() is None:
         return work()

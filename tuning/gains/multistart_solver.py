@@ -139,7 +139,7 @@ def solve_tasks(
 
 
 def _mark_converged(problems: list[_StartState], before: list[float]) -> None:
-    """Mark problems as converged whose objective improved by less than `MIN_RELATIVE_IMPROVEMENT` in a round.
+    """Mark a problem as converged if its objective fell by less than `MIN_RELATIVE_IMPROVEMENT` in a round.
 
     `before` holds the loss of each problem before the round.
     """
@@ -162,11 +162,11 @@ def _stop_poor_starts(problems: list[_StartState]) -> None:
 def compute_inverse_hessian(
     curvature: Float[np.ndarray, "gains gains"], value: float
 ) -> Float[np.ndarray, "gains gains"]:
-    """Return the inverse Hessian of the objective, relative to its value, in unit coordinates.
+    """Return the inverse Hessian of objective / `value` with respect to the gains' unit coordinates.
 
-    `curvature` is J^T J and `value` the objective. The inverse Hessian describes the region in which the
-    objective rises little. No eigenvalue exceeds (1/4)^2: the standard deviation of a gain is at most a
-    quarter of its range.
+    `value` is the objective at the current gains. `curvature` is J^T J with the Jacobian J of the residuals.
+    The inverse Hessian describes the region in which the objective rises little. No eigenvalue exceeds
+    (1/4)^2: the standard deviation of a gain is at most a quarter of its range.
     """
     # If a derivative has overflowed, the curvature is unknown and replaced by 0.
     curvature = np.where(np.all(np.isfinite(curvature)), curvature, 0.0)
@@ -201,7 +201,7 @@ def lower_solver(
 
 
 def _build_stepper(tasks, names, bounds, objectives, number, work: SearchProgress):
-    """Return a function that advances problems by up to `limit` solver steps and returns their new states."""
+    """Return a function (problems, limit) that makes up to `limit` solver steps and returns new states."""
     static, call = _build_call(tasks, names, bounds, objectives, number)
     size, runs = _choose_call_size(number), count_step_runs(tasks, names)
     options = tasks[0].model.derivative_options
@@ -230,10 +230,10 @@ def _choose_call_size(number: int) -> int:
 
 
 def assign_to_devices(size: int) -> np.ndarray:
-    """Return the index of the problem at each position of a call, so that all devices need about equal times.
+    """Return an order (indices) of a call's problems, such that all devices need about equal times.
 
-    Problems are sorted by duration and assigned to the devices in turn. The positions of a device are
-    adjacent.
+    The problems, which are sorted by duration, are assigned to the devices in turn. The problems of a device
+    are adjacent in the returned order.
     """
     devices = math.gcd(jax.device_count(), size)
     return np.arange(size).reshape(-1, devices).T.ravel()
@@ -272,7 +272,8 @@ def _build_call(tasks, names, bounds, objectives, number):
 def _sort_by_duration(task: TuneTask) -> Any:
     """Return the task's scenarios, sorted by duration if they have probes.
 
-    Scenarios with probes are simulated in tiles. After sorting, all scenarios of a tile take a similar time.
+    Scenarios with probes are simulated in groups (tiles). After sorting, all scenarios of a tile take a
+    similar time.
     """
     if not task.probed:
         return task.scenarios

@@ -64,7 +64,7 @@ class Objective:
           + limit^2 ((command_weight rms(C))^2 + (chatter_weight rms(S))^2 + (noise_weight N)^2)
 
         metric  norm of the errors, chosen by `name`
-        limit   limit of the error [1], the unit of three weights
+        limit   limit of the error [1]; three of the weights are multiples of it
         E  restitution error e - e* of each contact [1]; positive errors times sqrt(divergence_weight)
         H  restitution error e - e* of each contact of the transparency probes [1]
            (`tuning.transparency.probes`)
@@ -118,7 +118,7 @@ class Objective:
             )
 
     def unit(self, weight: str) -> float:
-        """Return the error [1] that corresponds to a value of 1 in the field `weight`."""
+        """Return the unit [1] of the field `weight`: the error limit for three weights, 1 for the others."""
         return self.limit if weight in LIMIT_SCALED_WEIGHTS else 1.0
 
     @property
@@ -149,7 +149,7 @@ class ObjectiveTerms(NamedTuple):
 class ObjectiveWeights(NamedTuple):
     """Weights of the terms C, N, S and H of `Objective` for each problem.
 
-    The compiled program takes them as arguments, so that it serves for all weights.
+    The compiled program takes the weights as arguments, so that one program serves for all weights.
     """
 
     divergence: Float[Array, "*problems"]  # weight of squared positive errors relative to negative ones [1]
@@ -176,9 +176,9 @@ def list_objectives(objective: Objective | Sequence[Objective], number: int) -> 
 def join_terms(objectives: Sequence[Objective], probed: bool = False, contacts: int = 0) -> ObjectiveTerms:
     """Return the union of the terms of several objectives, so that they can share a compiled program.
 
-    An objective without one of these terms gives the term a weight of 0. `probed`: whether the scenarios
-    include probes; `contacts`: number of contacts that a user's function gets. Raise ValueError if the
-    objectives differ in metric or function.
+    A term that an objective does not contain has a weight of 0 in this objective. `probed`: whether the
+    scenarios include transparency probes; `contacts`: number of contacts that a user's function gets. Raise
+    ValueError if the objectives do not have the same metric and the same user's function.
     """
     [(name, function)] = {(objective.name, objective.function) for objective in objectives}
     tolerance = any(objective.tolerance is not None for objective in objectives)
@@ -203,9 +203,9 @@ def compute_residuals(
     """Compute the least-squares residuals of every problem.
 
     Their sum of squares is (J / `RESIDUAL_SCALE`)^2, where J is the objective with the smooth norm as its
-    metric. Each contact of each scenario has one residual for its error, and one for each of the other terms
-    of the objective (probes, command, chatter). The noise has a single residual. A failed contact has an
-    error, an excess peak command and a chatter of `FAILED_CONTACT_ERROR`.
+    metric. Each contact of each scenario has one residual for its error, and one for each of these
+    terms, if the objective contains it: probes, command, chatter. The noise has a single residual. A failed
+    contact has an error, an excess peak command and a chatter of `FAILED_CONTACT_ERROR`.
 
     `static` holds the rig model, the loop, the names of the tuned gains and the objective's terms. All
     problems are simulated in one batch, whose lanes are their scenarios.
@@ -256,8 +256,8 @@ def weight_residuals(
     """Compute the least-squares residuals from the terms of all contacts and the noise amplification.
 
     `error`, `excess` and `chatter` are the results of `compute_contact_terms`. `probes` is True for contacts
-    of transparency probes. `metric` is the value of the user's function, which replaces all residuals of the
-    errors by a single residual.
+    of transparency probes. `metric` is the value of the user's function; if it is given, one residual with
+    this value replaces the residuals of the errors.
     """
 
     # A copy of a problem that only fills a call has no contact; a count of 1 avoids a division by 0.
@@ -309,10 +309,10 @@ def evaluate_objective(
 ) -> Float[np.ndarray, "*points"]:
     """Compute the exact objective J [1] of each point.
 
-    `errors`, `excesses` and `chatter` are terms of `compute_contact_terms` for existing contacts; None counts
-    as 0. `errors` exclude the contacts of transparency probes, which are in `probe_errors`. A non-finite
-    number counts as `FAILED_CONTACT_ERROR`. `value` is the value of the user's function, which replaces the
-    metric.
+    A point is a set of gains. `errors`, `excesses` and `chatter` are results of `compute_contact_terms`,
+    without the rows that are no contact; None counts as 0. `errors` exclude the contacts of transparency
+    probes, whose errors are `probe_errors`. A non-finite number counts as `FAILED_CONTACT_ERROR`. `value` is
+    the value of the user's function, which replaces the metric.
     """
     terms = errors, excesses, chatter, probe_errors
     error, excess, swings, transparency = (
@@ -357,8 +357,8 @@ def _compute_norm_residuals(
 ) -> Array:
     """Return residuals E (|E| / |E|_p)^(p/2 - 1) / m^(1/p), whose sum of squares is (sum of |E|^p / m)^(2/p).
 
-    E is `error`, m is `number` and p is `power`. The residuals are homogeneous of degree one in the errors,
-    so that Gauss-Newton steps have the right length.
+    E is `error`, |E|_p its p-norm over the contacts, m is `number` and p is `power`. The residuals are
+    homogeneous of degree one in the errors, so that Gauss-Newton steps have the right length.
     """
     size = jnp.abs(error)
     largest = lax.stop_gradient(jnp.max(size, axis=1, keepdims=True))

@@ -87,7 +87,7 @@ class _FrontGroup(NamedTuple):
 
     @property
     def inputs(self) -> list[Any]:
-        """Return all inputs that the fronts depend on, as a key of the cache."""
+        """Return all inputs that the Pareto fronts of this group depend on, as a key of the cache."""
         return [
             *("pareto", self.number, self.axis, self.settings, self.tuned[0].compensator),
             [(to_plain_data(result.mechanism), result.gains, result.starts) for result in self.tuned],
@@ -250,7 +250,7 @@ def _evaluate_fronts(
     settings: TuneSettings,
     axis: ParetoCriterion,
 ) -> list[ParetoFront]:
-    """Evaluate all points, the literature's gains and the earlier gains of every task on fresh scenarios."""
+    """Evaluate each task's points, literature's gains and earlier tuned gains on its fresh scenarios."""
     plans = [
         [*ladder, (None, task.literature), (None, result.gains)]
         for task, result, ladder in zip(validation.tasks, tuned, points, strict=True)

@@ -87,7 +87,7 @@ def build_weight_ladder(
 
 
 class _LadderCandidate(NamedTuple):
-    """Candidate gains for one mechanism, with error and second criterion on its training scenarios."""
+    """Candidate gains for a point of a Pareto front, with both criteria on the training scenarios."""
 
     gains: dict[str, float]
     error: float  # objective J without the second criterion's term [1]
@@ -96,7 +96,7 @@ class _LadderCandidate(NamedTuple):
     excess: float
 
     def value(self, weight: float) -> float:
-        """Return the objective J [1] for a weight of the second criterion."""
+        """Return the objective J [1] if the second criterion has the weight `weight`."""
         return math.hypot(self.error, weight * self.excess)
 
 
@@ -107,7 +107,7 @@ def solve_weight_ladders(
     settings: TuneSettings,
     axis: ParetoCriterion = NOISE_CRITERION,
 ) -> list[list[tuple[float, dict[str, float]]]]:
-    """Search for the best gains for every weight of every task; return (weight, gains) of every point."""
+    """Search for the best gains for each weight of each task; return the pairs (weight, gains) by task."""
     unit = settings.objective.unit(axis.weight)
     weight = unit * getattr(settings.objective, axis.weight)
     pools = [
@@ -143,7 +143,7 @@ def solve_weight_ladders(
 
 
 def estimate_ladder_runs(tasks: list[TuneTask], number: int, settings: TuneSettings) -> int:
-    """Return the approximate number of simulated runs of `solve_weight_ladders` if it makes all passes."""
+    """Estimate the number of simulated runs of `solve_weight_ladders` with the maximum number of passes."""
     starts = max(settings.starts, 2) + MAX_NEIGHBOUR_SEARCHES * 2
     return len(tasks) * number * starts * settings.steps * count_step_runs(tasks, list_tuned_gains(tasks))
 
@@ -182,7 +182,7 @@ def _choose_first_starts(
 def _choose_neighbour_starts(
     validation: Validation, picked: list[list[_LadderCandidate]]
 ) -> list[list[np.ndarray]]:
-    """Choose starting gains for each weight of each task: the best gains of this and adjacent weights."""
+    """Choose starts for each weight of each task: the best gains for this weight and for adjacent weights."""
     return [
         [validation.coordinates(task, gains) for gains in _collect_neighbour_gains(points)]
         for task, points in enumerate(picked)
@@ -255,7 +255,7 @@ def _pick_candidates(pool: list[_LadderCandidate], weights: np.ndarray) -> list[
 
 
 def _collect_neighbour_gains(picked: list[_LadderCandidate]) -> list[list[dict[str, float]]]:
-    """Return for each weight the distinct gains of the candidates for this and the adjacent weights."""
+    """Return for each weight the distinct gains picked for this weight and for the adjacent weights."""
     neighbourhoods = []
     for index, point in enumerate(picked):
         near = [point, *picked[max(index - 1, 0) : index], *picked[index + 1 : index + 2]]

@@ -40,7 +40,7 @@ QUIET_PENALTY_WEIGHT = 0.1
 
 
 class CommandExcess(NamedTuple):
-    """Excess noise and excess peaks of the force command with a set of gains."""
+    """Amounts by which noise amplification and peak command ratio exceed 1, for one set of gains."""
 
     noise: float  # amplification of the force sensor's noise minus 1, at least 0 [1]
     peaks: float  # rms of max(0, peak command / peak force of the ideal contact - 1) [1]
@@ -62,9 +62,10 @@ def compute_training_tolerance(limit: float, scenarios: int) -> float:
 
 
 def build_least_error_objective(objective: Objective) -> Objective:
-    """Return the objective of accurate gains, with a tolerance of 0.
+    """Return `objective` with a tolerance of 0, for the search for the most accurate gains.
 
-    Because of the tolerance, this objective shares the compiled program of the search for quiet gains.
+    A tolerance of 0 does not change the objective, but lets this search share the compiled program of the
+    search for quiet gains, which has a tolerance.
     """
     return replace(objective, tolerance=0.0)
 
@@ -86,7 +87,7 @@ def build_quiet_objective(objective: Objective, scenarios: int, accurate: Comman
 def compute_command_excess(
     validation: Validation, task: int, start: StartResult, objective: Objective
 ) -> CommandExcess:
-    """Compute the excess noise and peaks of the force command with a start's gains, on training scenarios."""
+    """Compute the `CommandExcess` of the gains in the solver result `start`, on the training scenarios."""
     tuned_task = validation.tasks[task]
     without, beside = (
         float(validation.losses(weighted, [task], start.coordinates[None, None])[0, 0])

@@ -32,12 +32,12 @@ class SearchProgress:
         return self._done
 
     def keep(self, text: str, runs: float) -> None:
-        """Report that the current group, of about `runs` runs, was read from the cache."""
+        """Count the `runs` runs of the current group as read from the cache, and report this as `text`."""
         self._kept += runs
         self.begin(text, 0.0)
 
     def begin(self, text: str, left: float) -> None:
-        """Begin a stage; `left` runs of the current group remain, including those of the stage."""
+        """Begin the stage `text`; `left` runs remain for the current group, including those of this stage."""
         self._left = left
         self.say(text)
 

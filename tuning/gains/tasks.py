@@ -53,17 +53,17 @@ class TuneTask:
 
     @property
     def number(self) -> int:
-        """Return the number of scenarios, not counting their probes."""
+        """Return the number of training scenarios, not counting their transparency probes."""
         return self.lanes // (LANES_PER_SCENARIO if self.probed else 1)
 
     @property
     def lanes(self) -> int:
-        """Return the number of scenarios and probes together."""
+        """Return the number of scenarios and of probes (perturbed copies of the scenarios) together."""
         return count_lanes(self.scenarios)
 
     @property
     def contacts(self) -> int:
-        """Return the number of contacts in a scenario, or of episodes with six axes."""
+        """Return the number of contacts in a scenario; for six axes, the number of episodes."""
         return self.model.runs(self.mechanism)
 
     @property
@@ -72,7 +72,7 @@ class TuneTask:
 
     @property
     def tuned(self) -> tuple[Gain, ...]:
-        """Return the gains of the compensator that are tuned for this mechanism."""
+        """Return the specifications (`Gain`) of the gains that are tuned for this mechanism."""
         mechanism: Any = self.mechanism
         return tuple(
             gain for gain in get_compensator(self.compensator, self.model.axes).gains if gain.tuned(mechanism)
@@ -163,7 +163,7 @@ def list_tuned_gains(tasks: list[TuneTask]) -> tuple[str, ...]:
 
 
 def build_gain_bounds(task: TuneTask, names: tuple[str, ...]) -> GainBounds:
-    """Return the bounds (gains,) of the gains `names`; an untuned gain is bounded to its literature value."""
+    """Return the bounds (gains,) of the gains `names`; for an untuned gain, both are its literature value."""
     gains = {gain.name: gain for gain in get_compensator(task.compensator, task.model.axes).gains}
     moved = {gain.name for gain in task.tuned}
 
@@ -211,9 +211,10 @@ def spread_points(first: np.ndarray, number: int, seed: int | tuple[int, ...]) -
 
 @partial(jax.jit, static_argnums=0)
 def _compute_time_limit(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*batch"]:
-    """Return the time limit [s] of a contact in each training scenario, based on its ideal duration.
+    """Return the time limit [s] of a contact in each training scenario, from the longest ideal contact.
 
-    The limit contains the longest wait for the decay of the command if the force sensor has noise or bias.
+    If the force sensor has noise or bias, the limit includes `MAX_DECAY_WAIT`, because the force command then
+    does not decay and the contact ends only after this wait.
     """
     shape = scenarios.phase.shape
     mass = jnp.broadcast_to(scenarios.equivalent_mass, shape)

@@ -68,8 +68,9 @@ def compute_traits(mechanism: Mechanism) -> MechanismTraits:
     """Compute the nominal properties by which a mechanism is compared with others.
 
     The contact frequencies of a nonlinear law are those of the linear contact with the same peak force
-    (`validity_envelope`). The damping ratio is b/(2 sqrt(k M)). For the law of Hunt and Crossley, it is chi
-    v/pi with the law's damping parameter chi, since e = 1 - chi v.
+    (`validity_envelope`). With damping b, stiffness k and mass M, the damping ratio is b/(2 sqrt(k M)). For
+    the law of Hunt and Crossley, it is chi v/pi with the law's damping parameter chi and the approach speed
+    v, since e is about 1 - chi v.
     """
     nominal = build_scenarios(mechanism)
     frequency = validity_envelope(mechanism, nominal)["contact_frequency"]
@@ -109,7 +110,7 @@ def find_nearest(mechanism: Mechanism, tuned: Sequence[EarlierGains]) -> Earlier
 def find_nearest_of_each(
     mechanism: AnyMechanism, sources: Sequence[Sequence[EarlierGains]]
 ) -> list[EarlierGains]:
-    """Return the nearest gains of each list in `sources`; none for six axes (no distance is defined)."""
+    """Return, from each list in `sources`, the gains tuned for the nearest mechanism; for six axes, none."""
     if not isinstance(mechanism, Mechanism):
         return []
     return [find_nearest(mechanism, tuned) for tuned in sources]

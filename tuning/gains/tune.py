@@ -52,7 +52,7 @@ class ErrorMetrics(NamedTuple):
 
 
 class GainTolerance(NamedTuple):
-    """Change of a gain that raises the loss by 1 %, as a fraction of the gain's range."""
+    """Change of a gain, as a fraction of its range, that raises the solver's loss (sum of squares) by 1 %."""
 
     alone: float  # change if all other gains are fixed [1]
     together: float  # change if all other gains are readjusted to minimise the loss [1]
@@ -90,7 +90,7 @@ class TuneResult:
 
     @property
     def usual_starts(self) -> int:
-        """Return the number of starts of the first batch that are not earlier gains (`first`)."""
+        """Return the number of starts in the first batch, without the starts at earlier gains (`first`)."""
         if get_compensator(self.compensator, axes_of(self.mechanism)).tuned_without_derivatives:
             return 1
         return max(self.settings.starts, 1 + len(self.first)) - len(self.first)
@@ -257,7 +257,7 @@ def _compute_transparency(
 def _compute_tolerances(
     task: TuneTask, names: tuple[str, ...], best: StartResult | None
 ) -> dict[str, GainTolerance]:
-    """Return the tolerance of each tuned gain, from the solver's final J^T J; empty without J^T J."""
+    """Return the tolerance of each tuned gain by name; empty if the solver gave no finite curvature."""
     moved = [i for i, name in enumerate(names) if name in {gain.name for gain in task.tuned}]
     if best is None or not moved or not best.curvature.size or not np.all(np.isfinite(best.curvature)):
         return {}

@@ -82,12 +82,13 @@ def tune_all(
     """Tune the gains of `compensator` for many mechanisms; yield (index, result) of each finished mechanism.
 
     Mechanisms that share a program are tuned together. Different kinds of mechanisms can share a `common`
-    program. Each mechanism also starts from the gains of the most similar mechanism in `tuned`. After the
-    first group, each mechanism also starts from the gains of the most similar mechanism of that group. The
-    literature's gains always remain a start.
+    program. One start is at the literature's gains, and one at the gains of the most similar mechanism in
+    `tuned`. Every group after the first also starts from the gains of the most similar mechanism in the first
+    group.
 
     `checkpoints` caches each result under the mechanism's name and its group, because the other mechanisms of
-    the group affect the last bits. If `scheduler` is given, the workers of a cluster tune the groups.
+    the group affect the last bits of the result. If `scheduler` is given, the workers of a cluster tune the
+    groups.
     """
     work, first_group = work or SearchProgress(), []
     tasks = _build_tasks(mechanisms, compensator, settings, common)

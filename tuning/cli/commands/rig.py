@@ -120,7 +120,7 @@ def load_checked_gains(gains: Path) -> tuple[dict[str, Any], Any, tuple[Any, Any
     """Check a gain file as the rig's runtime does.
 
     Return the file's document and mechanism, and the lowest and the highest position commands [m, rad] that
-    it allows. Raise `InputError` if a check fails.
+    the file allows. Raise `InputError` if a check fails.
     """
     from jaxhil.mechanism.file import any_from_plain_data
     from jaxhil.mechanism.six_axes import is_six_axes
@@ -152,7 +152,7 @@ class _LoopProgress:
         self._period, self._terminal = period, sys.stderr.isatty()
 
     def tell(self, done: int, total: int) -> None:
-        """Write the elapsed and the total time to standard error, from the ticks `done` and `total`."""
+        """Write the elapsed and the total time to standard error; `done` and `total` are numbers of ticks."""
         seconds = round(done * self._period)
         if self._terminal:
             sys.stderr.write(f"\r{seconds} of {total * self._period:.0f} s \r")
@@ -181,7 +181,7 @@ def _print(document: dict[str, Any]) -> None:
 
 
 def _build_tables(document: dict[str, Any], loops: dict[str, Any]) -> list[Any]:
-    """Return the tables of missed ticks, computing times and contacts, for each loop that was run."""
+    """Return the tables of missed ticks and computing times of all loops, and the table of contacts."""
     rate = f"{document['rate'] / document['control_period']:g} Hz over UDP"
     ticks = terminal.build_table(
         f"{document['mechanism']}, {document['compensator']}, {rate}: ticks",

@@ -66,7 +66,7 @@ def _print(document: dict[str, Any]) -> None:
 
 
 def _describe(document: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines below the table: other contacts, faults, findings and the verdict."""
+    """Yield the lines below the table: number of unlisted contacts, faults, findings and the verdict."""
     contacts = document["contacts"]
     if len(contacts) > MAX_TABLE_ROWS:
         yield f"... and {len(contacts) - MAX_TABLE_ROWS} more contacts."

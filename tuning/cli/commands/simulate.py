@@ -113,7 +113,7 @@ def _explain_status(status: str) -> str | None:
 
 
 def _contact_entry(contact: "ContactResult") -> dict[str, Any]:
-    """Return the JSON entry of a contact, without estimates that the compensator does not compute."""
+    """Return the JSON entry of a contact, with only those estimates that the compensator computes."""
     return {name: value for name, value in contact._asdict().items() if value is not None}
 
 

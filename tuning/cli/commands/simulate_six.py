@@ -53,8 +53,8 @@ def _check_animation_path(path: str) -> None:
 def run(options: SimulateOptions, mechanism: SixAxisMechanism) -> int:
     """Simulate the episodes of contact, and print a table of episodes and the verdict.
 
-    Return the exit code: 0 if twist errors are within the limit, and real peak force and time in contact
-    within their bounds, else 1.
+    Return exit code 0 if the run ended well, and all twist errors, real peak forces and times in contact are
+    within their limits. Otherwise return 1.
     """
     if options.reference:
         return _run_ideal_contact(options, mechanism)

@@ -12,7 +12,7 @@ def print_sweep(document: dict[str, Any]) -> None:
 
 
 def _build_tables(document: dict[str, Any]) -> list[Any]:
-    """Return the tables of outcomes, quantiles, worst scenarios and additional studies."""
+    """Return the tables of outcomes, quantiles, worst scenarios, and Sobol indices and rare events if any."""
     number = document["scenarios"]
     title = f"{document['mechanism']}, compensation: {document['compensator']}, {number} scenarios"
     outcomes = terminal.build_table(
@@ -144,7 +144,7 @@ def _subset_simulation_table(rare: dict[str, Any]):
 
 
 def _describe_interval_width(document: dict[str, Any]) -> list[str]:
-    """Return a list with a sentence on the interval's width; without `--until-width`, the list is empty."""
+    """Return a list: a sentence on the confidence interval's width, or nothing without `--until-width`."""
     width = document["until_width"]
     if width is None:
         return []

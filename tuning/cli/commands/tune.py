@@ -87,7 +87,7 @@ def run(options: Tune) -> int:
 
 
 def _suggest_next(options: Tune, entries: list[dict[str, Any]]) -> None:
-    """Print the next command: a sweep of the first good gains or, without any, a comparison."""
+    """Print the next command: a sweep of the first good gains; if none are good, a comparison."""
     good = [entry["gain_file"] for entry in entries if entry["verdict"] == "good"]
     if good:
         terminal.suggest("sweep", good[0])
@@ -309,8 +309,8 @@ def _start_entry(start) -> dict[str, Any]:
 def _starts_from_earlier_gains(result) -> list[dict[str, Any]]:
     """Return a JSON entry for each start from earlier tuned gains.
 
-    The entry contains the number of the start, the source of the gains, and the mechanism for which the gains
-    were tuned, with its distance from this mechanism.
+    The entry contains the number of the start, and the source of its gains. It names the mechanism for which
+    these gains were tuned, and states the distance of that mechanism from the tuned one.
     """
     from tuning.gains.transfer import compute_mechanism_distance
 
@@ -342,7 +342,7 @@ def _prepare_drawing(mechanism, compensator: str) -> None:
 
 
 def is_better(metrics, other) -> bool:
-    """Return whether `metrics` has fewer failed contacts than `other` or, with as many, a smaller rms."""
+    """Return whether `metrics` has fewer failed contacts than `other` or, if equally many, a smaller rms."""
     return metrics.failed < other.failed or (metrics.failed == other.failed and metrics.rms < other.rms)
 
 
@@ -376,7 +376,7 @@ def _draw(result, options: Tune, limit: float, folder: Path) -> list[str]:
 def _verdict(entries, problems, interrupted) -> str:
     """Return the verdict: "good" if the gains of every mechanism are good, else "bad".
 
-    If there is no verdict, return the reason: unusable input or an interruption.
+    After an interruption or with an unusable file, return that reason instead of a verdict.
     """
     if interrupted:
         return terminal.INTERRUPTED

@@ -113,7 +113,7 @@ def _write(options: Tune, points: Sequence[TradedGains], folder: Path) -> dict[s
 
 
 def _remove_stale_points(folder: Path, number: int) -> None:
-    """Remove from the folder the gain files of an earlier front that had more than `number` points."""
+    """Delete gain files of points numbered above `number`, left in the folder by an earlier, longer front."""
     for path in folder.iterdir():
         name = path.name
         is_beyond = name.isdecimal() and int(name) > number and name == f"{int(name):02d}"

@@ -63,14 +63,14 @@ def _six_axis_tables(document: dict[str, Any]) -> list[Any]:
 
 
 def _twist_table(title: str, final: dict[str, Any]) -> Any:
-    """Return a table that compares a final twist with the final twist of the simulation."""
+    """Return a table with two columns: the final twist found with the rig's code, and the simulated one."""
     twists = zip(("vx", "vy", "vz", "wx", "wy", "wz"), final["found"], final["simulated"], strict=True)
     rows = [(name, *(terminal.format_number(value, 9) for value in values)) for name, *values in twists]
     return terminal.build_table(title, ["", "found", "simulated"], rows)
 
 
 def _fmu_table(loop: dict[str, Any]) -> Any:
-    """Return the table of the nominal contacts, or of the final twist, in the loop of both FMUs."""
+    """Return the table of the loop that the two FMUs form: the nominal contacts, or the final twist."""
     if loop["final_twist"] is not None:
         return _twist_table(
             f"Final twist of the nominal run with the FMUs of FMI {loop['fmi']}, rig.command_latency = "
