@@ -163,7 +163,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
 
 
 def _panel_title(motion: RunMotion) -> str:
-    """Return the title of a panel: name and approach speed of the contact, and speeds that differ."""
+    """Return a panel's title: contact, ideal approach speed, and curves whose speed differs from it."""
     speed = motion.curves["ideal"].velocity
     text = f"{motion.name}, approach at {1e3 * speed:.3g} mm/s"
     for name, curve in motion.curves.items():

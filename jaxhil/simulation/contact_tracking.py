@@ -116,7 +116,7 @@ def record_contact(
     command: Array,
     shortfall: Array | None,
 ) -> ContactTracker:
-    """Return the record of the current contact, updated with the current tick (stage 6 of a tick).
+    """Return the record of the current contact, updated with the current tick.
 
     Args:
         loop: Structure of the loop.
@@ -187,7 +187,7 @@ def _has_begun(loop, rules, tracker, signals, touching, magnitude):
 
 
 def _choose_side(rules, tracker, signals):
-    """Return the side of the nearer surface, which is fixed during a contact; None with one surface."""
+    """Return the side of the surface nearer to the model, fixed during a contact; None with one surface."""
     if tracker.side is None:
         return None
     position = signals.position_desired
@@ -235,9 +235,9 @@ def _largest_shortfall(tracker, shortfall, lasts):
 def _update_variation(
     before: CommandVariation, command: Array, lasts: Array, ends: Array
 ) -> CommandVariation:
-    """Return the variation of the force command, updated in lanes whose contact `lasts`.
+    """Add the current tick to the variation of the force command in lanes whose contact `lasts`.
 
-    If a contact `ends` at this tick, the step of the command to 0 is included.
+    If a contact `ends` at this tick, add the step of the command from its last value to 0 as well.
     """
     step = jnp.abs(command - before.last) + jnp.where(ends, jnp.abs(command), 0)
     return CommandVariation(

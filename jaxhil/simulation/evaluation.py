@@ -90,7 +90,7 @@ class RigModel(abc.ABC):
 
     @abc.abstractmethod
     def initial_state(self, loop: Any, gains: Gains, scenario: Any) -> Any:
-        """Return the state of the loop over ticks at the start of a batch of scenarios (JAX arrays)."""
+        """Return the simulation's state before the first tick of a batch of scenarios (JAX arrays)."""
 
     @abc.abstractmethod
     def at_rest(self, scenarios: Any, idle: np.ndarray) -> Any:
@@ -104,7 +104,7 @@ class RigModel(abc.ABC):
     def whole_delays(self, scenarios: Any) -> np.ndarray:
         """Return a sorting key for each scenario, which places scenarios with similar delays together.
 
-        Two scenarios have equal keys if each delay contains the same number of whole control periods.
+        Two scenarios have equal keys if every delay has the same number of whole control periods in both.
         """
 
     @abc.abstractmethod
@@ -183,8 +183,8 @@ class RigModel(abc.ABC):
     def place_batch(self, scenarios: Any, at_least: int = 1, loop: Any = None) -> Batch:
         """Distribute scenarios to the devices; see `evaluate` for the arguments.
 
-        On an accelerator, the memory per lane is estimated for `loop`. None means that no loop over ticks
-        runs these scenarios.
+        On an accelerator, the memory per lane is estimated for `loop`. If `loop` is None, only the memory of
+        the scenarios counts.
         """
         assignment = self._assign_tiles(scenarios, at_least, loop)
         positions = np.empty_like(assignment.lane, shape=count_lanes(scenarios))
@@ -216,7 +216,7 @@ class RigModel(abc.ABC):
         return count_bytes(lane) + (_count_state_bytes(self, loop, structure, lane) if loop else 0)
 
     def _assign_tiles(self, scenarios: Any, at_least: int, loop: Any) -> "_TileAssignment":
-        """Assign the lanes of a batch to tiles on the devices; fill the tiles with idle lanes."""
+        """Assign lanes to tiles (groups of equal size) on the devices; fill the tiles with idle lanes."""
         number = count_lanes(scenarios)
         capacity = max(number, at_least)
         devices = jax.device_count()
@@ -237,7 +237,7 @@ class RigModel(abc.ABC):
         )
 
     def _sort_lanes(self, scenarios: Any) -> np.ndarray:
-        """Sort lane indices by expected duration and, if there are enough lanes per delay, first by delay."""
+        """Sort lane indices by expected duration; if enough lanes share each delay, sort by delay first."""
         duration, delays = self.expected_duration(scenarios), self.whole_delays(scenarios)
         if MIN_TILES_PER_DELAY * TILE_SIZE * len(np.unique(delays)) > len(delays):
             delays = np.zeros_like(delays)
@@ -255,7 +255,7 @@ class RigModel(abc.ABC):
 
 
 def place_gains(batch: Batch, gains: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Place gains on the devices; return the gains common to all lanes, and the gains per lane, in tiles."""
+    """Place gains on the devices; return gains common to all lanes, and gains per lane in groups (tiles)."""
     # The program computes in the floating-point precision of the scenarios.
     dtype = batch.scenarios.control_period.dtype
     values = {name: np.asarray(value, dtype) for name, value in gains.items()}
@@ -265,14 +265,14 @@ def place_gains(batch: Batch, gains: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def count_lanes(scenarios: Any) -> int:
-    """Return the number of scenarios in a batch."""
+    """Return the number of lanes (scenarios) in a batch."""
     return np.shape(scenarios.control_period)[-1]
 
 
 def run_tiles(static: tuple[RigModel, Any], common: Any, per_lane: Any, scenarios: Any) -> Outcome:
-    """Run all tiles. The devices work in parallel, and each device runs its tiles one after another.
+    """Run all tiles (groups of lanes): devices in parallel, the tiles of a device one after another.
 
-    `static` is the pair (model, loop).
+    `static` is the pair (model, loop); `common` and `per_lane` are the gains from `place_gains`.
     """
     model, loop = static
 
@@ -284,7 +284,7 @@ def run_tiles(static: tuple[RigModel, Any], common: Any, per_lane: Any, scenario
 
 
 def map_tiles(function: Callable[[Any, Any], Any], common: Any, per_lane: Any) -> Any:
-    """Apply `function(common, tile)` to all tiles of `per_lane`, (devices, tiles, ..., lanes of a tile)."""
+    """Apply `function(common, tile)` to each tile in `per_lane`, (devices, tiles, ..., lanes of a tile)."""
 
     def one_device(common, tiles):
         tiles = jax.tree.map(lambda leaf: leaf[0], tiles)
@@ -299,7 +299,7 @@ def map_tiles(function: Callable[[Any, Any], Any], common: Any, per_lane: Any) -
 
 
 def unfold_tiles(batch: Batch, results: Any) -> Any:
-    """Return results (devices, tiles, ..., lanes of a tile) of a batch as NumPy arrays (..., lanes)."""
+    """Merge the tiles of results, (devices, tiles, ..., lanes of a tile), into NumPy arrays, (..., lanes)."""
 
     def unfold(leaf):
         # The results are copied from one device at a time.
@@ -313,7 +313,7 @@ def unfold_tiles(batch: Batch, results: Any) -> Any:
 
 
 class _TileAssignment(NamedTuple):
-    """Assignment of lanes to tiles; arrays have the shape (devices, tiles, lanes of a tile)."""
+    """Assignment of lanes to groups (tiles); arrays have the shape (devices, tiles, lanes of a tile)."""
 
     lane: np.ndarray  # index of the lane in the batch
     idle: np.ndarray  # whether the lane only fills the tile
@@ -326,7 +326,7 @@ def _round_up(number: int) -> int:
 
 @lru_cache(maxsize=32)
 def _count_state_bytes(model: RigModel, loop: Any, structure: Any, leaves: tuple[Any, ...]) -> int:
-    """Return the memory [bytes] of a lane's state between ticks; `leaves` are the shapes of its arrays."""
+    """Return the memory [bytes] of a lane's state between ticks; `leaves` are shapes of scenario arrays."""
     lane = jax.tree.unflatten(structure, leaves)
     compensator = get_compensator(model.compensator_name(loop), model.axes)
     gains = {gain.name: lane.control_period for gain in compensator.gains}
@@ -338,13 +338,13 @@ def _place_leaves(tree: Any, spec: PartitionSpec) -> Any:
 
 
 def _arrange_leaf(assignment: _TileAssignment, leaf: np.ndarray) -> np.ndarray:
-    """Arrange an array with one value per lane as (devices, tiles, ..., lanes of a tile)."""
+    """Arrange an array with one value per lane in tiles, (devices, tiles, ..., lanes of a tile)."""
     return np.moveaxis(np.take(leaf, assignment.lane, axis=-1), (-3, -2), (0, 1))
 
 
 @lru_cache(maxsize=128)  # number of arrays, which is enough for a few batches of similar scenarios
 def _broadcast_to_lanes(content, dtype, slots, lanes):
-    """Place a value common to all lanes on the devices; later batches reuse the array."""
+    """Place an array on the devices that repeats a value for all lanes; later batches reuse this array."""
     devices, tiles, tile = lanes
     value = np.frombuffer(content, dtype).reshape(1, 1, *slots, 1)
     return jax.device_put(

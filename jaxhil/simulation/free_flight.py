@@ -35,10 +35,10 @@ def begin_approach(
 ) -> tuple[LoopState, Int[Array, "*batch"]]:
     """Return the state at the start of a run, and the number of skipped control periods.
 
-    The numerical model starts at x_d = min(p, 0) - v (0.02 s + phi T). Here p is the position of the
+    The numerical model starts at the position min(p, 0) - v (0.02 s + phi T). Here p is the position of the
     hardware's surface, v the approach speed, T the control period, and phi the phase: a fraction of T. With
-    `skip_flight`, a flight in which nothing can happen is skipped. Only the last two control periods before
-    the hardware touches the surface are simulated.
+    `skip_flight`, a flight in which nothing can happen is skipped. Only about the last two control periods
+    before the hardware touches the surface are simulated.
     """
     nearer = jnp.minimum(rig.scenario.contact_plane, 0)
     position = nearer - velocity * (APPROACH_TIME + phase * rig.constants.control_period)
@@ -94,7 +94,7 @@ def advance_to_surface(
 
 
 def _newest_sample(loop, rig, entered, stride):
-    """Return the position [m] of the real mechanism at the last force sample before the run starts."""
+    """Return the hardware's position [m] at the last force sample before the run starts."""
     drive = entered.plant.commands[-1]
     start = drive - stride if loop.hold == "linear" else drive
     before = steady_state(rig.propagation, start, stride)

@@ -126,7 +126,7 @@ def _gains_without_runtime(axes: int) -> dict[str, dict[str, GainSpecification]]
 
 
 def _check_entry(gain: Gain, entry: Mapping[str, Any], mechanism: AnyMechanism, source: str) -> None:
-    """Raise `InputError` if unit or bounds of a gain are different in the file and in the compensator."""
+    """Raise `InputError` if a gain file gives a gain another unit than the compensator, or wider bounds."""
     key = f"gains.{gain.name}"
     if entry["unit"] != gain.unit:
         raise _make_error(source, f"{key}.unit", format_value(entry["unit"]), f"'{gain.unit}'")

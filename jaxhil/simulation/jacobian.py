@@ -85,8 +85,8 @@ def jacobian(
 
     Raises:
         InputError: `of` or an entry of `by` is unknown; a parameter is not a finite real number; or the run
-            is not differentiable, because a sensor quantises its readings, or because the parameter is 0
-            and is the dead zone or a time constant of a sensor.
+            is not differentiable, because a sensor quantises its readings, or because `by` contains the
+            force sensor's dead zone or time constant, and this parameter is 0.
 
     Example:
         >>> import jaxhil
@@ -181,9 +181,9 @@ def _build_complete_loop(
 
 
 def _build_draws(mechanism: Mechanism, variables: list[_Variable], increments: Any) -> dict[str, Any]:
-    """Return values of the parameters in one lane per variable, by dotted path.
+    """Return the parameters' values by dotted path, as a batch with one lane per variable.
 
-    In lane i, variable i is its nominal value plus `increments[i]`; all other values are nominal.
+    In lane i, variable i has its nominal value plus `increments[i]`; all other values are nominal.
     """
     # If all variables are gains, the phase is the only draw, and determines the number of lanes.
     draws: dict[str, Any] = {"approach.phase": np.full(len(variables), mechanism.approach.phase)}
@@ -200,7 +200,7 @@ def _build_draws(mechanism: Mechanism, variables: list[_Variable], increments: A
 def _perturb_scenarios(
     mechanism: Mechanism, variables: list[_Variable], gains: dict[str, float], seed: int
 ) -> tuple[Gains, Gains, Scenario, Scenario]:
-    """Return gains, their derivatives, scenarios, and their derivatives, with one lane per variable.
+    """Return gains and their derivatives, then scenarios and their derivatives, one lane per variable.
 
     Lane i contains the derivatives with respect to variable i.
     """
@@ -226,9 +226,9 @@ def _perturb_scenarios(
 def _compute_derivatives(
     of: str, loop: Loop, gains: Gains, gain_rates: Gains, batch: Scenario, batch_rates: Any
 ) -> tuple[Array, Array]:
-    """Return the derivative of a result, and the status, for every contact, (contacts, lanes).
+    """Return the derivative of the result named `of`, and the status, for every contact, (contacts, lanes).
 
-    `of` is the name of the result.
+    `gain_rates` and `batch_rates` are the inputs' derivatives with respect to the variable of each lane.
     """
     moving, fixed = eqx.partition(batch, eqx.is_inexact_array)
 

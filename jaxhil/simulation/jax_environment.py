@@ -210,7 +210,7 @@ def _check_jax_variables() -> dict[str, str]:
 
 
 def active_xla_flags() -> str:
-    """Return the XLA_FLAGS with which this process compiles programs, as far as this module knows."""
+    """Return the XLA_FLAGS with which `start_jax` started JAX; else the XLA_FLAGS of the environment."""
     return _startup_flags[0] if _startup_flags else os.environ.get("XLA_FLAGS", "")
 
 

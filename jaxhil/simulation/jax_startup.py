@@ -74,7 +74,7 @@ def find_startup_error() -> InputError | None:
 
 
 def convert_jax_error(error: Exception) -> InputError:
-    """Convert an exception that JAX raises at its start to an error with a one-line message."""
+    """Convert an exception from the start of JAX to an `InputError` with a one-line message."""
     variables = {name: value for name, value in sorted(os.environ.items()) if name.startswith("JAX_")}
     found = ", ".join(f"{name}={value}" for name, value in variables.items()) or "no variable JAX_... set"
     reason = str(error) or "there is no such device"

@@ -76,7 +76,7 @@ class Loop(eqx.Module):
 
         Several conditions must hold. Readings have no noise, bias or quantisation. The motion simulator has
         no limits, and there are no timing effects. The compensator does nothing before the contact. The
-        scenarios have no `Probe`, whose time starts at the numerical model's first touch.
+        scenarios have no `Probe`, because a probe records the numerical model's first touch.
         """
         uneven = self.reads_always or self.has_position_noise or self.has_sample_effects or self.has_limits
         waits = vars(type(self.compensator)).get("waits_for_contact", False)
@@ -101,7 +101,7 @@ class Loop(eqx.Module):
 
     @property
     def has_cells(self) -> bool:
-        """Return whether the contact is computed from the exact motion between the samples."""
+        """Return whether the contact is computed from the exact motion in cells of each sampling interval."""
         return self.cells.part > 0
 
 
@@ -109,9 +109,9 @@ class Delays(NamedTuple):
     """Delays of a loop, in sampling intervals.
 
     With one surface, the contact law is evaluated as soon as the motion is computed: one transport delay
-    before the motion takes place. With two surfaces, the parameters of the contact law may change in this
-    time. The law is then evaluated when the motion takes place, and the delay of the force counts from this
-    time.
+    before the motion takes place. With two surfaces, the parameters of the contact law may change during this
+    delay. The law is therefore evaluated when the motion takes place, and the delay of the force counts from
+    that instant.
     """
 
     force: SplitDelay  # delay of the force reading

@@ -95,7 +95,7 @@ def build_loop(
 
 
 def _choose_cell_counts(mechanism: Mechanism, scenarios: Scenario, exact: bool) -> CellCounts:
-    """Return the numbers of cells; `NO_CELLS` if the motion is slow and `exact` is not set.
+    """Return the numbers of cells in a sampling interval; `NO_CELLS` for slow motion unless `exact` is set.
 
     The numbers suffice for the fastest pole, shortest lag and longest control period of all scenarios.
     """

@@ -25,7 +25,7 @@ class PlantState(NamedTuple):
 
     @property
     def sent(self) -> Float[Array, "*batch"]:
-        """Return the compensator's position command for tick n [m], to which no limit is applied yet."""
+        """Return the position command that the compensator sent for tick n [m], before limits are applied."""
         return self.commands[0] if self.unlimited_command is None else self.unlimited_command
 
     @property

@@ -86,7 +86,7 @@ def find_warnings(mechanism: Mechanism, contacts: tuple[ContactSummary, ...]) ->
 
 
 def _check_sensors(mechanism: Mechanism, strongest: ContactSummary) -> list[str]:
-    """Return a warning for every sensor error that is larger than the signal of all ideal contacts."""
+    """Return a warning for each sensor error that is at least the strongest ideal contact's signal."""
     frequency = strongest.frequency  # 0 if the contact does not end
     depth = mechanism.approach.velocity / (2 * math.pi * frequency) if frequency else math.inf
     limits = (

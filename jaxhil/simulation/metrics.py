@@ -88,7 +88,7 @@ def empty_metrics(loop: Loop, slots: int, like: Array) -> Metrics:
 
 
 def determine_status(scenario: Scenario, tracker: ContactTracker, age: Array) -> Array:
-    """Return the status of the current contact, which is `OK` while the contact continues.
+    """Return the status of the current contact; the status is `OK` while the contact continues.
 
     `age` is the number of ticks since the run began.
     """

@@ -16,15 +16,16 @@ SHORT_CELL_DEGREE = 8  # degree of the series in a short cell, in which the moti
 
 
 class CellMotion(NamedTuple):
-    """Position and velocity in each cell, as power series in the time since the cell's start [periods]."""
+    """Motion in each cell (part of a sampling interval), as power series in the time since its start."""
 
+    # variable of both power series: time since the cell's start [periods]
     position: Array  # coefficients of the position [m], (powers, cells, *batch)
     rate: Array  # coefficients of the velocity [m per period], (powers, cells, *batch)
     length: Array  # length of each cell [periods], (cells, *batch)
 
 
 class MonotoneSections(NamedTuple):
-    """Sections of the cells in which the motion is monotone, (sections of a cell, cells, *batch)."""
+    """Sections of monotone motion in each cell (part of an interval), (sections of a cell, cells, *batch)."""
 
     path: CellMotion  # motion in the cells
     low: Array  # relative time at which a section begins, 0 to 1
@@ -33,14 +34,15 @@ class MonotoneSections(NamedTuple):
 
 
 def build_cell_motion(series: Array, length: Array) -> CellMotion:
-    """Return the motion in cells of `length` [periods] from the coefficients of the position [m]."""
+    """Return the motion in the cells of an interval, `length` [periods] long, from position `series` [m]."""
     return CellMotion(series, _derivative(series), length)
 
 
 def split_at_reversals(path: CellMotion) -> MonotoneSections:
-    """Divide the cells at the instants at which the motion reverses.
+    """Divide the cells (parts of a sampling interval) at the instants at which the motion reverses.
 
-    The motion is assumed to reverse at most twice in a cell, and at most once in a short cell.
+    The motion is assumed to reverse at most twice in a cell. If the degree of the power series is at most
+    `SHORT_CELL_DEGREE`, the motion is assumed to reverse at most once.
     """
     low, high = jnp.zeros_like(path.length), jnp.ones_like(path.length)
     if len(path.position) == 2:
@@ -56,18 +58,18 @@ def split_at_reversals(path: CellMotion) -> MonotoneSections:
 
 
 def split_at(path: CellMotion, edges: Array) -> MonotoneSections:
-    """Divide each cell at the relative times `edges`, (edges, cells, *batch), into monotone sections."""
+    """Divide each cell into monotone sections at relative times `edges`, (edges, cells, *batch)."""
     step = position_at(path, edges[1:]) - position_at(path, edges[:-1])
     return MonotoneSections(path, edges[:-1], edges[1:], jnp.where(step < 0, -1, 1).astype(step.dtype))
 
 
 def position_at(path: CellMotion, s: Array) -> Array:
-    """Return the position [m] at the relative time `s` in each cell."""
+    """Return the position [m] in each cell of an interval at the time `s` (0: cell's start, 1: its end)."""
     return horner(path.position, s * path.length)
 
 
 def velocity_at(path: CellMotion, s: Array) -> Array:
-    """Return the velocity [m per period] at the relative time `s` in each cell."""
+    """Return the velocity [m per period] in each cell of an interval at the time `s` (0: start, 1: end)."""
     return horner(path.rate, s * path.length)
 
 

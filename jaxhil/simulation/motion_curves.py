@@ -67,9 +67,9 @@ def compute_scenario_motion(loaded: LoadedGains, scenarios: Scenario) -> list[Ru
 def _scenarios_by_compensator(
     mechanism: Mechanism, laws: NamedCompensators, seed: int
 ) -> Iterator[tuple[list[str], LoadedGains, Scenario]]:
-    """Yield, for each compensator, the names of its curves, their gains and the nominal scenario.
+    """Yield, for each compensator, the names of its curves in the plot, and gains and nominal scenarios.
 
-    Gains and scenario have one lane for each curve.
+    Gains and scenarios have one lane for each curve.
     """
     for compensator in dict.fromkeys(compensator for compensator, _ in laws.values()):
         gains_by_name = {name: gains for name, (law, gains) in laws.items() if law == compensator}

@@ -46,8 +46,8 @@ class SplitWindow(NamedTuple):
 class Propagation(NamedTuple):
     """Discretised motion simulator as row vectors.
 
-    Except for the last two fields, rows are multiplied by (state, command at the interval's start, command at
-    the interval's end) of a sampling interval.
+    Each row is multiplied by (state, command at the interval's start, command at the interval's end) of a
+    sampling interval. The fields `steady_command` and `steady_velocity` are states, not rows.
     """
 
     transition: Float[Array, "order columns *batch"]  # rows that give the state one period later
@@ -86,10 +86,10 @@ def discretise(
 ) -> Propagation:
     """Discretise the transfer function num(s)/den(s) of the motion simulator exactly.
 
-    With time in control periods, the state z follows z' = A z + B u. At the time t in an interval, the
-    state is z(t) = E(t) (z(0), u(0), u(1) - u(0)). Here E(t) consists of the first rows of the matrix
-    exponential of t [[A, B, 0], [0, 0, 1], [0, 0, 0]] (Van Loan 1978). The result is differentiable with
-    respect to every numeric argument.
+    With time in control periods, the state z follows z' = A z + B u for the position command u. At the time
+    t in an interval, the state is z(t) = E(t) (z(0), u(0), u(1) - u(0)). Here E(t) consists of the first rows
+    of the matrix exponential of t [[A, B, 0], [0, 0, 1], [0, 0, 0]] (Van Loan 1978). The result is
+    differentiable with respect to every numeric argument.
 
     Args:
         numerator: Coefficients of num(s), descending powers; the transfer function is strictly proper.
@@ -145,9 +145,9 @@ def generator_rows(
     denominator: Float[Array, "order_plus_1 *batch"],
     control_period: Float[Array, "*batch"],
 ) -> tuple[Float[Array, "order order_plus_2 *batch"], list[Array]]:
-    """Return the rows (A, B, 0) of the generator in `discretise`, and the output weights.
+    """Return the first rows (A, B, 0) of the matrix in `discretise`, and the weights of the output.
 
-    The position is the sum of output weights times state components. The order must be at least 1.
+    The position is the sum of the state's components, each times its weight. The order must be at least 1.
     """
     order = denominator.shape[0] - 1
     system, output = _companion(numerator, denominator, control_period)
@@ -178,7 +178,7 @@ def matrix_exponential(
         return units[order] + units[order + 1] * ramp[None]
 
     def product(left, right, ramp):
-        """Return the product left @ right without its last row; `ramp` is r in the last row of `right`."""
+        """Return left @ right without its last rows; `right` lacks the rows (0, 1, `ramp`) and (0, 0, 1)."""
         total = _matrix_product(left[:, :order], right)
         driven = left[:, order, None] * ramp_row(ramp)[None]
         return total + driven + left[:, order + 1, None] * units[None, order + 1]
@@ -204,7 +204,7 @@ def advance_state(transition: Array, state: SimulatorState, start: Array, end: A
 
 
 def apply_row(row: Array, state: SimulatorState, start: Array, end: Array) -> Array:
-    """Multiply a row by (state, command at the interval's start, command at the interval's end)."""
+    """Multiply a row of `Propagation` by (state, command at the interval's start, command at its end)."""
     total = row[-2] * start + row[-1] * end
     for i, component in enumerate(state):
         total = total + row[i] * component
@@ -223,9 +223,9 @@ def rate_row(
     denominator: Float[Array, "order_plus_1 *batch"],
     control_period: Float[Array, "*batch"],
 ) -> Float[Array, "columns *batch"]:
-    """Return the row that gives the time derivative of the quantity that `row` gives [per s].
+    """Return the row of `Propagation` for the time derivative, per second, of the quantity of `row`.
 
-    The formula follows from d/ds E(s) = E(s) G, where G is the generator in `discretise`.
+    The formula follows from dE(s)/ds = E(s) G, where G = [[A, B, 0], [0, 0, 1], [0, 0, 0]] (`discretise`).
     """
     *state, start, end = row
     zero = jnp.zeros_like(start)
@@ -240,13 +240,13 @@ def rate_row(
 
 
 def steady_state(plant: Propagation, command: Array, step: Array) -> SimulatorState:
-    """Return the steady state while the command is `command` [m] and grows by `step` [m] per period."""
+    """Return the motion simulator's steady state if `command` [m] grows by `step` [m] in each period."""
     order = plant.steady_command.shape[0]
     return tuple(plant.steady_command[i] * command + plant.steady_velocity[i] * step for i in range(order))
 
 
 def _ideal_propagation(control_period, force_fraction, position_fraction, hold, ends):
-    """Return the row vectors for an ideal motion simulator, whose position equals the command."""
+    """Return the `Propagation` of an ideal motion simulator, whose position equals its command."""
 
     def position(fraction):
         return jnp.stack([1 - fraction, fraction])
@@ -279,13 +279,13 @@ def _companion(numerator, denominator, control_period):
 
 
 def _last_row(denominator, control_period):
-    """Return the last row of the companion matrix A, which contains the coefficients of den(s)."""
+    """Return the last row of the companion matrix: negated denominator coefficients, with time in periods."""
     order = denominator.shape[0] - 1
     return [-denominator[order - i] * control_period ** (order - i) / denominator[0] for i in range(order)]
 
 
 def _steady_velocity(system, transition, steady_command, hold):
-    """Return the steady state under a ramp command that increases by 1 in each control period."""
+    """Return a transfer function's steady state under a command that increases by 1 in each period."""
     order = steady_command.shape[0]
     if hold == "linear":
         # The steady response to a ramp u is w = u/a_n - a_{n-1} u'/a_n^2 and w' = u'/a_n.

@@ -53,7 +53,7 @@ def discretise_moving_average(
     hold: str,
     ends: bool = False,
 ) -> Propagation:
-    """Discretise a moving average exactly; the arguments are those of `motion_simulator.discretise`.
+    """Discretise exactly a motion simulator whose position is the moving average of its command.
 
     Args:
         window: Length of the window [s].
@@ -92,10 +92,10 @@ def discretise_moving_average(
 
 
 def is_before_kink(window: Array, control_period: Array, s: Array) -> Bool[Array, "*batch"]:
-    """Return whether a reading at the fraction `s` of an interval is before the kink of the motion.
+    """Return whether the fraction `s` of an interval is before the kink of a moving average's motion.
 
-    The kink is at the instant at which the window's start passes a tick. A reading at this instant has the
-    value just before it.
+    The kink is at the instant at which the start of the averaging window passes a tick. A reading at this
+    instant has the value just before it.
     """
     return s <= split_window(window, control_period).fraction + TOLERANCE
 
@@ -103,13 +103,13 @@ def is_before_kink(window: Array, control_period: Array, s: Array) -> Bool[Array
 def motion_rows(
     window: Array, control_period: Array, s: Array, is_before: Array, hold: str
 ) -> tuple[Array, Array, Array]:
-    """Return the row vectors for the position and its first two time derivatives; time is in periods.
+    """Return the row vectors of `Propagation` for position, velocity and acceleration; time is in periods.
 
     Args:
         window: Length of the window [s].
         control_period: Control period [s].
-        s: Fraction of the interval.
-        is_before: Whether the window's start has not yet passed a tick at this instant.
+        s: Fraction of the interval at which the rows give the motion.
+        is_before: Whether the window's start has not yet passed a tick at the fraction `s`.
         hold: Hold of the command.
     """
     width, fraction = window / control_period, split_window(window, control_period).fraction
@@ -144,13 +144,13 @@ def read_leaving_commands(
     state: SimulatorState,
     before_run: UniformCommand | None = None,
 ) -> SimulatorState:
-    """Return the motion simulator's state, with the commands at the three ticks around the window's start.
+    """Read the three commands that leave the averaging window; return the state with these commands.
 
     Args:
         ring: Delay line of the drive commands at the end of each interval [m], including this interval.
-        tick: Number of the tick.
-        split: Window, divided into periods.
-        state: State of the motion simulator.
+        tick: Number of the current tick.
+        split: Averaging window, divided into periods.
+        state: State of the motion simulator (a moving average).
         before_run: Commands before the start of the run; None if the delay line contains them.
     """
     commands = []
@@ -166,7 +166,7 @@ def read_leaving_commands(
 
 
 def _steady_velocity(split, width, hold):
-    """Return the steady state under a ramp command that increases by 1 in each control period."""
+    """Return a moving average's steady state under a command that increases by 1 in each control period."""
     count = split.intervals.astype(width.dtype)
     if hold == "linear":
         return jnp.stack([-width / 2, -1 - count, -count, 1 - count])

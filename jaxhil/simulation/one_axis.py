@@ -40,7 +40,7 @@ class OneAxis(RigModel):
         return build_loop(mechanism, compensator, scenarios, **parts)
 
     def runs(self, mechanism: Mechanism) -> int:
-        """Return the number of contacts in a scenario of this mechanism."""
+        """Return the number of runs in a scenario of this mechanism; each run is one contact."""
         return mechanism.approach.contacts
 
     def run(self, loop: Loop, gains: Gains, scenario: Scenario) -> Outcome:
@@ -48,7 +48,7 @@ class OneAxis(RigModel):
         return compare_with_ideal(loop, scenario, rollout(loop, gains, scenario))
 
     def initial_state(self, loop: Loop, gains: Gains, scenario: Scenario) -> RunState:
-        """Return the state of the loop over ticks at the start of the first approach."""
+        """Return the simulation's state at the start of the first approach."""
         return start_rollout(loop, self.prepared(loop, scenario), gains)
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
@@ -68,7 +68,7 @@ class OneAxis(RigModel):
     def whole_delays(self, scenarios: Scenario) -> np.ndarray:
         """Return a sorting key for each scenario, which places scenarios with similar delays together.
 
-        Two scenarios have equal keys if each delay contains the same number of whole control periods.
+        Two scenarios have equal keys if every delay has the same number of whole control periods in both.
         """
         simulator = np.asarray(scenarios.simulator.delay)
         period = np.asarray(scenarios.control_period)
@@ -99,7 +99,7 @@ class OneAxis(RigModel):
         return build_rig_constants(loop, scenarios, measured=loop.compensator.reads_position)
 
     def outcome(self, loop: Loop, gains: Gains, rig: RigConstants) -> Outcome:
-        """Run the scenarios from which `prepared` made `rig`; the outcome is differentiable by the gains."""
+        """Run the scenarios that `prepared` received. The outcome is differentiable with respect to gains."""
         if loop.compensator.is_large:
             rig = _separate_loops(rig)
         return compare_with_ideal(loop, rig.scenario, run_contacts(loop, gains, rig))

@@ -84,7 +84,7 @@ def compare_with_ideal(loop: Loop, scenario: Scenario, metrics: Metrics) -> Outc
 
 
 def parameters_by_slot(contact: ContactParameters) -> ContactParameters:
-    """Reorder the parameters' axes to (segments, contacts, *batch), so that contacts are a batch axis."""
+    """Reorder axes to (segments, contacts, *batch): the contact law then computes all contacts as a batch."""
     nested = contact.stiffness.ndim > contact.damping.ndim
     return contact._replace(
         stiffness=jnp.moveaxis(contact.stiffness, 0, 1) if nested else contact.stiffness,

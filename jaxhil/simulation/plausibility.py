@@ -226,7 +226,7 @@ def _check_ticks(name: str, mechanism: Mechanism, scenarios: Scenario) -> None:
 
 
 def _squared(polynomial: np.ndarray) -> np.ndarray:
-    """Return the coefficients of |p(jw)|^2 as a polynomial in w^2; all powers are descending."""
+    """Return |p(jw)|^2 in descending powers of w^2; `polynomial` is p(s) in descending powers of s."""
     degrees = np.arange(len(polynomial) - 1, -1, -1)
     product = np.convolve(polynomial, polynomial * (-1.0) ** degrees)[::2]
     return product * (-1.0) ** degrees
@@ -245,7 +245,7 @@ def _compute_ideal_contacts(mechanism: Mechanism, scenarios: Scenario) -> IdealC
 def _compute_reference(
     law: ContactLaw, parameters: ContactParameters, mass: Any, velocity: Any
 ) -> IdealContact:
-    """Compute the ideal contacts of a contact law, (contacts, lanes), with a program of `run_cached`."""
+    """Compute the ideal contacts of a contact law, (contacts, lanes); `run_cached` compiles this function."""
     return law.ideal_contact(parameters_by_slot(parameters), mass, velocity)
 
 
@@ -302,9 +302,10 @@ def _longest_wait(scenarios: Scenario) -> np.ndarray:
 
 
 def _extreme_draws(mechanism: Mechanism, prefixes: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Return draws with all combinations of extreme values, for parameters whose path begins with a prefix.
+    """Return draws with all combinations of the extreme values of the parameters that `prefixes` select.
 
-    All other parameters have the median of their distribution.
+    A parameter is selected if its dotted path begins with one of `prefixes`. All other parameters have the
+    median of their distribution.
     """
     columns = count_dimensions(mechanism)
     paths = [path for path in columns if path.startswith(prefixes)]

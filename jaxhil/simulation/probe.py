@@ -18,10 +18,10 @@ from jaxhil.mechanism.sensor_filter import FilterModes
 
 
 class Push(NamedTuple):
-    """Push on the hardware with the shape of a half-sine.
+    """Test push on the hardware: a force with the shape of a half-sine.
 
-    The force is p(t) = size sin(pi s/width) for 0 < s < width, else 0. Here t is the time since the
-    hardware's first touch, and s = t - centre + width/2.
+    The force is size sin(pi s/width) for 0 < s < width, else 0. Here s = t - centre + width/2 is the time
+    since the push began, and t is the time since the hardware's first touch.
     """
 
     size: Float[Array, "*batch"]  # largest force [N]; a positive force acts against the penetration
@@ -40,9 +40,9 @@ class Push(NamedTuple):
     ) -> Float[Array, "*batch"]:
         """Return the push [N] as a sensor with a first-order lag reads it.
 
-        Until the push ends, the reading is size/(1 + (w tau)^2) (sin ws - w tau cos ws + w tau exp(-s/tau)),
-        where w = pi/width, tau is the time constant, and s is the time since the push began. Then the reading
-        decays exponentially.
+        Until the push ends, the reading is size/(1 + a^2) (sin(w s) - a cos(w s) + a exp(-s/tau)). Here
+        w = pi/width, tau is the time constant, a = w tau, and s is the time since the push began. Afterwards,
+        the reading decays exponentially.
 
         Args:
             time: Time since the hardware's first touch [s].
@@ -86,7 +86,7 @@ class Push(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """For each contact, the push that tests transparency and the ideal contact with which it is compared."""
+    """Test push on the hardware, and ideal contact as the numerical model's reference, for each contact."""
 
     push: Push  # push on the hardware, (contacts, *batch)
     # penetration in the ideal contact [m] at evenly spaced times, from 0 to `span` after the first touch
@@ -112,7 +112,7 @@ class Deviation(NamedTuple):
 
 
 def initial_first_contact(like: Float[Array, "*batch"]) -> FirstContact:
-    """Return the record of hardware that has not touched yet, with the batch shape of `like`."""
+    """Return the record of hardware that has not touched a surface yet, with the batch shape of `like`."""
     zeros = jnp.zeros_like(like)
     return FirstContact(jnp.zeros(like.shape, bool), zeros, zeros + 1)
 
@@ -190,13 +190,13 @@ def update_deviation(
 
 
 def root_mean_square(deviation: Deviation) -> Float[Array, "*batch"]:
-    """Return the root mean square of the deviation [m]; 0 before the first touch."""
+    """Return the root mean square of the deviation [m]; 0 before the numerical model's first touch."""
     mean = deviation.squares / jnp.maximum(deviation.count, 1)
     return safe_sqrt(mean)
 
 
 def _periods_since_touch(depth, rate, period):
-    """Return the time since the touch [control periods], 0 to 1, assuming uniform motion."""
+    """Return the time since a surface was touched [control periods], 0 to 1, assuming uniform motion."""
     stride = rate * period
     inward = stride > 0
     return jnp.where(inward, jnp.clip(depth / jnp.where(inward, stride, 1), 0, 1), 0)

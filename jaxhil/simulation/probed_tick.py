@@ -24,11 +24,11 @@ def apply_probe(
     tracker: ContactTracker,
     sensor_filter: FilterModes | None = None,
 ) -> tuple[LoopState, IntervalContact, ContactTracker]:
-    """Add the effects of the probe to the state, the contact and the contact's record.
+    """Apply the probe of a test: add its push to the contact, and record the model's deviation.
 
     Args:
         rig: Constants of the run.
-        probe: Probe of the current contact.
+        probe: Push in the current contact, and ideal contact from which the deviation is measured.
         state: State of the loop.
         has_ended: Whether the contact ended before this tick.
         signals: Inputs of the compensator at this tick.
@@ -53,7 +53,7 @@ def apply_push(
     contact: IntervalContact,
     sensor_filter: FilterModes | None = None,
 ) -> tuple[FirstContact, IntervalContact]:
-    """Add the push to the force on the hardware and to the reading of the force sensor."""
+    """Add the probe's push, a test force on the hardware, to the real force and to the sensor's reading."""
     assert first_contact is not None
     scenario, period = rig.scenario, rig.constants.control_period
     signed = deflection(sample.position, scenario.clearance)
@@ -74,7 +74,7 @@ def apply_push(
 def update_model_deviation(
     constants: KnownConstants, probe: Probe, has_ended: Array, signals: Signals, tracker: ContactTracker
 ) -> ContactTracker:
-    """Add the model's deviation from the ideal contact to the record, unless the contact has ended."""
+    """Record the numerical model's deviation from the ideal contact, unless the contact has ended."""
     assert tracker.deviation is not None
     depth, rate = signals.position_desired, signals.velocity_desired
     if tracker.side is not None:

@@ -8,7 +8,7 @@ from jaxhil.simulation.loop_state import PlantState
 
 
 def apply_limits(rig: RigConstants, plant: PlantState, command: Array) -> tuple[Array, Array, Array | None]:
-    """Return the limited command [m], its step [m] and the unlimited command [m] (None without limits)."""
+    """Return limited command [m], its step [m] and unlimited command [m]; the last is None without limits."""
     if plant.unlimited_command is None:
         return command, plant.step, None
     simulator = rig.scenario.simulator

@@ -86,7 +86,7 @@ def _check_name(law: Compensator | ContactLaw, table: dict[str, Any]) -> None:
 
 
 def _check_static(law: Compensator | ContactLaw) -> None:
-    """Raise `InputError` unless a law is hashable and equal to itself, as a static argument must be."""
+    """Raise `InputError` unless a law is hashable and equal to itself: JAX uses it as a static argument."""
     try:
         hash(law)
         is_equal = bool(law == law)
