@@ -80,8 +80,8 @@ def shadow(
 ) -> ShadowResult:
     """Show what a controller would have commanded on the readings in a rig's logs.
 
-    The controller is that of the bundle or gain file, in Python. It gets the readings tick by tick with the
-    time stamps of the log; nothing is sent anywhere.
+    The Python controller of the bundle or gain file gets the readings tick by tick, with the time stamps of
+    the log. No command is sent to a rig.
 
     Args:
         gains: path of a bundle, of a gain file, or of its folder; or a result of `tuning.tune`.
@@ -92,7 +92,8 @@ def shadow(
         **options: see `ShadowOptions`.
 
     Returns:
-        Differences of commands, faults, trips and statuses of each contact, and causes of the differences.
+        For each contact, the differences from the logged commands, and the controller's faults, trip and
+        status. For all contacts, causes of the differences.
 
     Raises:
         InputError: If an argument, the bundle or a log is unusable; the message has one line.
@@ -142,9 +143,10 @@ def _list_logs(logs: Any) -> list[Path]:
 
 
 def _prepare_controller(gains: Any, loaded: Any) -> Callable[[Sequence[str]], Any]:
-    """Check the code if `gains` is a bundle; return a function that makes controllers.
+    """Return a function that makes controllers; if `gains` is a bundle, check the bundle's code first.
 
-    The function's argument is a list of limit names. The controller gets the default of each of these limits.
+    The function gets names of limits. Its controller uses the defaults of these limits, and otherwise the
+    limits of the gain file.
     """
     from tuning.bundle.checking import check_bundle_code
     from tuning.bundle.controller_kind import kind_of
@@ -164,7 +166,7 @@ def _prepare_controller(gains: Any, loaded: Any) -> Callable[[Sequence[str]], An
 
 
 def _load_mapping(path: Any, axes: int) -> Any:
-    """Return the mapping of the logs; by default, the one for logs of `jaxhil simulate`."""
+    """Return the mapping, which describes the logs; without a path, that for logs of `jaxhil simulate`."""
     from tuning.identification.logs import mapping, six_axis_mapping
 
     if path is None:
@@ -179,7 +181,7 @@ def _load_mapping(path: Any, axes: int) -> Any:
 
 
 def _build_document(loaded: Any, comparison: "ShadowComparison") -> dict[str, Any]:
-    """Return the JSON document of a comparison."""
+    """Return the JSON document of the comparison between a controller and logs."""
     import msgspec
 
     contacts = comparison.contacts

@@ -107,7 +107,7 @@ class SweepStudy:
 
     @contextmanager
     def store(self) -> Iterator["SweepStore"]:
-        """Open the store that holds the rows: in the folder, or a temporary one for rows in memory."""
+        """Open the store with the rows; write rows that are in memory to a temporary store first."""
         from tuning.sweeps.chunk_file import from_table
         from tuning.sweeps.store import open_store, read_store, write_chunk
 
@@ -169,7 +169,7 @@ def sweep(
 def run_study(
     gains: Any, options: SweepOptions, folder: Path, progress: bool, keep: bool = True
 ) -> SweepStudy:
-    """Compute all scenarios that are missing in the store in `folder`, and the requested additional studies.
+    """Compute the scenarios whose results are missing in `folder`, and the requested additional studies.
 
     If `keep` is true, also write plots and the JSON document to the folder. Otherwise, the result contains
     the rows.
@@ -234,10 +234,10 @@ def _add_studies(
     keep: bool,
     workers: "ClusterWorkers | None",
 ) -> list[InputError]:
-    """Add plots and additional studies to the document; if `keep`, write the document after every step.
+    """Add plots and additional studies to the JSON document of a sweep.
 
-    Return the errors for files that could not be written. They are not raised, so that the results are not
-    lost if the disk is full.
+    If `keep`, also write the plots and, after each addition, the document to the folder. Return the errors
+    of files that could not be written. They are not raised: a full disk must not lose the results.
     """
     from tuning.plots.sweep import write_plots
     from tuning.sweeps.run_sweep import compare_precisions
@@ -330,7 +330,7 @@ def _scenario_entry(store: "SweepStore", mechanism: Any, index: int) -> dict[str
 
 
 def _read_table(store: "SweepStore") -> "pyarrow.Table":
-    """Return all intact rows of the store as an Arrow table, sorted by scenario index."""
+    """Return all rows in the store as an Arrow table, sorted by scenario index."""
     import pyarrow
 
     from tuning.sweeps.chunk_file import build_arrow_schema, to_table

@@ -70,7 +70,7 @@ def run_subset_simulation(
 def _study_runner(
     options: Any, store, total: int, unit: str, study: str, progress: bool, workers: Any
 ) -> Iterator[Any]:
-    """Context manager: provide the process or cluster, the checkpoints and the progress report of a study."""
+    """Context manager: show the progress of a study, and provide the settings for running its scenarios."""
     from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
     from tuning.sweeps.cluster_computers import BATCHES_PER_STUDY, build_point_computer
     from tuning.sweeps.point_batches import PointRunSettings

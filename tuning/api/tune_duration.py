@@ -58,7 +58,7 @@ def record_duration(
 
 
 def _read_times() -> dict[str, tuple[float, float]]:
-    """Return the stored times [s] and ticks; an empty dictionary if there are none."""
+    """Return time [s] and ticks of the last tunings, by axes and compensator; empty if none is stored."""
     folder = cache_folder()
     try:
         times = json.loads((Path(folder or ".") / RECORD_FILE).read_bytes())

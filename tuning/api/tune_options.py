@@ -206,9 +206,9 @@ class TuneOptions:
     def wants_quiet(self) -> bool:
         """Return whether the options ask for quiet gains.
 
-        Quiet gains are those that, among all gains whose error is within the limit, amplify sensor noise
-        least and cause the smallest peaks of the force command. The options ask for quiet gains if the limit
-        is positive and finite, and all options of the objective have their default values.
+        Quiet gains have an error within the limit. Among all such gains, they amplify sensor noise least and
+        cause the smallest peaks of the force command. The options ask for quiet gains if the limit is
+        positive and finite, and all options of the objective have their default values.
         """
         return self._has_default_objective and self._has_finite_limit
 

@@ -43,7 +43,7 @@ def check_six_axis_cost(against: Any) -> None:
 
 
 def select_cost_axis(against: str | None, compensator: str, axes: int = 1) -> "ParetoCriterion | None":
-    """Return the cost that the front trades off against the error; None if the gains do not affect it."""
+    """Return the cost that a Pareto front trades off against the error; None if no gain affects the cost."""
     from tuning.gains.pareto_search import (
         NOISE_CRITERION,
         PARETO_CRITERIA,
@@ -65,12 +65,12 @@ def compute_fronts(
     checkpoints: "Checkpoints | None" = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, list[TradedGains]]]:
-    """Compute a Pareto front for each tuned mechanism, and yield it as soon as it is finished.
+    """Compute the Pareto front of each tuning, and yield each front as soon as it is finished.
 
     Args:
-        tuned: results of the tuning.
+        tuned: results of `tune`, one per mechanism.
         number: number of points of a front.
-        against: name of the cost; None for the compensator's default.
+        against: name of the cost that is traded off against the error; None for the compensator's default.
         bar: progress display.
         checkpoints: results of finished work, which is not repeated; new results are added.
         scheduler: address of a cluster's scheduler, whose workers compute the fronts; None for this process.

@@ -41,8 +41,9 @@ def command_metrics(result: "TuneResult") -> CommandMetrics:
 def is_good(result: "TuneResult", limit: float) -> bool:
     """Return whether the verdict on the tuned gains is good, both with and without sensor noise.
 
-    The verdict is good if all contacts ended, the rms error (in six axes that of the twist) is within the
-    limit, and at most `MAX_UNLIKE_SHARE` of the real contacts differ too much from the ideal contacts.
+    The verdict is good if all contacts ended, and the rms error is within the limit. With six axes, this is
+    the twist error. In addition, at most `MAX_UNLIKE_SHARE` of the real contacts may violate the bounds in
+    `jaxhil.simulation.contact_bounds`.
     """
     return all(
         errors.failed == 0 and errors.rms <= limit and errors.unlike <= MAX_UNLIKE_SHARE

@@ -28,7 +28,7 @@ class TunedGains:
         mechanism_sha256: SHA-256 digest of the mechanism file.
         limit: largest rms error for which the verdict is good [1].
         pareto: points of the Pareto front; empty if no front was requested.
-        extra_periods: periods of the mechanism's command latency that a co-simulation adds [periods].
+        extra_periods: part of the mechanism's command latency that a co-simulation with FMUs adds [periods].
     """
 
     tune_result: "TuneResult"
@@ -86,9 +86,9 @@ class TunedGains:
     def verdict(self) -> str:
         """Return the verdict, "good" or "bad".
 
-        The verdict is "good" if three conditions hold with and without sensor noise: every contact ended; the
-        rms error is within the limit; at most 1 % of the real contacts have more than twice the peak force of
-        the ideal contact, or less than half or more than twice its duration.
+        The verdict is "good" if three conditions hold with and without sensor noise. Every contact ends. The
+        rms error is within the limit. Of the real contacts (on the hardware), at least 99 % have at most
+        twice the ideal contact's peak force, and 0.5 to 2 times its duration.
         """
         return "good" if tune_verdict.is_good(self.tune_result, self.limit) else "bad"
 
@@ -118,7 +118,7 @@ class TunedGains:
     def summary(self) -> "MechanismSummary | None":
         """Return a summary of the mechanism: mass, ideal contacts, rates, and warnings of implausible values.
 
-        The summary is None for six axes, where only a result of `jaxhil.simulate` has a summary.
+        The summary is None for six axes. Use the summary of a result of `jaxhil.simulate` instead.
         """
         from jaxhil.simulation import plausibility
 
@@ -170,7 +170,7 @@ class TunedGains:
 
 
 def _validity_envelope(result: "TuneResult") -> dict[str, Any]:
-    """Return the ranges of the fresh scenarios, for the gain file."""
+    """Return the ranges of frequency, delay, speed and force in the fresh scenarios, for the gain file."""
     from tuning.gain_file import six_axis_validity_envelope, validity_envelope
 
     if isinstance(result.mechanism, SixAxisMechanism):
@@ -180,7 +180,7 @@ def _validity_envelope(result: "TuneResult") -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class TradedGains:
-    """Gains of one point of a Pareto front that trades off the restitution error against a second cost.
+    """Gains of one point of a Pareto front, which trades off the error against a second cost.
 
     Attributes:
         tuned: gains that were tuned for the least error, without regard to the second cost.
@@ -206,8 +206,8 @@ class TradedGains:
     def traded(self) -> dict[str, Any]:
         """Return the JSON entry of this point: weight, cost, error [1], and whether it is on the front.
 
-        The weight is that of the cost in the objective of the tuning. A point is on the front unless another
-        point is better in error or cost and at least as good in the other.
+        The weight is that of the cost in the objective of the tuning. A point is not on the front if
+        another point has a smaller error or cost, and neither of them is larger.
         """
         axis = self.front.axis
         return {

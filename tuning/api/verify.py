@@ -70,7 +70,7 @@ def verify(path: Any, *, progress: bool = False, **options: Any) -> Verification
     """Check that the rig's controller code (runtime) returns the same force commands as the simulation.
 
     The runtime gets the sensor signals of simulated runs. The self-test of a bundle runs first. Code of a
-    bundle runs only if the bundle equals, byte for byte, this version's export of its gains.
+    bundle runs only if this version of jaxhil exports the same bundle, byte for byte, from its gains.
 
     Args:
         path: path of a bundle, of a gain file, or of the folder of a gain file; or a result of `tuning.tune`.
@@ -132,7 +132,7 @@ def _verify_bundle(folder: Path, key: Any, scenarios: int, seed: int, progress: 
 
 
 def _add_fmu_loop(document: dict[str, Any], files: Any, loaded: Any, progress: bool) -> dict[str, Any]:
-    """Simulate the loop with the bundle's two FMUs, if it has them; add the result to the document."""
+    """Compare a run of the bundle's FMUs with the simulation; add the comparison to the document."""
     import msgspec
 
     from tuning.bundle.fmu.closed_loop import compare_fmu_loop
@@ -154,7 +154,8 @@ def _add_fmu_loop(document: dict[str, Any], files: Any, loaded: Any, progress: b
 def _verify_gains(gains: Any, document: dict[str, Any], scenarios: int, seed: int, progress: bool):
     """Verify a gain file, or gains in memory.
 
-    Return `document` together with the result's JSON entries, and the loaded gains: None if they are invalid.
+    Return `document` with the result's JSON entries added, and the loaded gains. If the gains are invalid,
+    the second value is None.
     """
     with jax_context():
         import msgspec

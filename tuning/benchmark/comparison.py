@@ -50,8 +50,8 @@ class CompareSettings:
 class CompensatorMetrics(NamedTuple):
     """Metrics of one compensator on one mechanism, for each set of gains.
 
-    The sets of gains are "literature", the named settings of the compensator, and "tuned". A compensator
-    without gains, or with settings that hold for all mechanisms, is not tuned.
+    The sets of gains are "literature", the compensator's settings (named sets of gains for any mechanism),
+    and "tuned". A compensator without gains, or with settings, is not tuned.
     """
 
     compensator: str  # name of the compensator
@@ -97,7 +97,7 @@ def compare_compensators(
         processes: number of processes. With 0, this process computes all results, and an error ends the
             comparison.
         tell: callback, called with a description of the current work, the number of results (including
-            fractions of unfinished results), and the number of cached results.
+            fractions of unfinished results), and how many of these are cached.
         checkpoints: cache of results.
         scheduler: address of a cluster's scheduler, whose workers compute the results; None for no cluster.
     """
@@ -266,7 +266,7 @@ def _evaluate_in_processes(
 
 
 def _count_gains(compensator: str, axes: int) -> int:
-    """Return the number of a compensator's gains, which determines the compilation time."""
+    """Return the number of a compensator's gains; with more gains, the compilation takes longer."""
     from jaxhil.rig import COMPENSATORS
     from jaxhil.rig.six_axes import SIX_AXIS_COMPENSATORS
 
@@ -274,11 +274,11 @@ def _count_gains(compensator: str, axes: int) -> int:
 
 
 def build_scenario_sets(mechanisms: list[AnyMechanism], settings: CompareSettings) -> list[list[Any]]:
-    """Build the scenarios of all mechanisms.
+    """Build the scenario set of each mechanism.
 
-    Each entry is a `tuning.benchmark.runs.ScenarioSet` or, for six axes, a
-    `tuning.benchmark.six_axis_runs.SixAxisScenarioSet`. Mechanisms that share a compiled program are in the
-    same inner list.
+    A scenario set is a `tuning.benchmark.runs.ScenarioSet` or, for six axes, a
+    `tuning.benchmark.six_axis_runs.SixAxisScenarioSet`. Each inner list of the result contains the sets of
+    mechanisms that share one compiled program.
     """
     from tuning.benchmark.runs import build_scenario_set
     from tuning.benchmark.six_axis_runs import build_six_axis_scenario_set
@@ -302,7 +302,7 @@ def evaluate_compensator(
     settings: CompareSettings,
     tell: ComparisonProgress = lambda text, share: None,
 ) -> list[CompensatorMetrics]:
-    """Tune one compensator for mechanisms that share a program, and compute its metrics on each mechanism.
+    """Tune a compensator for mechanisms that share a compiled program; compute its metrics on each of them.
 
     `tell` is a callback, called with a description of the current work and the completed fraction.
     """

@@ -32,7 +32,7 @@ from tuning.transparency.pushes import (
 
 
 class ScenarioSet(NamedTuple):
-    """Scenarios of one one-axis mechanism, as NumPy arrays; they are the same for all compensators."""
+    """Scenarios of one one-axis mechanism, as NumPy arrays; all compensators use the same scenarios."""
 
     mechanism: Mechanism  # mechanism with its uncertainty
     common: CommonProgram  # program that the mechanism shares with other mechanisms
@@ -77,7 +77,7 @@ class ScenarioSet(NamedTuple):
 
 
 def build_scenario_set(mechanism: Mechanism, common: CommonProgram, scenarios: int, seed: int) -> ScenarioSet:
-    """Draw the scenarios of a mechanism, add damping to copies of them, and compute the ideal contacts."""
+    """Draw a mechanism's scenarios, make copies with additional damping, and compute the ideal contacts."""
     draws = draw(mechanism, scenarios, seed)
     damped_mechanism, damped_draws = perturb_damping(mechanism, draws)
     plain = common.scenarios(mechanism, build_scenarios(mechanism, draws, seed))
@@ -94,7 +94,7 @@ def build_scenario_set(mechanism: Mechanism, common: CommonProgram, scenarios: i
 def _run_scenarios(
     scene: ScenarioSet, law: str, gains: Mapping[str, float], ideal_contacts: IdealContacts
 ) -> PerturbedOutcomes:
-    """Simulate each scenario four times in one batch: unperturbed, with either push, and with damping."""
+    """Simulate each scenario four times: unperturbed, with an early push, with a late push, and damped."""
     plain, damped = (add_probe(scenarios, ideal_contacts) for scenarios in (scene.plain, scene.damped))
     early = add_probe(scene.plain, ideal_contacts, EARLY_PUSH_CENTRE)
     late = add_probe(scene.plain, ideal_contacts, LATE_PUSH_CENTRE)

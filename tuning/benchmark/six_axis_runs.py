@@ -14,7 +14,7 @@ from tuning.transparency.metrics import compute_error_metrics, compute_ratio_met
 
 
 class SixAxisScenarioSet(NamedTuple):
-    """Scenarios of one six-axis mechanism, as NumPy arrays; they are the same for all compensators."""
+    """Scenarios of one six-axis mechanism, as NumPy arrays; all compensators use the same scenarios."""
 
     mechanism: SixAxisMechanism  # mechanism with its uncertainty
     scenarios: Any  # scenarios with their ideal contacts
@@ -30,8 +30,9 @@ class SixAxisScenarioSet(NamedTuple):
     ) -> dict[str, IntervalEstimate]:
         """Simulate a compensator with the given gains in all scenarios, and compute its metrics by name.
 
-        The metrics are those of `tuning.transparency.metrics` for the twist error, the rms energy error
-        `energy_rms`, and the number `not_ended` of episodes that did not end.
+        `tuning.transparency.metrics` defines the metrics of the twist error. Two metrics are added:
+        `energy_rms`, the rms energy error, and `not_ended`, the number of episodes (contacts with all their
+        touches) that did not end.
 
         Args:
             law: name of the compensator.
@@ -56,7 +57,7 @@ class SixAxisScenarioSet(NamedTuple):
 
 
 def build_six_axis_scenario_set(mechanism: SixAxisMechanism, scenarios: int, seed: int) -> SixAxisScenarioSet:
-    """Draw the scenarios of a mechanism, and compute their ideal contacts, once for all compensators."""
+    """Draw the scenarios of a mechanism, and compute their ideal contacts, for use by all compensators."""
     model = choose_rig_model(mechanism)
     drawn = model.scenarios(mechanism, draw(mechanism, scenarios, seed), seed)
     return SixAxisScenarioSet(mechanism, model.with_ideal_contacts([drawn])[0])

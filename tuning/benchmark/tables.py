@@ -77,9 +77,9 @@ def build_mechanism_table(name: str, results: Sequence[CompensatorMetrics]) -> T
 
 
 def build_leaderboard(names: Sequence[str], results: Mapping[str, Sequence[CompensatorMetrics]]) -> Table:
-    """Build the table of rms errors [%], restitution or twist error, with a row for each mechanism.
+    """Build the table of the rms restitution or twist errors [%], with a row for each mechanism.
 
-    The columns are the compensators, and their named settings.
+    Each compensator has one column, and a further one for each of its settings (named sets of gains).
     """
     flat = [result for name in names for result in results[name]]
     laws = list(dict.fromkeys(result.compensator for result in flat))

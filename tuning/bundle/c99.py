@@ -200,11 +200,11 @@ def generate_c99(document: Mapping[str, Any], source: str = "gain document") -> 
 
 
 def test_program(controller: str, columns: str) -> str:
-    """Return the program that replays vectors.csv.
+    """Return the C program that replays the test vectors of vectors.csv.
 
     Args:
         controller: C code that includes the controller's headers and declares the controller.
-        columns: C code that defines the columns, and the functions that call the controller.
+        columns: C code that defines the columns of the file, and the functions that call the controller.
     """
     text = _read_text(TEST_FILE)
     return text.replace("@controller@\n", controller).replace("@columns@\n", columns)
@@ -216,7 +216,7 @@ def _read_text(file: str) -> str:
 
 @functools.cache
 def _generate_code(law: str, class_: type[Any], axes: int) -> tuple[CProgram, str, str]:
-    """Return the program of the controller with the compensator `law`, its declarations and definitions."""
+    """Return a controller's C program, the text of its declarations, and the text of its definitions."""
     kind = kind_of({"axes": axes})
     members = {name: inspect.getattr_static(kind.controller, name) for name in kind.methods}
     functions: dict[str, Any] = {
@@ -249,7 +249,7 @@ def _generate_code(law: str, class_: type[Any], axes: int) -> tuple[CProgram, st
 
 
 def _program(class_: type[Any], kind: ControllerKind, functions: Mapping[str, Any]) -> CProgram:
-    """Return a C program, still without functions, for a controller with a compensator's class."""
+    """Return a C program without functions, for a controller with the compensator `class_`."""
     enumerators = {fault.name.upper(): fault.bit for fault in kind.faults} | {"UNUSABLE": UNUSABLE}
     enumerators |= {status.name.upper(): status.number for status in STATUSES}
     return CProgram(
@@ -268,12 +268,12 @@ def _program(class_: type[Any], kind: ControllerKind, functions: Mapping[str, An
 def _initialisation(
     kind: ControllerKind, law_fails: bool, guard_fails: bool, has_status: bool
 ) -> tuple[str, str]:
-    """Return prototypes and definitions of the functions that Python has in `__init__`.
+    """Return prototypes and definitions of `jaxhil_init` and, on one axis, `jaxhil_identified`.
 
     Args:
         kind: kind of controller.
-        law_fails: whether the compensator's constructor has an error flag.
-        guard_fails: whether the constructor of the controller's guards has an error flag.
+        law_fails: whether the compensator's constructor may fail; its C function then has an error argument.
+        guard_fails: the same for the controller's method `_guard`.
         has_status: whether the compensator has a status.
     """
     is_one_axis = kind is ONE_AXIS

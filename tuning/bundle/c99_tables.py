@@ -34,7 +34,7 @@ NO_CONTRACTION = """\
 
 
 class CFragment(NamedTuple):
-    """C code of one table, divided by the files that contain it."""
+    """C code of one table, in one part for the header file and one for the source file."""
 
     comment: str  # comment above the declarations
     declarations: str  # code for the header file
@@ -133,7 +133,7 @@ def statuses_fragment() -> CFragment:
 
 
 def constants_check() -> str:
-    """Return a C function that checks the constants of the numerical model in six axes."""
+    """Return a C function that checks the constants of a six-axis controller, such as the mass matrix."""
     lowest, highest = (format_double(bound) for bound in MATRIX_ENTRIES)
     return (
         "static bool jaxhil_constants_fit(const jaxhil_constants *constants) {\n"
@@ -156,7 +156,7 @@ def constants_check() -> str:
 
 
 def gain_file_constants(gain_file: Any, kind: ControllerKind) -> str:
-    """Return C constants with the content of a gain file: gains, limits, and constants in six axes."""
+    """Return C constants with a gain file's content: gains, limits and, for six axes, model constants."""
     specifications = kind.compensators[gain_file.compensator].gains
     units = {"control_period": "s", **({"clearance": "m"} if kind.axes == 1 else {})}
     units |= {name: gain.unit for name, gain in specifications.items()}
@@ -172,7 +172,7 @@ def gain_file_constants(gain_file: Any, kind: ControllerKind) -> str:
 
 
 def _model_constants(constants: Any) -> str:
-    """Return the C constant of the numerical model's constants."""
+    """Return a C struct with the constants of a six-axis controller, such as the mass matrix."""
     lines = []
     for name, value in constants._asdict().items():
         if isinstance(value, float):
@@ -191,7 +191,7 @@ def _row(values: Sequence[float]) -> str:
 
 
 def _initialisers(values: Mapping[str, float], units: Mapping[str, str]) -> str:
-    """Return the C initialisers of a struct's fields, in order; before C++20, they cannot name the fields."""
+    """Return the C initialisers of a struct's fields, in order; initialisers with names require C++20."""
     return "".join(
         f"    {format_double(value)}, /* {name}, {units[name]} */\n" for name, value in values.items()
     )
@@ -204,7 +204,7 @@ def _define_struct(name: str, entries: Iterable[tuple[str, str]]) -> str:
 
 
 def _range_condition(name: str, lowest: float, highest: float, struct: str = "gains") -> str:
-    """Return the C condition that a field is within its range, and finite if the range is unbounded."""
+    """Return the C condition that a field is within its range and, if a bound is infinite, finite."""
     open_below, open_above = math.isinf(lowest), math.isinf(highest)
     conditions = [f"isfinite({struct}->{name})"] * (open_below or open_above)
     conditions += [] if open_below else [f"{struct}->{name} >= {format_double(lowest)}"]

@@ -77,7 +77,7 @@ def find_code_differences(folder: Path, compensator: str, axes: int = 1) -> list
 
 
 def check_bundle_code(folder: Path, compensator: str, axes: int) -> None:
-    """Raise `InputError` if the folder is a bundle that is damaged or contains code of another version."""
+    """Raise `InputError` if the folder is a bundle with damage, or with code of another jaxhil version."""
     reasons = find_code_differences(folder, compensator, axes) if is_bundle(folder) else []
     if reasons:
         raise InputError(f"{to_one_line(str(folder))}: {reasons[0]}: for details, run jaxhil verify")
@@ -135,9 +135,9 @@ def _check_manifest(folder: Path, signed_by: SignatureCheck | None) -> BundleChe
 
 
 def _export_again(files: Mapping[str, bytes], document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the files that this version exports for a gain document.
+    """Return the files of a bundle as this version of jaxhil exports them for its gain document.
 
-    The test vectors, the plot and the libraries of FMUs are those of the bundle.
+    The test vectors, the plot and the FMUs' libraries are taken from the bundle's `files`.
     """
     plot = PLOT.search(files["summary.html"])
     drawn = base64.b64decode(plot[1], validate=True) if plot else b""
@@ -173,7 +173,7 @@ def _find_export_differences(
 
 
 def _describe_origin(files: Mapping[str, bytes]) -> str:
-    """Describe which version exported the bundle according to its manifest, and what the user can do."""
+    """Return a message that the bundle's code was not run, with the version that the manifest names."""
     stated, present = json.loads(files[selftest.MANIFEST_FILE]).get("version"), package_version()
     if stated is None:
         return f"no code of the bundle was run: its manifest names no version, and this is {present}"

@@ -31,18 +31,18 @@ SIX_AXIS_READINGS = ("wrench_measured", "pose_measured", "pose", "twist")
 
 
 class FmuContact(msgspec.Struct, frozen=True):
-    """Nominal contact in the loop of both FMUs, and in the simulation."""
+    """Nominal contact, as computed with the FMUs of controller and rig, and as simulated."""
 
     restitution: float | None  # restitution with the FMUs [1]; None if the contact does not end
     simulated_restitution: float | None  # restitution of `simulate` with the master's period [1]
-    status: str  # status of the contact in the loop of FMUs
+    status: str  # status of the contact with the FMUs
     simulated_status: str  # status of the contact in the simulation
 
 
 class FmuLoop(msgspec.Struct, frozen=True):
-    """Comparison of the nominal run in the loop of both FMUs with the simulation.
+    """Comparison of the nominal run with the FMUs of controller and rig to the simulated nominal run.
 
-    On one axis, the contacts are compared; with six axes, the final twist.
+    On one axis, the contacts are compared; with six axes, the twist at the end of the run.
     """
 
     fmi: int  # version of FMI
@@ -53,18 +53,19 @@ class FmuLoop(msgspec.Struct, frozen=True):
 
 
 def compare_fmu_loop(files: Mapping[str, bytes], loaded: Any) -> FmuLoop | None:
-    """Close the loop through the FMUs of a checked bundle; compare the nominal contacts with the simulation.
+    """Run the nominal contacts with the FMUs of a checked bundle, and compare them with the simulation.
 
     The libraries are compiled from the sources, which `check_bundle` has verified. The sequential master adds
-    one period to the command latency. The controller's limits are left out, because they may stop this run.
-    On one axis, noise is left out as well: the rig's FMU has another random generator.
+    one period to the command latency. The controller has no limits here, because they may stop this run. On
+    one axis, the sensors have no noise, because the random generators of FMU and simulation differ.
 
     Args:
         files: content of the bundle's files.
         loaded: gain file of the bundle.
 
     Returns:
-        The comparison; None if there is no compiler, or no pair of FMUs that the simulation can repeat.
+        The comparison. It is None without a compiler or FMU of the rig, or if the simulation cannot repeat
+        the run: the latency is out of range or, on one axis, the force sensor has a bias.
     """
     document, mechanism = loaded.document, loaded.mechanism
     fmi = next((version for version in (3, 2) if f"fmi{version}/{rig.IDENTIFIER}.fmu" in files), None)
@@ -84,7 +85,7 @@ def compare_fmu_loop(files: Mapping[str, bytes], loaded: Any) -> FmuLoop | None:
 
 
 def _compare_contacts(files: Mapping[str, bytes], fmi: int, loaded: Any, mechanism: Mechanism) -> FmuLoop:
-    """Compare the nominal contacts on one axis."""
+    """Compare the nominal contacts with the FMUs to the simulated ones, on one axis."""
     latency, quiet = mechanism.rig.command_latency, _without_noise(mechanism)
     expected = simulate(quiet, loaded.compensator, loaded.gains).contacts
     contacts = _run_loop(files, fmi, loaded.document, quiet)
@@ -101,7 +102,7 @@ def _compare_contacts(files: Mapping[str, bytes], fmi: int, loaded: Any, mechani
 
 
 def _compare_final_twist(files: Mapping[str, bytes], fmi: int, loaded: Any, mechanism: Any) -> FmuLoop:
-    """Compare the twist at the end of the nominal run with six axes."""
+    """Compare the final twist of the nominal run with the FMUs to the simulated one, with six axes."""
     latency, period = mechanism.rig.command_latency, mechanism.rig.control_period
     final = simulate_six_axes(mechanism, loaded.compensator, loaded.gains).final
     ticks = round(final.time / period)
@@ -117,7 +118,7 @@ def _compare_final_twist(files: Mapping[str, bytes], fmi: int, loaded: Any, mech
 
 
 def _find_difference(contact: FmuContact) -> str:
-    """Return the difference between both loops in words; an empty text if they agree."""
+    """Describe the difference between FMUs and simulation; return an empty text if they agree."""
     found, simulated = contact.restitution, contact.simulated_restitution
     if contact.status != contact.simulated_status:
         return f"status '{contact.status}' with both FMUs, expected '{contact.simulated_status}'"
@@ -143,7 +144,7 @@ def _without_noise(mechanism: Mechanism) -> Mechanism:
 def _both_fmus(
     files: Mapping[str, bytes], fmi: int, document: Mapping[str, Any], mechanism: AnyMechanism, **noise: float
 ) -> Iterator[tuple[FmuInstance, FmuInstance]]:
-    """Return initialised instances of controller and rig, the controller without limits."""
+    """Context manager: provide the FMUs of controller (without limits) and rig (with `noise`)."""
     period, limits = mechanism.rig.control_period, kind_of(document).limits
     regulator = FmuInstance(
         files[f"fmi{fmi}/{controller.IDENTIFIER}.fmu"], controller_variables(document), period
@@ -159,7 +160,7 @@ def _both_fmus(
 def _run_six_axis_loop(
     files: Mapping[str, bytes], fmi: int, document: Mapping[str, Any], mechanism: Any, ticks: int
 ) -> np.ndarray:
-    """Run the loop of both FMUs as a sequential master, the controller first; return the final twist (6,)."""
+    """Step the FMUs in turn, the controller's first, for `ticks` periods; return the final twist (6,)."""
     readings = [name for vector in SIX_AXIS_READINGS for name in six_axis_names(vector)]
     commands = [name for vector in ("wrench_command", "pose_command") for name in six_axis_names(vector)]
     with _both_fmus(files, fmi, document, mechanism) as (regulator, plant):
@@ -178,9 +179,9 @@ def _run_six_axis_loop(
 
 
 def _run_loop(files: Mapping[str, bytes], fmi: int, document: Mapping[str, Any], mechanism: Mechanism):
-    """Run the nominal contacts like a sequential master, with the controller before the rig; return them.
+    """Step the FMUs in turn, the controller's first, until all contacts end or one fails; return them.
 
-    Each run begins at the speed of the previous rebound.
+    With one contact surface, each contact is a new run, which begins at the speed of the previous rebound.
     """
     watch, contacts, two_sided = ContactDetector(mechanism), [], math.isfinite(mechanism.contact.clearance)
     with _both_fmus(files, fmi, document, mechanism, force_noise=0.0, position_noise=0.0) as (

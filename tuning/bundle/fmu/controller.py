@@ -70,7 +70,7 @@ def controller_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
 
 
 def _log_constants(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return heading and mapping of the flight log, as string literals of C."""
+    """Return the flight log's first line, and the mapping file that describes the log, as C strings."""
     mass = None
     if kind_of(document) is ONE_AXIS:
         mass = from_plain_data(copy.deepcopy(document["mechanism"]), "gain document").bodies.mass
@@ -84,7 +84,7 @@ def _log_constants(document: Mapping[str, Any]) -> dict[str, str]:
 
 
 def fmu_test_program(document: Mapping[str, Any], fmi: int) -> str:
-    """Return the C program that replays vectors.csv through the FMU, to be compiled with the FMU's sources.
+    """Return a C program that replays the test vectors with the FMU; it needs the FMU's sources to compile.
 
     Args:
         document: gain document.

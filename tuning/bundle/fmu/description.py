@@ -99,7 +99,7 @@ def unit_exponents(unit: str) -> dict[str, int] | None:
 
 
 def _add_units(root: Element, variables: Sequence[Variable]) -> None:
-    """Add the definitions of all units in use."""
+    """Add the XML definitions of all units that the variables use."""
     units = SubElement(root, "UnitDefinitions")
     for name in dict.fromkeys(variable.unit for variable in variables):
         if name == "1":
@@ -111,7 +111,7 @@ def _add_units(root: Element, variables: Sequence[Variable]) -> None:
 
 
 def _add_variable(listed: Element, reference: int, variable: Variable, fmi: int) -> None:
-    """Add a variable; in FMI 2, the attributes that depend on the type are in an inner element."""
+    """Add a variable's XML element; in FMI 2, an inner element has the attributes that depend on the type."""
     common = {
         "name": variable.name,
         "valueReference": str(reference),
@@ -144,7 +144,7 @@ def _add_variable(listed: Element, reference: int, variable: Variable, fmi: int)
 
 
 def _start_text(variable: Variable) -> str:
-    """Return the start value as XML text."""
+    """Return the start value of a variable as XML text."""
     if variable.type == "string":
         return ""
     if variable.type == "boolean":
@@ -153,7 +153,7 @@ def _start_text(variable: Variable) -> str:
 
 
 def _add_structure(root: Element, variables: Sequence[Variable], fmi: int) -> None:
-    """Add the list of outputs.
+    """Add the XML element `ModelStructure`, which lists the outputs.
 
     The outputs change only at the ends of steps. The list therefore states no direct dependency on an input.
     """

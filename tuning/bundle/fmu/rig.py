@@ -115,7 +115,7 @@ def _model_files(document: Mapping[str, Any], mechanism: AnyMechanism) -> dict[s
 
 
 def _without_extra_periods(document: Mapping[str, Any]) -> AnyMechanism:
-    """Return the mechanism without the command latency that the co-simulation itself adds."""
+    """Return the mechanism of a gain document, without the command latency that a co-simulation adds."""
     mechanism = any_from_plain_data(copy.deepcopy(document["mechanism"]), "gain document")
     extra = document.get("figures", {}).get("co_simulation", {}).get("extra_periods", 0)
     if not 0 <= extra <= mechanism.rig.command_latency:
@@ -235,7 +235,7 @@ def rig_constants(mechanism: Mechanism) -> str:
 
 
 def _simulator_tables(plant: PlantConstants) -> list[str]:
-    """Return the C tables of the motion simulator; an ideal simulator gets a state that is always 0."""
+    """Return the C tables of the motion simulator; those of an ideal one have a state that is always 0."""
     rows = plant.rows
     order = max(1, len(rows.transition))
 
@@ -254,7 +254,7 @@ def _simulator_tables(plant: PlantConstants) -> list[str]:
 
 
 def _contact_tables(contact: Contact) -> tuple[list[list[float]], list[float], list[float]]:
-    """Return stiffness and damping of each contact, and the depths at which layers end."""
+    """Return the stiffnesses (one per layer) and damping of each contact, and the depths where layers end."""
     count = max(len(contact.stiffness), len(contact.damping))
     slopes = [contact.stiffness[min(number, len(contact.stiffness) - 1)] for number in range(count)]
     damping = [float(contact.damping[min(number, len(contact.damping) - 1)]) for number in range(count)]

@@ -70,9 +70,9 @@ const double rig_start[RIG_NUMBERS] = {start};
 
 
 class RigState(NamedTuple):
-    """State of the rig after the sensors were read.
+    """State of the rig, which the C functions `rig_move` and `rig_sense` change in turn.
 
-    Until they are read, the state of the contact is that of the previous tick.
+    The contact's own state, such as its memories, changes only in `rig_sense`.
     """
 
     run: RunState
@@ -87,7 +87,7 @@ def rig_program(document: Mapping[str, Any], mechanism: SixAxisMechanism) -> dic
         mechanism: mechanism of the document, without the command latency that the co-simulation adds.
 
     Raises:
-        InputError: If the program has a part that the generator cannot print.
+        InputError: If a part of the rig's JAX program cannot be translated to C.
     """
     gains = {name: float(gain["value"]) for name, gain in document["gains"].items()}
     plain = json.dumps([document["mechanism"], mechanism.rig.command_latency, document["compensator"], gains])
@@ -96,7 +96,7 @@ def rig_program(document: Mapping[str, Any], mechanism: SixAxisMechanism) -> dic
 
 @lru_cache(maxsize=8)
 def _generate(plain: str) -> tuple[tuple[str, str], ...]:
-    """Return names and texts of the C files for the content of a gain document, as JSON."""
+    """Return name and text of each C file; `plain` is JSON: mechanism, latency, compensator, gains."""
     raw, latency, compensator, gains = json.loads(plain)
     raw["rig"]["command_latency"] = latency
     mechanism = any_from_plain_data(raw, "gain document")
@@ -125,9 +125,9 @@ def _generate(plain: str) -> tuple[tuple[str, str], ...]:
 def _start(
     loop: Loop, rig: RigConstants, scenario: Scenario, compensator: str, gains: Mapping[str, float]
 ) -> RigState:
-    """Return the state before the sensors are read at tick 0.
+    """Return the rig's state at tick 0, before the sensors are read.
 
-    The hardware still follows the last pose command before tick 0, because the master delays commands by one
+    Its latest pose command is that of the previous tick, because a co-simulation delays commands by one
     period.
     """
     position, rates, _ = model_motion(rig.bodies, scenario.start)

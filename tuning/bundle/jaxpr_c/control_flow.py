@@ -13,7 +13,7 @@ Values = Sequence[Value]
 def add_branches(
     add: AddFunction, statements: Statements, params: dict[str, Any], values: Values, results: Values
 ) -> None:
-    """Add a choice between functions; an index beyond the last function chooses the last one."""
+    """Add C code that calls one of several functions by an index; any invalid index calls the last one."""
     index = values[0].element()
     arguments = ", ".join([*(_argument(statements, value) for value in values[1:]), *map(_target, results)])
     *first, last = [f"{{ {add(branch)}({arguments}); }}" for branch in params["branches"]]
@@ -24,7 +24,7 @@ def add_branches(
 def add_while(
     add: AddFunction, statements: Statements, params: dict[str, Any], values: Values, results: Values
 ) -> None:
-    """Add a loop that ends when the condition is false."""
+    """Add a C loop, which calls two functions: the condition and, while it is true, the body."""
     tested, body = add(params["cond_jaxpr"]), add(params["body_jaxpr"])
     arguments = [_argument(statements, value) for value in values]
     first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
@@ -42,7 +42,7 @@ def add_while(
 def add_scan(
     add: AddFunction, statements: Statements, params: dict[str, Any], values: Values, results: Values
 ) -> None:
-    """Add a loop with a constant number of steps."""
+    """Add a C loop that calls its body, a function, a constant number of times."""
     body, count = add(params["jaxpr"]), params["length"]
     constant_count, carry_count = params["num_consts"], params["num_carry"]
     carry, stacked = results[:carry_count], results[carry_count:]
@@ -67,35 +67,35 @@ CONTROL_FLOW = {"cond": add_branches, "while": add_while, "scan": add_scan}
 
 
 def _argument(statements: Statements, value: Value) -> str:
-    """Return the argument of a call; copy an array whose elements are not in successive places."""
+    """Return the C argument that passes a value to a function; copy an array that is not contiguous first."""
     return _passed(statements.contiguous(value))
 
 
 def _passed(value: Value) -> str:
-    """Return the argument for a value in successive places."""
+    """Return the C argument that passes a contiguous value to a function: a number or a pointer."""
     if value.size == 1:
         return value.element()
     return f"{value.name} + {value.offset}" if value.offset else value.name
 
 
 def _target(value: Value) -> str:
-    """Return the argument for the place of a result."""
+    """Return the C argument that tells a function where to store a result: a pointer."""
     return f"&{value.name}" if value.is_uniform else value.name
 
 
 def _row(value: Value, count: int, step: str) -> str:
-    """Return the argument for one step's part of stacked inputs."""
+    """Return the C argument that passes row `step` of an input with `count` rows to the body of a loop."""
     size = value.size // count
     return value.element(step) if size == 1 else f"{_passed(value)} + {size} * {step}"
 
 
 def _row_target(value: Value, count: int, step: str) -> str:
-    """Return the argument for the place of one step's part of stacked results."""
+    """Return the C argument, a pointer, for row `step` of a result in which a loop stores `count` rows."""
     return f"&{value.name}" if value.is_uniform else f"{value.name} + {value.size // count} * {step}"
 
 
 def _assign(results: Values, values: Values) -> str:
-    """Return the statements that copy values."""
+    """Return the C statements that copy `values` to `results`."""
     return " ".join(
         loops(
             [result.size],

@@ -148,7 +148,7 @@ static int64_t clamp_index(int64_t index, int64_t highest) {
 
 
 def expression(name: str, params: dict[str, Any], values: Sequence[Value]) -> Expression | None:
-    """Return a function that converts the operands' elements to the C expression of the result's element.
+    """Return a function that writes a JAX primitive in C; its arguments are elements of the operands.
 
     Args:
         name: name of the primitive.
@@ -203,7 +203,7 @@ def _integer(name: str, type_name: str) -> Expression | None:
 
 
 def _select(values: Sequence[Value]) -> Expression:
-    """Return the selection of one of several cases by a condition or by an integer."""
+    """Return a function that writes the C expression for selecting a case by a boolean or an integer."""
     if values[0].type == "bool":
         return "{0} ? {2} : {1}".format
     tests = "".join(f"{{0}} == {n} ? {{{n + 1}}} : " for n in range(len(values) - 2))
@@ -227,7 +227,7 @@ def _convert(element: str, old: str, new: str) -> str:
 
 
 def _power(element: str, exponent: int, type_name: str) -> str:
-    """Return an integer power as products, in the order of repeated squaring."""
+    """Return the C expression of an integer power, with its products in the order of repeated squaring."""
     if type_name != "float64":
         raise UnsupportedProgram(f"integer_pow: found {type_name}, expected float64")
     if exponent == 0:
