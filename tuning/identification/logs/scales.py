@@ -180,11 +180,15 @@ def estimate_force_beside_contacts(force: np.ndarray, contacts: list[tuple[int, 
 
 
 def _estimate_impulse_error(force: np.ndarray, period: float, contacts: list[tuple[int, int]]) -> float:
-    """Return the standard deviation [N s] of the total impulse of all contacts, due to the noise."""
+    """Return the standard deviation [N s] of the impulses of all contacts together, due to the noise.
+
+    The noise hides the ends of a contact. The force beside the contact, which is subtracted from all of its
+    readings, may therefore be wrong by as much as the noise's standard deviation.
+    """
     steps = np.abs(np.diff(force[:MAX_EVALUATED_ROWS]))
     std = 1.4826 * float(np.nanmedian(steps)) / np.sqrt(2.0)
-    rows = sum(end - begin + 2 * SPEED_SPAN_TICKS for begin, end in contacts)
-    return std * period * float(np.sqrt(rows))
+    rows = [end - begin + 2 * SPEED_SPAN_TICKS for begin, end in contacts]
+    return std * period * float(np.linalg.norm(rows))
 
 
 def _estimate_force_ratio(
