@@ -37,7 +37,7 @@ _MIN_UNIFORM, _MAX_UNIFORM = 2.0**-54, 1.0 - 2.0**-53
 
 
 def correlate(mechanism: AnyMechanism, uniform: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the uniform random numbers of every key, correlated as the mechanism states.
+    """Return the uniform random numbers of every key, correlated by the table ``[correlation]``.
 
     `uniform` contains independent uniform random numbers, an array (draws, columns) for each key. The result
     has the same form.
@@ -76,7 +76,7 @@ def find_correlated_groups(mechanism: AnyMechanism) -> list[tuple[str, ...]]:
 
 
 def fix_at_nominal(mechanism: Mechanism, keys: Collection[str]) -> Mechanism:
-    """Return the mechanism with some keys fixed at their nominal values; other keys stay uncertain."""
+    """Return the mechanism with `keys` fixed at their nominal values; the remaining keys stay uncertain."""
     uncertainty = {key: entry for key, entry in mechanism.uncertainty.items() if key not in keys}
     table = mechanism.correlation
     reduced = table and remove_keys(table.keys, table.matrix, keys)
@@ -90,7 +90,7 @@ def fix_at_nominal(mechanism: Mechanism, keys: Collection[str]) -> Mechanism:
 def remove_keys(
     keys: Sequence[str], matrix: Sequence[Sequence[Any]], removed: Collection[str]
 ) -> tuple[list[str], list[list[Any]]] | None:
-    """Remove keys from the lower triangle of a correlation matrix; return None if no key remains."""
+    """Return the remaining keys and the lower triangle of their correlation matrix; None if none remains."""
     rest = [i for i, key in enumerate(keys) if key not in removed]
     triangle = [[matrix[row][column] for column in rest if column <= row] for row in rest]
     return ([keys[i] for i in rest], triangle) if rest else None

@@ -112,7 +112,7 @@ def load_any(
 
 
 def source_sha256(mechanism: AnyMechanism) -> str:
-    """Return the SHA-256 of the mechanism's file in hexadecimal or, without a file, of its content."""
+    """Return the hexadecimal SHA-256 of a mechanism's file, or of its content if it comes from no file."""
     content = _content_sha256(mechanism)
     return _file_hashes.get(content, content)
 

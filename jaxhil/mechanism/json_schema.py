@@ -64,7 +64,7 @@ def _tables(kind: type[msgspec.Struct]) -> dict[str, Any]:
 
 
 def _add_prefix(node: Any) -> Any:
-    """Add the six-axis prefix to the references to tables in a schema."""
+    """Add `SIX_AXIS_PREFIX` to the names of the tables that a schema refers to."""
     if isinstance(node, list):
         return [_add_prefix(entry) for entry in node]
     if not isinstance(node, dict):
@@ -103,9 +103,9 @@ def _clean_schema(node: Any) -> Any:
 
 
 def _add_short_forms(node: dict[str, Any]) -> dict[str, Any]:
-    """Let the schema of six numbers or of a matrix also accept their short forms.
+    """Extend the schema of a list of six numbers, or of a matrix, to accept one number instead.
 
-    The short form is one number or, for six numbers, also a table of two numbers.
+    The schema of six numbers also accepts a table of two numbers.
     """
     full = _clean_schema(
         {key: value for key, value in node.items() if key not in ("six", "square", "description")}

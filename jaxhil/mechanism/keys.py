@@ -72,7 +72,7 @@ def _first_paragraph(kind: inspect.StructType) -> str:
 
 
 def _table_of(kind: inspect.Type) -> inspect.StructType | inspect.DictType | None:
-    """Return the struct or dictionary type of a key that is a table, else None."""
+    """Return the struct or dictionary type of a key that is a table; None for any other key."""
     match kind:
         case inspect.Metadata(type=inner):
             return _table_of(inner)
@@ -85,7 +85,7 @@ def _table_of(kind: inspect.Type) -> inspect.StructType | inspect.DictType | Non
 
 
 def _describe_key(field: inspect.Field, path: str) -> KeyDescription:
-    """Describe the key at a path. Raise ValueError if its type has no description or no unit."""
+    """Describe the key at a path. Raise ValueError if it has no description, or is a number without unit."""
     meaning = next(_find_descriptions(field.type), "")
     if not meaning:
         raise ValueError(f"{path}: found no description in the type of the key, expected one")
@@ -118,7 +118,7 @@ def _find_descriptions(kind: inspect.Type) -> Iterator[str]:
 
 
 def _unit(kind: inspect.Type, path: str, extra: Mapping[str, Any] | None = None) -> str | None:
-    """Return the unit of a number or a list of numbers, else None. Raise ValueError if it has no unit."""
+    """Return the unit of a type of numbers; None for other types. Raise ValueError if a number has none."""
     match kind:
         case inspect.Metadata(type=inner, extra=metadata):
             return _unit(inner, path, metadata)

@@ -66,7 +66,7 @@ def describe_struct(kind: type[Struct]) -> msgspec.inspect.StructType:
 
 @functools.cache
 def numeric_keys() -> dict[str, Range]:
-    """Return the allowed values of every real-valued key, or of its list entries, by dotted path."""
+    """Return the allowed values of the real numbers in a one-axis file, by the dotted path of the key."""
     return ranges_of(describe_struct(Mechanism), NO_METADATA)
 
 
@@ -109,7 +109,7 @@ def value_at(mechanism: Struct, path: str) -> Any:
 
 
 def _entry(table: Any, key: str) -> Any:
-    """Return the value of a table's key, or None if the table or the dictionary's entry is missing."""
+    """Return the value of a table's key; None if the table is None, or is a dictionary without the key."""
     if table is None:
         return None
     if isinstance(table, dict):

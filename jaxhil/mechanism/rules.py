@@ -86,8 +86,8 @@ def check_mechanism_rules(mechanism: Mechanism) -> None:
 def resolve_damping_ratio(mechanism: Mechanism) -> Mechanism:
     """Return the mechanism with `contact.damping` computed from its key `contact.damping_ratio`.
 
-    The mechanism is returned unchanged if it has no such key, or if `check_mechanism_rules` will reject the
-    key.
+    If the key is missing, return the mechanism unchanged. Do the same if no damping can be computed;
+    `check_mechanism_rules` then reports the problem.
     """
     contact, bodies = mechanism.contact, mechanism.bodies
     if contact.damping_ratio is None:
@@ -125,9 +125,9 @@ def _repeat_last(*lists: Sequence[Any]) -> list[tuple[Any, ...]]:
 def is_hurwitz(polynomial: Sequence[float]) -> bool:
     """Return whether all roots of a real polynomial (descending powers) have negative real parts.
 
-    This is true if and only if all entries in the first column of the Routh array, computed in exact rational
-    arithmetic, are nonzero and have the same sign (Routh 1877; Gantmacher, The Theory of Matrices, vol. 2,
-    ch. XV).
+    This is true if and only if all entries in the first column of the Routh array are nonzero and have the
+    same sign (Routh 1877; Gantmacher, The Theory of Matrices, vol. 2, ch. XV). The array is computed in exact
+    rational arithmetic.
     """
     coefficients = [Fraction(value) for value in polynomial]
     if coefficients[0] < 0:
@@ -151,7 +151,7 @@ def check_texts(mechanism: Any) -> None:
 
 
 def _check_bodies(mechanism: Mechanism) -> None:
-    """Raise `KeyProblem` unless the bodies have one equivalent mass, or two masses."""
+    """Raise `KeyProblem` unless the bodies have either an equivalent mass or two masses."""
     bodies = mechanism.bodies
     either = "either equivalent_mass, or both chaser_mass and target_mass"
     has_both = bodies.chaser_mass is not None and bodies.target_mass is not None
@@ -211,7 +211,7 @@ def _check_depths(path: KeyPath, law: ContactLaw, depths: Sequence[float]) -> No
 def _check_law_key(
     path: KeyPath, law: ContactLaw, contact: Any, uncertain: Collection[str], key: ContactKey
 ) -> None:
-    """Raise `KeyProblem` unless a contact has `key` if and only if its law uses the key."""
+    """Raise `KeyProblem` if a contact lacks a `key` that its law uses, or has an unused `key`."""
     value, laws = getattr(contact, key.name), laws_with_key(key)
     if law.name in laws and value is None:
         expected = f"{describe_allowed_at(type(contact), key.name)} (law {law.name} needs it)"
@@ -234,7 +234,7 @@ def is_damped(
 
 
 def check_simulator_model(simulator: Any, uncertain: Collection[str]) -> None:
-    """Raise `KeyProblem` unless the motion simulator has the keys of its model, and is stable."""
+    """Raise `KeyProblem` unless the motion simulator is stable and has exactly the keys of its model."""
     path = ("rig", "simulator")
     run_checks([lambda key=key: _check_model_key(simulator, uncertain, key) for key in _ALL_MODEL_KEYS])
     if simulator.model == "first_order" and not np.all(simulator.time_constant):
@@ -248,7 +248,7 @@ def check_simulator_model(simulator: Any, uncertain: Collection[str]) -> None:
 
 
 def _check_model_key(simulator: Any, uncertain: Collection[str], key: str) -> None:
-    """Raise `KeyProblem` unless the motion simulator has `key` if and only if its model uses it."""
+    """Raise `KeyProblem` if a motion simulator lacks a `key` that its model uses, or has an unused `key`."""
     path, value = ("rig", "simulator", key), getattr(simulator, key)
     is_used = key in KEYS_OF_MODELS[simulator.model]
     if is_used and value is None:
@@ -290,7 +290,7 @@ def _check_transfer_function(numerator: list[float], denominator: list[float]) -
 
 
 def _check_hold(mechanism: Mechanism) -> None:
-    """Raise `KeyProblem` if an ideal simulator with zero-order hold has a damped contact."""
+    """Raise `KeyProblem` for contact damping or friction if an ideal simulator has a zero-order hold."""
     # Such a simulator jumps at the ticks, where its velocity is not defined.
     rig, contact = mechanism.rig, mechanism.contact
     law, arguments = find_contact_law(contact.law), (("contact",), contact, mechanism.uncertainty)
@@ -315,7 +315,7 @@ def format_allowed_velocity_limit(approach: float) -> str:
 
 
 def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    """Raise `KeyProblem` unless the start of the approach lies between the two surfaces."""
+    """Raise `KeyProblem` unless the approach starts in the gap (clearance) between the two surfaces."""
     # The model starts at min(plane, 0) - v (0.02 s + phase T). The hardware lags behind the model by
     # the motion simulator's delay and lag, and by the command latency.
     extreme = build_extreme_function(mechanism, spans)
@@ -336,7 +336,7 @@ def _check_gap(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
 
 
 def _greatest_lag(simulator: Simulator, extreme: Callable[[str, int], Any]) -> float:
-    """Return the largest lag -G'(0) [s] of the motion simulator in uniform motion, excluding its delay."""
+    """Return the largest lag -G'(0) [s] of the motion simulator's transfer function G, without its delay."""
     path = "rig.simulator."
     if simulator.model == "first_order":
         return extreme(path + "time_constant", 1)

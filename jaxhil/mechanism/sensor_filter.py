@@ -19,9 +19,9 @@ from jaxhil.mechanism.structs import ForceSensor, SensorFilter
 
 
 class FilterModes(NamedTuple):
-    """Parallel form of a filter for the cutoff 1 rad/s, with one mode for each pair of conjugate poles.
+    """Sum of modes of a filter with the cutoff 1 rad/s: one for each real pole or pair of conjugate poles.
 
-    The output is the sum of Re(weights[m] y_m), where y_m' = rates[m] (F - y_m).
+    For the input F, the output is the sum of Re(weights[m] y_m), where dy_m/dt = rates[m] (F - y_m).
     """
 
     rates: tuple[complex, ...]  # rates of decay [rad/s]; a pole is -rate
@@ -29,18 +29,18 @@ class FilterModes(NamedTuple):
 
     @property
     def slowest(self) -> float:
-        """Return the decay rate [1/s] of the slowest mode, for the cutoff 1 rad/s."""
+        """Return the decay rate [1/s] of the slowest mode of the filter with the cutoff 1 rad/s."""
         return min(rate.real for rate in self.rates)
 
     @property
     def delay(self) -> float:
-        """Return the group delay [s] at low frequencies, for the cutoff 1 rad/s."""
+        """Return the group delay [s] at low frequencies of the filter with the cutoff 1 rad/s."""
         return sum((weight / rate).real for weight, rate in zip(self.weights, self.rates, strict=True))
 
 
 @functools.cache
 def find_modes(kind: str, order: int) -> FilterModes:
-    """Compute the parallel form of a Butterworth or Bessel filter with the cutoff 1 rad/s.
+    """Compute the modes (parallel form) of a Butterworth or Bessel filter with the cutoff 1 rad/s.
 
     Args:
         kind: "butterworth" or "bessel".
@@ -81,12 +81,12 @@ def settling_constant(sensor: ForceSensor | SixAxisForceSensor) -> float:
 
 
 def _butterworth_rates(order: int) -> list[complex]:
-    """Return the poles times -1, for the cutoff 1 rad/s. They are on the unit circle."""
+    """Return the negated poles of a Butterworth filter with the cutoff 1 rad/s, all on the unit circle."""
     return [cmath.exp(1j * math.pi * (2 * k - order + 1) / (2 * order)) for k in range(order)]
 
 
 def _bessel_rates(order: int) -> list[complex]:
-    """Return the poles times -1, for the cutoff 1 rad/s: scaled roots of the reverse Bessel polynomial."""
+    """Return the negated poles of a Bessel filter (roots of a Bessel polynomial) with the cutoff 1 rad/s."""
     coefficients = np.array(
         [
             math.factorial(2 * order - k)

@@ -92,7 +92,7 @@ class RigidBody(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Approach in free flight: motion of frame C relative to frame T at the first touch, along T's axes."""
+    """Approach in free flight: motion of the chaser's frame C in the target's frame T at the first touch."""
 
     offset: Annotated[
         list[Metre], Meta(min_length=2, max_length=2, description="x and y of the origin of C")
@@ -184,7 +184,7 @@ class Pattern(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class TargetPattern(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Rotation of the target's copies about z, in addition to the pattern's angle."""
+    """Rotation about z of the target's shapes in a circular pattern, in addition to the pattern's angles."""
 
     phase: Annotated[float, key_metadata("angle about z", "rad")]
 

@@ -148,6 +148,6 @@ def _check_friction(path: KeyPath, friction: Friction) -> None:
 
 
 def _file_values(shape: Shape) -> dict[str, Any]:
-    """Return the values of all keys of a shape except `shape`, by their names in the file."""
+    """Return the values of a shape's keys except `shape`, by the key's name in a mechanism file."""
     names = zip(shape.__struct_encode_fields__, shape.__struct_fields__, strict=True)
     return {key: getattr(shape, name) for key, name in names if name != "shape"}

@@ -160,7 +160,7 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Tool(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Tool on a moving force sensor, and the values that the controller assumes for the tool."""
+    """Tool that a moving force sensor carries, and the values that the controller assumes for the tool."""
 
     mass: Annotated[float, key_metadata("mass of the tool", "kg", ge=0.0)]
     com: Annotated[list[Metre], vector_metadata("centre of mass of the tool, in C axes")]

@@ -74,7 +74,7 @@ def check_contact_names(raw: Mapping[str, Any]) -> None:
 
 
 def check_leg_values(raw: Mapping[str, Any]) -> None:
-    """Raise `KeyProblem` unless a hexapod has values for legs, not for translation and rotation."""
+    """Raise `KeyProblem` if a hexapod has values for translation and rotation instead of for its legs."""
     simulator = raw["rig"]["simulator"]
     for key in PER_AXIS_KEYS:
         if simulator.get("space") == "stewart" and isinstance(simulator.get(key), Mapping):
@@ -102,7 +102,7 @@ def _check_inertia(path: KeyPath, inertia: Inertia, *, massless: bool = False) -
     """Check that a rigid body can have this inertia.
 
     Raise `KeyProblem` unless the matrix is symmetric and positive definite, and no principal moment exceeds
-    the sum of the others. If `massless` is true, the inertia may also be 0.
+    the sum of the other two. If `massless` is true, the inertia may also be 0.
     """
     if len({isinstance(entry, list) for entry in inertia}) > 1:
         raise KeyProblem(path, format_value(inertia), "three moments, or three rows of three entries")
@@ -186,7 +186,7 @@ def _rotate(rotation: list[float], vector: np.ndarray) -> np.ndarray:
 
 
 def _check_space(simulator: Simulator) -> None:
-    """Raise `KeyProblem` unless the motion simulator has the keys of its `space`, with valid values."""
+    """Raise `KeyProblem` unless the motion simulator's keys suit its `space` (kind of axes) and are valid."""
     path: KeyPath = ("rig", "simulator")
     required, optional = KEYS_OF_SPACES[simulator.space]
     for key in sorted({key for pair in KEYS_OF_SPACES.values() for keys in pair for key in keys}):
@@ -208,7 +208,7 @@ def _check_space(simulator: Simulator) -> None:
 
 
 def _check_hold(mechanism: SixAxisMechanism) -> None:
-    """Raise `KeyProblem` if an ideal simulator with zero-order hold has damping or friction."""
+    """Raise `KeyProblem` for contact damping or friction if an ideal simulator has a zero-order hold."""
     # Such a simulator jumps at the ticks, where its velocity is not defined.
     rig = mechanism.rig
     dissipates = any(contact.damping or contact.friction or contact.dry_friction
@@ -219,7 +219,7 @@ def _check_hold(mechanism: SixAxisMechanism) -> None:
 
 
 def _check_sensor(rig: Rig, uncertain: Collection[str]) -> None:
-    """Raise `KeyProblem` if the force sensor's crosstalk, filter, tool or gravity is invalid."""
+    """Raise `KeyProblem` if a key of the force sensor (crosstalk, filter, tool, gravity) is invalid."""
     sensor, path = rig.force_sensor, ("rig", "force_sensor")
     check_sensor_filter(sensor, uncertain)
     mixing = np.eye(6) + np.asarray(sensor.crosstalk)

@@ -126,7 +126,7 @@ class Bodies(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Approach(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Approach of the bodies: speed, number of contacts, and the first contact's time in a control period."""
+    """Approach: its speed, the number of contacts, and when within a control period the first one begins."""
 
     velocity: Annotated[float, key_metadata("speed of the first approach", "m/s", gt=0.0)]
     contacts: Annotated[
@@ -225,7 +225,7 @@ class Simulator(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class SensorFilter(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Low-pass filter of the force sensor, instead of a time constant; optional."""
+    """Optional low-pass filter of the force sensor, which replaces its time constant."""
 
     kind: Annotated[FilterKind, key_metadata("kind of filter")]
     order: Annotated[int, key_metadata("order of the filter", "1", ge=1, le=MAX_FILTER_ORDER)]

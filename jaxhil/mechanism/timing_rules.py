@@ -20,21 +20,21 @@ JITTER, MISSED_TICKS = "rig.force_sensor.jitter", "rig.missed_tick_probability"
 
 
 def check_jitter(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    """Raise `KeyProblem` if a one-axis force sensor has jitter that the mechanism does not support."""
+    """Raise `KeyProblem` if a one-axis mechanism does not support the jitter of its force sensor's delay."""
     law, has_clearance = mechanism.contact.law, math.isfinite(mechanism.contact.clearance)
     reasons = {f"the contact law {law}": find_contact_law(law).has_memory, "a clearance": has_clearance}
     _check_jitter(mechanism, spans, reasons)
 
 
 def check_missed_ticks(mechanism: Mechanism, spans: Mapping[str, Span]) -> None:
-    """Raise `KeyProblem` if a mechanism has both two surfaces and missed ticks."""
+    """Raise `KeyProblem` if a mechanism with a clearance (gap between two surfaces) can miss ticks."""
     if _is_used(mechanism, MISSED_TICKS) and math.isfinite(mechanism.contact.clearance):
         largest = build_extreme_function(mechanism, spans)(MISSED_TICKS, 1)
         _reject(MISSED_TICKS, largest, "0, because missed ticks are not supported with a clearance")
 
 
 def check_six_axis_jitter(mechanism: SixAxisMechanism, spans: Mapping[str, Span]) -> None:
-    """Raise `KeyProblem` if a six-axis force sensor has jitter that the mechanism does not support."""
+    """Raise `KeyProblem` if a six-axis mechanism does not support the jitter of its force sensor's delay."""
     laws = [contact.law for contact in mechanism.contact.values()]
     frictions = [contact.friction for contact in mechanism.contact.values()]
     reasons = {
@@ -48,8 +48,8 @@ def check_six_axis_jitter(mechanism: SixAxisMechanism, spans: Mapping[str, Span]
 def build_extreme_function(mechanism: AnyMechanism, spans: Mapping[str, Span]) -> Callable[[str, int], Any]:
     """Return a function `extreme(path, end)` that returns a key's smallest or largest possible draw.
 
-    `end` is 0 for the smallest draw and 1 for the largest. If the key is not uncertain, or has a normal
-    distribution, which may have no bounds, `extreme` returns the nominal value.
+    `end` is 0 for the smallest draw and 1 for the largest. For a key that is not uncertain, or whose
+    normal distribution may have no bounds, `extreme` returns the nominal value.
     """
 
     def extreme(path: str, end: int) -> Any:
@@ -61,12 +61,12 @@ def build_extreme_function(mechanism: AnyMechanism, spans: Mapping[str, Span]) -
 
 
 def _check_jitter(mechanism: AnyMechanism, spans: Mapping[str, Span], reasons: Mapping[str, bool]) -> None:
-    """Raise `KeyProblem` if a force sensor has jitter that is not supported.
+    """Raise `KeyProblem` if a mechanism does not support the jitter of its force sensor's delay.
 
     Args:
         mechanism: the mechanism.
         spans: smallest and largest draws of the uncertain keys.
-        reasons: further properties that exclude jitter, and whether the mechanism has them.
+        reasons: properties besides lag and filter that exclude jitter, and whether the mechanism has them.
     """
     extreme = build_extreme_function(mechanism, spans)
     if not _is_used(mechanism, JITTER):
@@ -88,5 +88,5 @@ def _reject(path: str, found: float, expected: str) -> None:
 
 
 def _is_used(mechanism: AnyMechanism, path: str) -> bool:
-    """Return whether the number at `path` is nonzero or uncertain."""
+    """Return whether a mechanism has the effect of the number at `path`: it is nonzero or uncertain."""
     return bool(value_at(mechanism, path)) or path in mechanism.uncertainty

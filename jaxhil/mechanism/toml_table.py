@@ -26,9 +26,9 @@ _TOKENS = re.compile(
 
 
 def read_bytes(path: Path, label: str, content: str) -> bytes:
-    """Read the bytes of a file, named `content` in messages, for example "a mechanism".
+    """Read a file of at most 1 MiB; messages state its name `label` and its kind `content` ("a mechanism").
 
-    Raise FileNotFoundError, or `InputError` for any other problem.
+    Raise FileNotFoundError if there is no such file, and `InputError` for any other problem.
     """
     try:
         with open_input(path) as file:
@@ -46,7 +46,7 @@ def read_bytes(path: Path, label: str, content: str) -> bytes:
 
 
 def parse_toml(data: bytes, label: str, content: str) -> dict[str, Any]:
-    """Parse the bytes of a TOML file, named `content` in messages. Raise `InputError` if they are invalid."""
+    """Parse the bytes of a TOML file; an `InputError` states the file's name `label` and kind `content`."""
     if not data.strip():
         raise InputError(f"{label}: found an empty file, expected {content} in TOML")
     try:
@@ -69,7 +69,7 @@ def parse_toml(data: bytes, label: str, content: str) -> dict[str, Any]:
 
 
 def _quote_line(text: str, reason: str) -> str:
-    """Return the line of `text` to which an error of the parser refers, as the end of a message."""
+    """Return the line of `text` that the parser's error `reason` refers to, for the end of a message."""
     match = re.search(r"at line (\d+)", reason)
     lines = text.split("\n")[int(match[1]) - 1 :] if match else []
     line = to_one_line(lines[0].strip(), 60) if lines else ""

@@ -51,12 +51,12 @@ _UNIFORM_PHASE = Uncertainty(distribution="uniform", low=0.0, high=1.0)
 
 
 def draw(mechanism: AnyMechanism, number: int, seed: int, first: int = 0) -> dict[str, np.ndarray]:
-    """Return random draws of every uncertain key, from draw number `first` on.
+    """Return `number` random draws of every uncertain key, beginning with the draw of index `first`.
 
     The result contains an array for each key by its dotted path, in the unit of the key. Its shape is
     (number,) for a scalar, and (number, *entries) for a list. With one axis, ``approach.phase`` is (number,
-    contacts). For each key and every 1024 draws a Philox generator draws uniform numbers, which the quantile
-    function of the key's distribution converts. Raise ValueError for a negative argument.
+    contacts). Each key has its own Philox generator for every 1024 draws. The quantile function of the key's
+    distribution converts the generator's uniform numbers. Raise ValueError for a negative argument.
     """
     if number < 0 or seed < 0 or first < 0:
         raise ValueError(f"number, seed, first: found {number}, {seed}, {first}, expected integers >= 0")
@@ -68,9 +68,9 @@ def draw(mechanism: AnyMechanism, number: int, seed: int, first: int = 0) -> dic
 def draw_quasi_random(mechanism: AnyMechanism, number: int, seed: int) -> dict[str, np.ndarray]:
     """Return draws of every uncertain key from a scrambled Sobol sequence, in the format of `draw`.
 
-    The points fill the unit box of all uncertain numbers more evenly than random points, most evenly if
-    `number` is a power of two (Sobol 1967; scrambled as in `scipy.stats.qmc.Sobol`). Raise ValueError for a
-    negative argument, or for more than 21201 uncertain entries.
+    The draws cover the ranges of all uncertain numbers more evenly than random draws, most evenly if `number`
+    is a power of two (Sobol 1967; scrambled as in `scipy.stats.qmc.Sobol`). Raise ValueError for a negative
+    argument, or for more than 21201 uncertain entries.
     """
     # The import takes most of a second, and only this function needs SciPy's generator.
     from scipy.stats import qmc
@@ -84,16 +84,16 @@ def draw_quasi_random(mechanism: AnyMechanism, number: int, seed: int) -> dict[s
 
 
 def draw_at_points(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the draws for points (number, dimensions) of the unit box, in the format of `draw`.
+    """Return the draws, as `draw` does, for points (number, dimensions) with coordinates from 0 to 1.
 
-    `count_dimensions` returns the number of columns of each key. The coordinates are correlated as the
-    mechanism states, then converted by the quantile function of each key.
+    `count_dimensions` returns the number of columns of each key. The table ``[correlation]`` correlates
+    the coordinates. The quantile function of each key then converts them to values.
     """
     return _compute_values(mechanism, correlate(mechanism, _split_by_key(mechanism, points)))
 
 
 def compute_quantiles(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
-    """Convert points (number, dimensions) of the unit box to values of each key, without correlation."""
+    """Return each key's quantiles at the probabilities `points` (number, dimensions), without correlation."""
     return _compute_values(mechanism, _split_by_key(mechanism, points))
 
 
@@ -106,7 +106,7 @@ def draw_extremes(mechanism: AnyMechanism) -> dict[str, np.ndarray]:
 def count_dimensions(mechanism: AnyMechanism) -> dict[str, int]:
     """Return the number of random numbers that one draw of each key needs.
 
-    The keys are in the order of the columns of points in the unit box: sorted by path, the phase last.
+    The keys are sorted by path, with `approach.phase` last. `draw_at_points` needs columns in this order.
     """
     columns = {}
     for path in sorted(set(mechanism.uncertainty) - {PHASE_KEY}):
@@ -120,14 +120,14 @@ def count_dimensions(mechanism: AnyMechanism) -> dict[str, int]:
 
 
 def _split_by_key(mechanism: AnyMechanism, points: np.ndarray) -> dict[str, np.ndarray]:
-    """Split points (number, dimensions) of the unit box into an array (number, columns) for each key."""
+    """Split the columns of `points` (number, dimensions) into an array (number, columns) for each key."""
     columns = count_dimensions(mechanism)
     bounds = np.cumsum(list(columns.values()))[:-1]
     return dict(zip(columns, np.split(points, bounds, axis=1), strict=True))
 
 
 def _draw_uniform(path: str, count: int, number: int, seed: int, first: int) -> np.ndarray:
-    """Return uniform random numbers (number, count) of the key at `path`, from draw number `first` on."""
+    """Return uniform random numbers (number, count) for the key at `path`; the first row is draw `first`."""
     start = first // DRAWS_PER_GENERATOR
     blocks = [np.empty((0, count))]
     philox = np.random.Philox(key=0)
@@ -165,7 +165,7 @@ def _compute_key_values(
     uniform: np.ndarray,
     per_contact: bool,
 ) -> np.ndarray:
-    """Convert the uniform random numbers (number, columns) of one key to values of the key."""
+    """Convert the uniform random numbers (draws, columns) of one key to the key's value in each draw."""
     number = uniform.shape[0]
     # The quantile at 0 is the lower bound, which an open range excludes.
     uniform = np.maximum(uniform, _MIN_UNIFORM)
@@ -189,7 +189,7 @@ def _compute_key_values(
 def _build_quantile_function(
     uncertainty: Uncertainty, nominal: np.ndarray, allowed: Range
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the quantile function of a distribution; its argument broadcasts against `nominal`."""
+    """Return a distribution's quantile function, whose argument broadcasts against `nominal`."""
     if uncertainty.distribution == "normal":
         assert uncertainty.std is not None
         return _truncated_normal(nominal, uncertainty.std, allowed)
@@ -208,8 +208,9 @@ def _build_quantile_function(
 def _truncated_normal(mean: np.ndarray, std: float, allowed: Range) -> Callable[[np.ndarray], np.ndarray]:
     """Return the quantile function of a normal distribution that is truncated to the `allowed` values.
 
-    With the standardised bounds a and b, the quantile is mean + std Phi^-1(Phi(a) + u (Phi(b) - Phi(a))). The
-    formula is accurate because the mean is an allowed value, so that a and b are not in the same tail.
+    The quantile at u is mean + std Phi^-1(Phi(a) + u (Phi(b) - Phi(a))), where a and b are the standardised
+    bounds, and Phi is the standard normal distribution function. The formula is accurate because the mean is
+    an allowed value, so that a and b are not in the same tail.
     """
     from scipy import special  # takes long to import, and most files do not need SciPy
 

@@ -35,13 +35,13 @@ class Clock:
         self.reset()
 
     def reset(self) -> None:
-        """Set both counts to 0 and forget the last tick's time."""
+        """Set the counts of missed and late ticks to 0 and forget the last tick's time."""
         self.missed = 0
         self.late = 0
         self.pause()
 
     def pause(self) -> None:
-        """Forget the last tick's time and the drift, so that the next tick may come at any time."""
+        """Forget the last tick's time and the clock's drift, so that the next tick may come at any time."""
         self._time = -inf
         self._drift = 0.0  # periods by which the clock is ahead of the ticks, including missed ticks
         self._awaited = 0  # number of ticks counted as missed that may still arrive
@@ -82,7 +82,7 @@ class Clock:
         return self._check_drift(drift, fault)
 
     def _miss(self, periods: NonNegative) -> int:
-        """Count the ticks missed in a gap of `periods` control periods; return the fault bit."""
+        """Count the missed ticks in a gap of `periods` control periods; return `MISSED_TICK` or `CLOCK`."""
         missed: SmallInt = MAX_MISSED - 1
         drift = 0.0
         if periods <= MAX_MISSED:
@@ -95,7 +95,7 @@ class Clock:
         return self._check_drift(drift, MISSED_TICK)
 
     def _check_drift(self, drift: float, fault: int) -> int:
-        """Store the drift [periods]; return `CLOCK` if the drift is too large, otherwise `fault`."""
+        """Store the clock's drift [periods]; return `CLOCK` if the drift is too large, otherwise `fault`."""
         self._drift = drift
         if abs(drift) > MAX_DRIFT:
             self.fatal = True

@@ -99,11 +99,11 @@ class Controller(ControllerBase):
         return self._law.force_delay
 
     def tare(self, force_measured: float) -> bool:
-        """Add one force reading out of contact to the tare; return True when the tare has ended.
+        """Add a reading to the tare, which averages force readings out of contact; return True at its end.
 
         Call this method once per tick before a run, until it returns True. The controller then subtracts the
-        mean of these readings from every reading until the next tare. Unusable readings trip the controller
-        with the fault `tare`.
+        mean (the bias) from every reading until the next tare. Unusable readings trip the controller with the
+        fault `tare`.
 
         Args:
             force_measured: force reading [N].
@@ -177,10 +177,10 @@ class Controller(ControllerBase):
     def position_command(self, position: float, velocity: float, acceleration: float) -> float:
         """Return the position [m] to command for the numerical model's motion after this tick's step.
 
-        Two successive commands differ by at most `velocity_limit` times the period. A run's first command may
-        differ from the measured position by at most the same amount. If the model is out of contact, the
-        limit is `start_distance` instead, because moving drives lag behind. Before a run's first `step`, the
-        model's position replaces the measured position if the model is out of contact.
+        Two successive commands differ by at most `velocity_limit` times the period. The same limit applies
+        between the measured position and a run's first command. If the model is out of contact, the first
+        command may be up to `start_distance` away, because moving drives lag behind their commands. Its
+        distance is then taken from the model's position if the run has no measured position yet.
 
         After a trip, the commands move to rest out of contact. The commands start from the last command or,
         if there is none, from the last measured position. If there is neither, they start from a position out
@@ -208,7 +208,7 @@ class Controller(ControllerBase):
         return positions.output
 
     def _sent(self, position: float, velocity: float, acceleration: float) -> float:
-        """Return the compensator's position command [m]; NaN after an exception or a non-finite motion."""
+        """Return the compensator's position command [m]; NaN if it raises or an argument is not finite."""
         if not (isfinite(position) and isfinite(velocity) and isfinite(acceleration)):
             return nan
         try:
@@ -217,11 +217,11 @@ class Controller(ControllerBase):
             return nan
 
     def reset(self) -> bool:
-        """Restart everything except the tare. While the emergency stop is active, do nothing; return False.
+        """Clear the trip and restart everything except the force sensor's bias; return True.
 
-        Filters, identified parameters, trip and tick counts restart. Force and position command continue
-        from their last values without a jump. If something else has moved the drives since the trip, also
-        call `next_contact`.
+        While the emergency stop is active, do nothing and return False. Filters, identified parameters and
+        tick counts restart. Force and position command continue from their last values without a jump. If
+        the drives have moved without these commands since the trip, also call `next_contact`.
         """
         if self._stopped or self.cause & UNUSABLE:
             return False
@@ -239,12 +239,12 @@ class Controller(ControllerBase):
         return True
 
     def next_contact(self) -> None:
-        """Begin a new run for the next contact: restart filters, delay lines and covariance.
+        """Begin a new run: restart filters, delay lines and the covariance of the identified parameters.
 
         Call this method after the rig has moved to the start of the run: the first position command continues
-        from the measured position, not from the last command. Identified parameters remain, a trip stays
-        latched, and the gap before the next tick counts no missed ticks. If a contact has not ended, it is
-        audited first, and `faults` contains the faults of this audit until the next `step`.
+        from the measured position, not from the last command. Identified parameters remain, and the gap
+        before the next tick counts no missed ticks. If a contact has not ended, it is audited first, and
+        `faults` contains the faults of this audit until the next `step`. After a trip, do nothing.
         """
         if self.cause:
             return
@@ -267,7 +267,7 @@ READING_NAMES = "time", "force_measured", "position_desired", "velocity_desired"
 
 
 def _detail(fatal: int, watchdog: Watchdog, values: tuple[Any, ...]) -> str:
-    """Describe a trip by the watchdog's audit, or by the arguments of `step` that are not finite."""
+    """Describe what tripped the controller: a contact's audit, or arguments of `step` that are not finite."""
     if fatal & RESTITUTION:
         return watchdog.detail()
     if fatal & (FORCE_NOT_FINITE | POSITION_NOT_FINITE | MODEL_NOT_FINITE | CLOCK):

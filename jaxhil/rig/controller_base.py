@@ -113,14 +113,14 @@ class ControllerBase:
 
     @property
     def last_contact(self) -> ContactRecord:
-        """Return the record of the last audited contact, with the compensator's status.
+        """Return the record of the last contact that the watchdog audited, with the compensator's status.
 
         Before the first audit, the contact number in the record is 0. `reset` keeps the record.
         """
         return contact_record(self._last_count())
 
     def _last_count(self) -> ContactCount:
-        """Return the record of the last audited contact: its number, and the compensator's status."""
+        """Return the counts of ticks with each compensator status in the last audited contact."""
         return self._watchdog.record
 
     def emergency_stop(self, active: bool) -> None:

@@ -14,8 +14,8 @@ class LeadFilter:
 
     y = ((2 T_2 - T) y_prev + (2 T_1 + T) u - (2 T_1 - T) u_prev) / (2 T_2 + T)
 
-    T is the control period. The filter begins at rest, y_prev = u_prev = 0. Times are in s; the output has
-    the input's unit.
+    u is the input, y the output, and T the control period. The filter begins at rest, y_prev = u_prev = 0.
+    Times are in s; the output has the input's unit.
     """
 
     __slots__ = ("_denominator", "_input", "_of_input", "_of_output", "_of_previous", "_output")
@@ -62,7 +62,7 @@ class VelocityFilter:
         self._velocity = 0.0
 
     def start(self, position: float, velocity: float) -> None:
-        """Set the previous values to a uniform motion [m/s] that reaches `position` [m] at the next step."""
+        """Set the previous values for a motion at `velocity` [m/s] that next reaches `position` [m]."""
         self._position = position - self._period * velocity
         self._velocity = velocity
 
@@ -77,12 +77,12 @@ class VelocityFilter:
 
 
 class DelayLine:
-    """Delay line for a position, with linear interpolation between samples for any delay tau >= 0.
+    """Delay line for a position, with linear interpolation between samples for a delay tau >= 0.
 
     r = tau/T, q = floor(r + 1e-9), f = r - q, output (1 - f) x[n-q] + f x[n-q-1]
 
-    T is the control period. Call `start` before the first `step`. The constructor raises ValueError if the
-    delay is longer than `MAX_DELAY_PERIODS` periods.
+    x[n] is the position at step n, and T the control period. Call `start` before the first `step`. The
+    constructor raises ValueError if the delay is longer than `MAX_DELAY_PERIODS` periods.
     """
 
     MAX_DELAY_PERIODS = 100_000
@@ -104,7 +104,7 @@ class DelayLine:
         self._head = 0
 
     def start(self, position: float, velocity: float) -> None:
-        """Set the samples before the first step (index j < 0) to the motion position + j T velocity."""
+        """Set sample j < 0 (before the first step) to position + j T velocity; T: control period."""
         period = self._period
         samples = self._samples
         size = self._size

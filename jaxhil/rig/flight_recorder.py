@@ -41,14 +41,14 @@ DEFAULT_TICKS = 600_000  # number of ticks in memory: ten minutes at 1 kHz
 
 
 class FlightRecorder:
-    """Recorder of the newest ticks of a controller, which allocates all memory when it is created.
+    """Recorder of a controller's newest ticks; its constructor allocates all memory.
 
     Args:
         period: control period [s].
         axes: number of axes, 1 or 6.
-        ticks: number of ticks in memory; when it is full, a new tick replaces the oldest one.
-        equivalent_mass: mass of a one-axis numerical model [kg] for the mapping, so that `identify` needs no
-            prior; None to leave it out.
+        ticks: number of ticks in memory; when the memory is full, a new tick replaces the oldest one.
+        equivalent_mass: mass of a one-axis numerical model [kg], which `write` adds to the mapping. None
+            leaves it out; `jaxhil identify` then needs it from a prior mechanism file.
 
     Example:
         >>> import tempfile
@@ -101,7 +101,7 @@ class FlightRecorder:
             position_desired: position of the numerical model before the tick [m]; six axes: pose [m, rad].
             velocity_desired: velocity of the numerical model [m/s]; six axes: twist [m/s, rad/s].
             position_measured: position reading [m]; six axes: pose [m, rad].
-            time: time of the tick [s]; if None, the number of the tick times the period.
+            time: time of the tick [s]; if None, the tick's index multiplied by the control period.
             command: command that `step` has returned [N]; six axes: wrench [N, N m].
             faults: bits of the tick's faults, and of the faults that tripped the controller.
         """
@@ -120,7 +120,7 @@ class FlightRecorder:
         self._contact += 1
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the log, a CSV file, and its mapping, a TOML file with the same name.
+        """Write the log (`NAME.csv`) and its mapping (`NAME.toml`), which describes the log's columns.
 
         Args:
             path: path of the log; its name must end in `.csv`.
@@ -153,7 +153,7 @@ class FlightRecorder:
             yield ",".join([*map(repr, values), f"{contact:.0f}", f"{faults:.0f}"]) + "\n"
 
     def mapping(self, pattern: str) -> str:
-        """Return the mapping, as TOML text, of the logs whose names match a pattern."""
+        """Return the mapping of logs whose names match `pattern`: TOML text that describes their columns."""
         lines = ['schema = "jaxhil/log/1"', "", "[channels]", 'time = "time"']
         for channel, prefix, suffixes in CHANNELS[self._axes]:
             columns = [f'"{prefix}{suffix}"' for suffix in suffixes]
