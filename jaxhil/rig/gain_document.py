@@ -182,14 +182,14 @@ def read_limits(
 
 
 def read_entry(mapping: Mapping[str, Any], key: str, source: str, prefix: str) -> Any:
-    """Return the entry `key` of an object. Raise GainFileError if it is missing."""
+    """Return `mapping[key]`. Raise GainFileError if this entry is missing."""
     if key not in mapping:
         raise make_gain_file_error(source, prefix + key, "nothing", "a value")
     return mapping[key]
 
 
 def read_object(mapping: Mapping[str, Any], key: str, source: str, prefix: str) -> Mapping[str, Any]:
-    """Return the entry `key`. Raise GainFileError if it is missing or not a JSON object."""
+    """Return `mapping[key]`. Raise GainFileError if this entry is missing or not a JSON object."""
     value = read_entry(mapping, key, source, prefix)
     if not isinstance(value, Mapping):
         raise make_gain_file_error(source, prefix + key, format_value(value), "an object")

@@ -32,7 +32,7 @@ NO_FURTHER_GAINS: Mapping[str, Mapping[str, GainSpecification]] = {}
 
 
 class GainFile(NamedTuple):
-    """Checked values of a gain file that the controller needs."""
+    """Checked content of a gain file, as far as the controller needs it."""
 
     compensator: str  # name of the compensator
     gains: Mapping[str, float]  # gains by name, in SI units

@@ -52,7 +52,7 @@ class Tare:
         self.fatal = False
 
     def take(self, reading: float) -> bool:
-        """Add a force reading [N]; return whether the tare has ended, with success or with `fatal` set."""
+        """Add a force reading [N]; return whether the tare has ended. If it has failed, `fatal` is True."""
         if not self._count < self._ticks:
             return True
         if self._count == 0:
@@ -114,7 +114,7 @@ class InputGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget past readings and counts of bad readings, but keep `located`."""
+        """Forget past readings and counts of bad readings, but keep `located`, the last valid position."""
         self._has_reading = False
         self._bad_forces = 0
         self._bad_positions = 0
@@ -129,9 +129,9 @@ class InputGuard:
         self.fatal = 0
 
     def locate(self, position: float) -> None:
-        """Store the measured position of the drives [m], also after a trip.
+        """Store the measured position of the drives [m], also after a trip; ignore a reading out of range.
 
-        Until the run's first in-range reading, accept every reading within `bounds.POSITIONS`.
+        Until the run's first in-range reading, accept every reading in the wider range `bounds.POSITIONS`.
         """
         if self._lowest <= position <= self._highest:
             self.is_located = True
@@ -214,14 +214,14 @@ class InputGuard:
         return fault
 
     def _same_position(self, travel: float) -> int:
-        """Update the model's travel since the position reading last changed [m]; return the fault bit."""
+        """Add to the model's travel [m] during a constant position reading; return `POSITION_STUCK` or 0."""
         self._position_travel += travel
         fault = POSITION_STUCK if self._position_travel > self._position_stuck else 0
         self.fatal |= fault
         return fault
 
     def _same_force(self, deeper: float) -> int:
-        """Update the travel in contact since the force reading last changed [m]; return the fault bit."""
+        """Add to the travel in contact [m] during a constant force reading; return `FORCE_STUCK` or 0."""
         if abs(self.force) <= TARE_ROUNDING * abs(self._force_reading):
             # Without a force, a damped mechanism may move out of contact, but no mechanism moves deeper.
             travel = self._force_travel + deeper

@@ -115,7 +115,7 @@ ORDER = (("retreat_velocity", "velocity_limit"),)
 
 
 def complete_limits(limits: Mapping[str, float]) -> dict[str, float]:
-    """Add the defaults of missing limits. Raise ValueError if two limits contradict each other."""
+    """Return all limits including defaults. Raise ValueError if two limits contradict each other."""
     return complete_limit_table(limits, LIMITS, RANGES, ORDER)
 
 
@@ -125,7 +125,7 @@ def complete_limit_table(
     ranges: Sequence[tuple[str, str]],
     order: Sequence[tuple[str, str]],
 ) -> dict[str, float]:
-    """Add the defaults of missing limits to the limits of a table. Raise ValueError if two limits contradict.
+    """Return all limits of a table including defaults. Raise ValueError if two limits contradict each other.
 
     Args:
         limits: limits that have been set, by name.

@@ -72,8 +72,8 @@ class PositionGuard:
 
     Two successive commands differ by at most one period's travel at `velocity_limit`. A run's first command
     may differ from the measured position by at most this travel. If the model is out of contact, the limit is
-    `start_distance` instead, because moving drives lag behind. A command is outside the stroke only while it
-    returns into the stroke.
+    `start_distance` instead, because moving drives lag behind. A command may be outside the stroke only on
+    the way back into the stroke.
 
     Attributes:
         output: last command [m].
@@ -105,7 +105,7 @@ class PositionGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the faults. Until the output first reaches a command, limiting the output does not trip."""
+        """Forget the faults; the rate limit does not trip before the output first reaches a command."""
         self._limited_ticks = 0
         self._engaged = False
         self._rate = 0.0
@@ -158,7 +158,7 @@ class PositionGuard:
         return VELOCITY_LIMIT
 
     def retreat(self, measured: float, position: float) -> None:
-        """Move the output by one period's step towards a standstill out of contact.
+        """Retreat from a near surface, or brake to a standstill, for one period after a trip.
 
         Args:
             measured: last measured position of the drives [m]; NaN if there is none.
@@ -193,10 +193,9 @@ class PositionGuard:
         self.at_rest = rate == 0.0 and target_rate == 0.0
 
     def _stand(self, measured: float, position: float) -> None:
-        """Set the output to the measured position or, without one, to a position out of contact.
+        """Set the output to `measured` or, if `measured` is NaN, to a substitute.
 
-        If `measured` is NaN, the output is `position`, moved out of contact if necessary, then moved into the
-        stroke.
+        The substitute is `position`, moved out of contact if necessary, and then limited to the stroke.
         """
         self.has_output = True
         self.output = measured

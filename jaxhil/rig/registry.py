@@ -13,7 +13,7 @@ from jaxhil.rig.types import Gains, Positive
 
 
 class GainSpecification(NamedTuple):
-    """Unit and absolute bounds of a gain; a gain file cannot widen the bounds (`bounds`)."""
+    """Unit and absolute bounds of a gain; these bounds apply in addition to those in a gain file."""
 
     unit: str  # "1" if dimensionless
     lowest: float = -inf  # lower bound
@@ -69,7 +69,7 @@ class Compensator(Protocol):
         """Restart everything, including the identified parameters."""
 
     def next_contact(self) -> None:
-        """Restart filters, delay lines and covariance; keep the identified parameters."""
+        """Restart filters, delay lines and the parameters' covariance; keep the identified parameters."""
         self.reset()
 
 

@@ -2,7 +2,7 @@
 
 
 def deflection(position: float, clearance: float) -> float:
-    """Return the penetration [m] at position x: x if x > 0, x + clearance if x < -clearance, otherwise 0."""
+    """Return the penetration [m] at x = `position`: x if x > 0, x + clearance if x < -clearance, else 0."""
     if position > 0.0:
         return position
     beyond = position + clearance

@@ -219,7 +219,7 @@ class Watchdog:
         self._sxx = self._sxv = self._svv = self._sxf = self._svf = 0.0
 
     def _regress(self, force: float, aligned: float) -> None:
-        """Add the interval since the last tick to the regression sums if both ticks are in contact."""
+        """Update the sums for the fit of stiffness and damping if this tick and the last are in contact."""
         # A threshold on noisy forces would prefer large readings and bias the stiffness.
         side = self._side
         before = self._aligned

@@ -106,7 +106,7 @@ def _find_program(function, static, arguments, options):
 
 
 def _identify_program(function, static, arguments, options):
-    """Return key and arguments of a program, and a function that calls `load_or_lower` for it."""
+    """Return a program's key and array arguments, and a function that calls `load_or_lower` for it."""
     leaves, structure = jax.tree.flatten(arguments)
     folder = program_folder()
     shapes = tuple([(leaf.shape, leaf.dtype) for leaf in leaves])
@@ -248,10 +248,10 @@ def _serialise_program(program, key, calls_lapack):
     content, unloaded = io.BytesIO(), program._executable._unloaded_executable
 
     class Pickler(serialize_executable._JaxPjrtPickler):
-        """Pickler that writes the key of the machine code instead of the machine code itself."""
+        """Pickler that writes the machine code's key in the compile cache instead of the machine code."""
 
         def persistent_id(self, obj):
-            """Return the key if the object is the machine code, else the result of JAX's pickler."""
+            """Return the cache key if `obj` is the machine code, else the result of JAX's pickler."""
             return (MACHINE_CODE_TAG, key) if obj is unloaded.xla_executable else super().persistent_id(obj)
 
     pickle.dump((calls_lapack, [device.id for device in unloaded.device_list]), content)
@@ -269,7 +269,7 @@ def _deserialise_program(content):
         """Unpickler that reads the machine code from the compile cache."""
 
         def persistent_load(self, pid):
-            """Return the machine code that the compile cache holds for a key."""
+            """Return the cached machine code if `pid` is its key, else the result of JAX's unpickler."""
             if pid[0] != MACHINE_CODE_TAG:
                 return super().persistent_load(pid)
             client, devices = self.backend, self.execution_devices

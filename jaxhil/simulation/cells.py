@@ -34,7 +34,7 @@ MIN_LAG = 1e-12  # lag below which a force sensor counts as a sensor without lag
 
 
 class CellCounts(NamedTuple):
-    """Number of cells in each of the two parts of a sampling interval, and degree of the power series."""
+    """Number of cells before the force sample, equal to that after it, and degree of the power series."""
 
     plain: int  # number of cells before the window of a force sensor with lag
     window: int  # number of cells in the sensor's window; 0 for a sensor without lag
@@ -42,7 +42,7 @@ class CellCounts(NamedTuple):
 
     @property
     def part(self) -> int:
-        """Return the number of cells in each of the two parts of a sampling interval."""
+        """Return the number of cells before the force sample, which is also the number after it."""
         return self.plain + self.window
 
 
@@ -50,7 +50,7 @@ NO_CELLS = CellCounts(0, 0, 0)
 
 
 class Cells(NamedTuple):
-    """Positions of the cells in a sampling interval, and matrices that give the motion in each cell.
+    """Positions of the cells (short parts) of a sampling interval, and matrices for the motion in them.
 
     Cells are in chronological order.
     """
@@ -76,7 +76,7 @@ class IntervalInputs(NamedTuple):
 
 
 def count_cells(fastest: float, lags: Any) -> CellCounts:
-    """Return the numbers of cells that a mechanism needs.
+    """Return the numbers of cells (short parts) into which a mechanism's sampling interval is divided.
 
     The numbers are powers of two, so that similar mechanisms share a compiled program.
 
@@ -191,10 +191,10 @@ def build_series(
     control_period: Float[Array, "*batch"],
     degree: int,
 ) -> Float[Array, "powers columns *batch"]:
-    """Return the matrix that maps (state, command, increase of the command in a period) to coefficients.
+    """Return the matrix that gives the position over time as a power series.
 
-    They are the coefficients of a power series, which gives the position [m] as a function of the time since
-    the instant of the state [periods].
+    The matrix maps (state, command, increase of the command in a period) to the series' coefficients. The
+    series gives the position [m] as a function of the time since the state's instant [periods].
     """
     if denominator.shape[0] > 1:
         return _series(*generator_rows(numerator, denominator, control_period), degree)
@@ -247,7 +247,7 @@ def bound_time_constant(time_constant: Array, control_period: Array) -> Array:
 
 
 class _CellEdges(NamedTuple):
-    """Positions of the cells in one part of a sampling interval."""
+    """Positions of the cells in one part of a sampling interval: before or after the force sample."""
 
     # time from each edge of a cell to the end of the part [periods], in the order of time
     before: Float[Array, "edges *batch"]
@@ -255,7 +255,7 @@ class _CellEdges(NamedTuple):
 
 
 def _divide_part(counts, whole, lag):
-    """Divide one part of a sampling interval, `whole` periods long, into cells; `lag` is in periods."""
+    """Divide a part of a sampling interval into cells; its length `whole` and the `lag` are in periods."""
     window = jnp.minimum(whole, LAG_WINDOW * lag) if counts.plain else whole
     window = window if counts.window else jnp.zeros_like(whole)
     before_window = [(whole - window) * (i / counts.plain) for i in range(counts.plain, 0, -1)]
@@ -266,16 +266,17 @@ def _divide_part(counts, whole, lag):
 
 
 def _divide_at(edges, before):
-    """Add an edge at the time `before` [periods] before the end of the part, clipped to the part's range."""
+    """Divide a cell of a part at the time `before` [periods] before the part's end, clipped to the part."""
     kink = jnp.clip(before, edges.before[-1], edges.before[0])
     edges = -jnp.sort(-jnp.concatenate([edges.before, kink[None]]), axis=0)
     return _CellEdges(edges, edges[:-1] - edges[1:])
 
 
 def _moving_average(begin, length, window, control_period, hold):
-    """Return the fields `states` and `series` of `Cells` for a moving average.
+    """Return the matrices `states` and `series` of `Cells` for a motion simulator with a moving average.
 
-    The motion in each cell is a parabola. The state at a cell's start consists of its three coefficients.
+    The motion in each cell is a parabola. The state at a cell's start consists of the parabola's three
+    coefficients.
     """
     # Rounding may place the start of a cell on either side of the kink, but not its middle.
     is_before = begin + length / 2 < split_window(window, control_period).fraction
@@ -287,7 +288,7 @@ def _moving_average(begin, length, window, control_period, hold):
 
 
 def _line_series(control_period, degree):
-    """Return the rows of `_series` for an ideal motion simulator, whose position is the command."""
+    """Return the result of `_series` for an ideal motion simulator: its position is the command."""
     ones, zeros = jnp.ones_like(control_period), jnp.zeros_like(control_period)
     lines = [jnp.stack([ones, zeros]), jnp.stack([zeros, ones])]
     return jnp.stack(lines + [jnp.zeros_like(lines[0])] * (degree - 1))
@@ -314,5 +315,5 @@ def _series(generator, output, degree):
 
 
 def _power_of_two(number: float) -> int:
-    """Round a number up to a power of two; ignore a relative excess of at most `CELL_LENGTH_TOLERANCE`."""
+    """Return the smallest power of two >= `number` / (1 + `CELL_LENGTH_TOLERANCE`), but at least 1."""
     return 1 << max(0, math.ceil(math.log2(max(number, 1.0) / (1 + CELL_LENGTH_TOLERANCE))))

@@ -146,13 +146,13 @@ class ContactSample(NamedTuple):
 
 
 def no_contact(like: Array) -> ContactSample:
-    """Return the sample of a mechanism without contact, with the batch shape of `like`."""
+    """Return a `ContactSample` of a mechanism without contact, with the batch shape of `like`."""
     zeros = jnp.zeros_like(like)
     return ContactSample(zeros - 1, zeros, zeros, zeros + 1)
 
 
 def compute_interval_motion(rows, state, start, end, plane):
-    """Return the mechanism's motion in the current interval, relative to the surface at `plane` [m]."""
+    """Return the mechanism's motion in a sampling interval, relative to the surface at `plane` [m]."""
 
     def motion(position, velocity):
         return MotionSample(
@@ -166,16 +166,16 @@ def compute_interval_motion(rows, state, start, end, plane):
 
 
 def read_current_interval(rig, pending, now, age):
-    """Return the motion in the current sampling interval, from the delay line of motions.
+    """Return the motion for which the contact is due now, from `pending`, the delay line of motions.
 
-    Before the start of the run, all entries are 0: the mechanism is at rest at the surface, without a force.
+    A motion before the start of the run is 0: the mechanism is at rest at the surface, without a force.
     """
     intervals = rig.delays.contact
     return jax.tree.map(lambda ring: look_back(ring, now, intervals, age >= intervals), pending)
 
 
 def compute_work_between(before: ContactSample, now: ContactSample) -> tuple[Array, Array]:
-    """Return the work done on the mechanism, and the work that it returns, between two samples [J].
+    """Return the work done on the mechanism and the work returned by it between two samples [J].
 
     The result is exact if the force is linear in the penetration.
     """
@@ -191,10 +191,9 @@ def compute_work_between(before: ContactSample, now: ContactSample) -> tuple[Arr
 def compute_work_along(
     surfaces: Surfaces, start: MotionSample, end: MotionSample, duration: Array
 ) -> tuple[Array, Array]:
-    """Return the work done on the mechanism, and the work that it returns, in a section of motion [J].
+    """Return the work done on the mechanism and the work returned by it in a smooth section of motion [J].
 
-    If the force pulls while the penetration decreases, the work of the force is subtracted from the returned
-    work.
+    If the force pulls while the penetration decreases, the returned work becomes smaller.
     """
     contact = _find_section_contact(surfaces, start, end, duration)
 
@@ -219,8 +218,8 @@ def largest_force(
 ) -> Float[Array, "*batch"]:
     """Return the largest |force| [N] within a sampling interval.
 
-    The result is the largest of three forces: at both ends, and at the vertex of a parabola through the
-    forces at the ends and in the middle.
+    The result is the largest of three values: |force| at the start, at the end, and at the vertex of the
+    parabola through |force| at both ends and in the middle.
     """
 
     def magnitude(motion, s):
@@ -286,7 +285,7 @@ def interpolate_motion(start: MotionSample, end: MotionSample, duration: Array, 
 
 
 def _find_turning_point(start, end, duration, side):
-    """Return the fraction of a section at which the motion into the surface reverses; 1 without reversal."""
+    """Return the fraction of a smooth section at which inward motion reverses; 1 without a reversal."""
     first, last = side * start.velocity, side * end.velocity
     turns = (first > 0) & (last < 0)
     # The inward velocity, times the duration, is first + slope s + bend s^2 at the fraction s.
@@ -298,14 +297,14 @@ def _find_turning_point(start, end, duration, side):
 
 
 def _force_along(surfaces, start, end, duration, s):
-    """Return motion and contact force [N] at the fraction `s` of a section."""
+    """Return motion and contact force [N] at the fraction `s` of a smooth section of motion."""
     motion = interpolate_motion(start, end, duration, s)
     force, _ = surfaces.advance(start, end, duration, s).force(motion)
     return motion, force
 
 
 class _SectionContact(NamedTuple):
-    """Beginning and end of the contact in a section of motion."""
+    """Beginning and end of the contact in a smooth section of motion."""
 
     touches: Array  # whether there is contact in the section
     side: Array  # side of the surface, 1 or -1
@@ -316,10 +315,10 @@ class _SectionContact(NamedTuple):
 
 
 def _find_section_contact(surfaces, start, end, duration):
-    """Find the beginning and the end of the contact in a section of motion.
+    """Find the beginning and the end of the contact in a smooth section of motion.
 
     The contact lasts while both the penetration and the contact law's `separation_function` are positive.
-    This function becomes negative if the force vanishes while there is still a penetration.
+    `separation_function` becomes negative if the force vanishes while there is still a penetration.
     """
     side, surface = surfaces.side(start, end)
 

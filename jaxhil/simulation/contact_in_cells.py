@@ -40,14 +40,14 @@ class QuadratureRule(NamedTuple):
     def nodes_and_ends(self, dtype: Any) -> np.ndarray:
         """Return the nodes, with an additional point just above 0 and one just below 1.
 
-        At the additional points, a force that jumps at 0 or 1 has its one-sided limits.
+        If a force jumps at 0 or 1, its values at these two points are its limits from inside the interval.
         """
         inside = np.finfo(dtype).eps ** 0.5
         return np.concatenate([[inside], self.nodes, [1 - inside]]).astype(dtype)
 
 
 def _build_quadrature(number: int) -> QuadratureRule:
-    """Return a rule with `number` nodes, which is accurate even for powers of the distance from its ends."""
+    """Return a rule with `number` nodes, accurate also for fractional powers of x and 1 - x on (0, 1)."""
     nodes, weights = np.polynomial.legendre.leggauss(number)
     unit = (nodes + 1) / 2
     # Near the ends, the force may be any power of the penetration. The substitution p -> 3 p^2 - 2 p^3, whose
@@ -98,7 +98,7 @@ def contact_in_cells(
     Args:
         touch: Contact law and surfaces.
         state: State of the contact law at the interval's start.
-        cells: Cells of the interval.
+        cells: Cells of the interval, from `build_cells`.
         series: Power series of the position [m] in each cell, from `power_series`.
         period: Control period [s].
         lagged: State of the force sensor's lag or filter at the interval's start [N].
@@ -109,7 +109,7 @@ def contact_in_cells(
 
     # Each branch returns distinct arrays: without optimisation, XLA confuses results that share an array.
     def touches(state):
-        """Compute the contact, and the states of the contact law at the sample and at the interval's end."""
+        """Compute the contact, and the law's states at the sampling instant and at the interval's end."""
         sections = split_at_reversals(build_cell_motion(series, cells.length))
         states, at_sample, at_end = _compute_law_states(touch, state, sections, period)
         parts = [
@@ -118,7 +118,7 @@ def contact_in_cells(
         return _sum_surfaces(parts), jax.tree.map(lambda *leaves: jnp.stack(leaves), at_sample, at_end)
 
     def free(state):
-        """Return the results without any contact: zeros, and the initial states of the contact law."""
+        """Return what `touches` returns without contact: zeros, and the contact law's initial states."""
         fresh = touch.law.init(jnp.zeros_like(period))
         count = _RESULT_COUNT if sensor_filter is None else _RESULT_COUNT - 2 + 2 * len(lagged)
         numbers = jnp.zeros((count, *period.shape), lagged.dtype)
@@ -139,7 +139,7 @@ def compute_jump_work(
     before: Float[Array, "*batch"],
     now: Float[Array, "*batch"],
 ) -> tuple[Array, Array]:
-    """Return two works [J] of a jump in position: done on the mechanism, and given back by it.
+    """Return the work done on the mechanism and the work returned by it in a jump of the position [J].
 
     `before` and `now` are the positions before and after the jump [m].
     """
@@ -166,7 +166,7 @@ class _SurfaceContribution(NamedTuple):
 
 
 def _sum_surfaces(parts: list[_SurfaceContribution]) -> Array:
-    """Combine the contributions of all surfaces to an array (results, *batch).
+    """Combine the contributions of all surfaces into one array of the shape (results, *batch).
 
     The last result is the largest peak force; all others are sums.
     """
@@ -180,9 +180,10 @@ def _sides(touch):
 
 
 def _compute_law_states(touch, state, sections, period):
-    """Return the contact law's states at the start of each section, at the sample and at the interval's end.
+    """Return the contact law's states at the sections' starts, the sampling instant and the interval's end.
 
-    The states at the starts of the sections have the shape (sections of a cell, cells, *batch).
+    In a section of a cell, the motion has one direction. The states at the starts of the sections have the
+    shape (sections of a cell, cells, *batch).
     """
     cells = sections.path.length.shape[0]
     if not touch.law.has_memory:
@@ -205,7 +206,7 @@ def _compute_law_states(touch, state, sections, period):
 
 
 class _SensorRates(NamedTuple):
-    """Decay of the force sensor's lag in a sampling interval."""
+    """Rate and durations of the decay of the force sensor's lag or filter in a sampling interval."""
 
     # durations of the parts before and after the sampling instant [time constants of the lag]
     part_durations: tuple[Array, Array]
@@ -215,7 +216,7 @@ class _SensorRates(NamedTuple):
 
 
 def _sensor_rates(cells, period, time_constant, sensor_filter=None) -> _SensorRates | None:
-    """Return the decay of the force sensor's lag or filter; None for a sensor without either."""
+    """Return the `_SensorRates` of the force sensor's lag or filter; None for a sensor without either."""
     if time_constant is None:
         return None
     modes = None
@@ -231,7 +232,7 @@ def _sensor_rates(cells, period, time_constant, sensor_filter=None) -> _SensorRa
 
 
 def _decay_reading(lagged, rates, readings):
-    """Return the output [N] of the force sensor's lag at the sample and at the interval's end."""
+    """Return the sensor's output at the sampling instant, and its state at the interval's end [N]."""
     if rates is None:
         return lagged, lagged
     if rates.modes is not None:
@@ -241,7 +242,7 @@ def _decay_reading(lagged, rates, readings):
 
 
 def _decay_modes(state, rates, readings):
-    """Return the output [N] of the filter at the sample, and the filter's state at the interval's end."""
+    """Return the filter's output at the sampling instant, and its state at the interval's end [N]."""
     half, states = len(readings) // 2, []
     for duration, added in zip(rates.part_durations, (readings[:half], readings[half:]), strict=True):
         decayed = []
@@ -265,7 +266,7 @@ def _decay_factors(rate: complex, duration: Array) -> tuple[Array, Array]:
 
 
 def _may_touch(touch, cells, series):
-    """Return whether any lane may be in contact, from a bound on the position in each cell."""
+    """Return whether contact is possible in any lane of the batch, from position bounds in each cell."""
     reach = horner(jnp.abs(series.at[0].set(0)), cells.length)
     may = series[0] + reach > 0
     if touch.clearance is not None:
@@ -274,7 +275,7 @@ def _may_touch(touch, cells, series):
 
 
 def _compute_side_contact(touch, states, sections, side, period, rates, still=False) -> _SurfaceContribution:
-    """Compute the contact at the surface on one side; with `still`, the contact law gets zero velocity."""
+    """Compute the contact at the surface on one side; if `still`, pass zero velocity to the contact law."""
     law, parameters, path = touch.law, touch.parameters, sections.path
     inward = side * sections.direction
     surface = 0.0 if side > 0 else touch.clearance
@@ -335,9 +336,9 @@ def _compute_side_contact(touch, states, sections, side, period, rates, still=Fa
 
 
 def _lag_contributions(rates, path, impulses, arguments):
-    """Return the response of the force sensor's lag [N] to impulses [N periods].
+    """Return the response [N] of the force sensor's lag or filter to the force's impulses [N periods].
 
-    The two results are the responses at the sampling instant and at the interval's end.
+    The results are the responses at the sampling instant, then at the interval's end.
     """
     if rates is None:
         zeros = jnp.zeros(path.length.shape[1:], path.length.dtype)
@@ -350,7 +351,7 @@ def _lag_contributions(rates, path, impulses, arguments):
 
 
 def _mode_contributions(rates, impulses, age):
-    """Return the response of each mode of a filter [N] to impulses [N periods].
+    """Return the response [N] of each mode of the sensor's filter to the force's impulses [N periods].
 
     `age` is the time since each impulse, multiplied by the filter's cutoff frequency [rad]. The results are
     real and imaginary part of each mode at the sampling instant, then at the interval's end.
@@ -364,16 +365,16 @@ def _mode_contributions(rates, impulses, age):
 
 
 def _sum_by_part(values):
-    """Sum the values of the cells before the sampling instant, and separately of the cells after it."""
+    """Return two sums: of the values in the cells before the sampling instant, and in those after it."""
     half = len(values) // 2
     return jnp.sum(values[:half], axis=0), jnp.sum(values[half:], axis=0)
 
 
 def _find_largest_force(force, arguments, begin, width, magnitudes):
-    """Return the largest |force| [N] in a span, from the values at the nodes (`magnitudes`).
+    """Return the largest |force| [N] in a span, a part of a cell; `magnitudes` are |force| at its nodes.
 
-    The largest force may lie between nodes. Therefore, the vertex of a parabola through the largest value and
-    its two neighbours is also considered.
+    The largest force may lie between nodes. Therefore, also compute |force| at the vertex of the parabola
+    through the largest magnitude and its two neighbours.
     """
     middle = jnp.clip(jnp.argmax(magnitudes, axis=0), 1, len(arguments) - 2)[None]
 

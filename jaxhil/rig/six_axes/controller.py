@@ -354,7 +354,7 @@ class Controller6(ControllerBase):
         self._poses.release()
 
     def _describe(self, fatal: int) -> str:
-        """Describe a trip by the channels with a fault, or by the watchdog's audit."""
+        """Describe a trip (faults `fatal`): name the bad sensor channels, or else give the audit's values."""
         if fatal & CLOCK:
             return ""
         bad = [name for n, name in enumerate(CHANNEL_NAMES) if self._inputs.channels >> n & 1]

@@ -59,7 +59,7 @@ class WrenchTare:
         self.fatal = False
 
     def take(self, reading: Vector) -> bool:
-        """Add a reading [N, N m]; return whether the tare has ended, with success or with `fatal` set."""
+        """Add a reading [N, N m]; return whether the tare has ended. If it has failed, `fatal` is True."""
         if not self._count < self._ticks:
             return True
         if self._count == 0:
@@ -149,9 +149,10 @@ class SixAxisInputGuard:
         self.fatal = 0
 
     def locate(self, pose: Vector) -> None:
-        """Store the measured pose of the drives [m, rad], also after a trip.
+        """Store the measured pose of the drives [m, rad], also after a trip; ignore a reading out of range.
 
-        Until the run's first in-range reading, accept every reading within `POSITIONS` and `ROTATIONS`.
+        Until the run's first in-range reading, accept every reading in the wider ranges `POSITIONS` and
+        `ROTATIONS`.
         """
         if is_within(pose, self._lowest, self._highest):
             self.is_located = True

@@ -94,7 +94,7 @@ class WrenchGuard:
 class PoseGuard:
     """Guard of the pose command: range (stroke), and rate of translation and rotation.
 
-    A command is outside the stroke only while it returns into the stroke.
+    A command may be outside the stroke only on the way back into the stroke.
 
     Attributes:
         output: last command [m, rad].
@@ -138,7 +138,7 @@ class PoseGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the faults. Until the output first reaches a command, limiting the output does not trip."""
+        """Forget the faults; the rate limit does not trip before the output first reaches a command."""
         self._limited_ticks = 0.0
         self._engaged = False
         self._rate = [0.0] * AXES
@@ -196,7 +196,7 @@ class PoseGuard:
         return fault
 
     def retreat(self, measured: Vector, pose: Vector) -> None:
-        """Move the output by one period of the retreat; see `limit` for the arguments."""
+        """Brake or retrace the path for one period after a trip; see `limit` for the arguments."""
         if not self.has_output:
             self._stand(measured, pose)
         if not self._back:
@@ -222,7 +222,7 @@ class PoseGuard:
             path.drop()
 
     def _next_share(self, remaining: float) -> float:
-        """Return the next speed on the way back, divided by the retreat speed; `remaining` is in m."""
+        """Return the next speed as a share of the retreat speed; `remaining` is the rest of the path [m]."""
         if remaining > 0.0 and self._retreat > 0.0 and self._retreat_turn > 0.0:
             gain = min(self._braking / self._retreat, self._braking_turn / self._retreat_turn)
             slowing = sqrt(2.0 * self._braking * remaining) / self._retreat
@@ -231,7 +231,7 @@ class PoseGuard:
         return 0.0
 
     def _brake(self) -> None:
-        """Slow down along the last change of the command."""
+        """Slow the command down for one period; at a standstill or the stroke's end, begin the way back."""
         rate = self._rate
         zero = [0.0] * AXES
         speed, turning = length(rate, zero), angle(rate, zero)
@@ -250,7 +250,7 @@ class PoseGuard:
             self._back = True
 
     def _stays(self, moved: Vector) -> bool:
-        """Return whether a pose is within the stroke, or on the way back into it."""
+        """Return False if a move to `moved` takes a coordinate out of the stroke, or further away from it."""
         stays = True
         for low, high, new, old in zip(self._lowest, self._highest, moved, self.output, strict=True):
             stays = stays and not (new < low and new < old) and not (new > high and new > old)
@@ -262,7 +262,7 @@ class PoseGuard:
         return near and angle(command, reference) <= self._start_angle
 
     def _share_of(self, target: Vector, max_change: float, max_turn: float) -> float:
-        """Return the fraction of the way to a pose, at most 1, that the largest step covers."""
+        """Return the fraction (at most 1) of the way to a pose that `max_change` and `max_turn` allow."""
         distance, turn = length(target, self.output), angle(target, self.output)
         share = 1.0
         if distance > 0.0 and distance > max_change:
@@ -281,7 +281,7 @@ class PoseGuard:
         self._rate = [new - old for new, old in zip(self.output, before, strict=True)]
 
     def _stand(self, measured: Vector, pose: Vector) -> None:
-        """Set the output to `measured`. If that is not finite, use `pose`, moved into the stroke."""
+        """Set the output to `measured`; if `measured` is not finite, use `pose` limited to the stroke."""
         self.has_output = True
         if is_finite(measured):
             self.output = list(measured)

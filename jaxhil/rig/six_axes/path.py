@@ -39,7 +39,7 @@ class CommandPath:
         self.clear()
 
     def clear(self) -> None:
-        """Forget the path."""
+        """Remove all points of the path."""
         self.count = 0
         self._head = 0
         self.newest = [0.0] * AXES

@@ -14,7 +14,7 @@ from jaxhil.rig.types import Gains, Positive
 
 
 class ModelConstants(NamedTuple):
-    """Constants of the numerical model and the rig, which a six-axis gain file contains."""
+    """Constants of the numerical model and of the rig, as stored in a six-axis gain file."""
 
     mass_matrix: Matrix  # relative mass matrix M at the docked pose, about C's origin [kg, kg m, kg m^2]
     inverse_mass: Matrix  # inverse of M

@@ -5,7 +5,7 @@ from jaxhil.rig.six_axes.vectors import Vector, cross, rotate, wrench_at_target
 
 
 class SensorReader:
-    """Reader of a force sensor: subtracts the weight of a tool and moves the moment to T's origin."""
+    """Reader of a force sensor: subtracts a tool's weight and moves the moment to target frame T's origin."""
 
     __slots__ = ("_sign", "_tool")
     _tool: Vector

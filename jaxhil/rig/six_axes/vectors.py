@@ -108,8 +108,8 @@ def rotate(pose: Vector, vector: Triple) -> Triple:
 def coordinate_rates(pose: Vector, twist: Vector) -> Vector:
     """Return the time derivatives of a pose's coordinates (p, theta) at the twist (v, w).
 
-    theta' = Jl(theta)^-1 w = w - theta x w/2 + c theta x (theta x w), where Jl is the left Jacobian, c = (1 -
-    t/2 cot(t/2))/t^2 and t = |theta|.
+    theta' = Jl(theta)^-1 w = w - theta x w/2 + c theta x (theta x w), where Jl is the left Jacobian,
+    c = (1 - t/2 cot(t/2))/t^2 and t = |theta|.
     """
     _, _, _, a, b, c = pose
     x, y, z, u, v, w = twist
@@ -131,7 +131,7 @@ def coordinate_rates(pose: Vector, twist: Vector) -> Vector:
 
 
 def lead_pose(leads: Vector, pose: Vector, rates: Vector) -> Vector:
-    """Extrapolate each coordinate of the pose by its lead time [s] at its rate."""
+    """Add to each coordinate of a pose its rate times its lead time [s]."""
     return [at + lead * rate for at, lead, rate in zip(pose, leads, rates, strict=True)]
 
 

@@ -118,9 +118,9 @@ class SixAxisWatchdog:
 
         Args:
             previous: wrench W_c of the last tick [N, N m].
-            status: the compensator's status at that wrench.
+            status: the compensator's status on the last tick.
             lag: lag of the hardware behind the model [s]; 0 if the compensator does not know it.
-            unpaid: uncorrected impulse error after the last contact, divided by the contact's impulse [1].
+            unpaid: impulse error that remains after the contact, divided by the contact's impulse [1].
             wrench: measured wrench of this tick [N, N m].
             pose: pose of the numerical model [m, rad].
             twist: twist of the numerical model [m/s, rad/s].
@@ -164,8 +164,8 @@ class SixAxisWatchdog:
 
         Args:
             previous: wrench W_c of the last tick [N, N m].
-            status: the compensator's status at that wrench.
-            unpaid: impulse error left uncorrected by this contact, divided by the contact's impulse [1].
+            status: the compensator's status on the last tick.
+            unpaid: impulse error that remains after the contact, divided by the contact's impulse [1].
         """
         if not self._open:
             return 0
@@ -178,7 +178,7 @@ class SixAxisWatchdog:
         return self._audit()
 
     def detail(self, fatal: int) -> str:
-        """Describe the faults with the bits `fatal` by the numbers of the last audit."""
+        """Describe the last audit: contact number, and the value of each fault whose bit is in `fatal`."""
         numbers = {
             MOMENTUM: f"momentum error {self.momentum_error:.4g}",
             ENERGY_GAIN: f"energy released {self.energy_gain:.4g}",
@@ -188,7 +188,7 @@ class SixAxisWatchdog:
         return f"contact {self.contacts}: {text}" if text else ""
 
     def _begin(self) -> None:
-        """Begin a contact after the last tick, whose twist is the approach twist."""
+        """Begin a contact; the twist on the last tick is the approach twist."""
         self._open = True
         self._entry = list(self._twist)
         self._impulse = [0.0] * AXES
