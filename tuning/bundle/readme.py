@@ -76,7 +76,7 @@ HOLDS = {
 
 
 def describe_numerical_model(mechanism: Mapping[str, Any]) -> str:
-    """Return the README's text on the numerical model: mass, sign, integrator in code, hold and latency."""
+    """Return the README's text on the numerical model: mass, signs, code of a step, hold and latency."""
     bodies, rig = mechanism["bodies"], mechanism["rig"]
     mass = bodies.get("equivalent_mass")
     if mass is None:

@@ -77,9 +77,9 @@ def check_files(folder):
 
 
 def find_differences(folder):
-    """Compare all files with the manifest.
+    """Compare all files in a bundle's folder with its manifest.
 
-    Return the content of each file by its path, and a list of (path, description) of the differences.
+    Return the content of each file by its path, and a list with (path, description) for each difference.
     """
     found, problems, wrong, left = {}, [], [], MAX_BUNDLE_BYTES
     if os.path.lexists(os.path.join(folder, SIGNATURE_FILE)):
@@ -168,7 +168,7 @@ def find_differing_lines(content, checksums):
 
 
 def find_value_differences(content, expected):
-    """Yield a text for each value of the gain file that differs: key, found value and expected value."""
+    """Yield a text for each changed value of the gain file: key, found value and expected value."""
     try:
         found = dict(flatten_document(json.loads(content), ""))
     except Exception:
@@ -257,7 +257,7 @@ def check_vectors(folder, found, replay, runtime):
 
 
 def check_c(found, damaged):
-    """Compile the controller in C and its FMUs; check that each of them reproduces the test vectors."""
+    """Compile the controller in each folder with C code; check that it reproduces the test vectors."""
     folders = [name for name in C_FOLDERS if any(path.startswith(f"{name}/") for path in {*found, *damaged})]
     compiler = shutil.which(os.environ.get("CC") or "cc") or shutil.which("gcc") or shutil.which("clang")
     good = bool(folders) or report_failure("c99", "found no file in C, expected a bundle with c99 or FMUs")
@@ -356,7 +356,7 @@ def escape_unprintable(text):
 
 
 def check_this_file():
-    """Check the SHA-256 of this file again, because a damaged check above could have accepted it."""
+    """Check the SHA-256 of this file again: damage to this file could have disabled the checks above."""
     here = os.path.dirname(os.path.abspath(__file__))
     try:
         manifest = json.loads(read_plain_file(here, "manifest.json", MAX_TEXT_BYTES))

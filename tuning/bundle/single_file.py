@@ -143,7 +143,7 @@ def _external_imports(node: ast.Import | ast.ImportFrom, where: str) -> Iterator
 def _sort_by_imports(names: Iterable[str], generated: dict[str, ModuleSource]) -> list[ModuleSource]:
     """Return the named modules and all modules that they import, in an order that satisfies the imports.
 
-    The sources in `generated` replace source files.
+    A source in `generated` replaces the source file of the module with this name.
     """
     ordered: dict[str, ModuleSource] = {}
 
@@ -185,7 +185,7 @@ def _bound_names(statement: ast.stmt) -> Iterator[str]:
 
 
 def _module_section(source: ModuleSource) -> Iterator[str]:
-    """Yield the lines of a module in the single file: docstring as a comment, then the remaining code."""
+    """Yield a module's lines for `jaxhil_runtime.py`: docstring as a comment, then code without imports."""
     yield from ("", "", f"# ---- {source.name} " + "-" * (100 - len(source.name)))
     for line in (ast.get_docstring(source.tree) or "").splitlines():
         yield f"# {line}".rstrip()

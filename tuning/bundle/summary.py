@@ -98,7 +98,7 @@ def describe_mechanism(mechanism: Mapping[str, Any], axes: int = 1) -> str:
 
 
 def _describe_filter(rig: Mapping[str, Any]) -> str:
-    """Return the force sensor's filter in words, with its delay at low frequencies; empty without one."""
+    """Describe the force sensor's filter and its delay at low frequencies; return "" without a filter."""
     stated = rig["force_sensor"].get("filter")
     if stated is None:
         return ""
@@ -128,7 +128,7 @@ def _describe_six_axes(mechanism: Mapping[str, Any]) -> str:
 
 
 def _error_table(document: Mapping[str, Any], key: str, title: str) -> Iterator[str]:
-    """Yield the HTML lines of the table of errors in fresh scenarios, with a legend of its numbers."""
+    """Yield the HTML lines of a table with the errors in fresh scenarios, which the tuning did not use."""
     robust = document["figures"].get(key)
     rows = []
     for name, errors in robust.items() if isinstance(robust, Mapping) else ():
@@ -152,11 +152,11 @@ def _error_table(document: Mapping[str, Any], key: str, title: str) -> Iterator[
 
 
 def describe_sweep(sweep: Any, error_name: str) -> Iterator[str]:
-    """Yield a sentence with the failure probability of a sweep; yield nothing without a sweep.
+    """Yield a sentence on the failure probability that a sweep estimated; yield nothing without a sweep.
 
     Args:
         sweep: result of `tuning.sweeps.run_sweep.summarise_failures`, or None.
-        error_name: name of the error to which the sweep's limit applies.
+        error_name: name of the error; a scenario of the sweep fails if this error exceeds the limit.
     """
     if isinstance(sweep, Mapping) and isinstance(sweep.get("failure_probability"), Mapping):
         value, low, high = (sweep["failure_probability"].get(key) for key in ("value", "low", "high"))
@@ -226,7 +226,7 @@ def _watchdog_verdict(rates: Mapping[str, Any]) -> str:
 
 
 def _active_limits(document: Mapping[str, Any]) -> dict[str, GainOrLimit]:
-    """Return the limits that have a value in the gain document."""
+    """Return those limits of a gain document that are set (not null)."""
     entries = limit_entries(document)
     return {name: entry for name, entry in entries.items() if document["limits"][name]["value"] is not None}
 
@@ -239,7 +239,7 @@ def describe_limit(value: float | None, unit: str) -> tuple[str, str]:
 
 
 def is_user_limit(limit: str) -> bool:
-    """Return whether users set the limit; False for the watchdog's fitted coefficients."""
+    """Return whether a limit is one that users set, and not a fitted coefficient of the watchdog."""
     return not limit.startswith(FITTED_LIMIT_PREFIXES)
 
 
@@ -278,7 +278,7 @@ def _describe_missed_faults(runs: Mapping[str, Any]) -> str:
 
 
 def _describe_noticed_errors(noticed: Mapping[str, Any], rates: Mapping[str, Any]) -> Iterator[str]:
-    """Yield texts on the smallest error that the watchdog detects in 95 % of contacts."""
+    """Yield texts on a widened `restitution_margin`, and on the smallest error that the watchdog detects."""
     if rates.get("widened_from") is not None:
         widened = (
             f"{format_number(rates['widened_from'], 2)} to {format_number(rates['restitution_margin'], 2)}"

@@ -69,7 +69,7 @@ def _bound_names(statement: ast.stmt) -> list[str]:
 
 
 def _restrict_import(statement: ast.stmt, names: set[str]) -> ast.stmt:
-    """Return the import statement reduced to `names`; rename a former name of `jaxhil.rig`."""
+    """Return an import statement with only `names`; replace the package `jaxhil.runtime` by `jaxhil.rig`."""
     assert isinstance(statement, (ast.Import, ast.ImportFrom))
     aliases = [alias for alias in statement.names if (alias.asname or alias.name.partition(".")[0]) in names]
     if isinstance(statement, ast.Import):

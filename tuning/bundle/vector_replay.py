@@ -97,7 +97,7 @@ def replay_vectors(rows, gains, runtime):
 
 
 def quantities(row, width):
-    """Return the quantities of a row: numbers, or lists of `width` numbers."""
+    """Return the numbers of a row if `width` is 1; else divide them into lists of `width` numbers."""
     if width == 1:
         return row
     return [row[index : index + width] for index in range(0, len(row), width)]

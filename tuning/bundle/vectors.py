@@ -92,7 +92,7 @@ class RecordedVectors(NamedTuple):
 def record_vectors(
     loaded: LoadedGains, gain_file: GainFile, seed: int, draws: int = DEFAULT_DRAWS
 ) -> RecordedVectors:
-    """Simulate the nominal run and random draws of the uncertain values, and replay them in the runtime."""
+    """Simulate the nominal run and runs with drawn uncertain values, and replay them in the rig's runtime."""
     mechanism = remove_fixed_uncertainty(loaded.mechanism)
     batch = nominal_and_draws(mechanism, 1 + draws, seed)
     _, lanes = record_lanes(loaded, batch)
@@ -134,7 +134,7 @@ def make_damaged_rows(
 
 
 def make_vectors(loaded: LoadedGains, seed: int, draws: int = DEFAULT_DRAWS) -> RecordedVectors:
-    """Return the test vectors of a bundle: first the recorded runs, then the damaged runs."""
+    """Return the test vectors of a one-axis bundle: the recorded runs, then runs with corrupted inputs."""
     gain_file = check_gain_document(loaded.document)
     vectors = record_vectors(loaded, gain_file, seed, draws)
     nominal = [row for row in vectors.rows if row.run == 0]
@@ -177,7 +177,7 @@ def _lane_inputs(run: int, lane: LaneRecord, period: float) -> Iterator[Controll
 def _damage_inputs(
     source: random.Random, run: int, segment: Sequence[VectorRow], period: float
 ) -> Iterator[ControllerInputs]:
-    """Yield the controller's inputs in each tick of a segment, randomly corrupted."""
+    """Yield randomly corrupted inputs of the controller for each tick of a segment."""
     timed = source.random() < 0.8
     time, stuck = source.uniform(0.0, 1e3), {}
     for tick, row in enumerate(segment):
@@ -222,8 +222,8 @@ def _run_controller(
 ) -> tuple[list[VectorRow], list[tuple[float, float]], list[int]]:
     """Run the controller with the inputs.
 
-    Return, for each tick, the row of the test vectors, the identified stiffness [N/m] and damping [N s/m],
-    and the bits of the faults that change a command.
+    Return three lists with one entry per tick: rows of the test vectors; stiffness [N/m] and damping [N s/m]
+    that the controller identified; and faults that change a command, as bits of an integer.
     """
     rows, identified, acting = [], [], []
     move = INTEGRATORS[integrator]
@@ -261,9 +261,10 @@ def _compare_with_simulation(
 ) -> tuple[list[VectorRow], str | None, str | None]:
     """Compare the runtime's rows with the simulation.
 
-    The comparison ends at the first tick in which a fault changes a command, or in which a rounding error
-    decides on which side of a threshold a value lies. Return the rows with the simulated forces up to that
-    tick, the reason for an early end or None, and a description of the first difference or None.
+    The comparison ends before the first tick in which a fault changes a command, or in which a rounding error
+    decides whether a value exceeds a threshold. Return three values: the rows; the reason for an early end or
+    None; and a description of the first difference or None. In the rows, the simulated force is NaN from the
+    end or from the first differing force on.
     """
     number = len(rows)
     if not number:

@@ -60,7 +60,7 @@ class SixAxisRow(NamedTuple):
 
     @property
     def run(self) -> int:
-        """Return the number of the run."""
+        """Return the index of the run, counted from 0."""
         return self.inputs.run
 
     def fields(self) -> list[float | None]:
@@ -72,7 +72,7 @@ class SixAxisRow(NamedTuple):
 
 
 def make_six_axis_vectors(loaded: LoadedGains, seed: int, draws: int = DEFAULT_DRAWS) -> RecordedVectors:
-    """Return the test vectors of a bundle: first the recorded runs, then runs with corrupted inputs."""
+    """Return the test vectors of a six-axis bundle: the recorded runs, then runs with corrupted inputs."""
     gain_file = check_six_axis_document(loaded.document)
     subject = loaded.mechanism, loaded.compensator, loaded.gains
     records = [*record_runs(*subject, 0, seed)[1], *record_runs(*subject, draws, seed)[1]]
@@ -125,11 +125,11 @@ def run_controller(gain_file: SixAxisGainFile, inputs: Sequence[SixAxisInputs]) 
 def compare_with_record(
     rows: list[SixAxisRow], record: ControllerRecord
 ) -> tuple[list[SixAxisRow], str | None, str | None]:
-    """Compare controller and record, up to the first fault that changes a command.
+    """Compare the controller's commands with the record, up to the first fault that changes a command.
 
     Returns:
-        The rows (without simulated wrenches after the first such fault or difference), a description of this
-        fault or None, and a description of the first difference or None.
+        Three values: the rows; a description of this fault or None; and a description of the first difference
+        or None. In the rows, the simulated wrench is NaN from this fault or difference on.
     """
     acting = [tick for tick, row in enumerate(rows) if row.acting]
     end, end_reason = len(rows), None
@@ -166,7 +166,7 @@ def format_six_axis_csv(rows: Sequence[SixAxisRow]) -> str:
 def _damaged_runs(
     nominal: Sequence[SixAxisInputs], period: float, first: int, seed: int
 ) -> Iterator[list[SixAxisInputs]]:
-    """Yield the inputs of runs that are random segments of the nominal run, randomly corrupted."""
+    """Yield the inputs of each damaged run: a random segment of the nominal run with corrupted inputs."""
     source = random.Random(seed)
     for run in range(first, first + DAMAGED_RUNS):
         begin = source.randrange(max(1, len(nominal) - DAMAGED_RUN_TICKS))
@@ -177,7 +177,7 @@ def _damaged_runs(
 def _damaged(
     source: random.Random, run: int, segment: Sequence[SixAxisInputs], period: float
 ) -> Iterator[SixAxisInputs]:
-    """Yield the controller's inputs in each tick of a segment, randomly corrupted."""
+    """Yield randomly corrupted inputs of the controller for each tick of a segment."""
     timed, time = source.random() < 0.8, source.uniform(0.0, 1e3)
     for tick, inputs in enumerate(segment):
         event = RUN_START if tick == 0 else NEXT_CONTACT if source.random() < DAMAGED_TICK_SHARE / 4 else 0

@@ -150,8 +150,8 @@ def c99_files(document: Mapping[str, Any]) -> dict[str, bytes]:
 def fmi3_files(document: Mapping[str, Any]) -> dict[str, bytes]:
     """Return the FMUs of FMI 3.0 as source code without a compiled library, in the folder `fmi3`.
 
-    These are the controller and the rig, if its FMU can simulate it. A test program replays the test vectors
-    through the controller's FMU.
+    One FMU contains the controller. Another FMU contains the rig, if an FMU can simulate this rig. A test
+    program replays the test vectors through the controller's FMU.
     """
     return _fmu_files(document, 3)
 

@@ -40,7 +40,7 @@ class Checkpoints:
 
     @property
     def is_enabled(self) -> bool:
-        """Return whether checkpoints are stored, because there is a folder."""
+        """Return whether there is a folder in which checkpoints are stored."""
         return self._folder is not None
 
     @property
@@ -51,8 +51,9 @@ class Checkpoints:
     def read(self, name: str, inputs: Any, kind: Any) -> Any:
         """Read the result of the checkpoint `name`, of type `kind`.
 
-        Return None if the checkpoint is missing or damaged, or if its digest does not match. Together with
-        the code, `inputs` must determine the result; they are mappings, sequences, records, text and numbers.
+        Return None if the checkpoint is missing or damaged, or if `inputs` or the code differ from those of
+        the stored result. `inputs` and the code must determine the result. `inputs` are mappings, sequences,
+        records, arrays, text and numbers.
         """
         path = self._path(name)
         if path is None or not self._resume or not path.exists():
@@ -88,7 +89,7 @@ class Checkpoints:
         return StepCheckpoints(steps, inputs)
 
     def remove(self) -> None:
-        """Remove all checkpoints, and their folder if it is empty then; add an error to `unwritten`."""
+        """Remove all checkpoints, and then their folder if it is empty; add any error to `unwritten`."""
         if self._folder is None or not self._folder.is_dir():
             return
         with self._recording_errors(self._folder):
@@ -113,7 +114,7 @@ class Checkpoints:
 
 
 class StepCheckpoints:
-    """Checkpoints of the steps of one computation, which are kept until the whole computation is finished.
+    """Checkpoints of a computation's steps; they are kept until the whole computation is finished.
 
     The result of a step must depend only on the inputs and the previous steps. Steps with the same name are
     numbered.
@@ -124,7 +125,7 @@ class StepCheckpoints:
         self._numbers: dict[str, int] = {}
 
     def step(self, name: str, kind: Any, make: Callable[[], Any]) -> Any:
-        """Read the result of the step `name`, of type `kind`; if none is stored, call `make` and store it."""
+        """Return the stored result of step `name`, of type `kind`; else call `make` and store its result."""
         number = self._numbers[name] = self._numbers.get(name, 0) + 1
         inputs = self._inputs, name, number
         result = self._checkpoints.read(f"{name} {number}", inputs, kind)
@@ -142,7 +143,7 @@ NO_CHECKPOINTS = Checkpoints()
 
 
 def compute_digest(inputs: Any) -> str:
-    """Return the SHA-256 digest of inputs, code and compiler flags; the order of mappings has no effect."""
+    """Return the SHA-256 digest of inputs, code and compiler flags; the order of keys has no effect."""
     whole = (inputs, sources_sha256(), dependency_versions(), rounding_flags(active_xla_flags()))
     return hashlib.sha256(encode_value(whole, order="deterministic")).hexdigest()
 

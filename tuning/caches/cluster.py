@@ -25,7 +25,7 @@ UNITS_PER_WORKER = 2  # submitted units per worker, so that a worker need not wa
 
 
 class WorkUnit(NamedTuple):
-    """One call of a function that a worker computes."""
+    """One function call for a worker, with a unique name."""
 
     name: Any  # unique name of the unit
     arguments: tuple[Any, ...]  # arguments of the function
@@ -120,8 +120,8 @@ class ClusterWorkers:
         """Call `function` for every work unit on the workers; yield (name, result) of each finished unit.
 
         Workers can join later. `function` must be defined at the top level of a module. `label` is a unique
-        name of this work. Raise `InputError` if the connection to the scheduler is lost, or if code, package
-        versions or XLA flags of a worker differ from `setting`, unless it is None.
+        name of this call. Raise `InputError` if the connection to the scheduler is lost, or if a worker's
+        code, package versions or XLA flags differ from `setting`. If `setting` is None, nothing is compared.
         """
         with _raise_if_lost(self._address):
             from cloudpickle import dumps  # pyright: ignore[reportMissingImports]
@@ -170,7 +170,7 @@ def _wait_for_next(ended: "SimpleQueue[Any]") -> Any:
 
 
 def _get_result(future: Any) -> tuple[Any] | None:
-    """Return the result of a unit as a tuple of length 1, or None if the unit killed several workers."""
+    """Return a work unit's result as a tuple of length 1, or None if the unit killed several workers."""
     from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
 
     try:

@@ -33,7 +33,7 @@ def get_process_setting() -> ProcessSetting:
 
 
 def dask_setup(worker: Any) -> None:
-    """Prepare JAX with the flags of a command; dask calls this function when it preloads the module."""
+    """Prepare JAX with the same flags as in a command; dask calls this when it preloads this module."""
     prepare_jax()
 
 
@@ -66,6 +66,6 @@ def check_process_setting(asked: ProcessSetting, here: ProcessSetting) -> None:
 
 
 def build_setting_error(difference: str, flags: bool) -> InputError:
-    """Return the error for a worker's wrong setting; if `flags`, name the command that starts workers."""
+    """Return the error for a worker with a `difference`; if `flags`, advise how to start workers."""
     advice = f"; start workers with: {PRELOAD_COMMAND}" if flags else ""
     return InputError(f"--scheduler: a worker: {difference}: its results would differ{advice}")

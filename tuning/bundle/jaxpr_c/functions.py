@@ -115,7 +115,7 @@ class Translator:
         return value._replace(shape=tuple(aval.shape))
 
     def _apply(self, equation: Any, values: Sequence[Value]) -> Sequence[Value]:
-        """Return the results of an equation."""
+        """Add the statements of one equation of a jaxpr; return the values of its results."""
         name, params, statements = equation.primitive.name, equation.params, self._statements
         shapes = [tuple(variable.aval.shape) for variable in equation.outvars]
         if name in CALLS:
@@ -165,7 +165,7 @@ class Translator:
 
 
 def _used_equations(jaxpr: Any) -> list[Any]:
-    """Return the equations whose results are used, in their order."""
+    """Return the equations of a jaxpr whose results are used, in the jaxpr's order."""
     used, used_equations = {id(atom) for atom in jaxpr.outvars}, []
     for equation in reversed(jaxpr.eqns):
         if any(id(variable) in used for variable in equation.outvars):

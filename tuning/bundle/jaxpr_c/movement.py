@@ -50,7 +50,7 @@ JOINING: dict[str, Callable[[Sequence[np.ndarray], Parameters], np.ndarray]] = {
 def select_elements(
     statements: Statements, name: str, params: Parameters, values: Sequence[Value]
 ) -> list[Value] | None:
-    """Return the results of a static selection; None if the primitive is another one."""
+    """Select elements at constant positions; return the results, or None if the primitive does not select."""
     numbers = [np.arange(value.size).reshape(value.shape) for value in values]
     if name in UNARY:
         return [_view_or_copy(statements, values[0], UNARY[name](numbers[0], params))]
@@ -92,7 +92,7 @@ def _view_or_copy(statements: Statements, value: Value, chosen: np.ndarray) -> V
 def _join(
     statements: Statements, values: Sequence[Value], starts: Sequence[int], chosen: np.ndarray
 ) -> Value:
-    """Copy elements of several operands; `chosen` contains indices into their concatenated elements."""
+    """Return elements of several operands; `chosen` contains indices into the joined list of all elements."""
     flat = chosen.ravel()
     owners = np.searchsorted(starts, flat, side="right") - 1
     parts = [
@@ -114,7 +114,7 @@ def _join(
 def _copy_runs(
     statements: Statements, result: Value, owners: np.ndarray, values: Sequence[Value], numbers: np.ndarray
 ) -> list[str]:
-    """Return the loops that copy runs of elements with a constant step, or one loop with a table."""
+    """Return C loops that copy elements: one per run with a constant step, or one with an index table."""
     runs, first = [], 0
     for last in range(1, len(owners) + 1):
         step = numbers[first + 1] - numbers[first] if last > first + 1 else 0
@@ -144,7 +144,7 @@ def _copy_runs(
 
 
 def slice_at(statements: Statements, params: Parameters, values: Sequence[Value]) -> Value:
-    """Return the elements of an array from computed start indices, which are clamped to the array."""
+    """Return a slice of an array; its start indices are computed in C, and clamped so that the slice fits."""
     array, starts = statements.contiguous(values[0]), values[1:]
     sizes = params["slice_sizes"]
     result = statements.variable(sizes, array.type)
@@ -160,7 +160,7 @@ def slice_at(statements: Statements, params: Parameters, values: Sequence[Value]
 
 
 def update_at(statements: Statements, values: Sequence[Value]) -> Value:
-    """Return a copy of an array with a part that is replaced at computed, clamped start indices."""
+    """Return an array with one part replaced; its start indices are computed in C, and clamped to fit."""
     array, part, starts = values[0], values[1], values[2:]
     result = statements.array(array.shape, array.type)
     begin, names = _clamped_starts(array.shape, part.shape, starts)
@@ -179,7 +179,7 @@ def update_at(statements: Statements, values: Sequence[Value]) -> Value:
 def _clamped_starts(
     shape: Sequence[int], sizes: Sequence[int], starts: Sequence[Value]
 ) -> tuple[str, list[str]]:
-    """Return the definitions of the start indices in C, and the index of each axis."""
+    """Return C code that defines the clamped start indices, and the C expression of each start index."""
     text, names = [], []
     for axis, (length, size, start) in enumerate(zip(shape, sizes, starts, strict=True)):
         if length == size:
@@ -191,7 +191,7 @@ def _clamped_starts(
 
 
 def _shifted(start: str, index: str) -> str:
-    """Return the sum of two indices of an axis."""
+    """Return the C expression of `start` plus `index`, without a term that is "0"."""
     return index if start == "0" else start if index == "0" else f"({start} + {index})"
 
 
@@ -235,7 +235,7 @@ def gather(
 
 
 def _fill_value(params: Parameters, type_name: str) -> str:
-    """Return the value of a gather outside its array."""
+    """Return the C literal that a gather uses for elements outside its array."""
     value = params["fill_value"]
     if value is None:
         kind = np.dtype(type_name)

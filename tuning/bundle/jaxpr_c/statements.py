@@ -13,7 +13,7 @@ NAME = re.compile(r"\bv\d+\b")
 
 
 class Statement(NamedTuple):
-    """Statement of a function, with the values that it computes."""
+    """C code of one statement, and the values that this code computes."""
 
     results: tuple[Value, ...]
     text: str
@@ -23,24 +23,24 @@ class Statements:
     """Statements of one C function.
 
     Args:
-        tables: names of the constant arrays of the file by their definitions; new arrays are added.
+        tables: names of the C file's constant arrays by their definitions; the method `table` adds arrays.
     """
 
     def __init__(self, tables: dict[str, str]) -> None:
         self._tables, self._count, self._statements = tables, 0, list[Statement]()
 
     def scalar(self, shape: Sequence[int], type_name: str) -> Value:
-        """Return a new value whose elements are all equal."""
+        """Return a new value whose elements are all equal: a scalar in C."""
         self._count += 1
         return Value(tuple(shape), type_name, f"v{self._count}", 0, None)
 
     def array(self, shape: Sequence[int], type_name: str) -> Value:
-        """Return a new array."""
+        """Return a new value that is an array in C."""
         self._count += 1
         return Value(tuple(shape), type_name, f"v{self._count}")
 
     def variable(self, shape: Sequence[int], type_name: str) -> Value:
-        """Return a new array, or a scalar for a single element."""
+        """Return a new array, or a new scalar if the shape has a single element."""
         return (self.scalar if math.prod(shape) == 1 else self.array)(shape, type_name)
 
     def constant(self, array: np.ndarray, type_name: str) -> Value:
@@ -56,7 +56,7 @@ class Statements:
         return self._tables.setdefault(definition, f"table_{len(self._tables) + 1}")
 
     def add(self, results: Sequence[Value], text: str) -> None:
-        """Add a statement that computes these values."""
+        """Add the C statement `text`, which computes the values `results`."""
         self._statements.append(Statement(tuple(results), text))
 
     def define(self, shape: Sequence[int], type_name: str, expression: str) -> Value:
@@ -66,7 +66,7 @@ class Statements:
         return value
 
     def contiguous(self, value: Value) -> Value:
-        """Return an array with these elements in successive places; a single element stays a scalar."""
+        """Return the elements as an array with a stride of 1; return a single element as it is."""
         if value.size == 1 or value.stride == 1:
             return value
         result = self.array(value.shape, value.type)
@@ -92,7 +92,7 @@ class Statements:
 
 
 def _declare_scalars(results: Sequence[Value], text: str) -> list[str]:
-    """Return a statement with the declarations of its scalar results."""
+    """Return the lines of the statement `text`, with declarations of its scalar results."""
     scalars = [value for value in results if value.is_uniform]
     if len(results) == 1 and scalars and text.startswith(f"{scalars[0].name} = ") and text.count(";") == 1:
         return [f"const {scalars[0].c_type} {text}"]
@@ -100,7 +100,7 @@ def _declare_scalars(results: Sequence[Value], text: str) -> list[str]:
 
 
 def _share_memory(statements: Sequence[Statement], end: str) -> tuple[dict[str, str], list[str]]:
-    """Return the C array that stores each array, by the array's name, and the declarations of the C arrays.
+    """Assign memory to arrays; return the memory's C name by the array's name, and the C declarations.
 
     Arrays of the same type and size share memory if one is no longer used when the other is first written.
     """
@@ -129,7 +129,7 @@ def strides_of(shape: Sequence[int]) -> list[int]:
 
 
 def index_of(strides: Sequence[int], indices: Sequence[str]) -> str:
-    """Return the C expression of an element's index; an index of "0" is omitted."""
+    """Return the C expression of an element's position: the sum of stride * index over all axes."""
     terms = [
         index if stride == 1 else f"{stride} * {index}"
         for stride, index in zip(strides, indices, strict=True)
@@ -139,9 +139,9 @@ def index_of(strides: Sequence[int], indices: Sequence[str]) -> str:
 
 
 def loops(shape: Sequence[int], body: Callable[..., str]) -> str:
-    """Return nested loops in C. `body` returns the statement for the indices.
+    """Return nested loops in C over all elements of an array.
 
-    The index of an axis with the length 1 is "0".
+    `body` takes an index for each axis and returns the C statement; an axis of length 1 has the index "0".
     """
     names = ["0" if length == 1 else f"i{axis}" for axis, length in enumerate(shape)]
     heads = [

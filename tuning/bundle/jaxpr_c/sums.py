@@ -21,7 +21,7 @@ FOLDS: dict[str, tuple[Any, str]] = {
 
 
 def fold(statements: Statements, name: str, axes: Sequence[int], value: Value) -> Value:
-    """Combine the elements along axes by the primitive `name` of `FOLDS`."""
+    """Reduce an array along `axes` by the primitive `name`, a key of `FOLDS`; return the result."""
     first_value, step = FOLDS[name]
     if value.type not in (("bool",) if isinstance(first_value, bool) else ("float64",)):
         raise UnsupportedProgram(f"{name}: found {value.type}, expected float64, or bool for `and` and `or`")
@@ -69,6 +69,6 @@ def multiply(statements: Statements, params: dict[str, Any], values: Sequence[Va
 
 
 def _element(value: Value, axes: Sequence[int], indices: Sequence[str]) -> str:
-    """Return the C expression of an element; `indices` are its indices along `axes`."""
+    """Return the C expression of an element; `indices[n]` is its index along `axes[n]`."""
     index = dict(zip(axes, indices, strict=True))
     return value.element(index_of(strides_of(value.shape), [index[n] for n in range(len(value.shape))]))

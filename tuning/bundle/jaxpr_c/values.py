@@ -46,7 +46,7 @@ class Value(NamedTuple):
 
     @property
     def is_uniform(self) -> bool:
-        """Return whether all elements are one scalar expression."""
+        """Return whether one scalar C expression is the value of all elements."""
         return self.stride is None
 
     def element(self, index: int | str = 0) -> str:
@@ -70,7 +70,7 @@ class Value(NamedTuple):
 
 
 def type_of(aval: Any) -> str:
-    """Return the name of a variable's type; raise `UnsupportedProgram` if C has no such type here."""
+    """Return the name of a variable's type; raise `UnsupportedProgram` if it is not one of `C_TYPES`."""
     name = str(getattr(aval, "dtype", aval))
     if name not in C_TYPES:
         raise UnsupportedProgram(f"type: found {name}, expected one of {', '.join(C_TYPES)}")
@@ -78,7 +78,7 @@ def type_of(aval: Any) -> str:
 
 
 def literal(number: Any, type_name: str) -> str:
-    """Return the C literal of a number, in parentheses if it could not follow an operator otherwise."""
+    """Return the C literal of a number, in parentheses if it begins with a minus sign."""
     if type_name == "bool":
         return "true" if number else "false"
     if type_name == "float64":

@@ -88,19 +88,20 @@ def _is_permitted(character: str) -> bool:
 def check_earlier_results(
     document: Path, mark: str, plots: Sequence[str], mechanisms: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Check that a command overwrites nothing but results of an earlier run; return the earlier document.
+    """Check that a command overwrites only results of an earlier run; return the document of that run.
 
     Args:
         document: path of the JSON document that the command writes.
-        mark: key that identifies a document of this command.
+        mark: key that shows that this command wrote a document.
         plots: file names of the plots that the command writes to the same folder.
         mechanisms: names of the mechanisms whose earlier results may be overwritten; empty for all.
 
     Returns:
-        The earlier document; an empty dictionary if there is none.
+        The earlier JSON document; an empty dictionary if there is none.
 
     Raises:
-        InputError: If other files, or results for other mechanisms, would be overwritten.
+        InputError: If the command would overwrite a file that jaxhil did not write, or results of a mechanism
+            that is not in `mechanisms`.
     """
     with report_write_errors(document):
         os.fsencode(document)  # raises an error if the locale cannot encode the path

@@ -37,7 +37,7 @@ def run(options: Export) -> int:
 
 
 def _parse_limits(settings: tuple[str, ...]) -> dict[str, float | None]:
-    """Return limits by name (None: no limit) from texts LIMIT=VALUE; raise `InputError` for wrong texts."""
+    """Return limits by name from texts LIMIT=VALUE ('none': None); raise `InputError` for invalid texts."""
     replaced: dict[str, float | None] = {}
     for words in settings:
         name, _, text = words.partition("=")

@@ -114,7 +114,7 @@ def _check_options(options: IdentifyOptions) -> None:
 def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], folder: Path) -> None:
     """Write the JSON document, then the mechanism file.
 
-    The document must be written first: it shows the next run that the mechanism file is an earlier result.
+    The order matters: a later run overwrites the mechanism file only if the JSON document exists.
     """
     from tuning.identification.mechanism_file import to_toml
 
@@ -126,9 +126,9 @@ def _write(mechanism: dict[str, Any], verdict: str, document: dict[str, Any], fo
 
 
 def _reject_other_logs(path: Path, earlier: dict[str, Any], campaign: Campaign) -> None:
-    """Raise `InputError` if the folder contains results of other logs, which would be overwritten.
+    """Raise `InputError` if the earlier results in the folder come from none of the campaign's logs.
 
-    Without a prior, all mechanisms have the same default name, so that a comparison of names is not enough.
+    Without a prior mechanism, all results have the same default name, so comparing names is not enough.
     """
     sources = earlier.get("sources")
     if not isinstance(sources, dict) or not sources or {*sources.values()} & {*campaign.sources.values()}:
@@ -240,7 +240,7 @@ def read_logs(logs: list[Path], mapping: str | None, prior: Mechanism | None) ->
 
 
 def _select_stage(campaign: Campaign, stage: str | None) -> Campaign:
-    """Return a campaign that contains only the runs of the kind `stage` and the runs at rest."""
+    """Return the campaign with only its runs of the kind `stage` and at rest; None keeps all runs."""
     if stage is None:
         return campaign
     runs = tuple(run for run in campaign.runs if run.kind in (stage, "rest"))
@@ -253,7 +253,7 @@ def _select_stage(campaign: Campaign, stage: str | None) -> Campaign:
 
 
 def _parse_order(options: IdentifyOptions) -> int | None:
-    """Return the motion simulator's order, or None for 'auto'; raise `InputError` for other texts."""
+    """Return the motion simulator's order, or None for 'auto'; raise `InputError` for an invalid order."""
     if options.order == "auto":
         return None
     if not options.order.isdecimal() or int(options.order) > MAX_ORDER:

@@ -78,7 +78,7 @@ def print_estimates(document: dict[str, Any], folder: Path | None) -> None:
 
 
 def build_check_table(document: dict[str, Any], title: str) -> Any:
-    """Return the table of the model's checks; a row shows what was found and its effect on e and e - e*."""
+    """Return the table of the model's checks; each row shows a finding and its effect on e and on e - e*."""
     rows = []
     for check in document["checks"]:
         finding = ", ".join(filter(None, (check["finding"], check["where"])))
@@ -113,7 +113,7 @@ def build_estimate_entry(estimate, prior: Mechanism | None) -> dict[str, Any]:
 
 
 def _prior_value(prior: Mechanism | None, key: str) -> float | None:
-    """Return the prior's value of a key, or None; a list is continued by copies of its last entry."""
+    """Return the prior's value of a key, or None; an index beyond a list selects the list's last entry."""
     if prior is None:
         return None
     path, _, index = key.rpartition(".")

@@ -67,5 +67,5 @@ def _six_axis_text(source: str, name: str) -> str:
 
 
 def _describe_source(source: str) -> str:
-    """Return the `source` text of a new file, whose numbers are still those of the built-in file."""
+    """Return the text of the key `source` for a new file that contains the values of a built-in file."""
     return f"the values of the built-in {source}, until you replace them and this text"

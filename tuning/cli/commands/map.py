@@ -46,7 +46,7 @@ def run(options: Map) -> int:
 
 
 def _describe_map(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences on the nominal point and its margins and, if theory does not apply, on the reason."""
+    """Yield sentences: nominal error, margins, spectral radius, and the reason if no closed form applies."""
     nominal, limit = document["nominal"], document["limit"]
     error = nominal["error"]
     if error is None:
@@ -96,7 +96,7 @@ def _describe_bounds(document: Mapping[str, Any]) -> str:
 
 
 def _describe_margins(document: Mapping[str, Any], margins: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a text for each key: the range around the nominal value with an error within the limit."""
+    """Yield, for each of the map's two keys, a text with the range between its lower and upper margin."""
     for axis in "xy":
         margin, values = margins[axis], document[axis]["values"]
         ends = [

@@ -94,9 +94,9 @@ def _six_axis_entry(name: str) -> dict[str, Any]:
 
 
 def _contact_frequencies(mechanism: Mechanism) -> list[float]:
-    """Return the contact frequency sqrt(k/M)/(2 pi) [Hz] of each distinct stiffness k.
+    """Return the frequency sqrt(k/M)/(2 pi) [Hz] of each distinct stiffness k; M is the equivalent mass.
 
-    The list is empty for a contact law with an exponent, whose k does not have the unit N/m.
+    The list is empty if the contact law has an exponent, so that k does not have the unit N/m.
     """
     if find_contact_law(mechanism.contact.law).stiffness_unit != "N/m":
         return []

@@ -21,7 +21,7 @@ NO_UNCERTAINTY_NOTE = (
 def run(options: MonitorOptions) -> int:
     """Compare the contacts in the logs with the mechanism file, and print the result.
 
-    Return the exit code: 1 if the rig changed by more than the file's uncertainty, else 0.
+    Return the exit code: 1 if the rig changed by more than the uncertainty in the mechanism file, else 0.
     """
     loaded = load(options.mechanism)
     with terminal.show_stages(2) as stages:
@@ -64,7 +64,7 @@ def _count_from_one(number: int | None) -> int | None:
 
 
 def _contact_entry(number: int, result: MonitorResult) -> dict[str, Any]:
-    """Return the JSON entry of contact `number`, counted from 0: log, state and metrics."""
+    """Return the JSON entry of contact `number`, counted from 0: log, state (such as good) and metrics."""
     contact = result.contacts[number]
     metrics = {
         name: {"value": float(value), "predicted_std": float(std), "z": float(z)}

@@ -13,7 +13,7 @@ PAGE_SUFFIXES = (".html", ".htm")
 
 
 def run(options: ReportOptions) -> int:
-    """Write the page, and print its requirements; return exit code 1 if its verdict is bad, else 0."""
+    """Write the HTML report, and print its requirements; return exit code 1 if its verdict is bad, else 0."""
     if not options.results:
         raise InputError("RESULT: found none, expected results of jaxhil identify, tune, sweep, ...")
     target = Path(options.output)
