@@ -42,7 +42,7 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> Metrics:
 
 
 def run_contacts(loop: Loop, gains: Gains, rig: RigConstants) -> Metrics:
-    """Simulate all contacts as `rollout` does, with constants that were computed before."""
+    """Simulate all contacts as `rollout` does, with the rig's constants computed in advance."""
     return run_until_done(loop, gains, rig).metrics
 
 
@@ -77,15 +77,15 @@ def run_until_done(loop: Loop, gains: Gains, rig: RigConstants) -> RunState:
 
 
 def segment_length(loop: Loop) -> int:
-    """Return the number of ticks in a segment.
+    """Return the number of ticks in a segment (the ticks between two checks for ended contacts).
 
-    The number is 1 for two surfaces, because the next contact may begin in the next tick.
+    The number is 1 with two surfaces, because the next contact may begin in the next tick.
     """
     return 1 if loop.is_two_sided else 16
 
 
 def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool = True) -> RunState:
-    """Return the initial state of the first approach; with `skip_flight`, skip flight without events."""
+    """Return the state at the start of the first approach; `skip_flight` omits uneventful free flight."""
     scenario, like = rig.scenario, rig.scenario.velocity
     zeros = jnp.zeros_like(like)
     index = jnp.zeros(like.shape, jnp.int32)
@@ -137,7 +137,7 @@ def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool
 def run_segment(
     loop: Loop, rig: RigConstants, gains: Gains, run: RunState, record: bool
 ) -> tuple[RunState, Tick | None]:
-    """Simulate one segment; return the new state, and the record of every tick if `record` is set."""
+    """Simulate one segment (a few ticks); return the new state and, with `record`, every tick's record."""
     prepared = prepare_segment(loop, rig, gains, run)
 
     def body(carry, noise):
@@ -152,7 +152,7 @@ def run_segment(
 
 
 def prepare_segment(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) -> SegmentConstants:
-    """Compute the values that do not change during a segment."""
+    """Compute the values that stay constant during a segment (a few successive ticks)."""
     return SegmentConstants(
         gains=gains,
         rules=build_end_conditions(rig.scenario),
@@ -164,7 +164,7 @@ def prepare_segment(loop: Loop, rig: RigConstants, gains: Gains, run: RunState) 
 def draw_segment_noise(
     loop: Loop, rig: RigConstants, run: RunState, ticks: int
 ) -> tuple[SensorNoise, TimingDraws | None]:
-    """Return the sensors' noise and the timing effects at the ticks of the next segment, (ticks, *batch)."""
+    """Return the sensors' noise and the timing effects at the next `ticks` ticks, (ticks, *batch)."""
     ahead = jnp.arange(ticks, dtype=jnp.int32).reshape(-1, *[1] * run.index.ndim)
     age = run.tick + ahead - run.state.onset_tick[None]
     noise = draw_noise(loop.has_force_noise, loop.has_position_noise, rig.scenario, run.index, age)
@@ -229,18 +229,18 @@ def begin_next_contacts(
 
 
 def _changing_parts(run):
-    """Return the parts of the state that change within a segment."""
+    """Return the parts of the simulation's state that change during the ticks of a segment."""
     return run.state, run.tracker, run.tick
 
 
 def _replace_changing_parts(run, parts):
-    """Return the state with the parts of `_changing_parts` replaced."""
+    """Return the state `run` with new `parts`, in the form that `_changing_parts` returns."""
     state, tracker, now = parts
     return run._replace(state=state, tracker=tracker, tick=now)
 
 
 def _build_rings(loop, rig, ring, measured, order):
-    """Return the initial delay lines of the signals that the loop uses; `ring` is an array of zeros."""
+    """Return an initial delay line (`ring`, an array of zeros) for each signal that the loop uses."""
     interval = None
     if loop.is_two_sided:
         motion = MotionSample(ring, ring)
@@ -267,7 +267,7 @@ def _finished_lanes(rig, run):
 
 
 def _restart(loop, gains, state, entered, begins, fresh):
-    """In lanes where a run begins (`begins`), replace the state by `entered`, the state at a run's start.
+    """Replace the state by `entered`, the state at a run's start, in the lanes in which a run `begins`.
 
     The delay lines and the parameters of the contact law do not change.
     """

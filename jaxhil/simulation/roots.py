@@ -42,7 +42,7 @@ def find_sign_change(
 
 
 def _find_root(function: RootFunction, data: Any, low: Array, high: Array) -> tuple[Array, Array, Array]:
-    """Return the root of a function in [low, high], and the function's values at both ends."""
+    """Return the root of a function in [low, high], and the function's values at `low` and `high`."""
     fixed, low, high = lax.stop_gradient((data, low, high))
     at_low, at_high = function(fixed, jnp.stack([low, high]))
     change = at_high - at_low

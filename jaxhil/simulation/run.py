@@ -48,7 +48,7 @@ class ContactResult(NamedTuple):
         reference_peak_force: Peak force of the ideal contact [N].
         peak_force_ratio: Peak force divided by the ideal contact's peak force [1].
         peak_command: Largest magnitude of the force command, which acts on the numerical model [N].
-        position_shortfall: Largest change of the position command by the motion simulator's limits [m].
+        position_shortfall: Largest amount by which the simulator's limits change the position command [m].
         duration: Time during which a real contact force acts [s].
         reference_duration: Duration of the ideal contact [s].
         duration_ratio: Duration divided by the ideal contact's duration [1].
@@ -110,7 +110,7 @@ class Run:
         gains: Gains of the compensator by name [SI units].
         seed: Seed of the sensors' noise.
         contacts: Results of every scheduled contact.
-        status: "ok" if the status of every contact is "ok", else the first other status.
+        status: "ok" if every contact has the status "ok"; else the first status that is not "ok".
     """
 
     mechanism: Mechanism = field(repr=False)
@@ -122,7 +122,7 @@ class Run:
 
     @cached_property
     def summary(self) -> MechanismSummary:
-        """Return the summary of the mechanism: mass, ideal contacts, rates, and implausible numbers."""
+        """Return the mechanism's summary: mass, ideal contacts, control rate, and implausible numbers."""
         return summarise_mechanism(self.mechanism)
 
     def reasons(self, limit: float = 0.01) -> list[str]:
@@ -168,7 +168,7 @@ class Run:
 
     @property
     def force_command(self) -> np.ndarray:
-        """Return the force on the numerical model at every tick [N]."""
+        """Return the compensator's force command at every tick [N]."""
         return self.ticks.force_command
 
     @property

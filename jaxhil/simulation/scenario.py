@@ -100,7 +100,8 @@ class Scenario(NamedTuple):
 def count_contact_slots(contacts: int) -> int:
     """Return the length of arrays with one entry per contact.
 
-    The length is a power of two, so that mechanisms with similar numbers of contacts share a program.
+    The length is a power of two, so that mechanisms with similar numbers of contacts share a compiled
+    program.
     """
     return max(4, 1 << (contacts - 1).bit_length())
 
@@ -159,7 +160,7 @@ def build_timing(optional: Callable[[str], Any]) -> TimingBatch | None:
 
 
 def add_jitter(delay: Any, timing: TimingBatch | None) -> Any:
-    """Return the longest `delay` [s] that a force reading with the nominal `delay` may have."""
+    """Return the longest delay [s] of a force reading: the nominal `delay` plus the jitter."""
     return delay if timing is None or timing.jitter is None else delay + timing.jitter
 
 
@@ -174,7 +175,7 @@ class _MechanismNumbers:
         self._mechanism, self._draws = mechanism, draws
 
     def drawn(self, path: str, default: Any = None) -> Any:
-        """Return the drawn values; else the nominal value; else, if the file has no value, `default`."""
+        """Return the drawn values for a `path`, else the nominal value, else `default`."""
         value = self._draws.get(path)
         if value is None:
             value = value_at(self._mechanism, path)
@@ -218,9 +219,10 @@ class _MechanismNumbers:
 
 
 def _build_phases(mechanism, table) -> Any:
-    """Return the phases (contacts, lanes); a draw contains one common phase or one phase per contact."""
+    """Return each contact's phase (extra time of the approach [control periods]), (contacts, lanes)."""
     phase = table.drawn("approach.phase")
-    phase = table.np.atleast_2d(phase.T).T  # shape (lanes or 1, contacts or 1)
+    # A draw contains one phase for all contacts or one phase per contact: (lanes or 1, contacts or 1).
+    phase = table.np.atleast_2d(phase.T).T
     phase = table.np.broadcast_to(phase, (table.number, phase.shape[1]))
     return phase[:, np.minimum(np.arange(table.slots), phase.shape[1] - 1)].T
 
@@ -234,7 +236,7 @@ def _build_mass(mechanism, table) -> Any:
 
 
 def _build_force_sensor(sensor, table) -> ForceSensorBatch:
-    """Return the force sensor. The time constant of a filter is that of its slowest mode."""
+    """Return the force sensor; the time constant of a filter is that of its slowest mode."""
     path, names = "rig.force_sensor.", ForceSensorBatch._fields[:-1]
     batch = ForceSensorBatch(*(table.scalar(path + name) for name in names))
     if sensor.filter is None:
@@ -245,7 +247,7 @@ def _build_force_sensor(sensor, table) -> ForceSensorBatch:
 
 
 def _build_motion_simulator(simulator, table) -> MotionSimulatorBatch:
-    """Return the motion simulator. For `ideal` and `moving_average`, the transfer function has order 0."""
+    """Return the motion simulator; for `ideal` and `moving_average`, num(s)/den(s) has order 0."""
     path = "rig.simulator."
     ones = table.constant(1.0)
     numerator: Any

@@ -63,7 +63,7 @@ def apply_lag(
     forces: list[Array],
     time_constant: Array,
 ) -> Float[Array, "*batch"]:
-    """Return the output y [N] of a first-order lag T_s y' = F - y after an interval with one contact.
+    """Return the output y [N] of a first-order lag T_s y' = F - y at the end of an interval with one contact.
 
     During contact, the force F is interpolated by parabolas, each through three of the values in `forces`.
     The result is exact for the interpolated force.
@@ -86,7 +86,7 @@ def apply_lag(
 
 
 def follow_ramp(mode: Array, before: Array, now: Array, span: Array) -> Array:
-    """Return the next output [N] of a filter's mode, y' = r (F - y), whose input is linear.
+    """Return the output y [N] of a filter mode y' = r (F - y) after a linear change of the input F.
 
     Args:
         mode: Output at the start, complex [N].
@@ -99,7 +99,7 @@ def follow_ramp(mode: Array, before: Array, now: Array, span: Array) -> Array:
 
 
 def lag_decay(duration: Array, time_constant: Array) -> Array:
-    """Return the factor [1] by which the output of a lag decays in `duration` [s] without force."""
+    """Return the factor [1] by which the output of a lag decays in `duration` [s] with the input 0."""
     return jnp.exp(-duration / _bound_above_zero(time_constant))
 
 
@@ -131,12 +131,12 @@ def sample_force(
 
 @jax.custom_jvp
 def cut_dead_zone(force: Float[Array, "*batch"], dead_zone: Array, step: Array) -> Float[Array, "*batch"]:
-    """Replace forces [N] up to `dead_zone` [N] by 0; larger forces remain unchanged.
+    """Replace forces [N] of a magnitude up to `dead_zone` [N] by 0; larger forces remain unchanged.
 
-    The reading jumps at the first tick after the force crosses the edge of the dead zone. The phase of the
-    contact in the control period determines this tick. Different phases therefore give different readings.
-    The derivative of this function is therefore that of a mean reading, for a force that is uniformly
-    distributed over the interval of its last change `step` [N]. With a `step` of 0, it excludes the jumps.
+    The reading jumps at the first tick after the force crosses the edge of the dead zone. The instant within
+    a control period at which the contact begins determines this tick. The derivative of this function is
+    therefore that of the mean reading for all such instants: for a force with a uniform distribution between
+    `force - step` and `force` [N]. With a `step` of 0, the derivative excludes the jumps.
     """
     return jnp.where(jnp.abs(force) > dead_zone, force, 0)
 
@@ -184,7 +184,7 @@ def uniform_noise(
 
 
 def _odd_multiples(key, contact, count, dtype):
-    """Return random odd multiples of a power of two, which lie strictly between 0 and 2."""
+    """Return uniform random numbers strictly between 0 and 2: odd multiples of a power of two."""
     bits, _ = threefry(key[0][None], key[1][None], contact[None].astype("uint32"), count.astype("uint32"))
     digits = min(32, jnp.finfo(dtype).nmant)
     return (2 * (bits >> (32 - digits)).astype(dtype) + 1) * 2**-digits
@@ -215,11 +215,11 @@ def _bound_above_zero(time_constant):
 
 
 def _lag_response(span):
-    """Return three response factors of a first-order lag after `span` time constants.
+    """Return three factors from the outputs of a first-order lag at the time s = `span` [time constants].
 
-    The time s from 0 to `span` is in units of the time constant. The first factor is the final output for
-    initial output 1 and input 0. The other factors have initial output 0: the second is 1 minus the final
-    output for the ramp s/span, the third the final output for the parabola 4 s/span (1 - s/span).
+    1. output for the initial output 1 and the input 0
+    2. 1 minus the output for the initial output 0 and the ramp s/span as input
+    3. output for the initial output 0 and the parabola 4 s/span (1 - s/span) as input
     """
     decay = jnp.exp(-span)
     positive = jnp.where(span > 0, span, 1)

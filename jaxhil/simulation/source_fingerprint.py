@@ -19,8 +19,8 @@ def sources_sha256(*laws: object) -> str:
     The files are read only once per process.
 
     Args:
-        *laws: Compensators and contact laws. The hash includes the fields and, if available, the source of
-            user-registered laws.
+        *laws: Compensators and contact laws. The hash includes the fields of each user-registered law and,
+            if available, its source code.
     """
     digest = _hash_folders(
         tuple(Path(str(sys.modules[name].__file__)).parent for name in OWN_PACKAGES if name in sys.modules)
@@ -45,7 +45,7 @@ def dependency_versions(packages: tuple[str, ...] = ("jaxhil", *DEPENDENCIES)) -
 
 
 def _read_class_source(kind: type) -> str:
-    """Return the source of a class's module or, without it, of the class; an empty text without both."""
+    """Return the source code of a class's module, else of the class, else an empty text."""
     for source in (sys.modules.get(kind.__module__), kind):
         with suppress(OSError, TypeError):
             return inspect.getsource(source)  # pyright: ignore[reportArgumentType]

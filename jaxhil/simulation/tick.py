@@ -73,7 +73,7 @@ class Tick(NamedTuple):
 
 
 class SegmentConstants(NamedTuple):
-    """Values that are computed once for all ticks of a segment."""
+    """Values that are computed once for all ticks of a segment (a few successive ticks)."""
 
     gains: Gains  # gains of the compensator
     controller: Any  # values that the compensator has computed from its gains
@@ -162,7 +162,7 @@ def sense(
     timing: TimingDraws | None = None,
     probe: Probe | None = None,
 ) -> tuple[Signals, PlantSignals]:
-    """Return the sensor readings at tick `now` and the real forces in the last interval (stage 1)."""
+    """Return the sensor readings at tick `now` and the last interval's real forces (stage 1 of a tick)."""
     scenario, sensed = rig.scenario, state.sensed
     age = now - state.onset_tick
     rings, delays, sensor = sensed.rings, rig.delays, scenario.force_sensor
@@ -211,7 +211,7 @@ def compensate(
 
 
 def integrate(loop: Loop, rig: RigConstants, state: LoopState, force: Array) -> ModelState:
-    """Integrate the numerical model for one control period, under the force -`force` [N] (stage 3)."""
+    """Integrate the numerical model under the force -`force` [N] for a control period (stage 3 of a tick)."""
     acceleration = -force * rig.inverse_mass
     step = INTEGRATORS[loop.integrator]
     position, velocity = step(state.position, state.velocity, acceleration, rig.constants.control_period)
@@ -308,7 +308,7 @@ def compute_contact(
 def _compute_contact_in_cells(
     loop: Loop, rig: RigConstants, state: LoopState, interval: SamplingInterval
 ) -> IntervalContact:
-    """Return the real contact in a sampling interval, from the exact motion between the samples."""
+    """Return the real contact in a sampling interval, from the exact motion in its parts (cells)."""
     scenario, period, cells = rig.scenario, rig.constants.control_period, rig.cells
     assert cells is not None and interval.interval_inputs is not None
     clearance = scenario.clearance if loop.is_two_sided else None
@@ -354,8 +354,8 @@ def update_state(
 ) -> LoopState:
     """Return the state of the loop after the tick.
 
-    The new contact is written to the delay lines. `before` was read from the delay lines at this tick; the
-    dependence on `before` makes XLA read before it writes.
+    The forces and the motion of this tick are written to the delay lines. `before` contains the forces that
+    were read from the delay lines at this tick: because the result depends on it, XLA reads before it writes.
     """
     plant_signals = jax.tree.map(depend_on, contact.plant_signals, before)
     samples = Rings(plant_signals, contact.reading, actuated.position, None, None, actuated.inputs)
@@ -376,14 +376,14 @@ def update_state(
 
 
 def _delayed_sample(ring, now, age, intervals):
-    """Return the sample that is `intervals` older than the newest sample; 0 before the start of the run."""
+    """Return the sample `intervals` control periods before the newest sample; 0 before the run."""
     return look_back(ring, now - 1, intervals, age > intervals)
 
 
 def _delayed_position(rig, state, now, age):
-    """Return the delayed position [m]; NaN if unused.
+    """Return the delayed position [m] for the position sensor; NaN if the loop does not measure the position.
 
-    Before the start of the run, the motion is assumed to be uniform.
+    The motion before the start of the run is assumed to be uniform.
     """
     ring, intervals = state.sensed.rings.position, rig.delays.position.intervals
     if ring is None:

@@ -36,7 +36,7 @@ def describe_devices() -> DeviceDescription:
 
 
 def choose_tile_size(device: DeviceDescription, lanes: int, cpu_size: int, lane_bytes: int) -> int:
-    """Return the maximum number of lanes per tile.
+    """Return the maximum number of lanes per tile (group of lanes that run together).
 
     Args:
         device: Description of the devices.
@@ -56,7 +56,7 @@ def choose_tile_size(device: DeviceDescription, lanes: int, cpu_size: int, lane_
 
 
 def find_tile_size(lanes: int, cpu_size: int, lane_bytes: Callable[[], int] = lambda: 0) -> int:
-    """Return the maximum number of lanes per tile on JAX's devices; see `choose_tile_size`.
+    """Return the maximum number of lanes that run together (a tile) on JAX's devices; see `choose_tile_size`.
 
     `lane_bytes` is a function that returns the memory of a lane [bytes]. This function is called only if
     there is an accelerator.
@@ -66,5 +66,5 @@ def find_tile_size(lanes: int, cpu_size: int, lane_bytes: Callable[[], int] = la
 
 
 def count_bytes(arrays: Any) -> int:
-    """Return the memory [bytes] of all arrays of a pytree; shapes and types without values suffice."""
+    """Return the memory [bytes] of all arrays of a pytree, computed from their shapes and types alone."""
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(arrays))

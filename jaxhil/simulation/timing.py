@@ -41,7 +41,7 @@ class TimingDraws(NamedTuple):
 
 
 class HeldValues(NamedTuple):
-    """Values that lost frames and missed ticks repeat, and the number of missed ticks."""
+    """Last reading and command (lost frames and missed ticks repeat them), and the number of missed ticks."""
 
     reading: Any  # force reading [N], (*batch); with six axes, reading of the sensor's channels
     command: Any  # force command [N], (*batch); with six axes, the wrench command
@@ -49,14 +49,14 @@ class HeldValues(NamedTuple):
 
 
 def no_held_values(like: Float[Array, "*batch"]) -> HeldValues:
-    """Return the values before the first tick of a run, for a batch with the shape of `like`."""
+    """Return the `HeldValues` at the start of a run (all 0), for a batch with the shape of `like`."""
     return HeldValues(0 * like, 0 * like, jnp.zeros(like.shape, jnp.int32))
 
 
 def update_held_values(
     before: HeldValues | None, reading: Any, command: Any, missed: Bool[Array, "*batch"] | None
 ) -> HeldValues | None:
-    """Return the values after a tick with this reading and command; None without timing effects."""
+    """Return the `HeldValues` after a tick with this reading and command; None without timing effects."""
     if before is None:
         return None
     count = before.missed if missed is None else before.missed + missed.astype(jnp.int32)
@@ -69,7 +69,7 @@ def draw_timing(
     contact: Int[Array, "*batch"],
     age: Int[Array, "ticks *batch"],
 ) -> TimingDraws | None:
-    """Return the timing effects of scenarios; None if they have none.
+    """Return the timing effects of scenarios at several ticks; None if they have none.
 
     Args:
         timing: Timing effects of the scenarios.
@@ -95,7 +95,7 @@ def draw_timing(
 
 
 def without_missed_ticks(scenarios: Any) -> Any:
-    """Return a copy of scenarios, with one axis or six axes, without missed ticks.
+    """Return scenarios (with one axis or six axes) in which the controller misses no tick.
 
     The rig's controller is compared with the simulation tick by tick and must therefore run at every tick.
     """
@@ -104,7 +104,7 @@ def without_missed_ticks(scenarios: Any) -> Any:
 
 
 def hold_compensator(missed: Bool[Array, "*batch"], before: Any, after: Any, ring: int) -> Any:
-    """Return the compensator's next state, which is its last state in lanes that missed the tick.
+    """Return the compensator's next state; lanes that missed the tick keep their last state.
 
     Args:
         missed: Lanes that missed the tick.
@@ -136,15 +136,15 @@ def motion_in_interval(
 ) -> tuple[Array, Array, Array]:
     """Return the exact position at any instant of a sampling interval, and its first two time derivatives.
 
-    Time is in control periods.
+    The unit of time in the derivatives is the control period.
 
     Args:
         series: Power series of the motion (`build_series`); unused for a moving average.
         window: Window of a moving average [s]; None for a transfer function.
         period: Control period [s].
-        hold: Hold of the position command.
-        inputs: Inputs of the interval.
-        s: Fraction of the interval.
+        hold: Hold of the position command, "linear" or "zoh".
+        inputs: Motion simulator's state at the interval's start, and commands at its start and end.
+        s: Instant, as a fraction of the interval from its start [1].
     """
     if window is not None:
         rows = motion_rows(window, period, s, is_before_kink(window, period, s), hold)
@@ -163,7 +163,7 @@ def read_force(
     jitter: Float[Array, "*batch"],
     probe: Probe | None,
 ) -> Float[Array, "*batch"]:
-    """Return the real force [N] that the sensor reads at tick `now`; 0 if that force precedes the run.
+    """Return the real force [N] that the sensor reads at tick `now`; 0 for an instant before the run.
 
     This is the force at the instant that precedes the tick by the delays and the jitter.
 
@@ -174,7 +174,7 @@ def read_force(
         now: Number of the tick.
         age: Number of ticks since the run began.
         jitter: Deviation of the delay [s].
-        probe: Probe, whose push is added; None without a probe.
+        probe: Probe (test push on the hardware), whose force is added; None without a probe.
     """
     scenario, period = rig.scenario, rig.constants.control_period
     simulator, first = scenario.simulator, state.first_contact

@@ -45,7 +45,7 @@ def find_touching_height(
 
 
 def begin(bodies: Pair, pose: Pose, twist: Twist, before: Float[Array, "*batch"]) -> States:
-    """Return the states from which a free flight of `before` [s] leads to this relative pose and twist.
+    """Return the bodies' states from which a free flight of `before` [s] leads to `pose` and `twist`.
 
     The target is at rest with its centre of mass at the world's origin. The target's body axes equal the
     world axes.

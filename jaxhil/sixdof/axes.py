@@ -62,7 +62,7 @@ class Axes(NamedTuple):
 
 
 class AxisMotion(NamedTuple):
-    """Positions, rates and accelerations of the axes or of the coordinates, (axes, *batch)."""
+    """Positions, rates and accelerations of the axes or of the pose coordinates, (axes, *batch)."""
 
     position: Float[Array, "..."]  # [m or rad]
     rate: Float[Array, "..."]  # [m/s or rad/s]
@@ -118,7 +118,7 @@ def build_axes(
 
 
 def _build_late_sampling(simulator, force_delay, period) -> LateSampling:
-    """Return the constants of readings with jitter."""
+    """Return the constants of force readings whose delay has jitter."""
     series = None
     if simulator.window is None:
         series = build_series(simulator.numerator, simulator.denominator, period, SERIES_DEGREE)
@@ -126,7 +126,7 @@ def _build_late_sampling(simulator, force_delay, period) -> LateSampling:
 
 
 def _build_averages(window, period, force, position, instant, hold, has_tool) -> Axes:
-    """Discretise axes that are moving averages."""
+    """Discretise axes that follow the moving average of their commands."""
     exact = discretise_moving_average(window, period, force.fraction, instant, hold)
     acceleration = None
     if has_tool:
@@ -136,7 +136,7 @@ def _build_averages(window, period, force, position, instant, hold, has_tool) ->
 
 
 def static_lags(simulator: MotionSimulatorBatch) -> np.ndarray:
-    """Return the low-frequency lag -G'(0) [s] of each axis, (axes, *batch), without the transport delay."""
+    """Return each axis' lag -G'(0) [s], (axes, *batch); the transfer function G(s) excludes the delay."""
     if simulator.window is not None:
         return np.asarray(simulator.window) / 2
     numerator, denominator = (np.asarray(part) for part in (simulator.numerator, simulator.denominator))
@@ -216,9 +216,9 @@ def read_samples(axes: Axes, hardware: Hardware, tick: Int[Array, ""]) -> Sample
 def read_late_motion(
     axes: Axes, hardware: Hardware, tick: Int[Array, ""], jitter: Float[Array, "*batch"], hold: str
 ) -> AxisMotion:
-    """Return the exact motion of the axes at the instant to which the force reading of a tick belongs.
+    """Return the exact motion of the axes at the instant whose force the sensor reads at a tick.
 
-    This instant precedes the tick by the sum of the axis' delay, the sensor's delay and the `jitter` [s].
+    For each axis, this instant precedes the tick by the axis' delay, the sensor's delay and the `jitter` [s].
     """
     late, inputs = axes.late, hardware.inputs
     assert late is not None and inputs is not None

@@ -110,7 +110,7 @@ def _body(numbers: DrawnValues, name: str) -> Body:
 
 
 def _specified(numbers: DrawnValues, bodies: Pair) -> States:
-    """Return the states of the bodies that the table [start] specifies."""
+    """Return the bodies' states from the table [start] of the mechanism file."""
 
     def state(name: str, body: Body):
         parts = numbers(f"start.{name}.attitude")
@@ -129,14 +129,14 @@ def _specified(numbers: DrawnValues, bodies: Pair) -> States:
 def _before_touch(
     numbers: DrawnValues, bodies: Pair, groups: tuple[ContactGroup, ...], before: Any
 ) -> States:
-    """Return the states of the bodies, `before` [s] before the first touch that [approach] specifies."""
+    """Return the bodies' states `before` [s] before the first touch, which the table [approach] describes."""
     keys = ("offset", "attitude", "velocity", "angular_velocity")
-    return _lowered(bodies, groups, *(numbers(f"approach.{key}") for key in keys), before)
+    return _compute_start(bodies, groups, *(numbers(f"approach.{key}") for key in keys), before)
 
 
 @jax.jit
-def _lowered(bodies, groups, offset, attitude, velocity, angular_velocity, before) -> States:
-    """Return the states of the bodies, `before` [s] before a first touch with this relative motion."""
+def _compute_start(bodies, groups, offset, attitude, velocity, angular_velocity, before) -> States:
+    """Return the bodies' states `before` [s] before a first touch with the given relative motion."""
     rotation = exponential(vector(attitude))
     height = find_touching_height(groups, offset[0], offset[1], rotation)
     pose = Pose(Vector(offset[0], offset[1], height), rotation)
@@ -157,7 +157,7 @@ def _kinematics(mechanism: SixAxisMechanism, numbers: DrawnValues) -> Kinematics
 
 
 def _simulator(mechanism: SixAxisMechanism, numbers: DrawnValues) -> MotionSimulatorBatch:
-    """Return the motion simulator of every axis. For "ideal" and "moving_average", G(s) has order 0."""
+    """Return the motion simulator of all axes; num(s)/den(s) has order 0 for "ideal" and "moving_average"."""
     path, model = "rig.simulator.", mechanism.rig.simulator.model
 
     def of(key: str) -> Any:

@@ -77,7 +77,7 @@ def build_latches(mechanism: SixAxisMechanism, numbers: DrawnValues) -> tuple[La
 
 
 def _latch(latch: six_axes.Latch, numbers: DrawnValues, path: str) -> Latch:
-    """Build the latches of one table: one for each copy of the table's pattern (points around the z axis)."""
+    """Build the latches of one [latch] table: one at each point of the table's pattern around the z axis."""
     count = latch.pattern.count if latch.pattern else 1
 
     def repeated(value: Any) -> Any:
@@ -108,7 +108,7 @@ def _latch(latch: six_axes.Latch, numbers: DrawnValues, path: str) -> Latch:
 def _candidate(
     contact: six_axes.Contact, numbers: DrawnValues, name: str, copy: int, count: int
 ) -> Candidate:
-    """Build the candidate contact (pair of shapes that may touch) for one copy of a `[contact]` table.
+    """Build the contact candidate (pair of shapes) for one copy in the pattern of a `[contact]` table.
 
     `count` is the number of copies, and `copy` is the index of this copy.
     """
@@ -137,7 +137,7 @@ def _pair(chaser: Shape, target: Shape) -> Candidates:
 
 
 def _shape(shape: six_axes.Shape, numbers: DrawnValues, path: str, turn: Any) -> Shape:
-    """Build a shape and rotate it about z by `turn` [rad]."""
+    """Build a shape, rotated by `turn` [rad] about the z axis of its body's frame (C or T)."""
 
     def of(key: str) -> Any:
         return jnp.asarray(numbers(f"{path}.{key}"))
@@ -168,7 +168,7 @@ def _law(contact: six_axes.Contact, numbers: DrawnValues, path: str) -> ContactL
 
 
 def _parameters(contact: six_axes.Contact, numbers: DrawnValues, path: str) -> ContactParameters:
-    """Return a candidate's contact-law parameters, (lanes,); slopes and depths are (segments, lanes)."""
+    """Return a contact law's parameters: a number as an array (lanes,), a list as (entries, lanes)."""
 
     def of_law(key: ContactKey) -> Any:
         if isinstance(key.default, bool):

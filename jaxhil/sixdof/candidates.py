@@ -35,7 +35,7 @@ class Candidates(eqx.Module):
 
     @abc.abstractmethod
     def touch(self, pose: Pose) -> Touch:
-        """Return penetration, normal and point at a pose, whose arrays have a leading axis of length 1."""
+        """Return penetration, normal and contact point of every pair at a `pose` with arrays (1, *batch)."""
 
     @property
     @abc.abstractmethod
@@ -102,7 +102,7 @@ class Capsules(Candidates):
 
 
 def motion_at(touch: Touch, pose: Pose, twist: Twist) -> tuple[Float[Array, "candidates *batch"], Vector]:
-    """Return the penetration rate d' [m/s], and the chaser's velocity along the target's surface [m/s]."""
+    """Return the penetration rate [m/s], and the chaser's velocity along the target's surface [m/s]."""
     velocity = twist.linear + cross(twist.angular, touch.point - pose.position)
     rate = -dot(touch.normal, velocity)
     return rate, velocity + rate * touch.normal

@@ -32,7 +32,7 @@ class ControllerRecord(NamedTuple):
 def record_controller(
     loop: Loop, gains: dict[str, Any], scenario: Scenario
 ) -> tuple[Metrics, list[ControllerRecord]]:
-    """Return the metrics of all lanes (runs), and the record of each lane until its run ends.
+    """Return the metrics of all lanes (runs), and each lane's readings and commands until its run ends.
 
     `loop.measures_pose` must be true.
     """
@@ -49,7 +49,7 @@ def record_controller(
 
 @partial(jax.jit, static_argnums=0)
 def known_constants(loop: Loop, scenario: Scenario) -> SixAxisConstants:
-    """Return the constants of the rig that the compensator knows; the last dimension is the lane."""
+    """Return the constants that the compensator knows about the rig; the last dimension is the lane."""
     return controller_constants(scenario, loop.side == "moving")
 
 
@@ -70,7 +70,7 @@ def _compiled() -> _Programs:
 
 
 def _evaluate(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Metrics, Any]:
-    """Return the metrics and the durations [s] of the runs, (lanes,) each."""
+    """Return the metrics of all lanes (runs), and the simulated duration [s] of each run, (lanes,)."""
     result = evaluate(loop, gains, scenario)
     return result.metrics, result.final_time
 

@@ -27,7 +27,7 @@ class DrawnValues:
         self._mechanism, self._draws = mechanism, draws
 
     def __call__(self, path: str, default: Any = None) -> Any:
-        """Return the drawn value, else the nominal value, else (if the file has no value) the `default`."""
+        """Return the drawn values for a `path`, else the nominal value, else `default`."""
         value = self._draws.get(path)
         if value is None:
             nominal = value_at(self._mechanism, path)

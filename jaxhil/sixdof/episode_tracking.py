@@ -55,7 +55,7 @@ class EpisodeTracker(NamedTuple):
 
 
 def start_tracking(rig: RigConstants, states: States, now: Array) -> EpisodeTracker:
-    """Return the tracker of an episode that starts now.
+    """Return the record of an episode that starts at tick `now`, with nothing recorded yet.
 
     Args:
         rig: Constants of the run.
@@ -91,7 +91,7 @@ def track_tick(
     after: States,
     ticks: Array,
 ) -> EpisodeTracker:
-    """Update the record of the episode with a tick, and end the episode if the conditions hold.
+    """Update an episode's record for a tick; end the episode if rig, ideal contact and model are free.
 
     Args:
         rig: Constants of the run.
@@ -121,15 +121,15 @@ def track_tick(
 def required_pause(sensor: Sensor, period: Array, timing: TimingBatch | None) -> Array:
     """Return the pause [s] (time without a touch) after which an episode may end.
 
-    The pause is `MIN_PAUSE` or, if longer, the time that the force sensor needs to settle: its delay with its
-    jitter, 20 of its time constants, and two control periods.
+    The pause is the time that the force sensor needs to settle, but at least `MIN_PAUSE`. The sensor settles
+    within the sum of its delay, its jitter, 20 of its time constants, and two control periods.
     """
     delay = add_jitter(sensor.delay + 20 * sensor.time_constant, timing)
     return jnp.maximum(MIN_PAUSE, delay + 2 * period)
 
 
 def has_rig_settled(rig: RigConstants, tracker: EpisodeTracker) -> Array:
-    """Return whether the hardware has paused and the wrench command has decayed, or the wait is too long."""
+    """Return whether touches have paused on the rig, and the command has decayed (or decays too slowly)."""
     pause = required_pause_ticks(rig)
     max_wait = pause + jnp.ceil(MAX_DECAY_WAIT / rig.period).astype(jnp.int32)
     return ((tracker.ticks_since_touch >= pause) & (tracker.ticks_since_decay > 0)) | (
@@ -138,24 +138,24 @@ def has_rig_settled(rig: RigConstants, tracker: EpisodeTracker) -> Array:
 
 
 def required_pause_ticks(rig: RigConstants) -> Array:
-    """Return the pause of `required_pause` as a number of ticks."""
+    """Return the pause after which an episode may end (`required_pause`) as a number of ticks."""
     pause = required_pause(rig.sensor, rig.period, rig.timing)
     return jnp.floor(pause / rig.period + 1e-9).astype(jnp.int32) + 1
 
 
 def relative_energy(rig: RigConstants, states: States) -> Array:
-    """Return twice the relative motion's energy [J], without the coupling of translation and rotation."""
+    """Return twice the relative kinetic energy [J]; the coupling of translation and rotation is neglected."""
     _, (linear, angular) = relative(rig.bodies, states)
     return dot(linear, linear) / mass_share(rig) + dot(angular, rig.bodies.chaser.inertia @ angular)
 
 
 def mass_share(rig: RigConstants) -> Array:
-    """Return the inverse of the reduced mass [1/kg]."""
+    """Return the inverse of the bodies' reduced mass, 1/m_target + 1/m_chaser [1/kg]."""
     return 1 / rig.bodies.target.mass + 1 / rig.bodies.chaser.mass
 
 
 def _updated(rig: RigConstants, tracker: EpisodeTracker, seen: Tick) -> EpisodeTracker:
-    """Update the touches, peaks and decay in the record of the episode with a tick."""
+    """Return `tracker` after the tick `seen`, with updated touches, peaks, penetration and command decay."""
     touching = tuple(forces.touch.depth > 0 for forces in seen.forces)
     caught = tracker.caught
     for latch in seen.latch_states:

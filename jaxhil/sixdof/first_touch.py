@@ -33,7 +33,7 @@ def find_first_touch(
     Args:
         contact_model: Constants of the ideal contact.
         before: States at the start of the integration step in which the first touch begins.
-        depths: Penetration of each pair of shapes at the end of this step [m]; 0 if nothing ever touches.
+        depths: Penetration of each pair of shapes at the end of this step [m]; 0 in lanes without any touch.
     """
     zero = jnp.zeros_like(before.target.position.x)
     if not contact_model.groups:
@@ -42,7 +42,7 @@ def find_first_touch(
         return FirstTouch(before, nowhere, nowhere)
 
     def touch_of(states: States) -> tuple[Touch, Array]:
-        """Return geometry and penetration rate of the shape pair that is deepest at the end of the step."""
+        """Return geometry and penetration rate, at `states`, of the pair with the largest of the `depths`."""
         pose, twist = jax.tree.map(lambda leaf: leaf[None], relative(contact_model.bodies, states))
         touches = [group.candidates.touch(pose) for group in contact_model.groups]
         rates = [motion_at(touch, pose, twist)[0] for touch in touches]

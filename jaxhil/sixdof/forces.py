@@ -84,7 +84,7 @@ def contact_wrench(
     twist: Twist,
     duration: Float[Array, "*batch"],
 ) -> tuple[Wrench, tuple[Forces, ...], tuple[Memory, ...]]:
-    """Compute the wrench [N, N m] of all groups on the chaser, the contact forces, and the next states.
+    """Compute the wrench [N, N m] of all groups on the chaser, the contact forces, and the laws' next states.
 
     `duration` is the time since the last evaluation of the contact and friction laws [s].
     """
@@ -100,7 +100,7 @@ def contact_wrench(
 
 
 def deepest(groups: tuple[ContactGroup, ...], pose: Pose) -> Float[Array, "*batch"]:
-    """Return the largest penetration [m] at a pose; minus infinity if no shapes may touch."""
+    """Return the largest penetration [m] of all shape pairs at a pose; minus infinity without shape pairs."""
     lifted = jax.tree.map(lambda leaf: leaf[None], pose)
     depth = jnp.full_like(pose.position.x, -jnp.inf)
     for group in groups:

@@ -43,11 +43,11 @@ class Frictionless(Friction):
 
 
 class Regularised(Friction):
-    """Regularised Coulomb friction f_t = -mu F t/sqrt(|t|^2 + v_s^2) for a slip t.
+    """Regularised Coulomb friction f_t = -mu F t/sqrt(|t|^2 + v_s^2) for normal force F and slip velocity t.
 
     The law is Coulomb friction at slips well above v_s, and a viscous damper at slips well below v_s. Bodies
-    that would stick under Coulomb friction creep instead, with the slip v_s s/sqrt(1 - s^2) for s = |f_t|/(mu
-    F).
+    that would stick under Coulomb friction creep instead, with the slip v_s s/sqrt(1 - s^2). Here s is
+    |f_t|/(mu F).
     """
 
     coefficient: Float[Array, "candidates *batch"]  # friction coefficient mu [1]
@@ -60,11 +60,12 @@ class Regularised(Friction):
 
 
 class Bristle(Friction):
-    """Bristle friction f_t = -(k_t z + b_t t), limited to mu F, for a slip t (Dahl's model).
+    """Bristle friction f_t = -(k_t z + b_t t), limited to mu F (Dahl's model).
 
-    The deflection z of the bristle follows z' = t - |t| z k_t/(mu F). The law is a spring for small
-    displacements, and Coulomb friction in steady slip. Each evaluation integrates z by one implicit step and
-    projects z on the tangent plane. Without contact z is 0.
+    F is the normal force, and t is the slip velocity. The deflection z of the bristle (stiffness k_t, damping
+    b_t) follows z' = t - |t| z k_t/(mu F). The law is a spring for small displacements, and Coulomb friction
+    in steady slip. Each evaluation projects z on the tangent plane and integrates it by one implicit step.
+    Without contact z is 0.
     """
 
     coefficient: Float[Array, "candidates *batch"]  # friction coefficient mu [1]

@@ -49,8 +49,8 @@ class IdealContactSummary(NamedTuple):
 class Gaps(NamedTuple):
     """Gaps of the ideal contact: periods without a touch that follow a noticeable change of the twist.
 
-    Arrays are (MAX_GAPS, *batch). If there are more gaps, the latest gap overwrites the last entry. An unused
-    entry begins at infinity.
+    Arrays are (MAX_GAPS, *batch). After more than MAX_GAPS gaps, the latest gap overwrites the last entry. An
+    unused entry begins at infinity.
     """
 
     begin: IdealContactSummary  # ideal contact up to the start of the gap
@@ -58,7 +58,7 @@ class Gaps(NamedTuple):
 
 
 class IdealContactRecord(NamedTuple):
-    """Ideal contact for the whole duration of a run: first touch, gaps, and values at the end."""
+    """Ideal contact for the whole duration of a run: first touch, gaps between touches, and final summary."""
 
     first_touch: FirstTouch  # first touch
     gaps: Gaps
@@ -137,8 +137,8 @@ def summary_at(
 ) -> IdealContactSummary:
     """Return the summary of the ideal contact up to the start of the gap that contains a `time` [s].
 
-    A gap is a period without a touch. In lanes in which `common` is false, return the summary of the whole
-    run.
+    A gap is a period without a touch. `common` states in which lanes the gap ends an episode; in all other
+    lanes, return the summary of the whole run.
     """
     summary = reference.last
     for slot in range(MAX_GAPS):
@@ -150,7 +150,7 @@ def summary_at(
 
 
 def states_at(bodies: Pair, summary: IdealContactSummary, time: Float[Array, "*batch"]) -> States:
-    """Extend the ideal contact by free flight, and return the bodies' states at a `time` [s]."""
+    """Return the bodies' states at a `time` [s], after free flight since the time of the `summary`."""
     free = IdealContactModel(bodies, (), ())
     left = jnp.where(time > summary.time, time - summary.time, 0)
     integration = start_integration(free, summary.states, left)
@@ -160,7 +160,7 @@ def states_at(bodies: Pair, summary: IdealContactSummary, time: Float[Array, "*b
 def _start(
     contact_model: IdealContactModel, states: States, first: Float[Array, "*batch"]
 ) -> IdealContactProgress:
-    """Return the state of the integration before the first step, which has the length `first` [s]."""
+    """Return the initial state of the integration; its first step has the length `first` [s]."""
     zero, none = jnp.zeros_like(first), jnp.zeros(first.shape, jnp.int32)
     depths = tuple(jnp.zeros_like(group.parameters.damping) for group in contact_model.groups)
     touching = tuple(depth > 0 for depth in depths)
@@ -203,7 +203,7 @@ def _summarise(progress: IdealContactProgress) -> IdealContactSummary:
 def _record_gap(
     progress: IdealContactProgress, constants: IntegrationConstants, ahead: IdealContactProgress, now: Instant
 ) -> IdealContactProgress:
-    """If a gap begins or ends in the step from `progress` to `ahead`, record it in `ahead`."""
+    """Add to `ahead` any gap (time without a touch) that begins or ends in the step from `progress`."""
     was, touches = _touches(progress), _touches(ahead)
     slot = jnp.arange(MAX_GAPS, dtype=jnp.int32).reshape(-1, *[1] * was.ndim) == progress.slot[None]
     change = jnp.stack(jax.tree.leaves(jax.tree.map(jnp.subtract, now.twist, constants.twist)))
@@ -232,7 +232,7 @@ def _square(matrix: Array, vector: Array) -> Array:
 def _update(
     progress: IdealContactProgress, constants: IntegrationConstants, after: IntegrationState, now: Instant
 ) -> IdealContactProgress:
-    """Update the metrics of the ideal contact with a step that ends with the motion `after`."""
+    """Update the metrics of the ideal contact with a step; `after` is the state after the step."""
     depths = tuple(forces.touch.depth for forces in now.forces)
     touching = tuple(depth > 0 for depth in depths)
     touches = progress.touches

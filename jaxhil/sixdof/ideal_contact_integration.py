@@ -134,7 +134,7 @@ def advance_integration(
     longest: Float[Array, "*batch"],
     speed: Float[Array, "*batch"],
 ) -> tuple[IntegrationState, Step]:
-    """Integrate one step. Return the state of the integration after the step, and the step itself.
+    """Integrate one step; return the state of the integration after the step, and the step itself.
 
     If the step is rejected, the state keeps its motion and has a shorter next step. If a number is not
     finite, or if there are too many steps, the time of the state becomes infinite.
@@ -184,7 +184,7 @@ def _try(
     length: Float[Array, "*batch"],
     speed: Array,
 ) -> tuple[Instant, LawStates, Array]:
-    """Compute a step of `length` [s]: motion and laws at its end, and its error divided by `TOLERANCE`."""
+    """Compute a step of `length` [s]: final motion, final states of the laws, and error/`TOLERANCE` [1]."""
 
     def slope(offset, states):
         now, memories = compute_instant(contact_model, states, integration.memories, offset)
@@ -217,7 +217,7 @@ def sample_ideal_contact(
     periods: int,
     longest: Float[Array, "*batch"],
 ) -> tuple[IntegrationState, Instant]:
-    """Integrate the ideal contact for a number of periods, and record the start of each period.
+    """Integrate the ideal contact over several periods, and record motion and forces when each begins.
 
     Args:
         contact_model: Constants of the ideal contact.
@@ -248,7 +248,7 @@ def integrate_until(
     longest: Array,
     speed: Array,
 ) -> IntegrationState:
-    """Continue an integration up to the time `until` [s] since its start.
+    """Continue an integration until `until` [s] after the integration's start.
 
     See `advance_integration` for `longest` and `speed`.
     """

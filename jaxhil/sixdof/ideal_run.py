@@ -85,7 +85,7 @@ def simulate_ideal_contact(mechanism: SixAxisMechanism) -> IdealRun:
 
 
 def _ideal_metrics(scenario: Scenario) -> Metrics:
-    """Return metrics whose fields of the ideal contact are valid; the fields of the rig are meaningless."""
+    """Return metrics in which only the fields of the ideal contact are valid; the rig's fields are not."""
     period = scenario.control_period
     until = jnp.round(scenario.duration / period) * period
     pause = required_pause(scenario.sensor, period, scenario.timing)

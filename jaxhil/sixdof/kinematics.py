@@ -49,7 +49,7 @@ class Kinematics(eqx.Module):
 
 
 class TaskSpace(Kinematics):
-    """Motion simulator with one axis for each coordinate."""
+    """Motion simulator with one axis for each coordinate of the pose."""
 
     def command(self, coordinates):
         return coordinates
@@ -76,7 +76,7 @@ class TwoRobots(Kinematics):
 
 
 def to_rigid_motion(motion: AxisMotion) -> RigidMotion:
-    """Convert the motion of the coordinates to pose, twist and acceleration."""
+    """Convert the motion of the pose coordinates to pose, twist and acceleration."""
 
     def pose_and_twist(at, rates):
         return motion_of(*(Coordinates(vector(part[:3]), vector(part[3:])) for part in (at, rates)))
