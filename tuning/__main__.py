@@ -97,7 +97,7 @@ def _open_closed_streams() -> None:
 
 
 def _report_error(words: Sequence[str], text: str, code: int) -> int:
-    """Print an error message on standard error and, with `--json`, as a document; return `code`."""
+    """Print an error on standard error and, with `--json`, as JSON on standard output; return `code`."""
     try:
         print(f"jaxhil: {text}", file=sys.stderr, flush=True)
     except OSError:

@@ -46,7 +46,7 @@ class LatchState(NamedTuple):
 
 
 def init_latch(latch: Latch, pose: Pose) -> LatchState:
-    """Return the latches' state at the start of a run, at which the chaser has the given pose."""
+    """Return the latches' state at the start of a run; `pose` is the chaser's pose at the start."""
     zero = jnp.zeros_like(latch.depth)
     attitude: Quaternion = jax.tree.map(lambda part: part[None] + zero, pose.attitude)
     return LatchState(latch.from_start, latch_points(latch, pose), attitude)

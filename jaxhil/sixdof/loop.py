@@ -107,7 +107,7 @@ def build_rig_constants(loop: Loop, gains: Gains, scenario: Scenario) -> RigCons
 def begin(
     loop: Loop, rig: RigConstants, states: States, command: Float[Array, "6 *batch"] | None = None
 ) -> RunState:
-    """Return the state of the loop before tick 0, from the states of the bodies at tick 0.
+    """Compute the state of the loop before tick 0 from the states of the bodies at tick 0.
 
     Before tick 0, the pose command is assumed to move uniformly with the bodies' relative rates. `command` is
     the pose command of tick 0. If it is None, the compensator computes this command.
@@ -190,7 +190,7 @@ def integrate(
 ) -> tuple[States, Array, Array, Array]:
     """Return the numerical model's next states, and its next coordinates, rates and twist (6, *batch).
 
-    In lanes that `missed` the tick, the numerical model keeps its states.
+    In lanes where `missed` is true, the controller does not run at this tick, and the states do not change.
     """
     states = advance(rig.bodies, state.states, command, rig.period, SHARES[loop.integrator])
     if missed is not None:
@@ -207,7 +207,9 @@ def complete_tick(
     model: tuple[States, Array, Array],
     sent: Float[Array, "6 *batch"],
 ) -> tuple[RunState, Tick]:
-    """Move the hardware. Return the next state (with the old state of the compensator) and the record.
+    """Complete a tick: move the hardware, and return the next state of the loop and the tick's record.
+
+    In the next state, only the compensator's state is still that before the tick.
 
     Args:
         loop: structure of the loop.
@@ -215,8 +217,8 @@ def complete_tick(
         state: state before the tick.
         sensed: real contact and readings of the tick.
         command: wrench command of the tick, which has moved the numerical model.
-        model: next states, coordinates and twist of the numerical model.
-        sent: pose command [m, rad].
+        model: the numerical model's states, coordinates and twist after the tick.
+        sent: pose command to the motion simulator [m, rad].
     """
     states, position, twist = model
     controller = state.controller._replace(

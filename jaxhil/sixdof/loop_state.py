@@ -24,7 +24,7 @@ SETTLING_TICKS = 256
 
 
 class Loop(eqx.Module):
-    """Structure of the loop. Each combination of the static fields needs a separate compiled program."""
+    """Structure of the loop. Each combination of values of the fields needs a separate compiled program."""
 
     integrator: str = eqx.field(static=True)  # integrator of the numerical model, a name of `SHARES`
     hold: str = eqx.field(static=True)  # hold of the command within a period, "linear" or "zoh"
@@ -70,7 +70,7 @@ class RigConstants(NamedTuple):
 
 
 class NumericalController(NamedTuple):
-    """States of the force sensor's lag and of the compensator, and values that timing effects repeat."""
+    """State of the controller: sensor lag, compensator, and values for lost frames and missed ticks."""
 
     # last input and last output of the lag, or of each mode of the filter; None without either
     lag: tuple[Wrench, Any] | None

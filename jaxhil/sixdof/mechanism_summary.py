@@ -18,8 +18,8 @@ class SixAxisSummary(NamedTuple):
         frequency: Frequency of the ideal contact, 1/(2 duration) [Hz]; NaN if a latch catches.
         peak_force: Peak force of the ideal contact [N].
         restitution: Restitution e* of the ideal contact [1]; NaN unless there is a single touch.
-        delay: Delay of the loop [s]: delay and lag of the slowest axis and of the force sensor.
-        slip_limit: Slip v_s of regularised friction below which the rig is unstable [m/s]; NaN without
+        delay: Delay of the loop [s]: delay plus lag of the force sensor, plus those of the slowest axis.
+        slip_limit: Minimum slip parameter v_s of regularised friction for a stable rig [m/s]; NaN without
             regularised friction.
         warnings: Implausible values of the file, each with key, found value and expected value.
     """
@@ -55,7 +55,7 @@ def summarise_six_axes(
 ) -> SixAxisSummary:
     """Summarise a mechanism whose first ideal contact has the given metrics, in SI units.
 
-    `tangential_mass` is the effective mass along the surface, `duration` the duration of the contact.
+    `tangential_mass` is the effective mass for a force along the surface, `duration` the contact's duration.
     """
     rig = mechanism.rig
     delay = force_delay(mechanism) + max(axis_lags(mechanism))

@@ -37,7 +37,8 @@ MIN_ENERGY_SHARE = 0.05
 class Metrics(NamedTuple):
     """Metrics of episodes (contacts with all their touches), (episodes, *batch); NaN for undefined metrics.
 
-    V is the twist after the contact, V_0 the twist before the contact. A star marks the ideal contact.
+    The fields' comments use V for the twist after the contact, V* for the twist after the ideal contact, V_0
+    for the twist before the contact, and M for the relative mass matrix.
     """
 
     energy_error: Float[Array, "..."]  # error of the energy change, divided by the approach's energy [1]
@@ -108,7 +109,7 @@ def compute_ideal_states(scenario: Scenario, time: Float[Array, "*batch"]) -> St
 
 
 def compare_with_ideal(bodies: Pair, episodes: EpisodeBatch) -> Metrics:
-    """Return the metrics of all episodes (episodes, *batch) from the `bodies` of each run (*batch)."""
+    """Compare episodes (episodes, *batch) with their ideal contacts; `bodies` has a pair per run (*batch)."""
     bodies = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, episodes.status.shape), bodies)
     summary, first_touch = episodes.summary, episodes.first_touch
     expected_states = states_at(bodies, summary, episodes.elapsed)
@@ -161,7 +162,7 @@ def _approach_speed(pose: Pose, first_touch: FirstTouch, twist: Twist) -> Array:
 
 
 def _take_snapshots(bodies: Pair, states: list[States]) -> list[Snapshot]:
-    """Return twist, kinetic energy and mass matrix for each of the states."""
+    """Return relative twist, kinetic energy and mass matrix of the bodies for each entry of `states`."""
 
     # The compiler would unroll a Python loop, fuse its computations and repeat them.
     def snapshot(_, states: States) -> tuple[None, Snapshot]:
@@ -174,9 +175,9 @@ def _take_snapshots(bodies: Pair, states: list[States]) -> list[Snapshot]:
 
 
 def _twist_parts(matrix: Array, after: Twist, expected: Twist, before: Twist) -> tuple[Array, ...]:
-    """Return the twist error in the norm of M, and its normal, lateral and rotational parts [1].
+    """Return the twist error in the norm of the mass `matrix`, and its normal, lateral and rotational parts.
 
-    All results are divided by the norm of the change of the twist in the ideal contact.
+    All results are divided by the norm of the ideal contact's change of twist, `expected` - `before` [1].
     """
     error, impulse = (_stacked(a) - _stacked(b) for a, b in ((after, expected), (expected, before)))
     size = safe_sqrt(_square(matrix, impulse))

@@ -15,7 +15,7 @@ from jaxhil.sixdof.vectors import components
 
 
 def model_constants(mechanism: SixAxisMechanism) -> dict[str, Any]:
-    """Return the fields of `ModelConstants` for a nominal mechanism as JSON data, by name."""
+    """Compute the `ModelConstants` of a nominal mechanism; return its fields by name, as JSON data."""
     with jax_context():
         scenario = build_scenarios(mechanism)
         # The delay line of a compensator that reads the pose limits the delay.

@@ -36,7 +36,7 @@ EQUAL_LAGS = 1e-9  # difference of lags below which two axes are equal [s]
 
 
 class OneAxisContact(NamedTuple):
-    """One-axis mechanism of a six-axis mechanism's first touch, and the keys that have no equivalent."""
+    """Result of `convert_to_one_axis`: a one-axis mechanism, and the six-axis keys without equivalent."""
 
     mechanism: Mechanism
     left_out: tuple[str, ...]  # keys of the six-axis file that the one-axis file cannot contain
@@ -50,10 +50,10 @@ def convert_to_one_axis(mechanism: SixAxisMechanism, episode: Episode | IdealEpi
         episode: first episode of this mechanism, on the rig or in the ideal contact.
 
     Returns:
-        The one-axis mechanism and the keys that it leaves out.
+        The one-axis mechanism, and the keys of the six-axis file that it cannot contain.
 
     Raises:
-        InputError: If the contact has no equivalent with one axis; the message has one line.
+        InputError: If no one-axis contact is equivalent to the mechanism's contact; the message has one line.
     """
     _check_has_equivalent(mechanism, episode)
     with jax_context():
@@ -91,7 +91,7 @@ def convert_to_one_axis(mechanism: SixAxisMechanism, episode: Episode | IdealEpi
 
 
 def _check_has_equivalent(mechanism: SixAxisMechanism, episode: Episode | IdealEpisode) -> None:
-    """Raise `InputError` if the contact has no equivalent with one axis."""
+    """Raise `InputError` if no one-axis contact is equivalent to the contact of this mechanism."""
 
     def reject(key: str, found: str, expected: str) -> None:
         raise InputError(f"{mechanism.name}: {key}: found {found}, expected for a one-axis file: {expected}")
@@ -119,9 +119,9 @@ def _check_has_equivalent(mechanism: SixAxisMechanism, episode: Episode | IdealE
 def _find_touch(
     mechanism: SixAxisMechanism, scenario: Scenario, states: States, episode: Episode | IdealEpisode
 ) -> tuple[str, np.ndarray]:
-    """Return the name of the contact that touches first, and the wrench of a unit force about C, (6,).
+    """Return the name of the first touch's contact, and the wrench of a unit force along its normal, (6,).
 
-    `states` are the states of the bodies at the first touch.
+    The wrench is about the origin of C. `states` are the states of the bodies at the first touch.
     """
     pose, _ = relative(scenario.bodies, states)
     depths = [
@@ -137,7 +137,7 @@ def _find_touch(
 
 
 def _convert_contact_keys(contact: Any) -> dict[str, Any]:
-    """Return the keys that only some contact laws have, with their names in one-axis files."""
+    """Return the contact's values of keys that only some laws have, by the keys' names in one-axis files."""
     values = {name: getattr(contact, key.name) for name, key in KEYS_IN_SIX_AXES.items()}
     return {name: value for name, value in values.items() if value is not None}
 
@@ -145,8 +145,8 @@ def _convert_contact_keys(contact: Any) -> dict[str, Any]:
 def _convert_simulator(mechanism: SixAxisMechanism, shares: np.ndarray) -> dict[str, Any]:
     """Return the motion simulator along the normal, with the axes' mean properties and mean lag.
 
-    The means are weighted by the axes' shares. The delay is chosen so that the lag in uniform motion equals
-    the weighted mean of the axes' lags.
+    The means are weighted by the axes' `shares` in the motion along the normal. The delay is chosen so that
+    the lag in uniform motion equals the weighted mean of the axes' lags.
     """
     simulator = mechanism.rig.simulator
     raw = to_plain_data(mechanism)["rig"]["simulator"]
@@ -201,9 +201,10 @@ def _convert_position_sensor(mechanism: SixAxisMechanism, lever: np.ndarray) -> 
 def _convert_uncertainty(
     mechanism: SixAxisMechanism, name: str
 ) -> tuple[dict[str, dict[str, Any]], tuple[str, ...]]:
-    """Return the uncertainty of the keys that a one-axis file has, and the keys without equivalent.
+    """Return the uncertainty table of the one-axis file, and the six-axis keys without equivalent.
 
-    `name` is the name of the contact. If the six-axis value is a list, only a common factor is converted.
+    `name` is the name of the contact. The uncertainty of a list is converted only if it is one factor for
+    all entries.
     """
     table: dict[str, dict[str, Any]] = to_plain_data(mechanism).get("uncertainty", {})
     one_axis_name = {key.name: name for name, key in KEYS_IN_SIX_AXES.items()}

@@ -20,10 +20,10 @@ def zero_peak(zero: Float[Array, "*batch"]) -> Peak:
 
 
 def update_peak(peak: Peak, now: Array, step: Array, anew: Bool[Array, "*batch"] | bool = False) -> Peak:
-    """Update the peak with the sample `now`, which follows a time `step` [s] after the last sample.
+    """Update the peak with the sample `now`, taken a time `step` [s] after the last sample.
 
-    A peak between samples is the vertex of a parabola through three samples, all greater than 0. `anew`
-    marks a sample at a jump or kink of the signal, where no parabola is fitted.
+    A peak between samples is the vertex of a parabola through the last three samples, which must be greater
+    than 0. `anew` marks the first sample after a jump or kink; no parabola is fitted across it.
     """
     first, middle = peak.before
     smooth = (first > 0) & (now > 0) & (middle >= first) & (middle >= now) & (step > 0) & ~jnp.asarray(anew)

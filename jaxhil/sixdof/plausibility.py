@@ -33,7 +33,7 @@ CHECK_PERIODS = SEGMENT_TICKS
 
 
 class StartValues(NamedTuple):
-    """Values at the start of a run from which `check_scenario` decides whether the run is possible."""
+    """Values at the start of a run, by which `check_scenario` decides whether the run can be simulated."""
 
     coordinates: Float[Array, "6 *batch"]  # coordinates of chaser frame C relative to target frame T
     depth: Float[Array, "*batch"]  # largest penetration [m]

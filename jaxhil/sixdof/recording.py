@@ -34,7 +34,7 @@ class RunRecord(NamedTuple):
     Coordinates (p, theta), twists (v, w) and wrenches (force, moment about the origin) are in target frame T.
     Signals of the hardware belong to the force sensor's sampling instant. The measured signals are the
     controller's inputs, with the sensors' delays and errors. The motion of a body consists of position,
-    attitude (w, x, y, z), velocity and angular velocity, in the axes of the file's table [start].
+    attitude (w, x, y, z), velocity and angular velocity, in the axes of the mechanism file's table [start].
 
     Attributes:
         time: Time since the start of the run [s], (ticks,).
@@ -57,7 +57,7 @@ class RunRecord(NamedTuple):
         point: Point where each candidate's force acts, in target frame T [m], (ticks, candidates, 3).
         push: Force of each candidate on the chaser, with friction, in target frame T [N],
             (ticks, candidates, 3).
-        groups: Groups of contact candidates.
+        groups: Groups of contact candidates; a group has one contact law and the same two kinds of shapes.
     """
 
     time: np.ndarray
@@ -93,7 +93,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 
 
 def to_columns(recorded: RunRecord) -> dict[str, np.ndarray]:
-    """Split the record into columns (ticks,) by name, such as `desired_x`, `wrench_fz` and `depth_tip`."""
+    """Return the record as named columns (ticks,), such as `desired_x`, `wrench_fz` and `depth_tip`."""
     columns = {"time": recorded.time}
     for name, suffixes in COLUMNS.items():
         column = name.replace("ideal", "in_space")  # name in CSV files
@@ -148,7 +148,7 @@ def _duration() -> Callable[..., Any]:
 def motion(bodies: Pair, states: States) -> tuple[Any, ...]:
     """Return coordinates, twist, motion of the target, and motion of the chaser, (components, lanes) each.
 
-    The motion of a body has the components of the file's table [start].
+    The motion of a body has 13 components: position, attitude (w, x, y, z), velocity and angular velocity.
     """
     pose, twist = relative(bodies, states)
     motions = (
@@ -193,7 +193,7 @@ _OF_CANDIDATES = {"force": (), "depth": (), "point": (3,), "push": (3,)}
 
 
 def _of_candidates(forces: Forces) -> dict[str, Any]:
-    """Return force, depth, point and push of a group's shape pairs, (ticks, candidates, ..., lanes)."""
+    """Return force, depth, point and push of `RunRecord` for a group, (ticks, candidates, ..., lanes)."""
     touch = forces.touch
     push = forces.normal * touch.normal + forces.tangential
     return {

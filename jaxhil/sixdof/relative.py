@@ -138,9 +138,9 @@ def power(wrench_at_chaser: Wrench, twist: Twist) -> Float[Array, "..."]:
 
 
 def loads(wrench: Wrench, target: Frame, states: States) -> tuple[Load, Load]:
-    """Return the loads on target and chaser: the wrench acts on the chaser, the reaction on the target.
+    """Return the loads on target and chaser: `wrench` acts on the chaser, its reaction on the target.
 
-    Both loads act at the origin of target frame T.
+    `wrench` is about the origin of target frame T. The loads are about the bodies' centres of mass.
     """
     force, moment = (rotate(target.attitude, part) for part in wrench)
 
@@ -156,7 +156,8 @@ def advance(
     """Integrate the motion of both bodies for a control `period` [s] under a constant wrench.
 
     `share` selects the integrator (see `bodies.SHARES`). Linear momentum is conserved exactly. Angular
-    momentum changes by (1 - share) period^2 (v_chaser - v_target) x f in a period, where f is the force.
+    momentum changes by (1 - share) period^2 (v_chaser - v_target) x f in a period, where f is the force on
+    the chaser, and v_chaser and v_target are the initial velocities of the centres of mass.
     """
     target, chaser = loads(wrench, interface_frame(bodies.target, states.target), states)
     return States(
@@ -166,9 +167,10 @@ def advance(
 
 
 def acceleration(bodies: Pair, states: States, wrench_at_chaser: Wrench) -> Twist:
-    """Return the relative acceleration M^-1 W_C of bodies at rest; W_C is the wrench about frame C's origin.
+    """Return the relative acceleration of bodies at rest due to a wrench about frame C's origin.
 
-    M is the relative mass matrix. M^-1 is the sum of the contributions of the two bodies.
+    The result is M^-1 W_C, where M is the relative mass matrix and W_C the wrench. The result is computed as
+    the sum of the contributions of the two bodies.
     """
     target = interface_frame(bodies.target, states.target)
     chaser = interface_frame(bodies.chaser, states.chaser)
@@ -201,8 +203,9 @@ def mass_matrix(bodies: Pair, states: States) -> Float[Array, "6 6 *batch"]:
 def effective_mass(bodies: Pair, states: States, point: Vector, normal: Vector) -> Float[Array, "..."]:
     """Return the effective mass m_n [kg] of the two bodies in a frictionless contact.
 
-    1/m_n is the sum of 1/m_i + a_i . J_i^-1 a_i for both bodies i, where a_i = (point - r_i) x normal. The
-    contact's `point` [m] and unit `normal` are in target frame T.
+    1/m_n is the sum of 1/m_i + a_i . J_i^-1 a_i for both bodies i, where a_i = (point - r_i) x normal. Body
+    i has the mass m_i, the inertia J_i and the centre of mass r_i. `point` [m] and `normal` (a unit vector)
+    are in target frame T.
     """
     target = interface_frame(bodies.target, states.target)
     total = jnp.zeros_like(normal.x)

@@ -104,7 +104,7 @@ def rollout(loop: Loop, gains: Gains, scenario: Scenario) -> RolloutResult:
 
 
 def compute_ideal_contact(scenario: Scenario) -> IdealContactRecord:
-    """Return the ideal contact from the start of a batch of scenarios, which does not depend on gains."""
+    """Compute the ideal contact from the start of each scenario. It does not depend on gains."""
     period = scenario.control_period
     until = jnp.round(scenario.duration / period) * period
     contact_model = IdealContactModel(scenario.bodies, scenario.groups, scenario.latches)
@@ -114,7 +114,7 @@ def compute_ideal_contact(scenario: Scenario) -> IdealContactRecord:
 
 
 def start_scenario(loop: Loop, rig: RigConstants, scenario: Scenario) -> EpisodeProgress:
-    """Return the state of the rollout at the start of the runs; compute missing ideal contacts."""
+    """Return the state of the rollout before tick 0; compute the ideal contacts if they are missing."""
     reference = scenario.ideal_contact
     if reference is None:
         reference = compute_ideal_contact(scenario)
@@ -124,9 +124,9 @@ def start_scenario(loop: Loop, rig: RigConstants, scenario: Scenario) -> Episode
 def start_rollout(
     loop: Loop, rig: RigConstants, run: RunState, reference: IdealContactRecord
 ) -> EpisodeProgress:
-    """Return the state of the rollout at the start of the runs, from the state of the loop before tick 0.
+    """Return the state of the rollout before tick 0.
 
-    `reference` is the ideal contact from the same start.
+    `run` is the state of the loop before tick 0, `reference` the ideal contact from the same start.
     """
     states = run.states
     none = jnp.zeros(rig.period.shape, jnp.int32)
@@ -185,7 +185,8 @@ def _episode(
 ) -> EpisodeBatch:
     """Return the results of the current episode.
 
-    In lanes where `has_ended` is false, the episode ends now, with the given `states` after `ticks` ticks.
+    In lanes where `has_ended` is false, the results are those up to now: `states` are the current states of
+    the bodies, and `ticks` is the number of ticks since the start of the run.
     """
     period = rig.period
     elapsed = (jnp.where(has_ended, tracker.end_tick, ticks) - episode_start.tick).astype(
@@ -262,7 +263,7 @@ def _begin_next(rig: RigConstants, last: Array, progress: EpisodeProgress, begin
 def _failure(
     rig: RigConstants, episode_start: EpisodeStart, tracker: EpisodeTracker, states: States
 ) -> Array:
-    """Return the status of runs that must end: DIVERGED, NON_FINITE or REACH; MISS for the other runs.
+    """Return DIVERGED, NON_FINITE or REACH for runs that have failed and must end, MISS for all other runs.
 
     REACH means that an axis was commanded beyond its workspace.
     """

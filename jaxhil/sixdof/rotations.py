@@ -111,7 +111,7 @@ def inverse_left_jacobian(theta: Vector, angular_velocity: Vector) -> Vector:
 
 
 def _sum(coefficients, x):
-    """Evaluate a power series in x with these coefficients, lowest order first."""
+    """Return the value of a power series at x; `coefficients` begin with the lowest order."""
     total = jnp.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         total = coefficient + x * total
@@ -124,13 +124,13 @@ def _alternating(first: int) -> tuple[float, ...]:
 
 
 def _cosine(square: Array) -> Array:
-    """Return cos t as a function of t^2."""
+    """Return cos t for the angle t = sqrt(square) [rad]."""
     _, turned, sign = _reduced(square)
     return sign * _sum(_COSINE, turned)
 
 
 def _sine(square: Array) -> Array:
-    """Return sin(t)/t as a function of t^2."""
+    """Return sin(t)/t for the angle t = sqrt(square) [rad]."""
     share, turned, sign = _reduced(square)
     return sign * share * _sum(_SINE, turned)
 
@@ -138,7 +138,8 @@ def _sine(square: Array) -> Array:
 def _reduced(square: Array) -> tuple[Array, Array, Array]:
     """Reduce the angle t = sqrt(square) to t = r + k pi with |r| <= pi/2; return r/t, r^2 and (-1)^k.
 
-    The power series for sine and cosine are faster than JAX's functions, which call a library per number.
+    With the reduced angle, power series give sine and cosine faster than JAX's functions, which call a
+    library function for each number.
     """
     near = square <= MAX_SERIES_SQUARE
     safe = jnp.where(near, 1, square)
@@ -154,23 +155,23 @@ def _reduced(square: Array) -> tuple[Array, Array, Array]:
 
 
 def _versine(square: Array) -> Array:
-    """Return (1 - cos t)/t^2 as a function of t^2."""
+    """Return (1 - cos t)/t^2 for the angle t = sqrt(square) [rad]."""
     return _sine(square / 4) ** 2 / 2
 
 
 def _cubic(square: Array) -> Array:
-    """Return (t - sin t)/t^3 as a function of t^2."""
+    """Return (t - sin t)/t^3 for the angle t = sqrt(square) [rad]."""
     sine = _sine(square / 4) * _cosine(square / 4)
     return _near(_CUBIC, MAX_SERIES_SQUARE, square, 1 - sine)
 
 
 def _cotangent(square: Array) -> Array:
-    """Return (1 - t/2 cot(t/2))/t^2 as a function of t^2."""
+    """Return (1 - (t/2) cot(t/2))/t^2 for the angle t = sqrt(square) [rad]."""
     return _near(_BERNOULLI, 0.25, square, 1 - _cosine(square / 4) / _sine(square / 4))
 
 
 def _near(series: tuple[float, ...], limit: float, square: Array, beyond: Array) -> Array:
-    """Return the power series in t^2 where t^2 is at most `limit`, and `beyond`/t^2 elsewhere."""
+    """Return a power series in `square` if `square` is at most `limit`, and `beyond`/`square` otherwise."""
     near = square <= limit
     return jnp.where(near, _sum(series, jnp.where(near, square, 0)), beyond / jnp.where(near, 1, square))
 

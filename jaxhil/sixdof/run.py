@@ -47,7 +47,7 @@ class Episode(NamedTuple):
         lateral_part: Translational part of the remaining twist error [1].
         rotational_part: Rotational part of the remaining twist error [1].
         restitution: Restitution e [1]; NaN unless there is a single touch.
-        reference_restitution: Restitution e* of the ideal contact [1]; NaN unless there is a single touch.
+        reference_restitution: Restitution e* of the ideal contact [1]; NaN unless it has a single touch.
         effective_mass: Effective mass m_n at the first touch [kg].
         approach_velocity: Approach velocity along the normal of the first touch [m/s].
         point: Point of the first touch, in target frame T [m].
@@ -60,7 +60,7 @@ class Episode(NamedTuple):
         reference_duration: Time during which the ideal contact touches [s].
         touches: Number of touches of the hardware, for all pairs of shapes.
         reference_touches: Number of touches of the ideal contact, for all pairs of shapes.
-        penetration: Largest penetration of the hardware, divided by the size of the shapes [1].
+        penetration: Largest penetration of the hardware, divided by the size of the touching shapes [1].
         status: How the episode ended, one of `rollout.STATUS_NAMES`.
     """
 
@@ -214,7 +214,7 @@ def _result(
 
 
 def episodes_of(metrics: Metrics) -> tuple[Episode, ...]:
-    """Return the episodes of a run with one lane, except later episodes with the status "miss"."""
+    """Return the first episode of a single run, and all further episodes whose status is not "miss"."""
     return tuple(
         _episode(metrics, slot)
         for slot in range(metrics.status.shape[0])
@@ -236,7 +236,7 @@ def check_integrated(mechanism: SixAxisMechanism, metrics: Metrics) -> None:
 
 
 def _stiffest(mechanism: SixAxisMechanism) -> str:
-    """Return key, found value and expected value for an ideal contact that takes too many steps."""
+    """Return a message that names the key to change if the ideal contact takes too many time steps."""
     frictions = {name: contact.friction for name, contact in mechanism.contact.items() if contact.friction}
     slips = {name: law.slip / max(law.coefficient, 1e-9) for name, law in frictions.items() if law.slip}
     if slips:
@@ -278,14 +278,14 @@ def _run(loop: Loop, gains: dict[str, Any], scenario: Scenario) -> tuple[Any, ..
 
 @jax.jit
 def _ideal_motion(scenario: Scenario, time: Any) -> tuple[Any, ...]:
-    """Return the arrays of `_motion` for the ideal contact at a `time` [s]."""
+    """Return the motion of the bodies in the ideal contact at a `time` [s], as arrays like `_motion`."""
     return _motion(scenario.bodies, compute_ideal_states(scenario, time))
 
 
 def _tangential_mass(scenario: Scenario, metrics: Metrics) -> Any:
-    """Return the effective mass [kg] at the first touch for motion along the surface.
+    """Return the effective mass [kg] at the point of the first touch, for a force along the surface.
 
-    The result is the smaller of the masses in two perpendicular directions.
+    The result is the smaller of the masses in two perpendicular directions along the surface.
     """
     point, normal = (vector(part[:, 0]) for part in (metrics.point, metrics.normal))
     zero = jnp.zeros_like(normal.x)

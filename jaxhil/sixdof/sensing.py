@@ -77,14 +77,14 @@ def sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
 
 
 def start_filter(modes: FilterModes | None, nothing: Wrench) -> Any:
-    """Return the state of the force sensor's lag or filter before the first tick, for the input `nothing`."""
+    """Return the initial state of the force sensor's lag or filter; `nothing` is a zero wrench (no input)."""
     if modes is None:
         return nothing
     return (jax.tree.map(as_complex, nothing),) * len(modes.rates)
 
 
 def _draw_timing(rig: RigConstants, now: Array) -> TimingDraws | None:
-    """Return the timing effects at tick `now`, (*batch); None if there are none."""
+    """Draw jitter, lost frame and missed tick of the tick `now`, (*batch); None without timing effects."""
     if rig.timing is None:
         return None
     age = jnp.broadcast_to(now, (1, *rig.period.shape))
@@ -119,7 +119,7 @@ def _read_sensor(
 
 
 def _undo_mounting(loop: Loop, sensor: Sensor, reading: Wrench, measured: Array | None) -> Wrench:
-    """Return the wrench about T's origin that the controller reconstructs from the sensor's channels."""
+    """Reconstruct the contact's wrench about T's origin from a reading, as the controller does."""
     unbiased: Wrench = jax.tree.map(jnp.subtract, reading, _wrench(sensor.assumed_bias))
     if loop.side == "fixed":
         return undo_fixed(unbiased, sensor.mounting)

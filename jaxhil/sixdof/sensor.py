@@ -19,7 +19,7 @@ from jaxhil.sixdof.vectors import Matrix, Vector, components, cross
 
 
 class Tool(NamedTuple):
-    """Mass properties of the mechanism that a sensor on the moving side carries."""
+    """Mass properties of the tool: the chaser's mechanism, carried by a force sensor on the moving side."""
 
     mass: Float[Array, "..."]  # mass m_t [kg]
     centre: Vector  # vector c from the origin of chaser frame C to the centre of mass, in C [m]
@@ -61,8 +61,8 @@ class Sensor(NamedTuple):
 def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity: Vector) -> Wrench:
     """Return the wrench of the tool's weight and inertial force about the origin of chaser frame C [N, N m].
 
-    The wrench is in target frame T, which is at rest. `acceleration` contains the acceleration of C's origin
-    and the tool's angular acceleration.
+    The wrench is in the axes of target frame T, which is at rest. `acceleration` contains the acceleration of
+    C's origin and the tool's angular acceleration.
     """
     centre = rotate(pose.attitude, tool.centre)
     angular, alpha = twist.angular, acceleration.angular
@@ -112,9 +112,9 @@ def undo_moving(reading: Wrench, load: Wrench, pose: Pose) -> Wrench:
 
 
 def read_fixed(wrench: Wrench, mounting: Pose | None) -> Wrench:
-    """Return the reading (the reaction) of a sensor on the fixed side, in the sensor's frame.
+    """Return the reading of a sensor on the fixed side: the reaction to `wrench`, in the sensor's frame.
 
-    `mounting` is the pose of the sensor's frame relative to target frame T; None if both are equal.
+    `mounting` is the pose of the sensor's frame relative to target frame T; None if both frames are equal.
     """
     if mounting is None:
         return Wrench(-wrench.force, -wrench.moment)
@@ -124,7 +124,7 @@ def read_fixed(wrench: Wrench, mounting: Pose | None) -> Wrench:
 
 
 def undo_fixed(reading: Wrench, mounting: Pose | None) -> Wrench:
-    """Reconstruct the contact's wrench from the reading of a sensor on the fixed side."""
+    """Reconstruct the contact's wrench from the reading of a sensor on the fixed side (see `read_fixed`)."""
     if mounting is None:
         return Wrench(-reading.force, -reading.moment)
     position, attitude = mounting
@@ -141,8 +141,9 @@ def sample(
 ) -> Wrench:
     """Add cross-talk, bias and `noise` [N, N m] to a reading.
 
-    If `has_effects` is true, apply quantum, dead zone and range too. With `cuts_dead_zone`, the dead zone
-    leaves larger values unchanged.
+    If `has_effects` is true, apply resolution (quantum), dead zone and range too. The dead zone sets small
+    values to 0 and reduces larger values by its half-width; with `cuts_dead_zone`, larger values remain
+    unchanged.
     """
     # Each component is a separate array: from a stack, the compiler would compute the components repeatedly.
     components, structure = jax.tree.flatten(reading)
@@ -163,5 +164,5 @@ def sample(
 
 
 def _inertia(tool: Tool, pose: Pose, angular: Vector) -> Vector:
-    """Return R J_t R^T angular, where R is the matrix of the attitude and J_t the tool's inertia."""
+    """Return R J_t R^T `angular`, where R is the matrix of the pose's attitude and J_t the tool's inertia."""
     return rotate(pose.attitude, tool.inertia @ rotate_back(pose.attitude, angular))

@@ -19,7 +19,7 @@ NEAR_AXIS = 1e-12  # distance from the axis below which the radial direction dec
 
 
 class Surface(NamedTuple):
-    """Distance and direction of a shape's surface from a point."""
+    """Signed distance from a point to a shape's surface, and the surface's outward normal."""
 
     distance: Float[Array, "..."]  # signed distance [m], positive if the point is outside the shape
     normal: Vector  # outward normal at the nearest point of the surface, unit vector
@@ -39,7 +39,7 @@ class Shape(eqx.Module):
 
 
 class Plane(Shape):
-    """Half-space that is bounded by a plane."""
+    """Half-space, bounded by a plane."""
 
     point: Vector  # point on the plane [m]
     normal: Vector  # outward normal, unit vector
@@ -99,7 +99,7 @@ class Drogue(Shape):
 
 
 class Shell(Drogue):
-    """Drogue of finite length: a thin shell, which is touched from both sides and ends at a mouth.
+    """Thin drogue of finite length, which can be touched from inside, from outside and at its edge.
 
     A sphere that touches the shell must have a radius greater than 0.
     """
@@ -157,11 +157,11 @@ class Capsule(Shape):
         return Surface(norm(apart) - self.radius, direction(apart))
 
     def at(self, s: Float[Array, "..."]) -> Vector:
-        """Return the point of the segment at a fraction `s` of its length."""
+        """Return the point of the segment at the fraction `s` of its length: 0 at its start, 1 at its end."""
         return self.start + s * (self.end - self.start)
 
     def nearest(self, point: Vector) -> Float[Array, "..."]:
-        """Return the fraction of the segment's length, from its start, at the point nearest to `point`."""
+        """Return the place on the segment nearest to `point`, as a fraction of its length from the start."""
         along = self.end - self.start
         square = dot(along, along)
         return jnp.clip(dot(along, point - self.start) / jnp.where(square > 0, square, 1), 0, 1)

@@ -50,7 +50,7 @@ STATUSES = {
 
 @dataclasses.dataclass(frozen=True)
 class SixAxes(RigModel):
-    """Rig model for six axes, whose runs are episodes with an energy error and a twist error."""
+    """Rig model for six axes. Each run is one episode, with an energy error and a twist error."""
 
     axes: ClassVar[int] = 6
     run_name: ClassVar[str] = "episode"
@@ -69,15 +69,15 @@ class SixAxes(RigModel):
         return jax.tree.map(np.asarray, building.build_scenarios(mechanism, draws, seed, first))
 
     def loop(self, mechanism: SixAxisMechanism, compensator: str, scenarios: Scenario, **parts: bool) -> Loop:
-        """Build the loop that runs all the scenarios; `parts`, the options of one-axis loops, are ignored."""
+        """Build the loop that runs all scenarios; `parts` (options for one axis only) is ignored."""
         return building.make_loop(mechanism, compensator, scenarios)
 
     def runs(self, mechanism: SixAxisMechanism) -> int:
-        """Return the number of evaluated episodes (contacts with all their touches) in a scenario."""
+        """Return the number of runs in a scenario. A run is an episode (a contact with all its touches)."""
         return mechanism.approach.episodes if mechanism.approach else 1
 
     def with_ideal_contacts(self, batches: Sequence[Scenario]) -> list[Scenario]:
-        """Add the ideal contacts, integrated together on all devices, to batches of scenarios."""
+        """Compute the ideal contacts of all batches at once, on all devices; return the completed batches."""
         together = self.place_batch(jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *batches))
         results = cached_programs.run_cached(
             _compute_ideal_contacts, self, together.scenarios, options=self.compiler_options
@@ -97,20 +97,20 @@ class SixAxes(RigModel):
         return to_outcome(evaluate(loop, gains, _separate_loops(scenario)).metrics, scenario)
 
     def initial_state(self, loop: Loop, gains: Gains, scenario: Scenario) -> EpisodeProgress:
-        """Return the state of the loop over ticks at the start of a batch of scenarios."""
+        """Return the state of the simulation before the first tick of a batch of scenarios."""
         return start_scenario(loop, build_rig_constants(loop, gains, scenario), scenario)
 
     def at_rest(self, scenarios: Scenario, idle: np.ndarray) -> Scenario:
-        """Return the scenarios with a duration of 0 in the `idle` lanes."""
+        """Return a copy of the scenarios; the `idle` lanes, which only fill a tile, have the duration 0."""
         duration: Any = np.where(idle, 0.0, scenarios.duration).astype(np.asarray(scenarios.duration).dtype)
         return scenarios._replace(duration=duration)
 
     def expected_duration(self, scenarios: Scenario) -> np.ndarray:
-        """Return zeros, because the duration of a run is not known in advance."""
+        """Return 0 for every scenario, because the duration of a run is not known in advance."""
         return np.zeros(np.shape(scenarios.duration))
 
     def whole_delays(self, scenarios: Scenario) -> np.ndarray:
-        """Return equal sorting keys (zeros), because six-axis delay lines are read lane by lane."""
+        """Return the sorting key 0 for every scenario: sorting by delay does not save time for six axes."""
         return np.zeros(np.shape(scenarios.duration))
 
     def without_noise(self, scenarios: Scenario) -> Scenario:
@@ -132,10 +132,10 @@ SIX_AXES = SixAxes()
 
 
 def _separate_loops(scenario: Scenario) -> Scenario:
-    """Return a copy with equal values that makes XLA compile the tick loop as a separate function.
+    """Return an equal copy of `scenario`, with which XLA compiles the tick loop as a separate function.
 
-    Otherwise, XLA merges the tick loop with the loop over tiles. A dummy sort of two numbers prevents this;
-    see the function of the same name in `jaxhil.simulation.one_axis`.
+    Otherwise, XLA merges the tick loop with the loop over tiles (groups of lanes). A dummy sort of two
+    numbers prevents this; see the function of the same name in `jaxhil.simulation.one_axis`.
     """
     most = jnp.max(scenario.duration)
     most = jnp.sort(jnp.stack([most, most + 1]))[1]
@@ -143,9 +143,9 @@ def _separate_loops(scenario: Scenario) -> Scenario:
 
 
 def _compute_ideal_contacts(_: SixAxes, scenarios: Any) -> tuple[Array, ...]:
-    """Compute the ideal contacts of scenarios that are arranged in tiles.
+    """Compute the ideal contacts of scenarios that are arranged in tiles (groups of lanes).
 
-    The result is a tuple of arrays that are arranged like the scenarios.
+    The result is a tuple of arrays in the same arrangement.
     """
     return tuple(map_tiles(lambda _, tile: jax.tree.leaves(compute_ideal_contact(tile)), (), scenarios))
 
@@ -153,7 +153,8 @@ def _compute_ideal_contacts(_: SixAxes, scenarios: Any) -> tuple[Array, ...]:
 def to_outcome(episodes: Metrics, scenario: Scenario) -> Outcome:
     """Convert the metrics of episodes to an outcome, whose arrays contain every episode twice.
 
-    The first half has the energy errors, the second half the twist errors. The chatter is 0.
+    The first half has the energy errors, the second half the twist errors. Metrics that only one-axis rigs
+    have are 0.
     """
     # A draw that misses the target has no contact to evaluate.
     begins = jnp.isfinite(scenario.start.chaser.position.z)

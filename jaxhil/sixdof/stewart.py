@@ -63,8 +63,8 @@ class Stewart(Kinematics):
 def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 6 *batch"]:
     """Return the derivatives of the leg lengths (rows) with respect to the coordinates (columns) [m, rad].
 
-    A row consists of u and Jl(theta)^T (R b x u), where u is the direction of the leg, b its joint on the
-    platform, R the rotation and Jl the left Jacobian.
+    A row consists of u and Jl(theta)^T (R b x u), where u is the direction of the leg and b its joint on
+    the platform. R is the rotation with the rotation vector theta, and Jl is the left Jacobian.
     """
     leg, arm, theta = _legs(hexapod, at)
     along = direction(leg)
@@ -73,7 +73,7 @@ def jacobian(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "6 
 
 
 def condition(hexapod: Stewart, at: Float[Array, "6 *batch"]) -> Float[Array, "*batch"]:
-    """Return the condition number of the Jacobian, with lengths in m, which is large near singular poses."""
+    """Return the condition number of the Jacobian (lengths in m); it is large near singular poses."""
     return jnp.linalg.cond(jnp.moveaxis(jacobian(hexapod, at), (0, 1), (-2, -1)))
 
 

@@ -78,7 +78,7 @@ def matrix(entries: Float[Array, "3 3 *batch"]) -> Matrix:
 
 
 def dot(a: Vector, b: Vector) -> Float[Array, "..."]:
-    """Return the scalar product."""
+    """Return the scalar product of two vectors."""
     return a.x * b.x + a.y * b.y + a.z * b.z
 
 

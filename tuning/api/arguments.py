@@ -73,7 +73,7 @@ def convert_os_errors(function: Callable[Parameters, Result]) -> Callable[Parame
 
 
 def check_integers(least: int, most: int | None = None, **values: Any) -> None:
-    """Raise `ArgumentError` unless every value is an integer from `least` to `most`.
+    """Raise `ArgumentError` unless every value is an integer from `least` to `most` (None: no maximum).
 
     The keywords are the names of the arguments.
     """
@@ -105,7 +105,7 @@ def check_limit(value: Any) -> None:
 
 
 def choose_limit(value: float | None, mechanism: AnyMechanism) -> float:
-    """Return `value` or, if it is None, the default error limit for the mechanism's number of axes [1]."""
+    """Return the limit of the error [1]: `value` or, if it is None, the default for one or for six axes."""
     if value is not None:
         return value
     return SIX_AXIS_DEFAULT_LIMIT if isinstance(mechanism, SixAxisMechanism) else DEFAULT_LIMIT
@@ -170,7 +170,7 @@ def compensator_names() -> tuple[str, ...]:
 
 
 def check_setting_name(compensator: str, value: Any, axes: int = 1) -> None:
-    """Raise `ArgumentError` unless `value` is None or one of the compensator's settings for 1 or 6 axes.
+    """Raise `ArgumentError` unless `value` is None or the name of a setting (named gains) of the compensator.
 
     Unless `value` is None, this function imports jax.
     """
@@ -185,10 +185,9 @@ def check_setting_name(compensator: str, value: Any, axes: int = 1) -> None:
 
 
 def as_list(value: Any, kinds: tuple[type, ...]) -> tuple[list[Any], bool]:
-    """Return a value as a list, and whether it was already an iterable of values.
+    """Return one value or several values as a list, and whether `value` contained several.
 
-    A value of one of the types `kinds`, a mapping, or a value that is not iterable becomes a list of one
-    entry.
+    A value of one of the types `kinds`, a mapping, or a value that is not iterable is a single value.
     """
     if isinstance(value, kinds) or not isinstance(value, Iterable) or isinstance(value, Mapping):
         return [value], False
@@ -216,7 +215,7 @@ def load_any_mechanisms(value: Any) -> tuple[list[LoadedAnyMechanism], bool]:
 
 
 def _as_mechanism_list(value: Any) -> tuple[list[Any], bool]:
-    """Return mechanisms as a list, and whether `value` was a list; raise `ArgumentError` if it is empty."""
+    """Return mechanisms as a list, and whether `value` was a list; an empty list raises `ArgumentError`."""
     listed, is_list = as_list(value, (Mechanism, SixAxisMechanism, str, os.PathLike))
     if not listed:
         raise ArgumentError("mechanism", "an empty list", "one mechanism or more")

@@ -61,7 +61,8 @@ class Board:
         figures: metrics by compensator, then by set of gains ("literature", "tuned", or the name of a
             setting). The metrics are the attributes rms, p99, worst, early, late, slope, peak [1] and more
             (see `tuning.transparency.metrics`); each is a `ComparedMetric`. For six axes, rms, p99 and worst
-            are those of the twist error, and energy_rms and not_ended replace the metrics of transparency.
+            are those of the twist error; energy_rms (rms energy error) and not_ended (number of episodes that
+            did not end) are added, and early, late, slope, trajectory and noise do not exist.
         gains: gains [SI units] by compensator, then by set of gains as in `figures`, then by the gain's name.
         winners: for each metric, the compensator that is better than all others by more than the confidence
             intervals, or None if there is no such compensator.
@@ -125,7 +126,7 @@ def compare(
     progress: bool = False,
     **options: Any,
 ) -> Any:
-    """Tune compensators for a mechanism, and compare their errors on the same fresh scenarios.
+    """Tune compensators for a mechanism, and compare their errors in the same, newly drawn scenarios.
 
     The metrics equal those of `jaxhil compare`. This function computes them in the current process, whereas
     the command starts a process for each core.
@@ -134,8 +135,8 @@ def compare(
         mechanism: result of `jaxhil.load`, or a name or path that `jaxhil.load` accepts; or a list of these,
             all with the same number of axes.
         compensators: names of built-in or registered compensators; by default all built-in ones for the
-            mechanism's number of axes. A compensator that has settings is evaluated with each setting instead
-            of being tuned.
+            mechanism's number of axes. A compensator that has settings (named sets of gains) is evaluated
+            with each setting instead of being tuned.
         progress: report the progress on standard error.
         **options: see `CompareOptions`.
 
@@ -234,7 +235,7 @@ def _has_six_axes(entry: LoadedAnyMechanism) -> bool:
 def build_board(
     entry: LoadedAnyMechanism, options: CompareOptions, results: "Mapping[str, CompensatorMetrics]"
 ) -> Board:
-    """Return the comparison for one mechanism, from the results of the finished compensators."""
+    """Build the `Board` of one mechanism from the results of the compensators that are finished."""
     from jaxhil.laws.compensators import axes_of, get_compensator
     from tuning.benchmark.tables import find_winners
 

@@ -180,7 +180,7 @@ def export(
 
 
 def _build_document(loaded, bundle, format_names, rates) -> dict[str, Any]:
-    """Return the JSON document of the export, in which the path of the bundle is still missing (None)."""
+    """Return the JSON document of the export, without the path of the bundle (its entry is None)."""
     from tuning.bundle.writers import describe_fmus
     from tuning.verification.stops import describe_limit_changes
 
@@ -223,7 +223,7 @@ def _calibrate_limits(
 ):
     """Compute the watchdog's limits, and its rates of false and missed alarms.
 
-    `replaced` contains the limits that the user set; `allowed` contains the acceptable rates of both alarms.
+    `replaced` contains the limits that the user set; `allowed` contains the acceptable values of both rates.
     """
     from tuning.watchdog.verdict import AllowedAlarmRates
 
@@ -256,7 +256,7 @@ def _check_limit_names(limits: Mapping[str, Any], axes: int) -> None:
 
 @contextmanager
 def _open_sweep(sweep: Any) -> "Iterator[SweepStore | None]":
-    """Open the rows of a sweep, given as a result of `tuning.sweep` or as a folder; None without a sweep."""
+    """Open the rows of a sweep, which is a result of `tuning.sweep` or its folder; None without a sweep."""
     from tuning.api.sweep import SweepStudy
     from tuning.sweeps.store import read_store
 
@@ -268,7 +268,7 @@ def _open_sweep(sweep: Any) -> "Iterator[SweepStore | None]":
 
 
 def _parse_limits(limits: Any) -> dict[str, float | None]:
-    """Check the limits that the user set, and return them by name; None removes a limit.
+    """Check the watchdog limits that the user set, and return them by name; None removes a limit.
 
     Raise `InputError` if a name or a value is not allowed.
     """
@@ -283,7 +283,7 @@ def _parse_limits(limits: Any) -> dict[str, float | None]:
 
 
 def allowed_values(name: str) -> str:
-    """Return a text that describes the allowed values of the limit `name`."""
+    """Return a text that describes the values that the user may set for the watchdog's limit `name`."""
     limit = ALL_LIMITS[name]
     return f"a finite number from {limit.lowest:g} to {limit.highest:g} {limit.unit}, or none"
 
@@ -296,7 +296,7 @@ def _check_formats(formats: Any) -> None:
 
 
 def _select_formats(formats: Sequence[str] | None, fmi: int) -> list[str]:
-    """Return the names of the requested formats in the order of `WRITERS`, by default all but FMUs."""
+    """Return the names of the requested formats (by default all but FMUs), in the order of `WRITERS`."""
     from tuning.bundle.writers import ON_REQUEST, WRITERS
 
     names = formats or [name for name in WRITERS if name not in ON_REQUEST]

@@ -47,8 +47,8 @@ class StabilityMap:
         document: all results, as `jaxhil map --json` prints them.
         x: values of the key along x, (columns,), in the unit of the key.
         y: values of the key along y, (rows,), in the unit of the key.
-        error: error with the largest magnitude among the contacts, (rows, columns) [1]; NaN if a contact did
-            not end, or if there was no contact.
+        error: error with the largest magnitude of all contacts at a point, (rows, columns) [1]; NaN if a
+            contact did not end, or if there was no contact.
         restitution: restitution e of the contact with this error, (rows, columns) [1]; for six axes NaN
             unless there is a single touch.
         results: the same results as arrays, with theory and margins (`tuning.stability_map.grid.MapResults`).
@@ -165,7 +165,7 @@ def _compute(
     target: Path | None,
     progress: bool,
 ) -> StabilityMap:
-    """Compute the map as a function of the keys x and y; unless `target` is None, write it to this folder."""
+    """Compute the stability map over two `keys`; unless `target` is None, write it to this folder."""
     from jaxhil.simulation.gain_choice import choose_gains
     from tuning.caches.checkpoints import CHECKPOINT_FOLDER, Checkpoints
     from tuning.stability_map.grid import compute_map, count_runs
@@ -191,7 +191,7 @@ def _compute(
 def _axes(
     mechanism: AnyMechanism, compensator: str, gains: Mapping[str, float], x: str, y: str
 ) -> "tuple[MapAxis, MapAxis]":
-    """Build both axes of the map; if this fails, raise an `InputError` that names the wrong option."""
+    """Build the axes x and y of the stability map; an `InputError` names the option that is wrong."""
     from jaxhil.laws.compensators import axes_of, get_compensator
     from tuning.stability_map.axes import check_axes, parse_axis
 

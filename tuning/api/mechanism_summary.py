@@ -10,8 +10,8 @@ from tuning import terminal
 def check_can_be_simulated(mechanism: AnyMechanism, label: str | None = None) -> None:
     """Raise `InputError` if the contacts of a mechanism cannot be simulated.
 
-    For one axis, this is the case if a nominal or drawn contact takes too many ticks; for six axes, if the
-    nominal run cannot begin. This function imports jax.
+    With one axis, the check includes all draws of the uncertain parameters (see `plausibility.check_run`).
+    With six axes, only the nominal run is checked. This function imports jax.
     """
     if isinstance(mechanism, SixAxisMechanism):
         from jaxhil.sixdof.building import build_scenarios
