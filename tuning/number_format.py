@@ -18,4 +18,4 @@ def format_number(value: Any, digits: int = 4) -> str:
     if isinstance(value, Integral):
         return str(value)
     text = f"{value:.{digits}g}"
-    return f"{float(text):.0f}" if "e+" in text and abs(value) < LARGEST_PLAIN else text
+    return f"{float(text):.0f}" if "e+" in text and abs(float(value)) < LARGEST_PLAIN else text

@@ -132,9 +132,9 @@ def compute_map(
     x, y = (axis.values(points) for axis in axes)
     lines = [axis.values(LINE_POINTS) for axis in axes]
     middle = np.array([[axis.nominal for axis in axes]])
-    across, up = np.repeat(middle, LINE_POINTS, axis=0), np.repeat(middle, LINE_POINTS, axis=0)
-    across[:, 0], up[:, 1] = lines
-    point_gains, scenarios = batch(np.concatenate([_grid_points(x, y), across, up, middle]))
+    on_lines = np.tile(middle, (2 * LINE_POINTS, 1))  # points along x, then points along y
+    on_lines[:LINE_POINTS, 0], on_lines[LINE_POINTS:, 1] = lines
+    point_gains, scenarios = batch(np.concatenate([_grid_points(x, y), on_lines, middle]))
     work = model, mechanism, compensator, point_gains, scenarios
     worst = _run_tiles(*work, tell, scheduler, checkpoints)
     restitution, error, force, duration = (row[: points**2].reshape(points, points) for row in worst[:4])
@@ -150,20 +150,14 @@ def compute_map(
     if isinstance(mechanism, Mechanism) and reason is None:
         plain = {name: float(value) for name, value in gains.items()}
         nominal_growth = compute_growth(mechanism, compensator, plain, batch(middle)[1])
-        coarse = min(
-            points,
-            max(
-                MIN_COARSE_POINTS,
-                int((MAX_EIGENVALUE_COST / eigenvalue_cost(mechanism, compensator, scenarios)) ** 0.5),
-            ),
-        )
+        cost = eigenvalue_cost(mechanism, compensator, scenarios)
+        coarse = min(points, max(MIN_COARSE_POINTS, int((MAX_EIGENVALUE_COST / cost) ** 0.5)))
         grid = [axis.values(coarse) for axis in axes]
-        all_radii = spectral_radii(
-            mechanism, compensator, *batch(np.concatenate([_grid_points(*grid), across, up]))
-        )
+        of_points = batch(np.concatenate([_grid_points(*grid), on_lines]))
+        all_radii = spectral_radii(mechanism, compensator, *of_points)
         radii = SpectralRadii(grid[0], grid[1], all_radii[: coarse**2].reshape(coarse, coarse))
-        on_lines = all_radii[coarse**2 :].reshape(2, LINE_POINTS)
-        margins = _line_margins(axes, lines, on_lines, 1.0) if nominal_growth.spectral_radius <= 1 else None
+        of_lines = all_radii[coarse**2 :].reshape(2, LINE_POINTS)
+        margins = _line_margins(axes, lines, of_lines, 1.0) if nominal_growth.spectral_radius <= 1 else None
         nominal = nominal._replace(growth=nominal_growth, radius_margins=margins)
     return MapResults(
         axes=axes,

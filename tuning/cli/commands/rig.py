@@ -26,13 +26,7 @@ def run(options: RigOptions) -> int:
 
     Return exit code 0 if the verdict is good, 130 after an interrupted run, else 1.
     """
-    arguments.check_limit(options.limit)
-    arguments.check_integers(0, seed=options.seed)
-    _check_injection(options)
-    if options.connect is not None:
-        arguments.check_integers(1, 65535, connect=options.connect)
-    if options.plot is not None:
-        checks.check_plot(options.plot)
+    _check_options(options)
     gains = arguments.find_gain_file(options.path)
     document, mechanism, stroke = load_checked_gains(gains)
     axes = document.get("axes", 1)
@@ -41,30 +35,12 @@ def run(options: RigOptions) -> int:
     check_bundle_code(Path(options.path), document["compensator"], axes)
     limit = arguments.choose_limit(options.limit, mechanism)
     period = mechanism.rig.control_period
-    if not period <= options.duration <= MAX_TICKS * period:
-        allowed = f"{period:g} to {MAX_TICKS * period:g} s, {MAX_TICKS} control periods"
-        raise InputError(f"--duration: found {options.duration:g}, expected {allowed}")
+    _check_timing(options, period)
 
     from tuning.rig.network import Injection
     from tuning.rig.rig_task import build_simulated_rig
-    from tuning.rig.session import SILENCE_TIMEOUT, SessionSettings, real_time_priority, run_session
+    from tuning.rig.session import SessionSettings, run_session
     from tuning.rig.session_report import evaluate_session
-
-    slowest = MIN_PACKETS * period / SILENCE_TIMEOUT
-    if options.connect is not None and options.rate < slowest:
-        raise InputError(
-            f"--rate: found {options.rate:g}, expected {slowest:g} to 1 with --connect, because a running "
-            f"controller ends after {SILENCE_TIMEOUT:g} s without a packet"
-        )
-    try:
-        with real_time_priority(options.realtime):
-            pass
-    except OSError as error:
-        reason = to_one_line(error.strerror or str(error), 100)
-        raise InputError(
-            f"--realtime: found no permission for real-time priority ({reason}), expected this permission: "
-            "grant it, or run without --realtime"
-        ) from None
 
     with tempfile.TemporaryDirectory(prefix="jaxhil-rig-") as temporary:
         scratch = Path(temporary)
@@ -160,6 +136,41 @@ class _LoopProgress:
         elif seconds and seconds % 60 == 0:
             sys.stderr.write(f"{seconds} of {total * self._period:.0f} s\n")
             sys.stderr.flush()
+
+
+def _check_options(options: RigOptions) -> None:
+    """Check the options that need neither the gain file nor the mechanism; raise `InputError`."""
+    arguments.check_limit(options.limit)
+    arguments.check_integers(0, seed=options.seed)
+    _check_injection(options)
+    if options.connect is not None:
+        arguments.check_integers(1, 65535, connect=options.connect)
+    if options.plot is not None:
+        checks.check_plot(options.plot)
+
+
+def _check_timing(options: RigOptions, period: float) -> None:
+    """Check duration, rate and priority for a control period [s]; raise `InputError`."""
+    if not period <= options.duration <= MAX_TICKS * period:
+        allowed = f"{period:g} to {MAX_TICKS * period:g} s, {MAX_TICKS} control periods"
+        raise InputError(f"--duration: found {options.duration:g}, expected {allowed}")
+    from tuning.rig.session import SILENCE_TIMEOUT, real_time_priority
+
+    slowest = MIN_PACKETS * period / SILENCE_TIMEOUT
+    if options.connect is not None and options.rate < slowest:
+        raise InputError(
+            f"--rate: found {options.rate:g}, expected {slowest:g} to 1 with --connect, because a running "
+            f"controller ends after {SILENCE_TIMEOUT:g} s without a packet"
+        )
+    try:
+        with real_time_priority(options.realtime):
+            pass
+    except OSError as error:
+        reason = to_one_line(error.strerror or str(error), 100)
+        raise InputError(
+            f"--realtime: found no permission for real-time priority ({reason}), expected this permission: "
+            "grant it, or run without --realtime"
+        ) from None
 
 
 def _check_injection(options: RigOptions) -> None:
