@@ -27,7 +27,7 @@ MIN_TIME_CONSTANT = 1e-6  # minimum time constant [s]; logs cannot resolve faste
 
 @dataclass(frozen=True)
 class SimulatorStructure:
-    """Structure of a model: numbers of first-order sections, second-order sections and zeros."""
+    """Structure of a motion model: numbers of first-order sections, second-order sections and zeros."""
 
     name: str
     first: int  # number of denominator sections 1 + T s
@@ -48,7 +48,7 @@ class SimulatorStructure:
         return MotionModel(self, parameters)
 
     def make_starts(self, lines: SpectralLines) -> list[tuple[float, np.ndarray]]:
-        """Return chi-squared and parameters of linear fits at several delays."""
+        """Return starting points of a fit: chi-squared and parameters of linear fits at several delays."""
         return [_fit_linear_start(self, lines, delay) for delay in _make_delay_grid(lines)]
 
 
@@ -78,7 +78,7 @@ class SpectralLines:
 
     @cached_property
     def images(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return s = 2 pi j f and the drives' input at the spectral images of all lines, (images, lines)."""
+        """Return s = 2 pi j f and the drives' input at all lines and their aliases, both (images, lines)."""
         frequencies = holds.compute_image_frequencies(self.frequency, self.period)
         return 2j * np.pi * frequencies, self.command * holds.compute_hold_response(
             frequencies, self.period, self.hold, self.latency, self.shift
@@ -92,8 +92,9 @@ class SpectralLines:
 class MotionModel:
     """Model of the motion simulator: a structure with values of its parameters.
 
-    The parameters are, in this order: log T of each first-order section, log w and log zeta of each
-    second-order section, the coefficients c of the numerator, and the delay; T, 1/w and the delay in s.
+    The parameters are, in this order: the logarithm of the time constant [s] of each first-order section;
+    the logarithms of natural frequency [rad/s] and damping ratio of each second-order section; the
+    coefficients of s and s^2 in the numerator, as far as the structure has them; and the delay [s].
     """
 
     structure: SimulatorStructure
@@ -106,7 +107,7 @@ class MotionModel:
 
     @property
     def memory(self) -> float:
-        """Return the time for which a command affects the motion, without the delay [s]."""
+        """Return the time [s] for which a command affects the motion, not counting the transport delay."""
         slowest = max((-1.0 / pole.real for pole in np.roots(self.fraction[1])), default=0.0)
         return MEMORY_TIME_CONSTANTS * slowest
 
@@ -120,7 +121,7 @@ class MotionModel:
 
     @cached_property
     def sections(self) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Return the coefficients of N(s) and of each denominator section, in ascending powers of s."""
+        """Return the coefficients of the numerator and each denominator section, in ascending powers of s."""
         many, values = self.structure, np.asarray(self.parameters, float)
         parts = [np.array([1.0, time]) for time in np.exp(values[: many.first])]
         for w, zeta in np.exp(values[many.first : many.order]).reshape(-1, 2):
@@ -129,7 +130,7 @@ class MotionModel:
 
     @cached_property
     def fraction(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the coefficients of the numerator and of the denominator, in descending powers of s."""
+        """Return the coefficients of numerator and denominator (without delay), in descending powers of s."""
         numerator, parts = self.sections
         denominator = np.array([1.0])
         for part in parts:
@@ -137,12 +138,12 @@ class MotionModel:
         return numerator[::-1], denominator[::-1]
 
     def response(self, s: np.ndarray) -> np.ndarray:
-        """Return H(s), including the delay."""
+        """Return the transfer function, including the delay, at each complex frequency in `s` [1/s]."""
         numerator, denominator = self.fraction
         return np.polyval(numerator, s) / np.polyval(denominator, s) * np.exp(-s * self.delay)
 
     def slopes(self, s: np.ndarray) -> np.ndarray:
-        """Return the derivatives of log H(s) with respect to the parameters, shape (parameters, *s.shape)."""
+        """Return the log transfer function's derivatives by each parameter, shape (parameters, *s.shape)."""
         numerator, parts = self.sections
         many, rows = self.structure, []
         for part in parts[: many.first]:
@@ -178,7 +179,7 @@ class MotionModel:
 
 @dataclass(frozen=True)
 class SpectrumFit:
-    """Model fitted to measured spectra, with the residuals and the covariance of its parameters."""
+    """Model fitted to measured spectra, with the covariance of its parameters and with the residuals."""
 
     model: MotionModel
     covariance: np.ndarray  # covariance of the parameters, from the curvature of the likelihood
@@ -242,7 +243,7 @@ def _refine_fit(structure: SimulatorStructure, start: np.ndarray, lines: Spectra
 
 
 def _limit_fast_poles(structure: SimulatorStructure, parameters: np.ndarray) -> np.ndarray:
-    """Return the parameters after limiting the magnitude of all poles to 1 / `MIN_TIME_CONSTANT`."""
+    """Limit the magnitude of all poles to 1 / `MIN_TIME_CONSTANT`; return the changed parameters."""
     first, order = structure.first, structure.order
     times = np.maximum(parameters[:first], np.log(MIN_TIME_CONSTANT))
     sections = []
@@ -259,7 +260,7 @@ def _limit_fast_poles(structure: SimulatorStructure, parameters: np.ndarray) -> 
 
 
 def estimate_low_frequency_delay(lines: SpectralLines) -> float:
-    """Return the delay from the drives' input to the reading [s], from the phase at low frequencies."""
+    """Return the delay [s] from the drives' input to the position reading at low frequencies."""
     s, command = lines.images
     middle = len(s) // 2
     phase = np.unwrap(np.angle(lines.output / command[middle]))
@@ -270,7 +271,7 @@ def estimate_low_frequency_delay(lines: SpectralLines) -> float:
 
 
 def _make_delay_grid(lines: SpectralLines) -> np.ndarray:
-    """Return a grid of delays [s] from 0 to the largest delay that the phase at low frequencies allows."""
+    """Return a grid of delays [s] from 0 to the delay at low frequencies, at least to one period."""
     longest = max(estimate_low_frequency_delay(lines), lines.period)
     return np.linspace(0.0, longest, int(np.clip(4.0 * longest / lines.period, 8, 40)))
 
@@ -280,7 +281,7 @@ def _fit_linear_start(
 ) -> tuple[float, np.ndarray]:
     """Fit a structure with a fixed delay by linear least squares; return chi-squared and the parameters.
 
-    The fit neglects the spectral images.
+    The fit neglects the aliases of the sampled command; chi-squared includes them.
     """
     s, command = lines.images
     s, command = s[len(s) // 2], command[len(s) // 2]
@@ -311,11 +312,11 @@ def _fit_linear_start(
 
 
 def _convert_sections(structure: SimulatorStructure, denominator: np.ndarray, unit: float) -> list[float]:
-    """Return the logarithms of the sections' parameters.
+    """Split a denominator into first- and second-order sections; return the logarithms of their parameters.
 
     Args:
         structure: Structure of the model.
-        denominator: Coefficients in ascending powers of the product of s and `unit`.
+        denominator: Coefficients of the denominator, in ascending powers of (`unit` times s).
         unit: Unit of time of the coefficients [s].
     """
     roots = polynomial.polyroots(denominator)

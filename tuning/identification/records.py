@@ -65,7 +65,7 @@ class LoggedRun:
 
 @dataclass(frozen=True)
 class CampaignTiming:
-    """Timing of the logged commands and readings, which the user specifies."""
+    """Timing of the logged commands and readings, as specified by the user."""
 
     control_period: float  # s
     command_hold: CommandHold  # drives' input between two ticks: held or interpolated
@@ -78,7 +78,7 @@ class CampaignTiming:
 
     @property
     def shift(self) -> int:
-        """Return the age of a row's readings relative to its command [periods].
+        """Return by how many periods the readings in a row of a log are older than the command in that row.
 
         The computing delay is subtracted, because in the loop it cannot be distinguished from a delay of the
         motion simulator.
@@ -88,7 +88,7 @@ class CampaignTiming:
 
 @dataclass(frozen=True)
 class Campaign:
-    """All runs of a rig, with their timing and the mass of the numerical model."""
+    """All logged runs of a rig, their timing, and the mass of the numerical model."""
 
     runs: tuple[LoggedRun, ...]
     timing: CampaignTiming

@@ -67,12 +67,12 @@ class Identification:
         estimates: Estimates of all parameters.
         draws: Posterior draws of the parameters that were not specified, in the order of `estimates`, shape
             (draws, parameters).
-        combinations: Parameter combinations that the logs determine better than the single parameters.
+        combinations: Combinations of parameters that the logs determine better than each parameter alone.
         confounded: Pairs of confounded parameters: two keys, their correlation, and the experiment that
             separates the parameters.
-        lines: Results of the checks.
-        mechanism: Content of a mechanism file, or None if a value is missing or invalid.
-        limit: Limit on the sum of the defects' effects, for the restitution e and for its error e - e* alike.
+        lines: Results of the checks, one for each line of the printed table of checks.
+        mechanism: Content of the identified mechanism file, or None if a value is missing or invalid.
+        limit: Limit of the total effect of all defects on the restitution e, and also on its error e - e*.
         notes: Further remarks.
         missing: Parameters that neither the logs nor the prior determine, each with advice.
         motion: Fit of the motion simulator, or None.
@@ -97,17 +97,17 @@ class Identification:
 
     @property
     def effect(self) -> float:
-        """Return the effect of all detected defects and of the parameters' uncertainty on e."""
+        """Return the effect on e of all detected defects and of the parameters' uncertainty."""
         return float(sum(line.effect_in_verdict for line in self.lines))
 
     @property
     def effect_on_error(self) -> float:
-        """Return the effect of all detected defects and of the parameters' uncertainty on e - e*."""
+        """Return the effect on e - e* of all detected defects and of the parameters' uncertainty."""
         return float(sum(line.error_in_verdict for line in self.lines))
 
     @property
     def good(self) -> bool:
-        """Return True if both effects are below the limit and the logs were compared with the model."""
+        """Return whether the model is complete and checked, with effects on e and e - e* below the limit."""
         is_small = max(self.effect, self.effect_on_error) < self.limit
         return not self.missing and self.is_compared and is_small
 

@@ -36,7 +36,7 @@ def check_result(
     """Check the mechanism file as `identify --check` does; if this is impossible, check the fits.
 
     Returns:
-        The mechanism (None if its file would be invalid), and the checks.
+        The mechanism (None if it makes an invalid file), and the checks.
     """
     written, errors = _parse_written_mechanism(mechanism)
     lines = _check_written_file(campaign, written, motion if options.order is None else None)
@@ -51,7 +51,7 @@ def check_result(
 def _parse_written_mechanism(
     mechanism: dict[str, Any] | None,
 ) -> tuple[Mechanism | None, list[validation.CheckResult]]:
-    """Return the mechanism as read from its file, or a failed check if the file would be invalid."""
+    """Read an identified mechanism back from its TOML text; if the text is invalid, return a failed check."""
     if mechanism is None:
         return None, []
     try:
@@ -63,12 +63,12 @@ def _parse_written_mechanism(
 def _check_written_file(
     campaign: Campaign, written: Mechanism | None, motion: FreeMotion | None
 ) -> list[validation.CheckResult] | None:
-    """Compare the logs with the written mechanism, as `identify --check` does.
+    """Compare the logs with the identified mechanism file, as `identify --check` does.
 
     Args:
         campaign: The logs.
-        written: The mechanism as read from its file, or None.
-        motion: Fit of the motion simulator without a specified order, or None.
+        written: The mechanism as read from this file, or None.
+        motion: Fit of the motion simulator; None if there is none, or if the user specified its order.
 
     Returns:
         The checks; or None if there is no file, or if the logs cannot be compared with it.
@@ -92,7 +92,7 @@ def _check_fits(
     frequency: float,
     written: Mechanism | None,
 ) -> list[validation.CheckResult]:
-    """Return the checks of the fits to free motion and contact, at the contact frequency [Hz]."""
+    """Check the fits to free motion and to contact; `frequency` is the contact frequency [Hz]."""
     lines = [] if written is None else check_modelled_effects(written)
     if motion is not None:
         lines += [

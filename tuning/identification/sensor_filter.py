@@ -25,12 +25,12 @@ def apply_filter(
     onsets: Onsets | None = None,
     first: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the whitened response of a low-pass filter to forces or regressors along the last axis.
+    """Apply a low-pass filter and a whitening filter to forces or regressors, along the last axis (rows).
 
     Args:
         modes: Parallel form of the filter.
         rate: Control period multiplied by the filter's angular cutoff frequency.
-        tables: Forces at the times of the rows and half a period earlier, arrays of the same shape.
+        tables: Forces at the times of the rows, and forces half a period earlier, of the same shape.
         whitening: Coefficients of the whitening filter.
         onsets: Onsets of contact between two rows, or None.
         first: Forces just after the onsets, shape (regressors, onsets), or None without onsets.
@@ -53,8 +53,8 @@ def apply_filter(
 def compute_lag_weights(rate: Any) -> tuple[Any, tuple[Any, Any, Any]]:
     """Return the pole of a sampled first-order lag, and the weights of the force during a control period.
 
-    The new reading is pole * previous reading + weighted sum of three forces. It is exact if the force is a
-    parabola in time.
+    The new reading is the pole times the previous reading, plus the weighted sum of three forces. The sum is
+    exact if the force is a parabola in time.
 
     Args:
         rate: Control period divided by the time constant; may be complex.

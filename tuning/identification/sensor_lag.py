@@ -50,7 +50,7 @@ class SensorLag:
 
 
 def estimate_sensor_lag(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> SensorLag | None:
-    """Estimate the sensor's lag; if a lag is uncertain, average over models with and without a lag.
+    """Estimate the force sensor's lag; if its existence is uncertain, average models with and without lag.
 
     Args:
         problem: Contact problem without a lag.
@@ -90,10 +90,10 @@ def estimate_sensor_lag(problem: ContactProblem, posterior: Posterior, seed: int
 
 
 def place_nodes(fit: Callable[[float], CoarseFit], value: float, misfit: float, least: float) -> np.ndarray:
-    """Return evenly spaced time constants [s] around the best one, over some standard deviations.
+    """Return evenly spaced time constants [s], up to several standard deviations from the best one.
 
     Args:
-        fit: Function that returns the best fit with a time constant.
+        fit: Function that returns the best fit with a given time constant [s].
         value: Best time constant [s].
         misfit: Chi-squared of the best fit.
         least: Smallest time constant [s] of the result.
@@ -108,7 +108,7 @@ def place_nodes(fit: Callable[[float], CoarseFit], value: float, misfit: float, 
 
 
 def join_posteriors(nodes: np.ndarray, posteriors: list[Posterior], seed: int) -> SensorLag:
-    """Return the lag with its posterior, combined from those at evenly spaced time constants `nodes` [s]."""
+    """Combine the posteriors at the evenly spaced time constants `nodes` [s] into an estimate of the lag."""
     draws, picked = _draw_between_lags(nodes, posteriors, seed)
     evidence: Any = special.logsumexp([node.evidence for node in posteriors])
     best = int(np.argmax([node.evidence for node in posteriors]))
@@ -120,10 +120,10 @@ def join_posteriors(nodes: np.ndarray, posteriors: list[Posterior], seed: int) -
 def _average_over_lag(
     problem: ContactProblem, posterior: Posterior, at: FitAt, seed: int
 ) -> SensorLag | None:
-    """Average over the models with and without a lag; return None if the readings exclude a lag.
+    """Average the contact models with and without sensor lag; return None if the readings exclude a lag.
 
-    The prior of the time constant is uniform up to `MAX_TIME_CONSTANT`. The delays of the result include the
-    time constant.
+    The prior of the time constant is uniform up to `MAX_TIME_CONSTANT`. In the result, each draw of the
+    delay includes the time constant of this draw.
     """
     heights = (
         np.array([posterior.best[2].misfit, *(at(value)[1][2] for value in TRIAL_TIME_CONSTANTS)]) / -2.0
@@ -146,7 +146,7 @@ def _average_over_lag(
 
 
 def _weigh_lag(posterior: Posterior, posteriors: list[Posterior], step: float) -> tuple[float, float]:
-    """Return the posterior probability of a lag, and the log evidence of the average of both models.
+    """Return a lag's posterior probability, and the log evidence averaged over models with and without lag.
 
     Args:
         posterior: Posterior without a lag.
@@ -162,7 +162,7 @@ def _weigh_lag(posterior: Posterior, posteriors: list[Posterior], step: float) -
 def _compute_posteriors(
     posterior: Posterior, at: FitAt, nodes: np.ndarray, count: int, seed: int
 ) -> list[Posterior]:
-    """Return the posterior at each time constant in `nodes`, on a grid of `count` delays."""
+    """Return one posterior for each time constant in `nodes`, each on a grid of `count` delays."""
     delay_std = float(posterior.draws[:, 0].std())
     return [compute_posterior_at_lag(*at(lag), delay_std, seed, count) for lag in nodes]
 
@@ -187,10 +187,10 @@ def compute_posterior_at_lag(
 def _draw_between_lags(
     nodes: np.ndarray, posteriors: list[Posterior], seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw from the posteriors at evenly spaced time constants; return draws and their time constants [s].
+    """Draw contact parameters, and time constants [s] between the evenly spaced time constants `nodes`.
 
-    Each posterior gives a number of draws in proportion to its probability. Each draw then gets a random time
-    constant near that of its posterior, and its parameters follow by linear interpolation.
+    The number of draws at each node is proportional to the probability of its posterior. A random shift then
+    moves the time constant of each draw off its node; the contact parameters change in proportion.
     """
     evidence = np.array([node.evidence for node in posteriors])
     weights = np.exp(evidence - evidence.max())

@@ -35,7 +35,7 @@ FIRST_DELAY_STD = 2e-4  # s, standard deviation of the delay that determines the
 def estimate_stated_filter(
     problem: ContactProblem, near: tuple[float, float] | None, seed: int = 0
 ) -> SensorLag:
-    """Estimate the time constant of the filter that the prior states, with all contact parameters.
+    """Estimate all contact parameters, and the time constant of the sensor's filter stated in the prior.
 
     Args:
         problem: Contact problem with the filter and the time constant of the prior.
@@ -43,8 +43,8 @@ def estimate_stated_filter(
         seed: Seed of the random numbers.
 
     Returns:
-        The time constant with the posterior. If the contacts hardly determine it, all draws have the prior's
-        value.
+        The time constant with the posterior. If the contacts hardly determine the time constant, all draws
+        have the prior's value.
     """
     stated, modes = problem.time_constant, problem.readings.modes
     first = search_coarsely(problem, None if near is None else (*near, np.inf))
@@ -79,7 +79,7 @@ def estimate_stated_filter(
 
 
 def _find_best(misfit: Callable[[float], float], start: float, limits: tuple[float, float]) -> float:
-    """Return the time constant [s] with the smallest misfit within limits, near a starting value."""
+    """Search from `start` for a time constant [s] within the limits that minimises the misfit."""
     best = start
     while True:
         bounds = max(best / TRIAL_RATIO, limits[0]), min(best * TRIAL_RATIO, limits[1])

@@ -87,14 +87,14 @@ def compute_residual_ratio(candidates: list[StructureCandidate]) -> float:
 
 
 def compute_criterion(fit: SpectrumFit, inflation: float) -> float:
-    """Return the Bayesian information criterion for a noise variance that is multiplied by `inflation`."""
+    """Return the Bayesian information criterion of a fit; `inflation` is a factor on the noise variance."""
     return fit.chi2 / inflation + fit.model.structure.size * float(np.log(2 * len(fit.residual)))
 
 
 def find_fault(fit: SpectrumFit, inflation: float = 1.0) -> str:
-    """Return the reason why a smaller structure is preferred to this fit, or an empty string.
+    """Return the reason to exclude the structure of a fit, or an empty string if there is none.
 
-    The noise variance is multiplied by `inflation`.
+    `inflation` is the factor on the noise variance.
     """
     numerator, denominator = fit.model.fraction
     poles, zeros = np.roots(denominator), np.roots(numerator)

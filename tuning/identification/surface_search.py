@@ -10,7 +10,7 @@ MIN_LIKELIHOOD_GAIN = 2.0  # Newton's method stops when a step increases the log
 def find_best_surface(
     problem: ContactProblem, delay: float, plane: float
 ) -> tuple[float, CoefficientFit, float]:
-    """Find the surface position with the smallest misfit at one force delay by Newton's method.
+    """Find, by Newton's method, the surface position with the smallest misfit at a given force delay.
 
     Args:
         problem: Least-squares fit of a contact law.
@@ -18,8 +18,8 @@ def find_best_surface(
         plane: Starting value of the surface position [m].
 
     Returns:
-        The best surface position [m], the fit before the last Newton step, and the increase of the log
-        likelihood in this step.
+        The best surface position [m]; the fit at this position or one small Newton step before it; and the
+        increase of the log likelihood expected from this step (0 without such a step).
     """
     inner = problem.at(delay, plane)
     for _ in range(MAX_NEWTON_STEPS):

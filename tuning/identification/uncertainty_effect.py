@@ -66,14 +66,14 @@ class _IdealContact(NamedTuple):
 
 
 def compute_uncertainty_effect(mechanism: Mechanism) -> UncertaintyEffect:
-    """Compute how much the uncertainty of identified parameters changes the restitution e and e - e*.
+    """Compute how much uncertain identified parameters change the restitution e and its error e - e*.
 
     The identified parameters are those in the file's `[correlation]` or, without this table, those with a
-    normal distribution in `[uncertainty]`. Others in `[uncertainty]` vary, but were not identified.
+    normal distribution in `[uncertainty]`. All other parameters in `[uncertainty]` are ignored.
 
     Returns:
-        The 99 % quantiles of the effects, for the entry of the lists in `[contact]` with the largest
-        effects; or 0 if the file does not come from an identification.
+        The 99 % quantiles of the effects; 0 if the file does not come from an identification. If
+        `[contact]` lists several contacts, the result is for the contact with the largest effects.
     """
     keys = _list_identified_keys(mechanism)
     if not keys:
@@ -174,14 +174,14 @@ def _replace_simulator_value(mechanism: Mechanism, name: str, value: float) -> M
 
 
 def _compute_motion_lag(mechanism: Mechanism, frequency: float) -> float:
-    """Return the phase delay [s] from the command to the position reading at a frequency [Hz]."""
+    """Return the phase delay [s] from the command to the position reading, at the contact frequency [Hz]."""
     model = mechanism_models.make_motion_model(mechanism)
     angle = float(np.angle(model.response(np.array([2j * np.pi * frequency]))[0]))
     return -angle / (2.0 * np.pi * frequency)
 
 
 def _compute_total_force_delay(mechanism: Mechanism, frequency: float) -> float:
-    """Return the total delay [s] from the command to the force reading at a frequency [Hz]."""
+    """Return the delay [s] from the command to the force reading, at the contact frequency [Hz]."""
     sensor = mechanism.rig.force_sensor
     total = _compute_motion_lag(mechanism, frequency) + sensor.delay + sensor.time_constant
     total += low_frequency_delay(sensor.filter)
@@ -193,10 +193,10 @@ def _compute_effect_quantile(values: np.ndarray) -> float:
 
 
 def _simulate_ideal_contact(mechanism: Mechanism, law: Law, entry: int) -> tuple[_IdealContact | None, float]:
-    """Simulate the ideal contact of one entry of the lists in `[contact]`.
+    """Simulate the ideal contact with the parameters at index `entry` of the lists in `[contact]`.
 
     Returns:
-        The contact, or None if there is no rebound; and the contact frequency [Hz].
+        The contact (None if there is no rebound), and the contact frequency [Hz].
     """
     mass, speed = mechanism.bodies.mass, mechanism.approach.velocity
     coefficients = np.array(mechanism_models.get_regression_coefficients(mechanism.contact, entry))
@@ -237,7 +237,7 @@ def _simulate_ideal_contact(mechanism: Mechanism, law: Law, entry: int) -> tuple
 
 
 def _find_max_depth(force: Any, energy: float) -> float | None:
-    """Return the depth [m] at which the elastic force has absorbed `energy` [J]; None above `MAX_DEPTH`."""
+    """Return the depth [m] where the elastic force has absorbed `energy` [J]; None if above `MAX_DEPTH`."""
     depth, work = 1e-9, 0.0
     while work < energy:
         work += force(1.005 * depth, 0.0) * 0.01 * depth

@@ -11,9 +11,9 @@ FILTER_KEY, CUT_ZONE_KEY = "rig.force_sensor.filter", "rig.force_sensor.dead_zon
 
 
 def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
-    """Return name and description of each effect in a file that is not modelled, by key.
+    """Return name and description of each effect that `monitor` does not model, by key of the mechanism file.
 
-    An effect that only the table `[uncertainty]` contains counts too.
+    An effect also counts if it occurs only in the table `[uncertainty]`.
     """
     rig, sensor, effects = mechanism.rig, mechanism.rig.force_sensor, {}
     if rig.simulator.window is not None:
@@ -37,9 +37,9 @@ def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
 
 
 def check_modelled_effects(mechanism: Mechanism) -> list[CheckResult]:
-    """Return a failed check for each effect in a mechanism file that `identify` does not model.
+    """Return a failed check for each effect that a mechanism file contains and `identify` does not model.
 
-    `identify` models a filter of the force sensor unless a dead zone hides the onset of contact.
+    A filter of the force sensor is not modelled if the sensor has a dead zone, which hides the onset.
     """
     effects = list_unmodelled_effects(mechanism)
     for key in (AVERAGE_KEY, CUT_ZONE_KEY):

@@ -31,14 +31,14 @@ MISFIT_SMOOTHING_LINES = 5  # number of adjacent frequency lines whose misfit is
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of a check of the model or the logs for one kind of defect.
+    """Result of checking the model or the logs for one kind of defect.
 
     Attributes:
         name: Name of the check.
         finding: Result in words and numbers.
         is_significant: Whether the defect is statistically significant.
         effect: Effect of the defect on the restitution e.
-        where: Where the error is largest: the frequency, or the log file and the time of the contact.
+        where: Place of the largest error: the frequency, or the log file and the time of the contact.
         on_error: Effect of the defect on the error e - e* (e*: ideal contact), or None if it equals `effect`.
         is_in_verdict: Whether the verdict includes this check.
     """
@@ -153,7 +153,7 @@ def _check_distortion(motion: FreeMotion) -> list[CheckResult]:
 def check_contact_model(
     contact: ContactFit, runs: list[LoggedRun], mass: float, frequency: float, lag: float, flags: np.ndarray
 ) -> list[CheckResult]:
-    """Compare a contact model with the contacts that `flags` selects.
+    """Check a contact model against the contacts that `flags` selects, and for drift over all contacts.
 
     Args:
         contact: Contact model.
@@ -180,7 +180,8 @@ def check_held_out_contacts(
 ) -> list[CheckResult]:
     """Compare a fit with the contacts that the fit did not use; `held_out` flags these contacts.
 
-    The verdict ignores these checks, because the mechanism file comes from another fit, to all contacts.
+    The verdict ignores these checks, because the mechanism file comes from a second fit that uses all
+    contacts.
     """
     residual_check = _check_law_residual(contact, runs, held_out)
     lines = [replace(residual_check, name="contact law, touches not fitted", is_in_verdict=False)]
@@ -217,10 +218,10 @@ def _check_law_residual(contact: ContactFit, runs: list[LoggedRun], chosen: np.n
 
 
 def flag_certain_rows(contact: ContactFit) -> np.ndarray:
-    """Return flags of the rows that are certainly in or out of contact, shape (rows, lanes).
+    """Return which rows are certainly in contact or certainly out of contact, shape (rows, contacts).
 
     A row is certain if it is in contact for all posterior draws of delay and surface position, or for none.
-    Residuals in other rows do not show an error of the law, because the force jumps at the onset.
+    In uncertain rows, residuals do not show an error of the law, because the force jumps at the onset.
     """
     count = len(contact.problem.names)
     flags = [
@@ -259,10 +260,10 @@ def _check_delay_in_search_range(contact: ContactFit) -> list[CheckResult]:
 def estimate_restitution_errors(
     contact: ContactFit, runs: list[LoggedRun], mass: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return each contact's error of e due to the unexplained force, and its standard deviation.
+    """Return how much the force residuals change e in each contact, and the change's standard deviation.
 
-    The standard deviation comes from the noise of the force. Both are NaN if the numerical model is not a
-    free body or does not rebound, or if the log of the contact is incomplete.
+    The standard deviation comes from the noise of the force. Both values are NaN if the numerical model is
+    not a free body or does not rebound, or if the log of the contact is incomplete.
     """
     delay, plane, coefficient_fit = contact.posterior.best
     predicted = contact.problem.force(delay, plane, coefficient_fit.coefficients)

@@ -26,7 +26,7 @@ LossFunction = Callable[[Float[np.ndarray, "candidates gains"]], Float[np.ndarra
 
 
 class SearchResult(NamedTuple):
-    """Best point of a derivative-free search, or of several independent searches by `polish`."""
+    """Best point of a derivative-free search, or of each of several independent searches by `polish`."""
 
     point: Float[np.ndarray, "*starts gains"]  # best point, in unit coordinates
     loss: Float[np.ndarray, "*starts"]  # loss at the best point
@@ -57,11 +57,11 @@ def polish(
         start: starting points of independent searches, in unit coordinates.
         evaluations: number of evaluations per start, rounded down to complete generations, at least one.
         candidates: number of candidates per generation.
-        reach: initial standard deviation in unit coordinates, averaged over the gains.
-        covariance: covariance of the initial distribution, up to a factor; None for an isotropic one. The
-            search needs fewer generations with the inverse Hessian of least squares, (J^T J / (2 L) + 16)^-1,
-            where J is the Jacobian of the residuals and L the loss. The 16 limits the standard deviation of a
-            gain without effect to a quarter of its range.
+        reach: initial standard deviation in unit coordinates, as the root mean square over the gains.
+        covariance: covariance of the initial distribution, before scaling to `reach`; None: isotropic. The
+            search needs fewer generations with (J^T J / (2 L) + 16 I)^-1, where J is the Jacobian of the
+            residuals, L the loss and I the identity: nearly the inverse Hessian of least squares. The 16 I
+            limits the standard deviation of a gain without effect to a quarter of its range.
         seed: seed of the random numbers.
 
     Returns:
@@ -104,9 +104,10 @@ def search_globally(
     """Find the best point of the whole unit box within `budget` evaluations.
 
     A scan of a scrambled Sobol sequence uses an eighth of the evaluations. The best points with a minimum
-    distance from each other are the starts of simultaneous runs of `polish`, in rounds of equal cost. Each
-    round continues from the better half of the minima, with an isotropic distribution and twice as many
-    candidates, which average out the roughness of the loss. The last round refines the best minimum.
+    distance from each other start simultaneous runs of `polish`, each in its own basin (neighbourhood of a
+    local minimum). The runs proceed in rounds of equal cost. Each round continues from the better half of the
+    minima, with an isotropic distribution. It has twice as many candidates per run, which average out the
+    roughness of the loss. The last round refines the best minimum.
 
     Source: restarts with a growing population, Auger and Hansen, "A restart CMA evolution strategy with
     increasing population size" (2005); successive halving, Jamieson and Talwalkar (2016).
@@ -274,10 +275,10 @@ def _replace_nonfinite(losses):
 
 
 def select_distant_points(ranked, fixed_points, number):
-    """Select `number` points: all `fixed_points`, then the best of `ranked` that are far from the others.
+    """Select `number` points: all `fixed_points`, then the best `ranked` points at a minimum distance.
 
-    `ranked` is in ascending order of loss. The minimum distance is a tenth of the unit box's diagonal, and
-    smaller if there are not enough such points.
+    `ranked` is in ascending order of loss. The minimum distance between selected points is a tenth of the
+    unit box's diagonal. It is reduced if too few points have this distance.
     """
     fixed_points = np.zeros((0, ranked.shape[-1])) if fixed_points is None else fixed_points
     distance = MIN_START_DISTANCE * np.sqrt(ranked.shape[-1])
@@ -289,7 +290,7 @@ def select_distant_points(ranked, fixed_points, number):
 
 
 def select_points_at_distance(ranked, fixed_points, number, distance=None):
-    """Select points like `select_distant_points`, but fewer if too few have the minimum `distance`."""
+    """Select points like `select_distant_points`, but fewer if too few points keep the given `distance`."""
     distance = MIN_START_DISTANCE * np.sqrt(ranked.shape[-1]) if distance is None else distance
     chosen = list(np.clip(fixed_points[:number], 0, 1))
     for point in ranked:

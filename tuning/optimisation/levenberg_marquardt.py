@@ -40,22 +40,22 @@ def solve_least_squares(
     longest: int = 32,
     tile: int | None = None,
 ) -> SolverResult:
-    """Minimise half the sum of squared residuals of many problems, which are distributed to all devices.
+    """Minimise half the sum of squared residuals for each of many problems, distributed over all devices.
 
-    A problem has converged if residuals and coordinates change by less than `RTOL` and `ATOL` permit, if a
-    step is shorter than `MIN_STEP_LENGTH`, or if the relative decrease of the loss in `PROGRESS_STEPS` steps
-    is below `MIN_LOSS_DECREASE`.
+    A problem has converged if a step changes its residuals and coordinates by less than the tolerances `RTOL`
+    and `ATOL`, or is shorter than `MIN_STEP_LENGTH`. It has also converged if the relative decrease of the
+    loss in `PROGRESS_STEPS` steps is below `MIN_LOSS_DECREASE`.
 
     Args:
         residuals: function that returns the residuals (problems, residuals). The residuals of a problem must
             depend only on the gains and arguments of this problem.
-        static: first argument of `residuals`, a constant of the compiled program.
+        static: first argument of `residuals`; a new value causes a new compilation.
         arguments: third argument of `residuals`, arrays with a leading axis of problems.
         bounds: bounds of the gains of each problem.
         starts: starting points in unit coordinates.
         steps: largest number of steps, at most `longest`.
-        longest: upper limit on `steps`, a constant of the compiled program.
-        tile: number of problems that are evaluated together; None: all problems of a device.
+        longest: upper limit on `steps`; a new value causes a new compilation.
+        tile: number of problems that a device evaluates together; None for all problems of the device.
 
     Returns:
         The best point of each problem, and the history of the loss.
@@ -107,11 +107,11 @@ def _shard_over_devices(one_device: Callable[..., SolverResult], *arguments: Any
 
 
 def _with_jacobian(residuals, free, arguments, tile=None):
-    """Return a function of one problem that computes (residuals, loss), to be mapped over all problems.
+    """Return a function that computes (residuals, loss) of one problem, for use inside `jax.vmap`.
 
-    The function must be mapped by `jax.vmap`. Its derivative is a product with the Jacobian, which is
-    computed once, in forward mode, for `tile` problems at a time. `free` and `arguments` are examples of its
-    arguments with a leading axis of problems.
+    The map must be over all problems. The function's derivative is the product of the Jacobian and a tangent.
+    The Jacobian is computed once, in forward mode, for `tile` problems at a time. `free` and `arguments` are
+    example inputs of the mapped function, with a leading axis of problems.
     """
 
     def value_and_jacobian(free, arguments):
@@ -175,10 +175,10 @@ class _LinearModel(NamedTuple):
 
 
 class _BoxedDescent(optx.AbstractDescent):
-    """Descent of optimistix whose step d minimises the damped linear model within the unit box.
+    """Optimistix descent whose step d minimises the damped linear model of the residuals in the unit box.
 
-    For the gains that are not at a bound, d solves (J^T J + D I) d = -J^T r, with the identity I and the
-    damping D = `INITIAL_DAMPING` mean(diag(J^T J)) / step_size.
+    For the gains that are not at a bound, d solves (J^T J + D I) d = -J^T r. Here, r are the residuals, J is
+    their Jacobian, I the identity, and D = `INITIAL_DAMPING` mean(diag(J^T J)) / step_size the damping.
     """
 
     def init(self, y, f_info_struct):
@@ -215,7 +215,7 @@ class _BoxedDescent(optx.AbstractDescent):
 
 
 class _BoxedLevenbergMarquardt(optx.AbstractGaussNewton):
-    """Levenberg-Marquardt solver whose steps end in the unit box."""
+    """Levenberg-Marquardt solver whose iterates stay in the unit box."""
 
     rtol: float
     atol: float

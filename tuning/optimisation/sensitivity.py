@@ -27,12 +27,12 @@ def compute_gain_tolerance(jacobian: Float[np.ndarray, "residuals gains"], loss:
         L(u + d) = L (1 + rise d^T A d),    A = J^T J / (2 rise L),    rise = `LOSS_RISE`
 
     so that d^T A d = 1 where L has risen by the fraction `LOSS_RISE`. A is replaced by B = A + I with the
-    identity I, so that no gain moves by more than its range. Then
+    identity I, so that no gain moves by more than its range. The tolerances of gain number p are
 
         alone_p = B_pp^(-1/2),        together_p = ((B^-1)_pp)^(1/2)
 
-    A gain with `together` near 1 is insensitive or is compensated by other gains; `alone` distinguishes the
-    two cases.
+    with the other gains fixed (alone) or readjusted to the optimum (together). A gain with `together` near 1
+    is insensitive or is compensated by other gains; `alone` distinguishes the two cases.
 
     Source: Transtrum, Machta, Sethna, "Geometry of nonlinear least squares with applications to sloppy
     models and optimization", Phys. Rev. E 83, 036701 (2011).

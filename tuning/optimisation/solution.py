@@ -8,7 +8,7 @@ SOLVER_STATUSES = ("converged", "step limit", "not finite", "failed")
 
 
 class SolverResult(NamedTuple):
-    """Result of the Levenberg-Marquardt solver for each start."""
+    """Result of the Levenberg-Marquardt solver for each starting point."""
 
     coordinates: Float[Array, "starts gains"]  # unit coordinates of the gains
     # J^T J, where J is the Jacobian of the residuals with respect to the coordinates

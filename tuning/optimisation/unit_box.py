@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 
 class GainBounds(NamedTuple):
-    """Bounds and scale of each gain."""
+    """Bounds of each gain, and whether its scale is logarithmic."""
 
     lower: Float[Array | np.ndarray, "*problems gains"]  # lower bound
     upper: Float[Array | np.ndarray, "*problems gains"]  # upper bound

@@ -63,9 +63,9 @@ def _draw_scene(
 ) -> list[tuple[LineCollection, Line2D, list[Polyline], np.ndarray, Any]]:
     """Draw the target in four subplots: two views of the ideal contact, and two of the contact on the rig.
 
-    Return for each subplot the data to draw the chaser in one frame of the animation. The data are the lines
-    of the chaser, the path of its docking interface C, its outline in frame C, its pose at each tick, and the
-    view.
+    Return, for each subplot, the data that draw the chaser at one instant: the lines of the chaser, the line
+    of its path, the chaser's outline in the frame C of its docking interface, the chaser's pose at each tick,
+    and the axes of the view.
     """
     target, chaser = outlines(recorded.groups)
     middle, half = _shown_region(recorded)
@@ -98,7 +98,7 @@ def _shown_region(recorded: RunRecord) -> tuple[np.ndarray, float]:
 
 
 def _format_axes(axes: Axes, middle: np.ndarray, half: float, view: tuple[int, int]) -> None:
-    """Set limits, labels and grid of a subplot that shows the region with this centre and half width [m]."""
+    """Set limits, labels and grid of a subplot, for a region with centre `middle` and half width `half`."""
     across, up = (1e3 * (centre + half * np.array([-1, 1])) for centre in middle)
     axes.set(xlim=tuple(across), ylim=tuple(up), aspect="equal")
     axes.set(xlabel=f"{AXIS_NAMES[view[0]]} of T [mm]", ylabel=f"{AXIS_NAMES[view[1]]} of T [mm]")

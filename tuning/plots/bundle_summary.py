@@ -46,7 +46,7 @@ def summary_png(document: Mapping[str, Any]) -> bytes:
 
 
 def _draw_errors(axes: Axes, document: Mapping[str, Any]) -> None:
-    """Draw, for each set of gains, bars of its errors in the nominal run and in fresh scenarios."""
+    """Draw bars of each gain set's errors, in the nominal run and in scenarios not used for tuning."""
     is_one_axis = document.get("axes", 1) == 1
     groups = _error_groups(document["figures"], "robust" if is_one_axis else "twist_error")
     title, label = ("Restitution error |e - e*|", "|e - e*| [1]") if is_one_axis else ("Twist error",) * 2
@@ -102,7 +102,7 @@ def _error_groups(metrics: Mapping[str, Any], robust: str) -> list[tuple[str, di
 
 
 def _draw_range(axes: Axes, key: str, span: Mapping[str, Any]) -> None:
-    """Draw the range of one quantity, in its displayed unit, on its own axis."""
+    """Draw the range of one quantity as a bar on an axis of its own, in the displayed unit."""
     name, unit, factor = ENVELOPE_QUANTITIES.get(key, (key.replace("_", " "), span["unit"], 1.0))
     low, high = sorted((factor * span["low"], factor * span["high"]))
     margin = 0.25 * (high - low) or 0.25 * abs(high) or 1.0

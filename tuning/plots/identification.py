@@ -53,7 +53,7 @@ def draw_identification(result: Identification, entries: Sequence[Mapping[str, A
 
 @matplotlib.style.context("default")
 def plot_bode(motion: FreeMotion) -> Figure:
-    """Plot noise, distortion, coherence, and measured and modelled frequency response of the simulator."""
+    """Plot a motion simulator's frequency response (measured, modelled), noise, distortion and coherence."""
     lines, fit = motion.lines, motion.fit
     order = np.argsort(lines.frequency)
     frequency = lines.frequency[order]
@@ -169,7 +169,7 @@ def plot_contacts(contact: ContactFit) -> Figure:
 
 @matplotlib.style.context("default")
 def plot_residuals(contact: ContactFit) -> Figure:
-    """Plot the whitened force residuals against time and penetration, and their correlations."""
+    """Plot the whitened force residuals, their autocorrelation, and their correlation with the speed."""
     readings, problem = contact.readings, contact.problem
     depth, predicted = _compute_depth_and_force(contact)
     residuals = problem.whiten(readings.force - predicted) / readings.std
@@ -271,9 +271,9 @@ def _find_distortion_levels(motion: FreeMotion) -> list[float]:
 
 
 def _compute_depth_and_force(contact: ContactFit) -> tuple[np.ndarray, np.ndarray]:
-    """Return penetration [m] and modelled force [N] of the best fit, both (rows, lanes).
+    """Return penetration [m] and modelled force [N] of the best fit, both (rows, contacts).
 
-    The penetration is that at the time when the force acted, before the delay of the force sensor.
+    The penetration of a row is taken one force delay earlier, when the force of the row acted.
     """
     delay, plane, inner = contact.posterior.best
     problem = contact.problem
@@ -290,7 +290,7 @@ def _select_plotted_contacts(contact: ContactFit, inside: np.ndarray) -> list[in
 
 
 def _plot_correlation(axes: Axes, x: np.ndarray, y: np.ndarray, lags: range, label: str) -> None:
-    """Plot the correlation of `x` with the later `y` against the lag [rows], and white noise's 95 % band."""
+    """Plot the correlation of `x` with the `y` of a later row, against the lag of `y` behind `x` [rows]."""
     values, chance = [], []
     for lag in lags:
         early, late = slice(max(0, -lag), len(x) - max(0, lag)), slice(max(0, lag), len(x) - max(0, -lag))

@@ -35,10 +35,10 @@ def describe_contact(motion: RunMotion) -> str | None:
 
 @matplotlib.style.context("default")
 def plot_one_contact(motion: RunMotion, name: str) -> Figure:
-    """Plot position against time of one contact, with the restitution e at the end of each curve.
+    """Plot the position in one contact against time, with the restitution e at the end of each curve.
 
     Args:
-        motion: curves of a contact for which `describe_contact` is not None.
+        motion: curves of one contact. `describe_contact` must not return None for them.
         name: name of the mechanism.
     """
     figure = create_figure((9, 4.8), f"{name}, {motion.name}: before and after tuning", above=0.85)
@@ -77,7 +77,7 @@ def _find_last_touch(curve: Curve) -> float:
 
 
 def _extend(curve: Curve, until: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [s] and positions [m] of a curve up to a time, continued with its last velocity."""
+    """Return times [s] and positions [m] of a curve up to `until` [s], extended at its final velocity."""
     is_shown = curve.time <= until
     time, position = curve.time[is_shown], curve.position[is_shown]
     if is_shown.all():

@@ -69,7 +69,7 @@ def _corners(shape: Any) -> np.ndarray:
 
 
 def _shape_outline(shape: Any, size: float) -> list[Polyline]:
-    """Return the outline of a shape as lines; infinite shapes end near the mechanism's `size` [m]."""
+    """Return the outline of a shape as lines; infinite shapes are cut off near the mechanism's `size` [m]."""
     if isinstance(shape, (Ball, Cavity)):
         radius = float(shape.radius)
         circles = [radius * np.roll(_circle(), turn, axis=1) for turn in range(3)] if radius else _cross(size)

@@ -33,7 +33,7 @@ def draw_limit(line: Callable[..., Any], limit: float | None, width: float = 1.2
 
 
 def legend_above(axes: Axes, columns: int, **style: Any) -> Any:
-    """Draw the legend above the axes instead of inside them, where data would hide it."""
+    """Draw the legend above the axes, so that it does not hide data."""
     legend_place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
     return axes.legend(ncols=columns, fontsize=8, frameon=False, **legend_place, **style)
 

@@ -26,11 +26,11 @@ COMPUTED: dict[str, Any] = {"color": BLUE, "linewidth": 1.3}
 
 @matplotlib.style.context("default")
 def shadow_plot(comparison: ShadowComparison, title: str) -> Figure:
-    """Plot logged commands, the controller's commands and their differences against time.
+    """Plot logged commands, the controller's commands, and the differences between both against time.
 
-    Each column shows one contact. At most `MAX_PANELS` contacts are shown: first those with trips, then those
-    with the largest differences. The columns follow the order of the logs. On six axes, the norms of force
-    and moment are drawn.
+    Each column shows one contact. If there are more than `MAX_PANELS` contacts, those in which the controller
+    tripped take precedence, then those with the largest differences. The columns follow the order of the
+    logs. On six axes, the norms of force and moment are drawn.
     """
     runs = [
         (ticks, run) for ticks, runs in zip(comparison.logs, comparison.runs, strict=True) for run in runs
@@ -60,13 +60,13 @@ def shadow_plot(comparison: ShadowComparison, title: str) -> Figure:
 
 
 def _rank(comparison: ShadowComparison, index: int) -> tuple[bool, float]:
-    """Return the rank of a contact: trips rank highest, then large differences."""
+    """Return the rank of a contact: a trip of the controller ranks highest, then large differences."""
     contact = comparison.contacts[index]
     return contact.trip is not None, 0.0 if contact.share is None else contact.share
 
 
 def _plot_part(panels: Any, ticks: LoggedTicks, run: ReplayedRun, part: int) -> None:
-    """Plot the commands of one contact in the upper panel, and their difference in the lower one."""
+    """Plot the logged and the controller's commands of one contact above, and their difference below."""
     upper: Axes = panels[0]
     lower: Axes = panels[1]
     columns = slice(3 * part, 3 * part + 3)
@@ -86,5 +86,5 @@ def _plot_part(panels: Any, ticks: LoggedTicks, run: ReplayedRun, part: int) -> 
 
 
 def _size(values: np.ndarray) -> np.ndarray:
-    """Return the single component, or the norm of three components."""
+    """Return the norm of each row with three components; with one component, the component itself."""
     return values[:, 0] if values.shape[1] == 1 else np.linalg.norm(values, axis=1)

@@ -85,7 +85,7 @@ def find_time_origin(recorded: RunRecord) -> tuple[int, str]:
 
 
 def _find_shown_instants(recorded: RunRecord) -> tuple[tuple[str, int], ...]:
-    """Return description and tick of the two instants at which the mechanism is drawn."""
+    """Return name and tick of first touch and largest penetration; without contact, of start and end."""
     touching = np.flatnonzero(np.any(recorded.depth > 0, axis=1))
     if not len(touching):
         return ("start", 0), ("end", len(recorded.time) - 1)

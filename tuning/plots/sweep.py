@@ -60,8 +60,9 @@ PROFILE_QUANTILES = (
 def draw_plots(store: SweepStore, acceptable: float | None = None) -> dict[str, Figure]:
     """Draw the plots of a sweep, and return them by file name.
 
-    The plots show the rows of all chunks before the first missing chunk. The chunks are read one by one, to
-    limit the memory. `acceptable` is a failure probability [1], drawn in the plot of convergence.
+    The plots show the stored scenarios before the first missing chunk (part of the sweep). The chunks are
+    read one by one, to limit the memory. `acceptable` is a failure probability [1], drawn in the plot of
+    convergence.
     """
     manifest, mechanism = store.manifest, load_gains(store.manifest).mechanism
     plan, regions = read_regions(store, mechanism)
@@ -211,9 +212,9 @@ def _draw_profile(
 def _draw_map(
     figure: Figure, axes: Axes, bar: Axes, plan: PlotPlan, sizes: np.ndarray, limit: float | None
 ) -> None:
-    """Draw the 95th percentile of |e - e*| per cell of two inputs, with colours that depend on the limit.
+    """Draw the 95th percentile of |e - e*| on a grid over two inputs, with colours relative to the limit.
 
-    Values below the limit are blue, and values above the limit are orange to red.
+    If there is a limit, values below the limit are blue, and values above the limit are orange to red.
     """
     first, second = plan.per_contact
     values = compute_error_quantile(sizes, 0.95, MIN_CONTACTS_PER_CELL)

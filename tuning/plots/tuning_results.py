@@ -204,7 +204,7 @@ def front_plot(front: ParetoFront, result: TuneResult, limit: float) -> Figure:
 
 
 def _set_log_scale(axes: Axes, name: str, values: Sequence[float]) -> None:
-    """Make axis "x" or "y" logarithmic, with plain tick labels, if its values span a factor above 3."""
+    """Make axis "x" or "y" logarithmic, with plain tick labels, if its values span a factor of over 3."""
     low, high = min(values), max(values)
     if not 0 < 3 * low < high:
         return

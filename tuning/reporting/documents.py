@@ -93,7 +93,7 @@ class SweepVerdict(Struct):
 
 
 class EstimateEntry(Struct):
-    """Parameter of a mechanism that was estimated from logs or fixed by the user, in SI units."""
+    """Mechanism parameter that was estimated from logs or fixed by the user, in SI units."""
 
     key: str  # key of the mechanism file
     value: float
@@ -167,7 +167,7 @@ class MonitoringDocument(Struct):
 
 
 class MetricEntry(Struct):
-    """Value of one metric of a compensator, with its 95 % confidence interval, if any."""
+    """Value of one metric of a compensator, with the 95 % confidence interval of the value, if known."""
 
     value: float | None = None
     low: float | None = None
@@ -222,7 +222,7 @@ class Theory(Struct):
 
 
 class RadiusOfMap(Struct):
-    """Spectral radius of the loop in contact, on a grid that may be coarser than the map."""
+    """Spectral radius of the loop in contact, on a grid that may be coarser than the map's grid."""
 
     x: list[float] | None = None  # values along x
     y: list[float] | None = None  # values along y
@@ -241,14 +241,14 @@ class GrowthOfMap(Struct):
 
 
 class MarginOfMap(Struct):
-    """Range of one key, around its nominal value, in which a condition holds."""
+    """Range of one map axis, around the nominal value, in which a condition of `MarginsOfMap` holds."""
 
     low: float | None = None  # lower end; None if the condition holds down to the end of the map
     high: float | None = None  # upper end; None if the condition holds up to the end of the map
 
 
 class MarginsOfMap(Struct):
-    """Margins of the nominal point for three conditions.
+    """Margins of a stability map's nominal point for three conditions.
 
     Each field has one range for axis "x" and another for axis "y", or is None if the nominal point itself
     violates the condition.

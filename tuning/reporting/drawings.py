@@ -62,7 +62,7 @@ class ScenarioPlot(NamedTuple):
 
 
 def draw_nominal_run(subject: LoadedGains) -> tuple[SvgPlot | None, SvgPlot]:
-    """Draw one contact, if its e is defined, and the nominal run, with and without compensation."""
+    """Plot the first nominal contact (None if its e is undefined), and the complete nominal run."""
     if isinstance(subject.mechanism, SixAxisMechanism):
         return None, _draw_six_axis_run(subject)
     law = subject.compensator
@@ -79,7 +79,7 @@ def draw_nominal_run(subject: LoadedGains) -> tuple[SvgPlot | None, SvgPlot]:
 
 
 def _draw_six_axis_run(subject: LoadedGains) -> SvgPlot:
-    """Draw the nominal run of a six-axis mechanism with the gains `subject`."""
+    """Plot the nominal run of a six-axis mechanism with the gains `subject`."""
     run = simulate_six_axes(subject.mechanism, subject.compensator, subject.gains)
     figure = six_axes_plot(run.ticks, f"{subject.mechanism.name}, nominal run: {subject.compensator}")
     says = "Pose, forces and moment over time, compared with the ideal contact"
@@ -89,7 +89,7 @@ def _draw_six_axis_run(subject: LoadedGains) -> SvgPlot:
 
 
 def draw_map(document: MapDocument) -> SvgPlot:
-    """Draw a stability map from its JSON document."""
+    """Plot a stability map from its JSON document."""
     title = f"{document.mechanism}, compensation: {document.compensator}"
     figure = map_plot(
         _map_from_document(document), title, np.inf if document.limit is None else document.limit
@@ -99,7 +99,7 @@ def draw_map(document: MapDocument) -> SvgPlot:
 
 
 def draw_estimates(document: IdentificationDocument) -> SvgPlot:
-    """Draw the identified parameters and their prior values."""
+    """Plot the identified parameters and their prior values."""
     estimates = [estimate for estimate in document.estimates if None not in (estimate.low, estimate.high)]
     entries = [{name: getattr(estimate, name) for name in ESTIMATE_FIELDS} for estimate in estimates]
     says = "95 % interval of each estimate, and the prior's value, relative to the estimate"
@@ -107,7 +107,7 @@ def draw_estimates(document: IdentificationDocument) -> SvgPlot:
 
 
 def monitor_drawing(document: MonitoringDocument) -> SvgPlot:
-    """Draw the metrics of monitored contacts against the number of the contact, from the JSON document."""
+    """Plot the metrics in a monitoring document against the number of the contact."""
     numbers = [contact.contact for contact in document.contacts]
     metrics = {name: _columns(document, name) for name, *_ in METRICS}
     figure = monitor_plot(document.mechanism, numbers, metrics, document.since)
@@ -116,7 +116,7 @@ def monitor_drawing(document: MonitoringDocument) -> SvgPlot:
 
 
 def _columns(document: MonitoringDocument, name: str) -> np.ndarray:
-    """Return value, predicted standard deviation and normalised deviation z of a metric, (3, contacts)."""
+    """Return values, predicted standard deviations and normalised deviations z of a metric, (3, contacts)."""
     rows = []
     for contact in document.contacts:
         metric = contact.figures.get(name)
@@ -127,7 +127,7 @@ def _columns(document: MonitoringDocument, name: str) -> np.ndarray:
 def draw_sweep(
     store: SweepStore, worst: Sequence[WorstScenario], say: Callable[[str], None]
 ) -> tuple[SvgPlot, list[ScenarioPlot]]:
-    """Draw the errors of a sweep's scenarios as points, and the runs of the worst and of some others.
+    """Plot the errors of a sweep's scenarios as points, and the runs of the worst and typical scenarios.
 
     `say` is called with the name of each run. Return the plot of the errors, and the plots of the runs.
     """
@@ -158,7 +158,7 @@ def draw_sweep(
 def _select_typical(points: PlotPoints) -> list[int]:
     """Return indices into `points` of scenarios whose ranks in the order of errors are evenly spaced.
 
-    The scenario with the smallest error is included, that with the largest error is not.
+    The scenario with the smallest error is included; the scenario with the largest error is not.
     """
     order = np.argsort(points.size, kind="stable")
     order = order[np.isfinite(points.size[order])]

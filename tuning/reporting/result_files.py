@@ -39,7 +39,7 @@ Kind = TypeVar("Kind")
 
 
 class ResultSource(NamedTuple):
-    """Origin of a result that a report shows."""
+    """Origin of a result in a report."""
 
     command: str  # command that wrote the result
     path: Path
@@ -154,7 +154,7 @@ def _document_path(source: Path) -> Path:
 
 
 def _read_json(path: Path, where: str) -> dict[str, Any]:
-    """Read a JSON object from a file; raise `InputError` if the file cannot be read or contains none."""
+    """Read a JSON object from a file; raise `InputError` if the file is unreadable or has no JSON object."""
     try:
         with open_regular(path) as file:
             content = file.read(MAX_DOCUMENT_BYTES + 1)
@@ -233,7 +233,7 @@ def _check_map(document: MapDocument, where: str) -> None:
 
 
 def _theory_tables(theory: Theory) -> list[list[list[float | None]]]:
-    """Return the tables of those closed forms that apply to a map."""
+    """Return the tables of a map's closed-form solutions, without the solutions that do not apply."""
     tables = theory.series, theory.characteristic_root, theory.delay_over_critical
     return [table for table in tables if table is not None]
 

@@ -85,7 +85,7 @@ def monitoring_section(results: Results) -> Section | None:
 
 
 def _significant_digits(estimate: EstimateEntry) -> int:
-    """Return the number of digits for an estimate, one more than its standard deviation justifies."""
+    """Return how many significant digits of an estimate to show, according to its standard deviation."""
     if (
         not estimate.std
         or not estimate.value
