@@ -40,7 +40,10 @@ def count_plots(results: Results) -> int:
 
 
 def run_sections(results: Results, say: Callable[[str], None]) -> tuple[Section | None, Section | None]:
-    """Return the report's section with one contact, and the section with the nominal run and scenarios."""
+    """Return two sections of the report: one contact in short, and simulated runs.
+
+    The runs are the nominal run and scenarios of the sweep. A section without data is None.
+    """
     if results.subject is None:
         return None, None
     say("the nominal run")
@@ -65,7 +68,7 @@ def run_sections(results: Results, say: Callable[[str], None]) -> tuple[Section 
 
 
 def _describe_results(results: Results, contact: str) -> Iterator[str]:
-    """Yield sentences for readers without the theory: one contact and, if there is a sweep, its failures."""
+    """Yield sentences that explain one contact and the sweep's failures to readers without the theory."""
     yield contact
     yield (
         "e, the restitution, is the rebound speed divided by the approach speed. Delays of the rig change e; "
@@ -104,7 +107,7 @@ def error_section(results: Results) -> Section | None:
 
 
 def sensitivity_section(results: Results) -> Section | None:
-    """Return the report's section on Sobol indices and rare errors, or None if none were computed."""
+    """Return the report's section on a sweep's Sobol indices and rare errors; None if it has neither."""
     sweep = results.sweep
     if sweep is None or (sweep.drivers is None and sweep.rare is None):
         return None

@@ -109,7 +109,7 @@ def assumption_section(results: Results) -> Section | None:
 
 
 def _unused_keys(mechanism: AnyMechanism) -> list[str]:
-    """Return the keys with a default value that the contact law of a one-axis mechanism does not use."""
+    """Return the keys of [contact] that the law of a one-axis mechanism does not use, but other laws do."""
     if not isinstance(mechanism, Mechanism):
         return []
     law = find_contact_law(mechanism.contact.law)
@@ -141,7 +141,7 @@ def _describe_contact_laws(mechanism: AnyMechanism) -> str:
 
 
 def gain_section(results: Results) -> Section | None:
-    """Return the report's section on gains: values, bounds, tuned errors, and the controller's limits."""
+    """Return the report's section on the gains: values, bounds, resulting errors, and controller's limits."""
     subject = results.subject
     if subject is None:
         return None
@@ -197,14 +197,14 @@ def _sweep_requirement(results: Results) -> Iterator[Requirement]:
 
 
 def _error_margin(limit: float | None, largest: float | None) -> str:
-    """Return a text with the difference between a sweep's limit and its largest error."""
+    """Return a text with a sweep's error limit minus the largest error; "none" if a value is missing."""
     if limit is None or largest is None:
         return "none"
     return f"{limit - abs(largest):+.2g} of the error"
 
 
 def _watchdog_requirements(results: Results) -> Iterator[Requirement]:
-    """Yield the requirements on the watchdog's rates of false and missed alarms, if a bundle has them."""
+    """Yield the requirements on false and missed alarms of the watchdog, if a bundle states their rates."""
     rates = watchdog_rates(results)
     faulty = [
         rate for rate in rates.get("fault_runs", ()) if isinstance(rate, Mapping) and rate.get("counted")
@@ -230,7 +230,7 @@ def _watchdog_requirements(results: Results) -> Iterator[Requirement]:
 
 
 def _identification_requirement(results: Results) -> Iterator[Requirement]:
-    """Yield the requirement on the effect of an identification's uncertainty on e, if there is one."""
+    """Yield the requirement on the change of the restitution e by the identified model's uncertainty."""
     document = results.identification
     if document is not None:
         effects = [value for value in (document.effect, document.effect_on_error) if value is not None]
@@ -256,7 +256,7 @@ def _monitoring_requirement(results: Results) -> Iterator[Requirement]:
 
 
 def is_other_file_monitored(results: Results) -> bool:
-    """Return whether the mechanism file of the monitoring differs from the file of the gains."""
+    """Return whether the mechanism file used for monitoring differs from the file used to tune the gains."""
     monitoring, subject = results.monitoring, results.subject
     if monitoring is None or subject is None:
         return False
@@ -278,7 +278,7 @@ def watchdog_section(results: Results) -> Section | None:
 
 
 def _as_verdict(verdict: str) -> str:
-    """Return a file's verdict, or unknown if it is neither good nor bad."""
+    """Return the given verdict if it is good or bad, else unknown."""
     return verdict if verdict in (GOOD, BAD) else UNKNOWN
 
 
@@ -305,7 +305,7 @@ def _error_rows(metrics: Any, key: str) -> Iterator[tuple[str, ...]]:
 
 
 def _identified_origins(results: Results) -> dict[str, str]:
-    """Return, for each key that was estimated or fixed by the user, a text with the source of its value."""
+    """Return, by key, the source of each identified value as text: estimated from logs, or kept fixed."""
     document = results.identification
     if document is None or not is_identified(results):
         return {}
@@ -321,7 +321,7 @@ def _identified_origins(results: Results) -> dict[str, str]:
 
 
 def is_identified(results: Results) -> bool:
-    """Return whether all parameters of the gains' mechanism equal those in the identified mechanism file."""
+    """Return whether the gain file's mechanism has the parameter values that `jaxhil identify` wrote."""
     subject, raw = results.subject, results.identified
     if subject is None:
         return False
@@ -380,6 +380,6 @@ def report_title(results: Results) -> str:
 
 
 def _identified_name(raw: Mapping[str, Any]) -> str:
-    """Return the mechanism's name from the content of an identified mechanism file."""
+    """Return the name in a mechanism file written by `jaxhil identify`; `raw` is the file's content."""
     name = raw.get("name")
     return to_one_line(name, 80) if isinstance(name, str) else "an identification"

@@ -105,7 +105,7 @@ class ContactDetector:
         return self._end_if_failed(command_magnitude)
 
     def cut(self, status: str) -> RigContact | None:
-        """End the current contact with the given status and return it; return None if there is no contact."""
+        """End the current contact with the given status; return this contact, or None if there is none."""
         return self._end(status, 0.0) if self._onset_tick >= 0 else None
 
     def _end_if_failed(self, command_magnitude: float) -> RigContact | None:

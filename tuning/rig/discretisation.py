@@ -44,9 +44,9 @@ class DiscreteSimulator(NamedTuple):
 
 
 def split_delay(delay: float, period: float) -> tuple[int, float]:
-    """Return the time of a sample that is `delay` [s] old, as a number of whole intervals and a fraction.
+    """Split the delay of a reading [s] into whole intervals, and the time of the sample in its interval.
 
-    The fraction is in (0, 1] and measured from the start of the sampling interval that contains the sample.
+    This time is a fraction in (0, 1], measured from the start of the interval that contains the sample.
     """
     periods = delay / period
     whole = math.floor(periods + DELAY_ROUNDING_TOLERANCE)
@@ -58,8 +58,9 @@ def discretise_simulator(
 ) -> DiscreteSimulator:
     """Discretise G(s) exactly by the matrix exponential of the system augmented by its input (Van Loan 1978).
 
-    For z' = A z + B u, the state at the fraction s of the period T is z(s T) = E(s) (z, u(0), u(T) - u(0)).
-    E(s) is the exponential of s T [[A, B, 0], [0, 0, 1/T], [0, 0, 0]].
+    The system is z' = A z + B u, with the state z and the command u. At the fraction s of the period T, the
+    state is E(s) (z(0), u(0), u(T) - u(0)). E(s) contains the first rows of the matrix exponential of
+    s T [[A, B, 0], [0, 0, 1/T], [0, 0, 0]].
 
     Args:
         simulator: motion simulator with the transfer function G(s).
@@ -117,7 +118,7 @@ def discretise_simulator(
 
 
 def transfer_function(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
-    """Return numerator and denominator of G(s) in descending powers of s; 1 and 1 for an ideal simulator."""
+    """Return numerator and denominator of the simulator's transfer function, in descending powers of s."""
     if simulator.model == "ideal":
         return np.ones(1), np.ones(1)
     if simulator.model == "transfer_function":
@@ -132,10 +133,10 @@ def transfer_function(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def series_rows(simulator: Simulator, period: float) -> tuple[ResponseRow, ...]:
-    """Return rows that give the position as a power series in the time since an interval's start [periods].
+    """Return the power series of the simulator's position in the time since an interval's start [periods].
 
-    The rows are multiplied by (state, command at the interval's start, its increase in the interval). The
-    series is accurate to rounding for poles up to 1 rad per period.
+    Row k, multiplied by the vector (state, command at the interval's start, increase of the command in the
+    interval), is the coefficient of power k. For poles up to 1 rad per period, only rounding errors remain.
     """
     numerator, denominator = transfer_function(simulator)
     order = len(denominator) - 1

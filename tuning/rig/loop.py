@@ -101,8 +101,8 @@ def run_loop(
 ) -> None:
     """Execute ticks in real time until `timing` is full, or until 1 s after the controller has tripped.
 
-    The loop also ends if the controller's process sends no answer for `MAX_SILENCE` and for
-    `MAX_UNANSWERED_TICKS`. After an interruption, `timing` holds the ticks executed so far.
+    The loop also ends if the controller's process sends no answer for more than `MAX_UNANSWERED_TICKS` ticks
+    and more than `MAX_SILENCE` seconds. After an interruption, `timing` holds the ticks executed so far.
 
     Args:
         task: work of the rig in each tick.

@@ -50,9 +50,10 @@ def discretise_moving_average(
 
 
 def average_rows(window: float, period: float, hold: str, fraction: float, is_before: bool) -> MotionRows:
-    """Return the rows at a fraction of a sampling interval.
+    """Return the coefficients of the moving average and its rate at `fraction` of a sampling interval.
 
-    `is_before` is true until the start of the window passes a tick within the interval.
+    During the interval, the start of the averaging window moves through parts of two earlier intervals.
+    `is_before` is true while the window's start is in the first one.
     """
     width = window / period
     kink = width - math.floor(width + DELAY_ROUNDING_TOLERANCE)
@@ -67,12 +68,18 @@ def average_rows(window: float, period: float, hold: str, fraction: float, is_be
 
 
 def _line_value(fraction: float, hold: str) -> tuple[float, float]:
-    """Return the weights of the two ends of an interval in the command at a fraction of the interval."""
+    """Return two weights; applied to the commands at an interval's ends, they give the command in between.
+
+    `fraction` is the fraction of the interval at which the command is computed.
+    """
     return (1.0 - fraction, fraction) if hold == "linear" else (0.0, 1.0)
 
 
 def _line_integral(start: float, length: float, hold: str) -> tuple[float, float]:
-    """Return the weights of an interval's ends in the integral of the command over a part of the interval."""
+    """Return two weights; applied to the commands at an interval's ends, they give the command's integral.
+
+    The integral covers the part from the fraction `start` of the interval to `start + length`.
+    """
     before, after = _line_value(start + length / 2.0, hold)
     return length * before, length * after
 
@@ -80,13 +87,20 @@ def _line_integral(start: float, length: float, hold: str) -> tuple[float, float
 def _weights(
     entering: tuple[float, float], first: tuple[float, float], second: tuple[float, float], width: float
 ) -> ResponseRow:
-    """Return the weights in the mean of the commands a, b, c (above), and of the commands at both ends."""
+    """Return the weights of five commands in the change, or in the rate, of the moving average.
+
+    The commands are a, b and c around the start of the window (the oldest first), then those at the ends of
+    the sampling interval. `first`, `second` and `entering` are the weights of (a, b), (b, c) and the ends.
+    """
     leaving = first[0], first[1] + second[0], second[1]
     return (*(-weight / width for weight in leaving), *(weight / width for weight in entering))
 
 
 def _steady_step(whole: int, kink: float, hold: str) -> ResponseRow:
-    """Return the state under a command that is 0 at the interval's start and grows by 1 per period."""
+    """Return the moving average's state at an interval's start, under a command that is 0 there.
+
+    The command grows by 1 per period, and the window is `whole + kink` periods long.
+    """
     if hold == "linear":
         return (-(whole + kink) / 2.0, -1.0 - whole, -float(whole), 1.0 - whole)
     mean = (whole * (whole + 1) / 2.0 + kink * (whole + 1)) / (whole + kink)

@@ -33,8 +33,8 @@ class Injection(NamedTuple):
 class Network:
     """UDP connection to one address, with injected faults; the clock is `time.monotonic_ns`.
 
-    The argument `number_of` is a function that returns the number of the packet that an answer belongs to, or
-    None if the received bytes are not an answer.
+    The function `number_of` decodes received bytes. It returns the number of the packet that they answer, or
+    None if they are not an answer.
 
     Attributes:
         lost: 1 if injection lost the packet or its answer, else 0, (packets,).

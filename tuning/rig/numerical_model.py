@@ -14,8 +14,8 @@ class NumericalModel:
     each control period.
 
     Attributes:
-        start: default position [m] and velocity v [m/s] at the start of a run. The motion reaches a surface
-            after 0.02 s + `approach.phase` T at the earliest (T: control period).
+        start: default position [m] and velocity [m/s] at the start of a run. At this velocity, the position
+            reaches the lower of 0 and `rig.contact_plane` after 0.02 s + `approach.phase` control periods.
         mass: equivalent mass of the bodies [kg].
         position: relative position of the bodies [m].
         velocity: relative velocity [m/s].
@@ -102,7 +102,7 @@ class OneAxisModelInLoop:
         self._update_command()
 
     def tare(self, force: Sequence[float]) -> bool:
-        """Give the controller a reading taken without contact; return True once it has finished its tare."""
+        """Add a reading without contact to the controller's tare (bias estimate); return True at its end."""
         return self._controller.tare(*force)
 
     def tick(self, tick: int, force: Sequence[float], position: Sequence[float], time: float) -> None:

@@ -48,8 +48,8 @@ class SixAxisModelInLoop:
     Attributes:
         axes: number of axes.
         command: pose command [m, rad].
-        force: wrench command of the last tick, about T's origin [N, N m].
-        motion: pose [m, rad] and twist [m/s, rad/s] of C relative to T.
+        force: wrench command of the last tick, about the origin of the target's interface frame T [N, N m].
+        motion: pose [m, rad] and twist [m/s, rad/s] of the chaser's interface frame C relative to T.
     """
 
     __slots__ = ("_bodies", "_controller", "_period", "_share", "_states", "command", "force", "motion")
@@ -73,9 +73,10 @@ class SixAxisModelInLoop:
 
     @property
     def rate(self) -> tuple[float, ...]:
-        """Return the rates of the model's coordinates [m/s, rad/s].
+        """Return the time derivatives of position and rotation vector in the model's pose [m/s, rad/s].
 
-        The rates of the rotation vector are a power series with an error of |theta|^4/720.
+        For a rotation by the angle theta, a power series gives the derivative of the rotation vector, with a
+        relative error of theta^4/720.
         """
         (_, _, _, *rotation), (*velocity, a, b, c) = self.motion
         angular = a, b, c
@@ -100,7 +101,7 @@ class SixAxisModelInLoop:
         self._update_command()
 
     def tare(self, force: Sequence[float]) -> bool:
-        """Pass a reading out of contact to the controller; return True when its tare has ended."""
+        """Add a reading without contact to the controller's tare (bias estimate); return True at its end."""
         return self._controller.tare(force)
 
     def tick(self, tick: int, force: Sequence[float], position: Sequence[float], time: float) -> None:
@@ -126,13 +127,13 @@ class SixAxisModelInLoop:
     def _move(
         self, body: FreeBody, state: BodyMotion, force: Sequence[float], torque: Sequence[float]
     ) -> BodyMotion:
-        """Integrate the motion of a body for one period under a constant load, in world axes."""
+        """Integrate the motion of a body for one period under a constant force and torque in world axes."""
         period, share = self._period, self._share
         kick = [period / body.mass * value for value in force]
         spin = [value + share * period * part for value, part in zip(state.spin, torque, strict=True)]
 
         def turned(attitude: Quaternion, duration: float) -> Quaternion:
-            """Rotate the initial attitude with the angular velocity of `attitude`."""
+            """Rotate the initial attitude for `duration` [s] at the body's angular velocity at `attitude`."""
             angular = _product(body.inverse_inertia, _rotate(_reverse(attitude), spin))
             return _compose(state.attitude, _exponential([duration * value for value in angular]))
 
@@ -147,7 +148,7 @@ class SixAxisModelInLoop:
         return BodyMotion((a, b, c), _add(state.velocity, kick), (w, x, y, z), momentum)
 
     def _observe(self) -> None:
-        """Compute pose and twist of frame C relative to frame T."""
+        """Compute pose and twist of the chaser's interface frame C relative to the target's frame T."""
         (origin, axes, velocity, angular), chaser = map(_interface, self._bodies, self._states)
         apart = _subtract(chaser[0], origin)
         back = _reverse(axes)

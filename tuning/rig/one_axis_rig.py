@@ -24,7 +24,7 @@ class OneAxisRig:
 
     Args:
         mechanism: mechanism and rig to simulate.
-        seed: seed of the sensor noise and of the phases.
+        seed: seed of the sensor noise and of the random phases (instants of contact in a control period).
     """
 
     axes = 1
@@ -88,7 +88,7 @@ class OneAxisRig:
         return False
 
     def cut(self, status: str) -> RigContact | None:
-        """End the current contact with the given status and return it; return None if there is no contact."""
+        """End the current contact with the given status; return this contact, or None if there is none."""
         return self._watch.cut(status)
 
     def evaluate(self, contacts: Sequence[RigContact]) -> list[dict[str, Any]]:

@@ -109,7 +109,7 @@ class RigHardware:
             position: position of the numerical model [m].
             velocity: velocity of the numerical model [m/s].
             command: position command of tick 0 [m].
-            number: index of the first contact in the mechanism's lists.
+            number: index of the first contact in the mechanism's lists of stiffness and damping.
         """
         self._law, self._number, self._next_number = _contact_law_of(self._contact, number), number, number
         stride = self._period * velocity
@@ -191,13 +191,16 @@ class RigHardware:
         self.expect(self._next_number)
 
     def expect(self, number: int) -> None:
-        """Set the index of the next contact; its law applies as soon as the mechanism is not in contact."""
+        """Set the index of the next contact; switch to its contact law once the current contact has ended."""
         self._next_number = number
         if number != self._number and not self._in_contact:
             self._law, self._number = _contact_law_of(self._contact, number), number
 
     def _contact_force(self, interval: SamplingInterval | None) -> float:
-        """Compute the contact in one sampling interval; return the output of the force sensor's lag [N]."""
+        """Compute the contact in a sampling interval; return the force [N] after the sensor's lag or filter.
+
+        The force belongs to the sensor's sampling time. It is 0 for None, an interval before the run.
+        """
         if interval is None:
             return 0.0
         sample, start, end = interval
@@ -231,9 +234,9 @@ class RigHardware:
         return reading
 
     def _filter(self, clearance: float, *segments: tuple[MotionState, MotionState, float, float]) -> float:
-        """Advance the force sensor's filter by two segments; return its output [N] between the segments.
+        """Advance the force sensor's filter by two segments; return its output [N] after the first segment.
 
-        A segment contains the motion at both ends, the duration [s] and the deepest earlier penetration [m].
+        A segment contains the motion at both ends, the duration [s] and the deepest penetration before [m].
         """
         outputs = []
         for start, end, duration, deepest in segments:
@@ -245,7 +248,7 @@ class RigHardware:
         return outputs[0]
 
     def _deepest_until(self, deepest: float, start: MotionState, end: MotionState, duration: float) -> float:
-        """Return the deepest penetration [m] of the contact until `end`; 0 if it has ended by then."""
+        """Return the contact's deepest penetration [m] up to `end`; 0 if the contact has ended at `end`."""
         if -self._clearance <= end.position <= 0.0:
             return 0.0
         if duration <= 0.0:  # If the force delay is a whole number of periods, the second segment is empty.
@@ -253,7 +256,7 @@ class RigHardware:
         return max(deepest, deepest_penetration(start, end, duration, self._clearance))
 
     def _limit(self, requested: float) -> float:
-        """Limit the rates of a position command [m], as `jaxhil.simulation.rate_limits` does."""
+        """Limit velocity and acceleration of a position command [m] like `jaxhil.simulation.rate_limits`."""
         velocity_limit, acceleration_limit = self._limits
         previous, before = self._commands[0], self._requested
         largest, change = velocity_limit * self._period, acceleration_limit * self._period**2

@@ -36,7 +36,7 @@ STALLED = "stalled"  # status of a contact in which the computer delayed the com
 class SimulatedRig(Protocol):
     """Simulated rig with one axis or six axes; vectors have one number for each axis.
 
-    A contact has at least the fields and the method of `RehearsedRun`, except the field `state`.
+    A contact (for six axes, a run) has the method and the fields of `RehearsedRun`, except the field `state`.
     """
 
     axes: int  # number of axes
@@ -58,7 +58,7 @@ def build_simulated_rig(mechanism: AnyMechanism, seed: int = 0) -> SimulatedRig:
 
     Args:
         mechanism: mechanism and rig to simulate.
-        seed: seed of the sensor noise and of the phases of contacts in a control period.
+        seed: seed of the sensor noise and of the random phases (instants of contact in a control period).
     """
     probability = mechanism.rig.missed_tick_probability
     if probability:
@@ -168,7 +168,7 @@ class RigTask:
         return answer.tick == self._tick
 
     def advance(self) -> None:
-        """End the tick: move the hardware by one period with the newest or the extrapolated command."""
+        """End the tick: move the hardware for one period under the newest command, extrapolated if old."""
         caused_by_old_command = self._resets and self.tripped.startswith(TRIPS_BY_OLD_COMMANDS)
         if caused_by_old_command and self._largest_command_age() > MAX_COMMAND_AGE:
             self._reset()
@@ -202,7 +202,7 @@ class RigTask:
         return _combine(min, _combine(max, command, low), high)
 
     def _largest_command_age(self) -> int:
-        """Return the largest command age [periods] of the current contact; between runs, of the last one."""
+        """Return the current contact's largest command age [periods]; between runs, the last contact's."""
         if self._tick < 0 and self._contacts:
             return self._contacts[-1].oldest_command
         return self._oldest
@@ -259,5 +259,5 @@ def _is_finite(values: Numbers) -> bool:
 
 
 def _combine(function: Any, left: Iterable[float], right: Iterable[float]) -> Numbers:
-    """Apply a function of two numbers to each axis."""
+    """Apply a function of two numbers to the values of `left` and `right`, axis by axis."""
     return tuple(map(function, left, right))

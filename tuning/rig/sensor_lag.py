@@ -21,7 +21,7 @@ MIN_CLOSED_FORM_DURATION = 1e-2
 
 
 class MotionState(NamedTuple):
-    """Position and velocity of the mechanism relative to its surface."""
+    """Position and velocity of the docking mechanism relative to the contact surface."""
 
     position: float  # [m]
     velocity: float  # [m/s]
@@ -89,7 +89,10 @@ def _find_forces(
     duration: float,
     deepest: float,
 ) -> tuple[float, float, list[float]]:
-    """Return start, end and values of the force in a segment; without force, the list of values is empty."""
+    """Return the fractions of a segment at which the force starts and ends, and its values [N] in between.
+
+    The values are equidistant. Without a contact force, their list is empty.
+    """
     side, surface = _reached_surface(start.position, end.position, clearance)
     if duration <= 0.0 or side == 0.0:
         return 1.0, 0.0, []
@@ -99,7 +102,10 @@ def _find_forces(
 def _respond(
     reading: Number, interval: tuple[float, float, list[float]], duration: float, time_constant: Number
 ) -> Number:
-    """Return the output [N] of a first-order lag at the end of a segment, from its output at the start."""
+    """Return the output [N] of a first-order lag at the end of a segment of motion.
+
+    `reading` is the lag's output at the start, and `interval` the result of `_find_forces`.
+    """
     if duration <= 0.0:
         return reading
     first, last, forces = interval
@@ -146,8 +152,8 @@ class _ContactInterval:
     def forces(self) -> tuple[float, float, list[float]]:
         """Return start and end of the force, and its values [N] at equidistant nodes in between.
 
-        Start and end are fractions s of the segment's duration. Of the `FORCE_PARABOLAS` parabolas, number i
-        passes through the nodes 2 i, 2 i + 1 and 2 i + 2.
+        Start and end are fractions s of the segment's duration. Parabola i = 0, 1, ... of the
+        interpolation passes through the nodes 2 i, 2 i + 1 and 2 i + 2.
         """
         enters, leaves = _positive_interval(self._depth)
         force_starts, force_ends = _positive_interval(self._hold)
@@ -185,7 +191,10 @@ class _ContactInterval:
 
 
 def _reached_surface(start: float, end: float, clearance: float) -> tuple[float, float]:
-    """Return direction (1, -1, or 0 for none) and position [m] of the surface that a segment penetrates."""
+    """Return direction (1, -1; 0 for none) and position [m] of the surface that a segment penetrates.
+
+    The surfaces are at 0 and -`clearance`; `start` and `end` are positions at the segment's ends [m].
+    """
     for position in (start, end):
         if position > 0.0:
             return 1.0, 0.0
@@ -195,9 +204,9 @@ def _reached_surface(start: float, end: float, clearance: float) -> tuple[float,
 
 
 def _turning_point(path: "_CubicPath", depth: Callable[[float], float], side: float) -> tuple[float, float]:
-    """Return the fraction s at which the motion reverses in contact, and the penetration [m] there.
+    """Return the fraction s of a segment at which the penetration stops growing, and the penetration there.
 
-    If the motion does not reverse, use the end of the segment, s = 1.
+    If this does not happen in the segment, s is 1, its end. `side` is the direction into the surface (1, -1).
     """
 
     def inward(s: float) -> float:

@@ -109,7 +109,7 @@ class LoopReport(NamedTuple):
 
 
 class SessionReport(NamedTuple):
-    """Results of a session: both loops, the contacts, the commands and the trips."""
+    """Results of a session: empty loop, loop with the simulated rig, contacts, commands and trips."""
 
     empty: LoopReport | None  # loop without a rig; None if the session ended before this loop began
     run: LoopReport | None  # loop with the simulated rig; None if the session ended before this loop began
@@ -154,7 +154,7 @@ def run_session(
     say: Callable[[str], None],
     progress: Callable[[int, int], None],
 ) -> SessionReport:
-    """Run an empty loop for comparison, then the loop with the simulated rig.
+    """Run an empty loop (packets without a rig) for comparison, then the loop with the simulated rig.
 
     Args:
         setup: settings of the session.

@@ -15,9 +15,9 @@ def is_stalled(contact: dict[str, Any], setup: SessionSettings, run: LoopReport 
     """Return whether the computer, and not the controller, delayed the commands during a contact.
 
     This is the case if a command was older than `MAX_COMMAND_AGE` periods and the controller did not cause
-    any missed tick of the contact. Such a contact says nothing about the controller. The result is always
-    False if faults are injected, and for a controller that this session did not start, because the causes of
-    its missed ticks are unknown.
+    any missed tick of the contact. Such a contact says nothing about the controller. If faults are injected,
+    the result is False. It is also False for a controller that this session did not start, because the causes
+    of missed ticks are then unknown.
     """
     if (
         run is None
@@ -90,12 +90,12 @@ def evaluate_session(
 
 
 def _describe_error(rig: SimulatedRig) -> str:
-    """Return the name of the error that decides the verdict."""
+    """Return, in words, the kind of error that decides the session's verdict."""
     return "restitution error" if rig.axes == 1 else rig.error_name.replace("_", " ")
 
 
 def _plain(value: Any) -> Any:
-    """Replace each tuple of one number, which only one axis has, by the number."""
+    """Convert tuples to lists for JSON, but a tuple with a single entry (one axis) to this entry."""
     if isinstance(value, dict):
         return {name: _plain(entry) for name, entry in value.items()}
     if not isinstance(value, tuple):

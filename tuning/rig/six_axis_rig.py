@@ -38,7 +38,7 @@ PAUSE_KEY = 0x80000000  # offset of the noise keys of readings between two runs
 
 
 class RehearsedRun(NamedTuple):
-    """Run on the simulated rig, with the states from which its episodes are evaluated."""
+    """Run on the simulated rig, with the final state from which its episodes (contacts) are evaluated."""
 
     number: int  # index of the run
     status: str  # "ok" if the run has ended by itself, else "tripped" or "stalled"
@@ -49,12 +49,12 @@ class RehearsedRun(NamedTuple):
     oldest_command: int = 0
 
     def as_tripped(self) -> "RehearsedRun":
-        """Return the run of a controller that has tripped."""
+        """Return this run with the status "tripped"."""
         return self._replace(status="tripped")
 
 
 class RunProgress(NamedTuple):
-    """State of a run between two ticks."""
+    """State of a six-axis run between two ticks."""
 
     progress: EpisodeProgress  # hardware, numerical model and episodes
     sensed: Sensed  # real contact and readings at the next tick
@@ -65,7 +65,7 @@ class SixAxisRig:
 
     Args:
         mechanism: mechanism and rig to simulate.
-        seed: seed of the sensor noise and of the phases of contacts in a control period.
+        seed: seed of the sensor noise and of the random phases (instants of contact in a control period).
     """
 
     axes = 6
@@ -112,7 +112,7 @@ class SixAxisRig:
     def read(self) -> tuple[Numbers, Numbers]:
         """Return the measured wrench [N, N m] and pose [m, rad] just before this tick's command acts.
 
-        Before the run begins, the hardware moves uniformly at its start, and only the noise changes.
+        Before the run begins, all readings belong to the state before tick 0, and only their noise differs.
         """
         if self._state is None:
             self._pauses += 1
@@ -147,15 +147,15 @@ class SixAxisRig:
         return None if is_active else RehearsedRun(self._run, "ok", self._state)
 
     def continues_after(self, _: RehearsedRun) -> bool:
-        """Return False, because every run is prepared separately."""
+        """Return False: `advance` returns whole runs, so the same run has no further contact."""
         return False
 
     def cut(self, status: str) -> RehearsedRun | None:
-        """End the current run with the given status and return it; return None if no run has begun."""
+        """End the current run with the given status; return this run, or None if no run has begun."""
         return None if self._state is None else RehearsedRun(self._run, status, self._state)
 
     def evaluate(self, contacts: Sequence[RehearsedRun]) -> list[dict[str, Any]]:
-        """Return the results of all episodes of the runs, with the twist at the end of each run."""
+        """Return the results of all episodes (contacts) of the runs, each with the final twist of its run."""
         with jax_context():
             return [document for contact in contacts for document in self._episode_documents(contact)]
 
@@ -174,11 +174,11 @@ class SixAxisRig:
             }
 
     def _noise_key(self, index: int) -> np.ndarray:
-        """Return the key of the sensors' noise for a run or a pause."""
+        """Return the key of JAX's random numbers for the sensor noise of a run or a pause."""
         return np.array([[self._seed], [index & 0xFFFFFFFF]], np.uint32)
 
     def _compile(self) -> None:
-        """Compile all programs, so that none is compiled during the session."""
+        """Run a few ticks, so that JAX compiles all programs of a run before the session."""
         self.prepare(None)
         self.read()
         self.begin(self._programs.command)
@@ -188,11 +188,11 @@ class SixAxisRig:
 
 
 class _Programs:
-    """Compiled programs for one lane.
+    """Compiled JAX programs for a batch with one lane (one scenario).
 
-    In a tick, rig and state of a run (`RunProgress`) are one array each: with hundreds of small arrays,
-    calling the program takes longer than its computation. The start of a run has separate programs, because
-    one program for all its steps takes long to compile.
+    In a tick, the rig's constants and the state of the run (`RunProgress`) are one array each, because a call
+    with hundreds of small arrays takes longer than the computation. The start of a run has separate programs,
+    because one program for all its steps takes long to compile.
     """
 
     def __init__(self, loop: Loop, scenario: Scenario, reference: IdealContactRecord) -> None:
@@ -224,7 +224,11 @@ Unpack = Callable[[Array], RunProgress]
 
 
 def _build_starts(mechanism: SixAxisMechanism, seed: int) -> Scenario:
-    """Build scenarios that differ in the phase: the nominal one, then `STARTS` random ones."""
+    """Build scenarios with the nominal phase, then with `STARTS` random phases.
+
+    The phase is the fraction of a control period at which the contact begins. If the mechanism file specifies
+    the states at the start, there is only one scenario.
+    """
     if mechanism.approach is None:
         return build_scenarios(mechanism, seed=seed)
     random = Random(seed + 1)
@@ -233,14 +237,14 @@ def _build_starts(mechanism: SixAxisMechanism, seed: int) -> Scenario:
 
 
 def _lane(tree: Any, lane: int) -> Any:
-    """Return one lane of a tree of arrays (..., lanes), as a batch with one lane."""
+    """Return one lane (scenario) of a tree of arrays (..., lanes), as a batch with one lane."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf)[..., lane : lane + 1], tree)
 
 
 def _start(
     loop: Loop, rig: RigConstants, run: RunState, reference: IdealContactRecord, key: Array
 ) -> RunProgress:
-    """Return the state at the start of a run, from the state of the loop before tick 0."""
+    """Return progress and readings at the start of a run; `run` is the state of the loop before tick 0."""
     rig = rig._replace(key=key)
     return RunProgress(start_rollout(loop, rig, run, reference), sense(loop, rig, run))
 
@@ -253,9 +257,10 @@ def _read(loop: Loop, rig: RigConstants, run: RunState, key: Array) -> Array:
 def _tick(
     loop: Loop, unpack: Unpack, rig: RigConstants, state: Array, last: Array, key: Array, answer: Array
 ) -> tuple[Array, Array]:
-    """End a tick with the controller's answer, (38, 1): wrench and pose command, and states of the bodies.
+    """Complete a tick of a run with the controller's `answer`, (38, 1).
 
-    Return the state after the tick, and the readings at the next tick.
+    The answer contains the wrench command, the pose command, and the states of both bodies. Return the state
+    of the run after the tick, and the readings at the next tick.
     """
     rig, (progress, sensed) = rig._replace(key=key), unpack(state)
     command = Wrench(vector(answer[:3]), vector(answer[3:6]))
@@ -271,9 +276,9 @@ def _tick(
 def _turn_over(
     loop: Loop, unpack: Unpack, rig: RigConstants, state: Array, last: Array
 ) -> tuple[Array, Array]:
-    """Store the results of finished episodes, and begin the next episode or end the run.
+    """Store the results of an episode (contact) that has ended; begin the next episode, or end the run.
 
-    Return the next state, and whether the run continues.
+    Return the state of the run, and whether the run continues.
     """
     progress, sensed = unpack(state)
     progress = turn_over(loop, rig, last, progress)

@@ -32,7 +32,7 @@ class TimingEffects:
         self.begin(1)
 
     def begin(self, size: int) -> None:
-        """Begin a run; `size` is the length of the delay line, a power of two."""
+        """Begin a run; `size` is the number of periods that the ring buffer stores, a power of two."""
         self._inputs: list[tuple[list[float], float, float] | None] = [None] * size
         self._reading = 0.0
 
@@ -42,7 +42,7 @@ class TimingEffects:
             self._inputs[tick & (len(self._inputs) - 1)] = [*state], start, end
 
     def late_force(self, tick: int, law: FloatLaw) -> float | None:
-        """Return the real force [N] that the sensor reads at this tick; None without jitter."""
+        """Return the real force [N] that the sensor reads after a random delay; None without jitter."""
         if self._jitter == 0.0:
             return None
         deviation = self._jitter * (2.0 * self._random.random() - 1.0)
@@ -54,13 +54,13 @@ class TimingEffects:
         return law.force(position - self._plane, velocity) if position > self._plane else 0.0
 
     def hold_lost(self, tick: int, reading: float) -> float:
-        """Draw whether the reading [N] is lost; return the reading or, if it is lost, the last one."""
+        """Return the reading [N]; if a random draw loses it, return the last reading that was not lost."""
         if not (self._loss > 0.0 and self._random.random() < self._loss and tick > 0):
             self._reading = reading
         return self._reading
 
     def _motion(self, fraction: float, state: list[float], start: float, end: float) -> tuple[float, float]:
-        """Return position [m] and velocity [m/s] at a fraction of a sampling interval."""
+        """Return position [m] and velocity [m/s] of the motion simulator at a fraction of an interval."""
         window = self._simulator.window
         if window is not None:
             kink = window / self._period % 1.0

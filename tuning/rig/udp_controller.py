@@ -82,7 +82,7 @@ class EmptyControllerTask:
     quality_flags: ClassVar[dict[str, int]] = {}
 
     def answer(self, reading: udp.ReadingPacket) -> udp.AnswerPacket:
-        """Return an answer to the reading's packet, with commands of zero."""
+        """Return an answer to this reading in which all commands are zero."""
         _, sequence, run, tick, *_ = reading
         form = udp.FORMATS[len(reading.force)]
         zero, bodies = (0.0,) * form.axes, (0.0,) * form.bodies
@@ -91,7 +91,7 @@ class EmptyControllerTask:
 
 
 class TickRecord:
-    """Preallocated record of the times of all ticks and of all packets.
+    """Record of all packets from the rig, and of the times of all ticks in preallocated arrays.
 
     Args:
         capacity: largest number of ticks and of packets; later ones are not recorded.
@@ -135,7 +135,7 @@ class TickRecord:
         return map(udp.decode_reading, self._packets)
 
     def above(self, limit: float) -> dict[int, int]:
-        """Return the CPU times [ns] per executed tick that exceed `limit` [ns], by sequence number."""
+        """Return each CPU time per executed tick above `limit` (both in ns), by sequence number."""
         times = {self.sequence[i]: self.cpu[i] // self.executed[i] for i in range(self.count)}
         return {sequence: cpu for sequence, cpu in times.items() if cpu > limit}
 
@@ -149,8 +149,8 @@ def replay_slow_ticks(
 ) -> dict[int, int]:
     """Replay all packets if a tick used more CPU time than `limit` [ns].
 
-    Return, by sequence number, the shortest CPU time [ns] of each such tick in the session and the replays.
-    A tick that follows missing packets also executes these; its time is divided by the number of ticks.
+    Return, by sequence number, each slow tick's shortest CPU time [ns] in the session and the replays. If an
+    answer also executes the ticks of missing packets, its time is divided by the number of executed ticks.
     `make_task` returns a new task of the same controller for each replay.
     """
     times, cpu_now = record.above(limit), time.thread_time_ns
@@ -310,7 +310,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def load_task(path: str) -> ControllerTask:
-    """Return the task for the controller and mechanism of a gain file.
+    """Return the task that answers readings with the controller and the mechanism of a gain file.
 
     Raise ValueError, OSError, KeyError, TypeError or AttributeError if the file is invalid.
     """

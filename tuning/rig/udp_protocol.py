@@ -208,11 +208,11 @@ def decode_opening(packet: bytes, number: int) -> Opening:
 class SessionNumbers:
     """Generator of session numbers, computed from address and port by a keyed hash.
 
-    Only a receiver at an address can know the session number of this address. Requests need no memory, and
-    an answer is not longer than its request, so that forged requests cannot exhaust memory or network.
+    Only a program that receives at an address can know the session number of this address. Requests need no
+    memory, and an answer is not longer than its request. So forged requests cannot exhaust memory or network.
 
     Args:
-        axes: number of axes stated in the answers; None to state the number that the request states.
+        axes: number of axes stated in the answers; None to repeat the number in the request.
     """
 
     def __init__(self, axes: int | None = None) -> None:

@@ -42,11 +42,11 @@ class ModelInLoop(Protocol):
 
 
 class ControllerTask:
-    """Controller and numerical model, which compute the answers to readings, independent of the network.
+    """Task that computes the answers to readings with a controller and its numerical model, without network.
 
     Args:
         controller: controller of the gain file.
-        model: the controller and its numerical model.
+        model: numerical model, coupled with the same controller.
         max_interpolated: largest number of successive missing ticks that are interpolated.
 
     Attributes:
@@ -119,7 +119,7 @@ class ControllerTask:
         return faults
 
     def _reported_faults(self) -> int:
-        """Return the controller's current faults; count the contact if they include `law_in_doubt`."""
+        """Return the controller's current faults; count the fault `law_in_doubt` in `quality_flags`."""
         controller = self._controller
         if controller.faults & LAW_IN_DOUBT:
             status = controller.last_contact.status
@@ -147,7 +147,7 @@ class ControllerTask:
         return self._reply(reading, 0, rate, motion, faults, model.force)
 
     def _interpolate(self, missed: int, reading: udp.ReadingPacket) -> int:
-        """Execute the ticks of missing packets with interpolated readings; return all their faults."""
+        """Execute the missing packets' ticks with interpolated readings; return the faults of these ticks."""
         self.interpolated += missed
         self.executed += missed
         faults = 0
