@@ -15,7 +15,7 @@ from tuning.shadow_mode.replay import ReplayedRun, compare_commands, relative_di
 
 
 class CommandDifference(msgspec.Struct, frozen=True):
-    """Difference between the controller's and the logged commands in one contact: force or moment."""
+    """Metrics of the controller's commands minus the logged ones in one contact, for forces or moments."""
 
     largest: float | None  # largest difference of a component [N, N m]; None if nothing is compared
     time: float | None  # instant of this difference, from the log's first row [s]
@@ -32,7 +32,7 @@ class FaultEntry(msgspec.Struct, frozen=True):
 
 
 class Trip(msgspec.Struct, frozen=True):
-    """Trip of the controller in a contact."""
+    """Trip (latched stop after a fault) of the controller in a contact."""
 
     time: float  # instant, from the log's first row [s]
     reason: str  # names of the faults that caused the trip
@@ -75,10 +75,10 @@ def compare_with_logs(
     """Feed the readings of logs to a controller; compare its commands with the logged ones.
 
     Args:
-        make_controller: Function that takes names of limits, and returns a new controller without them.
+        make_controller: Function that takes names of limits; returns a new controller without these limits.
         logs: Readings and commands of each log.
         mechanism: Mechanism of the gain file.
-        is_session: Whether all logs belong to one session, so that the controller keeps what it identifies.
+        is_session: Whether all logs belong to one session, in which the controller keeps its estimates.
     """
     replays, notes = replay_logs(make_controller, logs, is_session)
     contacts = []
@@ -98,7 +98,7 @@ def compare_with_logs(
 
 
 def _evaluate(ticks: LoggedTicks, run: ReplayedRun, number: int) -> ShadowContact:
-    """Return the metrics of one run."""
+    """Return the metrics of one run, which is contact `number` of all logs."""
     difference, ranges = compare_commands(ticks, run)
     instant = ticks.instant[run.rows]
     compared = int(np.count_nonzero(np.all(np.isfinite(difference), axis=1)))
@@ -120,7 +120,7 @@ def _evaluate(ticks: LoggedTicks, run: ReplayedRun, number: int) -> ShadowContac
 
 
 def _measure(difference: np.ndarray, size: float, instant: np.ndarray) -> CommandDifference:
-    """Return the metrics of the difference of forces or moments (rows, components)."""
+    """Return the metrics of `difference`, (rows, components); `size` is the range of the logged commands."""
     finite = np.all(np.isfinite(difference), axis=1)
     if not finite.any():
         return CommandDifference(None, None, None, size)

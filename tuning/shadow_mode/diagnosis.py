@@ -31,7 +31,7 @@ MIN_DEPTH_SHARE = 0.1  # minimum depth of a row that is used, as a share of the 
 
 
 def explain(ticks: LoggedTicks, runs: Sequence[ReplayedRun], mechanism: Any) -> list[str]:
-    """Return one line for each cause that the log shows; `mechanism` is that of the gain file."""
+    """Return one line for each reason, found in the log, why its commands differ from the controller's."""
     lines = [
         describe_lost_rows(ticks),
         *describe_signs(ticks),
@@ -72,7 +72,7 @@ def describe_signs(ticks: LoggedTicks) -> list[str]:
 
 
 def _agreement(ticks: LoggedTicks, force: np.ndarray) -> float | None:
-    """Return the agreement of a force with the model's change of velocity, from -1 to 1; None if unknown."""
+    """Return the agreement of a force's direction with the model's acceleration, -1 to 1; None if unknown."""
     span, rows = SPEED_SPAN_ROWS, len(ticks.tick)
     middle = np.arange(span, rows - span)
     first, last = middle - span, middle + span
@@ -135,9 +135,9 @@ def describe_shift(ticks: LoggedTicks, runs: Sequence[ReplayedRun]) -> str | Non
 
 
 def _get_fit_rows(ticks: LoggedTicks, run: ReplayedRun) -> tuple[CubicSpline, np.ndarray, np.ndarray] | None:
-    """Return the controller's commands of a run as a function of the tick, and the logged rows to compare.
+    """Return a spline of the controller's commands over the ticks of a run, and the logged rows to compare.
 
-    The result contains the ticks and the commands of these rows. It is None if there are too few rows.
+    These rows are an array of ticks and an array of logged commands. Return None if there are too few rows.
     """
     logged, tick = ticks.command[run.rows], ticks.tick[run.rows]
     finite = np.all(np.isfinite(run.commands), axis=1)
@@ -153,11 +153,11 @@ def _get_fit_rows(ticks: LoggedTicks, run: ReplayedRun) -> tuple[CubicSpline, np
 
 
 def describe_force_delay(ticks: LoggedTicks, mechanism: Any) -> str | None:
-    """Return a message if the force delay differs from that of the mechanism for which the gains were tuned.
+    """Return a message if the log's force delay differs from that of `mechanism`, for which gains were tuned.
 
-    In slow contacts, a delayed reading of the force F = k d + b d' is k d + (b - k delay) d'. To find the
-    delay, the function assumes the damping b of the mechanism. Return None on six axes and for other contact
-    laws.
+    For a penetration d, the force is F = k d + b d'. In slow contacts, its reading with the delay tau is
+    k d + (b - k tau) d'. To find tau, the function assumes the damping b of `mechanism`. Return None on six
+    axes and for a contact law other than this one.
     """
     if ticks.axes > 1 or mechanism.contact.law not in ("linear", "kelvin_voigt"):
         return None
@@ -181,7 +181,7 @@ def describe_force_delay(ticks: LoggedTicks, mechanism: Any) -> str | None:
 
 
 def _fit_delay(ticks: LoggedTicks, number: int, mechanism: Any) -> tuple[float, float] | None:
-    """Return the delay of the force reading in a run [s], and its standard error; None without a contact."""
+    """Fit the delay from position to force reading in a run; return (delay, standard error) [s], or None."""
     rows = slice(ticks.starts[number], [*ticks.starts[1:], len(ticks.tick)][number])
     depth = ticks.position_measured[rows, 0] - mechanism.rig.contact_plane
     force, tick = ticks.force[rows, 0], ticks.tick[rows]

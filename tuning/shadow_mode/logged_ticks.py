@@ -62,12 +62,12 @@ class LoggedTicks:
 
     @property
     def instant(self) -> np.ndarray:
-        """Return the time of each row from the first row [s]; without time stamps, use the ticks."""
+        """Return the time of each row since the first row [s]; without time stamps, from the tick numbers."""
         return self.period * self.tick if self.time is None else self.time
 
     @property
     def gaps(self) -> np.ndarray:
-        """Return the rows that follow lost rows within a run."""
+        """Return the indices of the rows that directly follow lost rows of the same run."""
         after = np.flatnonzero(np.diff(self.tick) > 1) + 1
         return after[~np.isin(after, self.starts)]
 
@@ -85,7 +85,7 @@ def read_logged_ticks(
     Args:
         logs: Paths of the log files.
         mapping: Mapping of columns to channels.
-        mechanism: Mechanism of the gain file, which provides what `[timing]` omits.
+        mechanism: Mechanism of the gain file; it supplies the values that `[timing]` in the mapping omits.
 
     Raises:
         InputError: If a log cannot be read, or its control period differs from that of the gains.
@@ -116,7 +116,7 @@ def _read_log(
     timing: CampaignTiming,
     is_two_sided: bool,
 ) -> LoggedTicks:
-    """Read one log; with two surfaces (`is_two_sided`), a run may have several contacts."""
+    """Read one log's contact rows; with two surfaces (`is_two_sided`), a run may have several contacts."""
     log = open_log(path, mapping.text)
     period = timing.control_period
     if isinstance(mapping, LogMapping):
@@ -162,7 +162,7 @@ def _is_two_sided(mechanism: Any) -> bool:
 
 
 def _read_one_axis(log: OpenLog, mapping: LogMapping, period: float):
-    """Return vectors (rows, 1) by field of `LoggedTicks`, further channels, time stamps [s], and notes."""
+    """Return arrays (rows, 1) by field name of `LoggedTicks`, optional channels, time stamps [s], notes."""
     columns, stamps, _, notes = read_channels(log, mapping, period)
     for name in ("force_measured", "force_command"):
         if name not in columns:
@@ -183,7 +183,7 @@ def _read_one_axis(log: OpenLog, mapping: LogMapping, period: float):
 
 
 def _read_six_axes(log: OpenLog, mapping: SixAxisLogMapping):
-    """Return vectors (rows, 6) by field of `LoggedTicks`, further channels, time stamps [s], and notes."""
+    """Return arrays (rows, 6) by field name of `LoggedTicks`, optional channels, time stamps [s], notes."""
     channels, index = mapping.channels, mapping.channels.contact_index
     names = [column for name in VECTOR_UNITS for column in getattr(channels, name).columns]
     if index is not None:
@@ -218,9 +218,10 @@ def _read_six_axes(log: OpenLog, mapping: SixAxisLogMapping):
 
 
 def _find_starts(force: np.ndarray, index: np.ndarray | None, period: float) -> np.ndarray:
-    """Return the rows at which a run begins, without the first row of the log.
+    """Return the rows at which a run (the rows of one contact) begins, except the first row of the log.
 
-    Without a contact index, a run begins in the middle between two contacts of a one-axis log.
+    A run begins where the contact index changes. If `index` is None, a run of a one-axis log begins midway
+    between two contacts, which the force shows.
     """
     if index is not None:
         return np.flatnonzero(np.diff(index)) + 1
@@ -233,7 +234,7 @@ def _find_starts(force: np.ndarray, index: np.ndarray | None, period: float) -> 
 def _align(ticks: LoggedTicks, timing: CampaignTiming) -> LoggedTicks:
     """Return one row per tick with the readings of this tick and the command that answers them.
 
-    The row convention and the computing delay of the mapping determine the rows of the log from which
+    In the mapping, `timing.row` and `timing.computing_delay` determine the rows of the log from which
     readings and command come.
     """
     motion, readings, command = {"tick": (0, 0, 0), "sent": (-1, 0, 0), "after": (0, -1, 0)}[timing.row]

@@ -27,7 +27,7 @@ ENDED_SHARE = 0.05  # a contact has ended if the last force is at most this shar
 
 
 class Audit(NamedTuple):
-    """Audit of the watchdog that is left out if the log's commands are not the controller's."""
+    """Kind of watchdog audit (check); it is left out if the logged commands are not the controller's."""
 
     name: str  # name in notes
     faults: int  # bits of the faults that the audit raises
@@ -49,7 +49,7 @@ AUDITS = (
 
 
 class ReplayedRun(NamedTuple):
-    """Commands and faults of the controller in one run of a log."""
+    """Commands and faults of the controller in one run (usually one contact) of a log."""
 
     rows: slice  # rows of the log
     commands: np.ndarray  # controller's commands, (rows, axes); NaN in rows that are not compared
@@ -64,15 +64,15 @@ class ReplayedRun(NamedTuple):
 def replay_log(
     make_controller: Callable[[], Any], ticks: LoggedTicks, controller: Any = None
 ) -> tuple[list[ReplayedRun], Any]:
-    """Feed a log's readings to a controller, run by run.
+    """Feed a log's readings to a controller, one run (usually one contact) after another.
 
     Args:
         make_controller: Function that returns a new `Controller` or `Controller6`.
         ticks: Readings of the log.
-        controller: Controller of the session's last log; None for a new session.
+        controller: Controller that replayed the session's previous log; None for a new session.
 
     Returns:
-        The runs, and the controller after the last run.
+        The replayed runs, and the controller after the last run.
     """
     edges = [*ticks.starts.tolist(), len(ticks.tick)]
     runs = []
@@ -87,7 +87,7 @@ def replay_log(
 
 
 def _replay_run(controller: Any, ticks: LoggedTicks, rows: slice) -> ReplayedRun:
-    """Feed one run to the controller; return its commands up to a trip."""
+    """Feed the readings of one run to the controller; return its commands and faults up to a trip."""
     unwrap = ticks.axes == 1
     columns = [
         getattr(ticks, name)[rows, 0].tolist() if unwrap else getattr(ticks, name)[rows].tolist()
@@ -138,7 +138,7 @@ def _replay_run(controller: Any, ticks: LoggedTicks, rows: slice) -> ReplayedRun
 
 
 def _count(seen: dict[int, list[float]], faults: int, instant: float) -> None:
-    """Add the faults of one tick to the counts in `seen`."""
+    """Add the faults of one tick (bits) to `seen`, which holds the count and first instant of each fault."""
     while faults:
         bit = faults & -faults
         seen.setdefault(bit, [0, instant])[0] += 1
@@ -146,17 +146,17 @@ def _count(seen: dict[int, list[float]], faults: int, instant: float) -> None:
 
 
 def _has_ended(force: np.ndarray) -> bool:
-    """Return whether the last row of a run has no contact force, so that the contact can be audited."""
+    """Return whether a run ends without contact force, so that the watchdog can audit (check) the contact."""
     size = np.linalg.norm(force, axis=1)
     return bool(size[-1] <= ENDED_SHARE * np.nanmax(size)) if np.any(np.isfinite(size)) else False
 
 
 def compare_commands(ticks: LoggedTicks, run: ReplayedRun) -> tuple[np.ndarray, np.ndarray]:
-    """Return the controller's minus the logged commands (rows, axes), and the ranges of the logged commands.
+    """Return the controller's commands minus the logged ones, (rows, axes), and the logged commands' ranges.
 
     Rows in which a command is missing are NaN. The first row of a run is NaN if its logged command is 0,
-    because rigs with a noisy sensor command no force in the first tick. Force and moment have separate
-    ranges.
+    because rigs with a noisy sensor command no force in the first tick. Each range also includes 0;
+    force and moment have separate ranges.
     """
     logged = ticks.command[run.rows]
     difference = run.commands - logged
@@ -168,7 +168,7 @@ def compare_commands(ticks: LoggedTicks, run: ReplayedRun) -> tuple[np.ndarray, 
 
 
 def relative_difference(difference: np.ndarray, ranges: np.ndarray) -> float:
-    """Return the largest difference divided by the range of its part: force, or moment."""
+    """Return the largest difference of force or moment commands, divided by the range of these commands."""
     parts = np.split(difference, len(ranges), axis=1)
     return max(
         _divide(float(np.nanmax(np.abs(part), initial=0.0)), float(size))
@@ -183,10 +183,10 @@ def _divide(value: float, size: float) -> float:
 def replay_logs(
     make_controller: Callable[[Sequence[str]], Any], logs: Sequence[LoggedTicks], is_session: bool
 ) -> tuple[list[list[ReplayedRun]], list[str]]:
-    """Replay all logs, without the audits that are not valid for these logs.
+    """Replay all logs, without the watchdog's audits (checks) that are not valid for these logs.
 
     Args:
-        make_controller: Function that takes names of limits, and returns a new controller without them.
+        make_controller: Function that takes names of limits; returns a new controller without these limits.
         logs: Readings of each log.
         is_session: Whether all logs belong to one session.
 
@@ -211,7 +211,7 @@ def replay_logs(
 
 
 def _is_invalid(audit: Audit, logs: Sequence[LoggedTicks], replays: Sequence[Sequence[ReplayedRun]]) -> bool:
-    """Return whether an audit tripped the controller in a run with lost rows or with other commands."""
+    """Return whether an audit trips in a run with lost rows, or in which controller and log disagree."""
     for ticks, runs in zip(logs, replays, strict=True):
         for run in runs:
             has_gaps = np.any((ticks.gaps >= run.rows.start) & (ticks.gaps < run.rows.stop))

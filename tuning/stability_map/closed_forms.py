@@ -58,7 +58,7 @@ def mean_delay(mechanism: Mechanism, scenarios: Scenario) -> np.ndarray:
 
 
 def restitution_by_series(phase: np.ndarray) -> np.ndarray:
-    """Return the restitution for x'' = -omega^2 x(t - tau), where `phase` is omega tau [rad], from a series.
+    """Compute the restitution for x'' = -omega^2 x(t - tau) by a series; `phase` is omega tau [rad].
 
     With time in units of 1/omega, the motion is S(t) = sum_n (-1)^n (t - n tau)^(2n+1)/(2n+1)!. The delayed
     force acts until the time tau after the first zero t_s of S, so that the restitution is |S'(t_s + tau)|.
@@ -76,7 +76,7 @@ def restitution_by_series(phase: np.ndarray) -> np.ndarray:
 
 
 def restitution_by_root(phase: np.ndarray) -> np.ndarray:
-    """Return the restitution for x'' = -omega^2 x(t - tau), where `phase` is omega tau [rad], from a root.
+    """Estimate the restitution for x'' = -omega^2 x(t - tau) from a root; `phase` is omega tau [rad].
 
     The dominant root s = (2/tau) W_0(j omega tau/2) of s^2 = -omega^2 e^(-s tau) gives the restitution exp(pi
     Re s/|Im s|). W_0 is the principal branch of the Lambert function. The result is NaN for a negative phase.

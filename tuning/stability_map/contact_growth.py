@@ -83,7 +83,7 @@ class Growth(NamedTuple):
 
 
 def explain_nonlinearity(mechanism: Mechanism, compensator: str) -> str | None:
-    """Return the reason why the growth is not computed, such as a nonlinear loop; None if it is computed."""
+    """Return why the growth is not computed, for example a nonlinear contact law; None if it is computed."""
     if compensator not in LINEAR_COMPENSATORS:
         return f"{compensator} is not linear"
     if not find_contact_law(mechanism.contact.law).is_linear:
@@ -120,7 +120,7 @@ def spectral_radii(
 
 
 def eigenvalue_cost(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> float:
-    """Return the approximate number of operations for the eigenvalues of one scenario."""
+    """Estimate how many operations it takes to compute the eigenvalues for one scenario."""
     shape = _program_parameters(mechanism, compensator, scenarios)
     return (
         len(_distinct_contacts(mechanism)) * float(_matrix_size(shape, _lane_parameters(scenarios, 0))) ** 3
@@ -130,7 +130,7 @@ def eigenvalue_cost(mechanism: Mechanism, compensator: str, scenarios: Scenario)
 def compute_growth(
     mechanism: Mechanism, compensator: str, gains: Mapping[str, float], scenarios: Scenario
 ) -> Growth:
-    """Return the growth in the contact with the largest spectral radius, for the first scenario."""
+    """Return the growth of the first scenario's oscillation in its contact of largest spectral radius."""
     shape, values = (
         _program_parameters(mechanism, compensator, scenarios),
         {k: jnp.asarray(v) for k, v in gains.items()},
@@ -160,7 +160,7 @@ def compute_growth(
 
 
 def _distinct_contacts(mechanism: Mechanism) -> list[int]:
-    """Return the indices of the contacts of the schedule that differ in stiffness or damping."""
+    """Return the index of one contact for each different pair of stiffness and damping in the schedule."""
     contact, pairs = mechanism.contact, {}
     for slot in range(mechanism.approach.contacts):
         pair = (contact.stiffness[min(slot, len(contact.stiffness) - 1)],
@@ -170,7 +170,7 @@ def _distinct_contacts(mechanism: Mechanism) -> list[int]:
 
 
 def _program_parameters(mechanism: Mechanism, compensator: str, scenarios: Scenario) -> ProgramParameters:
-    """Return the constants of the compiled program for a batch of scenarios."""
+    """Return the values that are fixed in the program compiled for a batch of scenarios."""
     rig = mechanism.rig
     delay = np.asarray(scenarios.simulator.delay) + np.asarray(scenarios.force_sensor.delay)
     longest = int(np.max(np.floor(delay / np.asarray(scenarios.control_period) + 1e-9)))
@@ -209,13 +209,13 @@ def _per_lane(gains: Mapping[str, Any], number: int) -> dict[str, np.ndarray]:
 
 
 def _matrix_size(shape: ProgramParameters, lanes: LoopParameters) -> int:
-    """Return the approximate number of rows of the matrix of one control period."""
+    """Return the approximate number of rows of the matrix that advances the loop by one control period."""
     return 2 + shape.latency + 1 + lanes.numerator.shape[-1] + shape.filter_size + shape.delays + 4
 
 
 @partial(jax.jit, static_argnums=0)
 def _period_matrices(shape: ProgramParameters, lanes: LoopParameters, gains: Gains) -> jax.Array:
-    """Return the matrix of one control period for every lane, (lanes, size, size)."""
+    """Return, for every lane, the matrix that advances the loop by one period, (lanes, size, size)."""
     return jax.vmap(partial(_period_matrix, shape))(lanes, gains)
 
 
@@ -223,7 +223,7 @@ def _period_matrices(shape: ProgramParameters, lanes: LoopParameters, gains: Gai
 def _matrix_derivatives(
     shape: ProgramParameters, lane: LoopParameters, gains: Gains
 ) -> tuple[jax.Array, Gains]:
-    """Return the matrix of one control period, and its derivative with respect to each gain."""
+    """Return the matrix that advances the loop by one period, and its derivative by each gain."""
     matrix = partial(_period_matrix, shape, lane)
     return matrix(gains), jax.jacfwd(matrix)(gains) if gains else {}
 
@@ -261,7 +261,7 @@ def _advance_period(
     reading: jax.Array,
     before: Any,
 ) -> Any:
-    """Return the state of the loop in contact at the next tick, from its state at a tick."""
+    """Advance the loop by one control period in contact; return the state that follows the state `before`."""
     position, velocity, commands, plant, readings, state = before
     # The reading at a tick is older than the newest reading by a whole number of periods.
     force = readings[jnp.floor(lane.delay / lane.period + 1e-9).astype(int)]

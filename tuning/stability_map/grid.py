@@ -38,14 +38,14 @@ MIN_COARSE_POINTS = 15  # smallest number of points along an axis of the coarser
 
 
 class NominalMargin(NamedTuple):
-    """Range of one key, around its nominal value, in which a limit is not exceeded."""
+    """Range of one key, around its nominal value, in which a quantity of the map stays within its limit."""
 
     low: float | None  # lower end [unit of the key]; None if the limit is not exceeded down to the map's end
     high: float | None  # upper end [unit of the key]; None if the limit is not exceeded up to the map's end
 
 
 class SpectralRadii(NamedTuple):
-    """Spectral radius of the loop in contact, on a grid that may be coarser than the map."""
+    """Spectral radii of the loop in contact, on the map's grid or on a coarser grid of the same ranges."""
 
     x: np.ndarray  # values along x, (columns,)
     y: np.ndarray  # values along y, (rows,)
@@ -103,9 +103,10 @@ def compute_map(
     scheduler: str | None = None,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> MapResults:
-    """Compute a stability map: errors and theory on a grid of two keys, and nominal margins.
+    """Compute a stability map: errors and theory on a grid of two keys, and margins of the nominal point.
 
-    The error is the restitution error or, for six axes, the twist error. There is no theory for six axes.
+    The error is the restitution error or, for six axes, the twist error. The theory consists of closed forms
+    and spectral radii; there is none for six axes.
 
     Args:
         mechanism: nominal mechanism.
@@ -182,10 +183,10 @@ def _nominal_point(
     lines: list[np.ndarray],
     limit: float,
 ) -> NominalPoint:
-    """Return the results at the nominal point, with its margins along both lines.
+    """Return the results at the nominal point, with its margins along the two lines through this point.
 
-    `worst` contains, run by run, the results of `_worst_contact`: first `size` runs of the map, then the runs
-    along both lines, then the nominal run.
+    `worst` contains the results of `_worst_contact` for each run: first the `size` runs of the map, then the
+    runs along both lines, then the nominal run.
     """
     restitution, error, force, duration, unlike = worst
     if not np.isfinite(error[-1]):
@@ -223,7 +224,8 @@ def run_tile(
 ) -> np.ndarray:
     """Simulate a tile (scenarios that are computed together); return the results of `_worst_contact`.
 
-    The results have the shape (5, lanes).
+    The results have the shape (5, lanes). A smaller tile is padded to `at_least` scenarios, so that all
+    tiles share a compiled program.
     """
     outcome = model.evaluate(loop, gains, scenarios, at_least=at_least)
     return np.stack(_worst_contact(model.select_verdict_error(outcome)))
@@ -328,10 +330,10 @@ def _point_gains(
 def _worst_contact(outcome: Outcome) -> tuple[np.ndarray, ...]:
     """Return five arrays (lanes,) with the worst values among the contacts of each lane.
 
-    The first two values are restitution and error of the contact with the largest error. The next two are the
-    largest peak force ratio, and the duration ratio farthest from 1. The last value is 1 if a real contact's
-    peak force or duration is out of bounds, else 0. All values are NaN if a contact did not end, or if there
-    is no contact.
+    The first two values are restitution and error of the contact with the largest error. The next two
+    compare contacts with their ideal contacts: the largest ratio of the peak forces, and the ratio of the
+    durations that is farthest from 1. The last value is 1 if a contact's peak force or duration is out of
+    bounds, else 0. All values are NaN if a contact did not end, or if there is no contact.
     """
     used = outcome.is_scheduled & outcome.good
     ended = np.any(outcome.is_scheduled, axis=0) & ~np.any(outcome.is_scheduled & ~outcome.good, axis=0)
@@ -355,9 +357,9 @@ def _worst_contact(outcome: Outcome) -> tuple[np.ndarray, ...]:
 def _line_margins(
     axes: tuple[MapAxis, MapAxis], lines: list[np.ndarray], values: np.ndarray, most: float
 ) -> tuple[NominalMargin, NominalMargin]:
-    """Return the range of each key, around its nominal value, in which `values` do not exceed `most`.
+    """Return for each axis the range around the nominal value in which `values` stay at or below `most`.
 
-    `lines` are the values of the keys, (points,) each, and `values` has the shape (axes, points).
+    `lines` holds the points on each axis, (points,), and `values` has the shape (axes, points).
     """
     margins = []
     for axis, line, line_values in zip(axes, lines, values, strict=True):

@@ -20,7 +20,7 @@ class Interval(NamedTuple):
 
 
 class ErrorIntervals(NamedTuple):
-    """Confidence intervals of restitution errors |e - e*|; NaN with fewer than two usable scenarios."""
+    """Confidence intervals of errors |e - e*|; NaN unless two or more scenarios have a contact that ended."""
 
     rms: Interval  # interval of the rms error [1]
     p99: Interval  # interval of the 99th percentile [1]

@@ -277,7 +277,7 @@ def _compute_share(failures: np.ndarray, number: np.ndarray) -> np.ndarray:
 
 
 def _bisect_boundary(outside, beyond: np.ndarray, within: np.ndarray) -> np.ndarray:
-    """Find by bisection the point between `within` and `beyond` at which `outside` becomes true."""
+    """Find by bisection the point at which `outside` changes from false (`within`) to true (`beyond`)."""
     for _ in range(_BISECTION_STEPS):
         middle = 0.5 * (beyond + within)
         is_outside = outside(middle)

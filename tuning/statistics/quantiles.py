@@ -28,15 +28,16 @@ def compute_order_ranks(
 ) -> tuple[int, int]:
     """Return the ranks of two order statistics between which a quantile lies with the confidence `level`.
 
-    Rank 1 is that of the smallest value. A lower rank of 0 or an upper rank of `number` + 1 means that there
+    The smallest value has rank 1. A lower rank of 0 or an upper rank of `number` + 1 means that there
     is no such bound. The interval includes both order statistics, and is valid even if some values are equal
     (David and Nagaraja 2003, section 7.1).
 
-    Let n = `number` and q = `order`. If n is fixed in advance, low and high - 1 are the quantiles of order (1
-    - level) / 2 and (1 + level) / 2 of the binomial distribution with n trials of probability q. If
-    `sequential`, they are the smallest and the largest count for which the martingale of
-    `tuning.statistics.intervals.confidence_sequence` at p = q is below 1 / (1 - level). The interval is then
-    valid for every stopping rule (Howard and Ramdas 2022, "Sequential estimation of quantiles").
+    Let n = `number` and q = `order`, and consider the lower rank, and the upper rank minus 1. If n is fixed
+    in advance, they are the quantiles of order (1 - level) / 2 and (1 + level) / 2 of the binomial
+    distribution with n trials of probability q. If `sequential` is true, they are the smallest and the
+    largest count for which the martingale of `tuning.statistics.intervals.confidence_sequence` at p = q is
+    below 1 / (1 - level). The interval is then valid for every stopping rule (Howard and Ramdas 2022,
+    "Sequential estimation of quantiles").
 
     Args:
         number: number of independent values.
@@ -92,13 +93,14 @@ def count_in_bins(values: ArrayLike) -> np.ndarray:
 def binned_quantile(
     counted: np.ndarray, order: float, level: float = CONFIDENCE_LEVEL, sequential: bool = False
 ) -> IntervalEstimate:
-    """Return a quantile of the magnitudes of values with its interval, from the counts of `count_in_bins`.
+    """Estimate a quantile of |values| and its interval from `counted`, the counts of `count_in_bins`.
 
     The bounds are the order statistics of `compute_order_ranks`, rounded outward to the edges of their bins.
-    This changes them by less than `BIN_RESOLUTION` between the first and the last edge. A bound without an
-    order statistic is 0 or infinity. The estimate is the geometric mean of the edges of the bin that contains
-    rank ceil(order n); in the first bin it is 0, and in the last bin infinity. The other arguments are those
-    of `compute_order_ranks`. Raise ValueError if an argument is out of its range.
+    Between the first and the last edge, this changes a bound by less than 1 % (`BIN_RESOLUTION`). Without an
+    order statistic, the lower bound is 0, and the upper bound is infinity. The estimate is the geometric mean
+    of the edges of the bin that contains rank ceil(order n) of n values; in the first bin it is 0, and in the
+    last bin infinity. The arguments after `counted` are those of `compute_order_ranks`. Raise ValueError if
+    an argument is out of its range.
     """
     number = int(np.sum(counted))
     below = np.cumsum(counted)
@@ -128,10 +130,10 @@ def replicate_quantile(
     """Return a quantile with its interval from independent scramblings of a Sobol sequence.
 
     For each edge of a bin, `tuning.statistics.intervals.replicate_interval` yields an interval of the
-    fraction of values below this edge. The lower bound of the quantile is the edge before the first edge
-    whose upper bound reaches `order`. The upper bound of the quantile is the edge after the last edge whose
-    lower bound is at most `order`. The interval misses the quantile only if the interval of the fraction
-    fails at one of the two edges next to the quantile.
+    fraction of values below this edge. Find the first edge whose fraction has an upper bound of at least
+    `order`: the edge before it is the lower bound of the quantile. Find the last edge whose fraction has a
+    lower bound of at most `order`: the edge after it is the upper bound of the quantile. The interval misses
+    the quantile only if the interval of the fraction fails at one of the two edges next to the quantile.
 
     Args:
         counted: counts of `count_in_bins` for each replicate, (replicates, `BIN_COUNT`).

@@ -95,8 +95,9 @@ def sobol_indices(
     as in `scipy.stats.sobol_indices`. Estimates are not clipped, so that they may be below 0. The bootstrap
     resamples the same rows of A, B and all AB_i (Archer, Saltelli, Sobol 1997), and assumes that the rows are
     independent. The rows of a Sobol sequence are more even, so that the intervals are conservative. An input
-    that changes no result has the total index 0 and an interval of width 0. This proves little if the results
-    are 0 or 1 (rare failures). If all results are equal, the indices are NaN and the intervals 0 to 1.
+    that changes no result has the total index 0 and an interval of width 0. If the results are only 0 or 1,
+    with rare failures, more scenarios may still show an effect of this input. If all results are equal, the
+    indices are NaN and the intervals 0 to 1.
 
     Args:
         values: results of the scenarios in the order of `saltelli_design`, (number (inputs + 2),).
@@ -167,7 +168,7 @@ def _resample_means(terms: np.ndarray, seed: int) -> np.ndarray:
 
 
 def _compute_indices(means: np.ndarray) -> np.ndarray:
-    """Return first-order and total indices from the means of the terms, (resamples, 2 inputs)."""
+    """Return the Sobol indices, (resamples, 2 inputs): means of the numerators divided by the variance."""
     variance = means[:, -1] - means[:, -2] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(variance[:, None] > 0.0, means[:, :-2] / variance[:, None], np.nan)

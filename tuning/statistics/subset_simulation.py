@@ -64,7 +64,7 @@ class SubsetSimulation(NamedTuple):
 
 
 class _SubsetState(NamedTuple):
-    """State of all replicates of a subset simulation at one level."""
+    """State of a subset simulation at one level (threshold of the performance), for all replicates."""
 
     points: np.ndarray  # standard normals of the level's scenarios, (steps, replicates, chains, inputs)
     values: np.ndarray  # performance of these scenarios, (steps, replicates, chains)
@@ -93,15 +93,15 @@ def subset_simulation(
     level: float = CONFIDENCE_LEVEL,
     levels: int = MAX_LEVELS,
 ) -> SubsetSimulation:
-    """Estimate by subset simulation the probability that performance(u) > limit; u are standard normals.
+    """Estimate by subset simulation the probability of performance(u) > limit for standard normal numbers u.
 
     The method fails if the performance does not show how close a scenario is to failure. Examples are
-    plateaus, and regions of failure to which no slope leads. A second region of failure may become relevant
-    only above the thresholds that lead to the first region (Breitung 2019, "The geometry of limit state
-    function graphs and subset simulation: counterexamples"). Most replicates then miss the second region, and
-    the interval is too narrow. A sign of this is a coefficient of variation far above that of the formula for
-    single runs. More samples help. If a replicate ends without a failure, the lower bound of the interval is
-    0, and the upper bound uses the probability that this replicate has reached.
+    plateaus, and regions of failure toward which the performance does not rise. A second region of failure
+    may become relevant only above the thresholds that lead to the first region (Breitung 2019, "The geometry
+    of limit state function graphs and subset simulation: counterexamples"). Most replicates then miss the
+    second region, and the interval is too narrow. A sign of this is a `coefficient_of_variation` far above
+    `formula_coefficient_of_variation`. More samples help. If a replicate ends without a failure, the lower
+    bound of the interval is 0, and the upper bound uses the probability that this replicate has reached.
 
     Args:
         performance: function that returns the performance (batch,) of scenarios, which are given as standard
@@ -186,12 +186,12 @@ def _choose_level(
 ) -> tuple[np.ndarray, _SubsetState]:
     """Return the next threshold of each replicate, (replicates,), and the updated state.
 
-    The probability in the state is multiplied by the conditional probability of exceeding the threshold.
+    The probability in the state is multiplied by the conditional probability of reaching the threshold.
 
-    The threshold is the performance that a tenth of the scenarios reach. If more than a tenth fail, the
-    threshold is `failing`. If fewer than a tenth exceed the smallest performance (a plateau), the threshold
-    is the second smallest performance. If all scenarios have the same performance, or at the last level, the
-    replicate ends.
+    The threshold is the performance that a tenth of the scenarios reach. If a tenth or more fail, it is
+    `failing`, the smallest performance that is a failure. If fewer than a tenth exceed the smallest
+    performance (a plateau), the threshold is the second smallest performance. It is also `failing` if all
+    scenarios have the same performance, and at the last level. A replicate with this threshold ends.
     """
     steps, replicates, chains = state.values.shape
     flat = np.sort(np.moveaxis(state.values, 1, 0).reshape(replicates, -1), axis=1)
@@ -217,11 +217,11 @@ def _choose_level(
 
 
 def _compute_chain_correlation(exceeds: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return the relative increase of the variance by the correlation along the chains, (replicates,).
+    """Return the relative increase of `share`'s variance by correlation along the chains, (replicates,).
 
     This is gamma of Au and Beck 2001, eq. 27-29: the sum over the lags k of 2 (1 - k / steps) rho(k). rho is
-    the autocorrelation along the chains of `exceeds`, (steps, replicates, chains), which is 1 above the
-    threshold.
+    the autocorrelation of `exceeds`, (steps, replicates, chains), along the chains. `exceeds` states which
+    scenarios reach the threshold, and `share` is their fraction.
     """
     steps = exceeds.shape[0]
     centred = exceeds - share[:, None]
@@ -239,11 +239,11 @@ def _run_chains(
     worst: _WorstScenarios,
     rng: np.random.Generator,
 ) -> tuple[_SubsetState, _WorstScenarios]:
-    """Run the Markov chains of the next level of a subset simulation, above each replicate's threshold.
+    """Run the Markov chains of a subset simulation's next level, which stay above each replicate's threshold.
 
     The step size sigma of a replicate is adapted to the acceptance rate of its chains, as in Papaioannou et
     al. 2015. A replicate is an independent repetition of the estimate. Replicates that have ended are
-    computed with the others, but their results are not used.
+    simulated too, but their results are not used.
     """
     steps, replicates, _, inputs = state.points.shape
     seeds = np.stack([_choose_chain_starts(state.values[:, r], threshold[r], rng) for r in range(replicates)])

@@ -155,7 +155,8 @@ def from_table(manifest: Manifest, table: Any) -> dict[str, np.ndarray]:
 
 
 def _locate_checksum(content: bytes | bytearray) -> slice:
-    """Return the slice of the checksum's digits, which follow its key, a header byte and a length byte."""
+    """Return the slice of a chunk file's bytes that holds the digits of the checksum."""
+    # In the file, one header byte and one length byte lie between the checksum's key and its digits.
     start = content.rfind(CHECKSUM_KEY) + len(CHECKSUM_KEY) + 2
     return slice(start, start + len(BLANK_CHECKSUM))
 

@@ -54,7 +54,7 @@ def build_sweep(manifest: Manifest) -> SweepProgram:
 
 
 def build_widest_loop(loaded: LoadedGains, works: bool) -> Any:
-    """Build a loop whose delay lines suffice for all draws; if `works`, it computes mechanical work."""
+    """Build a loop whose delay lines fit every possible draw; if `works`, it computes mechanical work."""
     draws = draw_extremes(loaded.mechanism)
     if CONTROL_PERIOD_KEY in draws:
         # The longest delay and the shortest control period together need the longest delay line.
@@ -67,8 +67,8 @@ def build_widest_loop(loaded: LoadedGains, works: bool) -> Any:
 def run_chunk(sweep: SweepProgram, first: int, number: int, precision: str | None = None) -> Rows:
     """Compute the rows of `number` scenarios, at most a chunk; `first` is the index of the first scenario.
 
-    A run that fails or becomes non-finite yields a row with this status. `precision` replaces the precision
-    of the manifest.
+    If a scenario fails or becomes non-finite, the status in its row says so. `precision` replaces the
+    precision of the manifest.
     """
     return _begin_evaluation(sweep, _draw_batch(sweep, first, number, precision))()
 
@@ -92,7 +92,7 @@ def run_chunks(sweep: SweepProgram, parts: Iterable[int]) -> Generator[tuple[int
 
 
 def convert_precision(scenarios: Any, precision: str) -> Any:
-    """Convert all floating-point numbers of the scenarios to `precision`, in which the program then runs."""
+    """Convert the scenarios' floating-point numbers to `precision`, so that they are simulated in it."""
 
     def cast(leaf: Any) -> Any:
         leaf = np.asarray(leaf)

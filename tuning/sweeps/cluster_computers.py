@@ -47,7 +47,7 @@ def run_manifest_chunk(content: bytes, part: int) -> Rows:
 
 
 def run_manifest_points(content: bytes, at: np.ndarray, noise: np.ndarray) -> Rows:
-    """Run the scenarios at the points `at` on a worker, with the same check as `run_manifest_chunk`."""
+    """Run the scenarios at points `at` on a worker; raise `InputError` as `run_manifest_chunk` does."""
     return point_batches.run_batch(_load_sweep(content), at, noise)
 
 

@@ -107,7 +107,7 @@ UNENDED_METRICS = (
 
 
 class ContactColumns(NamedTuple):
-    """Names of a contact's error and status columns; an episode in six axes has a pair for each error."""
+    """Names of a contact's error column and status column; a six-axis episode has a pair for each error."""
 
     number: int  # number of the contact or episode, from 1
     error: str  # name of the error's column
@@ -121,13 +121,13 @@ def list_contact_columns(mechanism: AnyMechanism) -> list[ContactColumns]:
 
 
 def list_verdict_columns(mechanism: AnyMechanism) -> list[ContactColumns]:
-    """Return the slots of the error to which the limit applies, one per contact or episode."""
+    """Return the columns of the error to which the limit applies, one pair per contact or episode."""
     model = choose_rig_model(mechanism)
     return list_error_columns([model.verdict_error], model.runs(mechanism))
 
 
 def list_error_columns(errors: Iterable[str], runs: int) -> list[ContactColumns]:
-    """Return the column names of every error of `runs` contacts or episodes."""
+    """Return the column names for each error in `errors`, in each of `runs` contacts or episodes."""
     numbers = range(1, runs + 1)
     return [
         ContactColumns(number, f"{error}_{number}", f"status_{number}")
@@ -137,7 +137,7 @@ def list_error_columns(errors: Iterable[str], runs: int) -> list[ContactColumns]
 
 
 def list_sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
-    """Return all columns of a sweep of `mechanism`, in the order in which they are stored."""
+    """Return all columns of a sweep of `mechanism` in stored order; `works` adds those of mechanical work."""
     columns = [Column("index", "integer", "", "number of the scenario")]
     columns += [
         Column(name, "input", find_key_unit(mechanism, path), f"drawn value of {path}")
@@ -167,7 +167,7 @@ def list_sweep_columns(mechanism: AnyMechanism, works: bool) -> list[Column]:
 
 
 def list_allowed_texts(column: str) -> tuple[str, ...]:
-    """Return the allowed texts of the text column `column`; the rows hold indices into this tuple."""
+    """Return a tuple of the texts that column `column` can hold; the rows store indices into this tuple."""
     return SCENARIO_OUTCOMES if column == "outcome" else CONTACT_STATUSES
 
 
@@ -258,7 +258,7 @@ def build_rows(
 
 
 def find_force_range(scenarios: Any) -> np.ndarray:
-    """Return the force sensor's range [N] in each scenario; for six axes, the smallest of three channels."""
+    """Return each scenario's force sensor range [N]; on six axes, the smallest range of a force channel."""
     if hasattr(scenarios, "sensor"):
         return np.min(np.asarray(scenarios.sensor.errors.range)[:3], axis=0)
     return np.asarray(scenarios.force_sensor.range)
@@ -285,9 +285,9 @@ def classify_outcomes(
     Args:
         rows: columns by name. Stores of an earlier version lack the ideal contact's peak force and duration,
             so that no row becomes `UNLIKE_IDEAL`.
-        made: column names of the contacts or episodes, with the error to which the limit applies.
-        force_range: range of the force sensor [N], common to all rows or for each row.
-        period: control period [s], common to all rows or for each row.
+        made: column names of the contacts or episodes, for the error to which the limit applies.
+        force_range: range of the force sensor [N], one value or one per row.
+        period: control period [s], one value or one per row.
         limit: limit of the error [1].
     """
 
@@ -310,7 +310,7 @@ def classify_outcomes(
 
 
 def _find_unlike(rows: Mapping[str, np.ndarray], numbers: Iterable[int], period: np.ndarray) -> np.ndarray:
-    """Return for each row whether a contact's force or duration differs too much from the ideal contact's."""
+    """Return for each row whether `is_contact_out_of_bounds` is true of one of the contacts `numbers`."""
     unlike = np.zeros(len(rows["index"]), bool)
     for number in numbers:
         ideal = [rows.get(f"reference_{name}_{number}") for name in ("peak_force", "duration")]

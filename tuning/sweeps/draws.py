@@ -39,9 +39,10 @@ def draw_values(
 
 
 def draw_sobol_points(dimension: int, seed: int, first: int, number: int) -> np.ndarray:
-    """Return points `first` to `first + number - 1` of the interleaved Sobol sequences, (number, dimension).
+    """Return points `first` to `first + number - 1`, (number, dimension), from Sobol sequences in turn.
 
-    Each coordinate is the centre of a cell of width 2**-30, so that it is above 0 and below 1.
+    Point i comes from sequence number i modulo `SOBOL_REPLICATES`. Each coordinate is the centre of a cell of
+    width 2**-30, so that it is above 0 and below 1.
     """
     points = np.empty((number, dimension))
     for replicate in range(SOBOL_REPLICATES):

@@ -179,7 +179,7 @@ def list_code_differences(old: Manifest, new: Manifest) -> list[str]:
 
 
 def list_process_differences(manifest: Manifest) -> list[str]:
-    """Return how this process differs from the manifest in code and settings, which affect the last bits."""
+    """Return the differences in code and compiler flags between this process and the manifest, as texts."""
     flags = rounding_flags(active_xla_flags())
     loaded = load_gains(manifest)
     changes = _list_version_differences(manifest, _compute_sources_digest(loaded), dependency_versions())

@@ -105,9 +105,9 @@ class PlotStatistics(NamedTuple):
 
 
 def read_regions(store: SweepStore, mechanism: AnyMechanism) -> tuple[PlotPlan | None, PlotStatistics | None]:
-    """Accumulate the statistics of all chunks before the first missing chunk, reading one at a time.
+    """Accumulate the plot statistics of a sweep's chunks, with one chunk at a time in memory.
 
-    Return (None, None) if the first chunk is missing.
+    Stop before the first missing chunk. Return (None, None) if this is the first chunk of the sweep.
     """
     plan = regions = None
     for part in range(store.manifest.parts):
@@ -120,10 +120,10 @@ def read_regions(store: SweepStore, mechanism: AnyMechanism) -> tuple[PlotPlan |
 
 
 def plan_statistics(manifest: Manifest, mechanism: AnyMechanism, rows: Rows) -> PlotPlan:
-    """Choose two inputs, a grid and numbers of scenarios for the statistics of a sweep.
+    """Choose inputs, grid and scenario counts for the plots of a sweep; `rows` are those of the first chunk.
 
     The inputs are contact stiffness and force delay. If one of them is not drawn, the input whose rank
-    correlation with |error| is strongest in `rows`, the first chunk, replaces it.
+    correlation with |error| is strongest in `rows` replaces it.
     """
     size = compute_error_sizes(rows)
     strengths = {
@@ -162,7 +162,7 @@ def build_empty_statistics(plan: PlotPlan) -> PlotStatistics:
 
 
 def add_to_statistics(plan: PlotPlan, regions: PlotStatistics, rows: Rows) -> PlotStatistics:
-    """Return the statistics with further rows added.
+    """Return the statistics with the scenarios of `rows` added.
 
     `rows` must contain the inputs, `index`, `error_*`, `status_*`, `worst_error`, `outcome` and `failed`.
     """
@@ -226,7 +226,7 @@ def _select_first_points(points: PlotPoints) -> PlotPoints:
 def _compute_rank_correlations(
     mechanism: AnyMechanism, path: str, rows: Rows, size: np.ndarray
 ) -> np.ndarray:
-    """Return |rank correlation| (Spearman 1904) of `size` with each input entry; NaN if one is constant."""
+    """Return |rank correlation| (Spearman 1904) of |error| with each number of an input; NaN if constant."""
     _, low, high = _find_input_range(mechanism, path)
 
     def ranks(values: np.ndarray) -> np.ndarray:
@@ -243,7 +243,7 @@ def _compute_rank_correlations(
 
 
 def _find_input_range(mechanism: AnyMechanism, path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the nominal value and the quantiles `END_PROBABILITIES` of each entry of an input."""
+    """Return nominal value and quantiles `END_PROBABILITIES` of each entry (number in a list) of an input."""
     points = np.repeat(
         np.array(END_PROBABILITIES)[:, None], sum(count_dimensions(mechanism).values()), axis=1
     )
@@ -253,7 +253,7 @@ def _find_input_range(mechanism: AnyMechanism, path: str) -> tuple[np.ndarray, n
 
 
 def _build_contact_input(mechanism: AnyMechanism, path: str) -> PlotInput:
-    """Describe an input with one column per contact: the contacts may use different entries of a list."""
+    """Describe an input with one column per contact, because a list can hold one entry for each contact."""
     names, (_, low, high) = list_input_columns(mechanism, path), _find_input_range(mechanism, path)
     contacts = range(len(list_contact_columns(mechanism)))
     listed = path == PHASE_KEY or (
@@ -273,9 +273,9 @@ def _build_contact_input(mechanism: AnyMechanism, path: str) -> PlotInput:
 
 
 def _build_scenario_input(mechanism: AnyMechanism, path: str, entry: int) -> PlotInput:
-    """Describe a plot's input that has one value in each scenario: the entry with index `entry`.
+    """Describe an input with one value per scenario: the number with index `entry`, if the input is a list.
 
-    If all entries are drawn with a common factor, the values are this factor.
+    If all numbers of the list are drawn with a common factor, the values are this factor.
     """
     names, (nominal, low, high) = list_input_columns(mechanism, path), _find_input_range(mechanism, path)
     name = INPUT_LABELS.get(path, path)

@@ -73,7 +73,7 @@ def run_sweep(
 
 
 def summarise_failures(store: SweepStore) -> dict[str, Any]:
-    """Return the failure probability of a stored sweep, with counts and limit, as plain data.
+    """Return a dictionary with failure probability, counts and error limit of a stored sweep.
 
     Raise `InputError` if a chunk is damaged.
     """
@@ -141,7 +141,7 @@ def _run_until_narrow(
     computed: ChunkProgress,
     computer: ChunkComputer,
 ) -> Tally:
-    """Run a sweep until its interval is at most `until_width` wide; return the tally of its chunks."""
+    """Run a sweep until its confidence interval is at most `until_width` wide; return the final tally."""
     manifest = store.manifest
     tally = build_empty_tally(manifest.replicates, manifest.scenarios, looked_at=True)
     width: Any = manifest.until_width

@@ -63,13 +63,13 @@ class SweepStore(NamedTuple):
 
 
 def open_store(folder: Path, manifest: Manifest, resume: bool) -> SweepStore:
-    """Create a store for `manifest`, or open the existing store if `resume` is true.
+    """Create a store for `manifest`; if `resume` is true and a store exists, open it.
 
-    Remove temporary files of an interrupted run.
+    Also remove temporary files that an interrupted run left behind.
 
     Raises:
-        InputError: If the folder holds a store but `resume` is false, if the store comes from other inputs or
-            other code, if the folder holds other files, or if the folder cannot be written.
+        InputError: If a store exists but `resume` is false, if its inputs or code differ from those in
+            `manifest`, if the folder holds files but no store, or if it cannot be written.
     """
     where = to_one_line(str(folder))
     exists = _is_store(folder)

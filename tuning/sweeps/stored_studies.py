@@ -106,7 +106,7 @@ def decode_study(manifest: Manifest, request: StudyRequest, content: bytes) -> A
 
 
 def _describe_study(manifest: Manifest, request: StudyRequest) -> dict[str, Any]:
-    """Return the entries of a study's file that identify the study: all but result and digest."""
+    """Return the entries that identify a study in its file: all entries except the result and the digest."""
     return {
         "schema": STUDY_SCHEMA,
         "study": "drivers" if isinstance(request, IndicesRequest) else "rare",
@@ -118,7 +118,7 @@ def _describe_study(manifest: Manifest, request: StudyRequest) -> dict[str, Any]
 
 
 def _convert_to_plain(value: Any, null: float | None) -> Any:
-    """Convert records to dictionaries, arrays to lists, and the non-finite number `null` to None."""
+    """Convert records to dictionaries, arrays to lists, and the number `null` (infinity or NaN) to None."""
     if hasattr(value, "_fields"):
         null = NULL_VALUES[type(value)]
         return {
@@ -135,7 +135,7 @@ def _convert_to_plain(value: Any, null: float | None) -> Any:
 
 
 def _restore_records(kind: Any, value: Any, null: float | None) -> Any:
-    """Reverse `_convert_to_plain` for a value of type `kind`; raise ValueError or TypeError on a mismatch."""
+    """Convert plain data to type `kind`, and None to `null`; raise ValueError or TypeError on a mismatch."""
     if hasattr(kind, "_fields"):
         hints, null = get_type_hints(kind), NULL_VALUES[kind]
         if value.keys() != hints.keys():

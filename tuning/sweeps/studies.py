@@ -47,7 +47,7 @@ class InputIndices(NamedTuple):
 
 
 class ErrorIndices(NamedTuple):
-    """Sobol indices of the worst |error| of a scenario, clipped at `cap`."""
+    """Sobol indices of a scenario's worst |error|, with errors above `cap` set to `cap`."""
 
     inputs: tuple[InputIndices, ...]  # in descending order of the total index
     cap: float  # largest |error| that the indices distinguish [1]
@@ -62,9 +62,9 @@ def compute_error_indices(
 
     `number` is a power of two. Each uncertain key of the mechanism file, even a list, is one input.
     Correlated keys are one input together, because the indices assume independent inputs. The phases of all
-    contacts are one input. Sensor noise is also one input; its realisations in matrix B of the design differ
-    from those in matrix A. A run whose |error| exceeds the cap, or that has no error, counts as the cap, so
-    that a few diverging runs do not dominate the variance.
+    contacts are one input. Sensor noise is also one input; the sets A and B of the design (`saltelli_design`)
+    have different noise. A scenario whose |error| exceeds the cap, or that has no error, counts as the cap,
+    so that a few diverging scenarios do not dominate the variance.
     """
     inputs = group_independent_inputs(sweep.mechanism)
     names, entries = list(inputs), [len(columns) for columns in inputs.values()]
@@ -116,9 +116,9 @@ def estimate_rare_failure(
 ) -> SubsetSimulation:
     """Estimate the probability that a scenario fails, by subset simulation.
 
-    A scenario fails if its worst |error| exceeds `limit` [1], or for another reason, which counts as an
+    A scenario fails if its worst |error| exceeds `limit` [1]. A failure for another reason counts as an
     infinite error. Every proposed scenario has a new realisation of sensor noise. The Markov chain accepts or
-    rejects scenario and realisation together, so that its distribution is correct.
+    rejects scenario and realisation together, so that the scenarios have the correct distribution.
     """
     unlike, run = SCENARIO_OUTCOMES.index(UNLIKE_IDEAL), 0
 
@@ -134,7 +134,7 @@ def estimate_rare_failure(
 
 
 def is_spread_beyond_formula(rare: SubsetSimulation) -> bool:
-    """Return whether the replicates of a subset simulation differ more than the formula can explain."""
+    """Return whether the replicates differ more than the variance formula for a single run can explain."""
     return rare.coefficient_of_variation > MAX_SPREAD_RATIO * rare.formula_coefficient_of_variation
 
 

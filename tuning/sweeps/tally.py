@@ -53,7 +53,7 @@ class Tally(NamedTuple):
 
     @property
     def left_out(self) -> int:
-        """Return the number of scenarios that `replicates` does not count."""
+        """Return the number of computed scenarios that belong to none of the replicates."""
         return self.scenarios - sum(number for number, _ in self.replicates)
 
 
@@ -78,8 +78,8 @@ class QuantileEstimate(NamedTuple):
 def build_empty_tally(replicates: int, scenarios: int = MAX_SCENARIOS, looked_at: bool = False) -> Tally:
     """Return a tally without rows, for a sweep of `scenarios` scenarios.
 
-    If `looked_at` is true, rows must be added in the order of their index; the confidence interval is then
-    valid even if the sweep stops early.
+    `looked_at` states that the sweep may stop early. The confidence interval is then valid if the rows are
+    added in the order of their index.
     """
     return Tally(
         (0,) * len(SCENARIO_OUTCOMES),
@@ -92,7 +92,7 @@ def build_empty_tally(replicates: int, scenarios: int = MAX_SCENARIOS, looked_at
 
 
 def add_to_tally(tally: Tally, rows: Mapping[str, np.ndarray]) -> Tally:
-    """Return the tally with further rows, with columns `index`, `outcome`, `failed` and `worst_error`."""
+    """Add rows with the columns `index`, `outcome`, `failed` and `worst_error`; return the new tally."""
     index, outcome, failed = rows["index"], rows["outcome"], rows["failed"]
     outcomes = np.bincount(outcome, minlength=len(SCENARIO_OUTCOMES))
     replicates, errors = _add_to_replicates(tally, rows)
@@ -168,7 +168,7 @@ def estimate_error_quantiles(tally: Tally) -> list[QuantileEstimate]:
 
 
 def _add_to_replicates(tally: Tally, rows: Mapping[str, np.ndarray]):
-    """Add the rows to the replicates; return (scenarios, failures) and the histogram of each replicate."""
+    """Add rows to the replicates; return, by replicate, counts (scenarios, failures) and histograms."""
     used = rows["index"] < tally.whole
     replicate = rows["index"][used] % len(tally.replicates)
     sizes, failed = compute_error_sizes(rows)[used], rows["failed"][used]
