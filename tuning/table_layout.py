@@ -10,11 +10,11 @@ MIN_BROKEN_NAME = 24  # length of the shortest dotted name that a narrow table b
 
 
 def fit_table(table: Table, console: Console) -> int:
-    """Fit a table to the console, and return its width [characters], at least that of the console.
+    """Fit a table to the console; return the larger of the table's and the console's width [characters].
 
-    If the console is too narrow, break headings to the width of their column's cells, wrap texts between
-    words, and if necessary break dotted names before their last part. The table may still be too wide; the
-    terminal then wraps its lines.
+    If the console is too narrow, wrap each heading at the width of its column's cells, and wrap texts
+    between words. If necessary, also break dotted names before their last part. The table may still be too
+    wide; the terminal then wraps its lines.
     """
 
     def full_width() -> int:
@@ -44,7 +44,7 @@ def fit_table(table: Table, console: Console) -> int:
 
 
 def _count_breakable(column: Column) -> int:
-    """Return the number of characters by which breaks between words make a column narrower."""
+    """Return how much narrower a column can become by line breaks between words [characters]."""
     if column.no_wrap:
         return 0
     lines = _lines(column)
@@ -52,7 +52,7 @@ def _count_breakable(column: Column) -> int:
 
 
 def _lines(column: Column) -> list[str]:
-    """Return the lines of heading and cells."""
+    """Return the text lines of a column's heading and cells."""
     return [line for cell in (*column.cells, column.header) for line in str(cell).splitlines()]
 
 

@@ -33,7 +33,7 @@ MIN_SHARE_FOR_RATE = 0.05  # finished share of the work above which the rate is 
 
 
 def emit(*things: RenderableType, wrap: bool = True) -> None:
-    """Print tables and texts on standard output; if `wrap` is true, wrap long texts. Ignore a closed pipe."""
+    """Print tables and texts on standard output; wrap long texts if `wrap` is true; ignore a closed pipe."""
     with _convert_output_errors():
         for thing in things:
             console = _make_console(sys.stdout)
@@ -65,7 +65,7 @@ def emit_json(command: str, document: Mapping[str, Any]) -> None:
 
 
 def emit_json_error(command: str, verdict: str, problems: Sequence[str]) -> None:
-    """Print the JSON document of a command without a result: a verdict and one-line messages."""
+    """Print the JSON document of a failed command: its verdict, and messages of one line each."""
     schema = {"schema": "jaxhil/error/1", "command": command}
     print_json({**schema, "verdict": verdict, "problems": list(problems)})
 
@@ -111,7 +111,7 @@ def build_table(
 
 
 def format_error(value: float | None) -> str:
-    """Return a restitution error as text with its sign, or a dash if it is None or NaN."""
+    """Return a restitution error as text with a sign, or a dash if the error is None or NaN."""
     return "-" if value is None or value != value else f"{value:+.4f}"
 
 
@@ -122,7 +122,7 @@ def format_ratio(value: float, ideal: float) -> str:
 
 
 def format_key(key: str) -> str:
-    """Return a dotted key with its list indices in brackets: `a.0` and the column `a_1` become `a[0]`."""
+    """Return a dotted key with list indices in brackets: `a.0` and the sweep column `a_1` become `a[0]`."""
     key = COLUMN_INDEX.sub(lambda match: f".{int(match[1]) - 1}", key)
     return "".join(f"[{part}]" if part.isdigit() else f".{part}" for part in key.split("."))[1:]
 
@@ -158,12 +158,12 @@ class Progress:
 
     @property
     def rate(self) -> float | None:
-        """Return the work units done per second, without skipped units; None before the first is done."""
+        """Return the rate [units/s] of the work done in this run; None before any work is done."""
         worked, duration = self._done - self._skipped, time.monotonic() - self._begun
         return worked / duration if worked > 0 and duration > 0 else None
 
     def skip(self, number: float) -> None:
-        """Count `number` units as done by an earlier run; they do not affect the rate."""
+        """Count `number` units as done by an earlier run; `rate` does not include them."""
         self._done += number
         self._skipped += number
         self._begun = time.monotonic()
@@ -173,7 +173,7 @@ class Progress:
         self.reach(self._done + number, text)
 
     def reach(self, done: float, text: str | None = None) -> None:
-        """Set the total number of units done; if given, `text` becomes the current activity or result."""
+        """Set the number of units done so far; if given, `text` becomes the current activity or result."""
         with self._lock:
             self._done = max(self._done, done)
             self._text = self._text if text is None else text
@@ -188,7 +188,7 @@ class Progress:
     def tell(self, text: str, done: float, skipped: float = 0.0) -> None:
         """Show `text` as the current activity.
 
-        `done` is the number of units done in total, and `skipped` the number done by an earlier run.
+        `done` is the number of units done so far, and `skipped` how many of them an earlier run did.
         """
         with self._lock:
             self._done, self._skipped = max(self._done, done), skipped
@@ -201,16 +201,16 @@ class Progress:
             self.say(text)
 
     def turn_to(self, text: str) -> None:
-        """Begin a unit that may be short; the previous unit, if any, counts as done.
+        """Count the previous unit, if any, as done, and make `text` the activity of the next unit.
 
-        Without a progress bar, `text` is printed only if no line was printed for `PROGRESS_INTERVAL`.
+        Without a bar, print `text` only if no line was printed in the last `PROGRESS_INTERVAL` seconds.
         """
         with self._lock:
             self._end_unit()
             self.reach(self._done, text)
 
     def remind(self) -> None:
-        """Print the current progress again if no line was printed for `MAX_SILENCE`."""
+        """Print the current progress again if no line was printed in the last `MAX_SILENCE` seconds."""
         with self._lock:
             self._show(due=MAX_SILENCE)
 
@@ -220,7 +220,7 @@ class Progress:
         self._begun_stage = True
 
     def _show(self, due: float) -> None:
-        """Update the bar. Without a bar, print a line if the last one is at least `due` seconds old."""
+        """Update the bar or, without a bar, print a line if the last line is at least `due` seconds old."""
         if self._bar is not None:
             rate = self._format_rate()
             self._bar.update(self._task, completed=self._done, description=self._text, pace=rate)
@@ -229,7 +229,7 @@ class Progress:
             self._note(", ".join(filter(None, [self._format_done(), self._format_rate(), self._text])))
 
     def _format_done(self) -> str:
-        """Return the work done as text, in units or, for a single unit, in percent."""
+        """Return the work done as text: in units, or in percent if the whole work is a single unit."""
         if self._done <= 0:
             return ""
         if self._total == 1:
@@ -323,7 +323,7 @@ def _make_console(stream) -> Console:
 
 
 def _width_without_terminal() -> int:
-    """Return the width of piped output: `COLUMNS`, or the width of a terminal on another standard stream."""
+    """Return the width of piped output: `$COLUMNS`, else a terminal's on any standard stream, else 80."""
     if (columns := os.environ.get("COLUMNS", "")).isdigit() and int(columns) > 0:
         return int(columns)
     for descriptor in range(3):
@@ -346,7 +346,7 @@ def _convert_output_errors() -> Iterator[None]:
 
 
 def _redirect_to_null(stream: Any) -> None:
-    """Redirect a stream to the null device, so that later writes do not fail and change the exit code."""
+    """Redirect a stream to the null device, because a failed flush at exit would change the exit code."""
     try:
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())

@@ -25,7 +25,7 @@ def perturb_damping(
 ) -> tuple[Mechanism, dict[str, np.ndarray]]:
     """Add damping to a mechanism, with a different damping ratio for each draw.
 
-    Return the mechanism, whose contact law has damping, and the draws with the additional damping. Raise
+    Return a mechanism with a damped contact law, and the draws with the additional damping. Raise
     `InputError` if the contact law does not define how to add damping.
     """
     number = len(next(iter(draws.values())))
@@ -69,5 +69,5 @@ def _compute_masses(mechanism: Mechanism, draws: Mapping[str, np.ndarray]) -> Fl
 
 
 def _repeat_last_entry(values: np.ndarray, entries: int) -> np.ndarray:
-    """Extend the values of each draw to `entries` columns by repeating the last column."""
+    """Extend `values`, (draws, columns), to `entries` columns by repeating the last column."""
     return values[:, np.minimum(np.arange(entries), values.shape[1] - 1)]

@@ -34,7 +34,7 @@ BEST_AT_ONE = ("early", "late", "slope")
 
 
 class PerturbedOutcomes(NamedTuple):
-    """Outcomes of one compensator with one set of gains, each (contacts, scenarios)."""
+    """Outcomes of one compensator without and with perturbations, each (contacts, scenarios)."""
 
     plain: Outcome  # scenarios without a perturbation
     early: Outcome  # the same scenarios with an early push on the first contact
@@ -57,7 +57,7 @@ def compute_metrics(
         outcomes: outcomes of the scenarios, with and without perturbations.
         pushed: restitution e* of the first ideal contacts with the early push, and with the late push.
         unpushed: restitution e* of the first ideal contacts without a push, from the same numerical
-            integration.
+            integration as `pushed`.
         depth: largest penetration of each ideal contact [m].
         amplification: amplification of white force noise by the compensator [1].
         limit: limit of the restitution error [1].
@@ -77,7 +77,7 @@ def compute_metrics(
 def compute_error_metrics(outcome: Any, limit: float, seed: int) -> dict[str, IntervalEstimate]:
     """Compute the metrics `rms`, `p99`, `worst` and `failures` of an outcome (slots, scenarios).
 
-    `limit` [1] is the limit of the error, `seed` the seed of the bootstrap.
+    `limit` [1] is the limit of the restitution error, `seed` the seed of the bootstrap.
     """
     good = outcome.good
     magnitudes = np.abs(outcome.error[good])
@@ -97,9 +97,10 @@ def compute_error_metrics(outcome: Any, limit: float, seed: int) -> dict[str, In
 
 
 def compute_ratio_metrics(outcome: Any, names: Sequence[str], seed: int) -> dict[str, IntervalEstimate]:
-    """Compute the 99th percentiles of attributes of an outcome that are ratios to the ideal contact.
+    """Compute the 99th percentile of each ratio in `names`, with its bootstrap interval.
 
-    `names` are the names of the attributes, `seed` is the seed of the bootstrap.
+    Each name is an attribute of `outcome`: a value divided by a value of the ideal contact. `seed` is the
+    seed of the bootstrap.
     """
     return {
         name: bootstrap_metric(_compute_99th_percentile, seed, outcome.good, getattr(outcome, name))
@@ -113,7 +114,7 @@ def compute_transparency_metrics(
     unpushed: Float[np.ndarray, "scenarios"],
     seed: int,
 ) -> dict[str, IntervalEstimate]:
-    """Compute the metrics `early`, `late`, `slope` and `peak`, with the arguments of `compute_metrics`."""
+    """Compute the metrics `early`, `late`, `slope` and `peak`; for the arguments, see `compute_metrics`."""
     plain: Any = outcomes.plain
     damped: Any = outcomes.damped
     metrics = {}
@@ -133,10 +134,10 @@ def compute_transparency_metrics(
 def fit_transmission(
     change: Float[np.ndarray, "*resamples contacts"], true: Float[np.ndarray, "*resamples contacts"]
 ) -> Float[np.ndarray, "*resamples"]:
-    """Return the slope of a least-squares line through the origin, of `change` against `true`.
+    """Return the slope of the least-squares line through the origin, of `change` against `true`.
 
-    A push changes the restitution e on the rig by `change`, and the restitution e* of the ideal contact by
-    `true`. NaN values are ignored.
+    A push (short additional force on the hardware) changes the restitution e on the rig by `change`. In the
+    ideal contact, the same push changes e* by `true`. NaN values are ignored.
     """
     return np.nansum(change * true, axis=-1) / np.nansum(true**2, axis=-1)
 
@@ -169,9 +170,9 @@ def bootstrap_metric(
     Source: Efron and Tibshirani, "An Introduction to the Bootstrap" (1993), chapter 13.
 
     Args:
-        function: metric of arrays (..., contacts), one for each array in `data`; it must ignore NaN.
+        function: computes the metric from one array (..., contacts) for each array in `data`; ignores NaN.
         seed: seed of the bootstrap.
-        good: whether each contact has ended; the others become NaN.
+        good: whether each contact has ended; the values of all other contacts become NaN.
         *data: values of each contact.
     """
     slots, scenarios = np.any(good, axis=1), np.any(good, axis=0)
@@ -200,7 +201,7 @@ def bootstrap_metric(
 
 
 def compute_distance_from_best(name: str, metric: IntervalEstimate) -> IntervalEstimate:
-    """Return the distance of a metric from its best value, which is 1 for `BEST_AT_ONE` and otherwise 0.
+    """Return the distance of a metric from its best value: 1 for the names in `BEST_AT_ONE`, otherwise 0.
 
     The bounds of the distance are NaN if the metric has no interval.
     """
@@ -214,8 +215,8 @@ def compute_distance_from_best(name: str, metric: IntervalEstimate) -> IntervalE
 def find_winner(name: str, figures: dict[str, IntervalEstimate]) -> str | None:
     """Return the compensator whose metric is significantly the best, or None.
 
-    Its interval must not overlap with the interval of any other compensator. `figures` contains the metric
-    `name` of each compensator.
+    `figures` contains the metric `name` of each compensator. The interval of the best one's distance from
+    the best value must not overlap with the interval of any other compensator's distance.
     """
     distances = {law: compute_distance_from_best(name, metric) for law, metric in figures.items()}
     finite = {law: d for law, d in distances.items() if np.isfinite(d.value) and np.isfinite(d.high)}

@@ -38,7 +38,7 @@ ANTICIPATING_WEIGHTS = {"transparency_weight": 1.0, "command_weight": 0.3}
 
 
 class ProbedScenarios(NamedTuple):
-    """Batch of scenarios with their transparency probes, and the restitution e* of their ideal contacts."""
+    """Scenarios, their transparency probes (copies with a push or more damping), and e* of ideal contacts."""
 
     scenarios: Scenario  # scenarios and probes, (..., scenarios * `LANES_PER_SCENARIO`)
     plain: Any  # restitution e* of the first ideal contact without a push [1], (scenarios,)
@@ -47,24 +47,25 @@ class ProbedScenarios(NamedTuple):
 
 
 def choose_default_weights(compensator: str, axes: int = 1) -> dict[str, float]:
-    """Return the default weights of `tuning.gains.objective.Objective` for a compensator, by name.
+    """Return the weights of a compensator's default objective (`tuning.gains.objective.Objective`), by name.
 
-    If the compensator predicts the contact, the errors of probes and of scenarios have the same weight.
-    Excess force is penalised, because such a compensator can correct a late response by a short, large force,
-    which the restitution error alone would reward. For other compensators the dictionary is empty.
+    If the compensator predicts the contact, the errors of transparency probes (copies of the scenarios with
+    a push or more damping) have the same weight as the errors of the scenarios. Excess force is penalised,
+    because such a compensator can correct a late response by a short, large force. The restitution error
+    alone would reward this. For other compensators, the dictionary is empty.
     """
     return dict(ANTICIPATING_WEIGHTS) if get_compensator(compensator, axes).anticipates else {}
 
 
 def mask_probes(lanes: int) -> np.ndarray:
-    """Return whether each of the first `lanes` lanes of `ProbedScenarios` is a probe, (lanes,) of bool."""
+    """Return which of the first `lanes` lanes of `ProbedScenarios` are probes, (lanes,) of bool."""
     return np.arange(lanes) % LANES_PER_SCENARIO > 0
 
 
 def build_probed_scenarios(
     mechanism: Mechanism, draws: Mapping[str, np.ndarray] | None = None, seed: int = 0
 ) -> ProbedScenarios:
-    """Build scenarios as `jaxhil.simulation.scenario.build_scenarios` does, and add the probes of each."""
+    """Build scenarios (see `build_scenarios`), each with copies: early push, late push, more damping."""
     plain = build_scenarios(mechanism, draws, seed)
     number = len(plain.velocity)
     perturbed, damped = perturb_damping(mechanism, draws or {"approach.phase": np.asarray(plain.phase).T})
@@ -95,7 +96,7 @@ def _add_push(
 ) -> Scenario:
     """Add a push on the first contact, centred at the fraction `centre` of the ideal contact's duration.
 
-    `restitution` is the restitution e* of the ideal contact with the push. With `centre` None, add no push.
+    `restitution` is the restitution e* of the ideal contact with the push. Without `centre`, add no push.
     """
     values = np.full((3, *ideal_contacts.peak_force.shape), np.nan)
     if centre is not None:
@@ -108,9 +109,10 @@ def _add_push(
 
 
 def compute_probe_metrics(probed: ProbedScenarios, outcome: Outcome) -> dict[str, IntervalEstimate]:
-    """Compute the metrics `early`, `late`, `slope` and `peak` from the outcome of probed scenarios.
+    """Compute the metrics `early`, `late`, `slope` and `peak` of scenarios with transparency probes.
 
-    The leaves of `outcome` have the shape (slots, scenarios, `LANES_PER_SCENARIO`).
+    The arrays in `outcome` have the shape (slots, scenarios, `LANES_PER_SCENARIO`). The last axis contains
+    the scenario itself and its copies with an early push, a late push and more damping.
     """
     plain, early, late, damped = (
         jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[..., i], outcome) for i in range(LANES_PER_SCENARIO)

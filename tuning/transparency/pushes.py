@@ -37,7 +37,7 @@ LANES_PER_CALL = 256  # number of contacts that are integrated in one call, to l
 
 
 class IdealContacts(NamedTuple):
-    """Ideal contacts of many scenarios, with and without pushes."""
+    """Ideal contacts of many scenarios without pushes, and e* of the first ideal contacts with a push."""
 
     restitution: Float[np.ndarray, "slots scenarios"]  # restitution e* without a push [1]
     peak_force: Float[np.ndarray, "slots scenarios"]  # peak force without a push [N]
@@ -53,9 +53,10 @@ def compute_ideal_contacts(
     velocity: Float[np.ndarray, "slots scenarios"],
     contacts: int,
 ) -> IdealContacts:
-    """Compute the first `contacts` ideal contacts of every scenario, with and without pushes.
+    """Compute ideal contacts of every scenario without pushes, and the first contact also with pushes.
 
-    `velocity` contains the approach speeds [m/s]. Slots after the first `contacts` repeat the last contact.
+    `velocity` contains the approach speeds [m/s]. Only the first `contacts` ideal contacts are computed; all
+    later entries of the axis `slots` repeat the last of them.
     """
     slots, number = velocity.shape
     contact = jax.tree.map(lambda leaf: np.asarray(leaf)[:contacts], scenarios.contact)
@@ -63,7 +64,7 @@ def compute_ideal_contacts(
     mass = np.broadcast_to(scenarios.equivalent_mass, (contacts, number))
 
     def integrate(parameters, mass, velocity, size, centre) -> Any:
-        """Integrate all contacts, `LANES_PER_CALL` in each call."""
+        """Integrate the motion of all contacts, in chunks of `LANES_PER_CALL` contacts."""
         leaves = parameters, mass, velocity, size, centre
         lanes = mass.size
         flat = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], lanes), leaves)
@@ -103,9 +104,9 @@ def compute_ideal_contacts(
 
 
 def add_probe(scenarios: Scenario, space: Any, share: float | None = None) -> Scenario:
-    """Add the motion of the ideal contacts to scenarios and, if `share` is given, a push.
+    """Add the motion of the ideal contacts `space` to their scenarios and, if `share` is given, a push.
 
-    The push is centred at the fraction `share` of the first ideal contact's duration.
+    The push acts on the first contact, centred at the fraction `share` of this ideal contact's duration.
     """
     size: Any = np.zeros_like(space.peak_force)
     centre: Any = np.zeros_like(space.peak_force)

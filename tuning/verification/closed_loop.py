@@ -151,7 +151,7 @@ def _advance(
     command: Array,
     sent: Array,
 ) -> RunState:
-    """Compute stages 3 to 6 of a tick from the force command [N] and the position command `sent` [m]."""
+    """Complete a tick after the controller, with its force command [N] and position command `sent` [m]."""
     state, now = run.state, run.tick
     model = integrate(loop, rig, state, command)
     actuated = actuate(loop, rig, gains, state, now, model, SentCommand(sent, state.controller))

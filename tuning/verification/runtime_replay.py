@@ -62,7 +62,7 @@ class LaneReplay(msgspec.Struct, frozen=True):
 
 
 class ContactComparison(msgspec.Struct, frozen=True):
-    """Comparison of one nominal contact in two loops: with the runtime, and with the JAX controller."""
+    """Comparison of one nominal contact with the rig's runtime and with the JAX controller in the loop."""
 
     restitution: float | None  # restitution with the runtime [1]; None if the contact does not end
     simulated_restitution: float | None  # JAX controller's restitution [1]; None if the contact does not end
@@ -153,7 +153,7 @@ def verify(
 
 
 def replay_lane(lane: LaneRecord, gain_file: GainFile) -> LaneReplay:
-    """Replay the recorded signals of a run in the runtime; compare its commands with the recorded ones."""
+    """Replay a recorded run in the runtime; compare the runtime's commands with the recorded commands."""
     controller = Controller(gain_file)
     commands, positions, stiffness, damping = compute_runtime_commands(controller, lane)
     near = find_threshold_ticks(lane.signals, gain_file)
@@ -245,8 +245,8 @@ def find_divergence_tick(
 ) -> int | None:
     """Return the first tick in which runtime and simulation decide differently at a threshold, or None.
 
-    This is the first tick near a threshold with a difference of commands or estimates. The result is None if
-    there is no such tick, or if a tick before it has such a difference.
+    This is the first tick near a threshold in which the commands or the estimates differ. The result is None
+    if there is no such tick, or if commands or estimates already differ in an earlier tick.
 
     Args:
         error: relative difference of the force commands, (ticks,).
@@ -266,12 +266,12 @@ def find_divergence_tick(
 
 
 def find_threshold_ticks(signals: Signals, gain_file: GainFile) -> np.ndarray:
-    """Return whether a value of the compensator is near a threshold, for each tick, (ticks,) of bool.
+    """Return for each tick whether a value of the compensator is near a threshold, (ticks,) of bool.
 
-    Compensators that identify the contact have two thresholds. The first is each surface, for the
-    delay-aligned position; near means within `THRESHOLD_TOLERANCE` times the largest measured position. The
-    second is the contact threshold, for the magnitude of the force in contact; near means within
-    `THRESHOLD_TOLERANCE` times the larger of force and threshold.
+    Compensators that identify the contact have two kinds of threshold: the surfaces, for the delay-aligned
+    position, and the contact threshold, for the magnitude of the force in contact. The position is near a
+    surface if their distance is below `THRESHOLD_TOLERANCE` times the largest measured position. The force
+    is near its threshold if the difference is below `THRESHOLD_TOLERANCE` times the larger of the two.
     """
     gains, clearance = gain_file.gains, gain_file.clearance
     near = np.zeros(len(signals.age), bool)

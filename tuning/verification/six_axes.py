@@ -103,7 +103,7 @@ def verify_six_axes(
 def run_six_axis_loop(
     loaded: LoadedGains, gain_file: SixAxisGainFile, ticks: int, seed: int = 0
 ) -> FinalTwist:
-    """Run `ticks` ticks of the nominal scenario with the rig's controller and with the JAX compensator."""
+    """Simulate the nominal run with the rig's and with the JAX controller; compare the final twists."""
     scenario = draw_scenarios(loaded.mechanism, 0, seed)
     loop = six_axis_loop(loaded.mechanism, loaded.compensator, scenario)
     gains = {name: jnp.asarray(value) for name, value in loaded.gains.items()}
@@ -131,7 +131,7 @@ def run_six_axis_loop(
 
 
 def compare_final_twists(found: np.ndarray, simulated: np.ndarray, ticks: int, status: str) -> FinalTwist:
-    """Compare the final twist of a run (6,) [m/s, rad/s] with that of the simulation."""
+    """Compare the final twist `found` of a run with the `simulated` final twist, both (6,) [m/s, rad/s]."""
     worst = 0.0
     for part in (slice(0, 3), slice(3, 6)):
         size = float(np.max(np.abs(simulated[part])))
@@ -155,7 +155,7 @@ def _sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
 
 @partial(jax.jit, static_argnums=0)
 def _integrate(loop: Loop, rig: RigConstants, state: RunState, command: Any) -> tuple[Any, ...]:
-    """Return the numerical model after a tick with the wrench `command` (6, lanes)."""
+    """Return the numerical model's state and motion after a tick with the wrench `command` (6, lanes)."""
     return integrate(loop, rig, state, _wrench(command))
 
 
@@ -174,7 +174,7 @@ def _wrench(command: Any) -> Wrench:
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _simulated_twist(loop: Loop, ticks: int, gains: dict[str, Any], scenario: Scenario) -> Any:
-    """Return the twist (6, lanes) after `ticks` ticks with the JAX compensator."""
+    """Return the numerical model's twist (6, lanes) after `ticks` ticks with the JAX compensator."""
     state, _ = run(loop, gains, scenario, ticks)
     return model_motion(scenario.bodies, state.states)[2]
 

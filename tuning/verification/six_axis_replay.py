@@ -33,12 +33,12 @@ class SixAxisReplay(msgspec.Struct, frozen=True):
 
 
 def six_axis_loop(mechanism: SixAxisMechanism, compensator: str, scenario: Scenario) -> Loop:
-    """Return the loop of a batch of scenarios, in which the pose is always measured."""
+    """Build the simulated loop of a batch of scenarios; always measure the pose, even if nothing reads it."""
     return dataclasses.replace(make_loop(mechanism, compensator, scenario), measures_pose=True)
 
 
 def draw_scenarios(mechanism: SixAxisMechanism, number: int, seed: int) -> Scenario:
-    """Draw `number` scenarios with the nominal control period; return the nominal scenario for 0."""
+    """Draw `number` scenarios with nominal control period; if `number` is 0, return the nominal scenario."""
     if not number:
         return build_drawn_scenarios(mechanism, {}, seed)
     return build_drawn_scenarios(mechanism, draw(mechanism, number, seed), seed)
@@ -65,7 +65,7 @@ def record_runs(
 def record_scenarios(
     mechanism: SixAxisMechanism, compensator: str, gains: Mapping[str, float], scenario: Scenario
 ) -> tuple[Metrics, list[ControllerRecord]]:
-    """Return metrics and records of the runs of a batch of scenarios."""
+    """Simulate a batch of scenarios; return their metrics and the controller's record of each run."""
     loop = six_axis_loop(mechanism, compensator, scenario)
     return record_controller(loop, {name: jnp.asarray(value) for name, value in gains.items()}, scenario)
 
@@ -99,9 +99,10 @@ def compare_record(controller: Controller6, record: ControllerRecord) -> SixAxis
 
 
 def command_difference(commands: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Return the largest difference in each tick, divided by the range of the expected values, (ticks,).
+    """Return the largest relative difference of `commands` and `expected` in each tick, (ticks,).
 
-    Force and torque (or translation and rotation) have separate ranges.
+    A difference is divided by the range of the expected values, including 0. Force and torque (or
+    translation and rotation) have separate ranges.
     """
     worst = np.zeros(len(commands))
     for part in (slice(0, 3), slice(3, 6)):

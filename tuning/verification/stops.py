@@ -143,7 +143,7 @@ class RecordingController:
         )  # fmt: skip
 
     def _record_faults(self) -> None:
-        """Store the first faults on which the controller acts; `LAW_IN_DOUBT` is not such a fault."""
+        """Store the first faults on which the controller acts; it does not act on `LAW_IN_DOUBT`."""
         if not self._acting:
             self._acting = self.controller.cause or self.controller.faults & ~faults.LAW_IN_DOUBT
 
@@ -162,10 +162,10 @@ class RecordingController:
         return watchdog
 
     def _describe_value(self, fault: int, watchdog: Watchdog) -> tuple[float | None, str | None, str]:
-        """Return the value that violates the limit of a fault, the limit's name, and a description.
+        """Return the value that violates a fault's limit, the limit's name, and a description of the value.
 
-        The value is None if it cannot be compared with the limit; value and name are None if the fault has no
-        limit.
+        The value is None if it cannot be compared with the limit. If the fault has no limit, value and name
+        are None, and the description is empty.
         """
         names = FAULT_LIMITS.get(fault)
         if not names:
@@ -218,9 +218,9 @@ class RecordingController:
         return math.nan if math.isfinite(before) else abs(sent - self._ticks[-1].measured)
 
     def _compute_travel(self, constant: str, moving: str, in_contact: bool) -> float:
-        """Return the distance [m] that the signal `moving` has travelled since the signal `constant` changed.
+        """Return the distance [m] that `moving` has travelled since the last change of the signal `constant`.
 
-        With `in_contact`, only the travel since the last tick without contact counts.
+        With `in_contact`, the distance begins at the last tick without contact, if this is later.
         """
         travel, clearance = 0.0, self._gain_file.clearance
         for tick in range(len(self._ticks) - 1, 0, -1):
@@ -233,7 +233,7 @@ class RecordingController:
         return travel
 
     def _compute_unlimited_commands(self) -> tuple[float, float, float]:
-        """Return the commands that the controller would have sent without limits.
+        """Return the commands that the same controller would have sent without limits.
 
         These are the force command [N] of the last recorded tick, and the last two position commands [m].
         """
@@ -288,7 +288,7 @@ def find_passing_limits(gain_file: GainFile, lane: "LaneRecord") -> dict[str, fl
 
 
 def describe_limit_changes(passing: Mapping[str, float] | None) -> str:
-    """Describe how the user can change limits so that they do not stop a run."""
+    """Describe to the user the limits `passing`, with which the controller does not stop a run."""
     if not passing:
         return "no change of limits prevents this"
     changes = " ".join(f"--set {name}={value:g}" for name, value in passing.items())
@@ -296,7 +296,7 @@ def describe_limit_changes(passing: Mapping[str, float] | None) -> str:
 
 
 def _widen_limit(name: str, found: float) -> float:
-    """Return a limit beyond the value `found`, rounded outward to two digits."""
+    """Return a limit beyond the value `found`, rounded outward to two significant digits."""
     outward = -1.0 if name.endswith("_lowest") else 1.0
     value = found + outward * (LIMIT_WIDENING - 1) * abs(found)
     unit = 10.0 ** (math.floor(math.log10(abs(value))) - 1) if value else 1.0

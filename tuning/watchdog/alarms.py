@@ -57,7 +57,10 @@ def find_good_runs(runs: EvaluatedRuns, limit: float) -> Bool[np.ndarray, "lanes
 
 
 def find_reached_contacts(runs: EvaluatedRuns, limit: float) -> Bool[np.ndarray, "slots lanes"]:
-    """Return for each contact whether it occurs on the rig, where a run ends after its first bad contact."""
+    """Return for each contact whether the rig reaches it: no earlier contact of its run is bad.
+
+    A contact is bad if it does not end, or if its error exceeds `limit`.
+    """
     bad = (runs.status != OK) | ~(np.abs(runs.error) <= limit)
     first = find_first_true(bad)
     return (np.arange(len(bad))[:, None] <= first) & runs.audited.occurred
@@ -80,11 +83,11 @@ def compute_alarm_rates(
 ) -> dict[str, Any]:
     """Compute the rates of false and missed alarms, with exact 95 % intervals, as JSON data.
 
-    A good run has no error above half the limit; its stop by the watchdog or another guard is a false alarm.
-    A bad run has a contact that does not end or has an error beyond the limit. If the watchdog has not
-    tripped by the end of this contact, the alarm is missed. The intervals are exact for independent
-    scenarios, and conservative for points of a Sobol sequence. The result also contains the smallest
-    detectable error (`find_detectable_error`).
+    A good run has no error above half the limit. A false alarm is a good run that the watchdog or another
+    guard stops. A bad contact does not end, or has an error beyond the limit. A missed alarm is a run in
+    which the watchdog does not trip up to and including the first bad contact. The intervals are exact for
+    independent scenarios; for points of a Sobol sequence, they are wider than necessary. The result also
+    contains the smallest detectable error (`find_detectable_error`).
 
     Args:
         runs: recorded runs.
@@ -137,7 +140,7 @@ def find_alarms(
 
 
 def find_guard_trips(extent: SignalExtremes, limits: Mapping[str, float | None]) -> Bool[np.ndarray, "lanes"]:
-    """Return for each run whether a guard, apart from the watchdog, would act on a reading or a command."""
+    """Return for each run whether a reading or a command violates a limit; omit the watchdog's limits."""
 
     def limit(name: str, unlimited: float = np.inf) -> float:
         value = limits[name]
@@ -161,11 +164,10 @@ def find_guard_trips(extent: SignalExtremes, limits: Mapping[str, float | None])
 def find_detectable_error(
     error: Float[np.ndarray, "contacts"], alarmed: Bool[np.ndarray, "contacts"]
 ) -> dict[str, Any]:
-    """Return the smallest detectable error: 95 % of the contacts with at least this |error| raise an alarm.
+    """Return the smallest |error| from which on at least 95 % of the contacts raise an alarm.
 
-    The keys of the result are `error` (None if no error is detectable, or if fewer than 20 contacts have at
-    least this error), `contacts` (the number of these contacts), and `largest` (the largest |error| of all
-    contacts).
+    The result contains `error` (this value; None if there is none with at least 20 contacts), `contacts`
+    (number of contacts from this value on) and `largest` (largest |error| of all contacts).
     """
     magnitude = np.abs(error)
     order = np.argsort(-magnitude)

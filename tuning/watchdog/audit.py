@@ -82,7 +82,7 @@ class _AuditState:
     def audit(self, where: Bool[np.ndarray, "lanes"], velocity: np.ndarray, extra: np.ndarray) -> None:
         """Audit the contacts that end in the lanes `where`.
 
-        `velocity` [m/s] is the rebound velocity, `extra` [J] the work of the last force command.
+        `velocity` [m/s] is the rebound velocity, and `extra` [J] is the work of the last force command.
         """
         lanes = np.nonzero(where & (self.count < self.slots))[0]
         mass = self.rules.mass
@@ -186,7 +186,7 @@ class _LaneDelayLine:
     def step(self, position: np.ndarray, velocity: np.ndarray, begins: np.ndarray) -> np.ndarray:
         """Return the delayed position [m].
 
-        In the lanes `begins`, a run begins; the motion before this tick is assumed to be uniform.
+        `begins` marks the lanes in which a run begins. Their motion before this tick is assumed uniform.
         """
         if not self._past:
             self._past = [np.zeros_like(position)] * (self._whole + 1)

@@ -76,9 +76,9 @@ def calibrate(
         scenarios: number of scenarios. Default: all scenarios of the sweep, or 2048 draws.
         limit: limit of the restitution error [1]. Default: the limit of the sweep, or 0.01.
         lanes: number of scenarios that are simulated together.
-        replaced: limits that replace the calibrated limits, also in the estimation of the rates.
+        replaced: limits by name, used instead of the calibrated limits, also to estimate the alarm rates.
         allowed: largest acceptable alarm rates.
-        progress: callback, called with the number of runs that have been completed since the last call.
+        progress: callback, called with the number of runs that have been completed since its last call.
         faulty: number of scenarios for each injected fault (`tuning.watchdog.fault_injection`). 0: inject no
             faults.
 
@@ -120,7 +120,7 @@ def calibrate(
 def _origin(
     chosen: ScenarioSelection, store: SweepStore | None, used: Bool[np.ndarray, "lanes"], are_good: bool
 ) -> dict[str, Any]:
-    """Return a description of the runs from which the limits were computed, as plain data."""
+    """Describe the runs `used` for the limits as plain data; `are_good` is whether these are good runs."""
     return {
         "scenarios": chosen.number,
         "sampling": chosen.sampling,
@@ -133,7 +133,7 @@ def _origin(
 
 
 def choose_error_limit(limit: float | None, store: SweepStore | None, default: float) -> float:
-    """Return `limit` or, if it is None, the sweep's limit (without a sweep, `default`)."""
+    """Return `limit`, else the sweep's limit, else `default`; raise `InputError` unless it is positive."""
     if limit is None and store is not None:
         limit = store.manifest.limit
     limit = default if limit is None else limit
@@ -143,7 +143,7 @@ def choose_error_limit(limit: float | None, store: SweepStore | None, default: f
 
 
 def build_audit_rules(loaded: LoadedGains) -> tuple[AuditRules, float]:
-    """Compute from the mechanism the parameters of the watchdog's audit, and the free distance [m].
+    """Compute the parameters of the watchdog's audit and the free distance [m] from the mechanism.
 
     The mechanism counts as in free flight if it is farther than the free distance from every surface.
     """
@@ -172,7 +172,7 @@ def build_audit_rules(loaded: LoadedGains) -> tuple[AuditRules, float]:
 def fit_reached_contacts(
     runs: EvaluatedRuns, limit: float, mass: float, chosen: Bool[np.ndarray, "lanes"]
 ) -> ExpectationFit:
-    """Fit the expected restitution to the contacts that the rig would reach in the chosen runs."""
+    """Fit the expected restitution to the chosen runs, up to the first bad contact of each run."""
     use = find_reached_contacts(runs, limit) & (runs.status == OK) & chosen & (runs.audited.approach > 0)
     run = np.broadcast_to(np.cumsum(chosen), use.shape)[use]
     features = ContactFeatures(*(leaf[use] for leaf in extract_features(runs.audited)))
@@ -186,7 +186,7 @@ def compute_guard_limits(
     rules: AuditRules,
     free_distance: float,
 ) -> dict[str, float | None]:
-    """Return limits of readings and commands: the signals' extremes in the runs `used`, plus a margin."""
+    """Return the limits of readings and commands: extreme signals in the runs `used`, times a margin."""
     extent = SignalExtremes(*(leaf[used] for leaf in runs.extent))
     rig, period = loaded.mechanism.rig, rules.period
     most = {name: float(np.max(getattr(extent, name))) for name in SignalExtremes._fields}
@@ -250,9 +250,9 @@ def _widen_range(low: float, high: float, clearance: float) -> tuple[float | Non
 
 
 def _find_largest_draws(loaded: LoadedGains) -> dict[str, float]:
-    """Return the largest values that the uncertainty permits for the quantities that determine limits.
+    """Return the largest possible values of the uncertain quantities on which the limits depend.
 
-    The keys are names of quantities, the values are in SI units.
+    The keys are the names of the quantities; the values are in SI units.
     """
     scenarios = build_scenarios(loaded.mechanism, draw_extremes(loaded.mechanism))
     force, position = scenarios.force_sensor, scenarios.position_sensor
@@ -275,7 +275,7 @@ def _find_largest_draws(loaded: LoadedGains) -> dict[str, float]:
 def _has_status(loaded: LoadedGains) -> bool:
     """Return whether the compensator reports a status (`jaxhil.rig.law_status`) on the rig.
 
-    If it does, the watchdog detects a contact by the force command, and needs no position of the surface.
+    If it does, a force command other than 0 shows a contact, even without a known surface position.
     """
     law = COMPENSATORS.get(loaded.compensator)
     if law is None:

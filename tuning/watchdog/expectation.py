@@ -23,7 +23,7 @@ SINGULAR_VALUE_CUTOFF = 1e-9  # singular values below this, relative to the larg
 
 
 class ExpectationFit(NamedTuple):
-    """Fitted polynomial of the expected restitution in p, w and z (see the module's docstring)."""
+    """Expected restitution: polynomial in p (from the stiffness), w (approach speed) and z (damping)."""
 
     coefficients: dict[str, float]  # coefficient of each of `POLYNOMIAL_TERMS` [1]
     stiffness: float  # reference stiffness k_0 [N/m]
@@ -74,16 +74,16 @@ def fit_expectation(
 
     Every set of polynomial terms in `TERM_SETS` is first fitted to half of the runs. A set is sufficient if
     its rms residual in the other half is at most `sufficient`, or at most `MAX_RESIDUAL_RATIO` times the
-    smallest rms residual of all sets. The simplest sufficient set is fitted to all runs, because a term that
-    hardly improves the fit may be wrong on a rig that differs from the sweep. If no contact has an observable
-    stiffness, the expectation is the mean of e*.
+    smallest rms residual of all sets. The simplest sufficient set is then fitted to all runs. Further terms
+    would hardly improve the fit, and may be wrong on the real rig. Contacts without an estimate of the
+    stiffness are not used. If no contact has such an estimate, the expectation is the mean of e*.
 
     Args:
         features: stiffness, damping and approach speed of the contacts.
         reference: restitution e* of the ideal contacts, (contacts,).
         run: number of each contact's run, (contacts,).
         mass: equivalent mass [kg].
-        sufficient: rms residual [1] at which a set of terms is sufficient.
+        sufficient: rms residual [1] up to which a set of terms is always sufficient.
     """
     observable = features.stiffness > 0
     if not np.any(observable):
@@ -129,7 +129,7 @@ def _find_term_indices(terms: Sequence[str]) -> list[int]:
 
 
 def _normalise_features(features: ContactFeatures, stiffness: float, velocity: float, mass: float):
-    """Return the dimensionless variables p, w and z of the polynomial, each (contacts,)."""
+    """Return the dimensionless p (stiffness), w (approach speed) and z (damping), each (contacts,)."""
     with np.errstate(invalid="ignore", divide="ignore"):
         p = np.sqrt(stiffness / features.stiffness) - 1
         z = features.damping / (2 * np.sqrt(features.stiffness * mass))

@@ -95,7 +95,7 @@ def compute_fault_rates(
         limit: restitution error [1] above which a run must be stopped.
         number: number of scenarios for each fault.
         seed: seed of the scenarios.
-        progress: callback, called with the number of runs that have been completed since the last call.
+        progress: callback, called with the number of runs that have been completed since its last call.
     """
     cases = _build_cases(loaded, limit, number, seed)
     loop = _build_widest_loop(loaded, cases)
@@ -114,8 +114,8 @@ def compute_fault_rates(
 def count_fault_scenarios(allowed: float) -> int:
     """Return a number of scenarios that decides whether the rate of missed alarms is at most `allowed`.
 
-    The result is twice the number that is needed without any missed alarm. This allows for a few missed
-    alarms and for scenarios that cannot be used.
+    The result, within fixed bounds, is twice the number that suffices if no alarm is missed. The factor 2
+    leaves room for a few missed alarms and for scenarios that cannot be used.
     """
     if not 0 < allowed < 1:
         return MIN_FAULT_SCENARIOS if allowed >= 1 else MAX_FAULT_SCENARIOS
@@ -146,7 +146,7 @@ def _build_cases(loaded: LoadedGains, limit: float, number: int, seed: int) -> l
 
 
 def _find_neutral_gains(loaded: LoadedGains) -> dict[str, float]:
-    """Return the neutral values, by name, of the gains that differ from their neutral value."""
+    """Return the neutral values (without effect), by name, of the gains that have a different value."""
     return {
         gain.name: float(gain.neutral)
         for gain in COMPENSATORS[loaded.compensator].gains
@@ -155,7 +155,7 @@ def _find_neutral_gains(loaded: LoadedGains) -> dict[str, float]:
 
 
 def _compute_ideal_duration(loaded: LoadedGains) -> float:
-    """Return the duration [s] of the first nominal ideal contact; half an oscillation if it does not end."""
+    """Return the duration [s] of the nominal first ideal contact; half an oscillation if it does not end."""
     first = summarise_mechanism(loaded.mechanism).contacts[0]
     return first.duration if math.isfinite(first.duration) else 0.5 / first.frequency
 
@@ -163,7 +163,7 @@ def _compute_ideal_duration(loaded: LoadedGains) -> float:
 def _inject_fault(
     loaded: LoadedGains, case: _FaultCase, sizes: FaultSizes
 ) -> tuple[Mapping[str, Any], Scenario]:
-    """Return gains and scenarios with the injected fault; `sizes` contains its size in each scenario."""
+    """Return gains and scenarios with the injected fault; `sizes` is the fault's size in each scenario."""
     scenarios, fault = case.scenarios, case.fault
     gains = {name: np.full(len(sizes), value) for name, value in loaded.gains.items()}
     if fault == GAIN_FAULT:
@@ -193,16 +193,17 @@ def _build_widest_loop(loaded: LoadedGains, cases: list[_FaultCase]) -> Any:
 
 
 def _limit_sizes(case: _FaultCase, multiples: FaultSizes) -> FaultSizes:
-    """Convert multiples to sizes in the fault's unit, at most the largest size."""
+    """Convert multiples of `case.unit` to sizes of the fault, each at most the largest size `case.most`."""
     return np.minimum(multiples * case.unit, case.most)
 
 
 def _find_critical_sizes(
     loop: Any, loaded: LoadedGains, case: _FaultCase, limit: float
 ) -> tuple[FaultSizes, np.ndarray]:
-    """Find for each scenario a size of the fault whose restitution error is slightly above the limit.
+    """Find for each scenario the fault's size that causes a restitution error slightly above the limit.
 
-    Return the sizes, and whether a scenario has such a size and can be used, both (lanes,).
+    Return the sizes, and whether each scenario can be used, both (lanes,). A scenario can be used if such a
+    size exists, and if its error without the fault is within the limit.
     """
     number = count_lanes(case.scenarios)
 

@@ -30,7 +30,7 @@ MIN_MARGIN_SHARE, USUAL_MARGIN_SHARE = 0.25, 0.75
 
 
 class RestitutionMargin(NamedTuple):
-    """Restitution margin, and the runs from which it was computed."""
+    """Restitution margin of the watchdog, and the runs from which it was computed."""
 
     value: float  # restitution margin [1]
     widened_from: float | None  # margin before it was widened for good runs [1]; None if it was not widened
@@ -45,13 +45,13 @@ def choose_restitution_margin(
     fitted: Bool[np.ndarray, "lanes"],
     false_alarms: float,
 ) -> RestitutionMargin:
-    """Choose the restitution margin.
+    """Choose the largest difference from the expected restitution that raises no alarm (the margin).
 
-    The margin is `USUAL_MARGIN_SHARE` times the limit. It is smaller if the sum of margin and error of the
-    expectation would exceed the limit, because an error e - e* beyond the limit might then be missed. The
-    margin is larger if more than the fraction `false_alarms` of good runs would exceed this margin. In this
-    case, every second run is used in addition to the `fitted` runs, because the estimate of a small fraction
-    needs many runs.
+    The margin is usually `USUAL_MARGIN_SHARE` times the limit. It is smaller if the sum of margin and error
+    of the expectation would exceed the limit, because an error e - e* beyond the limit could then be missed.
+    It is larger if more than the fraction `false_alarms` of good runs would otherwise raise an alarm. To
+    estimate such a small fraction, the larger margin is computed from many runs: the `fitted` runs and every
+    second run.
 
     Args:
         runs: recorded runs.
@@ -87,10 +87,11 @@ def choose_restitution_margin(
 
 
 def _find_passing_margin(furthest: Float[np.ndarray, "runs"], share: float) -> float:
-    """Return the smallest margin that at most the fraction `share` of runs exceeds, with 95 % confidence.
+    """Return the smallest margin with which at most a fraction `share` of runs raises an alarm.
 
-    `furthest` is the largest difference from the expected restitution in each run. If there are too few runs
-    for this confidence, return the largest of these differences.
+    `furthest` is each run's largest difference from the expected restitution; a run raises an alarm if this
+    exceeds the margin. The confidence is 95 %. If there are too few runs for it, return the largest of
+    these differences.
     """
     if not len(furthest):
         return 0.0

@@ -92,7 +92,7 @@ def _find_flight_ticks(measured, begins, clearance, free_distance, settling):
 
 
 def _measure_stuck_travel(signals: RecordedSignals, clearance: float):
-    """Return the longest travel [m] with a constant force reading, and with a constant position reading.
+    """Return the longest travel [m] while the force reading is constant, and while the position reading is.
 
     Both are computed as in `jaxhil.rig.inputs.InputGuard`, each (lanes,).
     """

@@ -72,10 +72,11 @@ def calibrate_six_axes(
     Args:
         loaded: gain file.
         store: sweep of this gain file whose first scenarios are simulated again. None: draw new scenarios.
-        replaced: limits that replace calibrated limits, also for the alarm rates; None removes a limit.
+        replaced: limits by name, used instead of the calibrated limits, also to estimate the alarm rates;
+            None removes a limit.
         allowed: maximum acceptable alarm rates.
-        progress: callback, called with the number of runs that have been completed since the last call.
-        scenarios: number of draws; with a sweep, the maximum number of its scenarios.
+        progress: callback, called with the number of runs that have been completed since its last call.
+        scenarios: number of draws; with a sweep, the largest number of its scenarios that are simulated.
         seed: seed of the draws without a sweep.
 
     Raises:
@@ -116,7 +117,7 @@ def _record(
     limit: float,
     progress: Callable[[int], None],
 ) -> list[DrawnRun]:
-    """Record runs with drawn values of the uncertain quantities, or the `chosen` runs of a sweep."""
+    """Record runs of new random draws or, if `chosen` is given, of the first scenarios of a sweep."""
     runs, mechanism = [], loaded.mechanism
     for first in range(0, scenarios, LANES):
         number = min(LANES, scenarios - first)
@@ -137,7 +138,7 @@ def _record(
 
 
 def signal_limits(records: list[ControllerRecord], period: float, mechanism: Any) -> dict[str, float]:
-    """Return the limits of readings, wrench, poses and durations, from the extreme signals of runs."""
+    """Compute the limits of readings, commands and durations from the extreme signals of recorded runs."""
     sensor = mechanism.rig.force_sensor
     force, torque = slice(0, 3), slice(3, 6)
     limits = {
@@ -162,7 +163,7 @@ def signal_limits(records: list[ControllerRecord], period: float, mechanism: Any
 
 
 def _motion_limits(records: list[ControllerRecord], period: float) -> dict[str, float]:
-    """Return the limits of measured and commanded poses, and of the retreat after a trip."""
+    """Return the limits of the measured and the commanded motion, and of the retreat after a trip."""
     limits = {}
     for name, column in (("measured", 3), ("command", 5)):
         lowest = np.min([np.min(record[column], axis=0) for record in records], axis=0)
@@ -190,7 +191,7 @@ def _motion_limits(records: list[ControllerRecord], period: float) -> dict[str, 
 
 
 def _stuck_limits(records: list[ControllerRecord]) -> dict[str, float]:
-    """Return the limits on the motion while a reading stays unchanged."""
+    """Return the largest motions that are allowed while a reading stays unchanged [m, rad]."""
     travels, turns, under_force = [0.0], [0.0], [0.0]
     for record in records:
         moved = np.linalg.norm(np.diff(record.pose_measured[:, :3], axis=0), axis=1)
@@ -206,7 +207,7 @@ def _stuck_limits(records: list[ControllerRecord]) -> dict[str, float]:
 
 
 def longest_sum(steps: np.ndarray, still: np.ndarray) -> float:
-    """Return the largest sum of successive `steps` of a motion while a reading is `still` (unchanged)."""
+    """Return the largest sum of motion `steps` over successive ticks with an unchanged reading (`still`)."""
     sums = np.cumsum(np.where(still, steps, 0.0))
     last_moved = np.maximum.accumulate(np.where(still, 0.0, sums))
     return float(np.max(sums - last_moved, initial=0.0))
@@ -235,7 +236,7 @@ def alarm_rates(
     runs: list[DrawnRun],
     error_limit: float = ERROR_LIMIT,
 ) -> dict[str, Any]:
-    """Return the rates of false and missed alarms with these limits, with 95 % confidence intervals.
+    """Return the rates of false and missed alarms if `limits` are used, with 95 % confidence intervals.
 
     The watchdog should stop the runs whose twist error is larger than `error_limit` [1].
     """
@@ -277,7 +278,7 @@ def is_stopped(gain_file: SixAxisGainFile, record: ControllerRecord) -> bool:
 
 
 def _rate(alarms: int, runs: int) -> dict[str, Any]:
-    """Return the counts and the exact 95 % confidence interval of a rate."""
+    """Return the numbers of runs and alarms, with the exact 95 % confidence interval of their ratio."""
     interval = binomial_interval(alarms, runs)
     return {"runs": runs, "alarms": alarms, "low": float(interval.low), "high": float(interval.high)}
 

@@ -25,8 +25,8 @@ DEFAULT_ALLOWED_RATES = AllowedAlarmRates()
 def add_verdict(rates: Mapping[str, Any], allowed: AllowedAlarmRates, scenarios: int) -> dict[str, Any]:
     """Add the allowed rates and the verdict to the estimated alarm rates.
 
-    If the rates of injected faults count, they decide whether missed alarms are good or unknown. The rate in
-    the drawn runs can then only make the verdict bad.
+    If an injected fault has enough runs (`counted`), an uncertain rate of missed alarms in drawn runs does
+    not make the verdict unknown. A rate that is certainly too high always makes the verdict bad.
 
     Args:
         rates: result of `tuning.watchdog.alarms.compute_alarm_rates`. If faults were injected, `fault_runs`
@@ -66,7 +66,7 @@ def _describe_interval(rate: Mapping[str, Any]) -> str:
 
 
 def _describe_deciding_runs(rate: Mapping[str, Any]) -> str:
-    """Describe how many runs with an injected fault would decide whether a rate is acceptable."""
+    """Describe how many runs with an injected fault are needed to decide whether a rate is acceptable."""
     runs = estimate_deciding_scenarios(rate["alarms"], rate["runs"], rate["allowed"])
     if runs is None:
         return "at this rate, no number of runs would decide"
@@ -74,7 +74,7 @@ def _describe_deciding_runs(rate: Mapping[str, Any]) -> str:
 
 
 def _describe_deciding_sweep(kind: str, rate: Mapping[str, Any], scenarios: int, held_out: int) -> str:
-    """Describe how large a sweep would decide whether a rate is acceptable."""
+    """Describe how large a sweep must be to decide whether a rate from `held_out` runs is acceptable."""
     runs = estimate_deciding_scenarios(rate["alarms"], rate["runs"], rate["allowed"])
     if runs is None:
         return "at this rate, no sweep would decide"
