@@ -55,16 +55,25 @@ MAX_SPREADS = 3.0  # limit on the difference between estimated and specified del
 ONSET_TICKS = 0.3  # standard deviation of the time of the onset, 1/sqrt(12) [periods]
 ONSET_MEAN = 0.25  # mean force at the onset, divided by the force at which the onset is detected [1]
 ONSET_SPREAD = 0.4  # standard deviation of the force at the onset, divided by the same force [1]
+GAINS = {
+    "equivalent_mass": GainSpecification("kg", *MASSES),
+    "identification_delay": GainSpecification("s", *TIMES),
+    "delay_spread": GainSpecification("s", 0.0, MAX_DELAY_SPREAD),
+    "force_noise": GainSpecification("N", *FORCES),
+    "force_noise_floor": GainSpecification("1/s", 2e-3, 10.0),
+    "prior_stiffness": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
+    "prior_stiffness_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
+    "prior_slope_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
+    "prior_damping_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
+    "prior_depth_damping_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
+    "prior_unloading_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
+    "prior_friction_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
+    "prior_preload_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
+    "velocity_gain": GainSpecification("1/s", 0.0, 1e5),
+    "correction_limit": GainSpecification("1", 0.0, 20.0),
+}
 # Names of the gains that are the prior standard deviations of the contact model.
-SPREADS = (
-    "prior_stiffness_spread",
-    "prior_slope_spread",
-    "prior_damping_spread",
-    "prior_depth_damping_spread",
-    "prior_unloading_spread",
-    "prior_friction_spread",
-    "prior_preload_spread",
-)
+SPREADS = tuple(name for name in GAINS if name.startswith("prior_") and name.endswith("_spread"))
 
 
 @register("impulse_ledger")
@@ -73,29 +82,13 @@ class ImpulseLedger(Compensator):
 
     __slots__ = (
         "_alignment", "_clearance", "_correction_limit", "_deepest", "_delay", "_delay_spread", "_detector",
-        "_estimate", "_floor", "_gain", "_identification_delay", "_in_contact", "_lag", "_mass", "_model",
-        "_origin", "_outside", "_peak", "_period", "_preload", "_reference", "_side", "_since_start",
-        "_speed", "_spreads", "_stiffness", "_variance", "status",
+        "_estimate", "_floor", "_gain", "_identification_delay", "_lag", "_mass", "_model", "_origin",
+        "_outside", "_peak", "_period", "_preload", "_reference", "_side", "_since_start", "_spreads",
+        "_stiffness", "_variance", "_velocity", "status",
     )  # fmt: skip
     _estimate: tuple[float, float]  # mean and variance of the delay after this contact
 
-    gains: ClassVar[Mapping[str, GainSpecification]] = {
-        "equivalent_mass": GainSpecification("kg", *MASSES),
-        "identification_delay": GainSpecification("s", *TIMES),
-        "delay_spread": GainSpecification("s", 0.0, MAX_DELAY_SPREAD),
-        "force_noise": GainSpecification("N", *FORCES),
-        "force_noise_floor": GainSpecification("1/s", 2e-3, 10.0),
-        "prior_stiffness": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
-        "prior_stiffness_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
-        "prior_slope_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
-        "prior_damping_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
-        "prior_depth_damping_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
-        "prior_unloading_spread": GainSpecification("1/s^2", *STIFFNESSES_BY_MASS),
-        "prior_friction_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
-        "prior_preload_spread": GainSpecification("1/s", *DAMPINGS_BY_MASS),
-        "velocity_gain": GainSpecification("1/s", 0.0, 1e5),
-        "correction_limit": GainSpecification("1", 0.0, 20.0),
-    }
+    gains: ClassVar[Mapping[str, GainSpecification]] = GAINS
 
     def __init__(self, gains: Mapping[str, float], period: float, clearance: float) -> None:
         self._period = period
@@ -125,10 +118,9 @@ class ImpulseLedger(Compensator):
     def next_contact(self) -> None:
         """Restart everything except the estimated delay."""
         self._since_start = 0.0  # number of ticks since the run began
-        self._side = 1.0  # direction of the approach, 1 or -1
-        self._speed = 0.0  # approach speed [m/s]; 0 if unknown
+        self._side = 0.0  # 1 or -1 if the run began in contact (with the surface at 0 or -clearance), else 0
+        self._velocity = 0.0  # approach velocity [m/s]; 0 if unknown
         self._outside = 0.0  # number of ticks since the hardware left the surface
-        self._in_contact = False
         self._detector.restart()
         self.status = OUT_OF_CONTACT
 
@@ -139,57 +131,63 @@ class ImpulseLedger(Compensator):
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """Return the force command F_c [N]."""
-        begins = self._since_start == 0.0
+        detector, begins = self._detector, self._since_start == 0.0
         position, velocity = self._alignment.step(position_measured, velocity_desired, begins)
         position -= self._delay * velocity
         settled = not self._since_start * self._period < SETTLING
         self._since_start += 1.0
-        if begins:
-            reach = deflection(position_desired, self._clearance)
-            self._in_contact = reach != 0.0
+        reach = deflection(position_desired, self._clearance)
+        if begins and reach != 0.0:
             self._side = 1.0 if reach > 0.0 else -1.0
-        if self._in_contact and not self._speed > 0.0:
-            # The run began in contact: return the measured force until model and hardware are out of contact.
+        if self._side != 0.0:
+            # Return the measured force until model and hardware are out of contact.
             self.status = UNSURE
-            inside = self._side * deflection(position_desired, self._clearance) > 0.0
-            self._in_contact = inside or self._side * deflection(position, self._clearance) > 0.0
+            inside = self._side * reach > 0.0
+            if not (inside or self._side * deflection(position, self._clearance) > 0.0):
+                self._side = 0.0
             return force_measured if inside else 0.0
-        detector = self._detector
-        if not self._in_contact:
+        if not detector.total > LEVEL:
             self.status = OUT_OF_CONTACT
             self._approach(force_measured, position_desired, velocity_desired, position, settled)
             if not detector.total > 0.0:
                 detector.learn(force_measured)
                 return 0.0
-            self._in_contact = detector.total > LEVEL
         command = self._follow(force_measured - detector.bias, velocity_desired, position, velocity)
-        return command if self._in_contact else 0.0
+        if not detector.total > LEVEL:
+            return 0.0
+        if self._reference.released and self._outside * self._period > RELEASE_TIME:
+            limit = MAX_SPREADS * self._delay_spread
+            shift, self._variance = self._estimate
+            self._delay = min(max(self._delay + shift, -limit), limit)
+            self._velocity = 0.0
+            detector.total = 0.0
+            self.status = OUT_OF_CONTACT
+            return 0.0
+        return command
 
     def _approach(
-        self, force: float, position_desired: float, velocity_desired: float, position: float, settled: bool
+        self, force: float, position_desired: float, velocity: float, position: float, settled: bool
     ) -> None:
         """Test a force reading for contact; if it shows free flight, prepare for contact on the next tick."""
-        side = 1.0 if velocity_desired > 0.0 or self._clearance == inf else -1.0
-        speed = side * velocity_desired
-        approaches = self._mass * speed > MIN_MOMENTUM
-        detector = self._detector
+        side = 1.0 if velocity > 0.0 or self._clearance == inf else -1.0  # direction of the approach
+        weight = self._mass * (side * velocity)
+        approaches = weight > MIN_MOMENTUM
         # The bias is known only after a reading of free flight during an approach in this direction.
-        settled = settled and approaches and self._speed > 0.0 and side == self._side
-        detector.update(force, side, self._floor * (self._mass * speed), settled)
-        if detector.total > 0.0:
+        settled = settled and approaches and self._velocity * velocity > 0.0
+        self._detector.update(force, side, self._floor * weight, settled)
+        if self._detector.total > 0.0:
             return
-        self._side = side
-        self._speed = speed if approaches else 0.0
+        self._velocity = velocity if approaches else 0.0
         if not approaches:
             return
-        self._origin = side * position - ONSET_PLACE * (self._period * speed)
-        self._lag = min(max(side * (position_desired - position) / speed, 0.0), MAX_LAG)
+        self._origin = position - ONSET_PLACE * (self._period * velocity)
+        self._lag = min(max((position_desired - position) / velocity, 0.0), MAX_LAG)
         self._deepest = 0.0
         self._peak = MIN_PEAK
         self._outside = 0.0
         self._estimate = 0.0, self._variance
         self._model.restart(self._stiffness, self._spreads, self._variance)
-        self._reference.begin((side * position - self._origin) / speed, self._model.theta)
+        self._reference.begin((position - self._origin) / velocity, self._model.theta)
 
     def _follow(self, force: float, velocity_desired: float, position: float, velocity: float) -> float:
         """Process one reading during a contact; return the force command [N].
@@ -200,13 +198,13 @@ class ImpulseLedger(Compensator):
             position: position of the hardware, delayed like the force [m].
             velocity: velocity of the hardware, delayed like the force [m/s].
         """
-        period, side, speed = self._period, self._side, self._speed
-        model, reference = self._model, self._reference
-        weight = self._mass * speed
-        depth = (side * position - self._origin) / speed
-        rate = side * velocity / speed
-        reading = side * force / weight
+        period, model, reference = self._period, self._model, self._reference
+        weight = self._mass * self._velocity
+        depth = (position - self._origin) / self._velocity
+        rate = velocity / self._velocity
+        reading = force / weight
         self._deepest = max(self._deepest, depth)
+        self._outside = 0.0 if depth > 0.0 else self._outside + 1.0
         phi = features(depth, rate, self._deepest, slope(model.mean, depth) * (1.0 - rate))
         noise = self._detector.variance / (weight * weight)
         self._learn(phi, depth, rate, reading, noise)
@@ -220,15 +218,12 @@ class ImpulseLedger(Compensator):
             stiffness = dot(phi[:HINGES], model.mean[:HINGES]) / max(depth, MIN_CONTACT_DEPTH)
             stiffness -= sqrt(max(model.covariance[0][0], 0.0))
             peak = max(peak, sqrt(max(stiffness, 0.0)))
-        unlimited = self._gain * (side * velocity_desired / speed - 0.5 * period * push - ahead)
+        unlimited = self._gain * (velocity_desired / self._velocity - 0.5 * period * push - ahead)
         limit = self._correction_limit * peak
         correction = min(max(unlimited, -limit), peak + limit - push)
-        if self._in_contact:
+        if self._detector.total > LEVEL:
             self.status = self._evaluate(peak, noise, correction == unlimited)
-        self._outside = 0.0 if depth > 0.0 else self._outside + 1.0
-        if self._in_contact and reference.released and self._outside * period > RELEASE_TIME:
-            self._end()
-        return side * weight * (push + correction)
+        return weight * (push + correction)
 
     def _learn(self, phi: Vector, depth: float, rate: float, reading: float, noise: float) -> None:
         """Update contact model and estimated delay with one `reading` [1/s] and its noise variance `noise`.
@@ -272,13 +267,3 @@ class ImpulseLedger(Compensator):
             if spread > UNCERTAIN or lost < -MAX_GAIN or lost > MAX_LOSS + 3.0 * spread:
                 return UNEXPLAINED
         return IDENTIFIED if free else SATURATED
-
-    def _end(self) -> None:
-        """End the contact; store the estimated delay for the following contacts."""
-        limit = MAX_SPREADS * self._delay_spread
-        shift, self._variance = self._estimate
-        self._delay = min(max(self._delay + shift, -limit), limit)
-        self._speed = 0.0
-        self._in_contact = False
-        self._detector.total = 0.0
-        self.status = OUT_OF_CONTACT

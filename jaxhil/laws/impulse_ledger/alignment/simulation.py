@@ -1,30 +1,35 @@
-"""Alignment in JAX: delays the measured position and velocity by the delay of the force measurement."""
+"""Alignment in JAX: batched version of `rig.py` in this folder."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxhil.laws.shared.delay_line import DelayLine, empty_delay_line, read_delayed, split_delay
 from jaxhil.laws.simulation_base import Signals
 
 
-class Aligned(NamedTuple):
-    """State of the alignment: positions measured before the next tick, with the force delay tau."""
+class Alignment(NamedTuple):
+    """Positions measured before the next tick; tau is the force delay, T the control period."""
 
+    line: DelayLine
     middle: Float[Array, "*batch"]  # position measured tau before the next tick [m]
     last: Float[Array, "*batch"]  # position measured tau + T before the next tick [m]
 
 
-def align(
-    old: Aligned, newest: Array, share: Array, signals: Signals, period: Array
-) -> tuple[Array, Array, Aligned]:
-    """Return the measured position [m] and velocity [m/s], delayed like the force, and the next state.
+def begin(ring: int, zeros: Array) -> Alignment:
+    """Return the state before the first tick, with `ring` samples in the delay line."""
+    return Alignment(empty_delay_line(ring, zeros), zeros, zeros)
 
-    `newest` [m] is the measured position, delayed by one tick less than the force.
-    """
-    begins = signals.age == 0
-    stride = period * signals.velocity_desired
+
+def align(
+    old: Alignment, delay: Array, period: Array, signals: Signals, tick: Array
+) -> tuple[Array, Array, Alignment]:
+    """Return the measured position [m] and velocity [m/s], delayed by `delay` [s], and the next state."""
+    periods = split_delay(jnp.where(delay > period, delay - period, 0), period)
+    newest, line = read_delayed(periods, old.line, signals, tick)
+    begins, stride = signals.age == 0, period * signals.velocity_desired
     middle = jnp.where(begins, newest - stride, old.middle)
     last = jnp.where(begins, newest - 2 * stride, old.last)
-    position = newest + share * (middle - newest)
-    return position, (newest - last) / (2 * period), Aligned(newest, middle)
+    position = newest + jnp.where(delay > period, 1, delay / period) * (middle - newest)
+    return position, (newest - last) / (2 * period), Alignment(line, newest, middle)

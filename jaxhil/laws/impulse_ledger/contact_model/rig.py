@@ -62,9 +62,8 @@ def features(depth: float, speed: float, deepest: float, delay_effect: float) ->
     if not depth > 0.0:
         return [0.0] * PARAMETERS
     phi = [depth - knot if depth > knot else 0.0 for knot in KNOTS]
-    back = depth - deepest
     turning = speed / sqrt(speed * speed + MIN_SLIDING_SPEED * MIN_SLIDING_SPEED)
-    return [*phi, speed, depth * speed / REACH, back if back < 0.0 else 0.0, turning, 1.0, delay_effect]
+    return [*phi, speed, depth * speed / REACH, min(0.0, depth - deepest), turning, 1.0, delay_effect]
 
 
 def force(theta: Sequence[float], depth: float, speed: float, deepest: float) -> float:
@@ -76,10 +75,9 @@ def force(theta: Sequence[float], depth: float, speed: float, deepest: float) ->
         if not depth > knot:
             break
         total += hinge * (depth - knot)
-    back = depth - deepest
     total += (theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH) * speed
-    if back < 0.0:
-        total += theta[UNLOADING] * back
+    if depth < deepest:
+        total += theta[UNLOADING] * (depth - deepest)
     return total + theta[FRICTION] * (speed / sqrt(speed * speed + MIN_SLIDING_SPEED * MIN_SLIDING_SPEED))
 
 
@@ -91,6 +89,11 @@ def slope(theta: Sequence[float], depth: float) -> float:
             break
         total += hinge
     return total if total > 0.0 else 0.0
+
+
+def damping(theta: Sequence[float], depth: float) -> float:
+    """Return the contact model's damping per unit mass [1/s]."""
+    return theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH if depth > 0.0 else 0.0
 
 
 class ContactModel:
@@ -118,13 +121,10 @@ class ContactModel:
                 preload [1/s].
             delay_variance: prior variance of the delay [s^2].
         """
-        variances = [0.0] * PARAMETERS
-        for j in range(DELAY):
-            spread = spreads[SPREAD_INDICES[j]]
-            variances[j] = spread * spread * FACTORS[j]
-        variances[DELAY] = delay_variance
-        prior = [0.0] * PARAMETERS
-        prior[0] = stiffness
+        squares = [spread * spread for spread in spreads]
+        scaled = [squares[index] * factor for index, factor in zip(SPREAD_INDICES, FACTORS, strict=True)]
+        variances = [*scaled, delay_variance]
+        prior = [stiffness, *[0.0] * (PARAMETERS - 1)]
         self._variances = variances
         self._prior_mean = prior
         self.mean = prior

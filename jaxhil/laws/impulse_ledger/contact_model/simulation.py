@@ -62,6 +62,11 @@ def slope(theta: Array, depth: Array) -> Float[Array, "*batch"]:
     return jnp.where(total > 0, total, 0)
 
 
+def damping(theta: Array, depth: Array) -> Float[Array, "*batch"]:
+    """Return the contact model's damping per unit mass [1/s]."""
+    return jnp.where(depth > 0, theta[DAMPING] + theta[rig.DEPTH_DAMPING] * depth / rig.REACH, 0)
+
+
 def learn(
     old: ContactModelEstimate, phi: Array, force: Array, variance: Array, used: Bool[Array, "*batch"]
 ) -> ContactModelEstimate:

@@ -42,11 +42,8 @@ class OnsetDetector:
     @property
     def variance(self) -> float:
         """Return the noise variance of a force reading [N^2]: the larger of specified and measured value."""
-        return (
-            max(self._noise_variance, self._square)
-            if self._count > MIN_FLIGHT_READINGS
-            else self._noise_variance
-        )
+        measured = self._square if self._count > MIN_FLIGHT_READINGS else 0.0
+        return max(self._noise_variance, measured)
 
     def update(self, force: float, side: float, floor: float, settled: bool) -> None:
         """Update the cumulative sum with one force reading [N].

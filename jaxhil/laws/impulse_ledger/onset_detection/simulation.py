@@ -16,14 +16,12 @@ class FreeFlight(NamedTuple):
     before: Float[Array, "*batch"]  # last reading [N]
     bias: Float[Array, "*batch"]  # mean of the readings [N]
     total: Float[Array, "*batch"]  # cumulative sum S [1]
+    velocity: Float[Array, "*batch"]  # approach velocity at the last reading [m/s]; 0 without an approach
 
 
 def variance(flight: FreeFlight, noise: Array) -> Float[Array, "*batch"]:
     """Return the noise variance of a force reading [N^2]: the larger of specified and measured value."""
-    specified = noise**2
-    return jnp.where(
-        (flight.count > MIN_FLIGHT_READINGS) & (flight.square > specified), flight.square, specified
-    )
+    return jnp.maximum(noise**2, jnp.where(flight.count > MIN_FLIGHT_READINGS, flight.square, 0))
 
 
 def update(flight: FreeFlight, deviation: Array, settled: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -32,10 +30,10 @@ def update(flight: FreeFlight, deviation: Array, settled: Bool[Array, "*batch"])
     return jnp.where(settled & (total > 0), total, 0)
 
 
-def learn(old: FreeFlight, force: Array) -> FreeFlight:
+def learn(old: FreeFlight, force: Array, velocity: Array) -> FreeFlight:
     """Update the estimates of bias and noise with one force reading [N] of free flight."""
     step = force - old.before
     change = (0.5 * (step * step) - old.square) / jnp.maximum(old.count, 1)
     square = old.square + jnp.where(old.count > 0, change, 0)
     bias = old.bias + (force - old.bias) / jnp.minimum(old.count + 1, MAX_MEAN)
-    return FreeFlight(old.count + 1, square, force, bias, old.total)
+    return FreeFlight(old.count + 1, square, force, bias, old.total, velocity)

@@ -16,20 +16,8 @@ Source: sensitivity equations, Khalil, "Nonlinear Systems" (2002), section 3.3.
 
 from math import sqrt
 
-from jaxhil.laws.impulse_ledger.contact_model.rig import (
-    DAMPING,
-    DELAY,
-    DEPTH_DAMPING,
-    PARAMETERS,
-    PRELOAD,
-    REACH,
-    Matrix,
-    Vector,
-    dot,
-    features,
-    force,
-    slope,
-)
+from jaxhil.laws.impulse_ledger.contact_model import rig as contact_model
+from jaxhil.laws.impulse_ledger.contact_model.rig import Matrix, Vector, damping, dot, features, force, slope
 
 STEPS = 12  # number of integration steps from the last reading to the present
 MAX_SCALED_SPEED = 2.0  # limit on speed / approach speed, a ratio that exceeds 1 only with added energy [1]
@@ -50,7 +38,7 @@ class ReferenceTrajectory:
     __slots__ = ("_depths", "_losses", "_speeds", "_theta", "deepest", "depth", "force", "released", "speed")
 
     def __init__(self) -> None:
-        self.begin(0.0, [0.0] * PARAMETERS)
+        self.begin(0.0, [0.0] * contact_model.PARAMETERS)
 
     def begin(self, depth: float, theta: Vector) -> None:
         """Start the trajectory with the approach speed, at `depth`: the depth / approach speed [s]."""
@@ -60,9 +48,9 @@ class ReferenceTrajectory:
         self.deepest = depth
         self.released = False
         self._theta = theta
-        self._depths = [0.0] * PARAMETERS  # s
-        self._speeds = [0.0] * PARAMETERS  # s'
-        self._losses = [0.0] * (PRELOAD - DAMPING)  # mechanical work per unit of each dissipative parameter
+        self._depths = [0.0] * contact_model.PARAMETERS  # s
+        self._speeds = [0.0] * contact_model.PARAMETERS  # s'
+        self._losses = [0.0] * contact_model.PARAMETERS  # work per unit of each dissipative parameter
 
     def correct(self, theta: Vector) -> None:
         """Correct the trajectory to first order for the contact model's new parameters `theta`."""
@@ -83,18 +71,23 @@ class ReferenceTrajectory:
         theta = self._theta
         depth = self.depth + period * self.speed - 0.5 * (period * period) * self.force
         speed = self.speed - period * self.force
-        self.deepest = depth if depth > self.deepest else self.deepest
+        self.deepest = max(self.deepest, depth)
         self.released = self.released or (depth <= 0.0 and speed < 0.0)
         undelayed = features(depth, speed, self.deepest, 0.0)
-        least = reading if reading < 0.0 else 0.0
         push = dot(theta, undelayed) + (reading - dot(theta, measured))
-        push = 0.0 if self.released else (push if push > least else least)
+        push = 0.0 if self.released else max(min(0.0, reading), push)
         if push != 0.0:
-            self._advance_sensitivities(period, depth, undelayed, measured)
-            losses = undelayed[DAMPING:PRELOAD]
-            self._losses = [
-                loss + period * speed * rate for loss, rate in zip(self._losses, losses, strict=True)
-            ]
+            # With larger stiffness or damping, the integration would be unstable.
+            stiffness = min(slope(theta, depth), 1.0 / (period * period))
+            resistance = min(damping(theta, depth), 1.0 / period)
+            depths, speeds = self._depths, self._speeds
+            for j in range(contact_model.PARAMETERS):
+                ahead = depths[j] + period * speeds[j]
+                rate = undelayed[j] - measured[j] + stiffness * ahead + resistance * speeds[j]
+                speeds[j] -= period * rate
+                depths[j] += period * speeds[j]
+            for j in range(contact_model.DAMPING, contact_model.PRELOAD):
+                self._losses[j] += period * speed * undelayed[j]
         self.speed = within(self.speed - 0.5 * period * (self.force + push), MAX_SCALED_SPEED)
         self.depth = depth
         self.force = push
@@ -107,16 +100,15 @@ class ReferenceTrajectory:
             delay_variance: variance of the delay [s^2], which replaces the variance in P.
         """
         columns = [dot(row, self._speeds) for row in covariance]
-        total, variance = dot(self._speeds, columns), covariance[DELAY][DELAY]
+        total, variance = dot(self._speeds, columns), covariance[contact_model.DELAY][contact_model.DELAY]
         if variance > 0.0:
-            by_delay = columns[DELAY] / variance
+            by_delay = columns[contact_model.DELAY] / variance
             total += by_delay * by_delay * (delay_variance - variance)
         return sqrt(total) if total > 0.0 else 0.0
 
     def imbalance(self) -> float:
         """Return the trajectory's energy loss minus the contact model's dissipation, divided by M v^2 [1]."""
-        dissipated = dot(self._losses, self._theta[DAMPING:PRELOAD])
-        return 0.5 * (1.0 - self.speed * self.speed) - dissipated
+        return 0.5 * (1.0 - self.speed * self.speed) - dot(self._losses, self._theta)
 
     def bridge(self, duration: float) -> tuple[float, float]:
         """Predict scaled force [1/s] and speed [1] at the time `duration` [s] after the last reading."""
@@ -134,20 +126,6 @@ class ReferenceTrajectory:
             speed -= 0.5 * step * (push + later)
             push = later
         return push, speed
-
-    def _advance_sensitivities(
-        self, period: float, depth: float, undelayed: Vector, measured: Vector
-    ) -> None:
-        theta, depths, speeds = self._theta, self._depths, self._speeds
-        damping = theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH if depth > 0.0 else 0.0
-        # With larger stiffness or damping, the integration would be unstable.
-        stiffness = min(slope(theta, depth), 1.0 / (period * period))
-        damping = min(damping, 1.0 / period)
-        for j in range(PARAMETERS):
-            ahead = depths[j] + period * speeds[j]
-            rate = undelayed[j] - measured[j] + stiffness * ahead + damping * speeds[j]
-            speeds[j] -= period * rate
-            depths[j] += period * speeds[j]
 
 
 def within(value: float, limit: float) -> float:

@@ -6,8 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxhil.laws.impulse_ledger.contact_model.rig import DAMPING, DEPTH_DAMPING, REACH
-from jaxhil.laws.impulse_ledger.contact_model.simulation import dot, features, force, slope
+from jaxhil.laws.impulse_ledger.contact_model.simulation import damping, dot, features, force, slope
 from jaxhil.laws.impulse_ledger.reference_trajectory.rig import MAX_SCALED_DEPTH, MAX_SCALED_SPEED, STEPS
 
 
@@ -28,10 +27,8 @@ def begin(depth: Array, like: Array) -> ReferenceTrajectory:
 
     The sensitivities are 0 and have the shape of `like`.
     """
-    zeros = jnp.zeros_like(depth)
-    return ReferenceTrajectory(
-        depth, zeros + 1, zeros, depth, zeros > 0, jnp.zeros_like(like), jnp.zeros_like(like)
-    )
+    zeros, sensitivities = jnp.zeros_like(depth), jnp.zeros_like(like)
+    return ReferenceTrajectory(depth, zeros + 1, zeros, depth, zeros > 0, sensitivities, sensitivities)
 
 
 def correct(old: ReferenceTrajectory, changes: Array) -> ReferenceTrajectory:
@@ -53,13 +50,12 @@ def advance(
     least = jnp.where(reading < 0, reading, 0)
     push = dot(theta, undelayed) + (reading - dot(theta, measured))
     push = jnp.where(released, 0, jnp.where(push > least, push, least))
-    damping = jnp.where(depth > 0, theta[DAMPING] + theta[DEPTH_DAMPING] * depth / REACH, 0)
     # With larger stiffness or damping, the integration would be unstable.
     stiffness = jnp.minimum(slope(theta, depth), 1 / (period * period))
-    damping = jnp.minimum(damping, 1 / period)
+    resistance = jnp.minimum(damping(theta, depth), 1 / period)
     tick, moves = period[None], (push != 0)[None]
     ahead = old.depths + tick * old.speeds
-    rates = undelayed - measured + stiffness[None] * ahead + damping[None] * old.speeds
+    rates = undelayed - measured + stiffness[None] * ahead + resistance[None] * old.speeds
     speeds = old.speeds - jnp.where(moves, tick * rates, 0)
     depths = old.depths + jnp.where(moves, tick * speeds, 0)
     speed = jnp.clip(old.speed - 0.5 * period * (old.force + push), -MAX_SCALED_SPEED, MAX_SCALED_SPEED)
