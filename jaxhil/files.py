@@ -230,7 +230,7 @@ def is_temporary(name: str) -> bool:
 
 
 def temporary_name() -> str:
-    """Return a unique name under which this process can write a file or folder before it renames it."""
+    """Return a unique name for a file or folder that this process writes first and renames afterwards."""
     return f".jaxhil-{os.getpid()}-{_PROCESS_TOKEN}-{next(_name_counter)}{TEMPORARY_SUFFIX}"
 
 

@@ -32,7 +32,7 @@ IRREPRODUCIBLE = ("sum", "fsum", "hypot", "pow")
 
 
 class CallLowering(ListLowering):
-    """Lowering of calls and attributes."""
+    """Lowering (translation) of Python calls and attributes to C."""
 
     share: Callable[[ast.AST, Locations, CExpression], None]
     changed: Callable[[CExpression, bool], None]
@@ -77,7 +77,10 @@ class CallLowering(ListLowering):
         return CExpression(text, type_, reads=owner.reads | keys, sign=type_.sign, length=length)
 
     def _class_constant(self, class_: type, name: str, value: float) -> CExpression:
-        """Return the value of a class attribute, as an enumerator if its module has an equal constant."""
+        """Return the C expression of a class attribute: an enumerator of the header, or its value.
+
+        The enumerator is used if the class's module has a constant with its name and value.
+        """
         owner = next(owner for owner in class_.__mro__ if name in vars(owner))
         namespace, result = vars(sys.modules[owner.__module__]), constant(value)
         numbers = self.program.enumerators
@@ -98,7 +101,7 @@ class CallLowering(ListLowering):
         return fields.setdefault(name, hinted)
 
     def new_samples(self, owner: CExpression, target: ast.Attribute, count: CExpression) -> None:
-        """Record an attribute that is a list of run-time length; emit a test of its length."""
+        """Record an attribute that is a list of floats of run-time length; emit a test of its length."""
         class_, plain = owner.type.of, target.attr.lstrip("_")
         is_initial = self.function.node.name == "__init__" and owner.text == "self"
         expected = "a list of fixed length, or an assignment in `__init__`"

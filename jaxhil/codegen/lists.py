@@ -23,7 +23,7 @@ class LoopRange(NamedTuple):
 
 
 class ListLowering(ExpressionLowering):
-    """Lowering of lists and loops."""
+    """Lowering (translation) of Python lists and loops to C."""
 
     def lower_list(self, node: Any) -> CExpression:
         return self.array(node, None)
@@ -142,7 +142,7 @@ class ListLowering(ExpressionLowering):
         return names
 
     def loop(self, node: Any) -> LoopRange:
-        """Return the index range of a `for` loop over the expression `node`, and its targets' values."""
+        """Return the C index range of a `for` loop over `node`, and the values of the loop's targets."""
         called = getattr(node.func, "id", "") if isinstance(node, ast.Call) else ""
         if called == "range":
             return self._range(node)

@@ -39,13 +39,13 @@ SIGN_IF_FALSE: dict[Any, int] = {ast.Lt: Sign.NONNEGATIVE, ast.LtE: Sign.POSITIV
 
 
 def is_small(value: CExpression) -> bool:
-    """Return whether an int is so small that a counter with this increment cannot reach LARGEST_INT."""
+    """Return whether an int is so small that a counter that it increments cannot reach LARGEST_INT."""
     has_bound = value.type.is_index or bool(value.below) or value.type.c_int != "int64_t"
     return has_bound or (value.span is not None and max(map(abs, value.span)) <= MAX_INCREMENT)
 
 
 class ExpressionLowering:
-    """Lowering of expressions; emits the C statements that must precede an expression."""
+    """Lowering (translation) of Python expressions to C; emits C statements that must precede them."""
 
     array: Callable[[Any, None], CExpression]
     call_helper: Callable[..., CExpression]
@@ -72,7 +72,10 @@ class ExpressionLowering:
 
     @contextmanager
     def captured(self) -> Iterator[list[str]]:
-        """Context manager: collect the lines that the body of `with` emits; at its end, restore the facts."""
+        """Context manager: collect the C lines that the `with` body emits, instead of appending them.
+
+        At its end, restore what was known about numbers before, except what the body invalidates.
+        """
         before, facts, effects = self.lines, self.facts, len(self.effects)
         self.lines, self.facts = [], dict(facts)
         yield self.lines
@@ -101,18 +104,18 @@ class ExpressionLowering:
         return value if is_simple else self.temporary(value, hint)
 
     def check(self, value: CExpression) -> None:
-        """If the call that computes `value` may fail, emit a return from the function for this case."""
+        """If the call that computes `value` may fail, emit C code that returns early if it has failed."""
         if value.fails:
             self.fail_if("*error", None)
 
     def fail_if(self, condition: str, node: Any, reason: str = "") -> None:
-        """Emit code that sets the error flag and returns from the function if a condition holds."""
+        """Emit C code that, if a condition holds, returns from the C function with the error flag set."""
         self.emit(f"if ({condition}) {{")
         self.fail(node, reason)
         self.emit("}")
 
     def fail(self, node: Any, reason: str) -> None:
-        """Emit a return from the function; unless `node` is None, also emit code that sets the error flag."""
+        """Emit a return from the C function. Unless `node` is None, the C code also sets the error flag."""
         self.failures += 1
         self.function.fails = True
         if node is not None:
@@ -122,7 +125,7 @@ class ExpressionLowering:
         self.emit(f"return {ZEROS.get(self.function.returns.kind, '')}".rstrip() + ";")
 
     def expression(self, node: Any) -> CExpression:
-        """Lower an expression, with the facts about its value."""
+        """Lower an expression to C; add what is known about the sign and range of its value."""
         lower = getattr(self, f"lower_{type(node).__name__.lower()}", None)
         if lower is None:
             raise self.reject(node, type(node).__name__, "an expression of numbers, lists and attributes")
@@ -175,13 +178,13 @@ class ExpressionLowering:
         return getattr(called, "attr", getattr(called, "id", "value")).lstrip("_")
 
     def note(self, writes: Locations) -> None:
-        """Record that a statement changes the variables `writes`; drop facts that depend on them."""
+        """Record that a statement changes the variables `writes`; forget signs and ranges based on them."""
         self.effects.append(writes)
         self.function.writes |= writes
         self.facts = {key: fact for key, fact in self.facts.items() if not fact.reads & writes}
 
     def facts_of(self, node: Any, truth: bool) -> dict[str, CExpression]:
-        """Return the facts about numbers that are certain if a condition has the value `truth`."""
+        """Return what a condition with the value `truth` implies about the signs and ranges of numbers."""
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
             return self.facts_of(node.operand, not truth)
         if isinstance(node, ast.BoolOp) and isinstance(node.op, ast.And) == truth:
@@ -320,7 +323,7 @@ class ExpressionLowering:
         return self._join_conditions(conditions, True)
 
     def _identity(self, node: Any, is_same: bool, comparator: Any) -> CExpression:
-        """Lower `type(x) is float`, whose value is known at export, or `x is None` of a parameter."""
+        """Lower `is` or `is not`: in `type(x) is float`, known at export, or in `parameter is None`."""
         if isinstance(node.left, ast.Call) and getattr(node.left.func, "id", "") == "type":
             kind = self.expression(node.left.args[0]).type.kind
             return constant((kind == getattr(comparator, "id", "")) == is_same)

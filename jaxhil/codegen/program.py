@@ -15,7 +15,7 @@ from .values import CExpression, Rank, constant
 
 
 class CFunction:
-    """C function that is the lowering of a Python function for given types of its parameters."""
+    """C function, lowered (translated) from a Python function for given types of its parameters."""
 
     def __init__(
         self, function: Callable[..., Any], owner: type | None, types: Mapping[str, ValueType]
@@ -106,7 +106,7 @@ class CProgram:
     def function(
         self, function: Any, owner: type | None, types: Mapping[str, ValueType], caller: Any
     ) -> CFunction:
-        """Return the C function for a Python function with parameter types; lower it on the first call."""
+        """Return the C function of a Python function for the parameter `types`; lower it at first use."""
         key = (function, owner, *((n, t.length, t.of) for n, t in types.items() if t.kind == "list"))
         if key in self.under_way and caller is not None:
             raise caller.reject(caller.function.node, f"{function.__name__} calling itself", "a loop")
@@ -198,7 +198,7 @@ class CProgram:
         return f"{self.prefix}{name}({', '.join(texts)})"
 
     def capacities(self, owner: Any, class_: type) -> dict[str, int]:
-        """Return the capacities of an object's lists whose length is known at run time only, by name."""
+        """Return the capacities (lengths) of `owner`'s lists of run-time length, by name of the constant."""
         result: dict[str, int] = {}
         for name, type_ in self.fields.get(class_, {}).items():
             lengths = {type_.capacity: len(getattr(owner, name))} if type_.capacity else {}

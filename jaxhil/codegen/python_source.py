@@ -35,7 +35,7 @@ def find_definition(function: Callable[..., Any]) -> tuple[ast.FunctionDef, str]
 
 
 def find_annotations(function: Callable[..., Any], protocol: type | None) -> dict[str, Any]:
-    """Return the annotations of a function; annotations of the protocol's method take precedence."""
+    """Return a function's annotations; those of the method with its name in `protocol` take precedence."""
     method = vars(protocol).get(function.__name__) if protocol else None
     method = method.fget if isinstance(method, property) else method
     more = typing.get_type_hints(method, include_extras=True) if inspect.isfunction(method) else {}

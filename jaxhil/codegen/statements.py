@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class BodyLowering(CallLowering):
-    """Lowering of the statements of one function."""
+    """Lowering (translation) of the statements of one Python function to C."""
 
     def __init__(self, program: "CProgram", function: "CFunction") -> None:
         super().__init__(program, function)
@@ -41,7 +41,7 @@ class BodyLowering(CallLowering):
         return [*self.hoisted, *lines]
 
     def block(self, body: list[ast.stmt]) -> bool:
-        """Lower the statements of a block; return whether control never reaches the end of the block."""
+        """Lower the statements of a block; return whether control always leaves it early, as by `return`."""
         leaves, outer = False, self.span
         self.span = (body[0].lineno, body[-1].end_lineno or 0) if body else outer
         for statement in body:
@@ -130,8 +130,8 @@ class BodyLowering(CallLowering):
     def replace(self, node: Any, keys: Locations, of_element: bool = False) -> None:
         """Record that an assignment has replaced the lists or objects of the attributes `keys`.
 
-        Raise SubsetError if a local name of the old list or object is used later, because in Python this name
-        still refers to the old list or object.
+        Raise SubsetError if a later line uses a local name that was assigned the old list or object. In
+        Python, this name still refers to the old one, but in C to the new one.
         """
         self.function.replaced |= keys
         for name, value, last in self.aliases:

@@ -29,7 +29,7 @@ Locations = frozenset[tuple[Any, str]]  # memory locations: pairs of class, "loc
 
 
 class Sign:
-    """Bits that state what is known about a number's sign; 0 if nothing is known. NaN satisfies all bits."""
+    """Bits for what is known about a number's sign; 0 if nothing is known. No bit excludes NaN."""
 
     NONNEGATIVE, NONZERO, POSITIVE = 1, 2, 3
 

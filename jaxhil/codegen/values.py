@@ -9,7 +9,7 @@ ZEROS = {"float": "0.0", "int": "0", "bool": "false"}
 
 
 class Rank:
-    """Precedence of C's operators; an operand of a lower rank needs parentheses."""
+    """Precedence of C's operators; an operand of a lower rank than its operator needs parentheses."""
 
     CONDITIONAL, OR, AND, BITS, EQUALITY, RELATION, SUM, PRODUCT, UNARY, ATOM = range(1, 11)
 
@@ -57,14 +57,14 @@ class CExpression(NamedTuple):
 
 
 def combine(text: str, type_: ValueType, rank: int, *parts: CExpression, **more: Any) -> CExpression:
-    """Return an expression whose evaluation includes the evaluation of `parts`."""
+    """Return a C expression that contains `parts`; it reads and writes all that they read and write."""
     reads: Locations = frozenset().union(*(part.reads for part in parts))
     writes: Locations = frozenset().union(*(part.writes for part in parts))
     return CExpression(text, type_, rank, reads, writes, **more)
 
 
 def constant(value: Any) -> CExpression:
-    """Return the C expression for a constant, without code if C has no equivalent."""
+    """Return the C expression for a constant; its C code is empty if C has no equivalent."""
     if isinstance(value, bool):
         return CExpression("true" if value else "false", BOOL, constant=value)
     if not isinstance(value, (int, float)):

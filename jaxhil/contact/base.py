@@ -78,7 +78,7 @@ class ContactLaw(abc.ABC):
 
     @property
     def is_locally_parabolic(self) -> bool:
-        """Return whether parabolas approximate the force of a slow contact, one in each quarter of a period.
+        """Return whether one parabola per quarter period approximates the force of a contact of many ticks.
 
         This is false if the slope changes at a given depth, if the force jumps when the motion reverses, or
         if the force near 0 is proportional to a power of the depth.
@@ -171,7 +171,7 @@ class ContactLaw(abc.ABC):
     # Magnitudes of the contact, from a mechanism file
 
     def nominal_peak_force(self, contact: Any, stiffness: list[float], mass: float, velocity: float) -> float:
-        """Estimate the largest peak force [N] of a mechanism's contacts; by default for a linear spring."""
+        """Estimate the largest peak force [N] of a mechanism's contacts. The default is a linear spring's."""
         return velocity * math.sqrt(max(stiffness) * mass)
 
     def damping_ratio(self, damping: float, mass: float, velocity: float, frequency: float) -> float:

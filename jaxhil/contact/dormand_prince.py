@@ -97,7 +97,7 @@ def interpolate_step(
 ) -> tuple[Array, Array]:
     """Interpolate position [m] and velocity [m/s] at the fraction s of a step (quintic Hermite polynomial).
 
-    `depth` and `velocity` are the values at the start of the step.
+    `depth` and `velocity` are position and velocity at the start of the step; `length` is its duration [s].
     """
     linear, square = velocity * length, end.start_acceleration * length**2 / 2
     # Differences from uniform acceleration at the end of the step, multiplied by powers of the step length.

@@ -68,7 +68,8 @@ class Elastoplastic(ContactLaw):
     def ideal_contact(self, parameters, mass, velocity):
         """Return the ideal contact, which consists of two quarter periods of harmonic oscillations.
 
-        The angular frequency is sqrt(k/M) during the inward motion and sqrt(k_u/M) during the outward motion.
+        The angular frequency is sqrt(k/M) during the inward motion and sqrt(r k/M) during the outward motion.
+        k is the stiffness, r is the unloading ratio, and M is `mass`.
         """
         from jaxhil.contact.ideal_contact import IdealContact
 
@@ -98,7 +99,7 @@ class Elastoplastic(ContactLaw):
 
 
 def _as_float_law(stiffness: float, unloading_ratio: float, deepest: float) -> FloatLaw:
-    """Return the law in Python floats for a contact whose largest penetration so far is `deepest` [m]."""
+    """Return the elastoplastic law in Python floats, for a largest penetration so far of `deepest` [m]."""
 
     def spring(depth: float, rate: float) -> float:
         if depth >= deepest:

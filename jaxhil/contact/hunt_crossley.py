@@ -53,16 +53,16 @@ class HuntCrossley(PowerLaw):
         )
 
     def damping_ratio(self, damping, mass, velocity, frequency):
-        """Return the damping ratio zeta = chi v/pi, where v is the approach speed.
+        """Return the damping ratio zeta = chi v/pi, where chi is `damping` and v is the approach speed.
 
         The restitution is about 1 - chi v for this law, and about 1 - pi zeta for a linear oscillator.
         """
         return damping * velocity / np.pi
 
     def perturb_damping(self, drawn, ratio, mass, velocity):
-        """Add pi zeta/v to chi, where zeta is the damping ratio `ratio` and v the approach speed.
+        """Add pi zeta/v to `damping`, where zeta is the damping ratio `ratio` and v the approach speed.
 
-        This reduces the restitution, which is about 1 - chi v, by about pi zeta.
+        With chi = `damping`, the restitution is about 1 - chi v; it decreases by about pi zeta.
         """
         return "damping", drawn("damping") + np.pi * ratio / velocity * np.ones_like(drawn("stiffness"))
 

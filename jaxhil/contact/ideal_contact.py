@@ -167,7 +167,7 @@ _POTENTIAL_SERIES = _COTH_SERIES * (1 + 1 / (2 * _SERIES_ORDERS))
 
 
 def _langevin(s):
-    """Return 1 - f(s) and the derivative L'(s) of L(s) = s f(s) for s >= 0.
+    """Return 1 - f(s) and L'(s) for s >= 0, where L'(s) is the derivative of L(s) = s f(s).
 
     f(s) = coth(s) - 1 / s is Langevin's function.
     """
@@ -192,7 +192,8 @@ def _hunt_crossley_shape(onset, exponent):
     """Return the dimensionless restitution, peak force and duration for Hunt and Crossley's law.
 
     The unit of force is M v^2 / D and the unit of time D / v, where the length D satisfies
-    D^(n+1) = (n + 1) M v^2 / k. `onset` is q = 3 chi v / 2 (`ideal_hunt_crossley`).
+    D^(n+1) = (n + 1) M v^2 / k. `onset` is q = 3 chi v / 2, and `exponent` is n. The other symbols are as in
+    `ideal_hunt_crossley`.
     """
     half_span, at_peak = _solve_half_span(onset), _solve_peak(onset, exponent)
     return _shape_at_roots(half_span, at_peak, onset, exponent)
@@ -218,7 +219,10 @@ def _hunt_crossley_shape_jvp(primals, tangents):
 
 
 def _shape_at_roots(half_span, at_peak, onset, exponent):
-    """Return the results of `_hunt_crossley_shape` from the solutions S and u of its two equations."""
+    """Return the results of `_hunt_crossley_shape` from the roots S = `half_span` and u = `at_peak`.
+
+    `_solve_half_span` and `_solve_peak` compute the roots.
+    """
     symmetry, _ = _langevin(half_span)
     exponent_ratio = exponent / (exponent + 1)
     # The peak force is stationary with respect to u = `at_peak`, so that u needs no derivative.
@@ -232,7 +236,7 @@ def _shape_at_roots(half_span, at_peak, onset, exponent):
 
 
 def _solve_half_span(onset):
-    """Return the root S >= 0 of S + L(S) = `onset`; L is the Langevin function (`ideal_hunt_crossley`)."""
+    """Return the root S >= 0 of S + L(S) = `onset`, where L(s) = s coth(s) - 1."""
 
     def newton(_, s):
         symmetry, slope = _langevin(s)
@@ -243,7 +247,10 @@ def _solve_half_span(onset):
 
 
 def _solve_peak(onset, exponent):
-    """Return u = y / q^2 at the peak force, where G(q) - G(y) = n y / (n + 1) (`ideal_hunt_crossley`)."""
+    """Return u = y / q^2 at the peak force, where y solves G(q) - G(y) = n y / (n + 1).
+
+    q is `onset`, n is `exponent`, and G(y) = y - log(1 + y), as in `ideal_hunt_crossley`.
+    """
     exponent_ratio = exponent / (exponent + 1)
     potential = _scaled_potential(onset)
 
@@ -289,7 +296,8 @@ _QUADRATURE_WEIGHTS = (
 def _duration_integral(half_span, exponent):
     """Integrate R^(-n/(n+1)) over tau in (0, 1), for the duration in `ideal_hunt_crossley`.
 
-    R = (G(S) - G(s)) / (S^2 (1 - s/S)) with 1 - s/S = tau^(n+1).
+    R = (G(S) - G(s)) / (S^2 (1 - s/S)) with 1 - s/S = tau^(n+1) and G(s) = L(s) + log(sinh(s) / s). S is
+    `half_span`, and n is `exponent`; L(s) is as in `ideal_hunt_crossley`.
     """
     column = (-1,) + (1,) * half_span.ndim
     log_node = jnp.asarray(_QUADRATURE_LOG_NODES, half_span.dtype).reshape(column)
@@ -309,9 +317,9 @@ def _duration_integral(half_span, exponent):
 
 
 def _gap_by_series(span, fraction):
-    """Return R of `_duration_integral` by a power series in S, for small S.
+    """Return R, as defined in `_duration_integral`, by a power series in S, for small S.
 
-    With r = s / S and the coefficients g_k of G (`_POTENTIAL_SERIES`),
+    With S = `span`, r = s / S = `fraction` and the coefficients g_k in `_POTENTIAL_SERIES`,
     R = (1 + r) sum_k g_k S^(2k-2) (1 + r^2 + ... + r^(2k-2)).
     """
 
@@ -327,7 +335,10 @@ def _gap_by_series(span, fraction):
 
 
 def _gap_in_closed_form(span, fraction, below_end):
-    """Return R of `_duration_integral` in closed form, without cancellation near s = S."""
+    """Return R, as defined in `_duration_integral`, in closed form without cancellation near s = S.
+
+    `span` is S, `fraction` is s / S, and `below_end` is 1 - s / S.
+    """
     s, distance = span * fraction, span * below_end
     loss = -jnp.expm1(-2 * span)
     # The surplus is defined by sinh(S) = exp(S - s) sinh(s) (1 + surplus).

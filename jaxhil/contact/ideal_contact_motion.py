@@ -70,8 +70,9 @@ def integrate_contact(
     """Integrate the motion of one ideal contact.
 
     The bodies separate when the penetration, or `ContactLaw.separation_function`, crosses 0 during the
-    outward motion. Since p >= 0 drives the bodies apart, they never touch again. If the push lasts longer
-    than the contact, the restitution is computed from the speed at the end of the push and may exceed 1.
+    outward motion. The push p(t) >= 0 drives the bodies apart, so that they never touch again. If the push
+    lasts longer than the contact, the restitution is computed from the speed at the end of the push and may
+    exceed 1.
 
     The function can be jitted, vmapped and differentiated in forward mode, also with respect to `times` and
     to the variables that `push` encloses. All arrays have one batch shape and one dtype; slopes and depths
@@ -135,7 +136,7 @@ class _IntegrationState(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """State of the step size control and of the search for an event."""
+    """State of the step size control and of the search for an event, which ends a phase of the motion."""
 
     step: Array  # step to try next [s]
     tries: Array  # iterations of the false position method; 0 while no event is bracketed
@@ -147,7 +148,7 @@ class _Search(NamedTuple):
 
 
 class _Nodes(NamedTuple):
-    """Motion at the start of each step, (steps, *batch)."""
+    """Nodes of the interpolation: the motion at the start of each integration step, (steps, *batch)."""
 
     time: Array  # time since the first touch [s]
     depth: Array  # penetration [m]
@@ -159,7 +160,8 @@ class _Nodes(NamedTuple):
 def _event_value(problem, state, time, depth, rate):
     """Return a value that is positive during a phase of the motion and 0 at the end of the phase.
 
-    A phase ends at the turning point, at the separation, or at the end of the push.
+    A phase ends at the turning point, at the separation, or at the end of the push (a force that drives the
+    bodies apart).
     """
     law_value = problem.law.separation_function(problem.parameters, state.memory, depth, rate)
     # Force and depth are scaled to order 1; otherwise the root of their minimum would be hard to find.
@@ -208,7 +210,7 @@ def _initial_state(problem):
 
 
 def _integrate_phases(problem, records):
-    """Integrate all contacts. Return the final state and, if `records` is true, the nodes, else None."""
+    """Integrate all contacts; return the final state and the motion's `_Nodes` (None unless `records`)."""
     like = problem.approach
     dtype, zeros = like.dtype, jnp.zeros_like(like)
     rounding = float(np.finfo(dtype).eps)
@@ -278,7 +280,7 @@ def _propose_step(problem, state, search):
 
 
 def _fill_nodes(nodes, end, count):
-    """Set the unused nodes, from index `count` on, to the state `end` at the end of the motion."""
+    """Fill the unused rows of `nodes`, from index `count` on, with the final state `end` of the motion."""
     zeros = jnp.zeros_like(end.time)
     is_unused = jnp.arange(MAX_STEPS, dtype=count.dtype).reshape(-1, *[1] * zeros.ndim) >= count
     filling = end.time, end.depth, end.velocity, zeros, zeros
@@ -287,7 +289,7 @@ def _fill_nodes(nodes, end, count):
 
 
 def _update_search(search, step, proposed, value, at_start, crosses, is_located):
-    """Return the state of the search after one more step: the search starts, narrows its bracket, or ends."""
+    """Update the search for an event after a step: the search starts, narrows its bracket, or ends."""
     searching = search.tries > 0
     before = value > 0
     # The Illinois rule halves the value at a bound that does not move for a second time.
@@ -354,7 +356,7 @@ def _update_state(problem, state, step, trial, correction, is_located):
 
 
 def _interpolate_nodes(nodes, end, approach, times):
-    """Return position [m] and velocity [m/s] at `times`; outside the nodes, assume uniform motion."""
+    """Return position [m] and velocity [m/s] at `times`; before 0 and after `end`, assume uniform motion."""
     columns = _Nodes(*(leaf.reshape(leaf.shape[0], -1) for leaf in nodes))
     last = [leaf.reshape(1, -1) for leaf in (end.time, end.depth, end.velocity)]
     requested = times.reshape(times.shape[0], -1)

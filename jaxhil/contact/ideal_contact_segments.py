@@ -25,7 +25,10 @@ def solve_chained_oscillators(
     damping: Float[Array, "*batch"],
     velocity: Float[Array, "*batch"],
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """Return restitution, peak force [N] and duration [s]; for the arguments see `ideal_piecewise_linear`."""
+    """Return restitution, peak force [N] and duration [s] of ideal contacts with a piecewise-linear force.
+
+    Each segment contributes a damped oscillation. `ideal_piecewise_linear` describes the arguments.
+    """
     count = slopes.shape[0]
     zero = jnp.zeros_like(velocity)
     thicknesses = jnp.diff(depths, axis=0, prepend=zero[None])
@@ -160,7 +163,10 @@ def _traverse(decay, segment: _Segment, inward, state: _State) -> _State:
 
 
 def _compute_passage(decay, segment: _Segment, inward, state: _State, active) -> _SegmentPassage:
-    """Compute the motion of the `active` batch elements through a segment. Times have no derivatives."""
+    """Compute the motion of the `active` batch elements through a segment.
+
+    In differentiation, the times in the result are constants; `_traverse` adds the derivative of `time`.
+    """
     stiffness, turns_here = segment.stiffness, state.segment == segment.number
     # The outward motion starts at the turning point, and enters each further segment at its deeper end.
     depth = jnp.where(inward, 0.0, jnp.where(turns_here, state.depth, segment.thickness))
@@ -194,7 +200,7 @@ def _compute_passage(decay, segment: _Segment, inward, state: _State, active) ->
 
 
 def _crossing_time(decay, stiffness, spring, velocity, target, start):
-    """Return the time [s] to travel the distance `target` [m], without derivative; 0 if `target` is 0.
+    """Return the time [s] in which the motion covers the distance `target` [m]; 0 if `target` is 0.
 
     `start` is 0 for the inward motion, and the time of separation for the outward motion. Since d is concave
     in time, Newton's method approaches the crossing from `start` without overshoot, until rounding stops it.
@@ -246,7 +252,10 @@ def _free_motion(decay, stiffness, spring, velocity, time):
 
 @jax.custom_jvp
 def _impulse_response(decay, stiffness, time):
-    """Return the impulse response S = e^(-a t) sin(w t) / w (w^2 = k - a^2), its rate S' and its integral."""
+    """Return the impulse response S = e^(-a t) sin(w t) / w, its rate S' and its integral.
+
+    a is `decay`, k is `stiffness`, t is `time`, and w^2 = k - a^2.
+    """
     over, rate = _characteristic_root(decay, stiffness)
     half = jnp.where(over, 0.0, rate * time) / 2
     sine = jnp.sin(half)

@@ -106,8 +106,9 @@ def deflection(position: Any, clearance: Any | None) -> Any:
 def compute_two_sided_force(law, parameters, state, position, velocity, clearance):
     """Return the signed contact force [N] at one or two surfaces, and the next state of the law.
 
-    At the first surface, the penetration is d = x and the force is F(d, d'). A `clearance` c [m] other than
-    None adds a second surface, where the penetration is d = -c - x and the force is -F(d, d').
+    At the first surface, the penetration is d = x, where x is `position` [m], and the force is F(d, d').
+    Unless None, `clearance` c [m] adds a second surface, where the penetration is d = -c - x and the force is
+    -F(d, d').
     """
     signed = deflection(position, clearance)
     if clearance is None:

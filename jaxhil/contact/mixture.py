@@ -78,7 +78,7 @@ class LawMixture(ContactLaw):
         return IdealContact(*(self._choose(parameters, leaves) for leaves in zip(*references, strict=True)))
 
     def _per_law(self, parameters: ContactParameters) -> list[ContactParameters]:
-        """Return the parameters for each law, with damping 0 for the batch elements of other laws."""
+        """Return the parameters for each law, with damping 0 in batch elements that use a different law."""
         per_law = []
         for kind, law in enumerate(self.laws):
             damping = jnp.where(parameters.kind == kind, parameters.damping, 0)

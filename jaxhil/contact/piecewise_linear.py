@@ -104,7 +104,10 @@ class PiecewiseLinear(ContactLaw):
 
 
 def _regression(depths: tuple[float, ...]) -> Regression:
-    """Return the regression F = sum_i k_i s_i(d) + b d' with the unknown coefficients k_i and b."""
+    """Return the regression F = sum_i k_i s_i(d) + b d' with the unknown coefficients k_i and b.
+
+    s_i(d) is the part of d within segment i; `depths` [m] separate the segments.
+    """
     bounds = np.array([0.0, *depths, np.inf])
 
     def overlaps(d, v):

@@ -31,5 +31,5 @@ def built_in_compensators(axes: int = 1) -> tuple[str, ...]:
 
 
 def module_name(name: str, axes: int = 1) -> str:
-    """Return the full name of the Python module with a compensator's JAX version."""
+    """Return the full name of the Python module that contains a compensator's JAX version."""
     return f"{__name__}.{name}.{_FILES[axes]}"

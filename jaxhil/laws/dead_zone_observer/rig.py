@@ -22,10 +22,11 @@ from jaxhil.rig.surfaces import deflection
 class DeadZoneObserver(Compensator):
     """Compensator F_c = lead(F + w), w = Q u, Q = 1/(1 + s/(2 pi f)).
 
-    F is the measured force, k_n is `observer_stiffness`, f is `observer_bandwidth`, and T is the control
-    period. d is the penetration (`deflection`), delayed by `identification_delay`. u is k_n d up to
-    `observer_limit`. Beyond this limit, u is `observer_limit` times `observer_saturation`, which is 1 for a
-    continuous and 0 for a cut dead zone. Q is realised by Tustin's rule with c = 2 pi f T:
+    lead is the phase lead (`LeadFilter`), F is the measured force, k_n is `observer_stiffness`, f is
+    `observer_bandwidth`, and T is the control period. d is the penetration (`deflection`), delayed by
+    `identification_delay`. u is k_n d up to `observer_limit`. Beyond this limit, u is `observer_limit` times
+    `observer_saturation`, which is 1 for a continuous and 0 for a cut dead zone. Q is realised by Tustin's
+    rule with c = 2 pi f T:
 
     w = ((2 - c) w_prev + c (u + u_prev)) / (2 + c)
     """
@@ -61,7 +62,7 @@ class DeadZoneObserver(Compensator):
         self._started = False
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
-        """Return the lead-filtered sum [N] of the measured force and the observed dead-zone force."""
+        """Return the lead-filtered sum [N] of the measured force and the estimated dead-zone force."""
         alignment = self._alignment
         if not self._started:
             alignment.start(position_measured, velocity_desired)

@@ -60,7 +60,10 @@ PASSBAND = 15.0, 0.9  # [Hz], [1]; up to this frequency, |Q| is at least this ga
 
 
 def _max_bandwidth(mechanism: Mechanism) -> float:
-    """Return the bandwidth [Hz] at which Q's pole is 0; above it, Q's output would alternate in sign."""
+    """Return the largest bandwidth [Hz] of the observer's filter Q, at which its discrete pole is 0.
+
+    Above this bandwidth, Q's output would alternate in sign.
+    """
     return 1 / (math.pi * mechanism.rig.control_period)
 
 
@@ -101,7 +104,10 @@ class PreparedObserver(NamedTuple):
 
 
 class DeadZoneObserver(Compensator):
-    """Compensator F_c = lead(F + Q u(k_n d)); see the module's docstring."""
+    """Compensator F_c = lead(F + Q u(k_n d)): phase lead on the measured force and an estimated force.
+
+    The estimate is the force that the sensor's dead zone removes. The module's docstring defines the symbols.
+    """
 
     name: ClassVar[str] = "dead_zone_observer"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, STIFFNESS, DEAD_ZONE)

@@ -5,7 +5,7 @@ from jaxhil.rig.types import Positive
 
 
 class Alignment:
-    """Delay of the measured position and velocity by the force delay `delay` [s]."""
+    """Filter that delays the measured position and its rate by the force delay `delay` [s]."""
 
     __slots__ = ("_last", "_line", "_middle", "_period", "_share")
     _period: Positive
@@ -21,7 +21,7 @@ class Alignment:
     def step(self, position: float, velocity: float, begins: bool) -> tuple[float, float]:
         """Return the delayed position [m] and velocity [m/s] for the `position` measured on this tick [m].
 
-        If a run `begins` on this tick, assume uniform motion before it, with the model's `velocity` [m/s].
+        If a run `begins` on this tick, assume uniform motion at `velocity` [m/s] before this tick.
         """
         period = self._period
         if begins:

@@ -55,9 +55,10 @@ Spreads = Annotated[list[float], 7]
 
 
 def features(depth: float, speed: float, deepest: float, delay_effect: float) -> Vector:
-    """Return the regressor phi; the contact model's force is the product phi.theta. Out of contact, phi = 0.
+    """Return the regressor phi: phi.theta is the force for the parameters theta. Out of contact, phi is 0.
 
-    `delay_effect` [1/s^2] is the derivative k (1 - v) of the force with respect to the delay.
+    `delay_effect` [1/s^2] is the derivative of the force with respect to the delay. It is k (1 - v) for the
+    slope k and the `speed` v.
     """
     if not depth > 0.0:
         return [0.0] * PARAMETERS
@@ -67,7 +68,7 @@ def features(depth: float, speed: float, deepest: float, delay_effect: float) ->
 
 
 def force(theta: Sequence[float], depth: float, speed: float, deepest: float) -> float:
-    """Return the contact model's force, divided by mass and approach speed [1/s], without the delay."""
+    """Return the contact model's force as if undelayed, divided by mass and approach speed [1/s]."""
     if not depth > 0.0:
         return 0.0
     total = theta[PRELOAD]
@@ -97,12 +98,12 @@ def damping(theta: Sequence[float], depth: float) -> float:
 
 
 class ContactModel:
-    """Recursive least-squares estimate of the contact model's parameters theta.
+    """Recursive least-squares estimate of theta, the parameters of the contact model in this module.
 
     Attributes:
         mean: posterior mean without constraints.
         covariance: posterior covariance without constraints.
-        theta: posterior mean with dissipative parameters constrained to be >= 0.
+        theta: posterior mean with the constraint that damping and other losses are >= 0.
         count: number of readings in the estimate.
     """
 
@@ -116,9 +117,9 @@ class ContactModel:
 
         Args:
             stiffness: prior mean of the slope at depth 0 [1/s^2].
-            spreads: prior standard deviations of the slope at depth 0 [1/s^2], the change of the slope per
-                `WANDER` [1/s^2], damping [1/s], depth damping [1/s], unloading [1/s^2], friction [1/s] and
-                preload [1/s].
+            spreads: prior standard deviations of the slope at depth 0 [1/s^2], its change over the scaled
+                depth `WANDER` [1/s^2], damping [1/s], depth damping [1/s], unloading [1/s^2], friction [1/s]
+                and preload [1/s].
             delay_variance: prior variance of the delay [s^2].
         """
         squares = [spread * spread for spread in spreads]
@@ -136,7 +137,10 @@ class ContactModel:
         self.count = 0.0
 
     def learn(self, phi: Vector, force: float, variance: float) -> None:
-        """Update the estimate with one scaled force reading [1/s] and its noise variance [1/s^2]."""
+        """Update the estimate with one force reading [1/s] and its noise variance [1/s^2].
+
+        The reading is divided by mass and approach speed; `phi` is its regressor (`features`).
+        """
         covariance = self.covariance
         column = [dot(row, phi) for row in covariance]
         total = variance + dot(phi, column)
@@ -152,7 +156,7 @@ class ContactModel:
         self.count += 1.0
 
     def conclude(self, delay: float) -> None:
-        """Compute `theta` from the estimate, for a known `delay` [s] and non-negative dissipation."""
+        """Compute `theta`, the estimated parameters for a known `delay` [s] and non-negative dissipation."""
         theta = list(self.mean)
         rows = [list(self.covariance[j]) for j in CONCLUDED]
         observe(theta, rows, len(DISSIPATIVE), DELAY, EXACT * delay, EXACT)
@@ -162,9 +166,10 @@ class ContactModel:
         self.theta = theta
 
     def estimate_delay(self, preload: float, preload_spread: float) -> tuple[float, float]:
-        """Estimate the delay d after a contact; return its mean [s] and variance [s^2].
+        """Estimate d, the true minus the specified force delay; return its mean [s] and variance [s^2].
 
-        `preload` and `preload_spread` [1/s] are prior mean and standard deviation of the scaled onset force.
+        Call this after a contact. `preload` and `preload_spread` [1/s] are prior mean and standard deviation
+        of the force at the onset, divided by mass and approach speed.
         """
         mean = [self.mean[j] for j in DELAY_PARAMETERS]
         rows = [[self.covariance[i][j] for j in DELAY_PARAMETERS] for i in DELAY_PARAMETERS]
@@ -201,11 +206,11 @@ class ContactModel:
         return weakened * delay / variance / (excess * excess), weakened
 
     def _dissipate(self, mean: list[float], rows: list[list[float]], first: Count, certain: bool) -> None:
-        """Constrain the dissipative parameters to be >= 0, in place.
+        """Constrain the dissipative parameters of a normal distribution to be >= 0, in place.
 
         Args:
-            mean: mean of some parameters.
-            rows: rows of the covariance; the first rows are those of the dissipative parameters.
+            mean: mean of the distribution, which describes all parameters or some of them.
+            rows: rows of its covariance; the first rows are those of the dissipative parameters.
             first: index of the first dissipative parameter in `mean` and in a row.
             certain: whether the constrained parameters count as exactly known.
         """
@@ -242,7 +247,7 @@ def observe(
 
 
 def zero_or_positive(mean: float, variance: Positive, prior_variance: float) -> tuple[float, float]:
-    """Return posterior mean and variance of a parameter >= 0 that is 0 with the prior `ZERO_PROBABILITY`.
+    """Return mean and variance of a parameter >= 0 that is 0 with prior probability `ZERO_PROBABILITY`.
 
     The arguments are posterior mean, posterior variance and prior variance without this constraint. Boyd's
     bound of Mills' ratio, pi/((pi - 1) t + sqrt(t^2 + 2 pi)), approximates the tail of the normal

@@ -18,7 +18,7 @@ from jaxhil.laws.impulse_ledger.contact_model.rig import DAMPING, DELAY, DISSIPA
 
 
 class ContactModelEstimate(NamedTuple):
-    """Recursive least-squares estimate of the contact model's parameters theta."""
+    """Recursive least-squares estimate of theta, the parameters of the contact model in `rig.py`."""
 
     mean: Float[Array, "parameters *batch"]  # posterior mean without constraints
     covariance: Float[Array, "parameters parameters *batch"]  # posterior covariance without constraints
@@ -42,7 +42,7 @@ def begin(mean: Array, variances: Array) -> ContactModelEstimate:
 
 
 def features(depth: Array, speed: Array, deepest: Array, delay_effect: Array) -> Array:
-    """Return the regressor phi; the contact model's force is phi.theta. Out of contact, phi is 0."""
+    """Return the regressor phi: phi.theta is the force for the parameters theta. Out of contact, phi is 0."""
     hinges = [jnp.where(depth > knot, depth - knot, 0) for knot in rig.KNOTS]
     turning = speed / jnp.sqrt(speed * speed + rig.MIN_SLIDING_SPEED * rig.MIN_SLIDING_SPEED)
     losses = [speed, depth * speed / rig.REACH, jnp.where(depth < deepest, depth - deepest, 0), turning]
@@ -70,7 +70,10 @@ def damping(theta: Array, depth: Array) -> Float[Array, "*batch"]:
 def learn(
     old: ContactModelEstimate, phi: Array, force: Array, variance: Array, used: Bool[Array, "*batch"]
 ) -> ContactModelEstimate:
-    """Update the estimate on the lanes `used` with a scaled force reading [1/s] and its variance [1/s^2]."""
+    """Update the estimate in the lanes `used` with one force reading [1/s] and its noise variance [1/s^2].
+
+    The reading is divided by mass and approach speed.
+    """
     column = reduce(add, (old.covariance[j] * phi[j][None] for j in range(PARAMETERS)))
     total = variance + dot(phi, column)
     used = used & (total > 0)  # false if the covariance is not positive because of rounding
@@ -88,7 +91,7 @@ def learn(
 def conclude(
     estimate: ContactModelEstimate, prior_variances: Array, delay: Array
 ) -> Float[Array, "parameters *batch"]:
-    """Return theta from the estimate, for a known `delay` [s] and non-negative dissipation."""
+    """Return theta, the estimated parameters for a known `delay` [s] and non-negative dissipation."""
     rows = [estimate.covariance[j] for j in rig.CONCLUDED]
     mean, rows = _observe(estimate.mean, rows, len(DISSIPATIVE), DELAY, rig.EXACT * delay, rig.EXACT)
     theta, _ = _dissipate(mean, rows, DAMPING, prior_variances, True)
@@ -136,7 +139,7 @@ def estimate_delay(
 def _dissipate(
     mean: Array, rows: list[Array], first: int, prior_variances: Array, certain: bool
 ) -> tuple[Array, list[Array]]:
-    """Return mean and covariance rows with the dissipative parameters constrained to be >= 0."""
+    """Constrain the dissipative parameters to be >= 0; return the new mean and the new covariance rows."""
     for row in range(len(DISSIPATIVE)):
         index = first + row
         variance = jnp.maximum(rows[row][index], rig.MIN_VARIANCE)
@@ -149,7 +152,7 @@ def _dissipate(
 def _observe(
     mean: Array, rows: list[Array], row: int, index: int, information: Array | float, precision: Array | float
 ) -> tuple[Array, list[Array]]:
-    """Return mean and covariance rows, conditioned on an observation of one parameter."""
+    """Condition a normal distribution on an observation of one parameter; return mean and covariance rows."""
     observed = rows[row]
     total = 1 + precision * observed[index]
     share = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
@@ -158,7 +161,7 @@ def _observe(
 
 
 def zero_or_positive(mean: Array, variance: Array, prior_variance: Array) -> tuple[Array, Array]:
-    """Return posterior mean and variance of a parameter >= 0 that is 0 with the prior `ZERO_PROBABILITY`."""
+    """Return mean and variance of a parameter >= 0 that is 0 with prior probability `ZERO_PROBABILITY`."""
     spread = jnp.sqrt(variance)
     ratio = mean / spread
     size = jnp.abs(ratio)
