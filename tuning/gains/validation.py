@@ -40,7 +40,7 @@ VALIDATION_SEED_OFFSET = 0x5EED  # added to the seed of training, so that fresh 
 
 @dataclass(frozen=True)
 class Validation:
-    """Evaluator of gains for tasks that share a compiled program, built by `build_validation`."""
+    """Evaluator of the gains of tasks that run in the same compiled program; see `build_validation`."""
 
     tasks: list[TuneTask]  # tasks with their training scenarios
     fresh: list[Any]  # fresh scenarios of each task
@@ -58,14 +58,14 @@ class Validation:
     def evaluate(
         self, gains: list[dict[str, float]], compensator: str | None = None, noise: bool = True
     ) -> list[tuple[Outcome, Outcome | None]]:
-        """Evaluate one set of gains for each task on the task's fresh scenarios.
+        """Evaluate one set of gains per task on fresh scenarios, which training does not use.
 
         `compensator` replaces the tasks' compensator. `noise=False` removes the sensor noise.
 
         Returns:
             Two outcomes for each task. The first contains the fresh scenarios and, as its last element, the
-            nominal run. The second contains each fresh scenario with its probes, as arrays (contacts,
-            scenarios, `LANES_PER_SCENARIO`); it is None for tasks without probes.
+            nominal run. The second contains each fresh scenario with its probes (perturbed copies), as arrays
+            (contacts, scenarios, `LANES_PER_SCENARIO`); it is None for tasks without probes.
         """
         model, loop = self.tasks[0].model, self.loop
         if compensator is not None:
@@ -93,11 +93,11 @@ class Validation:
         scenarios: int | None = None,
         lanes: int = 0,
     ) -> Float[np.ndarray, "which points"]:
-        """Evaluate the objective at points in unit coordinates, on training scenarios of the tasks `which`.
+        """Evaluate the objective for gains in unit coordinates, on training scenarios of the tasks `which`.
 
-        `objective` is common to all tasks, or a list with one per task. Only the first `scenarios` training
-        scenarios of each task are used, and probes count towards this number. The batch is padded to at least
-        `lanes` lanes.
+        `coordinates` are gains, scaled to 0..1. `objective` is common to all tasks, or a list with one per
+        task. Only the first `scenarios` training scenarios of each task are used; this number includes probes
+        (perturbed copies of scenarios). Each batch is padded to at least `lanes` lanes.
         """
         objectives = list_objectives(objective, len(self.tasks))
         noise = any(objectives[task].noise_weight > 0 for task in which)
@@ -149,7 +149,7 @@ class Validation:
     def _evaluate_function(
         self, objective: Objective, outcome: Outcome, pairs: int
     ) -> Float[np.ndarray, "pairs"] | None:
-        """Evaluate a user's objective function for every pair of task and point; return None if unused."""
+        """Evaluate the user's objective function, if there is one, for each pair of task and gains."""
         if objective.function is None:
             return None
         task = self.tasks[0]
@@ -160,9 +160,10 @@ class Validation:
     def _begin(
         self, noise, which, coordinates, number, lanes, read
     ) -> Callable[[], tuple[Outcome, Float[np.ndarray, "which points"]]]:
-        """Start the evaluation of several points of each task; return a function that waits for the result.
+        """Start to evaluate several sets of gains for each task; return a function that waits for the end.
 
-        The result is the part of the outcome that `read` selects, and the noise amplification of each point.
+        This function returns the part of the outcome that `read` selects, and the noise amplification of each
+        set of gains.
         """
         gains = [self._gains(task, points) for task, points in zip(which, coordinates, strict=True)]
         names = self.tasks[0].literature
@@ -193,12 +194,12 @@ class Validation:
 
     @cached_property
     def _placed(self) -> Callable[[tuple[int, ...], int, int, int], tuple[Any, Batch]]:
-        """Return `_place_training_scenarios` with a cache, because a search reuses the same scenarios."""
+        """Return a function that places training scenarios and caches them, because searches reuse them."""
         model, loop = self.tasks[0].model, self.loop
         return lru_cache(maxsize=4)(partial(_place_training_scenarios, model, loop, self.training))
 
     def gains(self, task: int, coordinates: Float[np.ndarray, "gains"]) -> dict[str, float]:
-        """Return all gains of the compensator; `coordinates` are the tuned gains as unit coordinates."""
+        """Return all gains of a task's compensator; `coordinates` are the tuned ones, scaled to 0..1."""
         return {name: float(gain) for name, gain in self._gains(task, coordinates).items()}
 
     def _gains(
@@ -225,7 +226,7 @@ def _keep_contact_terms(outcome: Any) -> Any:
 def _place_training_scenarios(
     model: RigModel, loop: Any, training: Any, which: tuple[int, ...], points: int, number: int, lanes: int
 ) -> tuple[Any, Batch]:
-    """Repeat the first training scenarios of each task for each point; return copies for host and devices."""
+    """Repeat the first training scenarios of each task per point; return host arrays and a device batch."""
 
     def side_by_side(leaf):
         picked = np.moveaxis(leaf[np.repeat(which, points)][..., :number], 0, -2)
@@ -238,9 +239,9 @@ def _place_training_scenarios(
 def build_validation(
     tasks: list[TuneTask], scenarios: int, seed: int, work: SearchProgress | None = None
 ) -> Validation:
-    """Build the evaluator of tasks that share a program, with `scenarios` fresh scenarios for each task.
+    """Build the evaluator of tasks that share a compiled program, with `scenarios` new scenarios per task.
 
-    Ideal contacts, which no gain changes, are computed here, once for all gains.
+    Ideal contacts do not depend on the gains, so they are computed only once, here.
     """
     drawn = [_draw_evaluation_lanes(task, scenarios, seed + VALIDATION_SEED_OFFSET) for task in tasks]
     fresh, probed, evaluated, loops = (list(column) for column in zip(*drawn, strict=True))
@@ -266,7 +267,7 @@ def build_validation(
 
 
 def count_evaluated_runs(scenarios: int, probed: bool) -> int:
-    """Return the number of runs for one set of gains: scenarios, their probes if `probed`, nominal run."""
+    """Count the runs for a set of gains: scenarios, their perturbed copies if `probed`, and a nominal run."""
     return scenarios * (LANES_PER_SCENARIO if probed else 1) + 1
 
 
@@ -280,7 +281,7 @@ def split_nominal(outcome: Outcome) -> tuple[Any, Any]:
 
 
 def draw_fresh_scenarios(task: TuneTask, number: int, seed: int) -> Any:
-    """Draw `number` scenarios of a task that differ from its training scenarios."""
+    """Draw `number` new scenarios of a task, different from its training scenarios."""
     seed += VALIDATION_SEED_OFFSET
     return task.model.scenarios(task.mechanism, draw(task.mechanism, number, seed), seed)
 
@@ -288,10 +289,10 @@ def draw_fresh_scenarios(task: TuneTask, number: int, seed: int) -> Any:
 def _draw_evaluation_lanes(
     task: TuneTask, number: int, seed: int
 ) -> tuple[Any, ProbedScenarios | None, Any, Any]:
-    """Draw the scenarios with which gains are evaluated on a task.
+    """Draw the scenarios on which the gains of a task are evaluated.
 
-    Return the fresh scenarios; the same scenarios with probes, or None; all lanes to evaluate, which include
-    the nominal run; and the loop.
+    Return the fresh scenarios; the same scenarios with probes (perturbed copies), or None; all lanes to
+    evaluate, which include the nominal run; and the static properties of the simulated loop.
     """
     drawn = draw(task.mechanism, number, seed)
     fresh, probed = task.model.scenarios(task.mechanism, drawn, seed), None

@@ -149,11 +149,11 @@ def fit_resampled_contacts(
 
 
 def _find_contact_entries(fit: ContactFit) -> np.ndarray:
-    """Return the index of each contact into the lists in the mechanism's `[contact]`."""
+    """Return, for each contact, its index into the parameter lists of the mechanism file's `[contact]`."""
     return np.max(fit.readings.entry, axis=0)
 
 
 def _describe_problem(problem: ContactProblem) -> Any:
-    """Return the data that define the problem, except its readings."""
+    """Return the data that define a contact problem, without its readings, for a checkpoint's digest."""
     law = problem.law
     return law.name, law.names, law.pulls, law.shape, problem.plane, problem.motion.__getstate__()

@@ -139,7 +139,7 @@ def _update_draws(
 ) -> np.ndarray:
     """Update posterior draws with further knowledge about linear combinations of the parameters.
 
-    The module's docstring gives the formula and the symbols.
+    Move each draw theta_i by K (p_i - H theta_i), K = C H^T (H C H^T + P)^-1. C is the draws' covariance.
 
     Args:
         draws: Draws theta_i, shape (parameters, draws).

@@ -97,11 +97,11 @@ def fit_contact(
         model: Model of the motion simulator.
         timing: Timing of commands and readings.
         noise: Noise of the force sensor at rest, or None if it is unknown.
-        law: Contact law; or name of a law whose shape parameters are fitted, too; or None to choose a law.
+        law: Contact law; or the name of a law, to fit its shape parameters, too; or None to choose a law.
         plane: Position of the surface [m], or None to estimate it.
         seed: Seed of the random numbers.
-        sensor: Specified force sensor, or None. Its filter is ignored if a dead zone hides the noise, and its
-            dead zone if readings at rest do not show one.
+        sensor: Specified force sensor, or None. Its filter is ignored if a dead zone hides the noise. Its
+            dead zone is ignored if readings at rest do not show a dead zone.
     """
     sensor = sensor or ForceSensor()
     drift = _estimate_clock_drift(runs, model, timing, noise, law, plane) if timing.two_clocks else None
@@ -152,7 +152,7 @@ def _prepare_readings(
     plane: float | None,
     sensor: ForceSensor,
 ) -> tuple[ForceReadings, float | None]:
-    """Return the readings with their noise and bias prior, and the surface position [m] for the fit.
+    """Return the readings (with noise and prior of the bias), and the surface position [m] for the fit.
 
     The surface position is None if the fit must estimate it.
     """
@@ -224,7 +224,7 @@ def _fit_laws(
 
 
 def _drop_readings_near_edges(problem: ContactProblem, posterior: Posterior) -> ForceReadings:
-    """Exclude readings that would be out of contact with a surface two standard deviations further away."""
+    """Exclude the readings at depths below twice the standard deviation of the assumed surface position."""
     position, _ = problem.motion.at(posterior.best[0])
     readings = problem.readings
     return replace(
@@ -259,7 +259,7 @@ def _fit_law(
     noise_is_hidden: bool,
     seed: int,
 ) -> tuple[ContactProblem, Posterior, SensorLag | None, float]:
-    """Fit one law with the stated filter, or with a lag unless a dead zone hides the onset of contact."""
+    """Fit one law with the prior's filter or else a sensor lag; with neither if a dead zone hides onsets."""
     problem = summarise_deep_lanes(ContactProblem(motion, readings, law, plane), near)
     if readings.time_constant:
         lag = estimate_stated_filter(problem, near, seed)
@@ -288,7 +288,7 @@ def _estimate_clock_drift(
     law: Law | str | None,
     plane,
 ) -> ClockDrift:
-    """Estimate the drift of the force clock; assume unknown noise to be a share of the largest force."""
+    """Estimate the drift of the force clock; if the noise is unknown, assume a share of the largest force."""
     if noise is None or noise.silent or noise.std == 0.0:
         readings = ForceReadings.of(runs, 1.0)
         readings = replace(readings, std=ASSUMED_NOISE_SHARE * float(np.abs(readings.force).max()))
@@ -334,7 +334,7 @@ def _estimate_noise_from_contact(
         at_rest: Noise at rest [N]; 0 if it is unknown or a dead zone hides it.
 
     Returns:
-        The readings, with their noise level and with flags that mark the readings for fits.
+        The readings, with the estimated noise and with flags (`counts`) of the readings that fits use.
     """
     counts = readings.counts
     if readings.threshold:
@@ -383,7 +383,7 @@ def compute_force_lag(contact: ContactFit, model: MotionModel, frequency: float)
 def refit_without(fit: ContactFit, held_out: np.ndarray, seed: int = 0) -> ContactFit:
     """Fit the same law again, without the contacts that `held_out` flags.
 
-    The result contains the readings of all contacts, so that checks can compare it with the omitted contacts.
+    The result keeps the readings of all contacts, so that checks can compare the fit with the omitted ones.
     """
     readings, problem = fit.readings, fit.problem
     rest = replace(readings, counts=readings.counts & ~held_out)

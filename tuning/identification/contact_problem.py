@@ -41,9 +41,9 @@ class ContactProblem:
     """Least-squares problem: fit of a contact law to force readings, for a known motion of the mechanism.
 
     The surface position `plane` [m] is None if the fit estimates it. Readings out of contact depend only on
-    the bias. Their number, sum and sum of squares therefore represent them, and the regressors of the law are
-    computed only near contact. If the sensor has a lag or another filter (`time_constant` [s], the inverse of
-    its angular cutoff frequency), the regressors pass through the same filter. If its noise is coloured,
+    the bias. The fit therefore needs only their number, sum and sum of squares, and computes the law's
+    regressors only near contact. If the sensor has a lag or another filter (`time_constant` [s], the inverse
+    of its angular cutoff frequency), the regressors pass through the same filter. If its noise is coloured,
     regressors and readings are whitened.
     """
 
@@ -101,7 +101,7 @@ class ContactProblem:
     def changed(self, law: Law, time_constant: float, delay: float | None = None) -> ContactProblem:
         """Return a copy of the problem with this contact law and this time constant of the sensor [s].
 
-        `delay` [s] is the approximate force delay of the later fits, or None if it is unknown.
+        `delay` [s] is the approximate force delay for later fits of the copy, or None if it is unknown.
         """
         return ContactProblem(self.motion, self.readings, law, self.plane, time_constant)
 
@@ -170,7 +170,7 @@ class ContactProblem:
         ]
 
     def motion_at(self, delay: float) -> Motion:
-        """Return position [m] and velocity [m/s] in all rows, at each of the times `periods_before`."""
+        """Return position [m] and velocity [m/s] in all rows, once per time in `self.periods_before`."""
         moved = [self.motion.at(delay + part * self.motion.period) for part in self.periods_before]
         return [(position.ravel(), rate.ravel()) for position, rate in moved]
 
@@ -182,15 +182,15 @@ class ContactProblem:
         return np.unique(position[inside & self.is_used[:-1] if self.is_unfiltered else inside])
 
     def _find_nearby_rows(self, moved: Motion, planes: np.ndarray, only_used: bool) -> list[NearbyRows]:
-        """Return the rows near contact at each of the times `periods_before`.
+        """Return the rows near contact, once per time in `self.periods_before` [periods before a row].
 
         The result includes all rows that are in contact for at least one of the surface positions `planes`
         [m]. If the readings are filtered, the result also includes the later rows that the filters affect.
 
         Args:
-            moved: Position [m] and velocity [m/s] in all rows, at each of the times `periods_before`.
+            moved: Position [m] and velocity [m/s] in all rows, one pair of arrays for each of these times.
             planes: Surface positions [m].
-            only_used: Whether to omit the rows that fits do not use, which is possible without filters.
+            only_used: Whether to omit rows that fits do not use; possible only without filters.
         """
         # Finite differences also need the rows that would be in contact with a slightly nearer surface.
         lowest = planes.min() - (STEP if self.time_constant else 0.0)
@@ -223,7 +223,7 @@ class ContactProblem:
         return columns
 
     def _flag_rows_in_contact(self, near: NearbyRows, coefficients: np.ndarray | None) -> np.ndarray:
-        """Return flags that mark the rows in contact in which the force of the law is not negative."""
+        """Flag the rows below the surface, except those in which the law's force would not be positive."""
         inside = near.depth > 0.0
         if coefficients is None or self.law.pulls or not self.damping_indices:
             return inside
@@ -234,7 +234,7 @@ class ContactProblem:
         return np.where(sound[:, None], pushing, inside)
 
     def _find_onsets(self, near: NearbyRows, moved: Motion, planes: np.ndarray) -> Onsets | None:
-        """Find the onsets of contact between two rows; return None if the sensor has no lag."""
+        """Find the onsets of contact, which lie between two rows; return None if the sensor has no lag."""
         if self.time_constant == 0.0:
             return None
         (now, _), (half, _) = moved
@@ -249,8 +249,8 @@ class ContactProblem:
         """Apply the sensor's filter and the whitening filter to the regressors in the rows near contact.
 
         Args:
-            tables: Regressors in the rows near contact, one array (surface positions, regressors, rows) for
-                each entry of `periods_before`, a time before the row. They are 0 out of contact.
+            tables: Regressors in the rows near contact (0 out of contact): one array (surface positions,
+                regressors, rows) per time in `self.periods_before` [periods before a row].
             onsets: Onsets of contact, or None if the sensor has no lag.
             first: Regressors just after the onsets, shape (regressors, onsets), or None.
             whitening: Coefficients of the whitening filter.
@@ -260,9 +260,10 @@ class ContactProblem:
         return apply_filter(self.readings.modes, self.filter_rate, tables, whitening, onsets, first)
 
     def inside(self, delay: float, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return design matrix and readings of lanes that are always in contact, in the order of the lanes.
+        """Return the design matrix and the readings of a problem whose lanes are always in contact.
 
-        The design has the shape (surface positions, coefficients, used rows), the readings (used rows,).
+        The design has the shape (surface positions, coefficients, used rows), the readings (used rows,). The
+        used rows are sorted by lane.
         """
         length, lanes = self.readings.force.shape
         rows = np.arange(length * lanes).reshape(length, lanes).T.ravel()
@@ -285,9 +286,9 @@ class ContactProblem:
     def _build_design(
         self, near: list[NearbyRows], flags: list[np.ndarray], onsets: Onsets | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return design (surface positions, coefficients, rows) and readings near contact.
+        """Return design matrix (surface positions, coefficients, rows) and readings of rows near contact.
 
-        Both are divided by the standard deviation of the noise.
+        Design matrix and readings are divided by the standard deviation of the noise.
         """
         std, rows, first = self.readings.std, near[0].rows, None
         # The last column belongs to the bias: 1 in all rows or, with a dead zone, only in rows in contact.
@@ -313,7 +314,7 @@ class ContactProblem:
         return design, self.whitened[rows[used]]
 
     def _solve(self, near, flags, onsets, pseudo: PseudoRows | None) -> LeastSquaresFit:
-        """Fit the coefficients at each surface position, for the rows in contact that `flags` marks."""
+        """Fit the coefficients at each surface position; `flags` marks the rows of `near` in contact."""
         design, target = self._build_design(near, flags, onsets)
         # Number, sum and sum of squares of the readings that depend on the bias alone.
         count, total, square = (
@@ -363,7 +364,7 @@ class ContactProblem:
         return force if self.has_dead_zone else force + coefficients[-1]
 
     def _predict(self, near, flags, onsets, coefficients, whitening) -> np.ndarray:
-        """Return the whitened predicted readings [N] without a constant bias, (surface positions, rows)."""
+        """Predict whitened readings [N], (surface positions, rows), without a bias that all rows share."""
         offset, first = self.has_dead_zone * coefficients[-1], None
         tables = [
             ((compute_force(coefficients, part.columns) + offset) * flag)[:, None]

@@ -117,7 +117,8 @@ def compute_posterior(
 def estimate_surface_from_onset(problem: ContactProblem, delay: float) -> float:
     """Return the position [m] at which the force first exceeds its noise, as the median of all runs.
 
-    If the readings have a prior of the bias, the result comes from the forces of a press run (`press_bias`).
+    If a prior of the sensor's bias is known, the result is the position at which a line through the forces
+    reaches the bias (`press_bias`).
     """
     position, _ = problem.motion.at(delay)
     readings = problem.readings
@@ -135,7 +136,7 @@ def estimate_surface_from_onset(problem: ContactProblem, delay: float) -> float:
 def _scan_delays(
     problem: ContactProblem, delays: np.ndarray, start: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return, at each delay, the best surface position, its standard deviation and the log posterior."""
+    """Find, from `start`, the best surface position at each delay; return it, its std and log posterior."""
     planes, stds, heights = [], [], []
     for delay in delays:
         plane, inner, gain = find_best_surface(problem, delay, start)
@@ -148,9 +149,9 @@ def _scan_delays(
 def _find_likely_delays(
     problem: ContactProblem, delays: np.ndarray, heights: np.ndarray, reach: float
 ) -> tuple[float, float]:
-    """Return the range of delays [s] in which twice the log posterior is at most `reach` below its maximum.
+    """Return the range of delays [s] in which the log posterior `heights` is close to its maximum.
 
-    The range is extended by one step on each side.
+    Twice the drop from the maximum is at most `reach` there. One step is added on each side.
     """
     inside = np.flatnonzero(2.0 * (heights.max() - heights) <= reach)
     step = delays[1] - delays[0]
@@ -160,10 +161,10 @@ def _find_likely_delays(
 def _fit_grid(
     problem: ContactProblem, delays: np.ndarray, surface: tuple[np.ndarray, np.ndarray], across: int
 ) -> tuple[np.ndarray, list[CoefficientFit]]:
-    """Fit the coefficients on a grid of delays and of the plausible surface positions at each delay.
+    """Fit the coefficients on a grid of force delays with plausible surface positions at each delay.
 
-    The force of damped contact jumps at the onset. The likelihood is therefore smooth in the surface position
-    only between two positions at which another row comes into contact: the edges of the grid cells.
+    The force of damped contact jumps at the onset. The likelihood therefore jumps at surface positions where
+    one more row comes into contact. The edges of the grid cells lie at such positions where possible.
 
     Args:
         problem: Readings, motion and contact law.
@@ -230,7 +231,7 @@ def _compute_cell_posteriors(places: np.ndarray, cells: list[CoefficientFit]) ->
 def _draw_from_grid(
     problem: ContactProblem, places: np.ndarray, cells: list[CoefficientFit], delays: np.ndarray, seed: int
 ) -> Posterior:
-    """Draw from the posterior: a cell with its probability, a point in the cell, and normal coefficients."""
+    """Draw from the posterior: choose a cell by its probability, a point in it, and normal coefficients."""
     heights = _compute_cell_posteriors(places, cells)
     weights = np.exp(heights - heights.max())
     weights /= weights.sum()
@@ -267,7 +268,7 @@ def _draw_from_grid(
 
 
 def _draw_coefficients(cell: CoefficientFit, positive: list[int], count: int, rng) -> np.ndarray:
-    """Return normal draws of the coefficients; draws with a negative damping are repeated."""
+    """Draw normally distributed coefficients; repeat draws in which a damping (`positive`) is negative."""
     root = factorise_covariance(cell.covariance)
     draws = cell.coefficients + rng.standard_normal((count, len(root))) @ root.T
     for _ in range(50):

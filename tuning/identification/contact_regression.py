@@ -25,9 +25,9 @@ class CoefficientFit:
 
 
 class PseudoRows(NamedTuple):
-    """Rows that replace many readings of deep lanes (`tuning.identification.deep_contact`).
+    """Few regression rows that replace the many readings of runs well below the surface.
 
-    Rows are divided by the standard deviation of the noise.
+    See `tuning.identification.deep_contact`. Rows are divided by the standard deviation of the noise.
     """
 
     design: np.ndarray  # (surface positions, coefficients, rows), design matrix

@@ -36,7 +36,7 @@ def split_long_run(run: LoggedRun, period: float) -> list[LoggedRun]:
 
 
 def exclude_rows_after_gaps(runs: Sequence[LoggedRun], model: MotionModel, period: float) -> list[LoggedRun]:
-    """Mark the rows after a gap in the log as not valid if the lost commands affect the motion in these rows.
+    """Mark rows after a gap in the log as invalid while the lost commands can still affect the motion.
 
     The lost commands affect the motion for as long as the motion simulator's memory plus all delays. If a run
     begins in uniform motion, the motion is assumed to have been uniform during the gap, and all rows remain

@@ -24,9 +24,9 @@ MIN_LOUD_SHARE = 0.1  # share of the peak force that shows a contact
 
 
 def find_largest_size(runs: Sequence[LoggedRun]) -> float:
-    """Return the largest possible size of the zone [N]: that of the smallest reading other than 0.
+    """Return the largest possible size [N] of a cut dead zone: the smallest magnitude of a nonzero reading.
 
-    If the readings are rounded, the result is larger by half a quantum. It is 0 if all readings are 0.
+    If the readings are rounded, half a rounding step is added. The result is 0 if all readings are 0.
     """
     readings = np.concatenate([run.valid_forces for run in runs])
     sizes = np.abs(readings[readings != 0.0])
@@ -36,14 +36,14 @@ def find_largest_size(runs: Sequence[LoggedRun]) -> float:
 def estimate_hidden_bias(
     runs: Sequence[LoggedRun], zone: float, subtracted: float = 0.0
 ) -> tuple[float, float]:
-    """Estimate the bias of readings before contact, of which a dead zone hides most.
+    """Estimate the bias of the readings before contact although a dead zone replaces most of them by 0.
 
     The noise is assumed to be normally distributed.
 
     Args:
         runs: Runs that begin before contact.
         zone: Size of the zone [N].
-        subtracted: Force that the zone subtracts from larger forces [N]; 0 for a cut zone.
+        subtracted: Force that the zone subtracts from larger forces [N]; 0 if it keeps larger forces.
 
     Returns:
         Mean and standard deviation of the bias [N]; assumed values if too few readings exceed the zone.
@@ -69,7 +69,7 @@ def estimate_hidden_bias(
 
 
 def draw_zone(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> np.ndarray:
-    """Return posterior draws of the size of the zone [N]; the prior is uniform up to the largest size.
+    """Draw the size of a cut dead zone [N] from its posterior; the prior is uniform up to the largest size.
 
     Args:
         problem: Contact problem, in which the zone has its largest possible size.
@@ -92,14 +92,14 @@ def draw_zone(problem: ContactProblem, posterior: Posterior, seed: int = 0) -> n
 
 
 def _log_probability_of_zero(force, std: float, zone: float):
-    """Return the log probability that a force [N] with noise is inside the zone."""
+    """Return the log probability that a force [N] with noise lies inside the dead zone and so reads 0."""
     force = np.abs(force)
     high, low = special.log_ndtr((zone - force) / std), special.log_ndtr((-zone - force) / std)
     return high + np.log1p(-np.exp(np.minimum(low - high, -1e-15)))
 
 
 def _take_readings_before_contact(run: LoggedRun) -> np.ndarray:
-    """Return the readings in the first half of the rows before the first large force."""
+    """Return the first half of the readings that precede the first large force."""
     force = run.valid_forces
     loud = np.abs(force) > MIN_LOUD_SHARE * np.abs(force).max(initial=0.0)
     return force[: int(np.argmax(loud)) // 2]

@@ -24,11 +24,11 @@ MIN_OUTSIDE_SHARE = 0.2  # minimum ratio of readings that exceed a stated zone t
 
 
 def check_cut_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list[CheckResult]:
-    """Check for a dead zone of the force sensor that does not change large forces.
+    """Check for a cut dead zone of the force sensor, which replaces small forces by 0 and keeps larger ones.
 
-    Only runs with readings of 0 out of contact are evaluated. If all their other readings are large, the
-    sensor replaces small forces by 0. A continuous dead zone is also subtracted from larger forces. If the
-    mechanism file states that the zone is cut, the check is that noise out of contact exceeds it.
+    Only contacts with many readings of 0 are evaluated. If all their other readings are large, the zone is
+    cut. (A continuous dead zone is also subtracted from larger forces, so small readings remain.) If the
+    mechanism file states a cut zone, the readings are checked against that zone instead.
     """
     delay, plane, coefficient_fit = contact.posterior.best
     touching = contact.problem.touching(delay, plane, coefficient_fit.coefficients)
@@ -60,10 +60,11 @@ def check_cut_dead_zone(contact: ContactFit, runs: list[LoggedRun]) -> list[Chec
 
 
 def check_zone_sampling(mechanism: Mechanism) -> list[CheckResult]:
-    """Return the change of the restitution if the force leaves or enters a cut zone some ticks later.
+    """Return how the restitution changes if a force crosses the limit of a cut dead zone some ticks later.
 
-    Readings jump by the size of the zone, so that a tick more or less at either end of a contact changes the
-    impulse by size * control period. Small errors of delay and surface position move an end to another tick.
+    The readings of each contact begin and end with a jump by the size of the zone. A jump one tick later
+    changes the impulse by size * control period. Small errors of delay and surface position move the jumps to
+    another tick.
     """
     rig, size = mechanism.rig, mechanism.rig.force_sensor.dead_zone
     if rig.force_sensor.dead_zone_kind != "cut" or size == 0.0:
@@ -74,9 +75,9 @@ def check_zone_sampling(mechanism: Mechanism) -> list[CheckResult]:
 
 
 def _check_stated_cut_zone(contact: ContactFit, touching: np.ndarray) -> list[CheckResult]:
-    """Check that no reading lies inside the dead zone that the prior states as cut.
+    """Check the readings against a stated cut dead zone, which replaces forces below its size by 0.
 
-    Noise beyond the zone is not hidden, and must occur in contact.
+    Nonzero readings must exceed the zone. Out of contact, noise must exceed the zone often enough.
     """
     readings, name = contact.readings, "dead zone of the force sensor"
     outside = readings.force[readings.is_valid & ~touching]

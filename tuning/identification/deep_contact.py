@@ -50,7 +50,7 @@ def find_deep_lanes(motion: MotionResponse, plane: float) -> np.ndarray:
 
 
 def summarise_deep_lanes(problem: ContactProblem, near: tuple[float, float] | None) -> ContactProblem:
-    """Replace the deep lanes of a contact problem by pseudo-rows if there are enough deep lanes.
+    """Replace the lanes well below the surface (deep lanes) by a few pseudo-rows, if there are enough.
 
     Args:
         problem: Problem with all rows.
@@ -64,7 +64,7 @@ def summarise_deep_lanes(problem: ContactProblem, near: tuple[float, float] | No
 
 
 def select_representative_lanes(problem: ContactProblem) -> np.ndarray:
-    """Return all lanes except those in deep contact, and `LANES_FOR_LAW_CHOICE` of the latter."""
+    """Return the indices of all lanes, but of only `LANES_FOR_LAW_CHOICE` lanes well below the surface."""
     deep = np.flatnonzero(find_deep_lanes(problem.motion, _approximate_surface(problem)))
     dropped = np.delete(
         deep, np.linspace(0, len(deep) - 1, min(LANES_FOR_LAW_CHOICE, len(deep))).round().astype(int)
@@ -82,12 +82,13 @@ def _approximate_surface(problem: ContactProblem) -> float:
 
 
 class SummarisedProblem(ContactProblem):
-    """Contact problem in which pseudo-rows replace the deep lanes wherever they are accurate enough."""
+    """Contact problem with few pseudo-rows in place of the runs well below the surface, where accurate."""
 
     def __init__(self, problem: ContactProblem, deep: np.ndarray, delay: float):
-        """Split the lanes of a problem into deep lanes, which pseudo-rows replace, and other lanes.
+        """Split the lanes of a problem: few pseudo-rows replace the deep lanes, others keep their rows.
 
-        `deep` marks the lanes that always stay well below the surface; `delay` [s] is the approximate delay.
+        `deep` marks the lanes (one per run) that always stay well below the surface. `delay` [s] is the
+        approximate force delay.
         """
         motion, readings, law = problem.motion, problem.readings, problem.law
         super().__init__(motion, readings, law, problem.plane, problem.time_constant)
@@ -103,14 +104,15 @@ class SummarisedProblem(ContactProblem):
     def changed(self, law: Law, time_constant: float, delay: float | None = None) -> ContactProblem:
         """Return a copy of the problem with this contact law and this time constant of the sensor [s].
 
-        The copy is fastest for fits with force delays near `delay` [s]; None keeps the present delay.
+        The copy is fastest for fits with force delays near `delay` [s]. None keeps the present sum of force
+        delay and filter delay.
         """
         if delay is None:
             delay = self.delay + (self.time_constant - time_constant) * self.readings.modes.delay
         return SummarisedProblem(super().changed(law, time_constant), self.deep, delay)
 
     def at(self, delay: float, plane: float, pseudo: PseudoRows | None = None) -> CoefficientFit:
-        """Fit the coefficients at one force delay [s] and surface position [m]."""
+        """Fit the coefficients at a delay [s] and surface position [m]; use pseudo-rows if accurate."""
         table = self._find_table(delay, np.array([plane]))
         if table is not None and pseudo is None:
             inner = self.others.at(delay, plane, table.rows(delay, np.array([plane])))
@@ -130,13 +132,13 @@ class SummarisedProblem(ContactProblem):
         return super().fit_surfaces(delay, planes, pseudo)
 
     def _is_pushing(self, table: _DesignTable, fits: list[CoefficientFit]) -> bool:
-        """Return whether all fits give a positive force in every reading that the table replaces."""
+        """Return whether all fits give a positive force in all rows that the table's pseudo-rows replace."""
         if self.law.pulls or not self.damping_indices:
             return True
         return all(np.all(compute_force(fit.coefficients[None], table.extreme) > 0.0) for fit in fits)
 
     def _find_table(self, delay: float, planes: np.ndarray) -> _DesignTable | None:
-        """Find or compute a table for a delay and surface positions; return None if no table is accurate."""
+        """Find or build a table of pseudo-rows for a delay and surface positions; else return None."""
         for table in self.tables:
             if table.covers(delay, planes):
                 return table
@@ -149,7 +151,7 @@ class SummarisedProblem(ContactProblem):
         return None
 
     def _build_table(self, delay: float, plane: float, count: int) -> _DesignTable:
-        """Tabulate the regression near a delay [s] and a surface position [m], at `count` positions."""
+        """Build a table around a delay [s] and surface position [m], with `count` surface positions."""
         low = (
             self.delay + DELAY_RANGE * np.floor((delay - self.delay) / DELAY_RANGE + 0.5) - DELAY_RANGE / 2.0
         )
@@ -175,7 +177,7 @@ class SummarisedProblem(ContactProblem):
 
 @dataclass(frozen=True)
 class _DesignTable:
-    """Table from which pseudo-rows are interpolated for any force delay and surface position in its range."""
+    """Table that gives the pseudo-rows (few regression rows) for delays and surface positions in range."""
 
     delays: np.ndarray  # delays of the nodes [s]
     planes: np.ndarray  # surface positions of the nodes [m]
@@ -201,7 +203,7 @@ class _DesignTable:
         return distance <= DELAY_TOLERANCE and low <= planes.min() and planes.max() < high
 
     def rows(self, delay: float, planes: np.ndarray) -> PseudoRows:
-        """Interpolate the pseudo-rows, which replace all readings in deep contact.
+        """Interpolate the pseudo-rows (few regression rows that replace all readings in deep contact).
 
         Args:
             delay: Force delay [s].
@@ -220,7 +222,7 @@ class _DesignTable:
         )
 
     def is_accurate(self) -> bool:
-        """Return whether the interpolated force is accurate enough between the nodes, for the best fit."""
+        """Return whether interpolation between nodes gives the force of the best fit accurately enough."""
         delay, plane = _point_between_nodes(self.delays, self.planes)
         rows = self.rows(delay, np.array([plane]))
         best = np.linalg.lstsq(rows.design[0].T, rows.target, rcond=None)[0]
@@ -229,7 +231,7 @@ class _DesignTable:
 
 
 def _split_into_blocks(problem: ContactProblem, lanes: np.ndarray) -> list[ContactProblem]:
-    """Split the deep lanes into problems of at most `LANES_PER_BLOCK` lanes, without unused first rows."""
+    """Split deep lanes into problems of at most `LANES_PER_BLOCK` lanes; drop unused rows at the start."""
     counts = problem.readings.counts[:, lanes]
     begin = max(int(np.argmax(counts.any(axis=1))) - problem.memory, 0)
     parts = np.array_split(lanes, -(-len(lanes) // LANES_PER_BLOCK))
@@ -248,10 +250,11 @@ def _split_into_blocks(problem: ContactProblem, lanes: np.ndarray) -> list[Conta
 def _factorise_columns(
     blocks: list[ContactProblem], delays: np.ndarray, planes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Factorise the regressors of all rows into few pseudo-rows with the same normal equations.
+    """Reduce the regressors and readings of all rows to few pseudo-rows with the same normal equations.
 
-    Return two arrays with one row per pseudo-row. The first contains the regressors at the nodes, the bias
-    and the readings. The second contains the regressors at a delay and a surface position between the nodes.
+    Return two arrays with one row per pseudo-row. The first contains the regressors at the interpolation
+    nodes (delays and surface positions), the bias and the readings. The second contains the regressors at a
+    delay and a surface position between the nodes.
     """
     total, count = 0.0, 0
     delay, plane = _point_between_nodes(delays, planes)
@@ -269,7 +272,7 @@ def _factorise_columns(
 
 
 def _point_between_nodes(delays: np.ndarray, planes: np.ndarray) -> tuple[float, float]:
-    """Return a delay and a surface position halfway between the first two nodes."""
+    """Return a delay and a surface position, each halfway between the first two interpolation nodes."""
     return 0.5 * float(delays[0] + delays[1]), 0.5 * float(planes[0] + planes[1])
 
 

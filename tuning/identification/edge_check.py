@@ -43,12 +43,12 @@ def check_contact_edges(
 
     Args:
         contact: Contact model.
-        runs: Runs in contact, one per lane of the model's readings.
+        runs: Runs in contact, in the order of the columns (lanes) of the model's readings.
         effect: Effect of the parameters' uncertainty on e and on e - e*.
 
     Returns:
         A list with one check. It is empty if no parameter is uncertain, or if fewer than
-        `MIN_CONTACTS_FOR_MEAN` runs contain both edges.
+        `MIN_CONTACTS_FOR_MEAN` runs contain both onset and release.
     """
     means = average_edge_residuals(contact, runs)
     if not effect.parts or not len(means):
@@ -69,10 +69,10 @@ def check_contact_edges(
 def check_force_smoothing(
     noise: NoiseEstimate | None, effect: UncertaintyEffect, frequency: float, period: float
 ) -> list[CheckResult]:
-    """Check that the noise at rest does not show a smoothing over two readings, such as an interpolation.
+    """Check that the noise of the force at rest is not correlated as if readings were interpolated.
 
     Linear interpolation with the shares a and 1 - a correlates only successive readings. Its impulse response
-    has the standard deviation sqrt(a (1 - a)) periods. Slower noise can have other causes and passes.
+    has the standard deviation sqrt(a (1 - a)) periods. Noise with a longer correlation passes the check.
 
     Args:
         noise: Noise of the force at rest, or None if it is unknown.
@@ -96,10 +96,10 @@ def check_force_smoothing(
 
 
 def average_edge_residuals(contact: ContactFit, runs: Sequence[LoggedRun]) -> np.ndarray:
-    """Return the weighted mean residual at each row near the two edges, divided by its standard deviation.
+    """Return the mean residual at each distance [rows] from onset and release, in standard deviations.
 
-    The standard deviation includes the noise, and the largest common time error of all readings that the file
-    allows.
+    The mean is weighted with the approach speeds. The standard deviation includes the noise, and a clock
+    error (`CLOCK_STD`) that shifts all readings by the same time.
     """
     delay, plane, coefficient_fit = contact.posterior.best
     problem, readings = contact.problem, contact.readings

@@ -107,7 +107,7 @@ def _estimate_from_draws(
 
     `at_bound` contains the damping coefficients whose draws accumulate at 0. The interval of such a
     coefficient is one-sided. The logs hardly distinguish damping from force delay. The interval of the force
-    delay therefore also includes the delays that zero damping would imply. Every interval includes the
+    delay therefore also includes the delays that would fit if the damping were 0. Every interval includes the
     estimate, which may exceed a quantile if nearly all draws are 0.
     """
     value = float(values.mean())

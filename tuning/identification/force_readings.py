@@ -69,7 +69,7 @@ class ForceReadings:
 
     @property
     def modes(self) -> FilterModes:
-        """Return kind and order of the sensor's filter: those of the prior, or a first-order lag."""
+        """Return the modes of the prior's sensor filter or, without one, those of a first-order lag."""
         kind, order = (
             ("butterworth", 1) if self.low_pass is None else (self.low_pass.kind, self.low_pass.order)
         )
@@ -81,13 +81,13 @@ class ForceReadings:
         return 0.0 if self.low_pass is None else 0.5 / (np.pi * self.low_pass.cutoff)
 
     def select_lanes(self, lanes: np.ndarray, begin: int = 0) -> ForceReadings:
-        """Return the readings of the given lanes, which may repeat, from row `begin` on."""
+        """Return the readings of `lanes` (indices, which may repeat), without the rows before `begin`."""
         names = ("force", "counts", "entry", "is_valid")
         return replace(self, **{name: getattr(self, name)[begin:, lanes] for name in names})
 
 
 def _assign_contact_entries(run: LoggedRun) -> np.ndarray:
-    """Return the index of each row into the lists in the mechanism's `[contact]`.
+    """Return, for each row, its index into the parameter lists of the mechanism file's `[contact]`.
 
     Rows out of contact get the index of the previous contact. Rows before the first contact get the index of
     the first contact.

@@ -43,7 +43,7 @@ MODEL_ERROR_ITERATIONS = 3  # number of alternating estimates of the parameters 
 
 @dataclass(frozen=True)
 class FreeMotion:
-    """Model of the motion simulator that was fitted to runs without contact, or compared with them."""
+    """Model of the motion simulator: fitted to runs without contact, or known and compared with such runs."""
 
     lines: SpectralLines  # spectra of all runs, with the measured noise
     spectra: tuple[Spectrum, ...]  # spectrum of each run
@@ -187,7 +187,7 @@ def compare_free_motion(
 
 
 def compute_spectra(runs: Sequence[LoggedRun], timing: CampaignTiming) -> list[Spectrum]:
-    """Return the spectrum of each run that is long enough."""
+    """Return the runs' spectra; omit runs that are too short or have fewer than four frequency lines."""
     rest = round(SETTLING_TIME_CONSTANTS * ASSUMED_TIME_CONSTANT / timing.control_period)
     spectra = []
     for run in runs:

@@ -149,7 +149,7 @@ def average_periods(command: np.ndarray, output: np.ndarray, valid: np.ndarray, 
 
 
 def _add_distortion(U, Y, variance, excited, frequency, noise, count) -> Spectrum:
-    """Return the spectrum with the nonlinear distortion, which the lines without excitation show."""
+    """Return the spectrum, with the nonlinear distortion measured at the lines without excitation."""
     number = np.arange(len(U))
     last = number[excited].max()
     rms = np.sqrt(np.mean(np.abs(Y[excited]) ** 2))

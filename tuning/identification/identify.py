@@ -122,7 +122,7 @@ def identify(
 
 
 def _specify_sensor(prior: Mechanism | None, options: IdentificationOptions) -> ForceSensor:
-    """Return the force sensor of the prior, with the fixed dead zone."""
+    """Return the prior's force sensor, with the dead zone that the user fixed, if any."""
     sensor = ForceSensor() if prior is None else prior.rig.force_sensor
     return msgspec.structs.replace(sensor, dead_zone=options.fixed.get(DEAD_ZONE_KEY, sensor.dead_zone))
 
@@ -253,7 +253,7 @@ def _fit_and_check_contact(
     options: IdentificationOptions,
     say: ReportProgress,
 ) -> tuple[ContactFit | None, list[validation.CheckResult]]:
-    """Fit the contact law to all contacts. Fit it again without some contacts, and check it on these.
+    """Fit the contact law to all contacts; check a second fit on contacts that the second fit did not use.
 
     Returns:
         The fit to all contacts, or None if there are no contacts; and the checks of the second fit.
@@ -275,7 +275,7 @@ def _fit_and_check_contact(
 
 
 def _note_clipped_values(draws_by_key: Mapping[str, np.ndarray]) -> list[str]:
-    """Return a note for each parameter that is 0 in the file because its estimate is negative."""
+    """Return a note for each parameter that is 0 in the mechanism file because its estimate is negative."""
     notes = []
     for key, draws in draws_by_key.items():
         if compute_bound_excess(key, draws) > 0.0:
@@ -287,7 +287,7 @@ def _note_clipped_values(draws_by_key: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def select_held_out_contacts(runs: Sequence[LoggedRun], share: float) -> np.ndarray:
-    """Select the contacts that a test fit omits: about a `share` of the contacts at each approach speed.
+    """Select contacts that a test fit omits: about the fraction `share` of those at each approach speed.
 
     If there are at least three contacts at a speed, at least one of them is selected.
 
@@ -320,7 +320,7 @@ def _draw_parameters(
         contact: Fit of the contact, or None.
         model: Model of the motion simulator, or None.
         frequency: Contact frequency [Hz].
-        share: Part of the fitted delays that is the delay of the position sensor [s].
+        share: Delay of the position sensor [s], moved from the fitted motion delay to the force delay.
         seed: Seed of the random numbers.
     """
     result, lag = {}, np.zeros(POSTERIOR_DRAWS)
@@ -347,7 +347,7 @@ def _draw_parameters(
 def _select_fixed_before_fit(
     keys: Sequence[str], share: float, prior: Mechanism | None, options: IdentificationOptions
 ) -> dict[str, float]:
-    """Return the fixed parameters in `keys`, and the position sensor's delay if it differs from the prior."""
+    """Return the user's fixed values of `keys`; add the position sensor's delay if it is not the prior's."""
     fixed = {key: options.fixed[key] for key in keys if key in options.fixed}
     if share != (0.0 if prior is None else prior.rig.position_sensor.delay):
         fixed[POSITION_DELAY_KEY] = share
@@ -360,7 +360,7 @@ def _choose_position_delay(
     prior: Mechanism | None,
     options: IdentificationOptions,
 ) -> float:
-    """Return the specified delay of the position sensor [s], increased if the force delay is negative."""
+    """Return the position sensor's delay [s]: as specified, or larger to avoid a negative force delay."""
     if POSITION_DELAY_KEY in options.fixed:
         return options.fixed[POSITION_DELAY_KEY]
     specified = 0.0 if prior is None else prior.rig.position_sensor.delay

@@ -55,9 +55,10 @@ class EvaluatedLaw:
 def choose_contact_law(
     motion: MotionResponse, readings: ForceReadings, plane: float | None, names=None
 ) -> list[EvaluatedLaw]:
-    """Fit and evaluate all contact laws or the named laws; return them with the chosen law first.
+    """Fit and evaluate the laws `names`, or all contact laws; return them, the chosen law first.
 
-    The segments of a long press run are similar. Shape parameters are therefore fitted to a few of them.
+    A long press run (pressed against the surface) has many similar segments. Shape parameters are therefore
+    first fitted to a few of these segments.
     """
     evaluated = []
     lanes = select_representative_lanes(ContactProblem(motion, readings, kelvin_voigt(), plane))
@@ -128,7 +129,7 @@ FITTABLE_LAW_NAMES = tuple(name for name, law in CONTACT_LAWS.items() if law.fam
 def list_law_families(
     deepest: float, entries: int, names: Sequence[str] | None = None
 ) -> list[RegressionFamily]:
-    """Return families of laws (each with a free shape parameter): those of the named laws, or all.
+    """Return the families of the laws `names`, or of all laws; a family has at most one shape parameter.
 
     Args:
         deepest: Largest depth of all contacts [m].
@@ -210,7 +211,7 @@ def flag_rows_near_edges(motion: MotionResponse, readings: ForceReadings, guess:
 def _cross_validate(motion, readings, tested: ForceReadings, law, plane, start: CoarseFit) -> np.ndarray:
     """Return the log likelihood of each odd contact under a fit to the even contacts, and vice versa.
 
-    If there are too few contacts, the result is a single value: minus half the information criterion.
+    If there are too few contacts, the result is one value: minus half the Bayesian information criterion.
     """
     lanes = readings.force.shape[1]
     if lanes < MIN_CONTACTS_FOR_CROSS_VALIDATION:

@@ -70,17 +70,18 @@ class Excitation:
 
 @dataclass(frozen=True)
 class ExcitationDesign:
-    """Commands of both runs, and the predicted accuracy of the identification.
+    """Commands of a free run and a press run, and the predicted accuracy of the identification.
 
     Attributes:
         free: Run in free motion.
-        press: Run in contact.
+        press: Run in contact (pressed against the surface).
         keys: Keys of the identified parameters.
         values: Values of the parameters in the mechanism, in SI units.
         std: Predicted standard deviation of each parameter.
-        slopes: Derivatives of e - e* with respect to the parameters; one row per contact and phase.
+        slopes: Derivatives of e - e* with respect to the parameters. One row per contact and per phase of the
+            contact within a control period.
         covariance: Predicted covariance of the parameters.
-        flat: Error e - e* for equal powers at all lines, divided by the error for this design.
+        flat: Predicted error e - e* with equal powers at all lines, divided by that with this design.
     """
 
     free: Excitation
@@ -94,7 +95,7 @@ class ExcitationDesign:
 
     @property
     def error(self) -> float:
-        """Return the rms of the restitution error e - e* that parameter errors with this covariance cause."""
+        """Return the rms of e - e* that the predicted parameter errors (`covariance`) would cause."""
         return float(np.sqrt(np.mean(np.sum(self.slopes @ self.covariance * self.slopes, axis=1))))
 
 
@@ -176,10 +177,10 @@ def differentiate_error(
         keys: Keys of the parameters.
 
     Returns:
-        Derivatives; one row per contact and phase, one column per key.
+        Derivatives; one row per contact and per phase within a control period, one column per key.
 
     Raises:
-        InputError: If no contact is completed with finite derivatives.
+        InputError: If no simulated contact ends and has finite derivatives.
     """
     document, rows = to_plain_data(mechanism), []
     for key in ("noise_std", "quantum", "dead_zone", "bias"):
@@ -208,11 +209,11 @@ def differentiate_error(
 def _plan_with_detectable_damping(
     mechanism: Mechanism, stroke: float, undamped: _MultisinePlan, weight: np.ndarray
 ) -> _MultisinePlan:
-    """Return the plan for the lowest damping that the runs can detect, for a mechanism without damping.
+    """Return the plan for an undamped mechanism, with the lowest damping that the runs can detect.
 
     Without damping, the derivatives of the force with respect to damping and force delay are proportional, so
-    a linear prediction of their uncertainty would be infinite. For a low damping, its standard deviation is
-    inversely proportional to the damping. The lowest detectable damping equals its own standard deviation.
+    a linear prediction of their uncertainty would be infinite. The standard deviation of a low damping is
+    inversely proportional to the damping. The lowest detectable damping is equal to its standard deviation.
     """
     stiffness, _ = differentiate_force(mechanism, undamped.depth)
     _, rate = differentiate_force(_replace_damping(mechanism, 1.0), undamped.depth)
@@ -231,7 +232,7 @@ def _replace_damping(mechanism: Mechanism, damping: float) -> Mechanism:
 
 
 class _MultisinePlan:
-    """Plan of both multisines: frequency lines, Fisher information per line, and limits of the signals."""
+    """Plan of the multisines in free motion and in contact: frequency lines, Fisher information, limits."""
 
     def __init__(self, mechanism: Mechanism, stroke: float):
         rig = mechanism.rig
@@ -290,7 +291,7 @@ class _MultisinePlan:
         return {key: _get_value(document, key) for key in keys}
 
     def _compute_responses(self, mechanism: Mechanism) -> tuple[np.ndarray, np.ndarray]:
-        """Return the frequency responses of the position and force readings to the command in a press run."""
+        """Return the frequency responses, in contact, from the command to position and force readings."""
         sensor, position = mechanism.rig.force_sensor, mechanism.rig.position_sensor
         motion = mechanism_models.make_motion_model(mechanism).response(self.s) * self.hold
         delay_exponent = self.s * (sensor.delay - position.delay)
@@ -300,7 +301,7 @@ class _MultisinePlan:
         )
 
     def _compute_run_lines(self, mechanism, index, response, std, limits, periods) -> powers.RunLines:
-        """Return the Fisher information and the used share of each limit, for unit power at each line.
+        """Compute each line's Fisher information and used share of each limit, both per unit power.
 
         Args:
             mechanism: Mechanism with the approximate parameters.
@@ -323,7 +324,7 @@ class _MultisinePlan:
         return powers.RunLines(fisher, use)
 
     def _list_limits(self, rig, stroke: float) -> list[tuple[np.ndarray, float]]:
-        """Return, for each limited signal, its frequency response to the command and its limit."""
+        """List the limits of stroke, speed and acceleration, each with the response from the command."""
         limits = [(np.ones_like(self.s), stroke)]
         for power, limit in ((1, rig.simulator.velocity_limit), (2, rig.simulator.acceleration_limit)):
             if np.isfinite(limit):
@@ -354,7 +355,7 @@ def _get_value(document: dict, key: str) -> float:
 
 
 def _find_stiffness_key(mechanism: Mechanism, depth: float) -> list[str]:
-    """Return a list of one key: that of the stiffness at a depth [m]."""
+    """Return the key of the stiffness at a depth [m], as a list with one element."""
     contact = mechanism.contact
     if not find_contact_law(contact.law).is_segmented:
         return ["contact.stiffness.0"]

@@ -23,7 +23,7 @@ POWER_ITERATIONS = 400  # number of multiplicative updates
 
 @dataclass(frozen=True)
 class RunLines:
-    """Fisher information of each frequency line of one run, and the part of each limit that the line uses."""
+    """Frequency lines of one run: Fisher information and used share of each limit, both per unit power."""
 
     information: np.ndarray  # (lines, parameters, parameters), Fisher information M_l per unit power
     use: np.ndarray  # (limits, lines), part g_il of each limit that a line uses per unit power

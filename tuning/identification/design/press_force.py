@@ -13,7 +13,7 @@ LIMIT_SHARE = 0.9  # maximum used share of the limits of speed, acceleration and
 
 
 def compute_force(mechanism: Mechanism, depth: np.ndarray, rate: float = 0.0) -> np.ndarray:
-    """Return the force [N] at depths [m] and a rate [m/s]."""
+    """Return the contact force [N] at each depth [m], for one rate of change of the depth [m/s]."""
     law = mechanism_models.make_regression_law(mechanism.contact)
     numbers = mechanism_models.get_regression_coefficients(mechanism.contact, 0)
     return np.array(numbers) @ np.array(law.entry_functions(depth, np.full_like(depth, rate)))
@@ -28,9 +28,10 @@ def differentiate_force(mechanism: Mechanism, depth: float) -> tuple[float, floa
 
 
 def find_preload(mechanism: Mechanism) -> tuple[float, float]:
-    """Return the depth at the preload [m] and the largest allowed force [N] of a press run.
+    """Return the depth [m] at the mean force of a press run, and the largest allowed force [N].
 
-    The force must exceed neither the sensor's range nor the peak force of a contact at the approach speed.
+    A press run keeps the mechanism pressed against the surface. The force must exceed neither the sensor's
+    range nor the peak force of a contact at the approach speed.
     """
     energy = 0.5 * mechanism.bodies.mass * mechanism.approach.velocity**2
 

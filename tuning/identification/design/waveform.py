@@ -58,7 +58,7 @@ def _reduce_peak(amplitude, lines, rows, limited, angle) -> np.ndarray:
     )
 
     def compute_log_norm(angle, doublings):
-        """Return the logarithm of the norm of order 2**`doublings`, and its gradient."""
+        """Return the logarithm of the signals' norm of order 2**`doublings`, and its gradient by `angle`."""
         power, total, slope = 2**doublings, 0.0, np.zeros(len(lines))
         for (response, limit), signal in zip(
             limited, make_limited_signals(amplitude, lines, rows, angle, limited), strict=True
@@ -106,7 +106,7 @@ def crest_factor(values: np.ndarray) -> float:
 
 
 def repeat_with_fades(period: np.ndarray, times: int, fade: int) -> np.ndarray:
-    """Return `times` periods of a signal between `fade` samples of fade-in and `fade` of fade-out."""
+    """Return `times` periods of a signal, plus a fade-in and a fade-out of `fade` samples each."""
     signal = np.concatenate([period[-fade:], np.tile(period, times), period[:fade]])
     rise = np.sin(0.5 * np.pi * np.arange(fade) / fade) ** 2
     signal[:fade] *= rise

@@ -14,7 +14,7 @@ from tuning.identification.logs.log_reader import ColumnsByName, LogReader
 
 
 def open_parquet_log(path: Path) -> LogReader:
-    """Open a Parquet file; a field's metadata `unit` is its unit."""
+    """Open a Parquet file; the metadata entry `unit` of a field states the unit of its values."""
     schema = parquet.read_schema(path)
     stated = {field.name: (field.metadata or {}).get(b"unit", b"") for field in schema}
     units = {name: unit.decode("utf-8", "replace") for name, unit in stated.items() if unit}

@@ -207,7 +207,7 @@ class _RunsOfFile:
         ]
 
     def _is_command_valid(self, segment: LogSegment, contacts: list[tuple[int, int]]) -> bool:
-        """Return whether the force command explains the motion; if not, remove its channel with a note."""
+        """Return whether the force command explains the motion; if not, remove the channel and add a note."""
         if segment.channels["force_command"] is None:
             return False
         timing = self._timing
@@ -221,7 +221,7 @@ class _RunsOfFile:
         return holds
 
     def _ignore_channel(self, segment: LogSegment, channel: str, note: str | None) -> None:
-        """Remove a channel from a segment for the reason in `note`; do nothing if there is no note."""
+        """Remove a channel from a segment and record the reason, `note`; do nothing if there is no note."""
         if note is not None:
             self.notes.append(note)
             segment.channels[channel] = None
@@ -344,7 +344,7 @@ def classify_rows(
 
 
 def find_restarts(x: np.ndarray, index: np.ndarray | None) -> np.ndarray:
-    """Return the rows at which the motion jumps to the start of the next contact, as in simulated logs."""
+    """Return the rows at which the velocity jumps because a simulated log begins the next contact there."""
     if index is None:
         return np.empty(0, int)
     rows = np.flatnonzero(index[1:] != index[:-1]) + 1

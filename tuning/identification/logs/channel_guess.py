@@ -42,9 +42,9 @@ def match_columns(log: OpenLog) -> dict[str, list[str]]:
 
 
 def choose_columns(sample: LogSample, matches: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
-    """Return the columns of each channel: one, or several or none if the user must decide.
+    """Return the columns of each channel: normally one; several or none if the user must decide.
 
-    Among several columns with fitting names, those that are constant are left out.
+    If several columns have a fitting name, constant columns are left out.
     """
     result: dict[str, list[str]] = {}
     for channel, names in matches.items():
@@ -103,7 +103,7 @@ def guess_channels(sample: LogSample, chosen: Mapping[str, Sequence[str]]) -> di
 
 
 def _guess_lengths(sample: LogSample, columns: Mapping[str, str]) -> dict[str, tuple[str | None, str]]:
-    """Return the unit of each position without a stated unit, and the reason."""
+    """Guess the unit of each position whose unit the file does not state; return unit and reason."""
     strokes = {
         name: float(np.ptp(values))
         for name in POSITIONS

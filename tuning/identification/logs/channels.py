@@ -80,7 +80,7 @@ def read_channels(
 def _convert_to_si(
     log: OpenLog, mapping: LogMapping, wanted: Mapping[str, str], read: ColumnsByName
 ) -> tuple[ColumnsByName, list[str]]:
-    """Return the channels in SI units, and notes on units that differ from those that the file states."""
+    """Return the channels in SI units, and notes where the mapping's unit differs from the file's unit."""
     columns, notes = ColumnsByName(), list[str]()
     for name, column in wanted.items():
         columns[name] = values = read[column]
@@ -103,9 +103,9 @@ def _convert_to_si(
 def _select_tick_rows(
     log: OpenLog, mapping: LogMapping, x: np.ndarray, stamps: np.ndarray | None, period: float
 ) -> tuple[np.ndarray | slice, list[str]]:
-    """Select the rows at the ticks, and return notes.
+    """Select one row per control tick; return the selection and notes.
 
-    Without time stamps, the rate of the rows in the mapping determines the number of rows per period.
+    Without time stamps, the row rate in the mapping determines the number of rows per control period.
     """
     rows, rate = mapping.timing.rows_per_period, mapping.channels.time.rate
     if mapping.timing.clock == "index":
@@ -140,7 +140,7 @@ def _read_channel_stamps(
 
 
 def _check_stamps_in_groups(log: OpenLog, mapping: LogMapping, wanted: Mapping[str, str]) -> None:
-    """Raise `InputError` if a group of columns has other time stamps than the mapping uses.
+    """Raise `InputError` if a group of columns has time stamps that differ from those of the mapping.
 
     In HDF5, MAT and TDMS files, the column names contain the group names.
     """
@@ -218,9 +218,9 @@ def _read_mapped_stamps(
 def read_row_stamps(
     log: OpenLog, read: ColumnsByName, mapping: LogMapping
 ) -> tuple[np.ndarray | None, float]:
-    """Return the time stamps of the rows relative to the first one, and the first one [s].
+    """Return the time stamps of the rows minus the first time stamp [s], and the first time stamp [s].
 
-    The time stamps are None if the mapping names no column of time stamps.
+    The results are None and 0 if the mapping names no column of time stamps.
     """
     time = mapping.channels.time
     if time.column is None:

@@ -95,8 +95,8 @@ def check_force(
 ) -> list[str]:
     """Check the sign and unit of the measured force in a segment; return notes.
 
-    The force must explain the model's change of speed in contacts, and increase with the position in press
-    runs.
+    In contacts, the force must explain the change of speed of the numerical model. In press runs, which stay
+    in contact, the force must increase with the position.
 
     Args:
         label: Name of the log in messages.
@@ -144,7 +144,7 @@ def check_force(
 def _check_one_side(label: str, pull: np.ndarray, x: np.ndarray, period: float, mass: float) -> None:
     """Raise `InputError` if the log contains contacts at the second (far) surface of a clearance.
 
-    In such a contact, the force pulls (F < 0) and reverses a retraction.
+    In such a contact, the force pulls (F < 0) and turns a retraction into an approach.
 
     Args:
         label: Name of the log in messages.
@@ -179,7 +179,7 @@ def _note_slow_readings(label: str, force: np.ndarray) -> list[str]:
 
 
 def find_change_interval(values: np.ndarray) -> int:
-    """Return the number of rows after which the value changes, or 1 if it does not change regularly."""
+    """Return for how many rows each value is held (repeated); 1 if values are not repeated regularly."""
     steps = np.diff(values[:MAX_EVALUATED_ROWS])
     apart = np.diff(np.flatnonzero(steps))
     if len(apart) < MIN_LOG_ROWS // 10:
@@ -199,7 +199,7 @@ def _detect_resolution(values: np.ndarray) -> float:
 
 
 def _check_size(label: str, kind: str, x: np.ndarray, measured: np.ndarray, period: float) -> list[str]:
-    """Raise `InputError` if a position's stroke or speed indicates a wrong unit; return notes."""
+    """Raise `InputError` if a stroke or speed indicates a wrong unit; return notes on large strokes."""
     largest, notes = USUAL_STROKE if kind == "press" else MAX_STROKE, []
     for name, values in (("position_desired", x), ("position_measured", measured)):
         stroke = float(np.ptp(values))
