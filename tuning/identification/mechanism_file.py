@@ -24,7 +24,8 @@ def make_uncertainty_tables(
         keys: Dotted keys of the parameters; the key of a list entry ends in its index.
         draws: Draws of the parameters, shape (draws, keys).
         floors: Minimum standard deviation of each parameter.
-        off: For each key, the value in the file minus the mean of the draws; the variance gets its square.
+        off: For each key, the value in the file minus the mean of the draws. Its square is added to the
+            variance.
     """
     covariance = np.atleast_2d(np.cov(draws.T))
     covariance = covariance if off is None else covariance + np.outer(off, off)

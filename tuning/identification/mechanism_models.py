@@ -19,7 +19,7 @@ REAL_POLE_TOLERANCE = 1e-9
 
 
 def make_motion_model(mechanism: Mechanism) -> MotionModel:
-    """Return the model from commanded to measured position, with the delay of the position sensor."""
+    """Return the model of the motion simulator; its delay includes that of the position sensor."""
     simulator, total_delay = mechanism.rig.simulator, mechanism.rig.simulator.delay
     total_delay += mechanism.rig.position_sensor.delay
     if simulator.window is not None:
@@ -36,7 +36,7 @@ def make_motion_model(mechanism: Mechanism) -> MotionModel:
 
 
 def list_structures(mechanism: Mechanism | None) -> tuple[SimulatorStructure, ...]:
-    """Return the structures to fit to free motion: the moving average if the mechanism states it."""
+    """Return the model structures to fit to free motion: only the moving average if the mechanism has one."""
     is_average = mechanism is not None and mechanism.rig.simulator.window is not None
     return (MOVING_AVERAGE,) if is_average else STRUCTURES
 
@@ -79,7 +79,7 @@ def make_regression_law(contact: Contact) -> Law:
 
 
 def get_regression_coefficients(contact: Contact, entry: int) -> list[float]:
-    """Return the coefficients of `make_regression_law` for one entry of the lists in `[contact]`."""
+    """Return the contact law's regression coefficients for entry `entry` of the lists in `[contact]`."""
     stiffness = contact.stiffness[min(entry, len(contact.stiffness) - 1)]
     damping = contact.damping[min(entry, len(contact.damping) - 1)]
     return laws.find_contact_law(contact.law).coefficients(contact, stiffness, damping)

@@ -27,7 +27,7 @@ MAX_CACHED_BYTES, MIN_CACHED_MOTIONS = 3.2e7, 2
 
 
 class MotionResponse:
-    """Position and velocity of the mechanism in several runs, which a model predicts from the commands."""
+    """Position and velocity of the mechanism, predicted by a model from the commands of several runs."""
 
     def __init__(
         self,
@@ -43,9 +43,9 @@ class MotionResponse:
             model: Model of the motion simulator.
             runs: Runs, one per lane.
             timing: Timing of commands and readings.
-            longest: Longest sensor delay [s] that `at` must support. The model's delay is not part of it.
-            late: Delay [s] that a separate clock adds to the readings of each run, minus the mean of
-                `LoggedRun.force_late`; or None.
+            longest: Longest sensor delay [s] that `at` must support, without the delay of the model.
+            late: Delay [s] that a separate clock adds to the force readings of each run, or None. The mean
+                of `LoggedRun.force_late` is subtracted from it.
         """
         self.delay, self.period = model.delay, timing.control_period
         if any(run.force_late is not None for run in runs):
@@ -128,7 +128,7 @@ class MotionResponse:
         return _sum_weighted(position, terms), _sum_weighted(rate / self.period, terms)
 
     def at_row_times(self) -> MotionResponse:
-        """Return the motion at the times of the rows, which may differ from those of the force readings."""
+        """Return the motion at the times of the rows instead of those of the force readings."""
         rows = copy(self)
         rows.late = None
         return rows
@@ -136,7 +136,7 @@ class MotionResponse:
     def of(
         self, lanes: np.ndarray, begin: int = 0, max_cached_bytes: float = MAX_CACHED_BYTES
     ) -> MotionResponse:
-        """Return the motion of the given lanes, which may repeat, from row `begin` on."""
+        """Return the motion of some lanes from row `begin` on; `lanes` may contain a lane several times."""
         result = copy(self)
         result.max_cached_bytes = max_cached_bytes
         result.offset, result.rows = self.offset + begin, self.rows - begin
@@ -146,9 +146,9 @@ class MotionResponse:
         return result
 
     def _commands(self, runs: Sequence[LoggedRun], ahead: int) -> np.ndarray:
-        """Return the commands before, during and after the runs, shape (history + rows + ahead, lanes).
+        """Return the commands of the runs, with `history` rows before and `ahead` after, one lane per run.
 
-        After the last row of a run, its last command is held.
+        Before a run, the command moves uniformly (contact, tap) or rests; after the run, it is held.
         """
         lanes = []
         for run in runs:
@@ -164,9 +164,9 @@ class MotionResponse:
         return np.ascontiguousarray(np.array(lanes).T)
 
     def _after(self, fraction: float):
-        """Return the three matrices that advance the state by a fraction of a period.
+        """Return three matrices that advance the state by a fraction of a control period.
 
-        The matrices multiply the state, the input at the start of the period and the input at its end.
+        They multiply the state, the input at the start of the period, and the input at its end.
         """
         n = self.order
         system = np.zeros((n + 2, n + 2))
@@ -175,7 +175,7 @@ class MotionResponse:
         return full[:, :n], full[:, n] - full[:, n + 1], full[:, n + 1]
 
     def _advance(self, hold: str) -> np.ndarray:
-        """Return the states at the start of every interval, shape (order, intervals + 1, lanes)."""
+        """Return the states at the ends of all periods, (order, periods + 1, lanes), for a command hold."""
         state, from_start, from_end = self._after(1.0)
         lanes = self.end.shape[1]
         states = np.empty((len(self.end) + 1, self.order, lanes))

@@ -28,16 +28,16 @@ MIN_SPECTRUM = 1e-12  # smallest magnitude of 1 - e^{-s W}, so that derivatives 
 
 @dataclass(frozen=True)
 class MovingAverageStructure(SimulatorStructure):
-    """Structure with the parameters log W and delay."""
+    """Structure of moving-average models, with the parameters log(window [s]) and delay [s]."""
 
     def make_model(self, parameters: np.ndarray) -> MotionModel:
-        """Return the model with these parameters."""
+        """Return the moving-average model with the given parameters."""
         return MovingAverageModel(self, parameters)
 
     def make_starts(self, lines: SpectralLines) -> list[tuple[float, np.ndarray]]:
-        """Return chi-squared and parameters of one model for each of several windows.
+        """Return starting points of a fit: chi-squared and parameters of models with different windows.
 
-        The delay plus half the window equals the delay that the phase shows at low frequencies.
+        In each model, the delay plus half the window equals the measured delay at low frequencies.
         """
         total = estimate_low_frequency_delay(lines)
         longest = MAX_WINDOW_RATIO * max(2.0 * total, 2.0 * MIN_WINDOW_PERIODS * lines.period)
@@ -50,7 +50,7 @@ class MovingAverageStructure(SimulatorStructure):
 
 
 class MovingAverageModel(MotionModel):
-    """Moving average with the parameters log W and delay; W and the delay in s."""
+    """Model that averages the command over a window W [s] and delays it; parameters: log W, delay [s]."""
 
     @property
     def window(self) -> float:
@@ -67,7 +67,7 @@ class MovingAverageModel(MotionModel):
 
     @cached_property
     def fraction(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return 1 / 1, because a moving average has no rational factor."""
+        """Return numerator 1 and denominator 1, because a moving average has no rational factor."""
         return np.ones(1), np.ones(1)
 
     def response(self, s: np.ndarray) -> np.ndarray:
@@ -78,7 +78,7 @@ class MovingAverageModel(MotionModel):
         return np.array([product * np.exp(-product) / self._spectrum(s) - 1.0, -s])
 
     def bandwidth(self) -> float:
-        """Return the -3 dB bandwidth [Hz]: x / W with sin(pi x) / (pi x) = 1 / sqrt(2)."""
+        """Return the -3 dB bandwidth f [Hz]: sin(pi f W) / (pi f W) = 1 / sqrt(2) for the window W [s]."""
         return 0.442946 / self.window
 
     def _spectrum(self, s: np.ndarray) -> np.ndarray:

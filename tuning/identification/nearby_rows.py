@@ -6,7 +6,7 @@ import numpy as np
 
 
 class NearbyRows(NamedTuple):
-    """Rows near contact for several surface positions, at one time."""
+    """Rows near contact: motion at one time relative to each row, and depth for several surface positions."""
 
     rows: np.ndarray  # (rows,), flat indices into an array (rows, lanes); -1 after the end of a lane
     position: np.ndarray  # (rows,), position of the mechanism [m]
@@ -16,7 +16,7 @@ class NearbyRows(NamedTuple):
 
 
 class Onsets(NamedTuple):
-    """Onsets of contact between two rows."""
+    """Onsets of contact, each of them between two successive rows."""
 
     plane: np.ndarray  # (onsets,), index of the surface position
     row: np.ndarray  # (onsets,), index into `NearbyRows.rows` of the row after the onset

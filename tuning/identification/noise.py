@@ -131,8 +131,8 @@ def _fit_dead_zone(readings: np.ndarray) -> tuple[float, tuple[float, float] | N
     D and the standard deviation of n are maximum likelihood estimates.
 
     Returns:
-        The standard deviation, and the dead zone with its standard error; or 0 and None if too few readings
-        differ from 0, or if a gap around 0 shows that the dead zone is not subtracted from larger values.
+        The standard deviation, and the dead zone with its standard error. The result is 0 and None if too few
+        readings differ from 0, or if a gap around 0 shows that the sensor does not subtract the dead zone.
     """
     size = np.abs(readings[readings != 0.0])
     zeros, number = len(readings) - len(size), len(size)
@@ -225,7 +225,7 @@ def fit_whitening_filter(values: np.ndarray) -> tuple[float, ...]:
 
 
 def autocorrelate(whitening: tuple[float, ...], longest: int = 200) -> np.ndarray:
-    """Return the autocorrelation, at lags 1 to `longest`, of the noise that this filter whitens."""
+    """Return the autocorrelation at lags 1 to `longest` of noise that the filter `whitening` makes white."""
     if len(whitening) == 1:
         return np.zeros(1)
     impulse = np.zeros(4 * longest)

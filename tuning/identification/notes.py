@@ -26,7 +26,7 @@ def collect_notes(
     Args:
         motion: Fit of the motion simulator, or None.
         contact: Fit of the contact, or None.
-        used: Fit of the contact if its values are in the mechanism file, or None.
+        used: The same as `contact` if the mechanism file contains its values; None if it does not.
         force: Noise of the force sensor at rest, or None.
         vague: Keys of the stiffness entries that the logs hardly determine.
     """

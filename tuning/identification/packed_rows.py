@@ -10,14 +10,14 @@ import numpy as np
 
 
 def pack_rows(inside: np.ndarray, memory: int) -> np.ndarray:
-    """Build the sequence of rows near contact, one lane after the other.
+    """Return the sequence of the rows near contact, one lane (run) after the other.
 
     Args:
         inside: Flags of the rows in contact, shape (rows, lanes).
-        memory: Number of rows until the response of the filters has decayed.
+        memory: Number of rows after contact in which the filters of the readings decay.
 
     Returns:
-        Flat index into an array (rows, lanes) for each element, or -1 after the end of a lane.
+        For each row in the sequence, its flat index into an array (rows, lanes); -1 after the end of a lane.
     """
     length, lanes = inside.shape
     by_lane = np.ascontiguousarray(inside.T)

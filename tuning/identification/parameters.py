@@ -51,8 +51,8 @@ def draw_simulator_parameters(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Draw the parameters of the motion simulator from a normal distribution.
 
-    The draws of a moving average or a first- or second-order model contain all its parameters. Those of other
-    models contain only the delay, which then includes the whole deviation of the phase delay at the contact
+    For a moving average or a first- or second-order model, the draws contain all parameters. For any other
+    model, they contain only the delay: the fitted delay plus the deviation of the phase delay at the contact
     frequency.
 
     Args:

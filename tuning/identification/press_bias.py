@@ -58,9 +58,10 @@ def find_bias_prior(
 def find_surface_of_press(
     position: np.ndarray, force: np.ndarray, counts: np.ndarray, bias: tuple[float, float]
 ) -> float | None:
-    """Return the position [m] at which a line through the forces of a press run reaches the bias.
+    """Return the position [m] where a line fitted to force against position equals the bias.
 
-    Returns None if the force does not increase with the position.
+    In the press runs of these readings, the simulator presses the mechanism in. Returns None if the force
+    does not increase with the position.
     """
     x, f = position[counts], force[counts] - bias[0]
     slope, at_zero = _fit_line(x, f)
@@ -68,7 +69,7 @@ def find_surface_of_press(
 
 
 def _has_release(runs: Sequence[LoggedRun], motion: MotionResponse) -> bool:
-    """Return whether a press run leaves the contact: whether its force at small depths exceeds the trend."""
+    """Return whether press runs leave the contact: shallow readings then exceed a line through deep ones."""
     position, _ = motion.at(TYPICAL_FORCE_DELAY)
     x, f = [], []
     for lane, run in enumerate(runs):
@@ -87,7 +88,7 @@ def _has_release(runs: Sequence[LoggedRun], motion: MotionResponse) -> bool:
 
 
 def _fit_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Return the slope of the least-squares line through points, and its value at x = 0."""
+    """Return slope and intercept (value at x = 0) of the least-squares line through the points (x, y)."""
     away = x - np.mean(x)
     power = float(away @ away)
     slope = float(away @ y) / power if power else 0.0

@@ -104,7 +104,7 @@ def estimate_row_period(stamps: np.ndarray) -> float | None:
 def _round_to_ticks(
     stamps: np.ndarray, period: float, label: str, column: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the time stamps relative to the first one, their phases [s], and their ticks.
+    """Return, for each row, the time since the first row [s], the phase [s] and the tick.
 
     Raises:
         InputError: If the time stamps do not identify ticks.
@@ -244,7 +244,7 @@ def _estimate_phase(stamps: np.ndarray, period: float) -> np.ndarray:
 
 
 def _correct_outliers(tick: np.ndarray) -> np.ndarray:
-    """Return strictly increasing ticks; a median filter corrects outliers."""
+    """Return the ticks of all rows; if they do not increase strictly, a median filter corrects outliers."""
     lost = tick - np.arange(len(tick))
     if np.all(np.diff(lost) >= 0):
         return tick

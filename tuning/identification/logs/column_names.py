@@ -53,7 +53,7 @@ _UNIT_PATTERN = re.compile(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$|\s/\s*(\S+)\s*$|,\s+
 
 
 class NameMatch(NamedTuple):
-    """Channel that a column's name indicates."""
+    """Channel that the name of a column indicates, and the certainty of this match."""
 
     channel: str
     certainty: int  # 3: the channel's own name; 2: the name states quantity and role; 1: only one of them
@@ -108,7 +108,7 @@ def match_channel(name: str, unit: str | None) -> NameMatch | None:
 
 
 def _find_last(meanings: dict[str, str], above: list[str], last: list[str]) -> str | None:
-    """Return the last meaning of a name's words; the letters d, c, m, a count only after a single letter."""
+    """Return the meaning of the last word that has one; d, c, m, a count only beside one letter (`x_d`)."""
     letters = [word for word in last if len(word) == 1]
     for word in reversed([*above, *last]):
         if word in "dcma" and not (len(letters) >= 2 and len(last) == 2):
@@ -119,7 +119,7 @@ def _find_last(meanings: dict[str, str], above: list[str], last: list[str]) -> s
 
 
 def _split_words(part: str) -> Iterator[str]:
-    """Yield the words in a part of a name, in lower case and without digits; `setpos` has two words."""
+    """Yield the words in a part of a name, in lower case and without digits: `setpos2` gives `set`, `pos`."""
     for token in re.findall(r"[^\W\d_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", part)):
         word = token.lower()
         if (match := re.fullmatch(r"([xyzvf])([dcma])", word)) is not None:

@@ -67,7 +67,7 @@ def estimate_contact_threshold(force: np.ndarray) -> float:
 
 
 def _average_readings(force: np.ndarray) -> np.ndarray:
-    """Return the mean of the existing readings around each row; NaN where there are none."""
+    """Return the mean of the `AVERAGED_ROWS` readings around each row, ignoring NaN; NaN if all are NaN."""
     exists, window = np.isfinite(force), np.ones(AVERAGED_ROWS)
     number = np.convolve(exists, window, "same")
     total = np.convolve(np.where(exists, force, 0.0), window, "same")

@@ -47,14 +47,14 @@ def check_command(
             because another program may command the rig there.
         period: Control period [s].
         mass: Equivalent mass of the numerical model [kg].
-        row: Row convention of the mapping.
+        row: Row convention that the mapping states (`timing.row`).
         integrator: Integrator of the numerical model, for logs whose velocity does not determine it.
 
     Returns:
         True if the force command can be used, and a note or None.
 
     Raises:
-        InputError: If the force command explains the motion only with another mass, sign or row convention.
+        InputError: If the mass, the sign of the force or the row convention contradicts the motion.
     """
     x, v, force = (segment.channels[key] for key in ("position_desired", "velocity_desired", "force_command"))
     assert x is not None and force is not None
@@ -87,7 +87,7 @@ def check_command(
 
 
 def _check_mass(label: str, fits: dict[int, FitsByConvention], mass: float) -> None:
-    """Raise `InputError` if the force command explains the motion only with another mass or sign."""
+    """Raise `InputError` if the force command fits the motion only with the opposite sign or another mass."""
     fit = min(
         (_select_best_fit(by_way)[1] for by_way in fits.values()), key=lambda candidate: candidate.error
     )
@@ -131,7 +131,7 @@ def _check_row(label: str, fits: dict[int, FitsByConvention], mass: float, row: 
 
 
 def _select_best_fit(fits: FitsByConvention) -> tuple[tuple[str, str], ScaleFit]:
-    """Return the fit with the smallest residual, after its row convention (`timing.row`) and integrator."""
+    """Return the key (row convention, integrator) of the fit with the smallest residual, and this fit."""
     return min(fits.items(), key=lambda item: item[1].rms)
 
 
@@ -163,11 +163,11 @@ def _interpolate_gaps(values: np.ndarray) -> np.ndarray:
 def _fit_conventions(
     moves: list[tuple[np.ndarray, np.ndarray, np.ndarray]], width: int, ways: list[tuple[str, str]]
 ) -> FitsByConvention:
-    """Fit the ratio of the positions' second differences to those that the force command causes.
+    """Fit the measured second differences of positions as a multiple of those that the forces cause.
 
     Args:
-        moves: For each contact: the positions, the second differences that the forces of the rows cause, and
-            flags of the valid rows.
+        moves: For each contact, three arrays over its rows: positions [m]; -T^2 F_c / M [m], as in
+            `compute_force_displacement`; and flags of the valid rows.
         width: Number of rows between the positions of a second difference.
         ways: Pairs of row convention and integrator.
 
@@ -196,12 +196,12 @@ def _fit_conventions(
 
 
 def compute_force_displacement(unit: np.ndarray, integrator: str, sent: bool) -> np.ndarray:
-    """Return the second differences x(n+1) - 2 x(n) + x(n-1) of the positions that the force command causes.
+    """Return the second differences x(n+1) - 2 x(n) + x(n-1) that the force command causes in positions x.
 
     Args:
-        unit: Second difference that the force of each row causes, -T^2 F_c / M.
+        unit: -T^2 F_c / M in each row, with control period T, force command F_c and equivalent mass M [m].
         integrator: Integrator of the numerical model.
-        sent: Whether row n contains the position x(n+1) instead of x(n).
+        sent: Whether row n contains the position of tick n + 1, not of tick n.
     """
     previous, current = unit[:-1], unit[1:]
     displacements = {

@@ -16,7 +16,7 @@ StampsOfColumns = Callable[[Sequence[str], str | None], Mapping[str, np.ndarray 
 
 
 def find_no_stamps(columns: Sequence[str], time: str | None = None) -> dict[str, None]:
-    """Return None for each column: the format has no separate time stamps."""
+    """Return None for each column, because the log's format has no separate time stamps."""
     return dict.fromkeys(columns)
 
 

@@ -42,7 +42,7 @@ class LogSample(NamedTuple):
 
 
 def sample_log(log: OpenLog, columns: Sequence[str]) -> LogSample:
-    """Read the first rows of columns; a missing or too large number is replaced by that of the row above."""
+    """Read the first rows of columns; replace a missing or too large number by the number above it."""
     names = [name for name in dict.fromkeys(columns) if log.names.count(name) == 1]
     read = log.read(names) if names else {}
     # Columns with other time stamps may have other lengths.

@@ -33,7 +33,7 @@ ChannelValues = Mapping[str, np.ndarray | None]
 
 
 class LogSegment(NamedTuple):
-    """Segment of a log without a long gap, with one row per tick."""
+    """Part of a log without long gaps, with one row per tick."""
 
     tick: np.ndarray  # int64
     channels: dict[str, np.ndarray | None]  # SI values of each channel; NaN (integers: -1) in lost rows
@@ -91,7 +91,7 @@ def detect_integrator(x: np.ndarray, v: np.ndarray | None, period: float) -> str
 def _detect_integrator_over_span(x: np.ndarray, v: np.ndarray, period: float) -> str | None:
     """Detect the integrator from the motion in `INTEGRATOR_SPAN_ROWS` rows, despite rounding or jitter.
 
-    The integrators use different velocities of a period: at its start, at its end, or the mean of both.
+    In each period, an integrator uses the velocity at the start, the velocity at the end, or their mean.
     """
     finite = np.isfinite(v)
     summed = np.cumsum(np.where(finite, v, 0.0))

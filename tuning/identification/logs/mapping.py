@@ -123,7 +123,7 @@ class RunFiles(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     end: Annotated[float, key_metadata("of the run, from the first row", "s", gt=0.0)] | None = None
 
     def names(self, path: Path) -> bool:
-        """Return whether one of the patterns matches the path of a file."""
+        """Return whether the entry names a file: whether one of its patterns matches the path."""
         return any(PurePath(path).match(pattern) for pattern in self.files)
 
 
@@ -166,7 +166,7 @@ def parse_mapping(raw: Mapping[str, Any], label: str) -> LogMapping:
     """Convert parsed TOML tables to a mapping; `label` is the name of the mapping in messages.
 
     Raises:
-        InputError: If the table is invalid.
+        InputError: If the tables are invalid.
     """
     try:
         mapping = to_struct(LogMapping, expand_shorthand(raw))
@@ -177,7 +177,7 @@ def parse_mapping(raw: Mapping[str, Any], label: str) -> LogMapping:
 
 
 def make_simulation_mapping() -> LogMapping:
-    """Return the mapping of logs that `jaxhil simulate --log` writes."""
+    """Return the mapping for the logs that `jaxhil simulate --log` writes."""
     names = ("position_desired", "position_measured", "force_measured", "velocity_desired", "force_command")
     channels = {"time": "time", **{name: name for name in names}, "contact_index": "contact"}
     runs = [{"files": "*", "kind": "contact"}]
@@ -209,7 +209,7 @@ def read_mapping_file(path: str | os.PathLike[str], label: str) -> dict[str, Any
 
 
 def expand_shorthand(raw: Mapping[str, Any]) -> dict[str, Any]:
-    """Expand shorthand in the tables: a column name becomes a table, a single pattern becomes a list."""
+    """Expand shorthand in a mapping: replace a column's name by a table, and a file pattern by a list."""
     tables = dict(raw)
     if isinstance(channels := tables.get("channels"), Mapping):
         named = {

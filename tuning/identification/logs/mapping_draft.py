@@ -72,12 +72,12 @@ def draft_mapping(paths: Sequence[Path], text: TextFormat = DEFAULT_TEXT_FORMAT)
 
 
 def _list_columns(log: OpenLog) -> list[str]:
-    """Return the columns that can be channels although their names do not say so."""
+    """Return the first columns that do not contain time stamps, as candidates for unrecognised channels."""
     return [name for name in log.names if name and name not in log.reader.stamps][: 4 * MAX_LISTED_COLUMNS]
 
 
 def _guess_kind(path: Path, log: OpenLog, matches: Mapping[str, Sequence[str]]) -> str:
-    """Guess the kind of experiment from the file name or, if it contains none, from the values."""
+    """Guess the kind of experiment from the file name or, if the name states no kind, from the values."""
     named = [kind for kind in KINDS if kind in path.stem.lower()]
     if named:
         return named[0]

@@ -39,7 +39,7 @@ def mat(path: Path) -> LogReader:
 
 
 def _flatten(name: str, value: Any, units: dict[str, str]) -> ColumnsByName:
-    """Return the numeric columns in a value by name; add the units of ControlDesk's signals to `units`."""
+    """Return the numeric columns in a nested value, by name; add units stored by ControlDesk to `units`."""
     if not isinstance(value, Mapping):
         return split_columns(name, value)
     columns: ColumnsByName = {}

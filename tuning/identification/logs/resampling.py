@@ -47,11 +47,11 @@ def check_lengths(label: str, columns: Mapping[str, np.ndarray], named: Mapping[
 def split_sparse_rows(
     columns: dict[str, np.ndarray], stamps: np.ndarray
 ) -> dict[str, np.ndarray | None] | None:
-    """Replace columns with empty cells by their readings; return the time stamps of the readings [s].
+    """Remove empty cells from each column; return the time stamps of each column's readings [s].
 
     Many cells are empty if a log has one row per message, because a message contains only the channels of one
     topic. Returns None, and changes nothing, if the share of empty cells is below `MIN_EMPTY_SHARE` in every
-    column, or if a column is empty.
+    column, or if all cells of a column are empty.
 
     Args:
         columns: Values of each channel, changed in place.
@@ -86,8 +86,8 @@ def resample_to_rows(
         period: Control period [s].
 
     Returns:
-        The values of each channel; the time stamps of the rows [s]; and notes. If the force readings nearest
-        to the rows are used, the further channel `FORCE_LATE_CHANNEL` states how late they are [s].
+        The values of each channel; the time stamps of the rows [s]; and notes. If each row gets the nearest
+        force reading, a further channel `FORCE_LATE_CHANNEL` contains the time from row to reading [s].
 
     Raises:
         InputError: If a channel has no valid time stamps, or no row has readings of all channels.
@@ -153,7 +153,7 @@ def check_clock(label: str, column: str, stamps: np.ndarray | None, rows: int) -
 
 
 class _RowsAmongReadings:
-    """Assignment of a channel's readings to the rows by time stamps."""
+    """Resampling of a channel that has separate time stamps to the rows of the desired position."""
 
     def __init__(self, label: str, column: str, stamps: np.ndarray, times: np.ndarray, period: float):
         self._column = column
@@ -189,15 +189,15 @@ class _RowsAmongReadings:
 
     @property
     def has_row_rate(self) -> bool:
-        """Return whether the readings have the same rate as the rows, but other times."""
+        """Return whether the readings have the rate of the rows, but are taken between the rows."""
         return not self._exact and abs(self._rate / self._period - 1.0) < EQUAL_RATE_TOLERANCE
 
     def nearest(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nearest reading of each row, and its time minus the row's time [s]."""
+        """Return the reading nearest to each row in time, and its time minus that of the row [s]."""
         return values[self._nearest], self._late
 
     def of(self, values: np.ndarray, steps: bool) -> np.ndarray:
-        """Interpolate the values linearly at the rows; if `steps`, hold each value until the next one."""
+        """Return the values at the times of the rows: held if `steps` is true, else interpolated linearly."""
         if self._exact:
             return values[self._before]
         if steps:
@@ -205,7 +205,7 @@ class _RowsAmongReadings:
         return values[self._before] * (1.0 - self._share) + values[self._before + 1] * self._share
 
     def note(self, master: str) -> str:
-        """Return a note that describes how the channel was resampled."""
+        """Return a note on the resampling; `master` is the column that defines the rows."""
         how = "used unchanged" if self._exact else "interpolated"
         how += ", but the nearest forces are used" if self.has_row_rate else ""
         begins = f"{abs(1e3 * self._begins):.4g} ms {'after' if self._begins >= 0 else 'before'} those"

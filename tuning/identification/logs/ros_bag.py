@@ -60,7 +60,7 @@ def bag(path: Path) -> LogReader:
 
 
 def _read_topics(path: Path) -> dict[str, dict[str, list[Any]]]:
-    """Return the fields of all topics; each has one value per message, as has `TIME` [ns]."""
+    """Return, for each topic, the values of each field in all messages; the field `TIME` has stamps [ns]."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 

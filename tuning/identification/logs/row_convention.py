@@ -79,7 +79,7 @@ def check_row_convention(
 
 
 def detect_common_integrator(runs: Sequence[LoggedRun], period: float) -> str | None:
-    """Return the integrator of the numerical model that most contacts indicate, or None if unclear."""
+    """Return the integrator that most runs in contact indicate for the numerical model; None if unclear."""
     contacts = [run for run in runs if run.kind == "contact"][:MAX_RUNS]
     integrators = [detect_integrator(run.position_desired, run.velocity_desired, period) for run in contacts]
     return max(set(integrators), key=integrators.count, default=None)
@@ -88,8 +88,8 @@ def detect_common_integrator(runs: Sequence[LoggedRun], period: float) -> str | 
 def detect_reading_offset(runs: Sequence[LoggedRun]) -> int | None:
     """Return the row offset from a command to the latest force reading that affects it.
 
-    The offset is positive if the reading is in a later row. It is None if the runs disagree, or if fewer than
-    two runs are conclusive.
+    The offset is positive if the reading is in a later row than the command. The result is None if the runs
+    disagree, or if fewer than two runs are conclusive.
     """
     contacts = [run for run in runs if run.kind == "contact"]
     contacts = contacts[:: -(-len(contacts) // MAX_RUNS) or 1]
@@ -107,9 +107,9 @@ def _find_latest_reading(commands: np.ndarray, columns: np.ndarray) -> int | Non
     """Return the row offset from a command to the latest reading that affects the command; None if unclear.
 
     Args:
-        commands: Second differences of the commands, differenced twice more.
-        columns: Regressors. The first regressor is the reading `ROWS_AFTER_COMMAND` rows after the command;
-            each further regressor is the reading of the previous row.
+        commands: Fourth differences of the commands, shape (rows,).
+        columns: Second differences of the regressors, shape (rows, regressors). The first regressor is the
+            reading `ROWS_AFTER_COMMAND` rows after the command; the next ones are those of earlier rows.
     """
     if len(commands) < MIN_REGRESSION_ROWS or _correlate_neighbours(columns) > MAX_NEIGHBOUR_CORRELATION:
         return None
@@ -138,12 +138,12 @@ def _find_latest_reading(commands: np.ndarray, columns: np.ndarray) -> int | Non
 
 
 def _make_regression_columns(run: LoggedRun) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the columns of the regression for one run, or None if the run has no contact.
+    """Return the columns of the regression for one run, or None if it has too few usable rows.
 
-    The first array contains the second differences of the commands. The second array contains the regressors:
-    force readings of adjacent rows, and the position and velocity of the numerical model. All columns are
-    differenced twice more. Only rows in and near contact are included, because other rows may not depend on
-    the force.
+    The first array contains the fourth differences of the commands. The second array contains the second
+    differences of the regressors: force readings of nearby rows, and the position and velocity of the
+    numerical model. Only rows in and near contact are included, because commands in other rows may not
+    depend on the force.
 
     Returns:
         Arrays of shape (rows,) and (rows, regressors).
@@ -175,7 +175,7 @@ def _make_regression_columns(run: LoggedRun) -> tuple[np.ndarray, np.ndarray] | 
 
 
 def _correlate_neighbours(columns: np.ndarray) -> float:
-    """Return the correlation of successive second differences of the readings, or 1 if it is undefined."""
+    """Return the correlation of force readings (second differences) in adjacent rows; 1 if undefined."""
     reading, next_reading = columns[:, ROWS_AFTER_COMMAND], columns[:, ROWS_AFTER_COMMAND + 1]
     size = float(np.sqrt(np.dot(reading, reading) * np.dot(next_reading, next_reading)))
     return float(np.dot(reading, next_reading)) / size if size else 1.0

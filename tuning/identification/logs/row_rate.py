@@ -16,7 +16,7 @@ MIN_CHANGE_SHARE = 0.9  # minimum share of the commands' changes in the rows of 
 
 
 def find_command_phase(tick: np.ndarray, x: np.ndarray, rows: int) -> int | None:
-    """Return the index of the row in a control period that has the new command; None if it is unclear.
+    """Return which row of each control period has the new command, as an index; None if it is unclear.
 
     Args:
         tick: Number of each row, counted at the rate of the rows, shape (rows,); lost rows are omitted.
@@ -42,7 +42,7 @@ def find_command_phase(tick: np.ndarray, x: np.ndarray, rows: int) -> int | None
 def select_tick_rows(
     label: str, x: np.ndarray, stamps: np.ndarray | None, period: float, rows: int | None
 ) -> tuple[np.ndarray | slice, list[str]]:
-    """Select the rows of a log at the ticks.
+    """Select one row per control period: that of the tick.
 
     Args:
         label: Name of the log in messages.

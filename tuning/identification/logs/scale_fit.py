@@ -10,7 +10,7 @@ OUTLIER_ITERATIONS = 4  # maximum number of iterations that exclude rows
 
 
 class ScaleFit:
-    """Fit of one signal as a multiple of another signal: factor (slope), its standard error, and residual."""
+    """Fit of one signal as a multiple of another: the factor (slope), its standard error, and residuals."""
 
     def __init__(self, slope: float, left: float, rms: float, error: float, rows: float):
         self.slope = slope
@@ -21,12 +21,12 @@ class ScaleFit:
 
 
 def fit_scale(signal: np.ndarray, unit: np.ndarray, width: int = 1) -> ScaleFit | None:
-    """Fit signal = slope * unit by least squares without outliers.
+    """Fit signal = slope * unit by least squares, excluding outliers.
 
     Args:
         signal: Signal to fit.
         unit: Signal that is multiplied by the slope.
-        width: Half the maximum number of rows between correlated errors.
+        width: Errors in rows up to 2 * `width` apart may be correlated.
 
     Returns:
         The fit, or None if one of the signals is 0 in all rows.
@@ -51,7 +51,7 @@ def fit_scale(signal: np.ndarray, unit: np.ndarray, width: int = 1) -> ScaleFit 
 
 
 def _count_correlated(values: np.ndarray, longest: int) -> float:
-    """Return the number of correlated values that contain as much information as one independent value."""
+    """Return how many of the correlated values contain as much information as one independent value."""
     power = float(values @ values)
     if power == 0.0:
         return 1.0

@@ -63,11 +63,11 @@ _LENGTH_FACTORS = {
 
 
 def ask_for_unit(factors: tuple[float, ...], tolerance: float, momentum: bool = True) -> str:
-    """Return a question that names confusions of units that may explain a wrong magnitude of the force.
+    """Return a question that names wrong units as possible causes of a wrong magnitude of the force.
 
     Args:
         factors: Estimates of the ratio of the force to its expected value; the best estimate comes first.
-        tolerance: Relative tolerance between a ratio and the factor of two units.
+        tolerance: Relative tolerance between an estimate and the factor that a wrong unit causes.
         momentum: Whether the question may also name units of positions and mass.
 
     Returns:
@@ -78,12 +78,12 @@ def ask_for_unit(factors: tuple[float, ...], tolerance: float, momentum: bool = 
 
 
 def ask_for_length_unit(factor: float, tolerance: float) -> str:
-    """Return a question whether lengths have a wrong unit, with the likely mistakes, such as mm for m."""
+    """Return a question that names wrong length units (such as mm for m) that may explain `factor`."""
     return _ask_for_units(list(_LENGTH_FACTORS.items()), (factor,), tolerance)
 
 
 def _ask_for_units(units: list[tuple[float, str]], factors: tuple[float, ...], tolerance: float) -> str:
-    """Return a question that names the confusions of units with the closest factors, or an empty text."""
+    """Return a question that names the wrong units whose factors match `factors`, or an empty text."""
     texts: list[str] = []
     for factor in factors:
         distances = sorted(
@@ -103,11 +103,11 @@ def check_impulse(
     mass_is_verified: bool,
     clipped: bool,
 ) -> None:
-    """Check that the impulse of the measured force roughly equals the model's change of momentum.
+    """Check that the measured impulse roughly equals the numerical model's change of momentum.
 
     Args:
         label: Name of the log in messages.
-        kind: Kind of experiment: "contact", or "tap" if the model need not move as a free body.
+        kind: Kind of experiment: "contact", or "tap" (contacts in which the model is not a free body).
         segment: Segment of the log.
         contacts: For each contact, its first row and the row after its last row.
         period: Control period [s].
@@ -152,7 +152,7 @@ def check_impulse(
 def _compute_impulses(
     force: np.ndarray, x: np.ndarray, contacts: list[tuple[int, int]], period: float, mass: float
 ) -> tuple[list[float], list[float]]:
-    """Return the model's change of momentum and the measured impulse of each contact [N s]."""
+    """Return the numerical model's changes of momentum and the measured impulses [N s], one per contact."""
     rest = estimate_force_beside_contacts(force, contacts)
     momentum_changes, impulses = [], []
     for begin, end in contacts:
@@ -194,9 +194,10 @@ def _estimate_impulse_error(force: np.ndarray, period: float, contacts: list[tup
 def _estimate_force_ratio(
     force: np.ndarray, x: np.ndarray, contacts: list[tuple[int, int]], period: float, mass: float
 ) -> float | None:
-    """Return the ratio of the measured force to -M x_d'' in contact, or None if it is undetermined.
+    """Return the measured force in contact, divided by -`mass` times the desired acceleration.
 
-    A regression excludes the constant and the rate-dependent part of the force.
+    A regression excludes the constant and the rate-dependent part of the force. Returns None if the
+    rows do not determine the ratio.
     """
     rows = [
         np.arange(max(begin, SPEED_SPAN_TICKS), min(end, len(x) - SPEED_SPAN_TICKS))
@@ -221,7 +222,7 @@ def _estimate_force_ratio(
 
 
 def make_triangular_weights(width: int) -> np.ndarray:
-    """Return the weights that convert second differences of adjacent rows to those of rows `width` apart."""
+    """Return the weights with which second differences of adjacent rows sum to one of rows `width` apart."""
     return width - np.abs(np.arange(1.0 - width, width))
 
 

@@ -65,7 +65,7 @@ class VectorChannel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class SixAxisChannels(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Table `[channels]` of a six-axis log."""
+    """Table `[channels]` of a mapping for six-axis logs: the columns of each channel."""
 
     time: TimeChannel
     wrench_measured: VectorChannel
@@ -100,7 +100,7 @@ def parse_six_axis_mapping(raw: Mapping[str, Any], label: str) -> SixAxisLogMapp
     """Convert parsed TOML tables to a mapping; `label` is the name of the mapping in messages.
 
     Raises:
-        InputError: If the table is invalid.
+        InputError: If the tables are invalid.
     """
     tables = expand_shorthand(raw)
     if isinstance(channels := tables.get("channels"), Mapping):
@@ -122,7 +122,7 @@ def parse_six_axis_mapping(raw: Mapping[str, Any], label: str) -> SixAxisLogMapp
 
 
 def make_six_axis_simulation_mapping() -> SixAxisLogMapping:
-    """Return the mapping of six-axis logs that `jaxhil simulate --log` writes."""
+    """Return the mapping for the six-axis logs that `jaxhil simulate --log` writes."""
     channels = {name: [prefix + suffix for suffix in suffixes] for name, prefix, suffixes in CHANNELS[6]}
     runs = [{"files": "*", "kind": "contact"}]
     return parse_six_axis_mapping(
@@ -138,7 +138,7 @@ def get_factors(channel: VectorChannel, name: str) -> list[float]:
 
 
 def _check_rows(mapping: SixAxisLogMapping) -> None:
-    """Raise `KeyProblem` for keys on time stamps and rows that do not apply to six-axis logs."""
+    """Raise `KeyProblem` if six-axis logs do not allow a key of the time stamps or of the rows."""
     index, timing = mapping.channels.contact_index, mapping.timing
     if index is not None and index.time is not None:
         expected = "none, because six-axis logs have the time stamps of the rows"

@@ -109,7 +109,7 @@ def _detect_dialect(lines: Sequence[str], text: TextFormat) -> tuple[str, str]:
 def _find_header(
     rows: Sequence[Sequence[str]], lines: Sequence[str], decimal: str, text: TextFormat
 ) -> tuple[int | None, int, int | None]:
-    """Return the line of column names, the first line of data, and the line of units; None if missing."""
+    """Return the indices of the line of names (or None), first line of data, and line of units (or None)."""
     is_data = [_is_data(row, decimal) for row in rows]
     width, begin, unit_row = _find_width(rows[-DIALECT_LINES:]), 0, None
     if text.skip_rows is None and rows and len(rows[0]) != width:

@@ -109,7 +109,7 @@ def mdf(path: Path) -> LogReader:
 
 
 def _open_mdf(path: Path) -> Any:
-    """Open an MDF file; if this fails, no destructor of the library prints a traceback."""
+    """Open an MDF file; if this fails, prevent the library from printing tracebacks later."""
     from asammdf import MDF
 
     try:

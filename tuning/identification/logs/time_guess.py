@@ -23,7 +23,7 @@ TIME_FORMATS = (
 
 
 def guess_time(sample: LogSample, names: Sequence[str], position: str) -> ChannelGuess | None:
-    """Return the guess of the time stamps' column, or None if no column can contain time stamps."""
+    """Guess which column contains the time stamps; return None if no column is a candidate."""
     for seconds in names:
         for nanoseconds in names:
             if (
@@ -66,7 +66,7 @@ def guess_time(sample: LogSample, names: Sequence[str], position: str) -> Channe
 
 
 def find_step(sample: LogSample, time: ChannelGuess, column: str | None) -> float | None:
-    """Return the time between rows [s] in which a column has a number, or None if this time is not known."""
+    """Return the median time between rows with a number in `column` [s]; None if this time is unknown."""
     if time.column is None:
         return None
     values = sample.values[time.column]
@@ -90,7 +90,7 @@ def _is_steady(values: np.ndarray) -> bool:
 
 
 def _owns(stamps: str, column: str) -> bool:
-    """Return whether a column of time stamps belongs to the topic or channel of a column."""
+    """Return whether the column `stamps` contains the time stamps of `column`, according to their names."""
     return column.startswith(re.sub(r"\.(time|header\.stamp)$", "", stamps)) or "." not in stamps
 
 
@@ -100,7 +100,7 @@ def _count_shared(name: str, other: str) -> int:
 
 
 def _find_time_format(values: np.ndarray | None) -> str | None:
-    """Return the format of time stamps in text: empty for ISO 8601, None if it is unknown."""
+    """Return the `strptime` format of time stamps in text; it is "" for ISO 8601 and None if unknown."""
     if values is None or values.dtype != object or not len(values):
         return None
     for time_format in (None, *TIME_FORMATS):

@@ -20,10 +20,10 @@ COVERAGE_PROBABILITY = 0.99
 
 
 class MetricFilter:
-    """Kalman filter of the rig's parameters; the metrics of each contact are the measurement.
+    """Kalman filter that estimates the rig's parameters from the metrics of each contact.
 
-    The state contains the deviations of the parameters from the file, divided by their standard deviations;
-    the bias of the force sensor [N]; and the relative increase of the sensor's noise.
+    The state contains the deviations of the parameters from the mechanism file, divided by their standard
+    deviations; the bias of the force sensor [N]; and the relative increase of the sensor's noise.
     """
 
     def __init__(self, correlation: np.ndarray, noise_std: float):
@@ -59,7 +59,7 @@ class MetricFilter:
         self.covariance = remainder @ self.covariance @ remainder.T + gain @ noise @ gain.T
 
     def covers(self, value: np.ndarray, slopes: np.ndarray, noise: np.ndarray) -> bool:
-        """Return whether the metrics lie within the uncertainty that the mechanism file states."""
+        """Return whether the uncertainty of the mechanism file explains the metrics."""
         finite, slopes = np.isfinite(value), _append_sensor_columns(slopes)
         slopes, noise = slopes[finite], noise[np.ix_(finite, finite)]
         spread = slopes @ self.initial_covariance @ slopes.T + noise
@@ -71,14 +71,14 @@ class MetricFilter:
 
 
 def _append_sensor_columns(slopes: np.ndarray) -> np.ndarray:
-    """Append the derivatives with respect to the sensor's bias and noise to those of the metrics."""
+    """Append columns to the metrics' derivatives: those with respect to the sensor's bias and noise."""
     sensor_columns = np.zeros((len(METRIC_NAMES), 2))
     sensor_columns[BIAS_INDEX, 0] = sensor_columns[NOISE_INDEX, 1] = 1.0
     return np.concatenate([slopes, sensor_columns], axis=1)
 
 
 def _solve_normalised(spread: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve a linear system with a covariance matrix, after scaling the metrics to similar magnitudes."""
+    """Solve `spread` x = `right` for x; the covariance matrix is first scaled to a correlation matrix."""
     size = np.sqrt(np.diag(spread))
     scaled = right / (size[:, None] if right.ndim > 1 else size)
     solution = np.linalg.solve(spread / np.outer(size, size), scaled)

@@ -38,7 +38,7 @@ DEEP_CONTACT_SHARE = 0.1  # maximum depth of omitted rows as a share of the larg
 
 @dataclass(frozen=True)
 class MetricWeights:
-    """Weights of one contact's readings; each metric is a weighted sum of these readings."""
+    """Weights of one contact's readings: each metric, except the noise, is a weighted sum of them."""
 
     # (metrics, rows), weights of the force readings in the first five metrics; NaN for a missing metric
     force: np.ndarray
@@ -46,7 +46,7 @@ class MetricWeights:
     rest: np.ndarray  # bool, (rows,), rows out of contact
 
     def shift(self, force: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return how much each metric changes if the force [N] and position [m] readings change."""
+        """Return the change of each metric if `force` [N] and `position` [m] are added to the readings."""
         result = np.zeros(len(METRIC_NAMES))
         result[FORCE_METRICS] = self.force @ force
         result[LAG_INDEX] = self.position @ position
@@ -73,7 +73,7 @@ def compute_weights(
     mass: float,
     period: float,
 ) -> MetricWeights:
-    """Compute the weights of a run's readings in the metrics of its contact.
+    """Compute the weights of the readings in the metrics of a run's contact.
 
     Args:
         run: The run.
@@ -130,7 +130,7 @@ def _compute_restitution_weights(run: LoggedRun, used: np.ndarray, mass: float, 
 
 
 def _compute_delay_weights(run: LoggedRun, expected: PredictedReadings, lane: int) -> np.ndarray:
-    """Return the weights of the position readings in the metric "lag of motion"."""
+    """Return the weights of the position readings in the metric "lag of motion": their delay [s]."""
     velocity = expected.velocity[: len(run.tick), lane]
     read = run.valid & np.isfinite(run.position_measured)
     varied = np.where(read, velocity - velocity[read].mean(), 0.0)
@@ -188,9 +188,10 @@ def compute_metrics(
 def _compute_noise_metric(
     rest: np.ndarray, sensors: ForceSensorSpec, colour: NoiseColour
 ) -> tuple[float, float, float]:
-    """Return the noise metric, its standard deviation, and the noise level [N] for the other force metrics.
+    """Return the relative change of the noise, its standard deviation, and the noise level [N].
 
-    The noise level is the standard deviation of a reading times the factor of `NoiseColour.extend`.
+    The noise level determines the covariance of the force metrics. It is the standard deviation of a
+    reading times the factor of `NoiseColour.extend`. If readings show no noise, the mechanism file gives it.
     """
     stated = float(np.hypot(sensors.std, sensors.quantum / np.sqrt(12.0)))
     if len(rest) < MIN_METRIC_ROWS:

@@ -43,10 +43,11 @@ class ContactDeviation:
 
     Attributes:
         source: Name of the log file.
-        value: Metrics relative to the mechanism file; NaN if the log does not determine a metric.
+        value: Metrics; 0 means agreement with the mechanism file, NaN that the log does not show the metric.
         predicted_std: Predicted standard deviation of each metric.
         z: Normalised deviation: (value - predicted value) / `predicted_std`.
-        state: "good"; "watch" after a change that the file's uncertainty explains; "bad" after a larger one.
+        state: "good" before any alarm; then "watch" if the uncertainty of the mechanism file explains the
+            mean metrics since the change, else "bad".
     """
 
     source: str
@@ -58,11 +59,11 @@ class ContactDeviation:
 
 @dataclass(frozen=True)
 class MetricChange:
-    """Change of a metric that raised an alarm, averaged over the contacts since the change.
+    """Metric for which an alarm was raised, averaged over the contacts since the change of the rig.
 
     Attributes:
         name: Name of the metric.
-        value: Mean of the metric relative to the mechanism file, in SI units.
+        value: Mean of the metric, in SI units; 0 if the rig agrees with the mechanism file.
         std: Standard deviation of this mean due to noise.
     """
 
@@ -139,7 +140,7 @@ def monitor_contacts(campaign: Campaign, mechanism: Mechanism) -> MonitorResult:
 def _compute_run_metrics(
     runs: Sequence[LoggedRun], mechanism: Mechanism, campaign: Campaign, numbers: Sequence[UncertainParameter]
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield the metrics of each run, their derivatives (one column per parameter), and their covariance."""
+    """Yield each run's metrics, their derivatives (one column per parameter) and their noise covariance."""
     rig, timing = mechanism.rig, campaign.timing
     sensor = rig.force_sensor
     sensors = ForceSensorSpec(
@@ -168,7 +169,7 @@ def _predict_with_sensitivities(
     timing: CampaignTiming,
     numbers: Sequence[UncertainParameter],
 ) -> tuple[PredictedReadings, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return the predicted readings, and their changes due to an increase of each parameter by its std."""
+    """Return the predicted readings, and their changes if each parameter rises by its standard deviation."""
     slack = max(number.std for number in numbers if number.path in SENSOR_DELAY_KEYS)
     motion, differences = simulate_motion(mechanism, runs, timing, slack), []
     expected = predict_readings(mechanism, runs, motion)
@@ -185,7 +186,7 @@ def _predict_with_sensitivities(
 
 
 class _MonitorState:
-    """State of the monitor after the contacts so far; after an alarm, the prediction is not updated."""
+    """State of the monitor after the latest contact; after an alarm, `prediction` is not updated."""
 
     def __init__(self, prediction: MetricFilter):
         self.prediction = prediction
@@ -221,7 +222,7 @@ class _MonitorState:
         return MonitorResult(tuple(self.contacts), self.alarm, self.since, result)
 
     def _mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the means of metrics, derivatives and covariance of the contacts since the change."""
+        """Return the mean metrics since the change, their mean derivatives, and their noise covariance."""
         values, slopes, noises = (
             np.array(part) for part in zip(*self.measurements[self.since :], strict=True)
         )

@@ -106,7 +106,7 @@ def predict_readings(
 
 
 def find_contact_entry(run: LoggedRun) -> int:
-    """Return the index of a run's contact into the lists in the mechanism's `[contact]`."""
+    """Return which entry of the parameter lists in `[contact]` belongs to the contact of a run."""
     if run.contact_index is None or run.force_measured is None:
         return 0
     return max(int(run.contact_index[np.argmax(np.abs(np.nan_to_num(run.force_measured)))]), 0)
