@@ -71,7 +71,7 @@ def test_fault_run_injects_every_fault_of_a_rig():
     assert [name for name, count in injected.items() if count == 0] == list(ELSEWHERE)
 
 
-def test_fault_run_check_detects_missing_fault():
+def test_check_of_fault_runs_detects_fault_that_was_not_raised():
     run = fault_run(2000, 0, "none")
     results = controller_in_python(check_gain_document(document("none")), run.rows)
     check(run, results)

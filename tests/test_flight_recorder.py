@@ -68,7 +68,7 @@ def test_flight_recorder_keeps_the_newest_ticks(tmp_path, columns):
     assert np.array_equal(rows[:, -2], columns["contact"][220:])
 
 
-def test_flight_recorder_overwrites_no_file_and_ignores_wrong_vectors(tmp_path):
+def test_flight_recorder_overwrites_no_file_and_ignores_vectors_of_wrong_length(tmp_path):
     recorder = FlightRecorder(0.001, axes=6, ticks=2)
     vector = [1.0, 2.0, 3.0, 4.0, 5.0, np.nan]
     recorder.add(vector, vector, vector, vector, None, vector)

@@ -47,7 +47,7 @@ def test_share_of_doubtful_ticks_identifies_contacts_that_are_too_short(suite):
         assert most > MAX_DOUBTFUL_SHARE
 
 
-def test_impulse_ledger_status_is_unexplained_if_contact_seems_to_add_energy():
+def test_impulse_ledger_reports_unexplained_if_contact_seems_to_add_energy():
     """The force delay exceeds the specified value by 1 ms."""
     nominal = load("suite-noisy").mechanism
     errors, statuses = [], []

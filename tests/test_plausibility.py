@@ -52,7 +52,7 @@ def test_mechanism_summary_states_frequency_peak_force_and_duration():
     assert "motion simulator" not in summarise_mechanism(behind(model="ideal")).line("ideal")
 
 
-def test_mechanism_summary_lists_different_contacts_once_in_order():
+def test_mechanism_summary_lists_each_distinct_contact_once_in_file_order():
     result = summarise_mechanism(
         jaxhil.load("varying", {"contact.stiffness": [2e5, 1e5, 2e5, 3e5], "approach.contacts": 9})
     )

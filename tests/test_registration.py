@@ -114,7 +114,10 @@ def test_unusable_compensator_or_contact_law_is_not_registered(registered):
         (3, "found 3, expected an instance of"),
         (Unnamed(), "Unnamed.name: found"),
         (Taken(), "register phase_lead: name: found the name of a registered law"),
-        (Boundless(), "gains.toy_lead: found 0, 1, inf, expected lower <= nominal <= upper"),
+        (
+            Boundless(),
+            "gains.toy_lead: found lower 0, nominal 1, upper inf, expected lower <= nominal <= upper",
+        ),
         (Broken(), "gains.toy_lead.lower: found AttributeError"),
         (Unitless(), "gains.toy_lead.unit: found ''"),
         (Holding(), "expected only numbers, texts and tuples (no arrays)"),

@@ -115,7 +115,7 @@ def test_report_verdict_follows_from_all_requirements(put):
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1 + 4e-12, "good"), (1 + 1e-9, "unknown")])
-def test_identification_supports_gains_for_mechanism_file_with_12_digits(put, factor, verdict):
+def test_identification_counts_as_evidence_although_its_file_is_rounded_to_12_digits(put, factor, verdict):
     gains = sign(gain_document("none") | {"envelope": {}})
     mechanism = copy.deepcopy(gains["mechanism"])
     mechanism["contact"]["stiffness"][0] *= factor

@@ -135,7 +135,7 @@ def test_transferred_literature_gains_equal_literature_gains_of_target(compensat
         assert transferred[name] == pytest.approx(value, rel=1e-12)
 
 
-def test_transferred_gains_keep_relative_position_to_literature_and_range():
+def test_transferred_gains_keep_their_position_between_published_value_and_range_limits():
     source = claw()
     target = claw("contact.stiffness=[497420.0]", "rig.force_sensor.delay=0.01", "rig.control_period=0.002")
     gains = {**literature_gains(source, "response_error"), "initial_stiffness": 1e5, "lead_filter": 1.5e-3}

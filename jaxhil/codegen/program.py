@@ -31,8 +31,8 @@ class CFunction:
         self.taken = {f"{name}_" if name in C_RESERVED_WORDS else name for name in names} | C_RESERVED_WORDS
         self.reads: Locations = frozenset()
         self.writes: Locations = frozenset()
-        self.changes: set[str] = set()  # list parameters that the function changes
-        self.retained: dict[str, Locations] = {}  # list parameters that the function assigns to attributes
+        self.changes: set[str] = set()  # parameters of type list that the function changes
+        self.retained: dict[str, Locations] = {}  # parameters of type list that an attribute gets
         self.shared: dict[Any, SubsetError] = {}  # errors for local lists that are also attributes
         self.replaced: Locations = frozenset()  # attributes that get a new list or object
         self.fails = False  # whether the function may fail

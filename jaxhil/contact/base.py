@@ -47,7 +47,7 @@ class ContactLaw(abc.ABC):
     stiffness_unit: ClassVar[str] = "N/m"
     damping_unit: ClassVar[str] = "N s/m"
     is_damped: ClassVar[bool] = True  # whether the force depends on the key `damping`
-    dissipation_process: ClassVar[str] = ""  # process that dissipates energy in a law that rejects `damping`
+    dissipation_process: ClassVar[str] = ""  # what dissipates energy in a law without the key `damping`
     is_segmented: ClassVar[bool] = False  # whether each entry of `stiffness` is a list of slopes
     is_linear: ClassVar[bool] = False  # whether the force in contact is k d + b d'
     damped_law: ClassVar[str] = ""  # name of the same law with damping; empty: this law itself

@@ -88,5 +88,5 @@ def _reject(path: str, found: float, expected: str) -> None:
 
 
 def _is_used(mechanism: AnyMechanism, path: str) -> bool:
-    """Return whether a mechanism has the effect of the number at `path`: it is nonzero or uncertain."""
+    """Return whether the number at `path` is nonzero or uncertain, so that the effect exists."""
     return bool(value_at(mechanism, path)) or path in mechanism.uncertainty

@@ -214,14 +214,14 @@ class InputGuard:
         return fault
 
     def _same_position(self, travel: float) -> int:
-        """Add to the model's travel [m] during a constant position reading; return `POSITION_STUCK` or 0."""
+        """Count the `travel` [m] during a constant position reading; return `POSITION_STUCK` or 0."""
         self._position_travel += travel
         fault = POSITION_STUCK if self._position_travel > self._position_stuck else 0
         self.fatal |= fault
         return fault
 
     def _same_force(self, deeper: float) -> int:
-        """Add to the travel in contact [m] during a constant force reading; return `FORCE_STUCK` or 0."""
+        """Count the travel in contact [m] while the force reading is constant; return `FORCE_STUCK` or 0."""
         if abs(self.force) <= TARE_ROUNDING * abs(self._force_reading):
             # Without a force, a damped mechanism may move out of contact, but no mechanism moves deeper.
             travel = self._force_travel + deeper

@@ -71,7 +71,7 @@ class IntervalInputs(NamedTuple):
     state: SimulatorState  # state of the motion simulator at the interval's start
     start: Float[Array, "*batch"]  # position command at the interval's start [m]
     end: Float[Array, "*batch"]  # position command at the interval's end [m]
-    # position of the mechanism's surface [m]; None in the delay line of readings with jitter
+    # position of the mechanism's surface [m]; None in a delay line whose readings have jitter
     surface: Float[Array, "*batch"] | None
 
 

@@ -135,7 +135,9 @@ def _check_bounds(law: Compensator, gain: Gain, mechanism: Mechanism) -> None:
     lower, nominal, upper = values.values()
     if not (math.isfinite(lower) and math.isfinite(upper) and lower <= nominal <= upper):
         allowed = f"lower <= nominal <= upper, all finite (tried on {mechanism.name})"
-        raise _make_error(law, f"gains.{gain.name}", f"{lower:g}, {nominal:g}, {upper:g}", allowed)
+        raise _make_error(
+            law, f"gains.{gain.name}", f"lower {lower:g}, nominal {nominal:g}, upper {upper:g}", allowed
+        )
 
 
 def _check_runtime(law: Compensator, runtime: object) -> None:

@@ -117,8 +117,8 @@ def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool
         first_contact=initial_first_contact(zeros) if loop.probed else None,
         held=None if scenario.timing is None else no_held_values(zeros),
     )
-    # Delay lines are read up to their whole length back. With this number of the first tick, no index is
-    # negative.
+    # Delay lines are read as far back as they are long. Ticks are counted from a number at which no index
+    # is negative.
     tick = jnp.array(loop.first_tick, jnp.int32)
     phase = _select_entry(scenario.phase, _select_slot(rig, index))
     state, skipped = begin_approach(loop, rig, gains, state, phase, like, tick, skip_flight)

@@ -135,7 +135,7 @@ def _check_manifest(folder: Path, signed_by: SignatureCheck | None) -> BundleChe
 
 
 def _export_again(files: Mapping[str, bytes], document: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the files of a bundle as this version of jaxhil exports them for its gain document.
+    """Return the files that this version of jaxhil exports for the bundle's gain document.
 
     The test vectors, the plot and the FMUs' libraries are taken from the bundle's `files`.
     """

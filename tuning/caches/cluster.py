@@ -179,7 +179,9 @@ def _get_result(future: Any) -> tuple[Any] | None:
         return None
     except ImportError as error:
         reason = to_one_line(str(error), 100)
-        raise InputError(f"--scheduler: a worker: {reason}, expected workers with jaxhil installed") from None
+        raise InputError(
+            f"--scheduler: a worker reports {reason}, expected workers with jaxhil installed"
+        ) from None
     finally:
         future.release()
 

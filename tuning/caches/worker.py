@@ -66,6 +66,6 @@ def check_process_setting(asked: ProcessSetting, here: ProcessSetting) -> None:
 
 
 def build_setting_error(difference: str, flags: bool) -> InputError:
-    """Return the error for a worker with a `difference`; if `flags`, advise how to start workers."""
+    """Return the error for a worker with the `difference`; if `flags`, the message says how to start one."""
     advice = f"; start workers with: {PRELOAD_COMMAND}" if flags else ""
     return InputError(f"--scheduler: a worker: {difference}: its results would differ{advice}")

@@ -28,7 +28,7 @@ class DirectSearchResult(NamedTuple):
     """Results of the search without derivatives for one task."""
 
     starts: list[StartResult]  # result of each start: the literature's gains, then earlier gains
-    objective: Objective  # objective that the search minimised, with its bound of the error
+    objective: Objective  # objective that the search minimised; it includes the limit on the training error
     evaluations: int  # number of evaluations of the objective
 
 

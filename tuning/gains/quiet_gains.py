@@ -47,7 +47,7 @@ class CommandExcess(NamedTuple):
 
 
 def is_quiet_search_needed(task: TuneTask, settings: TuneSettings) -> bool:
-    """Return whether quiet gains are requested, a sensor has noise, and gains affect the noise."""
+    """Return whether gains with little noise are requested, a sensor has noise, and gains affect it."""
     return (
         settings.quiet
         and isinstance(task.mechanism, Mechanism)

@@ -69,7 +69,7 @@ class TuneResult:
     compensator: str  # name of the compensator
     mechanism: AnyMechanism  # mechanism for which the gains were tuned
     gains: dict[str, float]  # all gains of the compensator after tuning
-    literature: dict[str, float]  # all gains by the literature's rule
+    literature: dict[str, float]  # values of all gains by the published rule of the compensator
     # metrics of the verdict's error (`RigModel.verdict_error`) in scenarios that were not used for tuning
     figures: dict[str, ErrorMetrics]
     nominal: dict[str, ErrorMetrics]  # metrics of the nominal run

@@ -111,7 +111,7 @@ def estimate_clock_drift(
 def _estimate_run_delays(
     motion: MotionResponse, readings: ForceReadings, time: np.ndarray, is_contact: np.ndarray
 ) -> np.ndarray:
-    """Estimate by how much the force clock delays the forces of each run [s], from the forces' mean time."""
+    """Estimate how late the force clock is in each run [s], from the mean time of the forces."""
     level = np.median(readings.force[readings.counts])
     above = np.where(readings.counts, np.abs(readings.force - level), 0.0)
     weight = np.where(above > FORCE_DETECTION_SIGMAS * readings.std, above, 0.0) ** 2

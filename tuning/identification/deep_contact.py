@@ -132,7 +132,7 @@ class SummarisedProblem(ContactProblem):
         return super().fit_surfaces(delay, planes, pseudo)
 
     def _is_pushing(self, table: _DesignTable, fits: list[CoefficientFit]) -> bool:
-        """Return whether all fits give a positive force in all rows that the table's pseudo-rows replace."""
+        """Return whether all fits give a positive force in all readings that the table summarises."""
         if self.law.pulls or not self.damping_indices:
             return True
         return all(np.all(compute_force(fit.coefficients[None], table.extreme) > 0.0) for fit in fits)

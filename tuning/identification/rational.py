@@ -212,7 +212,7 @@ def fit_structure(structure: SimulatorStructure, lines: SpectralLines) -> Spectr
 
 
 def _refine_fit(structure: SimulatorStructure, start: np.ndarray, lines: SpectralLines) -> SpectrumFit:
-    """Fit a structure by the Levenberg-Marquardt method from the starting parameters `start`."""
+    """Fit a model structure by the Levenberg-Marquardt method from the starting parameters `start`."""
     s, command = lines.images
     scale = np.sqrt(2.0) / lines.std
 

@@ -58,7 +58,7 @@ class CheckResult:
 
     @property
     def error_in_verdict(self) -> float:
-        """Return this defect's effect on e - e* as the verdict counts it.
+        """Return the effect of this defect on e - e* that counts for the verdict.
 
         The effect is 0 if the defect is not significant, or if the verdict ignores this defect.
         """

@@ -27,7 +27,7 @@ from tuning.rig.udp_protocol import (
 )
 
 ANSWER_SHARE = 0.8  # longest time until an answer [periods]; the rig needs the remaining time
-MAX_CATCH_UP_PERIODS = 10  # largest delay of the rig [periods] after which it still executes the due ticks
+MAX_CATCH_UP_PERIODS = 10  # if the rig is later than this [periods], it skips the missed ticks
 BUSY_WAIT_TIME = 100_000  # time before a tick [ns] in which the loop polls the clock; a sleep may be too long
 START_DELAY = 50_000_000  # time from the start of the loop to the first tick [ns]
 MAX_SILENCE = 2.0  # time without an answer after which the loop ends: the controller has ended or hangs [s]

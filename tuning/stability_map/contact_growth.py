@@ -314,7 +314,7 @@ def _plant_transition(shape: ProgramParameters, lane: LoopParameters) -> tuple[j
             generator = generator.at[u, u].add(-decay).at[u, v].add(turn)
             generator = generator.at[v, u].add(-turn).at[v, v].add(-decay)
             force = force.at[u].set(weight.real).at[v].set(-weight.imag)
-    # A reading has the value just before a tick, so that its time within the period is in (0, 1].
+    # A reading is the force just before a tick. Its time, as a share of the period, is thus in (0, 1].
     time = 1.0 - (lane.delay / period - jnp.floor(lane.delay / period + 1e-9))
     to_end, to_reading = (_matrix_exponential(generator * t) for t in (jnp.ones_like(time), time))
     rows = jnp.concatenate([to_end[:size], (force @ to_reading)[None]])

@@ -146,7 +146,7 @@ def _build_cases(loaded: LoadedGains, limit: float, number: int, seed: int) -> l
 
 
 def _find_neutral_gains(loaded: LoadedGains) -> dict[str, float]:
-    """Return the neutral values (without effect), by name, of the gains that have a different value."""
+    """Return the neutral value (without effect) of each gain that does not already have it, by name."""
     return {
         gain.name: float(gain.neutral)
         for gain in COMPENSATORS[loaded.compensator].gains

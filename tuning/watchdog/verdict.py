@@ -74,7 +74,7 @@ def _describe_deciding_runs(rate: Mapping[str, Any]) -> str:
 
 
 def _describe_deciding_sweep(kind: str, rate: Mapping[str, Any], scenarios: int, held_out: int) -> str:
-    """Describe how large a sweep must be to decide whether a rate from `held_out` runs is acceptable."""
+    """Describe how large a sweep must be to decide whether an alarm rate is acceptable."""
     runs = estimate_deciding_scenarios(rate["alarms"], rate["runs"], rate["allowed"])
     if runs is None:
         return "at this rate, no sweep would decide"

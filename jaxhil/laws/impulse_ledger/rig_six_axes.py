@@ -104,7 +104,7 @@ class ImpulseLedger(SixAxisCompensator):
         return wrench_at_target(command, pose_desired)
 
     def pose_command(self, pose, rates):
-        """Return the pose, extrapolated by `lag_lead_...` so that all coordinates lag equally [m, rad]."""
+        """Return the pose [m, rad], each coordinate extrapolated by its gain so that all lag equally."""
         return lead_pose(self._pose_leads, pose, rates)
 
     def _evaluate(self) -> int:

@@ -25,7 +25,7 @@ from jaxhil.rig.surfaces import deflection
 
 @register("response_error")
 class ResponseError(Compensator):
-    """Phase lead, plus the force that is missing because of the motion simulator's lag.
+    """Compensator with a phase lead that also adds the force that the motion simulator's lag removes.
 
     The measured force is older than the measured position. The identification therefore fits the force to
     the aligned position, which is delayed by `identification_delay`. The weight of a reading is the product

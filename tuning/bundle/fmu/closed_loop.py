@@ -35,8 +35,8 @@ class FmuContact(msgspec.Struct, frozen=True):
 
     restitution: float | None  # restitution with the FMUs [1]; None if the contact does not end
     simulated_restitution: float | None  # restitution of `simulate` with the master's period [1]
-    status: str  # status of the contact with the FMUs
-    simulated_status: str  # status of the contact in the simulation
+    status: str  # status of the contact that the FMUs computed
+    simulated_status: str  # status of the contact that `simulate` computed
 
 
 class FmuLoop(msgspec.Struct, frozen=True):

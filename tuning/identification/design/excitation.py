@@ -209,7 +209,7 @@ def differentiate_error(
 def _plan_with_detectable_damping(
     mechanism: Mechanism, stroke: float, undamped: _MultisinePlan, weight: np.ndarray
 ) -> _MultisinePlan:
-    """Return the plan for an undamped mechanism, with the lowest damping that the runs can detect.
+    """Plan runs for an undamped mechanism as if it had the lowest damping that the runs can detect.
 
     Without damping, the derivatives of the force with respect to damping and force delay are proportional, so
     a linear prediction of their uncertainty would be infinite. The standard deviation of a low damping is

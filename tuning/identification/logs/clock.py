@@ -28,7 +28,7 @@ MAX_RATE_ERROR = 0.1  # maximum relative difference between row rate and control
 # Maximum relative difference between mean row rate and control rate; above it, the phase changes too much per
 # chunk.
 MAX_MEAN_RATE_ERROR = 1.5e-3
-# maximum scatter of the time between rows for an estimate of the row rate [periods]
+# The row rate is estimated only if the time between rows scatters by less than this [periods].
 MAX_STEP_SCATTER = 0.15
 MAX_STAMP_SCATTER = 0.25  # maximum scatter of time stamps for an identification of ticks [periods]
 

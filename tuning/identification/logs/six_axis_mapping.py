@@ -42,7 +42,7 @@ from tuning.identification.logs.units import FORCE_UNITS, LENGTH_UNITS, SPEED_UN
 ANGLE_UNITS = {"rad": 1.0, "mrad": 1e-3, "deg": 0.017453292519943295}
 ANGULAR_SPEED_UNITS = {f"{unit}/s": factor for unit, factor in ANGLE_UNITS.items()}
 TORQUE_UNITS = {"N m": 1.0, "N mm": 1e-3, "kN m": 1e3}
-# Allowed units of the first and of the last three columns of a channel, with the SI units first.
+# Allowed units of the first three columns of a channel and of its last three; SI units come first.
 VECTOR_UNITS = {
     "wrench_measured": (FORCE_UNITS, TORQUE_UNITS),
     "wrench_command": (FORCE_UNITS, TORQUE_UNITS),

@@ -139,13 +139,13 @@ class TangentModel:
         return max(force, 0.0) if change > 0.0 else min(force, 0.0)
 
     def bridge(self, force: float, least: float, deeper: float, velocity: float, duration: float) -> None:
-        """Predict impulse and final force of the reference: integrate a unit mass against the model.
+        """Predict impulse and final force of the ideal contact: integrate a unit mass against this model.
 
         Args:
-            force: force on the reference at the last reading [m/s^2].
+            force: force on the ideal contact's mass at the last reading [m/s^2].
             least: lower bound of the force, 0 or negative [m/s^2].
-            deeper: depth of the hardware minus that of the reference at the last reading [m].
-            velocity: speed of the reference into the surface at the last reading [m/s].
+            deeper: depth of the hardware minus that of the ideal contact at the last reading [m].
+            velocity: speed of the ideal contact's mass into the surface at the last reading [m/s].
             duration: time from the last reading to the end of the prediction [s].
         """
         damping = self.damping
