@@ -95,13 +95,13 @@ class Compensator(eqx.Module):
         name: name of the compensator.
         knows: values of mechanism and rig that the compensator needs (`jaxhil.laws.shared.nominal_values`).
         gains: specifications of the gains.
-        settings: named sets of gains for any mechanism; a set contains the gains that are not nominal.
+        settings: named sets of gains for any mechanism; gains that a set does not state are nominal.
         estimates_delay: whether the compensator estimates the delay of the force measurement.
         reads_position: whether the compensator uses the measured position.
         waits_for_contact: whether, without noise, F_c is 0 and the state does not change before the hardware
             is in contact, so that the approach may be skipped. Every class sets this attribute itself.
-        anticipates: whether the compensator computes a reference motion that it could follow without any
-            regard to the hardware.
+        anticipates: whether the compensator predicts a reference motion of the contact, which it could follow
+            even without measurements.
         is_large: whether `step` is so large that solvers are compiled separately from runs.
         tuned_without_derivatives: whether tuning uses a search without derivatives, because the program with
             derivatives takes too long to compile.
@@ -133,14 +133,14 @@ class Compensator(eqx.Module):
         return ()
 
     def restart(self, gains: Gains, state: Any, begins: Array, fresh: Array) -> Any:
-        """Return the state with restarted filters and delay lines (default: zeros) on the lanes `begins`.
+        """Return the state with filters and delay lines restarted on the lanes `begins`; default: all zeros.
 
         Args:
             gains: gains by name.
             state: state after the last tick.
-            begins: lanes in which a run begins.
-            fresh: lanes in which the run is for the next contact of a schedule. In all other lanes the same
-                run continues after a skipped free flight, and its estimates remain.
+            begins: whether each lane restarts.
+            fresh: whether a lane that restarts begins a new run, with the next contact of its scenario. If
+                not, its run continues after a skipped free flight, and keeps its estimates.
         """
         return clear_lanes(state, begins)
 

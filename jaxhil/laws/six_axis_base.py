@@ -85,7 +85,7 @@ class SixAxisCompensator(eqx.Module):
     def step(
         self, prepared: Any, state: Any, signals: SixAxisSignals, tick: Array
     ) -> tuple[tuple[Array, ...], Any]:
-        """Return the wrench on the numerical model about T's origin [N, N m], and the next state.
+        """Return the wrench on the numerical model about the target's origin T [N, N m], and the next state.
 
         Args:
             prepared: result of `prepare`.

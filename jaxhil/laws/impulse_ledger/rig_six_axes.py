@@ -26,7 +26,7 @@ MIN_SPREAD = 1e-3  # lower bound of a prior's standard deviation, so that the va
 
 @register_six_axes("impulse_ledger")
 class ImpulseLedger(SixAxisCompensator):
-    """Compensator that commands the impulse that the model still owes; see the module's docstring."""
+    """Compensator that commands the contact impulse missing on the model; see the module's docstring."""
 
     __slots__ = (
         "_impulse", "_in_contact", "_ledger", "_period", "_pose_leads", "_reader", "_release_time", "_unpaid",
@@ -62,7 +62,7 @@ class ImpulseLedger(SixAxisCompensator):
         self.reset()
 
     def reset(self) -> None:
-        """Restart everything."""
+        """Begin a new run: forget all contacts, readings and commanded impulses."""
         self._reader.reset()
         self._ledger.reset()
         self._impulse = [0.0] * AXES  # I_c, impulse commanded so far [N s, N m s]
@@ -72,16 +72,16 @@ class ImpulseLedger(SixAxisCompensator):
 
     @property
     def loop_delay(self) -> float:
-        """Return the delay D [s] of the hardware behind the model in the last contact; 0 before contacts."""
+        """Return the hardware's delay D [s] relative to the model in the last contact; 0 before contacts."""
         return self._ledger.delay * self._period
 
     @property
     def unpaid_impulse(self) -> float:
-        """Return the impulse still owed after the last contact, divided by the contact's impulse."""
+        """Return the missing impulse after the last contact, divided by the impulse of all contacts."""
         return self._unpaid
 
     def step(self, wrench, pose_desired, twist_desired, pose_measured):
-        """Return the wrench on the numerical model about T's origin [N, N m]."""
+        """Return the wrench command on the numerical model about the target's origin T [N, N m]."""
         reader, ledger = self._reader, self._ledger
         reader.read(wrench, pose_desired, twist_desired, pose_measured, self._impulse, self._in_contact)
         begins = reader.loud and not self._in_contact
@@ -108,7 +108,7 @@ class ImpulseLedger(SixAxisCompensator):
         return lead_pose(self._pose_leads, pose, rates)
 
     def _evaluate(self) -> int:
-        """Return the status of the last command."""
+        """Return the quality of the last command as one of the numbers in `jaxhil.rig.law_status`."""
         ledger = self._ledger
         if ledger.tangent.readings < MIN_CONTACT_READINGS:
             return UNSURE

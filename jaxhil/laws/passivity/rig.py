@@ -9,13 +9,13 @@ from jaxhil.rig.registry import Compensator, GainSpecification, register
 
 @register("passivity")
 class Passivity(Compensator):
-    """Compensator F_c = F, or F_c = -E/(T v_d) if E + T F v_d would be negative.
+    """Compensator F_c = F, or F_c = -E/(T v_d) if E + T F v_d is negative.
 
     E is the energy that the numerical model has given to the contact until this tick, v_d the velocity of the
     numerical model, and T the control period. Each period adds to E the product of T, F_c and the mean of v_d
     at the start and the end of the period. This product is the energy that the model loses, for every mass
-    and integrator. The second form of F_c returns E to 0, and corresponds to a virtual damping alpha. The
-    magnitude of F_c never exceeds the magnitude of F.
+    and integrator. The second form of F_c acts like a virtual damper that returns E to 0. The magnitude of
+    F_c never exceeds the magnitude of F.
     """
 
     __slots__ = ("_command", "_energy", "_period", "_velocity")

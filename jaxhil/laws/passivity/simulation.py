@@ -28,7 +28,7 @@ class ObservedEnergy(NamedTuple):
 
 
 class Passivity(Compensator):
-    """Compensator F_c = F + alpha v_d while the observed energy is negative; see the module's docstring."""
+    """Compensator F_c = F, with a virtual damper if a contact would return more energy than it absorbed."""
 
     name: ClassVar[str] = "passivity"
     knows: ClassVar[tuple[str, ...]] = ()

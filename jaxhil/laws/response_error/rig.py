@@ -25,11 +25,12 @@ from jaxhil.rig.surfaces import deflection
 
 @register("response_error")
 class ResponseError(Compensator):
-    """Compensator with a phase lead that also adds the force that the motion simulator's lag removes.
+    """Compensator F_c = lead-filtered force + contact force that is missing due to the simulator's lag.
 
-    The measured force is older than the measured position. The identification therefore fits the force to
-    the aligned position, which is delayed by `identification_delay`. The weight of a reading is the product
-    of two gates: aligned position in contact, and force above `contact_threshold`.
+    The measured force is older than the measured position. The identification of stiffness and damping
+    therefore uses the aligned position: the measured position, delayed by `identification_delay`. The weight
+    of a reading is the product of two gates: aligned position in contact, and force above
+    `contact_threshold`.
     """
 
     __slots__ = (

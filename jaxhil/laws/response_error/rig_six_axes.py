@@ -25,7 +25,7 @@ DOCKING_AXIS = 2  # index of z
 
 @register_six_axes("response_error")
 class ResponseError(SixAxisCompensator):
-    """Phase lead of every channel, and response error along the docking axis; see the module's docstring."""
+    """Compensator: phase lead on all channels, and correction of the simulator's lag on the docking axis."""
 
     __slots__ = (
         "_aligned", "_aligned_velocity", "_alignment", "_identification", "_in_contact", "_lead",

@@ -99,7 +99,7 @@ class PreparedResponseError(NamedTuple):
 
 
 class ResponseError(Compensator):
-    """Phase lead, response error and identification; see the module's docstring."""
+    """Compensator: phase lead and correction of the motion simulator's lag; see the module's docstring."""
 
     name: ClassVar[str] = "response_error"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)

@@ -89,7 +89,7 @@ def _covariance(name: str, size: Any) -> Gain:
 
 
 class ResponseError(SixAxisCompensator):
-    """Compensator with response error along the docking axis and phase lead on all channels of the wrench."""
+    """Compensator: phase lead on all channels, and correction of the simulator's lag on the docking axis."""
 
     name: ClassVar[str] = "response_error"
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY,)

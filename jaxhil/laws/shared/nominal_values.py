@@ -32,9 +32,10 @@ def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
 def simulator_inverse(mechanism: Mechanism) -> tuple[float, float]:
     """Return the coefficients a_1 [s] and a_2 [s^2] of the series e^(s tau)/G(s) = 1 + a_1 s + a_2 s^2 + ...
 
-    tau is the transport delay of the motion simulator plus the mean delay of the command. For the control
-    period T and a latency of L periods, the delay of the command is L T with linear interpolation, and L T -
-    T/2 with zero-order hold (notebooks/guide/model.md section 6, item 7).
+    G is the motion simulator's transfer function without transport delay. tau is this transport delay plus
+    the mean delay of the command. For the control period T and a latency of L periods, the delay of the
+    command is L T with linear interpolation, and L T - T/2 with zero-order hold (notebooks/guide/model.md
+    section 6, item 7).
     """
     rig = mechanism.rig
     first, second = _inverse_series(rig.simulator)
@@ -80,7 +81,7 @@ def peak_force(mechanism: Mechanism) -> float:
 
 
 def typical_stiffness(mechanism: Mechanism) -> float:
-    """Return an estimate of the contact stiffness [N/m]: F^2/(M v^2), where F is `peak_force`."""
+    """Return an estimate of the contact stiffness [N/m] from `peak_force`, mass and approach speed."""
     return (peak_force(mechanism) / mechanism.approach.velocity) ** 2 / mechanism.bodies.mass
 
 
@@ -90,7 +91,7 @@ def contact_frequency(mechanism: Mechanism) -> float:
 
 
 def critical_damping(mechanism: Mechanism) -> float:
-    """Return the critical damping 2 sqrt(k M) [N s/m], where k is `typical_stiffness`."""
+    """Return the critical damping 2 sqrt(k M) [N s/m]: k is `typical_stiffness`, M the equivalent mass."""
     return 2 * math.sqrt(typical_stiffness(mechanism) * mechanism.bodies.mass)
 
 
@@ -102,7 +103,7 @@ def noise_bound(mechanism: Mechanism) -> float:
 
 
 def _lags(simulator: Simulator, robot: Simulator | TargetRobot) -> list[float]:
-    """Return the lag [s] of each axis of a robot in uniform motion: transport delay minus G'(0)."""
+    """Return a robot's lag [s] on each axis in uniform motion: lag of its dynamics plus transport delay."""
 
     def of(key: str) -> list[float]:
         return getattr(robot, key) or getattr(simulator, key)
@@ -125,7 +126,7 @@ def _lags(simulator: Simulator, robot: Simulator | TargetRobot) -> list[float]:
 
 
 def _inverse_series(simulator) -> tuple[float, float]:
-    """Return the coefficients a_1 [s] and a_2 [s^2] of the series 1/G(s) = 1 + a_1 s + a_2 s^2 + ..."""
+    """Return a_1 [s] and a_2 [s^2] of 1/G(s) = 1 + a_1 s + a_2 s^2 + ... for the simulator's dynamics G."""
     if simulator.model == "first_order":
         return simulator.time_constant, 0.0
     if simulator.model == "second_order":

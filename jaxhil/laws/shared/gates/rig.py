@@ -24,7 +24,7 @@ def share_beyond(excess: float, excess_before: float, moved: float) -> float:
 
 
 def gate(share: float, share_before: float) -> float:
-    """Return the gate, from 0 to 1, for the shares of the last two periods.
+    """Return the gate: a factor that rises smoothly from 0 to 1 when a reading exceeds a threshold.
 
     The gate is the integral of a triangular weight over the time above the threshold in the last two periods.
 
@@ -32,8 +32,8 @@ def gate(share: float, share_before: float) -> float:
     above the threshold in periods, and the mean delay of the gate is one period.
 
     Args:
-        share: share of the last period in which the reading exceeded the threshold.
-        share_before: share of the previous period.
+        share: share of the last period during which the reading exceeded the threshold.
+        share_before: the same share for the period before.
     """
     return (share * share + share_before * share_before) / 2.0 + share * share_before * (
         2.0 - share - share_before

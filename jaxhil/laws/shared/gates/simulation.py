@@ -32,14 +32,14 @@ def share_beyond(
 
 
 def gate(share: Float[Array, "*batch"], share_before: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return the gate, from 0 to 1, for the shares s of the last period and l of the period before it.
+    """Return the gate: a factor that rises smoothly from 0 to 1 when a reading exceeds a threshold.
 
-    The shares are those returned by `share_beyond`.
+    From `share_beyond`, s is the share of the last period above the threshold, l that of the period before.
 
     The gate is (s^2 + l^2)/2 + s l (2 - s - l).
 
-    If the reading crossed the threshold once, the gate is the integral of a weight over the time during which
-    the reading was above the threshold. At the age u [periods], the weight is u for u < 1 and 2 - u for
-    1 <= u < 2. On the first tick after an upward crossing the gate is s^2/2, on the second 1/2 + l - l^2/2.
+    If the reading crossed the threshold once, the gate is the integral of a weight over the time above the
+    threshold. A moment u periods ago has the weight u for u < 1, and 2 - u for 1 <= u < 2. On the first tick
+    after an upward crossing the gate is s^2/2, on the second 1/2 + l - l^2/2.
     """
     return (share**2 + share_before**2) / 2 + share * share_before * (2 - share - share_before)

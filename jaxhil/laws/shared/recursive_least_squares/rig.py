@@ -2,14 +2,14 @@
 
 
 class ContactIdentification:
-    """Weighted recursive least squares with forgetting, in Bierman's factored form.
+    """Weighted recursive least squares for stiffness k and damping b in F = k p + b p', p the depth.
 
-    With the regressor phi = (p, p') and a reading's weight w, K = w P phi/(lambda_w + w phi' P phi),
-    theta += K (F - phi' theta), P = (P - K phi' P)/lambda_w, lambda_w = 1 - w (1 - lambda). The factors of
-    P = U D U', U = [[1, u], [0, 1]], D = diag(d1, d2), keep P symmetric and positive despite rounding
-    (Bierman, "Factorization Methods for Discrete Sequential Estimation", 1977). d1 and d2 never exceed their
-    initial values: a contact at rest has no information on the damping, and forgetting would increase the
-    variance of the damping without limit.
+    For theta = (k, b), its covariance P, phi = (p, p') and a reading's weight w, the recursion is
+    K = w P phi/(lambda_w + w phi^T P phi), theta += K (F - phi^T theta), P = (P - K phi^T P)/lambda_w, with
+    lambda_w = 1 - w (1 - lambda). The factors of P = U D U^T, U = [[1, u], [0, 1]], D = diag(d1, d2), keep P
+    symmetric and positive despite rounding (Bierman, "Factorization Methods for Discrete Sequential
+    Estimation", 1977). d1 and d2 never exceed their initial values: a contact at rest has no information on
+    the damping, and forgetting would increase the variance of the damping without limit.
 
     Args:
         stiffness: initial stiffness [N/m].

@@ -34,11 +34,11 @@ def update_estimate(
 ) -> ContactEstimate:
     """Update the estimate with one reading: deflection [m], rate [m/s], force F [N] and weight w [1].
 
-    With phi = (deflection, rate) and lambda_w = 1 - w (1 - `forgetting`), the recursion is K = w P
-    phi/(lambda_w + w phi'P phi), theta += K (F - phi'theta), P = (P - K phi'P)/lambda_w. The recursion
-    minimises the sum of all w (F - phi'theta)^2, in which each new reading multiplies the earlier terms by
-    its lambda_w. With w = 0, nothing changes. `initial_variances` are the upper bounds of d_1 and d_2 (P = U
-    diag(d_1, d_2) U^T).
+    For theta = (k, b), its covariance P, phi = (deflection, rate) and lambda_w = 1 - w (1 - `forgetting`),
+    the recursion is K = w P phi/(lambda_w + w phi^T P phi), theta += K (F - phi^T theta),
+    P = (P - K phi^T P)/lambda_w. It minimises the sum of all w (F - phi^T theta)^2, in which each new reading
+    multiplies the earlier terms by its lambda_w. With w = 0, nothing changes. `initial_variances` are the
+    upper bounds of d_1 and d_2 in P = U diag(d_1, d_2) U^T.
     """
     factor = 1 - weight * (1 - forgetting)
     f_1 = deflection

@@ -70,11 +70,12 @@ class Smith(Compensator):
 def cascade_amplification(gains: Gains, constants: KnownConstants, excess: float) -> Float[Array, "*batch"]:
     """Return the noise amplification [1] of the lead filter in series with (1 + A s)/(1 + C s).
 
-    C = T_s/2 and A = excess C. Tustin's rule maps the unit circle to the imaginary axis. The variance of
-    filtered white noise is therefore T times the integral (1/2 pi) int |H(j w)/(1 + j w E)|^2 dw, where
-    E = T/2 and H is the continuous filter. For the numerator 1 + b_1 s + b_2 s^2 and the denominator
-    1 + a_1 s + a_2 s^2 + a_3 s^3 the integral is (b_2^2 a_1/a_3 + b_1^2 - 2 b_2 + a_2)/(2 (a_1 a_2 - a_3))
-    (James, Nichols and Phillips 1947, I_3). A factor C cancels in b_2^2/a_3, so that T_s = 0 is allowed.
+    C = T_s/2 and A = excess C, with the gain T_s = simulator_lag. Tustin's rule maps the unit circle to the
+    imaginary axis. The variance of filtered white noise is therefore T times the integral
+    (1/2 pi) int |H(j w)/(1 + j w E)|^2 dw, with the control period T, E = T/2 and the continuous filter H.
+    For the numerator 1 + b_1 s + b_2 s^2 and the denominator 1 + a_1 s + a_2 s^2 + a_3 s^3, the integral is
+    (b_2^2 a_1/a_3 + b_1^2 - 2 b_2 + a_2)/(2 (a_1 a_2 - a_3)) (James, Nichols and Phillips 1947, I_3).
+    A factor C cancels in b_2^2/a_3, so that T_s = 0 is allowed.
     """
     period, pole = constants.control_period, gains["lead_filter"]
     zero = pole + gains["phase_lead"]

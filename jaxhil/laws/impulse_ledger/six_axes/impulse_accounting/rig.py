@@ -20,12 +20,12 @@ from jaxhil.rig.types import Gains, Positive
 
 
 class Ledger:
-    """State of one contact, and the impulse that the numerical model still owes.
+    """State of one contact, and the impulse that is still missing on the numerical model.
 
     Attributes:
         delay: delay D of the loop [ticks].
-        tangent: tangent model of the force along the contact's direction.
-        is_limited: whether the last correction was limited.
+        tangent: model of the contact force along the contact's direction.
+        is_limited: whether the last correction of the impulse was limited in norm.
     """
 
     __slots__ = (
@@ -71,7 +71,7 @@ class Ledger:
         self.tangent.restart()
 
     def begin(self, reader: SixAxisReader, pose_desired: Vector, twist_desired: Vector) -> None:
-        """Begin a contact with the reader's reading (equation b); `follow` sets its impulse."""
+        """Begin a contact: set its direction, delay and speed (equation b); `follow` sets the impulse."""
         wrench = list(reader.wrench)
         direction = multiply(1.0 / self._size(wrench), wrench)
         if not reader.is_recent:
@@ -88,7 +88,7 @@ class Ledger:
         self._peak = 0.0
 
     def _approach(self, direction: Vector, lag: Vector, twist: Vector) -> None:
-        """Compute delay and approach speed from the mean lag and twist in free flight."""
+        """Compute the loop's delay and the approach speed from the hardware's `lag` and model's `twist`."""
         momentum = product(self._mass, twist)
         whole = dot(twist, momentum)
         speed = sqrt(whole) if whole > 0.0 else 0.0
@@ -135,9 +135,9 @@ class Ledger:
         return add_multiple(self._command, 1.0, self._correction(pulled, stiffness))
 
     def _book(self, reader: SixAxisReader, recalled: ModelRows, force: float) -> None:
-        """Update the tangent model, and advance the reference to the time t - D (equation c).
+        """Update the tangent model, and advance the reference trajectory to the time t - D (equation c).
 
-        D is the delay between model and readings.
+        D is the loop's delay: a reading at the time t belongs to the model's motion at t - D.
         """
         period, direction, tangent = self._period, self._direction, self.tangent
         rate = -dot(direction, reader.moved) / period
@@ -157,9 +157,9 @@ class Ledger:
         self._impulse = add_multiple(self._impulse, period * (self._corrected - force), direction)
 
     def _bridge(self, recalled: ModelRows, least: float, stiffness: float, ahead: float) -> float:
-        """Predict from t - D to the middle of the period in which the command acts (equation d).
+        """Predict the reference trajectory from t - D to the middle of the command's period (equation d).
 
-        Return the force at the end of the prediction.
+        Return the contact force at the end; subtract the predicted impulse from `_unpaid`.
         """
         direction, tangent = self._direction, self.tangent
         missing = product(self._inverse, subtract(recalled[12:18], self._impulse))
@@ -170,7 +170,7 @@ class Ledger:
         return min(tangent.force, HIGHEST * expected)
 
     def unpaid_share(self) -> float:
-        """Return the norm of the impulse still owed, divided by the norm of the reference's impulse I_r."""
+        """Return the norm of the missing impulse, divided by that of the reference trajectory's impulse."""
         return self._size(self._unpaid) / self._size(self._impulse)
 
     def _turn(self, reader: SixAxisReader, begins: bool) -> None:
@@ -203,7 +203,7 @@ class Ledger:
             self._path -= dot(direction, reader.moved)
 
     def _correction(self, unpaid: Vector, stiffness: float) -> Vector:
-        """Return the wrench that corrects the missing impulse `unpaid`, with a limited norm."""
+        """Return the wrench, limited in norm, that reduces the impulse error `unpaid` [N s, N m s]."""
         wrench = multiply(-self._velocity_gain, unpaid)
         limit = self._correction_limit * sqrt(stiffness) * self._speed
         square = dot(wrench, product(self._inverse, wrench))

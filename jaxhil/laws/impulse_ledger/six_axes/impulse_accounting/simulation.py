@@ -29,7 +29,7 @@ def onset(
 ) -> SixAxisContact:
     """Return the state of a contact that begins with this reading (equation b of README.md).
 
-    Its impulse is 0 here; `follow` sets the impulse from the delay line.
+    The impulse of the reference trajectory is 0 here; `follow` sets it from the delay line.
     """
     period, mass = prepared.constants.control_period, prepared.constants.mass_matrix
     flight, last = state.flight, state.contact
@@ -136,7 +136,7 @@ def follow(
 def _correction(
     prepared: PreparedLedger, unpaid: Six, stiffness: Float[Array, "*batch"], speed: Float[Array, "*batch"]
 ) -> Six:
-    """Return the wrench that corrects the missing impulse `unpaid`, with a limited norm."""
+    """Return the wrench, limited in norm, that reduces the impulse error `unpaid` [N s, N m s]."""
     wrench = -prepared.gains["velocity_gain"][None] * unpaid
     limit = prepared.gains["correction_limit"] * jnp.sqrt(stiffness) * speed
     large = safe_sqrt(dot(wrench, product(prepared.constants.inverse_mass, wrench)))
@@ -152,7 +152,7 @@ def _norm(prepared: PreparedLedger, wrench: Six) -> Float[Array, "*batch"]:
 def _direction(
     prepared: PreparedLedger, contact: SixAxisContact, reading: Reading, begins: Bool[Array, "*batch"]
 ) -> tuple[Six, Six]:
-    """Return the contact's direction, a unit wrench, and the filtered wrench of the same direction.
+    """Return the contact's direction as a unit wrench, and the low-pass filtered wrench that defines it.
 
     A pulling force, for example of a latch, does not reverse the direction.
     """

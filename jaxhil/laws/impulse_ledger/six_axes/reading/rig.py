@@ -36,8 +36,8 @@ class SixAxisReader:
     """Readings of the six-axis impulse ledger; README.md in the parent folder states the equations.
 
     Attributes:
-        wrench: W, contact wrench about the chaser's origin C, corrected for bias and tool [N, N m].
-        variance: variance of the norm |W| due to noise [N^2/kg].
+        wrench: W, contact wrench about the chaser's origin C, without bias and tool inertia [N, N m].
+        variance: mean of the squared norm |W|^2 if W is only noise [N^2/kg].
         pose: xi_a, filtered pose of the hardware, delayed like the wrench [m, rad].
         moved: change of `pose` since the last tick [m, rad].
         loud: whether the wrench is large enough to count as contact.
@@ -93,7 +93,7 @@ class SixAxisReader:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a new run."""
+        """Begin a new run: forget all readings and the means of free flight."""
         self._age = 0
         self._bias = [0.0] * AXES
         self._readings = 0.0
@@ -158,7 +158,7 @@ class SixAxisReader:
         self._age += 1
 
     def _noise_variance(self, pose: Vector) -> float:
-        """Return the mean |W|^2 of a corrected wrench W that is only noise; `pose` is that of frame C."""
+        """Return the mean squared norm [N^2/kg] of the wrench noise if the chaser's frame C is at `pose`."""
         metric, angular = self._metric, self._noise_angular
         x, y, z = pose[:3]
         coupling = (metric[2][4] - metric[1][5]) * x + (metric[0][5] - metric[2][3]) * y
@@ -171,7 +171,7 @@ class SixAxisReader:
         return self._force_variance * force + self._torque_variance * angular
 
     def weigh_tool(self) -> None:
-        """Update `tool`, the largest inertia force of the tool so far, with the current wrench."""
+        """Raise `tool` to the squared norm of the tool's inertia force on this tick, if that is larger."""
         share = subtract(product(self._tool_correction, self.wrench), self.wrench)
         self.tool = max(self.tool, dot(share, product(self._inverse, share)))
 
@@ -185,7 +185,7 @@ class SixAxisReader:
         return [new + share * (old - new) for new, old in zip(newer, older, strict=True)]
 
     def _model_at(self, age: int) -> ModelRows:
-        """Return pose, twist and impulse of the model at a tick; before tick 0, assume uniform motion."""
+        """Return pose, twist and impulse of the model on tick `age`; before tick 0, assume uniform motion."""
         if age >= 0:
             index: Index = age & MASK
             return self._rows[index][AXES:ROWS]
@@ -197,7 +197,7 @@ class SixAxisReader:
     def _aligned(
         self, pose_desired: Vector, twist_desired: Vector, pose_measured: Vector, impulse: Vector
     ) -> Vector:
-        """Store this tick; return the filtered pose, delayed like the wrench reading."""
+        """Store this tick's inputs in the delay line; return the filtered pose, delayed like the wrench."""
         age: Index = self._age & MASK
         pole, period = self._pole, self._period
         rows = self._rows
@@ -221,7 +221,7 @@ class SixAxisReader:
         ]
 
     def _fly(self, wrench: Vector, lag: Vector, twist: Vector, is_uniform: bool) -> None:
-        """Update the bias with a reading of free flight; if the motion is uniform, also lag and twist."""
+        """Update the mean wrench (bias) in free flight; in uniform motion, also `lag` and `twist`."""
         self._readings = min(self._readings + 1.0, MAX_MEAN)
         share = 1.0 / max(self._readings, 1.0)
         self._bias = [mean + share * (now - mean) for mean, now in zip(self._bias, wrench, strict=True)]

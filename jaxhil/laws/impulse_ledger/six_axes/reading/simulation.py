@@ -45,7 +45,7 @@ def record(
 def read(
     prepared: PreparedLedger, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]
 ) -> tuple[Reading, LedgerState]:
-    """Return the corrected readings of this tick, and the state with updated means of free flight."""
+    """Return this tick's corrected readings, and the state with updated mean values of free flight."""
     constants, gains = prepared.constants, prepared.gains
     period, inverse_mass = constants.control_period, constants.inverse_mass
     pose = _aligned(prepared, state, signals, tick)
@@ -87,7 +87,7 @@ def _computed_once(components: tuple[Array, ...], tick: Int[Array, ""]) -> tuple
 
 
 def noise_variance(prepared: PreparedLedger, pose: Six) -> Float[Array, "*batch"]:
-    """Return the mean |W|^2 of a corrected wrench W that is only noise; `pose` is that of frame C."""
+    """Return the mean squared norm [N^2/kg] of the wrench noise if the chaser's frame C is at `pose`."""
     gains, metric, position = prepared.gains, prepared.noise_metric, pose[:3]
     linear, angular = (sum(metric[i, i] for i in part) for part in (range(3), range(3, 6)))
     coupling = jnp.stack(
@@ -102,7 +102,7 @@ def noise_variance(prepared: PreparedLedger, pose: Six) -> Float[Array, "*batch"
 def _aligned(
     prepared: PreparedLedger, state: LedgerState, signals: SixAxisSignals, tick: Int[Array, ""]
 ) -> Six:
-    """Return the filtered pose, delayed like the force; assume uniform motion before the first tick."""
+    """Return the hardware's filtered pose, delayed like the force; before the run, assume uniform motion."""
     back = prepared.back
     recalled = look_back(state.ring, POSE, tick, back)
     ago = back - signals.age.astype(back.dtype)
@@ -119,7 +119,7 @@ def _update_free_flight(
     uniform: Bool[Array, "*batch"],
     period: Float[Array, "*batch"],
 ) -> FreeFlightState:
-    """Update the bias on the lanes `free`, and the means of lag and twist on the lanes `uniform`."""
+    """Update the mean wrench (bias) on the lanes `free`, and mean lag and twist on the lanes `uniform`."""
     readings = jnp.minimum(flight.readings + free.astype(period.dtype), fixed.MAX_MEAN)
     ticks = jnp.minimum(flight.ticks + 1, fixed.MAX_FLIGHT / period)
     ticks = jnp.where(uniform, ticks, jnp.where(free, 0, flight.ticks))

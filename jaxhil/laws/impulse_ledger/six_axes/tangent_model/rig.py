@@ -25,14 +25,14 @@ Covariance = Annotated[list[list[float]], FEATURES, FEATURES]
 
 
 class TangentModel:
-    """Estimate of the tangent model; forces and impulses are per unit mass.
+    """Contact force model F = k x + c x|x| + b x' + F_0 at the depth x; forces are per unit mass.
 
     Attributes:
         readings: number of readings since the last restart.
         stiffness: k [1/s^2].
         curvature: c times the approach speed [1/s^3].
         damping: b [1/s].
-        impulse: impulse of the last prediction [m/s].
+        impulse: impulse of the last prediction, per unit mass [m/s].
         force: force at the end of the last prediction [m/s^2].
     """
 
@@ -65,10 +65,10 @@ class TangentModel:
         self.force = 0.0
 
     def turn(self, path: float, force: float, speed: float) -> None:
-        """Adapt the estimate to a turn of the direction: the depth restarts at 0, the force continues.
+        """Adapt the estimate to a turn of the contact's direction, which restarts the depth at 0.
 
-        The slope at the last depth and the damping remain the best guess; their covariance is that of the
-        prior.
+        The means are now the slope at the last depth, the old damping, `force`, and no curvature. The
+        covariance is that of the prior.
 
         Args:
             path: depth at the last reading [m].
@@ -119,7 +119,7 @@ class TangentModel:
         self.readings += 1.0
 
     def settle(self, path: float, speed: float) -> None:
-        """Set stiffness, curvature and damping to the estimate at depth `path` [m]; `speed` is v_0 [m/s]."""
+        """Set the model to the estimate, within bounds, at depth `path` [m] for approach `speed` [m/s]."""
         self._path = path / speed
         self._speed = speed
         stiffness, damping, _, curvature = self._mean
@@ -130,7 +130,7 @@ class TangentModel:
     def compute_force_change(self, change: float) -> float:
         """Return the change of the elastic force [m/s^2] for a `change` of the depth [m], or 0.
 
-        The result is 0 if the two changes have opposite signs.
+        The result is 0 if force and depth would change with opposite signs.
         """
         path, speed = self._path, self._speed
         later = path + change / speed
@@ -139,13 +139,13 @@ class TangentModel:
         return max(force, 0.0) if change > 0.0 else min(force, 0.0)
 
     def bridge(self, force: float, least: float, deeper: float, velocity: float, duration: float) -> None:
-        """Predict impulse and final force of the ideal contact: integrate a unit mass against this model.
+        """Integrate a unit mass, the reference trajectory, under the model's force; set `impulse`, `force`.
 
         Args:
-            force: force on the ideal contact's mass at the last reading [m/s^2].
+            force: force on the reference trajectory at the last reading [m/s^2].
             least: lower bound of the force, 0 or negative [m/s^2].
-            deeper: depth of the hardware minus that of the ideal contact at the last reading [m].
-            velocity: speed of the ideal contact's mass into the surface at the last reading [m/s].
+            deeper: depth of the hardware minus depth of the reference trajectory, at the last reading [m].
+            velocity: speed of the reference trajectory into the surface at the last reading [m/s].
             duration: time from the last reading to the end of the prediction [s].
         """
         damping = self.damping

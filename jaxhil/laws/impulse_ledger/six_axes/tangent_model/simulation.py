@@ -24,10 +24,10 @@ from jaxhil.laws.impulse_ledger.six_axes.simulation import dot
 
 
 class Estimate(NamedTuple):
-    """Mean and covariance of the tangent model's parameters.
+    """Mean and covariance of the parameters of the force model F = k x + c x|x| + b x' + F_0 (depth x).
 
-    The parameters are stiffness k [1/s^2], damping b [1/s], F_0 divided by the approach speed [1/s], and
-    curvature c times `BEND` and the approach speed [1/s^2].
+    The parameters are stiffness k [1/s^2], damping b [1/s], F_0/v_0 [1/s] and c v_0 `BEND` [1/s^2], where
+    v_0 is the approach speed and F the force per unit mass.
     """
 
     mean: Float[Array, "features *batch"]
@@ -35,7 +35,7 @@ class Estimate(NamedTuple):
 
 
 class Tangent(NamedTuple):
-    """Tangent model at the depth of the last reading, per unit mass."""
+    """Contact force model, per unit mass, about the depth of the last reading."""
 
     stiffness: Float[Array, "*batch"]  # k [1/s^2]
     curvature: Float[Array, "*batch"]  # c times the approach speed [1/s^3]
@@ -45,7 +45,7 @@ class Tangent(NamedTuple):
 
 
 def begin_estimate(spreads: tuple[Array, ...]) -> Estimate:
-    """Return the estimate before a contact from the prior standard deviations of the parameters."""
+    """Return the prior estimate: all means 0, the standard deviations `spreads`, and no correlation."""
     zero = jnp.zeros_like(spreads[0])
     variances = jnp.stack([spread**2 for spread in spreads])
     identity = jnp.eye(FEATURES, dtype=zero.dtype).reshape(FEATURES, FEATURES, *[1] * zero.ndim)
@@ -53,10 +53,10 @@ def begin_estimate(spreads: tuple[Array, ...]) -> Estimate:
 
 
 def turn(old: Estimate, prior: Estimate, path: Array, force: Array) -> Estimate:
-    """Return the estimate after a turn of the direction: the depth restarts at 0, the force continues.
+    """Return the estimate after a turn of the contact's direction, which restarts the depth at 0.
 
-    The slope at the last depth `path` [s] and the damping remain the best guess; their covariance is that of
-    the prior. Depth and `force` [1/s] are divided by the approach speed.
+    The means are now the slope at the last depth `path` [s], the old damping, `force` [1/s], and no
+    curvature. The covariance is that of `prior`. Depth and force are divided by the approach speed.
     """
     slope = jnp.maximum(old.mean[0] + 2 * old.mean[3] * jnp.abs(path) / BEND, 0)
     mean = jnp.stack([slope, old.mean[1], force, jnp.zeros_like(force)])
@@ -91,8 +91,8 @@ def learn(
 def compute_force_change(tangent: Tangent, change: Array) -> Float[Array, "*batch"]:
     """Return the change of the tangent model's elastic force for a `change` of the depth, or 0.
 
-    The result is 0 if the two changes have opposite signs, because a negative curvature could otherwise push
-    apart bodies that separate.
+    The result is 0 if force and depth would change with opposite signs. Otherwise, a negative curvature could
+    push apart bodies that separate.
     """
     later = tangent.path + change / tangent.speed
     bend = later * jnp.abs(later) - tangent.path * jnp.abs(tangent.path)
@@ -107,14 +107,14 @@ def bridge(
 
     Args:
         tangent: tangent model at the depth of the last reading.
-        force: force per unit mass on the reference at the last reading.
-        least: lower bound of the force, 0 or negative.
-        deeper: depth of the hardware minus depth of the reference at the last reading.
-        velocity: speed of the reference into the surface at the last reading.
+        force: force per unit mass on the reference trajectory at the last reading [m/s^2].
+        least: lower bound of the force, 0 or negative [m/s^2].
+        deeper: depth of the hardware minus depth of the reference trajectory, at the last reading [m].
+        velocity: speed of the reference trajectory into the surface at the last reading [m/s].
         duration: time from the last reading to the present [s].
 
     Returns:
-        Impulse of the force in this time, and force at its end.
+        Impulse of the force in this time [m/s], and force at the end [m/s^2].
     """
     step = duration / BRIDGE_STEPS
     start = compute_force_change(tangent, -deeper)
