@@ -7,6 +7,8 @@ import ambiguous_campaigns as ambiguous
 import campaigns
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_fields
+from scipy.signal import butter, lfilter
 
 from jaxhil.mechanism.file import from_plain_data, to_plain_data
 from tuning.identification.edge_check import check_force_smoothing
@@ -28,26 +30,43 @@ def zoned(campaign, size, is_cut):
     return replace(campaign, runs=tuple(runs))
 
 
-def checked(monkeypatch, lag):
-    """Return the check of onset and end of contact for a mechanism file with the time constant `lag` [s].
+def checked(campaign, truth, check, lag, shift=0.0):
+    """Return a check for a mechanism file with the time constant `lag` [s] and this true mechanism.
 
-    The sum of force delay and lag is that of the true rig.
+    The sum of force delay and lag is larger than the true one by `shift` [s], and the damping is larger, too.
     """
-    campaign = ambiguous.campaign(monkeypatch, "lag", 0, seconds=5.0)
-    raw: dict[str, Any] = to_plain_data(ambiguous.truth("lag")) | {"source": "identified from logs"}
-    sensor = raw["rig"]["force_sensor"]
-    raw["rig"]["force_sensor"] = {**sensor, "time_constant": lag, "delay": sensor["delay"] + 0.0016 - lag}
+    raw: dict[str, Any] = to_plain_data(truth) | {"source": "identified from logs"}
+    sensor, (stiffness,) = raw["rig"]["force_sensor"], raw["contact"]["stiffness"]
+    raw["contact"]["damping"] = [raw["contact"]["damping"][0] + stiffness * shift]
+    delay = sensor["delay"] + sensor.get("time_constant", 0.0) - lag + shift
+    raw["rig"]["force_sensor"] = {**sensor, "time_constant": lag, "delay": delay}
     raw["uncertainty"] = {"rig.force_sensor.delay": {"distribution": "normal", "std": 1e-4}}
+    raw["uncertainty"]["rig.contact_plane"] = {"distribution": "normal", "std": 1e-6}
     result = check_against_mechanism(campaign, from_plain_data(raw, "identified"))
-    (line,) = (line for line in result.lines if line.name == "edges of contact")
+    (line,) = (line for line in result.lines if line.name == check)
     return line
 
 
 @pytest.mark.parametrize(("lag", "there"), [(0.0016, False), (0.0, True)])
 def test_force_lag_missing_from_model_is_detected_at_onset_and_end_of_contact(monkeypatch, lag, there):
-    line = checked(monkeypatch, lag)
+    campaign = ambiguous.campaign(monkeypatch, "lag", 0, seconds=5.0)
+    line = checked(campaign, ambiguous.truth("lag"), "edges of contact", lag)
     assert line.is_significant == there
     assert not there or line.error_in_verdict > 0.01
+
+
+def test_filter_that_explains_logs_with_another_damping_adds_to_the_effect(monkeypatch):
+    campaign, cutoff = ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0), 100.0
+    b, a = butter(2, cutoff, fs=1000.0)
+    runs = [replace(run, force_measured=lfilter(b, a, run.force_measured)) for run in campaign.runs]
+    truth = ambiguous.truth("plain")
+    sensor = replace_fields(truth.rig.force_sensor, time_constant=0.7071 / np.pi / cutoff)
+    truth = replace_fields(truth, rig=replace_fields(truth.rig, force_sensor=sensor))
+    name = "filter of the force sensor"
+    line = checked(replace(campaign, runs=tuple(runs)), truth, name, 0.0016, shift=3e-4)
+    assert line.is_significant and line.error_in_verdict > 0.01
+    line = checked(campaign, ambiguous.truth("plain"), name, 0.0)
+    assert not line.is_significant and "larger with a filter of order 2" in line.finding
 
 
 def test_dead_zone_is_estimated_from_noise_at_rest():

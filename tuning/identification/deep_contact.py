@@ -27,9 +27,10 @@ from tuning.identification.surface_search import find_best_surface
 MIN_DEEP_LANES = 6  # minimum number of deep lanes for which pseudo-rows save time
 LANES_FOR_LAW_CHOICE = 8  # number of deep lanes that suffice to fit the shape of a contact law
 MIN_DEPTH_SHARE = 0.1  # minimum ratio of the smallest depth of a deep lane to its median depth
-DELAY_RANGE = 0.002  # range of delays that one table covers [s]
+DELAY_RANGE = 0.002  # range of delays that one table covers, if the delay is not yet known well [s]
 DELAY_TOLERANCE = 1e-9  # a table also covers delays that exceed its range by a rounding error [s]
 DELAY_NODES = 8  # number of delays at which the interpolation is exact
+SHORT_DELAY_RANGE, FEW_DELAY_NODES = 3e-4, 4  # the same for searches near a known delay
 # numbers of surface positions at which the interpolation is exact: first for a linear force, then for others
 SURFACE_NODES = 2, 4
 # width of the range of surface positions that one table covers, divided by the smallest depth; the range of a
@@ -49,18 +50,25 @@ def find_deep_lanes(motion: MotionResponse, plane: float) -> np.ndarray:
     return least > MIN_DEPTH_SHARE * np.maximum(np.median(depths[1], axis=0), 0.0)
 
 
-def summarise_deep_lanes(problem: ContactProblem, near: tuple[float, float] | None) -> ContactProblem:
+def summarise_deep_lanes(
+    problem: ContactProblem, near: tuple[float, float] | None, has_known_delay: bool = False
+) -> ContactProblem:
     """Replace the lanes well below the surface (deep lanes) by a few pseudo-rows, if there are enough.
+
 
     Args:
         problem: Problem with all rows.
         near: Approximate force delay [s] and surface position [m] of the later fits, or None if unknown.
+        has_known_delay: Whether all later fits have delays near the one in `near`.
     """
     delay, plane = near or (MAX_FORCE_DELAY / 4.0, _approximate_surface(problem))
     deep = find_deep_lanes(problem.motion, plane) & problem.readings.counts.any(axis=0)
     # At least one lane must remain in the problem of the other lanes.
     deep[-1] = False
-    return SummarisedProblem(problem, deep, delay) if deep.sum() >= MIN_DEEP_LANES else problem
+    if deep.sum() < MIN_DEEP_LANES:
+        return problem
+    nodes = (SHORT_DELAY_RANGE, FEW_DELAY_NODES) if has_known_delay else (DELAY_RANGE, DELAY_NODES)
+    return SummarisedProblem(problem, deep, delay, nodes)
 
 
 def select_representative_lanes(problem: ContactProblem) -> np.ndarray:
@@ -84,15 +92,15 @@ def _approximate_surface(problem: ContactProblem) -> float:
 class SummarisedProblem(ContactProblem):
     """Contact problem with few pseudo-rows in place of the runs well below the surface, where accurate."""
 
-    def __init__(self, problem: ContactProblem, deep: np.ndarray, delay: float):
+    def __init__(self, problem: ContactProblem, deep: np.ndarray, delay: float, nodes: tuple[float, int]):
         """Split the lanes of a problem: few pseudo-rows replace the deep lanes, others keep their rows.
 
         `deep` marks the lanes (one per run) that always stay well below the surface. `delay` [s] is the
-        approximate force delay.
+        approximate force delay. `nodes` states range [s] and number of the delays of a table.
         """
         motion, readings, law = problem.motion, problem.readings, problem.law
         super().__init__(motion, readings, law, problem.plane, problem.time_constant)
-        self.deep, self.delay = deep, delay
+        self.deep, self.delay, self.nodes = deep, delay, nodes
         lanes = np.flatnonzero(~deep)
         self.others = ContactProblem(
             motion.of(lanes, 0, 0.0), readings.select_lanes(lanes), law, problem.plane, problem.time_constant
@@ -109,7 +117,7 @@ class SummarisedProblem(ContactProblem):
         """
         if delay is None:
             delay = self.delay + (self.time_constant - time_constant) * self.readings.modes.delay
-        return SummarisedProblem(super().changed(law, time_constant), self.deep, delay)
+        return SummarisedProblem(super().changed(law, time_constant), self.deep, delay, self.nodes)
 
     def at(self, delay: float, plane: float, pseudo: PseudoRows | None = None) -> CoefficientFit:
         """Fit the coefficients at a delay [s] and surface position [m]; use pseudo-rows if accurate."""
@@ -152,15 +160,14 @@ class SummarisedProblem(ContactProblem):
 
     def _build_table(self, delay: float, plane: float, count: int) -> _DesignTable:
         """Build a table around a delay [s] and surface position [m], with `count` surface positions."""
-        low = (
-            self.delay + DELAY_RANGE * np.floor((delay - self.delay) / DELAY_RANGE + 0.5) - DELAY_RANGE / 2.0
-        )
-        low = float(np.clip(low, self.min_delay, MAX_FORCE_DELAY - DELAY_RANGE))
-        delays = _chebyshev_nodes(low, low + DELAY_RANGE, DELAY_NODES)
+        reach, number = self.nodes
+        low = self.delay + reach * np.floor((delay - self.delay) / reach + 0.5) - reach / 2.0
+        low = float(np.clip(low, self.min_delay, MAX_FORCE_DELAY - reach))
+        delays = _chebyshev_nodes(low, low + reach, number)
         moved = [block.motion.at(node) for node in delays for block in self.blocks]
         lowest = min(float(x.min()) for x, _ in moved)
         # At delays between two nodes, the smallest depth may be smaller than at the nodes.
-        lowest -= DELAY_RANGE / DELAY_NODES * max(float(np.abs(v).max()) for _, v in moved)
+        lowest -= reach / number * max(float(np.abs(v).max()) for _, v in moved)
         half = 0.5 * SURFACE_RANGE_SHARE * max(lowest - plane, 1e-9)
         planes = _chebyshev_nodes(plane - half, plane + half, count)
         # The force first becomes negative in the row with the fastest retraction relative to the depth.
@@ -171,7 +178,7 @@ class SummarisedProblem(ContactProblem):
         )  # fmt: skip
         extreme = self._tabulate(np.full((1, 1), depth), np.full(1, rate), np.zeros(1, int))
         limit = (-np.inf, lowest) if count == SURFACE_NODES[0] else (plane - half, min(plane + half, lowest))
-        return _DesignTable(delays, planes, (low, low + DELAY_RANGE), limit, extreme,
+        return _DesignTable(delays, planes, (low, low + reach), limit, extreme,
                       *_factorise_columns(self.blocks, delays, planes))  # fmt: skip
 
 

@@ -22,6 +22,7 @@ from tuning.identification.dead_zone_check import check_cut_dead_zone, check_zon
 from tuning.identification.edge_check import check_contact_edges, check_force_smoothing
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.free_motion import FreeMotion
+from tuning.identification.hidden_filter import check_hidden_filter
 from tuning.identification.motion import MotionResponse
 from tuning.identification.noise import NoiseEstimate, estimate_noise
 from tuning.identification.rational import MotionModel
@@ -96,6 +97,7 @@ def check_against_mechanism(
         lines += check_contact_edges(contact, touching, effect)
     if contact is not None:
         lines += check_force_smoothing(_estimate_force_noise(campaign.runs), effect, frequency, period)
+        lines += check_hidden_filter(contact, mechanism, effect)
     lines += check_file_uncertainty(effect, any(run.kind == "press" for run in campaign.runs))
     return Identification(
         estimates=(),

@@ -19,6 +19,7 @@ d tau). With gains that compensate for the delay, c = 1. The result is the large
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import msgspec
@@ -91,21 +92,62 @@ def compute_uncertainty_effect(mechanism: Mechanism) -> UncertaintyEffect:
         changes = {
             key: _compute_change(mechanism, contact, entry, frequency, key, drawn[key]) for key in keys
         }
-        gain = (
-            1.0
-            + contact.delay_sensitivity
-            * _compute_total_force_delay(mechanism, frequency)
-            / contact.restitution
-        )
+        gain = _compute_gain(mechanism, contact, frequency)
         ideal, error = np.sum(list(changes.values()), axis=0)
+        restitution, differences = _combine_changes(ideal, error, gain)
         entry_effect = UncertaintyEffect(
-            gain * _compute_effect_quantile(ideal + error),
-            max(_compute_effect_quantile(error), _compute_effect_quantile(gain * (ideal + error) - ideal)),
+            _compute_effect_quantile(restitution),
+            max(_compute_effect_quantile(difference) for difference in differences),
             {key: _compute_effect_quantile(a + b) for key, (a, b) in changes.items()},
         )
         if max(entry_effect[:2]) > max(worst[:2]):
             worst = entry_effect
     return worst
+
+
+def compute_change_effect(
+    mechanism: Mechanism, coefficients: Mapping[int, np.ndarray], added_delay: float
+) -> tuple[float, float]:
+    """Compute how much a change of the contact law and of the force delay changes e and e - e*.
+
+    Args:
+        mechanism: Mechanism with the nominal parameters.
+        coefficients: Changed coefficients of `make_regression_law`, by entry of the lists in `[contact]`.
+        added_delay: Change of the total force delay [s].
+
+    Returns:
+        The magnitudes of both effects, for the entry of the lists in `[contact]` with the largest effect.
+    """
+    law, worst = mechanism_models.make_regression_law(mechanism.contact), (0.0, 0.0)
+    for entry, changed in coefficients.items():
+        contact, frequency = _simulate_ideal_contact(mechanism, law, entry)
+        if contact is None:
+            continue
+        nominal = np.array(mechanism_models.get_regression_coefficients(mechanism.contact, entry))
+        ideal = (changed - nominal) @ contact.coefficient_sensitivity
+        gain = _compute_gain(mechanism, contact, frequency)
+        error = added_delay * contact.delay_sensitivity
+        restitution, differences = _combine_changes(ideal, error, gain)
+        worst = max(worst, (abs(float(restitution)), float(np.abs(differences).max())), key=max)
+    return worst
+
+
+def _compute_gain(mechanism: Mechanism, contact: _IdealContact, frequency: float) -> float:
+    """Return the factor by which the delays speed up the rebound without compensation."""
+    delay = _compute_total_force_delay(mechanism, frequency)
+    return 1.0 + contact.delay_sensitivity * delay / contact.restitution
+
+
+def _combine_changes(ideal: Any, error: Any, gain: float) -> tuple[Any, tuple[Any, Any]]:
+    """Return the change of e, and the changes of e - e* with and without compensation.
+
+    Args:
+        ideal: Changes of e*.
+        error: Changes of e - e* with compensation.
+        gain: Factor by which the delays speed up the rebound without compensation.
+    """
+    restitution = gain * (ideal + error)
+    return restitution, (error, restitution - ideal)
 
 
 def _list_identified_keys(mechanism: Mechanism) -> list[str]:
