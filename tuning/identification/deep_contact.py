@@ -55,7 +55,6 @@ def summarise_deep_lanes(
 ) -> ContactProblem:
     """Replace the lanes well below the surface (deep lanes) by a few pseudo-rows, if there are enough.
 
-
     Args:
         problem: Problem with all rows.
         near: Approximate force delay [s] and surface position [m] of the later fits, or None if unknown.
