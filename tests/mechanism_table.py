@@ -41,6 +41,7 @@ FULL = {
             "quantum": 0.1,
             "dead_zone": 1.0,
             "bias": -1.0,
+            "bias_random_walk": 0.5,
             "range": 1000.0,
             "loss_probability": 0.01,
             "filter": {"kind": "bessel", "order": 3, "cutoff": 200.0},

@@ -5,6 +5,7 @@ import numpy as np
 
 from jaxhil.contact.laws import CONTACT_KEYS, CONTACT_LAWS, ContactParameters
 from jaxhil.simulation.scenario import MotionSimulatorBatch
+from jaxhil.simulation.sensors import BIAS_WALK_STREAM, white_noise
 from jaxhil.simulation.timing import draw_timing
 from jaxhil.sixdof.approach import begin
 from jaxhil.sixdof.bodies import build_body
@@ -105,3 +106,12 @@ def drawn_timing(scenario, ticks):
     return {"jitter": jitter} | {
         name: set() if ticks is None else set(np.flatnonzero(ticks).tolist()) for name, ticks in sets.items()
     }
+
+
+def drawn_bias_walk(scenario, ticks):
+    """Return the change of the force sensor's bias at each tick of a scenario, (ticks, 6)."""
+    count = jnp.arange(6 * ticks, dtype=jnp.int32)[:, None]
+    noise = white_noise(scenario.key, jnp.full(1, BIAS_WALK_STREAM, jnp.int32), count, float)
+    steps = np.asarray(noise).reshape(ticks, 6) * np.asarray(scenario.sensor.bias_walk)[:, 0]
+    steps[0] = 0.0
+    return np.cumsum(steps, axis=0) * float(scenario.control_period[0]) ** 0.5

@@ -166,14 +166,15 @@ class Axis:
         return np.array([state[0], state[1], (self.flow @ state)[1]])
 
 
-def on_the_rig(case, ticks, controller=None, leads=0.0, jitter=None, lost=(), missed=()):
+def on_the_rig(case, ticks, controller=None, leads=0.0, jitter=None, lost=(), missed=(), bias=None):
     """Return the states of the numerical model's bodies after the given number of ticks.
 
     A controller's `from_sensor(reading, measured)` converts the sensor's reading, its
     `step(wrench, pose, twist, measured)` changes the wrench, and its `pose_command(pose, twist)` changes the
     command. `leads` are the times by which the controller leads the coordinates before
     the first tick. `jitter` is the deviation of the force's delay [s] at every tick; `lost` and `missed` are
-    the ticks whose frame is lost, and at which the controller does not run.
+    the ticks whose frame is lost, and at which the controller does not run. `bias` is the bias of the tool's
+    sensor at every tick, (ticks, 6).
     """
     bodies, period = case["start"], case["period"]
     at, rates = command(case, bodies)
@@ -199,6 +200,8 @@ def on_the_rig(case, ticks, controller=None, leads=0.0, jitter=None, lost=(), mi
         frame = force, moment
         if case["tool"] is not None:
             frame = sensor_reading(case, x, rotation, w, rate, bend, force, moment)
+            if bias is not None:
+                frame = frame[0] + bias[tick, :3], frame[1] + bias[tick, 3:]
         reading = reading if tick in lost else frame
         if tick in missed:
             for axis in axes:

@@ -163,6 +163,10 @@ def test_loop_of_fmus_reproduces_simulation_of_every_compensator(compensator, tm
             "rig.force_sensor.loss_probability=0.01",
             "rig.force_sensor.loss_probability: found 0.01, expected 0",
         ),
+        (
+            "rig.force_sensor.bias_random_walk=0.5",
+            "rig.force_sensor.bias_random_walk: found 0.5, expected 0",
+        ),
         ("rig.force_sensor.filter.cutoff=200", "rig.force_sensor.filter: found a filter, expected none"),
     ],
 )

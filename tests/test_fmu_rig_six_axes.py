@@ -36,6 +36,7 @@ CASES = [
     ("claw-two-arms", "response_error", ()),
     ("probe-drogue", "impulse_ledger", (*NOISY, "rig.force_sensor.time_constant=0.002")),
     ("probe-drogue", "none", (*NOISY, "rig.force_sensor.jitter=0.001")),
+    ("probe-drogue", "none", ("rig.force_sensor.bias_random_walk=[2.0, 1.0, 3.0, 0.1, 0.2, 0.1]",)),
     ("petals", "none", ("rig.command_latency=1", "rig.command_hold=zoh", "rig.integrator=zoh")),
 ]  # fmt: skip
 

@@ -82,7 +82,7 @@ def test_missing_mechanism_keys_get_documented_defaults():
     assert (rig.command_hold, rig.simulator.delay, rig.contact_plane) == ("linear", 0.0, 0.0)
     assert rig.simulator.velocity_limit == rig.simulator.acceleration_limit == math.inf
     assert rig.force_sensor.range == math.inf
-    for name in ("delay", "time_constant", "noise_std", "quantum", "dead_zone", "bias"):
+    for name in ("delay", "time_constant", "noise_std", "quantum", "dead_zone", "bias", "bias_random_walk"):
         assert getattr(rig.force_sensor, name) == 0.0
     for name in ("delay", "noise_std", "quantum"):
         assert getattr(rig.position_sensor, name) == 0.0

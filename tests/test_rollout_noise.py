@@ -52,7 +52,7 @@ def noise():
     scenario = noisy_batch(6)[2]
     age = np.broadcast_to(np.arange(400)[:, None], (400, 6))
     contact_pairs = jax.jit(draw_noise, static_argnums=(0, 1), compiler_options=QUICK)
-    drawn = [contact_pairs(True, True, scenario, np.full(6, contact), age) for contact in range(2)]
+    drawn = [contact_pairs(True, True, scenario, np.full(6, contact), age)[:2] for contact in range(2)]
     return tuple(np.stack(values) for values in zip(*drawn, strict=True))
 
 

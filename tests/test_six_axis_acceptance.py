@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gain_documents import sign
 from scipy.spatial.transform import Rotation
-from six_axes import drawn_timing
+from six_axes import drawn_bias_walk, drawn_timing
 from six_axis_c99 import ControllerInC, controller_of_bundle
 from six_axis_documents import six_axis_document
 from six_axis_oracle import on_the_rig, relative
@@ -100,6 +100,34 @@ def test_exported_controller_on_independent_rig_gives_simulated_final_twist(name
                 assert error <= 1e-8
 
 
+def assert_final_twist(run, case, bodies):
+    """Assert that the bodies have the final twist of a simulated run."""
+    *_, v, w, _, _ = relative(case, bodies)
+    error = np.max(np.abs([*v, *w] - np.array(run.final.twist))) / np.max(np.abs(run.final.twist))
+    print(error)
+    assert error <= 1e-8
+
+
+def controller_and_leads(name, gains):
+    """Return the exported controller with its leads of the coordinates; None and 0 for `none`."""
+    if name == "none":
+        return None, 0.0
+    document = sign(six_axis_document(name, **gains))
+    return controller_of_bundle(document), np.array([gains[lead] for lead in LEADS])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["none", "phase_lead", "response_error", "impulse_ledger"])
+def test_controller_on_independent_rig_with_bias_walk_gives_simulated_final_twist(name):
+    walk = {"rig.force_sensor.bias_random_walk": {"force": 2.0, "torque": 0.2}}
+    mechanism = load_any("probe-drogue", walk).mechanism
+    gains, scenario = literature_gains(mechanism, name), build_scenarios(mechanism)
+    run, case = jaxhil.simulate(mechanism, name, gains=gains), case_of(mechanism, scenario)
+    ticks = round(run.final.time / mechanism.rig.control_period)
+    bias = drawn_bias_walk(scenario, ticks)
+    assert_final_twist(run, case, on_the_rig(case, ticks, *controller_and_leads(name, gains), bias=bias))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["none", "phase_lead", "response_error", "impulse_ledger"])
 def test_controller_on_independent_rig_with_timing_effects_gives_simulated_final_twist(name):
@@ -112,14 +140,8 @@ def test_controller_on_independent_rig_with_timing_effects_gives_simulated_final
     mechanism = load_any("probe-drogue", overrides).mechanism
     gains = literature_gains(mechanism, name)
     run = jaxhil.simulate(mechanism, name, gains=gains)
-    case, controller = case_of(mechanism, build_scenarios(mechanism)), None
-    leads = 0.0
-    if name != "none":
-        controller = controller_of_bundle(sign(six_axis_document(name, **gains)))
-        leads = np.array([gains[lead] for lead in LEADS])
+    case = case_of(mechanism, build_scenarios(mechanism))
+    controller, leads = controller_and_leads(name, gains)
     ticks = round(run.final.time / mechanism.rig.control_period)
     timing = drawn_timing(build_scenarios(mechanism), ticks)
-    *_, v, w, _, _ = relative(case, on_the_rig(case, ticks, controller, leads, **timing))
-    error = np.max(np.abs([*v, *w] - np.array(run.final.twist))) / np.max(np.abs(run.final.twist))
-    print(name, error)
-    assert error <= 1e-8
+    assert_final_twist(run, case, on_the_rig(case, ticks, controller, leads, **timing))

@@ -25,7 +25,8 @@ OFF_CENTRE = {
             "law": "kelvin_voigt", "stiffness": 6e4, "damping": 150.0,
         },
     },
-    "rig.force_sensor": {"delay": 0.004, "noise_std": {"force": 0.5, "torque": 0.05}, "range": 500.0},
+    "rig.force_sensor": {"delay": 0.004, "noise_std": {"force": 0.5, "torque": 0.05}, "range": 500.0,
+                         "bias_random_walk": {"force": 0.2, "torque": 0.05}},
     "rig.position_sensor": {"delay": 0.001, "noise_std": {"translation": 3e-6, "rotation": 1e-5}},
     "uncertainty": {
         "contact.ball.stiffness": SPRING,
@@ -50,6 +51,7 @@ def test_one_axis_file_has_the_values_of_the_first_touch():
     assert converted.approach.phase == 0.25 and converted.name == "probe-drogue-one-axis"
     contact, rig = converted.contact, converted.rig
     assert (contact.law, contact.stiffness, contact.damping) == ("kelvin_voigt", [6e4], [150.0])
+    assert rig.force_sensor.bias_random_walk == 0.2
     assert rig.force_sensor.noise_std == 0.5 and rig.force_sensor.range == 500.0
     # The position along the normal is z + 0.3 (-ry) + (-0.2) rx, to first order.
     noise = np.hypot(3e-6, 1e-5 * np.hypot(0.3, 0.2))
@@ -104,7 +106,8 @@ def test_one_axis_option_does_not_overwrite_a_file(jaxhil, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("compensator", ["none", "phase_lead"])
 def test_one_axis_file_has_the_restitution_of_the_off_centre_contact(jaxhil, tmp_path, compensator):
-    quiet = {"rig.force_sensor.noise_std": [0.0] * 6, "rig.position_sensor.noise_std": [0.0] * 6}
+    keys = "force_sensor.noise_std", "force_sensor.bias_random_walk", "position_sensor.noise_std"
+    quiet = {f"rig.{key}": [0.0] * 6 for key in keys}
     mechanism = package.load("probe-drogue", OFF_CENTRE | quiet)
     run = package.simulate(mechanism, compensator)
     [episode] = run.episodes

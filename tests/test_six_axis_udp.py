@@ -52,6 +52,9 @@ CONTROLLERS = {
     "python_file": lambda document, folder: controller_of_bundle(document),
     "c": ControllerInC,
 }
+# Changes of the mechanism file.
+TIMING = ("rig.force_sensor.jitter", 0.002), ("rig.force_sensor.loss_probability", 0.1)
+BIAS_WALK = (("rig.force_sensor.bias_random_walk", 0.5),)
 CASES = list(itertools.product(MECHANISMS, SIX_AXIS_COMPENSATORS, CONTROLLERS))
 
 
@@ -132,9 +135,9 @@ def test_six_axis_rehearsal_gives_final_twists_and_errors_of_simulate(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compensator", ["phase_lead", "impulse_ledger"])
-def test_six_axis_rehearsal_with_jitter_and_lost_frames_gives_final_twist_of_simulate(compensator):
+@pytest.mark.parametrize("changes", [TIMING, BIAS_WALK], ids=["timing", "bias walk"])
+def test_six_axis_rehearsal_with_drawn_sensor_effects_gives_final_twist_of_simulate(compensator, changes):
     name = "probe-drogue"
-    changes = (("rig.force_sensor.jitter", 0.002), ("rig.force_sensor.loss_probability", 0.1))
     rig, task, _ = exchange(name, compensator, 1, changes=changes)
     assert task.status == "ok" and task.interpolated == task.stale == 0
     (result,) = simulated_rig(name, changes).evaluate(rig.contacts)

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, Struct, field
 
 from jaxhil.mechanism.structs import (
+    BIAS_RANDOM_WALK,
     DEAD_ZONE_KINDS,
     MAX_LATENCY,
     CommandHold,
@@ -70,6 +71,7 @@ Window = Annotated[float, key_metadata("window of one axis", "s", gt=0.0, le=1.0
 Share = Annotated[float, key_metadata("share of one coordinate", "1", ge=0.0, le=1.0)]
 Load = Annotated[float, key_metadata("load of one channel", "N, N m")]
 LoadMagnitude = Annotated[float, key_metadata("load of one channel", "N, N m", ge=0.0)]
+LoadDrift = Annotated[float, key_metadata("drift of one channel", "N/sqrt(s), N m/sqrt(s)", ge=0.0)]
 Error = Annotated[float, key_metadata("error of one coordinate", "m, rad", ge=0.0)]
 LoadLimit = Annotated[float, key_metadata("limit of one channel", "N, N m", gt=0.0, infinite=True)]
 
@@ -197,6 +199,9 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
              extra={"square": 6}, extra_json_schema={"square": 6}),
     ] = field(default_factory=lambda: [[0.0] * 6 for _ in range(6)])  # fmt: skip
     bias: Annotated[list[Load], six_axis_metadata("bias added to every reading", LOAD_NAMES)] = field(
+        default_factory=zeros(6)
+    )
+    bias_random_walk: Annotated[list[LoadDrift], six_axis_metadata(BIAS_RANDOM_WALK, LOAD_NAMES)] = field(
         default_factory=zeros(6)
     )
     quantum: Annotated[

@@ -55,6 +55,7 @@ FilterKind = Literal["butterworth", "bessel"]
 MAX_FILTER_ORDER = 4
 Distribution = Literal["uniform", "loguniform", "normal"]
 
+BIAS_RANDOM_WALK = "random walk of the bias: standard deviation of its change in a second"
 DEAD_ZONE_KINDS = "forces above the dead zone: reduced by it (continuous) or unchanged (cut)"
 
 # Types of the entries of lists. A number must be finite unless its metadata contains `infinite`.
@@ -246,6 +247,7 @@ class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     dead_zone: Annotated[float, key_metadata("magnitude below which the reading is 0", "N", ge=0.0)] = 0.0
     dead_zone_kind: Annotated[DeadZoneKind, key_metadata(DEAD_ZONE_KINDS)] = "continuous"
     bias: Annotated[float, key_metadata("bias added to every reading", "N")] = 0.0
+    bias_random_walk: Annotated[float, key_metadata(BIAS_RANDOM_WALK, "N/sqrt(s)", ge=0.0)] = 0.0
     range: Annotated[
         float, key_metadata("magnitude at which a reading saturates", "N", gt=0.0, infinite=True)
     ] = math.inf

@@ -254,4 +254,5 @@ def start_uniform_motion(
         onset_tick=jnp.broadcast_to(tick, position.shape),
         first_contact=initial_first_contact(position) if loop.probed else None,
         held=None if state.held is None else no_held_values(position),
+        bias_walk=None if state.bias_walk is None else jnp.zeros_like(position),
     )

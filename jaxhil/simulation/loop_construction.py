@@ -69,7 +69,7 @@ def build_loop(
         latency=rig.command_latency,
         has_lag=bool(np.any(force.time_constant > 0)),
         sensor_filter=None if sensor_filter is None else find_modes(sensor_filter.kind, sensor_filter.order),
-        has_force_bias=bool(np.any(force.bias != 0)),
+        has_force_bias=force.bias_walk is not None or bool(np.any(force.bias != 0)),
         has_force_noise=bool(np.any(force.noise_std > 0)),
         has_position_noise=bool(np.any(position.noise_std > 0)),
         has_sample_effects=bool(

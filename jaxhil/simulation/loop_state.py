@@ -75,3 +75,5 @@ class LoopState(NamedTuple):
     onset_tick: Int[Array, "*batch"]  # number of the first tick of the run
     first_contact: FirstContact | None  # first touch of the hardware; None without a probe
     held: HeldValues | None  # values of the last tick; None without timing effects
+    # change of the force sensor's bias since the run began [N]; None for a constant bias
+    bias_walk: Float[Array, "*batch"] | None = None

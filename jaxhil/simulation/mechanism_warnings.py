@@ -95,11 +95,12 @@ def _check_sensors(mechanism: Mechanism, strongest: ContactSummary) -> list[str]
     )
     warnings = []
     for sensor, limit, unit, meaning, smaller in limits:
-        for key in ("noise_std", "quantum", "dead_zone", "bias"):
+        for key in ("noise_std", "quantum", "dead_zone", "bias", "bias_random_walk"):
             value = getattr(getattr(mechanism.rig, sensor), key, 0.0)
+            units = f"{unit}/sqrt(s)" if key == "bias_random_walk" else unit
             if 0.0 < limit <= abs(value):
                 warnings.append(
-                    f"rig.{sensor}.{key}: found {value:.4g} {unit}, expected less than {limit:.3g} {unit}, "
+                    f"rig.{sensor}.{key}: found {value:.4g} {units}, expected less than {limit:.3g} {units}, "
                     f"{meaning} of ideal contact {strongest.number} (is it in {smaller}?)"
                 )
     return warnings

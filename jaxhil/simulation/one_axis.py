@@ -79,11 +79,14 @@ class OneAxis(RigModel):
         return force + position / (1 + np.max(position))
 
     def without_noise(self, scenarios: Scenario) -> Scenario:
-        """Return a copy of the scenarios in which the sensors have no noise."""
-        force, position = (
-            sensor._replace(noise_std=np.zeros_like(sensor.noise_std))
-            for sensor in (scenarios.force_sensor, scenarios.position_sensor)
+        """Return a copy of the scenarios in which the sensors have no noise and a constant bias."""
+        force, position = scenarios.force_sensor, scenarios.position_sensor
+        walk = force.bias_walk
+        force = force._replace(
+            noise_std=np.zeros_like(force.noise_std),
+            bias_walk=None if walk is None else np.zeros_like(walk),
         )
+        position = position._replace(noise_std=np.zeros_like(position.noise_std))
         return scenarios._replace(force_sensor=force, position_sensor=position)
 
     def with_compensator(self, loop: Loop, compensator: str) -> Loop:

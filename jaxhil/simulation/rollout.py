@@ -116,6 +116,7 @@ def start_rollout(loop: Loop, rig: RigConstants, gains: Gains, skip_flight: bool
         onset_tick=index,
         first_contact=initial_first_contact(zeros) if loop.probed else None,
         held=None if scenario.timing is None else no_held_values(zeros),
+        bias_walk=None if scenario.force_sensor.bias_walk is None else zeros,
     )
     # Delay lines are read as far back as they are long. Ticks are counted from a number at which no index
     # is negative.
@@ -213,7 +214,8 @@ def begin_next_contacts(
                     has_ended, initial_first_contact(tracker.approach), state.first_contact
                 )
             )
-        if skip_flight:
+        # A flight with a random walk of the bias is not uniform.
+        if skip_flight and state.bias_walk is None:
             arrived, skipped = advance_to_surface(loop, rig, gains, state, tracker, tracker.command, run.tick)
             state = _restart(loop, gains, state, arrived, skipped, jnp.zeros_like(skipped))
     else:

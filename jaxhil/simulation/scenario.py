@@ -55,6 +55,8 @@ class ForceSensorBatch(NamedTuple):
     # cutoff frequency of the low-pass filter [rad/s], (*batch); None without a filter. With a filter,
     # `time_constant` is that of the filter's slowest mode.
     cutoff: Any = None
+    # random walk of the bias [N/sqrt(s)], (*batch); None if no scenario of the batch has one
+    bias_walk: Any = None
 
 
 class PositionSensorBatch(NamedTuple):
@@ -237,8 +239,9 @@ def _build_mass(mechanism, table) -> Any:
 
 def _build_force_sensor(sensor, table) -> ForceSensorBatch:
     """Return the force sensor; the time constant of a filter is that of its slowest mode."""
-    path, names = "rig.force_sensor.", ForceSensorBatch._fields[:-1]
-    batch = ForceSensorBatch(*(table.scalar(path + name) for name in names))
+    path, names = "rig.force_sensor.", ForceSensorBatch._fields[:-2]
+    walk = table.optional(path + "bias_random_walk")
+    batch = ForceSensorBatch(*(table.scalar(path + name) for name in names), bias_walk=walk)
     if sensor.filter is None:
         return batch
     cutoff = 2 * np.pi * table.scalar(path + "filter.cutoff")

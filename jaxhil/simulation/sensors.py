@@ -1,4 +1,4 @@
-"""Force sensor and position sensor: first-order lag, noise, quantisation, dead zone and range.
+"""Force sensor and position sensor: first-order lag, noise, bias, quantisation, dead zone and range.
 
 The first-order lag of the force sensor is computed in continuous time. The other effects apply to samples.
 The delays of the sensors are part of `jaxhil.simulation.motion_simulator`.
@@ -19,6 +19,7 @@ from jaxhil.lanes import as_complex
 from jaxhil.simulation.scenario import Scenario
 
 THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))  # bits; rotation constants of Threefry-2x32
+BIAS_WALK_STREAM = 0x20000000  # offset of the contact's index, which separates the bias from the noise
 THREEFRY_PARITY = 0x1BD11BDA  # parity constant in the key schedule of Threefry-2x32
 
 
@@ -27,6 +28,8 @@ class SensorNoise(NamedTuple):
 
     force: Array | None  # noise of the force sensor [N]; None for a sensor without noise
     position: Array | None  # noise of the position sensor [m]; None for a sensor without noise
+    # change of the force sensor's bias since the last tick [N]; None for a constant bias
+    bias_step: Array | None = None
 
 
 def draw_noise(
@@ -36,7 +39,7 @@ def draw_noise(
     contact: Int[Array, "*batch"],
     age: Int[Array, "ticks *batch"],
 ) -> SensorNoise:
-    """Return the noise of both sensors.
+    """Return the noise of both sensors, and the steps of the random walk of the force sensor's bias.
 
     Args:
         has_force: Whether the force sensor has noise.
@@ -49,10 +52,32 @@ def draw_noise(
     def white(sensor, deviation):
         return deviation[None] * white_noise(scenario.key, contact, 2 * age + sensor, deviation.dtype)
 
+    walk = scenario.force_sensor.bias_walk
     return SensorNoise(
         white(0, scenario.force_sensor.noise_std) if has_force else None,
         white(1, scenario.position_sensor.noise_std) if has_position else None,
+        None if walk is None else draw_bias_steps(walk, scenario.control_period, scenario.key, contact, age),
     )
+
+
+def draw_bias_steps(
+    walk: Float[Array, "*batch"],
+    period: Float[Array, "*batch"],
+    key: UInt32[Array, "2 *batch"],
+    contact: Int[Array, "*batch"],
+    age: Int[Array, "ticks *batch"],
+) -> Float[Array, "ticks *batch"]:
+    """Return the change of the force sensor's bias [N] since the last tick; 0 at the first tick of a run.
+
+    Args:
+        walk: Random walk of the bias [N/sqrt(s)].
+        period: Control period [s].
+        key: Noise keys of the scenarios.
+        contact: Index of the current contact.
+        age: Number of ticks since the run began.
+    """
+    steps = white_noise(key, contact + BIAS_WALK_STREAM, age, walk.dtype)
+    return jnp.where(age > 0, (walk * jnp.sqrt(period))[None] * steps, 0)
 
 
 def apply_lag(

@@ -113,7 +113,7 @@ def tick(
     timing: TimingDraws | None = None,
 ) -> tuple[RunState, Tick]:
     """Simulate one control period; return the next state and the record of the tick."""
-    state, now = run.state, run.tick
+    state, now = advance_bias(run.state, noise), run.tick
     missed = None if timing is None else timing.is_missed
     signals, plant_signals = sense(loop, rig, state, now, noise, timing, prepared.probe)
     force, controller = compensate(loop, prepared, state, signals, now)
@@ -153,6 +153,13 @@ def tick(
     return run._replace(state=state, tracker=tracker, tick=now + 1), record
 
 
+def advance_bias(state: LoopState, noise: SensorNoise) -> LoopState:
+    """Return the state with the force sensor's bias at the current tick, of which `noise` has the step."""
+    if noise.bias_step is None or state.bias_walk is None:
+        return state
+    return state._replace(bias_walk=state.bias_walk + noise.bias_step)
+
+
 def sense(
     loop: Loop,
     rig: RigConstants,
@@ -180,6 +187,8 @@ def sense(
     )
     if loop.has_force_bias:
         force = force + sensor.bias
+    if state.bias_walk is not None:
+        force = force + state.bias_walk
     if noise.force is not None:
         force = force + noise.force
     if loop.has_sample_effects:

@@ -212,12 +212,15 @@ def _sensor(mechanism: SixAxisMechanism, numbers: DrawnValues) -> sensor.Sensor:
         *(numbers(path + key) for key in ("bias", "quantum", "dead_zone", "range")),
     )
     gravity = numbers.vector(numbers(path + "gravity"))
+    walk = path + "bias_random_walk"
+    is_walking = walk in mechanism.uncertainty or not numbers.is_zero(walk)
     return sensor.Sensor(
         delay=numbers(path + "delay"),
         time_constant=numbers(path + "time_constant") if cutoff is None else 1 / (slowest * cutoff),
         cutoff=cutoff,
         errors=errors,
         noise_std=numbers(path + "noise_std"),
+        bias_walk=numbers(walk) if is_walking else None,
         mounting=None,
         tool=tool,
         gravity=gravity,

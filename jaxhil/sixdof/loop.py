@@ -148,6 +148,7 @@ def begin(
             (nothing, start_filter(loop.sensor_filter, nothing)) if loop.has_lag else None,
             law.init(rig.prepared, rig.constants, start, loop.controller_ring),
             None if rig.timing is None else HeldValues(nothing, nothing, start.age),
+            None if rig.sensor.bias_walk is None else jnp.zeros_like(rig.sensor.bias_walk),
         ),
         tick=jnp.array(0, jnp.int32),
     )
@@ -223,6 +224,7 @@ def complete_tick(
     states, position, twist = model
     controller = state.controller._replace(
         lag=sensed.lag,
+        bias_walk=sensed.bias_walk,
         held=update_held_values(state.controller.held, sensed.reading, command, sensed.missed),
     )
     hardware = actuate(

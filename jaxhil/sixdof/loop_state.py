@@ -76,6 +76,8 @@ class NumericalController(NamedTuple):
     lag: tuple[Wrench, Any] | None
     law: Any  # state of the compensator
     held: HeldValues | None = None  # values of the last tick; None without timing effects
+    # change of the force sensor's bias until the last tick [N, N m], (6, *batch); None for a constant bias
+    bias_walk: Array | None = None
 
 
 class RunState(NamedTuple):
@@ -117,3 +119,4 @@ class Sensed(NamedTuple):
     signals: SixAxisSignals  # inputs of the compensator
     reading: Wrench | None  # reading of the force sensor's channels; None without timing effects
     missed: Bool[Array, "*batch"] | None  # whether the controller misses the tick; None if it misses none
+    bias_walk: Array | None  # change of the force sensor's bias since tick 0, (6, *batch); None if constant

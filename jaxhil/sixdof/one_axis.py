@@ -182,7 +182,10 @@ def _convert_force_sensor(mechanism: SixAxisMechanism, normal: np.ndarray) -> di
         **{key: getattr(sensor, key) for key in ("delay", "jitter", "loss_probability", "time_constant")},
         "bias": float(np.dot(normal, sensor.bias[:3])),
         "range": min(sensor.range[:3]),
-        **{key: along(getattr(sensor, key)) for key in ("noise_std", "quantum", "dead_zone")},
+        **{
+            key: along(getattr(sensor, key))
+            for key in ("noise_std", "bias_random_walk", "quantum", "dead_zone")
+        },
         "dead_zone_kind": sensor.dead_zone_kind,
         **({} if sensor.filter is None else {"filter": msgspec.to_builtins(sensor.filter)}),
     }

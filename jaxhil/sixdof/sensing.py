@@ -10,7 +10,7 @@ from jaxtyping import Array
 from jaxhil.lanes import as_complex, select_lanes
 from jaxhil.laws.six_axis_base import SixAxisSignals
 from jaxhil.mechanism.sensor_filter import FilterModes
-from jaxhil.simulation.sensors import apply_lag, follow_ramp, quantise, white_noise
+from jaxhil.simulation.sensors import BIAS_WALK_STREAM, apply_lag, follow_ramp, quantise, white_noise
 from jaxhil.simulation.timing import TimingDraws, draw_timing
 from jaxhil.sixdof.axes import AxisMotion, read_late_motion, read_samples
 from jaxhil.sixdof.forces import contact_wrench
@@ -52,7 +52,8 @@ def sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
         read_contact, _, _ = contact_wrench(
             rig.groups, state.memories, read_motion.pose, read_motion.twist, rig.period
         )
-    reading, lag = _read_sensor(loop, rig, state, read_contact, read_motion)
+    bias_walk = _advance_bias(rig, state)
+    reading, lag = _read_sensor(loop, rig, state, read_contact, read_motion, bias_walk)
     if timing is not None and timing.is_lost is not None and state.controller.held is not None:
         reading = select_lanes(timing.is_lost, state.controller.held.reading, reading)
     wrench = _undo_mounting(loop, rig.sensor, reading, measured)
@@ -73,6 +74,7 @@ def sense(loop: Loop, rig: RigConstants, state: RunState) -> Sensed:
         signals=signals,
         reading=None if timing is None else reading,
         missed=None if timing is None else timing.is_missed,
+        bias_walk=bias_walk,
     )
 
 
@@ -101,8 +103,22 @@ def _measured_pose(loop: Loop, rig: RigConstants, state: RunState, measured: Arr
     return quantise(noisy, rig.sensor.position_quantum)
 
 
+def _advance_bias(rig: RigConstants, state: RunState) -> Array | None:
+    """Return the change of the force sensor's bias since tick 0, (6, *batch); None for a constant bias."""
+    walk, before = rig.sensor.bias_walk, state.controller.bias_walk
+    if walk is None or before is None:
+        return None
+    step = walk * jnp.sqrt(rig.period)[None] * _noise(rig, state.tick, BIAS_WALK_STREAM)
+    return before + jnp.where(state.tick > 0, step, 0)
+
+
 def _read_sensor(
-    loop: Loop, rig: RigConstants, state: RunState, contact: Wrench, motion: RigidMotion
+    loop: Loop,
+    rig: RigConstants,
+    state: RunState,
+    contact: Wrench,
+    motion: RigidMotion,
+    bias_walk: Array | None,
 ) -> tuple[Wrench, tuple[Wrench, Any] | None]:
     """Return the reading of the sensor's channels, and the next state of the sensor's lag or filter."""
     sensor, last = rig.sensor, state.controller
@@ -114,6 +130,8 @@ def _read_sensor(
     lagged = raw if last.lag is None else _advance_filter(loop, rig, state.tick, raw, *last.lag)
     reading = _read_filter(loop.sensor_filter, lagged)
     noise = sensor.noise_std * _noise(rig, state.tick, 0) if loop.has_noise else None
+    if bias_walk is not None:
+        noise = bias_walk if noise is None else noise + bias_walk
     reading = sample(reading, sensor.errors, noise, loop.has_sample_effects, loop.cuts_dead_zone)
     return reading, None if last.lag is None else (raw, lagged)
 
@@ -169,9 +187,9 @@ def _wrench(channels: Array) -> Wrench:
     return Wrench(vector(channels[:3]), vector(channels[3:]))
 
 
-def _noise(rig: RigConstants, now: Array, sensor: int) -> Array:
-    """Return standard normal noise for six channels; `sensor` is 0 for the force and 1 for the pose."""
+def _noise(rig: RigConstants, now: Array, stream: int) -> Array:
+    """Return standard normal noise for six channels; `stream` is 0 for the force and 1 for the pose."""
     channel = jnp.arange(6, dtype=jnp.int32).reshape(6, *[1] * rig.period.ndim)
     count = jnp.broadcast_to(6 * now + channel, (6, *rig.period.shape))
-    stream = jnp.full(rig.period.shape, sensor, jnp.int32)
-    return white_noise(rig.key, stream, count, rig.period.dtype)
+    streams = jnp.full(rig.period.shape, stream, jnp.int32)
+    return white_noise(rig.key, streams, count, rig.period.dtype)

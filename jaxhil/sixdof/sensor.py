@@ -56,6 +56,8 @@ class Sensor(NamedTuple):
     # cutoff frequency of the low-pass filter of all channels [rad/s], (*batch); None without a filter. With a
     # filter, `time_constant` is that of the filter's slowest mode.
     cutoff: Any = None
+    # random walk of the bias, (6, *batch) [N/sqrt(s), N m/sqrt(s)]; None if no scenario has one
+    bias_walk: Any = None
 
 
 def tool_load(tool: Tool, pose: Pose, twist: Twist, acceleration: Twist, gravity: Vector) -> Wrench:
@@ -139,7 +141,7 @@ def sample(
     has_effects: bool = True,
     cuts_dead_zone: bool = False,
 ) -> Wrench:
-    """Add cross-talk, bias and `noise` [N, N m] to a reading.
+    """Add cross-talk, bias and `noise` [N, N m], which includes changes of the bias, to a reading.
 
     If `has_effects` is true, apply resolution (quantum), dead zone and range too. The dead zone sets small
     values to 0 and reduces larger values by its half-width; with `cuts_dead_zone`, larger values remain

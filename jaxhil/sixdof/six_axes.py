@@ -114,9 +114,10 @@ class SixAxes(RigModel):
         return np.zeros(np.shape(scenarios.duration))
 
     def without_noise(self, scenarios: Scenario) -> Scenario:
-        """Return the scenarios with noise-free sensors of force and pose."""
-        sensor = scenarios.sensor
-        quiet = {name: np.zeros_like(getattr(sensor, name)) for name in ("noise_std", "position_noise_std")}
+        """Return the scenarios with noise-free sensors of force and pose, and a constant bias."""
+        sensor, names = scenarios.sensor, ["noise_std", "position_noise_std"]
+        names += [] if sensor.bias_walk is None else ["bias_walk"]
+        quiet = {name: np.zeros_like(getattr(sensor, name)) for name in names}
         return scenarios._replace(sensor=sensor._replace(**quiet))
 
     def with_compensator(self, loop: Loop, compensator: str) -> Loop:

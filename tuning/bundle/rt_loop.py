@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxhil.rig.flight_recorder import FlightRecorder
 from tuning.bundle.controller_kind import ONE_AXIS, kind_of
-from tuning.rig.numerical_model import NumericalModel
+from tuning.rig.numerical_model import NOISE_AND_BIAS_KEYS, NumericalModel
 from tuning.rig.numerical_model_six_axes import BODY_NUMBERS, SHARES, build_body
 
 # Files of the loop, and the source of its numerical model by number of axes.
@@ -58,7 +58,7 @@ def rt_loop_files(document: Mapping[str, Any]) -> dict[str, str]:
 def _one_axis_constants(mechanism: Mapping[str, Any], model: NumericalModel, integrator: str) -> list[str]:
     """Return the C constants of the numerical model with one axis."""
     sensor = mechanism["rig"].get("force_sensor", {})
-    has_noise_or_bias = sensor.get("noise_std", 0.0) != 0.0 or sensor.get("bias", 0.0) != 0.0
+    has_noise_or_bias = any(sensor.get(key, 0.0) != 0.0 for key in NOISE_AND_BIAS_KEYS)
     return [
         "enum { START_VALUES = 2 };",
         f"#define EQUIVALENT_MASS {model.mass!r} /* kg, of the numerical model */",

@@ -150,7 +150,7 @@ def _group_one_axis(mechanisms: Sequence[Mechanism]) -> list[tuple[list[int], Co
         key = (
             *(getattr(loop, name) for name in _DISTINGUISHING_PROPERTIES),
             len(batch.simulator.denominator),
-            jax.tree.structure((batch.simulator.window, batch.timing)),
+            jax.tree.structure((batch.simulator.window, batch.timing, batch.force_sensor.bias_walk)),
             _needs_simulated_speeds(mechanisms[index]),
         )
         groups.setdefault(key, []).append(index)

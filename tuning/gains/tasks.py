@@ -19,6 +19,7 @@ from jaxhil.contact.laws import ContactLaw
 from jaxhil.laws.compensators import get_compensator, literature_gains
 from jaxhil.laws.simulation_base import Gain
 from jaxhil.mechanism.file import AnyMechanism
+from jaxhil.mechanism.number_ranges import value_at
 from jaxhil.mechanism.structs import Mechanism
 from jaxhil.mechanism.uncertainty import draw_quasi_random
 from jaxhil.rig_models import choose_rig_model
@@ -121,11 +122,13 @@ def build_task(
 
 
 def has_sensor_noise(mechanism: AnyMechanism) -> bool:
-    """Return whether the force sensor or the position sensor has noise in at least one scenario."""
-    rig = mechanism.rig
-    paths = "rig.force_sensor.noise_std", "rig.position_sensor.noise_std"
-    deviations = rig.force_sensor.noise_std, rig.position_sensor.noise_std
-    noisy = any(bool(np.max(deviation) > 0) for deviation in deviations)
+    """Return whether a sensor has noise, or a random walk of its bias, in at least one scenario."""
+    paths = (
+        "rig.force_sensor.noise_std",
+        "rig.force_sensor.bias_random_walk",
+        "rig.position_sensor.noise_std",
+    )
+    noisy = any(bool(np.max(value_at(mechanism, path)) > 0) for path in paths)
     return noisy or any(path in mechanism.uncertainty for path in paths)
 
 
@@ -223,5 +226,8 @@ def _compute_time_limit(law: ContactLaw, scenarios: Scenario) -> Float[Array, "*
     longest = TIME_LIMIT_FACTOR * jnp.max(reference.duration, axis=0) + TIME_LIMIT_OFFSET
     # With noise, the command does not decay: a contact ends only after the longest wait for its decay.
     sensor = scenarios.force_sensor
-    longest = longest + jnp.where((sensor.noise_std != 0) | (sensor.bias != 0), MAX_DECAY_WAIT, 0.0)
+    is_unsteady = (sensor.noise_std != 0) | (sensor.bias != 0)
+    if sensor.bias_walk is not None:
+        is_unsteady = is_unsteady | (sensor.bias_walk != 0)
+    longest = longest + jnp.where(is_unsteady, MAX_DECAY_WAIT, 0.0)
     return jnp.minimum(longest, scenarios.time_limit)

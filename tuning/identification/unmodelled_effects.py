@@ -8,6 +8,7 @@ from tuning.identification.validation import CheckResult
 
 AVERAGE_KEY = "rig.simulator.model"
 FILTER_KEY, CUT_ZONE_KEY = "rig.force_sensor.filter", "rig.force_sensor.dead_zone_kind"
+WALK_KEY = "rig.force_sensor.bias_random_walk"
 
 
 def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
@@ -25,6 +26,7 @@ def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
         text = f"a {sensor.filter.kind} filter of order {sensor.filter.order}"
         effects[FILTER_KEY] = "filter of the force sensor", text
     for key, name, value, unit in (
+        (WALK_KEY, "drift of the force sensor's bias", sensor.bias_random_walk, " N/sqrt(s)"),
         ("rig.force_sensor.jitter", "jitter of the force sensor", sensor.jitter, " s"),
         ("rig.force_sensor.loss_probability", "lost frames of the force sensor", sensor.loss_probability, ""),
         ("rig.missed_tick_probability", "missed ticks", rig.missed_tick_probability, ""),

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from jaxhil.mechanism.sensor_filter import settling_constant
 from jaxhil.mechanism.structs import Mechanism
+from tuning.rig.numerical_model import NOISE_AND_BIAS_KEYS
 
 FADED_COMMAND_RATIO = 1e-6  # force command, divided by its peak, below which it has decayed [1]
 MAX_FADING_TIME = 0.1  # longest wait for the force command to decay [s]
@@ -46,7 +47,7 @@ class ContactDetector:
         min_ticks = math.floor(lag + 2 + 1e-9) + 1
         max_ticks = min_ticks + math.ceil(MAX_FADING_TIME / self._period)
         self._min_ticks_without_force, self._max_ticks_without_force = min_ticks, max_ticks
-        self._has_noise_or_bias = sensor.noise_std != 0.0 or sensor.bias != 0.0
+        self._has_noise_or_bias = any(getattr(sensor, key) != 0.0 for key in NOISE_AND_BIAS_KEYS)
         self._max_contact_ticks = MAX_CONTACT_DURATION / self._period
         self._max_approach_ticks = self._max_contact_ticks
         if math.isfinite(self._clearance):

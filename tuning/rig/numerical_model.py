@@ -4,6 +4,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+# Keys of the force sensor with which it reads a force without contact.
+NOISE_AND_BIAS_KEYS = ("noise_std", "bias", "bias_random_walk")
 APPROACH_TIME = 0.02  # time from the start of a run to the contact [s]
 
 
@@ -78,7 +80,7 @@ class OneAxisModelInLoop:
         self._controller, self._model = controller, NumericalModel(mechanism)
         sensor = mechanism["rig"].get("force_sensor", {})
         # At tick 0 the mechanism is free. Noise or bias of the sensor must not act on the numerical model.
-        self._has_noise_or_bias = sensor.get("noise_std", 0.0) != 0.0 or sensor.get("bias", 0.0) != 0.0
+        self._has_noise_or_bias = any(sensor.get(key, 0.0) != 0.0 for key in NOISE_AND_BIAS_KEYS)
         self.command = self.force = (0.0,)
 
     @property

@@ -56,7 +56,8 @@ class OneAxisRig:
     def begin(self, command: Numbers) -> None:
         """Begin the prepared run in uniform motion, with this position command of tick 0 [m]."""
         position, velocity = self._start
-        self._plant.begin(position, velocity, command[0], self._number)
+        runs = 1 if self._two_sided else self._mechanism.approach.contacts  # runs in a scenario
+        self._plant.begin(position, velocity, command[0], self._number, (self._runs - 1) // runs)
         self._watch.begin(self._number)
 
     def read(self) -> tuple[Numbers, Numbers]:

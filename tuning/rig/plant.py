@@ -17,6 +17,7 @@ from jaxhil.contact.float_law import FloatLaw
 from jaxhil.contact.laws import find_contact_law
 from jaxhil.mechanism.sensor_filter import find_modes
 from jaxhil.mechanism.structs import Contact, Mechanism
+from tuning.rig.bias_walk import BiasWalk
 from tuning.rig.discretisation import (
     DELAY_ROUNDING_TOLERANCE,
     DiscreteSimulator,
@@ -99,10 +100,10 @@ class RigHardware:
         self._contact_intervals = constants.contact_intervals
         self._force_intervals = constants.force_intervals
         self._position_intervals = constants.position_intervals
-        self._timing = TimingEffects(mechanism, seed)
+        self._timing, self._bias_walk = TimingEffects(mechanism, seed), BiasWalk(mechanism, seed)
         self.begin(-1.0, 0.0, -1.0, 0)
 
-    def begin(self, position: float, velocity: float, command: float, number: int) -> None:
+    def begin(self, position: float, velocity: float, command: float, number: int, scenario: int = 0) -> None:
         """Begin a run at tick 0, in the steady state of a uniform motion without contact.
 
         Args:
@@ -110,6 +111,7 @@ class RigHardware:
             velocity: velocity of the numerical model [m/s].
             command: position command of tick 0 [m].
             number: index of the first contact in the mechanism's lists of stiffness and damping.
+            scenario: index of the scenario to which the run belongs, for the random walk of the bias.
         """
         self._law, self._number, self._next_number = _contact_law_of(self._contact, number), number, number
         stride = self._period * velocity
@@ -134,6 +136,7 @@ class RigHardware:
         self._drives = [self._commands[-1] + (index - size + 1) * stride for index in range(size)]
         self._tick = 0
         self._timing.begin(size)
+        self._bias_walk.begin(scenario)
         self._lag = self.force = 0.0
         self._modes = [0j] * len(self._rates)
         self._in_contact, self._deepest = False, 0.0
@@ -145,7 +148,7 @@ class RigHardware:
         force = self._timing.late_force(self._tick, self._law)
         if force is None:
             force = self._forces[(self._tick - 1 - self._force_intervals) & last]
-        force += sensor.bias
+        force += sensor.bias + self._bias_walk.read(self._tick, self._next_number)
         if sensor.noise_std > 0.0:
             force += sensor.noise_std * noise.gauss(0.0, 1.0)
         force = _quantise(force, sensor.quantum)

@@ -24,15 +24,18 @@ from jaxhil.simulation.metrics import Metrics
 from jaxhil.simulation.recording import convert_gains, start_batch
 from jaxhil.simulation.rollout import begin_next_contacts, draw_segment_noise, segment_length
 from jaxhil.simulation.scenario import Scenario
+from jaxhil.simulation.sensors import SensorNoise
 from jaxhil.simulation.tick import (
     ModelState,
     RunState,
     actuate,
+    advance_bias,
     compute_contact,
     integrate,
     sense,
     update_state,
 )
+from jaxhil.simulation.timing import TimingDraws
 from tuning.verification.stops import ControllerStop, RecordingController
 
 
@@ -133,8 +136,13 @@ def _compile_loop(loop: Loop) -> _LoopProgram:
 
 
 def _sense(loop: Loop, rig: RigConstants, run: RunState) -> tuple[Signals, PlantSignals]:
-    noise, timing = jax.tree.map(lambda leaf: leaf[0], draw_segment_noise(loop, rig, run, 1))
-    return sense(loop, rig, run.state, run.tick, noise, timing)
+    noise, timing = _draw_noise(loop, rig, run)
+    return sense(loop, rig, advance_bias(run.state, noise), run.tick, noise, timing)
+
+
+def _draw_noise(loop: Loop, rig: RigConstants, run: RunState) -> tuple[SensorNoise, TimingDraws | None]:
+    """Return the sensors' noise and the timing effects at the next tick."""
+    return jax.tree.map(lambda leaf: leaf[0], draw_segment_noise(loop, rig, run, 1))
 
 
 def _integrate(loop: Loop, rig: RigConstants, run: RunState, command: Array) -> ModelState:
@@ -152,7 +160,7 @@ def _advance(
     sent: Array,
 ) -> RunState:
     """Complete a tick after the controller, with its force command [N] and position command `sent` [m]."""
-    state, now = run.state, run.tick
+    state, now = advance_bias(run.state, _draw_noise(loop, rig, run)[0]), run.tick
     model = integrate(loop, rig, state, command)
     actuated = actuate(loop, rig, gains, state, now, model, SentCommand(sent, state.controller))
     contact = compute_contact(loop, rig, state, actuated.interval)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxhil.errors import InputError
-from jaxhil.laws.shared.nominal_values import force_delay
+from jaxhil.laws.shared.nominal_values import BIAS_WALK_TIME, force_delay
 from jaxhil.mechanism.uncertainty import draw_extremes
 from jaxhil.rig.law_status import UNSTATED
 from jaxhil.rig.limits import LIMITS
@@ -154,7 +154,7 @@ def build_audit_rules(loaded: LoadedGains) -> tuple[AuditRules, float]:
     # Time that the simulated loop waits for the force to decay, with the largest delays of all draws.
     wait = drawn["force_delay"] + 20 * drawn["force_lag"] + 2 * period
     mass = mechanism.bodies.mass
-    noise = 3 * drawn["force_noise"] + drawn["force_bias"] + drawn["force_quantum"]
+    noise = 3 * drawn["force_noise"] + drawn["force_bias"] + drawn["force_quantum"] + drawn["force_drift"]
     rules = AuditRules(
         period=period,
         clearance=mechanism.contact.clearance,
@@ -208,12 +208,13 @@ def compute_guard_limits(
         "position_stuck_travel": LIMIT_MARGIN * max(most["position_stuck"], within),
         "free_distance": free_distance,
         "settling": rules.settling,
-        "free_force": max(LIMIT_MARGIN * most["flight_force"], smallest),
+        # On the rig, the flight after a tare lasts longer than in the simulation.
+        "free_force": max(LIMIT_MARGIN * most["flight_force"], smallest) + drawn["force_drift"],
         "late_fraction": LIMITS["late_fraction"].default,
         "missed_in_a_row": float(MAX_BAD_TICKS_IN_A_ROW),
         "tare_ticks": float(max(10, round(TARE_DURATION / period))),
-        "tare_spread": max(2 * LIMIT_MARGIN * most["flight_spread"], smallest),
-        "bias_limit": max(LIMIT_MARGIN * drawn["force_bias"], 5 * smallest),
+        "tare_spread": max(2 * LIMIT_MARGIN * most["flight_spread"], smallest) + drawn["force_drift"],
+        "bias_limit": max(LIMIT_MARGIN * drawn["force_bias"], 5 * smallest) + drawn["force_drift"],
         "force_limit": LIMIT_MARGIN * most["command"],
         "force_slew": LIMIT_MARGIN * max(most["slew"], smallest / period),
         "limited_in_a_row": float(MAX_BAD_TICKS_IN_A_ROW),
@@ -261,6 +262,8 @@ def _find_largest_draws(loaded: LoadedGains) -> dict[str, float]:
         "force_lag": force.time_constant,
         "force_noise": force.noise_std,
         "force_bias": np.abs(force.bias),
+        # three standard deviations of the change of the bias
+        "force_drift": 0.0 if force.bias_walk is None else 3 * BIAS_WALK_TIME**0.5 * force.bias_walk,
         "force_quantum": force.quantum,
         "force_range": force.range,
         "position_delay": position.delay,

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxhil.laws.shared.nominal_values import BIAS_WALK_TIME
 from jaxhil.rig.six_axes import Controller6
 from jaxhil.rig.six_axes.gain_file import SixAxisGainFile, check_six_axis_document
 from jaxhil.rig.six_axes.limits import NO_SIX_AXIS_LIMITS, SIX_AXIS_LIMITS, complete_six_axis_limits
@@ -140,6 +141,7 @@ def _record(
 def signal_limits(records: list[ControllerRecord], period: float, mechanism: Any) -> dict[str, float]:
     """Compute the limits of readings, commands and durations from the extreme signals of recorded runs."""
     sensor = mechanism.rig.force_sensor
+    drift = np.array(sensor.bias_random_walk)
     force, torque = slice(0, 3), slice(3, 6)
     limits = {
         "held_readings": TICKS_IN_A_ROW,
@@ -152,13 +154,15 @@ def signal_limits(records: list[ControllerRecord], period: float, mechanism: Any
         reading = _largest(np.max(np.abs(record.wrench[:, part])) for record in records)
         command = _largest(np.max(np.abs(record.command[:, part])) for record in records)
         slew = _largest(np.max(np.abs(np.diff(record.command[:, part], axis=0))) for record in records)
-        noise = max(np.hypot(sensor.noise_std[part], sensor.quantum[part]))
+        steady = np.hypot(sensor.noise_std[part], sensor.quantum[part])
+        noise = max(np.hypot(steady, drift[part] * TARE_TIME**0.5))
         limits[f"{kind}_range"] = MARGIN * reading + SIGMAS * noise
         limits[f"{kind}_limit"] = MARGIN * max(command, reading)
         limits[f"{kind}_slew"] = MARGIN * max(slew, 0.1 * command) / period
         limits[f"tare_{kind}_spread"] = SIGMAS * noise + 0.01 * reading
         limits[f"{kind}_bias_limit"] = SIGMAS * noise + 0.05 * reading
-    limits["fading"] = max(5.0 * max(sensor.noise_std[force]), 0.01 * limits["force_range"])
+    noise = max(5.0 * np.array(sensor.noise_std[force]) + 3.0 * BIAS_WALK_TIME**0.5 * drift[force])
+    limits["fading"] = max(float(noise), 0.01 * limits["force_range"])
     return limits | _motion_limits(records, period)
 
 

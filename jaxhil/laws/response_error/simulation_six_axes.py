@@ -28,7 +28,7 @@ from jaxhil.laws.shared.lead_filter import (
     apply_lead_filter,
     build_lead_filter,
 )
-from jaxhil.laws.shared.nominal_values import FORCE_DELAY, force_delay
+from jaxhil.laws.shared.nominal_values import BIAS_WALK_TIME, FORCE_DELAY, force_delay
 from jaxhil.laws.shared.recursive_least_squares.simulation import ContactEstimate, update_estimate
 from jaxhil.laws.simulation_base import Gain, Gains, Signals, rig_gain
 from jaxhil.laws.six_axis_base import COORDINATES, SixAxisCompensator, lag_leads
@@ -74,7 +74,8 @@ def approach_speed(mechanism: Any) -> float:
 def noise_level(mechanism: Any) -> float:
     """Return a force [N] above the sensor noise along the docking axis: 4 sigma plus bias and quantum."""
     sensor = mechanism.rig.force_sensor
-    return 4 * sensor.noise_std[AXIS] + abs(sensor.bias[AXIS]) + sensor.quantum[AXIS]
+    drift = sensor.bias_random_walk[AXIS] * BIAS_WALK_TIME**0.5
+    return 4 * (sensor.noise_std[AXIS] + drift) + abs(sensor.bias[AXIS]) + sensor.quantum[AXIS]
 
 
 def _never(mechanism: Any) -> bool:

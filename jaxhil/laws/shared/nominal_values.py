@@ -22,6 +22,8 @@ DEAD_ZONE = "dead zone"
 FORCE_NOISE = "force noise"
 EQUIVALENT_MASS = "equivalent mass"
 
+BIAS_WALK_TIME = 1.0  # s; typical duration of an approach and a contact, in which the bias changes
+
 
 def force_delay(mechanism: Mechanism | SixAxisMechanism) -> float:
     """Return the nominal delay [s] of the force measurement: transport delay plus lag or filter."""
@@ -96,10 +98,14 @@ def critical_damping(mechanism: Mechanism) -> float:
 
 
 def noise_bound(mechanism: Mechanism) -> float:
-    """Return a force [N] above the noise: 4 standard deviations plus bias and quantum of the force sensor."""
+    """Return a force [N] above the noise: 4 standard deviations plus bias and quantum of the force sensor.
+
+    A random walk of the bias counts with its change in `BIAS_WALK_TIME`.
+    """
     sensor = mechanism.rig.force_sensor
     # With 3 standard deviations, noise at a small depth sometimes causes a wrong identified stiffness.
-    return 4 * sensor.noise_std + abs(sensor.bias) + sensor.quantum
+    drift = sensor.bias_random_walk * math.sqrt(BIAS_WALK_TIME)
+    return 4 * (sensor.noise_std + drift) + abs(sensor.bias) + sensor.quantum
 
 
 def _lags(simulator: Simulator, robot: Simulator | TargetRobot) -> list[float]:

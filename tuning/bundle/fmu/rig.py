@@ -59,6 +59,7 @@ def describe_unsupported(mechanism: AnyMechanism) -> str | None:
         effects = {
             "force_sensor.jitter": sensor.jitter,
             "force_sensor.loss_probability": sensor.loss_probability,
+            "force_sensor.bias_random_walk": sensor.bias_random_walk,
             **effects,
         }
     if sensor.filter is not None:

@@ -157,6 +157,7 @@ def _move(
         signals=unused,
         reading=state.reading,
         missed=None,
+        bias_walk=run.controller.bias_walk,
     )
     after, _ = complete_tick(loop, rig, run, sensed, command, (states, position, twist), pose)
     return RigState(after, state.reading)
@@ -168,7 +169,7 @@ def _sense(loop: Loop, rig: RigConstants, state: RigState) -> tuple[Array, Array
     after = run._replace(
         memories=sensed.memories,
         latch_states=sensed.latch_states,
-        controller=run.controller._replace(lag=sensed.lag),
+        controller=run.controller._replace(lag=sensed.lag, bias_walk=sensed.bias_walk),
     )
     signals = sensed.signals
     outputs = pack((signals.wrench, signals.pose_measured, run.near, run.twist, sensed.contact))

@@ -183,7 +183,7 @@ def differentiate_error(
         InputError: If no simulated contact ends and has finite derivatives.
     """
     document, rows = to_plain_data(mechanism), []
-    for key in ("noise_std", "quantum", "dead_zone", "bias"):
+    for key in ("noise_std", "quantum", "dead_zone", "bias", "bias_random_walk"):
         document["rig"]["force_sensor"][key] = 0.0
     for key in ("noise_std", "quantum"):
         document["rig"]["position_sensor"][key] = 0.0
