@@ -6,7 +6,16 @@ import re
 import pytest
 from bundles import document
 from cases import CASES
-from fmus import RunningFmu, compile_sources, extract, run_loop, run_parallel_loop, validate_fmu, write_fmu
+from fmus import (
+    RunningFmu,
+    compile_sources,
+    extract,
+    fmpy,
+    run_loop,
+    run_parallel_loop,
+    validate_fmu,
+    write_fmu,
+)
 from lanes import validated
 from test_plant import AGAINST_THE_ORACLE
 
@@ -38,6 +47,9 @@ def test_rig_fmu_is_valid_and_compiles_without_warning(fmi, tmp_path):
     archive = rig_fmu(document(), fmi)
     path = write_fmu(tmp_path / "rig.fmu", archive, with_library=False)
     assert validate_fmu(str(path)) == []
+    # Outputs must not depend on commands before the first step: a loop of equations would follow.
+    unknowns = fmpy.read_model_description(str(path)).initialUnknowns
+    assert {known.causality for unknown in unknowns for known in unknown.dependencies} == {"parameter"}
     folder = extract(path)
     assert compile_sources(folder, "gcc", "-std=c99", *PEDANTIC) == ""
     assert compile_sources(folder, "g++", "-std=c++11", "-x", "c++", *PEDANTIC) == ""

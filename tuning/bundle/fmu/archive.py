@@ -8,7 +8,7 @@ import subprocess
 import tempfile
 import uuid
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -31,6 +31,7 @@ def build_fmu(
     files: Mapping[str, str],
     constants: Mapping[str, int | str],
     fmi: int,
+    initial_inputs: Collection[str] = (),
 ) -> bytes:
     """Return the archive of an FMU with sources, without a library.
 
@@ -43,10 +44,11 @@ def build_fmu(
         files: text of the model's source files by name.
         constants: constants of the model for its C code, by name.
         fmi: version of FMI, 2 or 3.
+        initial_inputs: names of the inputs on which outputs depend before the first step.
     """
     sources = {**common_files(fmi), **files, **variable_files(variables, "", period, constants)}
     compiled = files_to_compile([*sources])
-    described = FmuDescription(identifier, name, description, "", period, variables, compiled)
+    described = FmuDescription(identifier, name, description, "", period, variables, compiled, initial_inputs)
     token = _token([model_description(described, fmi), *(text.encode() for text in sources.values())])
     sources |= variable_files(variables, token, period, constants)
     described = described._replace(token=token)

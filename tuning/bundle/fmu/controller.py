@@ -11,10 +11,11 @@ from tuning.bundle.c99 import GAINS_FILE, HEADER_FILE, SOURCE_FILE, generate_c99
 from tuning.bundle.controller_kind import ONE_AXIS, kind_of
 from tuning.bundle.fmu.archive import build_fmu
 from tuning.bundle.fmu.sources import read_source
-from tuning.bundle.fmu.variables import c_names, controller_variables
+from tuning.bundle.fmu.variables import c_names, controller_variables, six_axis_names
 from tuning.bundle.vector_replay import LAYOUTS
 
 IDENTIFIER = "jaxhil_controller"
+INITIAL_INPUTS = ("position", "velocity", "position_desired", "velocity_desired")
 _TESTED_FMU = """\
 #include <stdbool.h>
 #include <stdint.h>
@@ -66,6 +67,7 @@ def controller_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
             "FMU_INTEGRATOR": f"INTEGRATOR_{document['mechanism']['rig']['integrator'].upper()}",
         },
         fmi=fmi,
+        initial_inputs=INITIAL_INPUTS if is_one_axis else six_axis_names("pose"),
     )
 
 

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -36,6 +36,7 @@ class FmuDescription(NamedTuple):
     period: float  # control period, which is the communication step [s]
     variables: Sequence[Variable]
     sources: Sequence[str]  # names of the source files to compile
+    initial_inputs: Collection[str]  # names of the inputs on which outputs depend before the first step
 
 
 def model_description(fmu: FmuDescription, fmi: int) -> bytes:
@@ -67,7 +68,7 @@ def model_description(fmu: FmuDescription, fmi: int) -> bytes:
     for reference, variable in enumerate(fmu.variables):
         if fmi == 3 or variable.causality != "independent":
             _add_variable(listed, reference, variable, fmi)
-    _add_structure(root, fmu.variables, fmi)
+    _add_structure(root, fmu, fmi)
     return _to_bytes(root)
 
 
@@ -152,24 +153,31 @@ def _start_text(variable: Variable) -> str:
     return str(int(variable.start)) if variable.type == "integer" else repr(float(variable.start))
 
 
-def _add_structure(root: Element, variables: Sequence[Variable], fmi: int) -> None:
+def _add_structure(root: Element, fmu: FmuDescription, fmi: int) -> None:
     """Add the XML element `ModelStructure`, which lists the outputs.
 
     The outputs change only at the ends of steps. The list therefore states no direct dependency on an input.
+    Before the first step, outputs depend on parameters and on a few inputs. If the list did not state them,
+    importing tools would assume all inputs, and solve equations between controller and rig.
     """
     structure = SubElement(root, "ModelStructure")
-    outputs = [n for n, variable in enumerate(variables) if variable.causality == "output"]
+    outputs = [n for n, variable in enumerate(fmu.variables) if variable.causality == "output"]
+    dependencies = " ".join(
+        str(n)
+        for n, variable in enumerate(fmu.variables)
+        if variable.causality == "parameter" or variable.name in fmu.initial_inputs
+    )
     if fmi == 3:
         for reference in outputs:
             SubElement(structure, "Output", valueReference=str(reference), dependencies="")
         for reference in outputs:
-            SubElement(structure, "InitialUnknown", valueReference=str(reference))
+            SubElement(structure, "InitialUnknown", valueReference=str(reference), dependencies=dependencies)
         return
     # FMI 2 counts the listed variables from 1, and the time is not listed.
     listed, unknowns = SubElement(structure, "Outputs"), SubElement(structure, "InitialUnknowns")
     for reference in outputs:
         SubElement(listed, "Unknown", index=str(reference), dependencies="")
-        SubElement(unknowns, "Unknown", index=str(reference))
+        SubElement(unknowns, "Unknown", index=str(reference), dependencies=dependencies)
 
 
 def _to_bytes(root: Element) -> bytes:
