@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tuning.bundle.writers import c99_files
+from tuning.bundle.writers import c99_files, rehearsal_files
 from tuning.rig.loop import PacketTimes, answered_packet_number, build_empty_reading, run_loop
 from tuning.rig.network import Injection, Network
 from tuning.rig.rig_task import RigTask
@@ -48,16 +48,27 @@ class Ran(NamedTuple):
     log: Path
 
 
-def compile_loop(compiler, document, folder: Path, *options: str, plant: str | Path = UDP_PLANT) -> Path:
-    """Write the C files of a gain document to the folder, and compile the loop with a plant."""
+def compile_loop(
+    compiler, document, folder: Path, *options: str, plant: Sequence[str | Path] = (UDP_PLANT,)
+) -> Path:
+    """Write the C files of a gain document to the folder, and compile the loop with the files of a plant."""
     for name, text in c99_files(document).items():
         (folder / Path(name).name).write_bytes(text)
     program = folder / "rt_loop"
-    sources = [folder / name for name in (*SOURCES, plant)]
+    sources = [folder / name for name in (*SOURCES, *plant)]
     command = [compiler, *FLAGS, *options, f"-I{folder}", "-o", program, *sources, "-lm"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     return program
+
+
+def compile_rehearsal(compiler, document, folder: Path, *options: str) -> Path:
+    """Compile the loop with the simulated rig in C."""
+    files = {Path(name).name: content for name, content in rehearsal_files(document).items()}
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    plant = [name for name in files if name.endswith(".c")]
+    return compile_loop(compiler, document, folder, *options, plant=plant)
 
 
 @contextmanager

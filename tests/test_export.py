@@ -27,6 +27,7 @@ from tuning.bundle.bundle import (
 )
 from tuning.bundle.checking import check_bundle
 from tuning.bundle.checking import run_selftest as run_selftest_alone
+from tuning.bundle.fmu.rig import SOURCE_FILES
 from tuning.bundle.readme import readme_text
 from tuning.bundle.writers import ON_REQUEST, WRITERS
 from tuning.gain_file import write_gain_file
@@ -372,13 +373,18 @@ def test_each_export_format_writes_its_own_files():
         "c99": {f"c99/{file}" for file in (*C_FILES, *LOOP_FILES)},
         "fmu": {f"fmi3/{file}" for file in FMU_FILES},
         "fmu2": {f"fmi2/{file}" for file in FMU_FILES},
+        "rehearsal": {f"rehearsal/{file}" for file in RIG_FILES},
     }.items():
         assert {*WRITERS[name](made)} == names
-    assert len(WRITERS) == 6
+    assert len(WRITERS) == 7
 
 
 C_FILES = ("jaxhil_controller.h", "jaxhil_controller.c", "jaxhil_gains.h", "test_vectors.c")
 FMU_FILES = ("jaxhil_controller.fmu", "jaxhil_rig.fmu", "test_vectors.c")
+RIG_FILES = (
+    *("rt_plant_rig.c", "rt_plant_rig.h", "fmu.h", "fmu_log.h", "fmu_model.h", "fmu_model.c"),
+    *("fmu_variables.h", "fmu_variables.c", "rig_constants.h", *SOURCE_FILES),
+)
 LOOP_FILES = (
     *("rt_loop.h", "rt_loop.c", "rt_task.h", "rt_task.c", "rt_model.h", "rt_model.c"),
     *("rt_log.h", "rt_log.c", "rt_plant_udp.c"),

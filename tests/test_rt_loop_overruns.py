@@ -19,7 +19,9 @@ WRAP = "-Wl,--wrap=jaxhil_step"
 def program(tmp_path_factory):
     folder = tmp_path_factory.mktemp("loop")
     document = test_rt_loop.Result.document
-    return rt_loops.compile_loop(c99_cases.COMPILER, document, folder, "-O1", WRAP, plant=rt_loops.SLOW_PLANT)
+    return rt_loops.compile_loop(
+        c99_cases.COMPILER, document, folder, "-O1", WRAP, plant=[rt_loops.SLOW_PLANT]
+    )
 
 
 def run_program(program, *arguments, seconds=0.5, pauses=0, before=()):

@@ -120,7 +120,8 @@ def export(
         folder: folder of the bundle: a new or empty folder, or an earlier bundle, which is replaced.
         sweep: result of `tuning.sweep` for these gains, or the folder with such a result. Limits and alarm
             rates are computed from its runs.
-        formats: additional formats of the gains: "ros2", "matlab", "csv", "c99", "fmu"; None: all but "fmu".
+        formats: additional formats of the gains: "ros2", "matlab", "csv", "c99", "fmu",
+            "rehearsal"; None: all but the last two.
         limits: limits of this rig by name [SI units], which replace the computed limits; a value of None
             removes a limit.
         progress: report the progress on standard error.
@@ -296,7 +297,7 @@ def _check_formats(formats: Any) -> None:
 
 
 def _select_formats(formats: Sequence[str] | None, fmi: int) -> list[str]:
-    """Return the names of the requested formats (by default all but FMUs), in the order of `WRITERS`."""
+    """Return the requested formats in the order of `WRITERS`; by default all but those in `ON_REQUEST`."""
     from tuning.bundle.writers import ON_REQUEST, WRITERS
 
     names = formats or [name for name in WRITERS if name not in ON_REQUEST]

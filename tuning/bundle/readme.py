@@ -34,6 +34,7 @@ FILE_DESCRIPTIONS = {
     "c99": "controller in C99, its gains, its test program, and a real-time loop for Linux",
     "fmi3": "FMUs of FMI 3.0 with sources: the controller and the simulated rig",
     "fmi2": "FMUs of FMI 2.0 with sources: the controller and the simulated rig",
+    "rehearsal": "simulated rig in C for the real-time loop of `c99`: a rehearsal without Python",
     "ros2.yaml": "gains as ROS 2 parameters",
     "gains.mat": "gains for MATLAB",
     "gains.csv": "gains as a table",

@@ -1,4 +1,4 @@
-"""Export of gain documents to the formats of other programs: ROS 2, MATLAB, CSV, C99 and FMUs.
+"""Export of gain documents to the formats of other programs: ROS 2, MATLAB, CSV, C99, FMUs, and a rig in C.
 
 `WRITERS` maps the name of each format (`--format`) to a function. The function takes a checked gain document
 and returns the content of each file by its path. All formats preserve the bits of the numbers. A limit of
@@ -161,6 +161,16 @@ def fmi2_files(document: Mapping[str, Any]) -> dict[str, bytes]:
     return _fmu_files(document, 2)
 
 
+def rehearsal_files(document: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return the simulated rig in C for the real-time loop, in the folder `rehearsal`.
+
+    Raise `InputError` if the rig has a property that its FMU cannot simulate.
+    """
+    from tuning.bundle.rt_rig import rig_plant_files
+
+    return {f"rehearsal/{name}": text.encode("ascii") for name, text in rig_plant_files(document).items()}
+
+
 def _fmu_files(document: Mapping[str, Any], fmi: int) -> dict[str, bytes]:
     from tuning.bundle.c99 import TEST_FILE
     from tuning.bundle.fmu import controller, rig
@@ -200,9 +210,10 @@ WRITERS: dict[str, Callable[[Mapping[str, Any]], dict[str, bytes]]] = {
     "c99": c99_files,
     "fmu": fmi3_files,
     "fmu2": fmi2_files,
+    "rehearsal": rehearsal_files,
 }
-# Folder of each format that is written only on request: FMUs contain a library built by this computer.
-ON_REQUEST = {"fmu": "fmi3/", "fmu2": "fmi2/"}
+# Folder of each format that is written only on request: to generate a rig's C code can take seconds.
+ON_REQUEST = {"fmu": "fmi3/", "fmu2": "fmi2/", "rehearsal": "rehearsal/"}
 
 
 def _format_cell(value: float | str | None) -> str:

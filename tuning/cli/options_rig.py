@@ -37,7 +37,7 @@ class Export(ExportOptions):
         UseAppendAction[tuple[str, ...]],
         text_option(
             "NAME[,NAME]",
-            "Additional format of the gains: ros2, matlab, csv, c99, fmu; repeatable; default: all but fmu.",
+            "Additional format: ros2, matlab, csv, c99, fmu, rehearsal; repeatable; default: the first four.",
             name="format",
         ),
     ] = ()

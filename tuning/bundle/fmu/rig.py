@@ -81,7 +81,7 @@ def rig_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
         UnsupportedRig: If the rig's FMU cannot simulate the rig, see `describe_unsupported`.
         InputError: If a user's contact law has an operation that the generator of C code does not know.
     """
-    mechanism = _without_extra_periods(document)
+    mechanism = without_extra_periods(document)
     unsupported = describe_unsupported(mechanism)
     if unsupported is not None:
         raise UnsupportedRig(f"fmu: {unsupported}; no FMU of the rig can be written")
@@ -91,13 +91,13 @@ def rig_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
         description="Simulated docking rig: numerical model, motion simulator, contact and sensors",
         period=mechanism.rig.control_period,
         variables=rig_variables(mechanism),
-        files=_model_files(document, mechanism),
+        files=model_files(document, mechanism),
         constants={},
         fmi=fmi,
     )
 
 
-def _model_files(document: Mapping[str, Any], mechanism: AnyMechanism) -> dict[str, str]:
+def model_files(document: Mapping[str, Any], mechanism: AnyMechanism) -> dict[str, str]:
     """Return the C files of the rig's model."""
     if isinstance(mechanism, Mechanism):
         return {
@@ -115,7 +115,7 @@ def _model_files(document: Mapping[str, Any], mechanism: AnyMechanism) -> dict[s
     }
 
 
-def _without_extra_periods(document: Mapping[str, Any]) -> AnyMechanism:
+def without_extra_periods(document: Mapping[str, Any]) -> AnyMechanism:
     """Return the mechanism of a gain document, without the command latency that a co-simulation adds."""
     mechanism = any_from_plain_data(copy.deepcopy(document["mechanism"]), "gain document")
     extra = document.get("figures", {}).get("co_simulation", {}).get("extra_periods", 0)

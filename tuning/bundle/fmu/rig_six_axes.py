@@ -94,6 +94,14 @@ def rig_program(document: Mapping[str, Any], mechanism: SixAxisMechanism) -> dic
     return dict(_generate(plain))
 
 
+def nominal_start(mechanism: SixAxisMechanism) -> tuple[list[float], int]:
+    """Return the states of both bodies at tick 0, and the maximum duration of the run [ticks]."""
+    with jax_context():
+        scenario = build_scenarios(mechanism)
+        start = [float(leaf[0]) for leaf in jax.tree.leaves(scenario.start)]
+        return start, round(float(scenario.duration[0]) / mechanism.rig.control_period)
+
+
 @lru_cache(maxsize=8)
 def _generate(plain: str) -> tuple[tuple[str, str], ...]:
     """Return name and text of each C file; `plain` is JSON: mechanism, latency, compensator, gains."""
