@@ -26,14 +26,15 @@ class FirstTouch(NamedTuple):
 
 
 def find_first_touch(
-    contact_model: IdealContactModel, before: States, depths: tuple[Float[Array, "candidates *batch"], ...]
+    contact_model: IdealContactModel, before: States, depths: tuple[Float[Array, "_ *batch"], ...]
 ) -> FirstTouch:
     """Compute the first touch: Newton's method finds the duration of the free flight before the touch.
 
     Args:
         contact_model: Constants of the ideal contact.
         before: States at the start of the integration step in which the first touch begins.
-        depths: Penetration of each pair of shapes at the end of this step [m]; 0 in lanes without any touch.
+        depths: Penetration of each pair of shapes at the end of this step [m], one array for each group; 0 in
+            lanes without any touch.
     """
     zero = jnp.zeros_like(before.target.position.x)
     if not contact_model.groups:
