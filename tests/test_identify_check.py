@@ -8,6 +8,7 @@ import pytest
 
 from jaxhil.errors import InputError
 from tuning.identification.mechanism_check import check_against_mechanism
+from tuning.identification.validation import CheckResult
 
 FEW = (0.003, 0.006, 0.012)
 
@@ -62,6 +63,14 @@ def test_mechanism_check_detects_wrong_command_hold(clean):
         for line in check_against_mechanism(wrong, campaign_rigs.mechanism("clean")).lines
         if line.is_significant
     ]
+
+
+def test_verdict_names_the_model_that_explains_logs_best(clean):
+    result = check_against_mechanism(clean, campaign_rigs.mechanism("clean"))
+    hold = CheckResult("command hold", "", True, 0.02, gain=4.0)
+    low_pass = CheckResult("filter of the force sensor", "", True, 0.002, gain=40.0)
+    assert worst(replace(result, lines=(hold, low_pass))) == low_pass.name
+    assert worst(replace(result, lines=(hold, replace(low_pass, gain=2.0)))) == hold.name
 
 
 @pytest.mark.slow

@@ -105,6 +105,7 @@ def test_identify_verdict_is_good_for_campaign_of_independent_simulator(tmp_path
         ("cut_dead_zone", 6050, "dead zone"),
         ("resampled_force", 6004, "interpolated"),
         ("butterworth_4", 8034, "with a filter of order"),
+        ("butterworth_2", 8033, "with a filter of order"),
     ],
 )
 def test_identify_names_defect_of_sensor_that_residuals_hardly_show(kind, seed, word, tmp_path):

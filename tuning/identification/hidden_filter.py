@@ -99,8 +99,16 @@ def _describe(
     finding = f"chi-squared is {comparison} with a filter of {cutoff}"
     is_present = max(on_restitution, on_error) > MIN_EFFECT
     if is_present:
-        finding += ", which explains the logs as well; state rig.force_sensor.filter as in its data sheet"
-    return CheckResult("filter of the force sensor", finding, is_present, on_restitution, on_error=on_error)
+        quality = "better" if gains[best] > MAX_LIKELIHOOD_DROP else "as well"
+        finding += f", which explains the logs {quality}; state rig.force_sensor.filter as in its data sheet"
+    return CheckResult(
+        "filter of the force sensor",
+        finding,
+        is_present,
+        on_restitution,
+        on_error=on_error,
+        gain=max(gains[best], 0.0),
+    )
 
 
 def _fit_filter(contact: ContactFit, mechanism: Mechanism, order: int) -> _FilterFit:

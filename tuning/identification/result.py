@@ -118,9 +118,16 @@ class Identification:
 
     @property
     def worst(self) -> CheckResult | None:
-        """Return the check whose defect has the largest effect, or None if there is no defect."""
+        """Return the check whose defect has the largest effect, or None if there is no defect.
+
+        If another model explains the logs better (see `CheckResult.gain`), but a second one explains them
+        even better, return the check of the second model.
+        """
         defects = [line for line in self.lines if line.is_significant and line.is_in_verdict]
-        return max(defects, key=lambda line: max(line.effect_in_verdict, line.error_in_verdict), default=None)
+        worst = max(
+            defects, key=lambda line: max(line.effect_in_verdict, line.error_in_verdict), default=None
+        )
+        return max(defects, key=lambda line: line.gain) if worst is not None and worst.gain > 0.0 else worst
 
     @property
     def verdict(self) -> str:

@@ -41,6 +41,7 @@ class CheckResult:
         where: Place of the largest error: the frequency, or the log file and the time of the contact.
         on_error: Effect of the defect on the error e - e* (e*: ideal contact), or None if it equals `effect`.
         is_in_verdict: Whether the verdict includes this check.
+        gain: Decrease of chi-squared with another model than the file's; 0 if the check fits no other model.
     """
 
     name: str
@@ -50,6 +51,7 @@ class CheckResult:
     where: str = ""
     on_error: float | None = None
     is_in_verdict: bool = True
+    gain: float = 0.0
 
     @property
     def effect_in_verdict(self) -> float:
@@ -119,6 +121,7 @@ def _check_command_hold(motion: FreeMotion, frequency: float) -> CheckResult:
         f"{'less' if motion.other_hold_gain > 0 else 'more'} with {other_hold}",
         motion.other_hold_gain > MIN_HOLD_CRITERION_GAIN,
         float(np.pi**2 * frequency * half),
+        gain=max(motion.other_hold_gain, 0.0),
     )
 
 
