@@ -13,9 +13,10 @@ compensator has four steps:
 
 f_p and v_p are force and speed of the predicted trajectory in the middle of the next period, v_d is the
 model's velocity, c the velocity gain, and p the present estimate of the contact's peak force. Forces are
-scaled by equivalent mass and approach speed, so that one set of gains serves every mechanism. In free flight,
-before the onset is detected (`onset_detection`), F_c = 0. If a run begins in contact, the approach speed is
-unknown, and F_c is the measured force.
+scaled by equivalent mass and approach velocity, so that one set of gains serves every mechanism. The approach
+velocity is negative for the surface at -clearance; scaled depth and force are positive at both surfaces. In
+free flight, before the onset is detected (`onset_detection`), F_c = 0. If a run begins in contact, the
+approach velocity is unknown, and F_c is the measured force.
 
 If the force delay is uncertain (`delay_spread` > 0), the compensator estimates the delay when the hardware
 leaves the surface. The estimate corrects the speed at which this contact ends. In the following contacts the
@@ -81,9 +82,9 @@ class ImpulseLedger(Compensator):
     """Compensator that follows a predicted reference trajectory; see the module's docstring."""
 
     __slots__ = (
-        "_alignment", "_clearance", "_correction_limit", "_deepest", "_delay", "_delay_spread", "_detector",
-        "_estimate", "_floor", "_gain", "_identification_delay", "_lag", "_mass", "_model", "_origin",
-        "_outside", "_peak", "_period", "_preload", "_reference", "_side", "_since_start", "_spreads",
+        "_age", "_alignment", "_clearance", "_correction_limit", "_deepest", "_delay", "_delay_spread",
+        "_detector", "_estimate", "_floor", "_gain", "_identification_delay", "_lag", "_mass", "_model",
+        "_origin", "_outside", "_peak", "_period", "_preload", "_reference", "_side", "_spreads",
         "_stiffness", "_variance", "_velocity", "status",
     )  # fmt: skip
     _estimate: tuple[float, float]  # mean and variance of the delay after this contact
@@ -117,10 +118,9 @@ class ImpulseLedger(Compensator):
 
     def next_contact(self) -> None:
         """Restart everything except the estimated delay."""
-        self._since_start = 0.0  # number of ticks since the run began
+        self._age = -1.0  # number of ticks since the first tick of the run
         self._side = 0.0  # 1 or -1 if the run began in contact (with the surface at 0 or -clearance), else 0
         self._velocity = 0.0  # approach velocity [m/s]; 0 if unknown
-        self._outside = 0.0  # number of ticks since the hardware left the surface
         self._detector.restart()
         self.status = OUT_OF_CONTACT
 
@@ -131,11 +131,10 @@ class ImpulseLedger(Compensator):
 
     def step(self, force_measured, position_desired, velocity_desired, position_measured) -> float:
         """Return the force command F_c [N]."""
-        detector, begins = self._detector, self._since_start == 0.0
+        self._age += 1.0
+        detector, begins = self._detector, self._age == 0.0
         position, velocity = self._alignment.step(position_measured, velocity_desired, begins)
         position -= self._delay * velocity
-        settled = not self._since_start * self._period < SETTLING
-        self._since_start += 1.0
         reach = deflection(position_desired, self._clearance)
         if begins and reach != 0.0:
             self._side = 1.0 if reach > 0.0 else -1.0
@@ -148,7 +147,7 @@ class ImpulseLedger(Compensator):
             return force_measured if inside else 0.0
         if not detector.total > LEVEL:
             self.status = OUT_OF_CONTACT
-            self._approach(force_measured, position_desired, velocity_desired, position, settled)
+            self._approach(force_measured, position_desired, velocity_desired, position)
             if not detector.total > 0.0:
                 detector.learn(force_measured)
                 return 0.0
@@ -165,15 +164,13 @@ class ImpulseLedger(Compensator):
             return 0.0
         return command
 
-    def _approach(
-        self, force: float, position_desired: float, velocity: float, position: float, settled: bool
-    ) -> None:
+    def _approach(self, force: float, position_desired: float, velocity: float, position: float) -> None:
         """Test a force reading for contact; if it shows free flight, prepare for contact on the next tick."""
         side = 1.0 if velocity > 0.0 or self._clearance == inf else -1.0  # direction of the approach
         weight = self._mass * (side * velocity)
         approaches = weight > MIN_MOMENTUM
         # The bias is known only after a reading of free flight during an approach in this direction.
-        settled = settled and approaches and self._velocity * velocity > 0.0
+        settled = not self._age * self._period < SETTLING and approaches and self._velocity * velocity > 0.0
         self._detector.update(force, side, self._floor * weight, settled)
         if self._detector.total > 0.0:
             return
@@ -184,7 +181,7 @@ class ImpulseLedger(Compensator):
         self._lag = min(max((position_desired - position) / velocity, 0.0), MAX_LAG)
         self._deepest = 0.0
         self._peak = MIN_PEAK
-        self._outside = 0.0
+        self._outside = 0.0  # number of ticks since the hardware left the surface
         self._estimate = 0.0, self._variance
         self._model.restart(self._stiffness, self._spreads, self._variance)
         self._reference.begin((position - self._origin) / velocity, self._model.theta)

@@ -10,6 +10,7 @@ from jaxhil.contact.laws import deflection
 from jaxhil.lanes import safe_sqrt, select_lanes, update_lanes
 from jaxhil.laws.impulse_ledger import rig, specified
 from jaxhil.laws.impulse_ledger.alignment import simulation as alignment
+from jaxhil.laws.impulse_ledger.alignment.simulation import align
 from jaxhil.laws.impulse_ledger.contact_model import simulation as contact_model
 from jaxhil.laws.impulse_ledger.contact_model.simulation import dot, features, slope
 from jaxhil.laws.impulse_ledger.onset_detection import simulation as onset_detection
@@ -26,11 +27,8 @@ def _from_file(name: str, nominal, factor: float, margin: float, lowest: float =
 
     The bounds are `lowest` times the nominal value, and `factor` times the nominal value plus `margin`.
     """
-
-    def upper(m):
-        return factor * nominal(m) + margin
-
-    return rig_gain(name, lambda m: lowest * nominal(m), upper, nominal, tuned=lambda m: False)
+    bounds = (lambda m: lowest * nominal(m)), (lambda m: factor * nominal(m) + margin)
+    return rig_gain(name, *bounds, nominal, tuned=lambda m: False)
 
 
 def _constant(name: str, lower: float, upper: float, nominal: float, **others) -> Gain:
@@ -57,8 +55,8 @@ GAINS: tuple[Gain, ...] = (
         lambda m: max(USUAL_UNLOADING, specified.unloading(m)), logarithmic=True,
         tuned=lambda m: specified.unloading(m) > 0,
     ),
-    _from_file("prior_friction_spread", specified.friction, 1.0, 50.0),
-    _from_file("prior_preload_spread", specified.preload, 1.0, 50.0),
+    _from_file("prior_friction_spread", lambda m: specified.scaled_force(m, "contact.friction"), 1.0, 50.0),
+    _from_file("prior_preload_spread", lambda m: specified.scaled_force(m, "contact.preload"), 1.0, 50.0),
     rig_gain(
         "velocity_gain", lambda m: 1.0, lambda m: 1 / m.rig.control_period,
         lambda m: min(VELOCITY_GAIN, 0.7 / m.rig.control_period), logarithmic=True,
@@ -77,8 +75,7 @@ class LedgerContact(NamedTuple):
     outside: Float[Array, "*batch"]  # number of ticks since the hardware left the surface
     estimate: contact_model.ContactModelEstimate
     reference: reference_trajectory.ReferenceTrajectory
-    delay: Float[Array, "*batch"]  # mean of the delay that this contact estimates [s]
-    variance: Float[Array, "*batch"]  # variance of this delay [s^2]
+    delay: contact_model.DelayEstimate  # estimate from this contact, relative to that of earlier contacts
 
 
 class LedgerState(NamedTuple):
@@ -88,8 +85,7 @@ class LedgerState(NamedTuple):
     side: Float[Array, "*batch"]  # 1 or -1 if the run began in contact (with the surface at 0 or -clearance)
     flight: onset_detection.FreeFlight
     contact: LedgerContact
-    delay: Float[Array, "*batch"]  # estimated minus specified force delay [s]
-    variance: Float[Array, "*batch"]  # variance of the force delay [s^2]
+    delay: contact_model.DelayEstimate  # estimate from earlier contacts, relative to the specified delay
 
 
 class ImpulseLedger(Compensator):
@@ -114,28 +110,26 @@ class ImpulseLedger(Compensator):
 
     def init(self, gains, constants, ring):
         zeros, (full, _) = jnp.zeros_like(constants.control_period), self.prepare(gains, constants)
-        variance = full["delay_spread"] ** 2
+        delay = contact_model.DelayEstimate(zeros, full["delay_spread"] ** 2)
         return LedgerState(
             alignment=alignment.begin(ring, zeros),
             side=zeros,
             flight=onset_detection.FreeFlight(*[zeros] * len(onset_detection.FreeFlight._fields)),
-            contact=_begin_contact(full, zeros, zeros, zeros, variance),
-            delay=zeros,
-            variance=variance,
+            contact=_begin_contact(full, zeros, zeros, zeros, delay),
+            delay=delay,
         )
 
     def restart(self, gains, state, begins, fresh):
         return state._replace(flight=clear_lanes(state.flight, begins))
 
     def force_delay(self, gains, state):
-        return gains["identification_delay"] + state.delay
+        return gains["identification_delay"] + state.delay.mean
 
     def step(self, prepared, state, signals, tick):
         gains, (period, clearance) = prepared
-        position, velocity, aligned = alignment.align(
-            state.alignment, gains["identification_delay"], period, signals, tick
-        )
-        position = position - state.delay * velocity
+        force_delay = gains["identification_delay"]
+        position, velocity, aligned = align(state.alignment, force_delay, period, signals, tick)
+        position = position - state.delay.mean * velocity
         reach = deflection(signals.position_desired, clearance)
         side = jnp.where(signals.age == 0, jnp.sign(reach), state.side)
         inside = side * reach > 0
@@ -144,13 +138,12 @@ class ImpulseLedger(Compensator):
         state = self._approach(prepared, state, signals, position, flies)
         # All lanes of a tile have contact at about the same time: on most ticks, no lane needs `_follow`.
         follow = partial(self._follow, prepared, state, signals, position, velocity)
-        command, contact = update_lanes(
-            state.flight.total > 0, follow, (jnp.zeros_like(position), state.contact)
-        )
+        command = jnp.zeros_like(position)
+        command, contact = update_lanes(state.flight.total > 0, follow, (command, state.contact))
         acts = state.flight.total > rig.LEVEL
         over = acts & contact.reference.released & (contact.outside * period > rig.RELEASE_TIME)
         limit = rig.MAX_SPREADS * gains["delay_spread"]
-        shifted = jnp.clip(state.delay + contact.delay, -limit, limit)
+        mean = jnp.clip(state.delay.mean + contact.delay.mean, -limit, limit)
         command = jnp.where(acts & ~over, command, jnp.where(inside, signals.force_measured, 0))
         return command, LedgerState(
             alignment=aligned,
@@ -160,8 +153,7 @@ class ImpulseLedger(Compensator):
                 velocity=jnp.where(over, 0, state.flight.velocity),
             ),
             contact=contact,
-            delay=jnp.where(over, shifted, state.delay),
-            variance=jnp.where(over, contact.variance, state.variance),
+            delay=select_lanes(over, contact.delay._replace(mean=mean), state.delay),
         )
 
     def _approach(self, prepared, state, signals, position, flies):
@@ -182,7 +174,7 @@ class ImpulseLedger(Compensator):
         divisor = jnp.where(approaches, velocity, 1)
         origin = position - rig.ONSET_PLACE * (period * velocity)
         lag = jnp.clip((signals.position_desired - position) / divisor, 0, rig.MAX_LAG)
-        begin = partial(_begin_contact, gains, origin, lag, (position - origin) / divisor, state.variance)
+        begin = partial(_begin_contact, gains, origin, lag, (position - origin) / divisor, state.delay)
         learned = onset_detection.learn(flight, force, jnp.where(approaches, velocity, 0))
         return state._replace(
             flight=select_lanes(free, learned, flight),
@@ -193,7 +185,7 @@ class ImpulseLedger(Compensator):
         """Process one reading during a contact; return the force command [N] and the contact."""
         gains, (period, _) = prepared
         flight, contact, estimate = state.flight, state.contact, state.contact.estimate
-        prior_mean, prior_variances = _prior(gains, state.variance)
+        prior_mean, prior_variances = _prior(gains, state.delay)
         approach_velocity = jnp.where(flight.velocity != 0, flight.velocity, 1)
         weight = gains["equivalent_mass"] * approach_velocity
         depth = (position - contact.origin) / approach_velocity
@@ -211,15 +203,11 @@ class ImpulseLedger(Compensator):
         onset = onset + gains["force_noise_floor"] + safe_sqrt(noise)
         spread = jnp.sqrt(gains["prior_preload_spread"] ** 2 + (rig.ONSET_SPREAD * onset) ** 2)
         is_outside = ~(depth > 0)
-        estimate_delay = partial(
-            contact_model.estimate_delay,
-            *(estimate, prior_mean, prior_variances, rig.ONSET_MEAN * onset, spread),
-        )
-        mean, variance = update_lanes(
-            is_outside & (state.variance > 0), estimate_delay, (contact.delay, contact.variance)
-        )
+        prior = prior_mean, prior_variances, rig.ONSET_MEAN * onset, spread
+        estimate_delay = partial(contact_model.estimate_delay, estimate, *prior)
+        delay = update_lanes(is_outside & (state.delay.variance > 0), estimate_delay, contact.delay)
         ended = is_outside & (rate < 0)
-        theta = contact_model.conclude(estimate, prior_variances, jnp.where(ended, mean, 0))
+        theta = contact_model.conclude(estimate, prior_variances, jnp.where(ended, delay.mean, 0))
         theta = jnp.where((learns | ended)[None], theta, estimate.theta)
         reference = reference_trajectory.correct(contact.reference, theta - estimate.theta)
         reference = reference_trajectory.advance(reference, theta, period, reading, phi)
@@ -239,24 +227,23 @@ class ImpulseLedger(Compensator):
             outside=jnp.where(is_outside, contact.outside + 1, 0),
             estimate=estimate._replace(theta=theta),
             reference=reference,
-            delay=mean,
-            variance=variance,
+            delay=delay,
         )
 
 
-def _prior(gains, variance):
-    """Return prior means and variances of the contact model; `variance` is the delay's variance [s^2]."""
+def _prior(gains, delay):
+    """Return prior means and variances of the contact model, for the delay's estimate before the contact."""
     spreads = [gains[name] for name in rig.SPREADS]
     spreads[-1] = jnp.sqrt(spreads[-1] ** 2 + rig.USUAL_PRELOAD**2)
-    return contact_model.prior(gains["prior_stiffness"], spreads, variance)
+    return contact_model.prior(gains["prior_stiffness"], spreads, delay.variance)
 
 
-def _begin_contact(gains, origin, lag, depth, variance) -> LedgerContact:
+def _begin_contact(gains, origin, lag, depth, delay) -> LedgerContact:
     """Return a contact before its first reading, at the scaled `depth` [s]."""
-    zeros, prior = jnp.zeros_like(depth), _prior(gains, variance)
+    zeros, prior = jnp.zeros_like(depth), _prior(gains, delay)
     reference = reference_trajectory.begin(depth, prior[0])
     peak, estimate = zeros + rig.MIN_PEAK, contact_model.begin(*prior)
-    return LedgerContact(origin, lag, zeros, peak, zeros, estimate, reference, zeros, variance)
+    return LedgerContact(origin, lag, zeros, peak, zeros, estimate, reference, delay._replace(mean=zeros))
 
 
 COMPENSATOR = ImpulseLedger()

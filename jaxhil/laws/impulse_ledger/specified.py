@@ -18,14 +18,10 @@ def delay_spread(mechanism: Mechanism) -> float:
     return min(spread / math.sqrt(3) if is_range else spread, MAX_DELAY_SPREAD)
 
 
-def friction(mechanism: Mechanism) -> float:
-    """Return the largest dry friction that the file permits, divided by mass and approach speed [1/s]."""
-    return _scaled(mechanism, "contact.friction")
-
-
-def preload(mechanism: Mechanism) -> float:
-    """Return the largest preload that the file permits, divided by mass and approach speed [1/s]."""
-    return _scaled(mechanism, "contact.preload")
+def scaled_force(mechanism: Mechanism, path: str) -> float:
+    """Return the largest force that the file permits for a key, divided by mass and approach speed [1/s]."""
+    size = abs(value_at(mechanism, path)) + _spread(mechanism, path)
+    return size / (mechanism.bodies.mass * mechanism.approach.velocity)
 
 
 def unloading(mechanism: Mechanism) -> float:
@@ -38,11 +34,6 @@ def unloading(mechanism: Mechanism) -> float:
         return 0.0
     excess = ratio + _spread(mechanism, "contact.unloading_ratio") - 1
     return excess * typical_stiffness(mechanism) / mechanism.bodies.mass
-
-
-def _scaled(mechanism: Mechanism, path: str) -> float:
-    size = abs(value_at(mechanism, path)) + _spread(mechanism, path)
-    return size / (mechanism.bodies.mass * mechanism.approach.velocity)
 
 
 def _spread(mechanism: Mechanism, path: str) -> float:

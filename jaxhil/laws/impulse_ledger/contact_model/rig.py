@@ -127,9 +127,7 @@ class ContactModel:
         variances = [*scaled, delay_variance]
         prior = [stiffness, *[0.0] * (PARAMETERS - 1)]
         self._variances = variances
-        self._prior_mean = prior
-        self.mean = prior
-        self.theta = prior
+        self._prior_mean = self.mean = self.theta = prior
         self.covariance = [[0.0] * PARAMETERS for _ in range(PARAMETERS)]
         for j, variance in enumerate(variances):
             self.covariance[j][j] = variance

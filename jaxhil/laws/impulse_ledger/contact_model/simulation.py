@@ -4,7 +4,6 @@
 """
 
 import math
-from collections.abc import Sequence
 from functools import reduce
 from operator import add
 from typing import NamedTuple
@@ -27,7 +26,14 @@ class ContactModelEstimate(NamedTuple):
     count: Float[Array, "*batch"]  # number of readings in the estimate
 
 
-def prior(stiffness: Array, spreads: Sequence[Array], delay_variance: Array) -> tuple[Array, Array]:
+class DelayEstimate(NamedTuple):
+    """Estimate of the true minus an assumed force delay."""
+
+    mean: Float[Array, "*batch"]  # s
+    variance: Float[Array, "*batch"]  # s^2
+
+
+def prior(stiffness: Array, spreads: list[Array], delay_variance: Array) -> tuple[Array, Array]:
     """Return prior means and variances of the parameters; arguments as in `rig.ContactModel.restart`."""
     variances = [spreads[k] ** 2 * factor for k, factor in zip(rig.SPREAD_INDICES, rig.FACTORS, strict=True)]
     mean = jnp.stack([stiffness, *[jnp.zeros_like(stiffness)] * (PARAMETERS - 1)])
@@ -49,16 +55,10 @@ def features(depth: Array, speed: Array, deepest: Array, delay_effect: Array) ->
     return jnp.where((depth > 0)[None], jnp.stack([*hinges, *losses, jnp.ones_like(depth), delay_effect]), 0)
 
 
-def force(theta: Array, depth: Array, speed: Array, deepest: Array) -> Float[Array, "*batch"]:
-    """Return the contact model's force, divided by mass and approach speed [1/s], without the delay."""
-    return dot(theta, features(depth, speed, deepest, jnp.zeros_like(depth)))
-
-
 def slope(theta: Array, depth: Array) -> Float[Array, "*batch"]:
     """Return the contact model's stiffness per unit mass [1/s^2], at least 0."""
-    total = reduce(
-        add, (jnp.where(depth > knot, hinge, 0) for hinge, knot in zip(theta, rig.KNOTS, strict=False))
-    )
+    slopes = [jnp.where(depth > knot, hinge, 0) for hinge, knot in zip(theta, rig.KNOTS, strict=False)]
+    total = reduce(add, slopes)
     return jnp.where(total > 0, total, 0)
 
 
@@ -101,12 +101,10 @@ def conclude(
 
 def estimate_delay(
     estimate: ContactModelEstimate, prior_mean: Array, variances: Array, preload: Array, preload_spread: Array
-) -> tuple[Array, Array]:
-    """Estimate the delay d after a contact; return its mean [s] and variance [s^2]."""
-    mean = jnp.stack([estimate.mean[j] for j in rig.DELAY_PARAMETERS])
-    rows = [
-        jnp.stack([estimate.covariance[i, j] for j in rig.DELAY_PARAMETERS]) for i in rig.DELAY_PARAMETERS
-    ]
+) -> DelayEstimate:
+    """Estimate the delay d after a contact."""
+    used = np.array(rig.DELAY_PARAMETERS)
+    mean, rows = estimate.mean[used], list(estimate.covariance[used][:, used])
     last = len(DISSIPATIVE)  # index of the delay
     for index, j, value, spread in (
         (last + 1, 0, *rig.WIDE_STIFFNESS),
@@ -133,7 +131,7 @@ def estimate_delay(
     variance, before = jnp.where(usable, variance, 1), jnp.where(usable, variances[DELAY], 1)
     weakened = 1 / (1 / before + (1 / variance - 1 / before) / excess**2)
     delay = jnp.where(usable, weakened * delay / variance / excess**2, 0)
-    return delay, jnp.where(usable, weakened, variances[DELAY])
+    return DelayEstimate(delay, jnp.where(usable, weakened, variances[DELAY]))
 
 
 def _dissipate(

@@ -54,11 +54,9 @@ class OnsetDetector:
             floor: force that is added to the standard deviation of the noise [N].
             settled: whether a contact may be detected; otherwise the sum is set to 0.
         """
-        if not settled:
-            self.total = 0.0
-            return
-        total = self.total + side * (force - self.bias) / (sqrt(self.variance) + floor) - DRIFT
-        self.total = total if total > 0.0 else 0.0
+        push = side * (force - self.bias)
+        total = self.total + push / (sqrt(self.variance) + floor) - DRIFT if settled else 0.0
+        self.total = max(0.0, total)
 
     def learn(self, force: float) -> None:
         """Update the estimates of bias and noise with one force reading [N] of free flight."""

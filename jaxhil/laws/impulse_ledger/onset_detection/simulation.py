@@ -31,7 +31,7 @@ def update(flight: FreeFlight, deviation: Array, settled: Bool[Array, "*batch"])
 
 
 def learn(old: FreeFlight, force: Array, velocity: Array) -> FreeFlight:
-    """Update the estimates of bias and noise with one force reading [N] of free flight."""
+    """Update the estimates with one force reading [N] of free flight, at the approach velocity [m/s]."""
     step = force - old.before
     change = (0.5 * (step * step) - old.square) / jnp.maximum(old.count, 1)
     square = old.square + jnp.where(old.count > 0, change, 0)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxhil.laws.impulse_ledger.contact_model.simulation import damping, dot, features, force, slope
+from jaxhil.laws.impulse_ledger.contact_model.simulation import damping, dot, features, slope
 from jaxhil.laws.impulse_ledger.reference_trajectory.rig import MAX_SCALED_DEPTH, MAX_SCALED_SPEED, STEPS
 
 
@@ -71,7 +71,7 @@ def bridge(now: ReferenceTrajectory, theta: Array, duration: Array) -> tuple[Arr
         depth = depth + (step * speed - 0.5 * (step * step) * push)
         ahead = speed - step * push
         deepest = jnp.where(depth > deepest, depth, deepest)
-        later = force(theta, depth, ahead, deepest)
+        later = dot(theta, features(depth, ahead, deepest, jnp.zeros_like(depth)))
         released = released | ((ahead < 0) & ((depth <= 0) | (later <= 0)))
         later = jnp.where(released | (later < 0), 0, later)
         return depth, speed - 0.5 * step * (push + later), later, deepest, released
