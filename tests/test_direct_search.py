@@ -1,13 +1,14 @@
 """Search for gains without derivatives: objective, bound of the error, starts, no compiled solver."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from lead_cases import lead_tasks
 
 from jaxhil.laws.compensators import COMPENSATORS
-from tuning.gains import multistart, multistart_solver
+from tuning.gains import multistart, multistart_solver, pareto_search
 from tuning.gains.direct_search import CANDIDATES_PER_GENERATION, estimate_direct_runs
 from tuning.gains.multistart import estimate_search_runs, find_gains
 from tuning.gains.objective import BOUND_PENALTY, Objective, evaluate_objective
@@ -27,7 +28,8 @@ def validation():
 def direct(monkeypatch):
     """Tune phase lead without derivatives, and fail if the solver is used."""
     monkeypatch.setattr(type(COMPENSATORS["phase_lead"]), "tuned_without_derivatives", True)
-    for module, name in ((multistart, "solve_tasks"), (multistart_solver, "lower_solver")):
+    solvers = (multistart, "solve_tasks"), (multistart_solver, "lower_solver"), (pareto_search, "solve_tasks")
+    for module, name in solvers:
         monkeypatch.setattr(module, name, lambda *_: pytest.fail("the solver was called"))
 
 
@@ -75,6 +77,25 @@ def test_bounded_direct_search_keeps_error_of_initial_gains(validation, direct):
         ]
         assert errors[1] <= 1.001 * largest < errors[0]
         assert bounded[index].objective.error_bound == pytest.approx(largest, rel=1e-12)
+
+
+def test_pareto_search_without_derivatives_improves_every_weight_without_solver(
+    validation, direct, monkeypatch
+):
+    monkeypatch.setattr(pareto_search, "MAX_NEIGHBOUR_SEARCHES", 1)
+    brief = replace(settings(Objective()), steps=2)
+    searched = find_gains(validation, brief)
+    tuned = [SimpleNamespace(starts=result.starts, gains=result.best.gains) for result in searched]
+    ladders = pareto_search.solve_weight_ladders(validation, tuned, 3, brief)
+    for index, ladder in enumerate(ladders):
+        assert ladder[0][0] == 0.0
+        for weight, gains in ladder[1:]:
+            points = validation.coordinates(index, [tuned[index].gains, gains])
+            before, after = (value(validation, index, x, Objective(noise_weight=weight)) for x in points)
+            assert after <= before
+        assert after < before  # at the largest weight
+    runs = pareto_search.estimate_ladder_runs(validation.tasks, 3, brief)
+    assert runs == 2 * 3 * estimate_direct_runs(validation.tasks, brief.steps)
 
 
 def test_objective_above_its_error_bound_has_a_penalty():

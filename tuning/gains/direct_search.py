@@ -63,7 +63,7 @@ def _search_task(
     starts, objective = validation.coordinates(task, gains), settings.objective
     if settings.bounded:
         objective = _bound_error(validation, task, objective, starts[:1])
-    searched = [_search_from(validation, task, start, objective, settings) for start in starts]
+    searched = [search_from(validation, task, start, objective, settings) for start in starts]
     return DirectSearchResult(searched, objective, sum(r.steps for r in searched) * CANDIDATES_PER_GENERATION)
 
 
@@ -77,13 +77,14 @@ def _bound_error(
     return replace(objective, error_bound=float(validation.losses(metric, [task], literature[None])[0, 0]))
 
 
-def _search_from(
+def search_from(
     validation: Validation,
     task: int,
     start: Float[np.ndarray, "gains"],
     objective: Objective,
     settings: TuneSettings,
 ) -> StartResult:
+    """Search for the best gains of a task from one start; `settings.steps` is the number of generations."""
     history: list[float] = []
 
     def losses(points: Float[np.ndarray, "candidates gains"]) -> Float[np.ndarray, "candidates"]:

@@ -2,7 +2,8 @@
 
 The weights of a front are in ascending order and are called a ladder. One compiled program solves all weights
 of all mechanisms on the training scenarios. In each further pass, the gains of each weight are also starts
-for the next smaller and the next larger weight. The search ends when no point improves.
+for the next smaller and the next larger weight. The search ends when no point improves. For a compensator
+that is tuned without derivatives, a derivative-free search begins at the best gains of each weight instead.
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ import numpy as np
 
 from jaxhil.laws.compensators import COMPENSATORS
 from tuning.gains.contact_terms import FAILED_CONTACT_ERROR
+from tuning.gains.direct_search import estimate_direct_runs, is_search_direct, search_from
 from tuning.gains.multistart import choose_starts
 from tuning.gains.multistart_solver import StartResult, count_step_runs, solve_tasks
 from tuning.gains.noise import compute_noise_amplification, has_noise_trade_off
@@ -125,7 +127,7 @@ def solve_weight_ladders(
         ]
         starts = (
             _choose_neighbour_starts(validation, before)
-            if turn > 0
+            if turn > 0 or is_search_direct(validation.tasks[0])
             else _choose_first_starts(validation, tuned, objectives, settings)
         )
         results = _solve_points(validation, starts, objectives, settings, axis)
@@ -144,6 +146,8 @@ def solve_weight_ladders(
 
 def estimate_ladder_runs(tasks: list[TuneTask], number: int, settings: TuneSettings) -> int:
     """Estimate the number of simulated runs of `solve_weight_ladders` with the maximum number of passes."""
+    if is_search_direct(tasks[0]):
+        return (1 + MAX_NEIGHBOUR_SEARCHES) * number * estimate_direct_runs(tasks, settings.steps)
     starts = max(settings.starts, 2) + MAX_NEIGHBOUR_SEARCHES * 2
     return len(tasks) * number * starts * settings.steps * count_step_runs(tasks, list_tuned_gains(tasks))
 
@@ -182,9 +186,13 @@ def _choose_first_starts(
 def _choose_neighbour_starts(
     validation: Validation, picked: list[list[_LadderCandidate]]
 ) -> list[list[np.ndarray]]:
-    """Choose starts for each weight of each task: the best gains for this weight and for adjacent weights."""
+    """Choose starting gains for each weight of each task: the best gains of this and adjacent weights.
+
+    A search without derivatives needs only the gains that are best for this weight.
+    """
+    number = 1 if is_search_direct(validation.tasks[0]) else None
     return [
-        [validation.coordinates(task, gains) for gains in _collect_neighbour_gains(points)]
+        [validation.coordinates(task, gains[:number]) for gains in _collect_neighbour_gains(points)]
         for task, points in enumerate(picked)
     ]
 
@@ -192,11 +200,16 @@ def _choose_neighbour_starts(
 def _solve_points(
     validation: Validation, starts, objectives, settings, axis: ParetoCriterion
 ) -> list[list[_LadderCandidate]]:
-    """Run the solver for all weights of all tasks; return the resulting gains of each task as candidates."""
-    number = len(objectives[0])
+    """Search for the best gains for all weights of all tasks; return each task's results as candidates."""
+    number, points, flat = len(objectives[0]), list(chain(*starts)), list(chain(*objectives))
     tasks = [task for task in validation.tasks for _ in range(number)]
-    flat = list(chain(*objectives))
-    solved = solve_tasks(tasks, list(chain(*starts)), settings.steps, flat, validation.work)
+    if is_search_direct(tasks[0]):
+        solved = [
+            [search_from(validation, index // number, start, objective, settings) for start in of_point]
+            for index, (of_point, objective) in enumerate(zip(points, flat, strict=True))
+        ]
+    else:
+        solved = solve_tasks(tasks, points, settings.steps, flat, validation.work)
     candidates = [
         _collect_candidates(
             validation,
