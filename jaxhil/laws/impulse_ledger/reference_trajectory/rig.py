@@ -16,8 +16,19 @@ Source: sensitivity equations, Khalil, "Nonlinear Systems" (2002), section 3.3.
 
 from math import sqrt
 
-from jaxhil.laws.impulse_ledger.contact_model import rig as contact_model
-from jaxhil.laws.impulse_ledger.contact_model.rig import Matrix, Vector, damping, dot, features, force, slope
+from jaxhil.laws.impulse_ledger.contact_model.rig import (
+    DAMPING,
+    DELAY,
+    PARAMETERS,
+    PRELOAD,
+    Matrix,
+    Vector,
+    damping,
+    dot,
+    features,
+    force,
+    slope,
+)
 
 STEPS = 12  # number of integration steps from the last reading to the present
 MAX_SCALED_SPEED = 2.0  # limit on speed / approach speed, a ratio that exceeds 1 only with added energy [1]
@@ -38,7 +49,7 @@ class ReferenceTrajectory:
     __slots__ = ("_depths", "_losses", "_speeds", "_theta", "deepest", "depth", "force", "released", "speed")
 
     def __init__(self) -> None:
-        self.begin(0.0, [0.0] * contact_model.PARAMETERS)
+        self.begin(0.0, [0.0] * PARAMETERS)
 
     def begin(self, depth: float, theta: Vector) -> None:
         """Start the trajectory with the approach speed, at `depth`: the depth / approach speed [s]."""
@@ -48,9 +59,9 @@ class ReferenceTrajectory:
         self.deepest = depth
         self.released = False
         self._theta = theta
-        self._depths = [0.0] * contact_model.PARAMETERS  # s
-        self._speeds = [0.0] * contact_model.PARAMETERS  # s'
-        self._losses = [0.0] * contact_model.PARAMETERS  # work per unit of each dissipative parameter
+        self._depths = [0.0] * PARAMETERS  # s
+        self._speeds = [0.0] * PARAMETERS  # s'
+        self._losses = [0.0] * PARAMETERS  # work per unit of each dissipative parameter
 
     def correct(self, theta: Vector) -> None:
         """Correct the trajectory to first order for the contact model's new parameters `theta`."""
@@ -81,12 +92,12 @@ class ReferenceTrajectory:
             stiffness = min(slope(theta, depth), 1.0 / (period * period))
             resistance = min(damping(theta, depth), 1.0 / period)
             depths, speeds = self._depths, self._speeds
-            for j in range(contact_model.PARAMETERS):
+            for j in range(PARAMETERS):
                 ahead = depths[j] + period * speeds[j]
                 rate = undelayed[j] - measured[j] + stiffness * ahead + resistance * speeds[j]
                 speeds[j] -= period * rate
                 depths[j] += period * speeds[j]
-            for j in range(contact_model.DAMPING, contact_model.PRELOAD):
+            for j in range(DAMPING, PRELOAD):
                 self._losses[j] += period * speed * undelayed[j]
         self.speed = within(self.speed - 0.5 * period * (self.force + push), MAX_SCALED_SPEED)
         self.depth = depth
@@ -100,9 +111,9 @@ class ReferenceTrajectory:
             delay_variance: variance of the delay [s^2], which replaces the variance in P.
         """
         columns = [dot(row, self._speeds) for row in covariance]
-        total, variance = dot(self._speeds, columns), covariance[contact_model.DELAY][contact_model.DELAY]
+        total, variance = dot(self._speeds, columns), covariance[DELAY][DELAY]
         if variance > 0.0:
-            by_delay = columns[contact_model.DELAY] / variance
+            by_delay = columns[DELAY] / variance
             total += by_delay * by_delay * (delay_variance - variance)
         return sqrt(total) if total > 0.0 else 0.0
 
