@@ -87,6 +87,14 @@ def loads(case, bodies, force, moment):
 
 def ideal_motion(case, time):
     """Return the bodies' states after a time, with the undelayed ideal contact."""
+    return integrated(case, time, wrench)[1]
+
+
+def integrated(case, time, wrench, event=None, max_step=5e-4):
+    """Integrate the ideal contact under `wrench(case, ...)`; return the time of integration and the states.
+
+    The integration ends when `event(p, rotation, v, w)` becomes positive.
+    """
     inertias = [np.asarray(j) for j in case["inertias"]]
 
     def unpacked(y):
@@ -104,9 +112,16 @@ def ideal_motion(case, time):
             rates += [v, f / mass, (a @ skew(w)).ravel(), spun]
         return np.concatenate(rates)
 
+    def crossing(_, y):
+        return event(*relative(case, unpacked(y))[:4])
+
+    crossing.terminal, crossing.direction = True, 1.0
     begin = np.concatenate([np.ravel(part) for body in case["start"] for part in body])
-    solution = solve_ivp(slope, (0, time), begin, method="DOP853", rtol=1e-12, atol=1e-14, max_step=5e-4)
-    return unpacked(solution.y[:, -1])
+    solution = solve_ivp(
+        slope, (0, time), begin, method="DOP853", rtol=1e-12, atol=1e-14, max_step=max_step,
+        events=None if event is None else crossing,
+    )  # fmt: skip
+    return solution.t[-1], unpacked(solution.y[:, -1])
 
 
 def moved(case, bodies, force, moment):
@@ -141,7 +156,7 @@ class Axis:
         self.flow = np.zeros((4, 4))
         self.flow[0, 1] = self.flow[2, 3] = 1
         self.flow[1] = [-(w**2), -2 * ratio * w, w**2, 0]
-        self.period, self.late = period, 2 * ratio / w * rate
+        self.period, self.late, self.transitions = period, 2 * ratio / w * rate, {}
         self.is_held, self.history = hold == "zoh", 0 if hold == "linear" else round(1 / period)
         self.at, self.rate = at - self.history * period * rate, rate
         self.starts = []
@@ -154,7 +169,14 @@ class Axis:
         slope = (value - self.sent) / self.period
         start = np.array([*self.state, value, 0] if self.is_held else [*self.state, self.sent, slope])
         self.starts.append(start)
-        self.state, self.sent = (expm(self.flow * self.period) @ start)[:2], value
+        self.state, self.sent = (self.transition(self.period) @ start)[:2], value
+
+    def transition(self, time):
+        """Return the transition matrix of a time, rounded to 1e-14 s so that ticks share their matrices."""
+        time = round(time, 14)
+        if time not in self.transitions:
+            self.transitions[time] = expm(self.flow * time)
+        return self.transitions[time]
 
     def response(self, time):
         """Return y, y', y'' at a time after the first tick."""
@@ -162,7 +184,7 @@ class Axis:
         if time <= 1e-9 * self.period:
             return np.array([self.at - self.late + self.rate * time, self.rate, 0.0])
         index = min(int(np.ceil(time / self.period - 1e-9)) - 1, len(self.starts) - 1)
-        state = expm(self.flow * (time - index * self.period)) @ self.starts[index]
+        state = self.transition(time - index * self.period) @ self.starts[index]
         return np.array([state[0], state[1], (self.flow @ state)[1]])
 
 
