@@ -26,8 +26,8 @@ _HEADER = """\
 /* Variables at which force, position and their commands begin, and the index of the contact (TIME: none). */
 enum {{ FORCE = V_{0}, POSITION = V_{1}, FORCE_COMMAND = V_{2}, POSITION_COMMAND = V_{3}, CONTACT = V_{4} }};
 
-/* Ticks after which a run ends, see rt_plant_rig.c; number of contacts in the lists of the mechanism file. */
-enum {{ RUN_TICKS = {ticks}, BEHIND_TICKS = {behind}, CONTACTS = {contacts} }};
+/* When a run ends, see rt_plant_rig.c; number of contacts in the lists of the mechanism file. */
+enum {{ LAST_TICK = {ticks}, BEHIND_TICKS = {behind}, CONTACTS = {contacts} }};
 
 /* State of the numerical model at tick 0, see `readings` in rt_loop.h. */
 #define RUN_START {{{start}}}

@@ -2,7 +2,7 @@
  *
  * The rig is that of jaxhil_rig.fmu. It moves by one period when the loop sends its commands: a deadline that the
  * loop misses delays the rig, and no tick is lost. The drives wait until the controller is ready. A run ends
- * after RUN_TICKS ticks; on one axis, it ends earlier if the numerical model was behind its start for BEHIND_TICKS
+ * after tick LAST_TICK; on one axis, it ends earlier if the numerical model was behind its start for BEHIND_TICKS
  * ticks. The next run begins at the same state, with other noise. After a trip, the run goes on until the stop.
  */
 #include <string.h>
@@ -71,7 +71,7 @@ static bool rig_write(void *plant, const commands *answer) {
     }
     rig->behind += AXES == 1 && answer->model_position[0] < rig->now.start[0];
     rig->now.tick++;
-    if (!(answer->flags & TRIPPED) && (rig->now.tick >= RUN_TICKS || rig->behind >= BEHIND_TICKS)) {
+    if (!(answer->flags & TRIPPED) && (rig->now.tick > LAST_TICK || rig->behind >= BEHIND_TICKS)) {
         prepare_run(rig);
     }
     return true;
