@@ -10,6 +10,9 @@ from six_axis_records import recorded
 
 from jaxhil.mechanism.file import load_any
 from jaxhil.rig.six_axes import Controller6
+from jaxhil.rig.six_axes.gain_file import check_six_axis_document
+from jaxhil.sixdof.controller_record import ControllerRecord
+from tuning.watchdog.six_axes import audit_limits
 
 
 @pytest.fixture(scope="module")
@@ -124,3 +127,20 @@ def test_six_axis_watchdog_trips_if_momentum_differs_from_impulse():
 def test_six_axis_watchdog_trips_on_contact_that_lasts_too_long():
     limits = {"force_stuck_travel": 1.0, "fading": 1.0, "longest_contact": 0.1}
     assert names(pushed(controller("none", **limits), 10.0, 120)) == ["contact_too_long"]
+
+
+@pytest.mark.parametrize("after", [[], [0.0] * 40 + [-5.0] * 5 + [0.0] * 40], ids=["open", "ended"])
+def test_calibration_audits_every_contact_of_a_run(after):
+    """A push releases energy; the run ends in this contact, or after a second one that absorbs energy."""
+    gain_file = check_six_axis_document(six_axis_document("none"))
+    mass, inverse = (np.array(getattr(gain_file.constants, name)) for name in ("mass_matrix", "inverse_mass"))
+    push = [0.0] + [30.0] * 150
+    wrench = np.array(push + after)[:, None] * np.array([0, 0, 1, 0, 0, 0])
+    twist = np.array([0, 0, -0.005, 0, 0, 0]) + PERIOD * np.cumsum(wrench @ inverse, axis=0)
+    twist = np.vstack([[0, 0, -0.005, 0, 0, 0], twist])  # the last row follows the last wrench
+    pose = np.zeros_like(wrench)
+    record = ControllerRecord(wrench, pose, twist[:-1], pose, wrench, pose)
+    before, then = (motion @ mass @ motion for motion in (twist[0], twist[len(push)]))
+    limits = audit_limits(gain_file, [record], fading=1.0)
+    assert limits["energy_gain"] == pytest.approx(1.5 * (then / before - 1)) and then > 2 * before
+    assert limits["momentum_error"] == 0.05

@@ -1,7 +1,7 @@
 """Recorded runs of a simulated six-axis rig, and their replay through the rig's controller."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from math import inf
 from typing import Any
 
@@ -75,13 +75,23 @@ def replay_record(controller: Controller6, record: ControllerRecord) -> tuple[np
 
     The last tick has no pose command, because the record lacks the numerical model's motion after it.
     """
+    commands, sent = zip(*replay_ticks(controller, record), strict=True)
+    return np.reshape(commands, (-1, 6)), np.reshape(sent[:-1], (-1, 6))
+
+
+def replay_ticks(
+    controller: Controller6, record: ControllerRecord
+) -> Iterator[tuple[list[float], list[float] | None]]:
+    """Run a controller with the readings of a recorded run; yield its wrench and pose command of each tick.
+
+    The last tick has no pose command.
+    """
     columns = [column.tolist() for column in record[:4]]
-    commands, sent = [], []
     for tick, readings in enumerate(zip(*columns, strict=True)):
-        commands.append(controller.step(*readings))
+        command, sent = controller.step(*readings), None
         if tick + 1 < len(columns[0]):
-            sent.append(controller.pose_command(columns[1][tick + 1], columns[2][tick + 1]))
-    return np.reshape(commands, (-1, 6)), np.reshape(sent, (-1, 6))
+            sent = controller.pose_command(columns[1][tick + 1], columns[2][tick + 1])
+        yield command, sent
 
 
 def compare_record(controller: Controller6, record: ControllerRecord) -> SixAxisReplay:

@@ -29,6 +29,7 @@ from tuning.verification.six_axis_replay import (
     draw_scenarios,
     record_scenarios,
     replay_record,
+    replay_ticks,
 )
 from tuning.watchdog.calibration import Calibration, choose_error_limit, choose_scenarios
 from tuning.watchdog.recording import ScenarioSelection
@@ -94,7 +95,7 @@ def calibrate_six_axes(
     fitted = [run for index, run in enumerate(runs) if index % FITTED_SHARE == 0]
     used = [run for run in fitted if run.good] or [run for run in fitted if np.isfinite(run.error)] or fitted
     limits = signal_limits([run.record for run in used], gain_file.control_period, loaded.mechanism)
-    limits |= _audit_limits(gain_file, [run.record for run in used])
+    limits |= audit_limits(gain_file, [run.record for run in used], limits["fading"])
     plain = {name: float(value) for name, value in limits.items()}
     final = {name: plain.get(name) for name in SIX_AXIS_LIMITS} | dict(replaced or {})
     held_out = [run for index, run in enumerate(runs) if index % FITTED_SHARE]
@@ -217,14 +218,21 @@ def longest_sum(steps: np.ndarray, still: np.ndarray) -> float:
     return float(np.max(sums - last_moved, initial=0.0))
 
 
-def _audit_limits(gain_file: SixAxisGainFile, records: list[ControllerRecord]) -> dict[str, float]:
-    """Return the limits of the contact audit, from replays without limits."""
-    wide = {**NO_SIX_AXIS_LIMITS, "settling": SETTLING}
+def audit_limits(
+    gain_file: SixAxisGainFile, records: list[ControllerRecord], fading: float
+) -> dict[str, float]:
+    """Return the limits of the contact audit, from replays without other limits than `fading` [N].
+
+    The limits cover the audits of all contacts, and of contacts that have not ended, such as a capture.
+    """
+    wide = {**NO_SIX_AXIS_LIMITS, "settling": SETTLING, "fading": fading}
     audits, lags = [], []
     for record in records:
         controller = Controller6(gain_file._replace(limits=wide))
-        replay_record(controller, record)
+        # The controller keeps the numbers of an audit until the next one.
+        audits.append(np.max([controller.last_audit for _ in replay_ticks(controller, record)], axis=0))
         lags.append(controller.loop_delay)
+        controller.next_contact()
         audits.append(controller.last_audit)
     largest = dict(zip(WATCHDOG_LIMITS, np.max(audits, axis=0).tolist(), strict=True))
     limits = {name: max(least, MARGIN * largest[name]) for name, least in WATCHDOG_LIMITS.items()}

@@ -46,9 +46,9 @@ class SixAxisWatchdog:
         on: whether contacts are audited.
         contacts: number of audited contacts.
         record: compensator status of the last audited contact.
-        momentum_error: momentum error of that contact, divided by its impulse [1]; 0 after `restart`.
-        energy_gain: energy that the contact released, divided by the approach energy [1]; 0 after `restart`.
-        unpaid_impulse: uncorrected impulse error, divided by the contact's impulse [1]; 0 after `restart`.
+        momentum_error: momentum error of that contact, divided by its impulse [1].
+        energy_gain: energy that the contact released, divided by the approach energy [1].
+        unpaid_impulse: uncorrected impulse error, divided by the contact's impulse [1].
     """
 
     __slots__ = (
@@ -83,12 +83,15 @@ class SixAxisWatchdog:
         self._lag_lowest = limits["lag_lowest"]
         self._lag_highest = limits["lag_highest"]
         self.on = stated or limits["fading"] > 0.0
+        self.momentum_error = 0.0
+        self.energy_gain = 0.0
+        self.unpaid_impulse = 0.0
         self.restart()
         self.contacts = 0
         self.record = ContactCount(0, 0, 0, 0, 0, 0, OUT_OF_CONTACT, UNSTATED)
 
     def restart(self) -> None:
-        """Forget the current contact and the past motion, but keep `contacts` and `record`."""
+        """Forget the current contact and the past motion, but keep the results of the last audit."""
         self._has_motion = False
         self._open = False
         self._measured = False
@@ -100,9 +103,6 @@ class SixAxisWatchdog:
         self._quiet = 0.0
         self._ticks = 0.0
         self._statuses.restart()
-        self.momentum_error = 0.0
-        self.energy_gain = 0.0
-        self.unpaid_impulse = 0.0
 
     def tick(
         self,
