@@ -4,9 +4,9 @@ A filter of order 2 or 4 resembles a lag with a longer delay. The fit of a lag c
 damping is then wrong, because only the onset of contact distinguishes damping from delay.
 
 The check fits Butterworth filters of both orders in place of the lag. The error of e - e* then has a mixture
-of normal distributions: around 0 if the file is right, or around the difference between a filter's fit and
-the file. The weights are the likelihoods of the fits. The effect of the check is the increase of the error's
-bound by the mixture.
+of normal distributions: around 0 if the file is right, or around the difference between the fits of a filter
+and of the lag. The weights are the likelihoods of the fits, times the prior probabilities of the filters. The
+effect of the check is the increase of the error's bound by the mixture.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ START_TIME_CONSTANT_PERIODS = 0.25  # first time constant without a lag in the f
 TRIAL_RATIO = 2.0  # ratio of successive time constants in the search
 AGE_STEP, MAX_AGE_SHIFT, MAX_PARABOLAS = 5e-5, 5e-4, 3  # steps of the search for the age of the force [s]
 MAX_LIKELIHOOD_DROP = 6.0  # largest increase of chi-squared with a filter that explains the logs as well
+PRIOR_FILTER_PROBABILITY = 0.1  # prior probability of each order; data sheets usually state such a filter
 MIN_EFFECT = 1e-3  # smallest effect on e or e - e* that the check reports
 
 
@@ -72,16 +73,17 @@ def check_hidden_filter(
     # Unmodelled disturbances enlarge all misfits.
     scale = max(1.0, min(file, *(fit.misfit for fit in filters)) / contact.degrees_of_freedom)
     gains = [(file - fit.misfit) / scale for fit in filters]
-    models = [(0.0, 0.0, 0.0)]
-    file_age = contact.posterior.best[0] + mechanism.rig.force_sensor.time_constant
+    log_weights, changes = [np.log(1.0 - PRIOR_FILTER_PROBABILITY * len(filters))], [(0.0, 0.0)]
     for fit, gain in zip(filters, gains, strict=True):
         if gain > -MAX_LIKELIHOOD_DROP:
-            coefficients = dict(zip(contact.readings.entries, fit.coefficients, strict=True))
-            models.append((gain, *compute_change_effect(mechanism, coefficients, fit.age - file_age)))
-    gain, *changes = np.array(models).T
+            # Both fits have nearly the same error due to the noise, which the file's uncertainty includes.
+            change = zip(contact.readings.entries, fit.coefficients - lag.coefficients, strict=True)
+            changes.append(compute_change_effect(mechanism, dict(change), fit.age - lag.age))
+            log_weights.append(np.log(PRIOR_FILTER_PROBABILITY) + 0.5 * gain)
+    weights = special.softmax(log_weights)
     increases = [
-        _find_bound(special.softmax(0.5 * gain), change, bound) - bound
-        for change, bound in zip(changes, effect[:2], strict=True)
+        _find_bound(weights, np.array(change), bound) - bound
+        for change, bound in zip(zip(*changes, strict=True), effect[:2], strict=True)
     ]
     return [_describe(filters, gains, *increases)]
 
@@ -144,7 +146,9 @@ def _fit_filter(contact: ContactFit, mechanism: Mechanism, order: int) -> _Filte
 
 
 def _fit_age(problem: ContactProblem, age: float, plane: float, lag: float) -> tuple[float, float, float]:
-    """Fit the age of the force by parabolas; return the age [s], the surface position [m] and chi-squared.
+    """Fit the age of the force by parabolas; return the age [s], the surface position [m] and the misfit.
+
+    The misfit is chi-squared, plus a penalty of negative damping.
 
     Args:
         problem: Contact problem.
@@ -156,7 +160,9 @@ def _fit_age(problem: ContactProblem, age: float, plane: float, lag: float) -> t
     def fit(age: float, plane: float) -> tuple[float, float, float]:
         delay = float(np.clip(age - lag, problem.min_delay, MAX_FORCE_DELAY))
         plane, inner, gain = find_best_surface(problem, delay, plane)
-        return delay + lag, plane, inner.misfit - 2.0 * gain
+        dampings = problem.damping_indices
+        positive = special.log_ndtr((inner.coefficients / np.sqrt(np.diag(inner.covariance)))[dampings]).sum()
+        return delay + lag, plane, inner.misfit - 2.0 * (gain + float(positive))
 
     best = fit(age, plane)
     for _ in range(MAX_PARABOLAS):

@@ -106,25 +106,24 @@ def compute_uncertainty_effect(mechanism: Mechanism) -> UncertaintyEffect:
 
 
 def compute_change_effect(
-    mechanism: Mechanism, coefficients: Mapping[int, np.ndarray], added_delay: float
+    mechanism: Mechanism, changes: Mapping[int, np.ndarray], added_delay: float
 ) -> tuple[float, float]:
     """Compute how much a change of the contact law and of the force delay changes e and e - e*.
 
     Args:
         mechanism: Mechanism with the nominal parameters.
-        coefficients: Changed coefficients of `make_regression_law`, by entry of the lists in `[contact]`.
+        changes: Changes of the coefficients of `make_regression_law`, by entry of the lists in `[contact]`.
         added_delay: Change of the total force delay [s].
 
     Returns:
         The magnitudes of both effects, for the entry of the lists in `[contact]` with the largest effect.
     """
     law, worst = mechanism_models.make_regression_law(mechanism.contact), (0.0, 0.0)
-    for entry, changed in coefficients.items():
+    for entry, change in changes.items():
         contact, frequency = _simulate_ideal_contact(mechanism, law, entry)
         if contact is None:
             continue
-        nominal = np.array(mechanism_models.get_regression_coefficients(mechanism.contact, entry))
-        ideal = (changed - nominal) @ contact.coefficient_sensitivity
+        ideal = change @ contact.coefficient_sensitivity
         gain = _compute_gain(mechanism, contact, frequency)
         error = added_delay * contact.delay_sensitivity
         restitution, differences = _combine_changes(ideal, error, gain)
