@@ -122,9 +122,12 @@ class ContactModel:
                 and preload [1/s].
             delay_variance: prior variance of the delay [s^2].
         """
-        squares = [spread * spread for spread in spreads]
-        scaled = [squares[index] * factor for index, factor in zip(SPREAD_INDICES, FACTORS, strict=True)]
-        variances = [*scaled, delay_variance]
+        # `restart` runs on every tick of free flight, and this loop is faster than a comprehension.
+        variances = [0.0] * PARAMETERS
+        for j in range(DELAY):
+            spread = spreads[SPREAD_INDICES[j]]
+            variances[j] = spread * spread * FACTORS[j]
+        variances[DELAY] = delay_variance
         prior = [stiffness, *[0.0] * (PARAMETERS - 1)]
         self._variances = variances
         self._prior_mean = self.mean = self.theta = prior
