@@ -32,6 +32,7 @@ class Kind:
     defect: tuple[str, ...] = ()  # a message must contain one of these words; empty for a kind without defect
     states_filter: bool = False  # the prior states kind and order of the filter, and a cutoff
     states_cut: bool = False  # the prior states that the dead zone is cut
+    states_walk: bool = False  # the prior states a random walk of the bias
     states_window: bool = False  # the prior states a moving average, and a window
     noiseless: bool = False  # only rounding disturbs the readings
     sweep: bool = False  # the free motion is a swept sine in place of a multisine
@@ -86,6 +87,7 @@ KINDS = {
         lambda rng, rig: {"dead_zone": rng.uniform(1.0, 6.0), "cut": True}, states_cut=True
     ),
     "bias_walk": Kind(walk=0.7, defect=("bias", "drift", "noise")),
+    "bias_walk_stated": Kind(walk=0.7, states_walk=True),
     "mode": Kind(
         lambda rng, rig: {"mode": 40.0, "mode_ratio": rng.uniform(0.01, 0.03)},
         defect=("contact law", "resonance", "mode"),
@@ -366,6 +368,8 @@ def mechanism_file(rig, speed, kind, factors):
         cutoff = rig.cutoff * factors[2]
         low_pass = f'{{ kind = "butterworth", order = {rig.filter_order}, cutoff = {cutoff} }}'
         values["rig.force_sensor.filter"] = low_pass
+    if kind.states_walk:
+        values["rig.force_sensor.bias_random_walk"] = kind.walk * factors[2]
     if kind.states_window:
         second_order = ("rig.simulator.natural_frequency", "rig.simulator.damping_ratio")
         values = {key: value for key, value in values.items() if key not in second_order}

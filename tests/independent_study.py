@@ -15,6 +15,7 @@ LIMIT = 0.01  # error of e or e - e* beyond which a file is wrong
 SILENT = {
     f"rig.{sensor}_sensor.{key}": 0.0 for sensor in ("force", "position") for key in ("noise_std", "quantum")
 }
+NO_BIAS = {"rig.force_sensor.bias": 0.0, "rig.force_sensor.bias_random_walk": 0.0}
 VERDICTS = {0: "good", 1: "bad", 2: "refused"}
 
 
@@ -60,7 +61,7 @@ def errors_of(file, campaign):
     from jaxhil.rig import COMPENSATORS
 
     approach = {"approach.velocity": campaign.speed, "approach.contacts": 1}
-    mechanism = jaxhil.load(str(file), {**SILENT, **approach, "rig.force_sensor.bias": 0.0})
+    mechanism = jaxhil.load(str(file), {**SILENT, **approach, **NO_BIAS})
     run = jaxhil.simulate(mechanism, "response_error")
     law = COMPENSATORS["response_error"](run.gains, campaign.rig.period, np.inf)
     e, ideal = (

@@ -76,7 +76,6 @@ def silent():
         ({"dead_zone": 4.0, "dead_zone_kind": "cut"}, "a cut dead zone of 4 N"),
         ({"jitter": 1e-4}, "jitter = 0.0001 s"),
         ({"loss_probability": 0.01}, "loss_probability = 0.01"),
-        ({"bias_random_walk": 0.1}, "bias_random_walk = 0.1 N/sqrt[(]s[)]"),
     ],
 )
 def test_file_with_unmodelled_effect_is_rejected_by_monitor_and_not_good_in_identify(silent, effect, finding):
@@ -86,10 +85,15 @@ def test_file_with_unmodelled_effect_is_rejected_by_monitor_and_not_good_in_iden
         monitor_contacts(silent, changed)
     result = check_against_mechanism(silent, changed)
     assert not result.good
-    finding = finding.replace("[", "").replace("]", "")
     is_modelled = effect.keys() & {"filter", "dead_zone"} != set()
     assert is_modelled != any(line.finding.startswith(finding) for line in result.lines)
     assert is_modelled != (f"{finding}, which `identify` does not model" in result.verdict)
+
+
+def test_file_with_drift_of_the_bias_is_rejected_by_monitor(silent):
+    changed = file_of(changed_kind(noiseless(CLEAN), force_sensor={"bias_random_walk": 0.1}))
+    with pytest.raises(package.InputError, match=r"bias_random_walk = 0[.]1 N/sqrt\(s\), expected none"):
+        monitor_contacts(silent, changed)
 
 
 def test_file_with_missed_ticks_in_its_uncertainty_is_rejected_by_monitor(silent):

@@ -275,9 +275,8 @@ def _fit_law(
 
 
 def _make_readings(runs: Sequence[LoggedRun], noise: NoiseEstimate) -> ForceReadings:
-    return ForceReadings.of(
-        runs, float(np.hypot(noise.innovation, noise.quantum / np.sqrt(12.0))), noise.filter
-    )
+    std = float(np.hypot(noise.innovation, noise.quantum / np.sqrt(12.0)))
+    return replace(ForceReadings.of(runs, std, noise.filter), bias_step=noise.bias_step)
 
 
 def _estimate_clock_drift(

@@ -24,6 +24,7 @@ from tuning.identification.contact_regression import (
     sum_and_squares,
     sum_products,
 )
+from tuning.identification.drifting_noise import LONG_FILTER, subtract_weighted_mean
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.motion import MotionResponse
 from tuning.identification.nearby_rows import NearbyRows, Onsets
@@ -386,6 +387,8 @@ class ContactProblem:
 
 
 def _whiten(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:
+    if len(whitening) > LONG_FILTER:
+        return subtract_weighted_mean(values, whitening)
     filtered = values.copy() if len(whitening) > 1 else values
     for lag, weight in enumerate(whitening[1:], 1):
         filtered[..., lag:] += weight * values[..., :-lag]

@@ -83,7 +83,7 @@ def check_force_smoothing(
     Returns:
         A list with one failed check, or an empty list if the noise shows no smoothing.
     """
-    if noise is None or noise.silent or len(noise.filter) == 1 or not effect.parts:
+    if noise is None or noise.silent or noise.walk or len(noise.filter) == 1 or not effect.parts:
         return []
     first, second = autocorrelate(noise.filter)[:2]
     if first < MIN_CORRELATION_ERRORS / np.sqrt(noise.number) or second > MAX_CORRELATION_RATIO * first:

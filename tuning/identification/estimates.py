@@ -35,6 +35,8 @@ def make_estimates(draws_by_key, motion, contact, force, position, fixed) -> tup
     if force is not None and not force.silent:
         direct.append(_make_normal_estimate("rig.force_sensor.noise_std", force.std, force.std_std))
         direct.append(_make_normal_estimate("rig.force_sensor.bias", force.mean, force.mean_std))
+        if force.walk:
+            direct.append(_make_normal_estimate("rig.force_sensor.bias_random_walk", *force.walk))
     elif contact is not None:
         std = contact.readings.std
         direct.append(

@@ -32,6 +32,7 @@ class ForceReadings:
     subtracted: float = 0.0  # specified size of a continuous dead zone that hides the noise [N]
     zone: float = 0.0  # largest possible size of a cut dead zone [N]; 0 if the dead zone is not cut
     is_valid: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), bool))  # whether a reading exists
+    bias_step: float = 0.0  # standard deviation of the change of the bias between two rows [N]
     low_pass: SensorFilter | None = None  # filter of the sensor in the prior, or None
 
     @classmethod

@@ -20,6 +20,7 @@ from tuning.identification.bootstrap import bootstrap
 from tuning.identification.contact_fit import ContactFit
 from tuning.identification.contact_profile import POSTERIOR_DRAWS
 from tuning.identification.contact_runs import exclude_rows_after_gaps, split_long_run
+from tuning.identification.drifting_noise import estimate_force_noise
 from tuning.identification.estimates import estimate_combinations, get_unit, make_estimates
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.identified_mechanism import compute_bound_excess, make_mechanism
@@ -72,12 +73,12 @@ def identify(
     runs = {
         kind: [run for run in campaign.runs if run.kind == kind] for kind in ("rest", "free", *CONTACT_KINDS)
     }
-    force, position = _estimate_sensor_noise(runs)
+    sensor = _specify_sensor(prior, options)
+    force, position = _estimate_sensor_noise(runs, campaign.timing.control_period, sensor)
     say("fitting the motion simulator")
     structures = mechanism_models.list_structures(prior if options.order is None else None)
     motion = free_motion.fit_free_motion(runs["free"], campaign.timing, options.order, structures)
     model = _make_prior_model(prior) if motion is None else motion.model
-    sensor = _specify_sensor(prior, options)
     touching = [] if model is None else _select_runs_in_contact(campaign, model)
     if force is not None and not sensor.dead_zone:
         force = recognise_noise_free_readings(force, [run.valid_forces for run in touching])
@@ -221,7 +222,7 @@ def _make_prior_model(prior: Mechanism | None) -> MotionModel | None:
 
 
 def _estimate_sensor_noise(
-    runs: Mapping[str, Sequence[LoggedRun]],
+    runs: Mapping[str, Sequence[LoggedRun]], period: float, sensor: ForceSensor
 ) -> tuple[NoiseEstimate | None, NoiseEstimate | None]:
     """Return the noise of force sensor and position sensor at rest; each may be None.
 
@@ -232,7 +233,7 @@ def _estimate_sensor_noise(
         if run.valid.sum() < MIN_REST_ROWS:
             continue
         if force is None and run.force_measured is not None:
-            force = estimate_noise(run.valid_forces)
+            force = estimate_force_noise(run.valid_forces, period, sensor.bias_random_walk)
         if position is None and run.kind == "rest":
             position = estimate_noise(
                 _select_finite(run.position_measured - run.position_desired[0], run.valid)

@@ -19,12 +19,13 @@ from tuning.identification.contact_profile import Posterior
 from tuning.identification.contact_regression import CoefficientFit
 from tuning.identification.contact_runs import exclude_rows_after_gaps, split_long_run
 from tuning.identification.dead_zone_check import check_cut_dead_zone, check_zone_sampling
+from tuning.identification.drifting_noise import estimate_force_noise
 from tuning.identification.edge_check import check_contact_edges, check_force_smoothing
 from tuning.identification.force_readings import ForceReadings
 from tuning.identification.free_motion import FreeMotion
 from tuning.identification.hidden_filter import check_hidden_filter
 from tuning.identification.motion import MotionResponse
-from tuning.identification.noise import NoiseEstimate, estimate_noise
+from tuning.identification.noise import NoiseEstimate
 from tuning.identification.rational import MotionModel
 from tuning.identification.records import Campaign, LoggedRun
 from tuning.identification.result import (
@@ -96,7 +97,9 @@ def check_against_mechanism(
     if contact is not None and not _has_uncertain_dead_zone(mechanism):
         lines += check_contact_edges(contact, touching, effect)
     if contact is not None:
-        lines += check_force_smoothing(_estimate_force_noise(campaign.runs), effect, frequency, period)
+        lines += check_force_smoothing(
+            _estimate_force_noise(campaign.runs, mechanism), effect, frequency, period
+        )
         lines += check_hidden_filter(contact, mechanism, effect)
     lines += check_file_uncertainty(effect, any(run.kind == "press" for run in campaign.runs))
     return Identification(
@@ -156,7 +159,7 @@ def _make_contact_fit(
     plane = rig.contact_plane
     lag = rig.force_sensor.time_constant if rig.force_sensor.filter is None else None
     motion = MotionResponse(model, runs, campaign.timing, max(MAX_FORCE_DELAY, delay) + period)
-    noise = _estimate_force_noise(campaign.runs)
+    noise = _estimate_force_noise(campaign.runs, mechanism)
     has_dead_zone = rig.force_sensor.dead_zone > 0.0
     std = float(np.hypot(rig.force_sensor.noise_std, rig.force_sensor.quantum / np.sqrt(12.0)))
     whitening = (1.0,)
@@ -165,7 +168,8 @@ def _make_contact_fit(
     if has_dead_zone or not std:
         whitening = (1.0,)
     readings = ForceReadings.of(runs, std or 1.0, whitening, std if has_dead_zone else 0.0)
-    readings = replace(readings, low_pass=rig.force_sensor.filter)
+    step = 0.0 if noise is None else noise.bias_step
+    readings = replace(readings, low_pass=rig.force_sensor.filter, bias_step=step)
     coefficients = [
         coefficient
         for entry in readings.entries
@@ -199,16 +203,17 @@ def _make_contact_fit(
     return ContactFit(law, (), problem, posterior, len(problem.used_rows), error, has_dead_zone)
 
 
-def _estimate_force_noise(runs: Sequence[LoggedRun]) -> NoiseEstimate | None:
+def _estimate_force_noise(runs: Sequence[LoggedRun], mechanism: Mechanism) -> NoiseEstimate | None:
     """Return the force sensor's noise from the first long run at rest or, without one, in free motion.
 
     Returns None if no run has 200 readings.
     """
+    walk = mechanism.rig.force_sensor.bias_random_walk
     for kind in ("rest", "free"):
         for run in runs:
             if run.kind == kind and run.force_measured is not None:
                 if len(run.valid_forces) >= 200:
-                    return estimate_noise(run.valid_forces)
+                    return estimate_force_noise(run.valid_forces, mechanism.rig.control_period, walk)
     return None
 
 

@@ -43,6 +43,9 @@ class NoiseEstimate:
     number: int  # number of readings
     drift: float = 0.0  # change from the first to the last reading; 0 if it is smaller than the noise
     dead_zone: tuple[float, float] | None = None  # dead zone for a bias of 0, and its standard error
+    # random walk of the bias, per sqrt(s), and its standard error; None if the bias is assumed to be constant
+    walk: tuple[float, float] | None = None
+    bias_step: float = 0.0  # standard deviation of the change of the bias between two readings
 
     @property
     def pole(self) -> float:
@@ -52,6 +55,9 @@ class NoiseEstimate:
     @property
     def innovation(self) -> float:
         """Return the standard deviation of the noise after whitening, in the unit of the readings."""
+        if self.walk is not None:
+            # The bias that the whitening filter expects has the variance `std` times `bias_step`.
+            return float(np.hypot(self.std, np.sqrt(self.std * self.bias_step)))
         return self.std * float(np.sqrt(compute_whitened_share(self.filter)))
 
 

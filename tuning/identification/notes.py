@@ -54,7 +54,7 @@ def collect_notes(
         notes.append(contact.resampled)
     if force is not None and force.drift:
         notes.append(f"the force drifts at rest, by {force.drift:.3g} N from the first row to the last")
-    if force is not None and force.pole > 0.5:
+    if force is not None and not force.walk and force.pole > 0.5:
         notes.append(f"the force's noise is coloured (pole {force.pole:.2f}); tuning treats it as white")
     if contact is not None and (entries := contact.readings.entries) != tuple(range(len(entries))):
         notes.append(f"the logs contain only entries {', '.join(map(str, entries))} of the contact lists")

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from jaxhil.mechanism.sensor_filter import FilterModes
+from tuning.identification.drifting_noise import LONG_FILTER, subtract_weighted_mean
 from tuning.identification.nearby_rows import Onsets
 
 
@@ -45,7 +46,11 @@ def apply_filter(
             after, end = compute_onset_weights(mode, onsets.share)
             then = tables[0][onsets.plane, :, onsets.row].T
             drive[onsets.plane, :, onsets.row] = (after * first + end * then).T
-        lagged: Any = lfilter(whitening, [1.0, -pole], drive)
+        lagged: Any
+        if len(whitening) > LONG_FILTER:
+            lagged = subtract_weighted_mean(np.asarray(lfilter([1.0], [1.0, -pole], drive)), whitening)
+        else:
+            lagged = lfilter(whitening, [1.0, -pole], drive)
         total = total + (weight * lagged if weight.imag else weight.real * lagged).real
     return total
 

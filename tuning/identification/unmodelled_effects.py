@@ -41,13 +41,15 @@ def list_unmodelled_effects(mechanism: Mechanism) -> dict[str, tuple[str, str]]:
 def check_modelled_effects(mechanism: Mechanism) -> list[CheckResult]:
     """Return a failed check for each effect that a mechanism file contains and `identify` does not model.
 
-    A filter of the force sensor is not modelled if the sensor has a dead zone, which hides the onset.
+    `identify` models a filter of the force sensor and a drift of its bias, unless a dead zone hides the onset
+    of contact.
     """
     effects = list_unmodelled_effects(mechanism)
     for key in (AVERAGE_KEY, CUT_ZONE_KEY):
         effects.pop(key, None)
     if mechanism.rig.force_sensor.dead_zone == 0.0:
         effects.pop(FILTER_KEY, None)
+        effects.pop(WALK_KEY, None)
     return [
         CheckResult(name, f"{text}, which `identify` does not model", True, 1.0)
         for name, text in effects.values()

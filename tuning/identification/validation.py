@@ -292,9 +292,16 @@ def estimate_restitution_errors(
         residual = (readings.force[:rows, lane] - predicted[:rows, lane]) * touching
         scale = mass * before * abs(after / before)
         errors[lane] = -float(np.sum(residual * speed)) * period / scale / before
-        # Only the low-frequency part of coloured noise affects the impulse.
-        slow = readings.std / abs(float(np.sum(readings.whitening)))
-        stds[lane] = slow * period * float(np.sqrt(np.sum((speed * touching) ** 2))) / scale / before
+        weights = speed * touching
+        if readings.bias_step:
+            # A step of the bias changes all later readings.
+            later = readings.bias_step * np.cumsum(weights[::-1])
+            std = float(np.sqrt(np.sum((readings.std * weights) ** 2) + np.sum(later**2)))
+        else:
+            # Only the low-frequency part of coloured noise affects the impulse.
+            slow = readings.std / abs(float(np.sum(readings.whitening)))
+            std = slow * float(np.sqrt(np.sum(weights**2)))
+        stds[lane] = std * period / scale / before
     return errors, stds
 
 
@@ -323,11 +330,9 @@ def _check_trends(contact: ContactFit, touches: int, frequency: float, lag: floa
     """Check that the scale and the delay of the force do not drift from the first to the last contact."""
     delay, plane, coefficient_fit = contact.posterior.best
     problem, std = contact.problem, contact.readings.std
-    predicted = np.where(
-        contact.readings.counts, problem.force(delay, plane, coefficient_fit.coefficients), 0.0
-    )
-    force = np.where(contact.readings.counts, contact.readings.force, 0.0)
-    predicted, force = (problem.whiten(value) for value in (predicted, force))
+    readings = problem.force(delay, plane, coefficient_fit.coefficients), contact.readings.force
+    # A reading that the fit does not use must not affect others.
+    predicted, force = (np.where(contact.readings.counts, problem.whiten(values), 0.0) for values in readings)
     power = np.sum(predicted**2, axis=0)
     used = power > 100.0 * std**2
     if used.sum() < 4:

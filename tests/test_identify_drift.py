@@ -1,0 +1,59 @@
+"""Identification of rigs whose force sensor has a random walk of its bias that the prior states."""
+
+import numpy as np
+import pytest
+from independent_study import evaluate_identification
+from scipy.signal import lfilter
+
+from tuning.identification.drifting_noise import (
+    LONG_FILTER,
+    estimate_drifting_noise,
+    subtract_weighted_mean,
+)
+
+PERIOD, NOISE, WALK, BIAS = 1e-3, 0.3, 0.7, 0.2
+
+
+def rest(seed, walk=WALK, number=5000):
+    """Return readings at rest."""
+    random = np.random.default_rng(seed)
+    steps = walk * PERIOD**0.5 * random.normal(size=number)
+    steps[0] = 0.0
+    return BIAS + np.cumsum(steps) + NOISE * random.normal(size=number)
+
+
+def test_noise_at_rest_separates_random_walk_from_white_noise():
+    estimates = [estimate_drifting_noise(rest(seed), PERIOD, 1.3 * WALK) for seed in range(20)]
+    walks = np.array([noise.walk for noise in estimates])
+    z = (walks[:, 0] - WALK) / walks[:, 1]
+    assert abs(z.mean()) < 4 / 20**0.5 and 0.5 < z.std() < 1.6
+    stds = [noise.std for noise in estimates]
+    assert np.mean(stds) == pytest.approx(NOISE, rel=5 / (2 * 5000 * 20) ** 0.5)
+    biases = np.array([(noise.mean - BIAS) / noise.mean_std for noise in estimates])
+    assert abs(biases.mean()) < 4 / 20**0.5 and 0.5 < biases.std() < 1.6
+
+
+def test_filter_of_drifting_noise_whitens_readings_and_removes_bias():
+    readings = rest(3, number=40_000)
+    noise = estimate_drifting_noise(readings, PERIOD, WALK)
+    assert len(noise.filter) > LONG_FILTER and abs(sum(noise.filter)) < 0.006
+    expected = np.asarray(lfilter(noise.filter, [1.0], readings))
+    white = subtract_weighted_mean(readings, noise.filter)
+    np.testing.assert_allclose(white, expected, rtol=0, atol=1e-12)
+    white = white[len(noise.filter) :]
+    assert white.std() == pytest.approx(noise.innovation, rel=0.02)
+    for lag in (1, 10, 50):
+        assert abs(np.mean(white[lag:] * white[:-lag])) < 5 * white.var() / len(white) ** 0.5
+
+
+def test_readings_without_noise_have_no_random_walk():
+    noise = estimate_drifting_noise(np.full(500, 0.2), PERIOD, WALK)
+    assert (noise.mean, noise.std, noise.walk, noise.bias_step) == (0.2, 0.0, None, 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [8000, 8001])
+def test_identify_verdict_is_good_for_campaign_with_stated_random_walk(seed, tmp_path):
+    """The seed 8001 has a press run, in which the bias drifts by several newtons."""
+    outcome = evaluate_identification("bias_walk_stated", seed, tmp_path)
+    assert (outcome.verdict, outcome.check, outcome.wrong, outcome.trouble) == ("good", "good", False, "")

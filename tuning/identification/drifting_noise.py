@@ -1,0 +1,96 @@
+"""Noise of a force sensor at rest whose bias drifts: white noise plus a random walk of the bias.
+
+The differences of successive readings are a moving average e(n) - p e(n-1) of white noise e, with a pole p
+between 0 and 1. The steps of the bias have the standard deviation (1 - p) std(e), and the white noise has the
+variance p var(e). The filter (1 - z^-1)/(1 - p z^-1) whitens the readings; it subtracts the exponentially
+weighted mean of earlier readings. Without its response to old readings, it has finite length.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy import optimize
+from scipy.signal import lfilter
+
+from tuning.identification.noise import NoiseEstimate, detect_quantum, estimate_noise
+
+STATED_LOG_STD = 1.0  # standard deviation of the logarithm of the drift that the mechanism states
+FORGOTTEN_SHARE = 0.005  # weight of the readings that the whitening filter leaves out
+MAX_FILTER_LENGTH = 200  # largest number of coefficients of the whitening filter
+# Number of coefficients above which a whitening filter is one of this module; autoregressions are shorter.
+LONG_FILTER = 16
+LOG_GAIN_RANGE = -9.0, -0.01  # range of log(1 - p)
+
+
+def estimate_force_noise(readings: np.ndarray, period: float, stated: float) -> NoiseEstimate:
+    """Estimate the noise at rest, with a random walk of the bias if the mechanism states one."""
+    return estimate_drifting_noise(readings, period, stated) if stated else estimate_noise(readings)
+
+
+def estimate_drifting_noise(readings: np.ndarray, period: float, stated: float) -> NoiseEstimate:
+    """Estimate white noise and random walk of the bias from readings at rest at successive ticks.
+
+    Args:
+        readings: At least 20 finite readings.
+        period: Time between readings [s].
+        stated: Random walk that the mechanism states, above 0, in units of the readings per sqrt(s).
+
+    Returns:
+        The noise, with the random walk; without it if a dead zone hides the noise, or if there is no noise.
+        The mean is the bias at the first reading.
+    """
+    steady = estimate_noise(readings)
+    if steady.silent or steady.std == 0.0:
+        return steady
+    steps, number, root = np.diff(readings), len(readings), math.sqrt(period)
+
+    def innovations(log_gain: float) -> float:
+        """Return the standard deviation of e for a given log(1 - p)."""
+        pole = -math.expm1(log_gain)
+        return float(np.std(lfilter([1.0], [1.0, -pole], steps)[1:]))
+
+    def cost(log_gain: float) -> float:
+        std = innovations(log_gain)
+        surprise = (log_gain + math.log(std / root / stated)) / STATED_LOG_STD
+        return number * math.log(std) + 0.5 * surprise**2
+
+    optimum: Any = optimize.minimize_scalar(
+        cost, bounds=LOG_GAIN_RANGE, method="bounded", options={"xatol": 1e-4}
+    )
+    best = float(optimum.x)
+    step = 0.3
+    curvature = (cost(best + step) - 2.0 * cost(best) + cost(best - step)) / step**2
+    log_std = 1.0 / math.sqrt(max(curvature, 1.0 / STATED_LOG_STD**2))
+    gain, std = math.exp(best), innovations(best)
+    pole, quantum = 1.0 - gain, detect_quantum(readings)
+    # Rounding adds to the white noise.
+    white = math.sqrt(max(pole * std**2 - quantum**2 / 12.0, 0.01 * pole * std**2))
+    weights = gain * pole ** np.arange(number)
+    length = min(math.ceil(math.log(FORGOTTEN_SHARE) / math.log(pole)) + 1, MAX_FILTER_LENGTH)
+    walk = gain * std / root
+    return NoiseEstimate(
+        mean=float(weights @ readings / weights.sum()),
+        std=white,
+        mean_std=white * math.sqrt(gain),
+        std_std=white / math.sqrt(2.0 * number),
+        quantum=quantum,
+        silent=False,
+        filter=(1.0, *(-weights[: length - 1]).tolist()),
+        number=number,
+        walk=(walk, walk * log_std),
+        bias_step=gain * std,
+    )
+
+
+def subtract_weighted_mean(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:
+    """Apply a whitening filter of this module along the last axis, as fast as a filter of first order."""
+    length, gain, pole = len(whitening), -whitening[1], whitening[2] / whitening[1]
+    total: Any = lfilter([gain], [1.0, -pole], values)
+    result = values.copy()
+    result[..., 1:] -= total[..., :-1]
+    result[..., length:] += pole ** (length - 1) * total[..., :-length]
+    return result
