@@ -93,7 +93,7 @@ def show(text, missed, runs):
     return low, high
 
 
-@pytest.mark.parametrize("name", ["ring-capture", "petals"])
+@pytest.mark.parametrize("name", ["ring-capture", "petals", "probe-drogue"])
 def test_six_axis_alarm_rates_in_fresh_scenarios(name, tmp_path):
     with jax_context():
         document = six_axis_document("impulse_ledger", name)
@@ -143,6 +143,18 @@ def test_six_axis_alarm_rates_in_fresh_scenarios(name, tmp_path):
         missed_runs = [noticeable for run, noticeable in runs if not plain.stops(run)]
         show(f"missed, {label} stuck", len(missed_runs), len(runs))
         assert not any(missed_runs), "the motion suffices to notice the stuck channel"
+
+
+def test_limits_from_few_draws_stop_more_good_runs():
+    with jax_context():
+        loaded = check_document(six_axis_document(), any_axes=True)
+        few, many = (
+            calibrate_six_axes(loaded, scenarios=draws).rates["false_alarms"] for draws in (128, 512)
+        )
+    for draws, rate in ((128, few), (512, many)):
+        show(f"false alarms, probe-drogue, {draws} draws", rate["alarms"], rate["runs"])
+    assert many["high"] <= many["allowed"] < few["high"]
+    assert few["alarms"] / few["runs"] > many["alarms"] / many["runs"]
 
 
 def test_doubled_wrench_scale_equals_a_contact_twice_as_stiff():

@@ -30,7 +30,9 @@ class Export(ExportOptions):
     sweep: Annotated[
         str | None,
         text_option(
-            "STORE", "Folder with a sweep of these gains, from which limits and alarm rates are computed."
+            "STORE",
+            "Folder with a sweep of these gains, from which limits and alarm rates are computed; with six "
+            "axes, limits from fewer than 512 scenarios stop more good runs.",
         ),
     ] = None
     formats: Annotated[
