@@ -42,6 +42,15 @@ PRIOR_FILTER_PROBABILITY = 0.1  # prior probability of each order; data sheets u
 MIN_EFFECT = 1e-3  # smallest effect on e or e - e* that the check reports
 
 
+class _AgeFit(NamedTuple):
+    """Best fit at one cutoff."""
+
+    age: float  # sum of the force delay and the filter's delay at low frequencies [s]
+    plane: float  # surface position [m]
+    misfit: float  # chi-squared, plus a penalty of negative damping
+    coefficients: np.ndarray  # coefficients of the contact law of all entries, without the bias
+
+
 class _FilterFit(NamedTuple):
     """Best fit of a filter with a free cutoff."""
 
@@ -123,32 +132,26 @@ def _fit_filter(contact: ContactFit, mechanism: Mechanism, order: int) -> _Filte
     start = max(lag, START_TIME_CONSTANT_PERIODS * period) / unit_delay
     problem = ContactProblem(contact.problem.motion, readings, contact.law, surface, start)
     problem = summarise_deep_lanes(problem, (delay + lag - start * unit_delay, plane), has_known_delay=True)
-    fits: dict[float, tuple[float, float, float]] = {}
-
-    def at(time_constant: float) -> ContactProblem:
-        return problem.changed(contact.law, time_constant, delay + lag - time_constant * unit_delay)
+    fits: dict[float, _AgeFit] = {}
 
     def misfit(time_constant: float) -> float:
         if time_constant not in fits:
             nearest = min(fits, key=lambda other: abs(np.log(other / time_constant)), default=None)
-            age, surface = (delay + lag, plane) if nearest is None else fits[nearest][:2]
-            fits[time_constant] = _fit_age(at(time_constant), age, surface, time_constant * unit_delay)
-        return fits[time_constant][2]
+            start_at = (delay + lag, plane) if nearest is None else fits[nearest][:2]
+            changed = problem.changed(contact.law, time_constant, delay + lag - time_constant * unit_delay)
+            fits[time_constant] = _fit_age(changed, *start_at, time_constant * unit_delay)
+        return fits[time_constant].misfit
 
     limits = MIN_TIME_CONSTANT_PERIODS * period, MAX_TIME_CONSTANT
     if order == 1 and lag:  # the file has the best lag
         limits = start, start
     best = _find_minimum(misfit, start, limits)
-    age, plane, least = fits[best]
-    coefficients = at(best).at(age - best * unit_delay, plane).coefficients[:-1]
-    table = coefficients.reshape(len(readings.entries), -1)
-    return _FilterFit(order, 0.5 / (np.pi * best), age, table, least)
+    table = fits[best].coefficients.reshape(len(readings.entries), -1)
+    return _FilterFit(order, 0.5 / (np.pi * best), fits[best].age, table, fits[best].misfit)
 
 
-def _fit_age(problem: ContactProblem, age: float, plane: float, lag: float) -> tuple[float, float, float]:
-    """Fit the age of the force by parabolas; return the age [s], the surface position [m] and the misfit.
-
-    The misfit is chi-squared, plus a penalty of negative damping.
+def _fit_age(problem: ContactProblem, age: float, plane: float, lag: float) -> _AgeFit:
+    """Fit the age of the force by parabolas, with surface position and coefficients.
 
     Args:
         problem: Contact problem.
@@ -157,20 +160,23 @@ def _fit_age(problem: ContactProblem, age: float, plane: float, lag: float) -> t
         lag: Filter's delay [s].
     """
 
-    def fit(age: float, plane: float) -> tuple[float, float, float]:
+    def fit(age: float, plane: float) -> _AgeFit:
         delay = float(np.clip(age - lag, problem.min_delay, MAX_FORCE_DELAY))
         plane, inner, gain = find_best_surface(problem, delay, plane)
         dampings = problem.damping_indices
         positive = special.log_ndtr((inner.coefficients / np.sqrt(np.diag(inner.covariance)))[dampings]).sum()
-        return delay + lag, plane, inner.misfit - 2.0 * (gain + float(positive))
+        coefficients = inner.coefficients
+        if inner.by_plane is not None:
+            coefficients = coefficients + inner.by_plane * (plane - inner.plane)
+        return _AgeFit(delay + lag, plane, inner.misfit - 2.0 * (gain + float(positive)), coefficients[:-1])
 
     best = fit(age, plane)
     for _ in range(MAX_PARABOLAS):
-        low, high = (fit(best[0] + side * AGE_STEP, best[1]) for side in (-1.0, 1.0))
-        curvature = low[2] - 2.0 * best[2] + high[2]
-        shift = 0.5 * AGE_STEP * (low[2] - high[2]) / max(curvature, 1e-300)
+        low, high = (fit(best.age + side * AGE_STEP, best.plane) for side in (-1.0, 1.0))
+        curvature = low.misfit - 2.0 * best.misfit + high.misfit
+        shift = 0.5 * AGE_STEP * (low.misfit - high.misfit) / max(curvature, 1e-300)
         limited = float(np.clip(shift, -MAX_AGE_SHIFT, MAX_AGE_SHIFT))
-        best = min(low, best, high, fit(best[0] + limited, best[1]), key=lambda result: result[2])
+        best = min(low, best, high, fit(best.age + limited, best.plane), key=lambda result: result.misfit)
         if abs(shift) < 2.0 * AGE_STEP:
             break
     return best
