@@ -57,7 +57,8 @@ def test_force_lag_missing_from_model_is_detected_at_onset_and_end_of_contact(mo
 
 def test_filter_that_explains_logs_with_another_damping_adds_to_the_effect(monkeypatch):
     campaign, cutoff = ambiguous.campaign(monkeypatch, "plain", 0, seconds=5.0), 100.0
-    b, a = butter(2, cutoff, fs=1000.0)
+    low_pass: Any = butter(2, cutoff, fs=1000.0)
+    b, a = low_pass
     runs = [replace(run, force_measured=lfilter(b, a, run.force_measured)) for run in campaign.runs]
     truth = ambiguous.truth("plain")
     sensor = replace_fields(truth.rig.force_sensor, time_constant=0.7071 / np.pi / cutoff)

@@ -22,6 +22,7 @@ LIMITS = {
     "probe-drogue": {"bias": 0.055, "tool": 0.055, "mass": 0.06, "delay": 0.13},
     "ring-capture": {"bias": 1.3, "mass": 1.5, "delay": 4.0},
     "hydraulic-hexapod": {"bias": 1.3, "mass": 1.5, "delay": 4.6},
+    "petals": {"bias": 1.3, "mass": 1.5, "delay": 4.0},
 }
 WRONG_DELAY = 1e-3  # true force delay minus the specified force delay [s]
 # Largest undisturbed twist error of the scenarios that count. The only larger error, 0.99 in `ring-capture`,

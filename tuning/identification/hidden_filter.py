@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import optimize, special
@@ -221,4 +221,5 @@ def _find_bound(weights: np.ndarray, changes: np.ndarray, bound: float) -> float
         outside = special.ndtr((changes - limit) / std) + special.ndtr((-changes - limit) / std)
         return float(weights @ outside) - (1.0 - EFFECT_PROBABILITY)
 
-    return float(optimize.brentq(excess, 0.0, np.max(changes) + bound + 10.0 * std))
+    root: Any = optimize.brentq(excess, 0.0, np.max(changes) + bound + 10.0 * std)
+    return root
