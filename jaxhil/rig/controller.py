@@ -179,8 +179,8 @@ class Controller(ControllerBase):
 
         Two successive commands differ by at most `velocity_limit` times the period. The same limit applies
         between the measured position and a run's first command. If the model is out of contact, the first
-        command may be up to `start_distance` away, because moving drives lag behind their commands. Its
-        distance is then taken from the model's position if the run has no measured position yet.
+        command may be up to `start_distance` from the measured position, because moving drives lag behind
+        their commands. Without a measured position, the model's position replaces it.
 
         After a trip, the commands move to rest out of contact. The commands start from the last command or,
         if there is none, from the last measured position. If there is neither, they start from a position out

@@ -69,7 +69,7 @@ def position_at(path: CellMotion, s: Array) -> Array:
 
 
 def velocity_at(path: CellMotion, s: Array) -> Array:
-    """Return the velocity [m per period] in each cell of an interval at the time `s` (0: start, 1: end)."""
+    """Return each cell's velocity [m per period] at the fraction `s` of its duration (0: start, 1: end)."""
     return horner(path.rate, s * path.length)
 
 

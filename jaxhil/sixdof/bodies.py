@@ -92,7 +92,7 @@ def kick_drift(
     spin = state.spin + share * twist
 
     def turned(attitude: Quaternion, duration) -> Quaternion:
-        """Rotate the initial attitude for `duration` [s]; `spin` and `attitude` give the angular velocity."""
+        """Rotate the initial attitude for `duration` [s]; momentum and inertia are those at `attitude`."""
         angular = body.inverse_inertia @ rotate_back(attitude, spin)
         return compose(state.attitude, exponential(duration * angular))
 

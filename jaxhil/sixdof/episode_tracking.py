@@ -129,7 +129,7 @@ def required_pause(sensor: Sensor, period: Array, timing: TimingBatch | None) ->
 
 
 def has_rig_settled(rig: RigConstants, tracker: EpisodeTracker) -> Array:
-    """Return whether touches have paused on the rig, and the command has decayed (or decays too slowly)."""
+    """Return whether the rig's touches have paused and the command has decayed, or the wait is too long."""
     pause = required_pause_ticks(rig)
     max_wait = pause + jnp.ceil(MAX_DECAY_WAIT / rig.period).astype(jnp.int32)
     return ((tracker.ticks_since_touch >= pause) & (tracker.ticks_since_decay > 0)) | (

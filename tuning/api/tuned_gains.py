@@ -79,7 +79,7 @@ class TunedGains:
 
     @property
     def co_simulation(self) -> dict[str, dict[str, int]]:
-        """Return the gain file's entry on the co-simulation; empty without extra periods."""
+        """Return the gain file's entry on the periods that a co-simulation adds; empty if it adds none."""
         return {"co_simulation": {"extra_periods": self.extra_periods}} if self.extra_periods else {}
 
     @property

@@ -61,7 +61,8 @@ class CommonProgram:
         """Return a contact law that applies to each lane the law of the lane's mechanism.
 
         For some laws, the ideal contact has no closed form. If `precomputed` is true, the scenarios must
-        contain these ideal contacts; otherwise the returned law integrates them. None: `self.precomputed`.
+        contain these ideal contacts; otherwise the returned law integrates them. None stands for
+        `self.precomputed`.
         """
         return LawMixture(self._kinds, self.precomputed if precomputed is None else precomputed)
 

@@ -47,9 +47,9 @@ def search_directly(
 ) -> list[DirectSearchResult]:
     """Search for the best gains of every task, from the literature's gains and from the gains in `first`.
 
-    A search has `settings.steps` generations. If `settings.bounded` is true, the search penalises gains whose
-    metric on the training scenarios exceeds that of the literature's gains. Without this penalty, the much
-    larger errors of the transparency probes could outweigh the errors of the scenarios.
+    A search has `settings.steps` generations. If `settings.bounded` is true, the search penalises gains with
+    a larger error in the training scenarios than the literature's gains. Without this penalty, the much
+    larger errors of transparency could outweigh the errors of the scenarios.
     """
     return [
         _search_task(validation, i, settings, [task.literature, *(first[i] if first else ())])
@@ -70,7 +70,7 @@ def _search_task(
 def _bound_error(
     validation: Validation, task: int, objective: Objective, literature: Float[np.ndarray, "1 gains"]
 ) -> Objective:
-    """Return the objective with `error_bound` set to the metric of the literature's gains."""
+    """Return the objective with `error_bound` set to the error that the literature's gains leave."""
     metric = replace(
         objective, command_weight=0.0, noise_weight=0.0, chatter_weight=0.0, transparency_weight=0.0
     )

@@ -109,8 +109,8 @@ class ContactProblem:
     def at(self, delay: float, plane: float, pseudo: PseudoRows | None = None) -> CoefficientFit:
         """Fit the coefficients at one force delay [s] and surface position [m].
 
-        `pseudo` adds rows that replace the readings of runs in deep contact. Rows in which the force of the
-        law would be negative are treated as out of contact.
+        `pseudo` holds rows that are used in place of the readings of runs in deep contact. Rows in which
+        the force of the law would be negative are treated as out of contact.
         """
         near, flags, fit = self._fit_until_consistent(delay, np.array([plane]), pseudo)
         (inner,) = self._make_fits(fit)
@@ -183,7 +183,7 @@ class ContactProblem:
         return np.unique(position[inside & self.is_used[:-1] if self.is_unfiltered else inside])
 
     def _find_nearby_rows(self, moved: Motion, planes: np.ndarray, only_used: bool) -> list[NearbyRows]:
-        """Return the rows near contact, once per time in `self.periods_before` [periods before a row].
+        """Return the rows near contact, as one record for each time in `self.periods_before` [periods].
 
         The result includes all rows that are in contact for at least one of the surface positions `planes`
         [m]. If the readings are filtered, the result also includes the later rows that the filters affect.

@@ -71,7 +71,7 @@ def summarise_deep_lanes(
 
 
 def select_representative_lanes(problem: ContactProblem) -> np.ndarray:
-    """Return the indices of all lanes, but of only `LANES_FOR_LAW_CHOICE` lanes well below the surface."""
+    """Return the indices of all lanes but most deep ones: at most `LANES_FOR_LAW_CHOICE` of these remain."""
     deep = np.flatnonzero(find_deep_lanes(problem.motion, _approximate_surface(problem)))
     dropped = np.delete(
         deep, np.linspace(0, len(deep) - 1, min(LANES_FOR_LAW_CHOICE, len(deep))).round().astype(int)

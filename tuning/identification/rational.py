@@ -271,7 +271,7 @@ def estimate_low_frequency_delay(lines: SpectralLines) -> float:
 
 
 def _make_delay_grid(lines: SpectralLines) -> np.ndarray:
-    """Return a grid of delays [s] from 0 to the delay at low frequencies, at least to one period."""
+    """Return a grid of delays [s] from 0 to the response's low-frequency delay, at least to one period."""
     longest = max(estimate_low_frequency_delay(lines), lines.period)
     return np.linspace(0.0, longest, int(np.clip(4.0 * longest / lines.period, 8, 40)))
 

@@ -112,7 +112,8 @@ def compute_change_effect(
 
     Args:
         mechanism: Mechanism with the nominal parameters.
-        changes: Changes of the coefficients of `make_regression_law`, by entry of the lists in `[contact]`.
+        changes: Changes of the coefficients of `make_regression_law`; key i is the index of a contact in the
+            lists of `[contact]`.
         added_delay: Change of the total force delay [s].
 
     Returns:

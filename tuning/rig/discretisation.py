@@ -23,7 +23,7 @@ DELAY_ROUNDING_TOLERANCE = 1e-9
 
 
 class MotionRows(NamedTuple):
-    """Coefficients of position [m] and velocity [m/s] at one fraction of a sampling interval."""
+    """Coefficients of states and commands for position [m] and velocity [m/s] within a sampling interval."""
 
     position: ResponseRow
     velocity: ResponseRow

@@ -212,7 +212,7 @@ class SessionNumbers:
     memory, and an answer is not longer than its request. So forged requests cannot exhaust memory or network.
 
     Args:
-        axes: number of axes stated in the answers; None to repeat the number in the request.
+        axes: number of axes in the answers; None to repeat the number of axes that the request states.
     """
 
     def __init__(self, axes: int | None = None) -> None:

@@ -221,9 +221,9 @@ def longest_sum(steps: np.ndarray, still: np.ndarray) -> float:
 def audit_limits(
     gain_file: SixAxisGainFile, records: list[ControllerRecord], fading: float
 ) -> dict[str, float]:
-    """Return the limits of the contact audit, from replays without other limits than `fading` [N].
+    """Return the limits of the contact audit, from replays in which `fading` [N] is the only limit.
 
-    The limits cover the audits of all contacts, and of contacts that have not ended, such as a capture.
+    The limits are wide enough for all contacts, also for those that have not ended, such as a capture.
     """
     wide = {**NO_SIX_AXIS_LIMITS, "settling": SETTLING, "fading": fading}
     audits, lags = [], []

@@ -236,7 +236,7 @@ def rig_constants(mechanism: Mechanism) -> str:
 
 
 def _simulator_tables(plant: PlantConstants) -> list[str]:
-    """Return the C tables of the motion simulator; those of an ideal one have a state that is always 0."""
+    """Return the C tables of the motion simulator; an ideal simulator gets one state that stays 0."""
     rows = plant.rows
     order = max(1, len(rows.transition))
 

@@ -83,7 +83,7 @@ def ask_for_length_unit(factor: float, tolerance: float) -> str:
 
 
 def _ask_for_units(units: list[tuple[float, str]], factors: tuple[float, ...], tolerance: float) -> str:
-    """Return a question that names the wrong units whose factors match `factors`, or an empty text."""
+    """Return the question whether the log has units that explain `factors`; empty if no units match."""
     texts: list[str] = []
     for factor in factors:
         distances = sorted(

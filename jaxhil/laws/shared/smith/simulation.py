@@ -36,7 +36,7 @@ class Cascade(NamedTuple):
 
 
 class Smith(Compensator):
-    """Base class that computes F_c from the lead-filtered force and the predicted force."""
+    """Base class that computes the force command F_c from the lead-filtered and the predicted force."""
 
     knows: ClassVar[tuple[str, ...]] = (FORCE_DELAY, SIMULATOR_LAG)
     reads_position: ClassVar[bool] = False

@@ -67,8 +67,8 @@ class TangentModel:
     def turn(self, path: float, force: float, speed: float) -> None:
         """Adapt the estimate to a turn of the contact's direction, which restarts the depth at 0.
 
-        The means are now the slope at the last depth, the old damping, `force`, and no curvature. The
-        covariance is that of the prior.
+        The stiffness becomes the slope at the last depth, the damping stays, the offset becomes `force`, and
+        the curvature 0. The covariance is that of the prior.
 
         Args:
             path: depth at the last reading [m].
@@ -128,7 +128,7 @@ class TangentModel:
         self.damping = min(max(damping, 0.0), self._most_damping)
 
     def compute_force_change(self, change: float) -> float:
-        """Return the change of the elastic force [m/s^2] for a `change` of the depth [m], or 0.
+        """Return the change of the elastic force per mass [m/s^2] for a `change` of the depth [m].
 
         The result is 0 if force and depth would change with opposite signs.
         """
