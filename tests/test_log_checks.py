@@ -55,14 +55,14 @@ def test_wrong_sign_or_mass_for_logged_force_command_is_detected(tmp_path):
     path = write_csv(tmp_path / "a.csv", model("zoh", "tick", sign=-1))
     assert "force_command: found forces that accelerate the approach" in message(path)
     assert read(path, force_command={"column": "Fc", "sign": -1}).notes == ()
-    assert "moves 350 kg like position_desired (it would move 175 kg)" in message(
+    assert "moves 350 kg like position_desired (as if the mass were 175 kg)" in message(
         path, force_command={"column": "Fc", "sign": -1, "scale": 0.5}
     )
     coarse = model("zoh", "tick")
     coarse["xd"] = np.round(coarse["xd"], 6)
     path = write_csv(tmp_path / "b.csv", coarse)
     assert read(path).notes == ()
-    assert "(it would move 175 kg)" in message(path, force_command={"column": "Fc", "scale": 0.5})
+    assert "(as if the mass were 175 kg)" in message(path, force_command={"column": "Fc", "scale": 0.5})
     assert 'expected "tick", with which force_command' in message(path, timing={"row": "sent"})
 
 

@@ -67,7 +67,7 @@ NO_COMMAND = {"force_command": None}
         ({"F": 1 / 9.80665}, NO_COMMAND, "force in kgf, read as N"),
         ({"Fc": 1 / LBF}, {}, "0.2248 times the force that moves"),
         ({"Fc": 1 / LBF}, {}, "within 1 % (force in lbf, read as N?); correct unit or mass"),
-        ({"F": 1 / LBF, "Fc": 1 / LBF}, {}, "(it would move 78.68 kg)"),
+        ({"F": 1 / LBF, "Fc": 1 / LBF}, {}, "(as if the mass were 78.68 kg)"),
         (dict.fromkeys(ALL, 1 / 2.54), {}, "2.54 times the force that moves"),
         (dict.fromkeys(ALL, 1 / 2.54), {}, "(positions in in, read as cm?)"),
         (dict.fromkeys(ALL, 1 / 2.54), NO_COMMAND, "positions in in, read as cm"),
@@ -99,7 +99,7 @@ def test_impulse_of_weak_contact_in_strong_noise_is_accepted(tmp_path, seed):
 def test_mass_error_of_a_few_percent_is_detected_from_log(tmp_path):
     result = refused(tmp_path, scaled(LOG, Fc=1.03))
     assert (
-        "found 1.03 times the force that moves 350 kg like position_desired (it would move 360.5 kg)"
+        "found 1.03 times the force that moves 350 kg like position_desired (as if the mass were 360.5 kg)"
         in result
     )
     assert read(write_csv(tmp_path / "b.csv", scaled(LOG, Fc=1.005))).notes == ()
@@ -127,7 +127,7 @@ def test_force_command_column_is_used_in_rounded_logs(tmp_path, name, without):
     assert 'expected "tick", with which force_command' in refused(
         tmp_path, log, timing={"row": "sent"}, **gone
     )
-    assert "(it would move 367.5 kg)" in refused(tmp_path, scaled(log, Fc=1.05), **gone)
+    assert "(as if the mass were 367.5 kg)" in refused(tmp_path, scaled(log, Fc=1.05), **gone)
     assert "accelerate the approach" in refused(tmp_path, scaled(log, Fc=-1.0), **gone)
 
 

@@ -37,7 +37,7 @@ def run(made: Mechanism, seed: int = 0):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_contact_that_hardware_never_touches_has_status_not_reached(noise):
+def test_contact_that_hardware_never_touches_ends_as_not_reached(noise):
     result = run(rig(1.2 * DEEPEST, noise_std=noise))
     assert result.status == "not reached"
     for contact in result.contacts:
@@ -46,7 +46,7 @@ def test_contact_that_hardware_never_touches_has_status_not_reached(noise):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_contact_has_status_not_reached_if_only_sensor_bias_reverses_model(noise):
+def test_contact_ends_as_not_reached_if_only_sensor_bias_reverses_model(noise):
     """Use a bias of 70 N or 40 N.
 
     The first reverses the model 0.09 mm before it reaches the surface, the second 0.2 mm beyond the surface.
@@ -56,7 +56,7 @@ def test_contact_has_status_not_reached_if_only_sensor_bias_reverses_model(noise
         assert result.status == "not reached" and math.isnan(result.contacts[0].restitution)
 
 
-def test_contact_hidden_by_dead_zone_has_status_not_reached():
+def test_contact_hidden_by_dead_zone_ends_as_not_reached():
     largest = STIFFNESS * 0.5 * DEEPEST
     hidden = run(rig(0.5 * DEEPEST, dead_zone=1.01 * largest))
     assert hidden.contacts[0].status == "not reached"

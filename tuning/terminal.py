@@ -51,7 +51,7 @@ def emit_line(text: str) -> None:
 
 
 def suggest(*words: str) -> None:
-    """Print the next command to run: `jaxhil` with these words."""
+    """Print the next command to run: `jaxhil` followed by `words`."""
     emit_line(f"Next: jaxhil {shlex.join(words)}")
 
 
@@ -323,7 +323,7 @@ def _make_console(stream) -> Console:
 
 
 def _width_without_terminal() -> int:
-    """Return the width of piped output: `$COLUMNS`, else a terminal's on any standard stream, else 80."""
+    """Return the width of piped output: `$COLUMNS`, the width of a terminal on a standard stream, or 80."""
     if (columns := os.environ.get("COLUMNS", "")).isdigit() and int(columns) > 0:
         return int(columns)
     for descriptor in range(3):

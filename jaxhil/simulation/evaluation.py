@@ -326,7 +326,7 @@ def _round_up(number: int) -> int:
 
 @lru_cache(maxsize=32)
 def _count_state_bytes(model: RigModel, loop: Any, structure: Any, leaves: tuple[Any, ...]) -> int:
-    """Return the memory [bytes] of a lane's state between ticks; `leaves` are shapes of scenario arrays."""
+    """Return the memory [bytes] of a lane's state; `leaves` are the shapes of one scenario's arrays."""
     lane = jax.tree.unflatten(structure, leaves)
     compensator = get_compensator(model.compensator_name(loop), model.axes)
     gains = {gain.name: lane.control_period for gain in compensator.gains}

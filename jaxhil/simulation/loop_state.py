@@ -42,7 +42,7 @@ class Rings(NamedTuple):
     reading: Float[Array, "samples *batch"] | None
     # position of the mechanism at the position sensor's sampling instant [m]; None if unused
     position: Float[Array, "samples *batch"] | None
-    # data of the sampling intervals whose contact a later stage computes; None with one surface
+    # data of the sampling intervals whose contact is computed later in the tick; None with one surface
     interval: SamplingInterval | None
     # drive command at the end of each interval [m]; None unless the motion simulator is a moving average
     command: Float[Array, "samples *batch"] | None

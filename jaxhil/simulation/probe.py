@@ -141,7 +141,7 @@ def update_first_contact(
 
 
 def initial_deviation(like: Float[Array, "*batch"]) -> Deviation:
-    """Return the deviation before the numerical model's first touch: 0, with the batch shape of `like`."""
+    """Return the probe's deviation before the first touch: 0, with the batch shape of `like`."""
     zeros = jnp.zeros_like(like)
     return Deviation(jnp.zeros(like.shape, bool), zeros, zeros, zeros)
 

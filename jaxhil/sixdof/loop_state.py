@@ -100,7 +100,7 @@ class Tick(NamedTuple):
     pose: Pose  # pose of the hardware at the force sensor's sampling instant
     twist: Twist  # twist of the hardware at the force sensor's sampling instant
     contact: Wrench  # wrench of contacts and latches at the sampling instant
-    forces: tuple[Forces, ...]  # contact forces of each group at the sampling instant
+    forces: tuple[Forces, ...]  # contact forces of each group of shape pairs at the sampling instant
     latch_states: tuple[LatchState, ...]  # states of the latches
     signals: SixAxisSignals  # inputs of the compensator
     command: Wrench  # wrench command, which acts on the numerical model
@@ -112,7 +112,7 @@ class Sensed(NamedTuple):
 
     motion: RigidMotion  # motion of the hardware at the force sensor's sampling instant
     contact: Wrench  # wrench of contacts and latches at the sampling instant
-    forces: tuple[Forces, ...]  # contact forces of each group at the sampling instant
+    forces: tuple[Forces, ...]  # contact forces of each group of shape pairs at the sampling instant
     memories: tuple[Memory, ...]  # next states of the contact laws
     latch_states: tuple[LatchState, ...]  # next states of the latches
     lag: tuple[Wrench, Any] | None  # next state of the force sensor's lag or filter

@@ -18,7 +18,7 @@ class SixAxisSummary(NamedTuple):
         frequency: Frequency of the ideal contact, 1/(2 duration) [Hz]; NaN if a latch catches.
         peak_force: Peak force of the ideal contact [N].
         restitution: Restitution e* of the ideal contact [1]; NaN unless there is a single touch.
-        delay: Delay of the loop [s]: delay plus lag of the force sensor, plus those of the slowest axis.
+        delay: Delay of the loop [s]: sum of the delays and lags of the force sensor and the slowest axis.
         slip_limit: Minimum slip parameter v_s of regularised friction for a stable rig [m/s]; NaN without
             regularised friction.
         warnings: Implausible values of the file, each with key, found value and expected value.

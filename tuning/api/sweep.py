@@ -171,8 +171,8 @@ def run_study(
 ) -> SweepStudy:
     """Compute the scenarios whose results are missing in `folder`, and the requested additional studies.
 
-    If `keep` is true, also write plots and the JSON document to the folder. Otherwise, the result contains
-    the rows.
+    If `keep` is true, also write plots and the JSON document to the folder. If not, return the rows of all
+    scenarios in the result.
     """
     path = gains if hasattr(gains, "document") else arguments.find_gain_file(gains)
     with jax_context(), _connect_workers(options.scheduler) as workers:

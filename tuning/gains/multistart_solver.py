@@ -258,7 +258,7 @@ def _build_call(tasks, names, bounds, objectives, number):
 
     def call(members: list[_StartState], limit: int):
         order = assign_to_devices(size)
-        # Unused positions of the call hold copies of the first problem, and simulate nothing.
+        # Unused places in the batch hold copies of the first problem, which are not simulated.
         filled = [members[i] if i < len(members) else members[0] for i in order]
         idle = order[:, None] >= len(members)
         index = np.array([p.task for p in filled])

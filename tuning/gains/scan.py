@@ -55,7 +55,7 @@ def _evaluate_points(
     """Evaluate the objective at the points of a scan; the value of a discarded point is infinite.
 
     A few scenarios yield a lower bound of the objective at each point. A point is discarded without full
-    evaluation if `number` points, at the minimum distance from each other, are better than its bound.
+    evaluation if `number` points, which are not too close to each other, are better than its bound.
     """
     share = PRESCREEN_SCENARIOS / min(SCAN_SCENARIOS, validation.tasks[0].lanes)
     if share > 0.5 or not _is_sum_of_squares(validation, which, objective):

@@ -303,7 +303,7 @@ def _compare_real_contacts(outcome: Outcome) -> dict[str, Any]:
 
 
 def compute_metrics_by_error(result: TuneResult) -> dict[str, dict[str, ErrorMetrics]]:
-    """Return the metrics by error (energy, twist) and by set of gains for six axes; empty for one axis."""
+    """Return metrics[error][set of gains] for the energy and twist errors; empty for one axis."""
     model = choose_rig_model(result.mechanism)
     if len(model.errors) == 1:
         return {}

@@ -33,7 +33,7 @@ MAX_CELL_EDGES = 1000  # maximum number of cell edges; an uncertain surface posi
 COARSE_STD_FACTOR = 2.0  # the coarse grid's standard deviation of the surface is multiplied by this factor
 FINAL_GRID_DELAYS, FINAL_GRID_SURFACES = 61, 13  # numbers of delays and surface positions of the final grid
 DELAY_SEARCH_HALF_WIDTH = 0.003  # half width of the search around an approximate delay [s]
-SURFACE_HALF_WIDTH_SIGMAS = 3.2  # half width of the grid at a delay, in standard deviations of the surface
+SURFACE_HALF_WIDTH_SIGMAS = 3.2  # half width of the grid of surface positions [standard deviations]
 POSTERIOR_DRAWS = 4000  # number of posterior draws
 
 
@@ -117,8 +117,8 @@ def compute_posterior(
 def estimate_surface_from_onset(problem: ContactProblem, delay: float) -> float:
     """Return the position [m] at which the force first exceeds its noise, as the median of all runs.
 
-    If a prior of the sensor's bias is known, the result is the position at which a line through the forces
-    reaches the bias (`press_bias`).
+    If a prior of the sensor's bias is known, the result is the position at which a line fitted to the forces
+    reaches the bias (module `press_bias`).
     """
     position, _ = problem.motion.at(delay)
     readings = problem.readings

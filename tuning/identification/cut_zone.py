@@ -17,7 +17,7 @@ from tuning.identification.contact_profile import POSTERIOR_DRAWS, Posterior
 from tuning.identification.noise import MIN_READINGS_BEYOND_DEAD_ZONE, detect_quantum
 from tuning.identification.records import LoggedRun
 
-ZONE_GRID_SIZE = 400  # number of sizes from 0 to the smallest reading
+ZONE_GRID_SIZE = 400  # number of zone sizes that are tried, from 0 to the smallest reading
 PARAMETER_DRAWS = 40  # number of posterior draws of the contact for which the size is drawn
 ASSUMED_BIAS_SHARE = 0.2  # standard deviation of a bias that a dead zone hides, divided by the zone
 MIN_LOUD_SHARE = 0.1  # share of the peak force that shows a contact

@@ -64,7 +64,7 @@ class _FilterFit(NamedTuple):
 def check_hidden_filter(
     contact: ContactFit, mechanism: Mechanism, effect: UncertaintyEffect
 ) -> list[CheckResult]:
-    """Check that no filter of order 2 or 4 explains the logs as well as the file, with another e or e - e*.
+    """Check that filters of order 2 and 4 that fit as closely as the file give the same e and e - e*.
 
     Args:
         contact: Contact model of the file.

@@ -6,7 +6,7 @@ import numpy as np
 
 
 class NearbyRows(NamedTuple):
-    """Rows near contact: motion at one time relative to each row, and depth for several surface positions."""
+    """Rows near contact: motion at a fixed time before each row, and depth for several surface positions."""
 
     rows: np.ndarray  # (rows,), flat indices into an array (rows, lanes); -1 after the end of a lane
     position: np.ndarray  # (rows,), position of the mechanism [m]

@@ -105,7 +105,7 @@ def find_fault(fit: SpectrumFit, inflation: float = 1.0) -> str:
     if fit.model.delay < -NEGATIVE_DELAY_SIGMAS * relative[-1] and fit.model.structure.order:
         return "its delay is negative"
     for name, std, value in zip(fit.model.names, relative, fit.model.parameters, strict=True):
-        # The standard deviation of a logarithm is relative. Coefficients of zeros are not logarithms.
+        # The standard deviation of a logarithm is relative. Only coefficients of zeros are not logarithms.
         share = std / abs(value) if name.startswith("zero") else 0.0 if name == "delay" else std
         if not share < MAX_RELATIVE_STD:
             return f"{name} is not determined"

@@ -18,7 +18,7 @@ from tuning.stability_map.axes import MapAxis
 from tuning.stability_map.grid import MapResults
 from tuning.sweeps.plot_statistics import DISPLAY_UNITS, INPUT_LABELS
 
-CONTOUR_ERRORS = [step * 10.0**power for power in range(-4, 2) for step in (1, 3)]  # errors with a contour
+CONTOUR_ERRORS = [step * 10.0**power for power in range(-4, 2) for step in (1, 3)]  # errors at contours
 MAX_COLOUR_ERROR = 10.0  # largest error on the colour scale
 # Largest numbers of contours, and of ticks of the colour bar, for errors of the same sign.
 MAX_CONTOURS, MAX_COLOUR_TICKS = 4, 20

@@ -211,7 +211,7 @@ def replay_logs(
 
 
 def _is_invalid(audit: Audit, logs: Sequence[LoggedTicks], replays: Sequence[Sequence[ReplayedRun]]) -> bool:
-    """Return whether an audit trips in a run with lost rows, or in which controller and log disagree."""
+    """Return whether an audit trips without meaning: rows are lost, or controller and log disagree."""
     for ticks, runs in zip(logs, replays, strict=True):
         for run in runs:
             has_gaps = np.any((ticks.gaps >= run.rows.start) & (ticks.gaps < run.rows.stop))

@@ -80,7 +80,7 @@ class _AuditState:
         self.results["tick"][index] = tick
 
     def audit(self, where: Bool[np.ndarray, "lanes"], velocity: np.ndarray, extra: np.ndarray) -> None:
-        """Audit the contacts that end in the lanes `where`.
+        """Check momentum and energy of contacts that end; the mask `where` selects their lanes.
 
         `velocity` [m/s] is the rebound velocity, and `extra` [J] is the work of the last force command.
         """

@@ -57,7 +57,7 @@ class DrawnRun(NamedTuple):
 
     record: ControllerRecord
     error: float  # twist error [1]; NaN if the contacts have not ended
-    good: bool  # whether the contacts end well, with at most half of the limit of the error
+    good: bool  # whether every contact ends with an error of at most half of the limit
 
 
 def calibrate_six_axes(

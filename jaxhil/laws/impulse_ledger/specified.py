@@ -11,7 +11,7 @@ DELAY = "rig.force_sensor.delay"
 
 
 def delay_spread(mechanism: Mechanism) -> float:
-    """Return the force delay's standard deviation [s] in the file, at most 4 ms; 0 for a certain delay."""
+    """Return the force delay's standard deviation [s] in the file, limited to 4 ms; 0 if it states none."""
     uncertainty = mechanism.uncertainty.get(DELAY)
     is_range = uncertainty is not None and uncertainty.std is None
     spread = _spread(mechanism, DELAY)

@@ -40,7 +40,7 @@ class FmuContact(msgspec.Struct, frozen=True):
 
 
 class FmuLoop(msgspec.Struct, frozen=True):
-    """Comparison of the nominal run with the FMUs of controller and rig to the simulated nominal run.
+    """Comparison of two nominal runs: one computed by the FMUs of controller and rig, one by `simulate`.
 
     On one axis, the contacts are compared; with six axes, the twist at the end of the run.
     """

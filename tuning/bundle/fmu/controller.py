@@ -86,7 +86,7 @@ def _log_constants(document: Mapping[str, Any]) -> dict[str, str]:
 
 
 def fmu_test_program(document: Mapping[str, Any], fmi: int) -> str:
-    """Return a C program that replays the test vectors with the FMU; it needs the FMU's sources to compile.
+    """Return a C program that replays the test vectors with the FMU, compiled with the FMU's sources.
 
     Args:
         document: gain document.

@@ -262,7 +262,8 @@ def _six_axis_row(contact: dict[str, Any]) -> tuple[Any, ...]:
     )
 
 
-# Headings of the columns between number and status, and function that returns their entries, by axes.
+# By number of axes: headings of the columns after "contact" and before "status", and the function that
+# returns their entries.
 _CONTACT_TABLES = {
     1: (["in file", "e", "e*", "error", "peak force [N]", "duration [ms]"], _one_axis_row),
     6: (

@@ -101,7 +101,7 @@ def _check_mass(label: str, fits: dict[int, FitsByConvention], mass: float) -> N
         units = ask_for_unit((factor,), tolerance)
         raise InputError(
             f"{label}: force_command: found {factor:.4g} times the force that moves {mass:g} kg like "
-            f"position_desired (it would move {mass * factor:.4g} kg), expected M x_d'' = -F_c within "
+            f"position_desired (as if the mass were {mass * factor:.4g} kg), expected M x_d'' = -F_c within "
             f"{100 * tolerance:.2g} %{units}; correct unit or mass, or leave force_command out"
         )
 

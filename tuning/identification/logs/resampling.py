@@ -153,7 +153,7 @@ def check_clock(label: str, column: str, stamps: np.ndarray | None, rows: int) -
 
 
 class _RowsAmongReadings:
-    """Resampling of a channel that has separate time stamps to the rows of the desired position."""
+    """Resampling of a channel with its own time stamps, at the rows of the desired position."""
 
     def __init__(self, label: str, column: str, stamps: np.ndarray, times: np.ndarray, period: float):
         self._column = column

@@ -138,7 +138,7 @@ def get_factors(channel: VectorChannel, name: str) -> list[float]:
 
 
 def _check_rows(mapping: SixAxisLogMapping) -> None:
-    """Raise `KeyProblem` if six-axis logs do not allow a key of the time stamps or of the rows."""
+    """Raise `KeyProblem` if a key on time stamps or rows has a value that six-axis logs do not allow."""
     index, timing = mapping.channels.contact_index, mapping.timing
     if index is not None and index.time is not None:
         expected = "none, because six-axis logs have the time stamps of the rows"

@@ -139,7 +139,7 @@ class TangentModel:
         return max(force, 0.0) if change > 0.0 else min(force, 0.0)
 
     def bridge(self, force: float, least: float, deeper: float, velocity: float, duration: float) -> None:
-        """Integrate a unit mass, the reference trajectory, under the model's force; set `impulse`, `force`.
+        """Integrate the reference trajectory of a unit mass in this model; set `impulse` and `force`.
 
         Args:
             force: force on the reference trajectory at the last reading [m/s^2].

@@ -89,10 +89,10 @@ def learn(
 
 
 def compute_force_change(tangent: Tangent, change: Array) -> Float[Array, "*batch"]:
-    """Return the change of the tangent model's elastic force for a `change` of the depth, or 0.
+    """Return the change of the tangent model's elastic force for a `change` of the depth.
 
-    The result is 0 if force and depth would change with opposite signs. Otherwise, a negative curvature could
-    push apart bodies that separate.
+    The result is 0 if force and depth would change with opposite signs, because a model with a negative
+    curvature could otherwise push apart bodies that separate.
     """
     later = tangent.path + change / tangent.speed
     bend = later * jnp.abs(later) - tangent.path * jnp.abs(tangent.path)
