@@ -138,12 +138,13 @@ def replay_vectors(fmu: RunningFmu, vectors: bytes) -> int:
 
 SIX_AXIS_INPUTS = ("wrench_measured", "pose_desired", "twist_desired", "pose_measured", "pose", "twist")
 SIX_AXIS_RESULTS = ("wrench_command", "pose_command")
-PARTS = {"wrench": WRENCH, "pose": COORDINATES, "twist": TWIST}
+PARTS = {"wrench": WRENCH, "pose": COORDINATES, "twist": TWIST, "angular": TWIST[3:]}
 
 
 def part_names(vector: str) -> list[str]:
     """Return the names of the FMU's variables for a vector of six axes."""
-    return [f"{vector}.{part}" for part in PARTS[vector.split("_")[0]]]
+    [parts] = [PARTS[word] for word in vector.split("_") if word in PARTS]
+    return [f"{vector}.{part}" for part in parts]
 
 
 def _columns(vectors: tuple[str, ...]) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Controller and rig as FMUs in one loop of OMSimulator, compared with `simulate` and with our own master.
+"""Controller and rig as FMUs in one loop of OMSimulator, compared with `simulate`.
 
 OMSimulator exchanges all values before each step (a parallel master). If it is not installed with pip, set
 `$OMSIMULATOR` to the folder that contains its Python package, built from its sources.
@@ -7,15 +7,17 @@ OMSimulator exchanges all values before each step (a parallel master). If it is 
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from bundles import document
-from fmus import RunningFmu, extract, part_names, write_fmu
+from fmus import write_fmu
 from test_fmu_rig import NOISELESS, assert_same_contacts, simulated
-from test_fmu_rig_six_axes import READINGS, document_of
+from test_fmu_rig_six_axes import COMMANDS, START, document_of, names_of
 
-from jaxhil.mechanism.file import load
+from jaxhil.mechanism.file import load, load_any
+from jaxhil.sixdof.run import simulate_six_axes
 from tuning.bundle.fmu.controller import controller_fmu
 from tuning.bundle.fmu.rig import rig_fmu
 from tuning.rig.contact_detector import ContactDetector
@@ -39,6 +41,11 @@ ONE_AXIS_CONNECTIONS = {
     "rig.force_command": "controller.force_command",
     "rig.position_command": "controller.position_command",
 }
+SENSED = ("wrench_measured", "pose_measured")
+SIX_AXIS_LOOPS = [
+    *(("probe-drogue", compensator) for compensator in ("none", "response_error", "impulse_ledger")),
+    ("petals", "impulse_ledger"),
+]
 
 
 def checked(status):
@@ -112,48 +119,32 @@ def test_omsimulator_loop_reproduces_simulation_with_one_more_period(name, compe
     assert abs(contacts[0].restitution - simulated(name, compensator, 0)[0].restitution) > 1e-6
 
 
-def parts(*vectors):
-    return [part for vector in vectors for part in part_names(vector)]
-
-
 def six_axis_connections():
     """Return the connections of the FMUs with six axes: the start of each connection by its end."""
-    connections = {f"rig.{part}": f"controller.{part}" for part in parts("wrench_command", "pose_command")}
-    connections |= {f"controller.{part}": f"rig.{part}" for part in parts(*READINGS)}
-    desired = {part.replace(".", "_desired."): part for part in parts("pose", "twist")}
-    return connections | {f"controller.{end}": f"rig.{begin}" for end, begin in desired.items()}
+    ends, begins = names_of(*SENSED, *START), names_of(*SENSED, *START.values())
+    connections = {f"controller.{end}": f"rig.{begin}" for end, begin in zip(ends, begins, strict=True)}
+    return connections | {f"rig.{part}": f"controller.{part}" for part in names_of(*COMMANDS)}
 
 
-def run_parallel_master(paths, ticks):
-    """Run both FMUs in FMPy, with all values exchanged before each step; return the final twist."""
-    fmus = {name: RunningFmu(extract(path)) for name, path in paths.items()}
-    inputs = {name: {} for name in fmus}  # variables of the other FMU, by the inputs of each FMU
-    for end, begin in six_axis_connections().items():
-        name, _, variable = end.partition(".")
-        inputs[name][variable] = begin.partition(".")[2]
-    fmus["controller"].reset(**fmus["rig"].get(*part_names("pose")))  # the pose command of the first step
-    for _ in range(ticks):
-        for name, other in (("controller", "rig"), ("rig", "controller")):
-            values = fmus[other].get(*inputs[name].values())
-            fmus[name].set({variable: values[begin] for variable, begin in inputs[name].items()})
-        for fmu in fmus.values():
-            fmu.step()
-    twist = fmus["rig"].get(*part_names("twist"))
-    for fmu in fmus.values():
-        fmu.close()
-    return np.array([*twist.values()])
+def simulate_latency(name, compensator, made, latency):
+    """Return the end of the run of `simulate` with this command latency [periods]."""
+    mechanism: Any = load_any(name, (f"rig.command_latency={latency}",)).mechanism
+    gains = {name: gain["value"] for name, gain in made["gains"].items()}
+    return simulate_six_axes(mechanism, compensator, gains).final
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.parametrize("compensator", ["none", "response_error", "impulse_ledger"])
-def test_omsimulator_loop_with_six_axes_has_final_twist_of_a_parallel_master(compensator, fmi, tmp_path):
-    paths = write_fmus(document_of("probe-drogue", compensator), fmi, tmp_path)
-    ticks = 400  # the contact has ended after about 350 ticks
-    expected = run_parallel_master(paths, ticks)
-    loop = OmsLoop(paths, six_axis_connections(), tmp_path)
-    start = np.array([loop.get(f"rig.{part}") for part in part_names("twist")])
-    loop.step(ticks)
-    twist = np.array([loop.get(f"rig.{part}") for part in part_names("twist")])
+@pytest.mark.parametrize(("name", "compensator"), SIX_AXIS_LOOPS)
+def test_omsimulator_loop_with_six_axes_reproduces_simulation_with_one_more_period(
+    name, compensator, fmi, tmp_path
+):
+    made = document_of(name, compensator)
+    paths = write_fmus(made, fmi, tmp_path)
+    without, expected = (simulate_latency(name, compensator, made, latency) for latency in (0, 1))
+    loop = OmsLoop(paths, six_axis_connections(), tmp_path, "controller.integrates_model")
+    loop.step(round(expected.time / PERIOD))
+    twist = np.array([loop.get(f"controller.{part}") for part in names_of("model_twist")])
     loop.close()
-    assert np.array_equal(twist, expected)
-    assert np.max(np.abs(twist - start)) > 1e-3
+    difference = float(np.max(np.abs(twist - expected.twist)))
+    print(f"{name} {compensator} FMI {fmi}: {difference:.1e}")
+    assert difference < 1e-9 and np.max(np.abs(twist - without.twist)) > 1e-6

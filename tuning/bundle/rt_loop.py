@@ -7,6 +7,7 @@ from typing import Any
 
 from jaxhil.rig.flight_recorder import FlightRecorder
 from tuning.bundle.controller_kind import ONE_AXIS, kind_of
+from tuning.bundle.fmu.sources import read_source
 from tuning.rig.numerical_model import NOISE_AND_BIAS_KEYS, NumericalModel
 from tuning.rig.numerical_model_six_axes import BODY_NUMBERS, SHARES, build_body
 
@@ -52,6 +53,8 @@ def rt_loop_files(document: Mapping[str, Any]) -> dict[str, str]:
     folder = resources.files("tuning") / "bundle" / "rt"
     sources = {**{name: name for name in FILES}, MODEL_FILE: MODEL_SOURCES[kind.axes]}
     texts = {name: (folder / source).read_text(encoding="utf-8") for name, source in sources.items()}
+    if kind is not ONE_AXIS:
+        texts["numerical_model.h"] = read_source("numerical_model_six_axes.h")
     return {name: text.replace("@constants@", "\n".join(lines)) for name, text in texts.items()}
 
 
@@ -72,16 +75,21 @@ def _one_axis_constants(mechanism: Mapping[str, Any], model: NumericalModel, int
 
 def _six_axis_constants(mechanism: Mapping[str, Any], integrator: str) -> list[str]:
     """Return the C constants of the numerical model with six axes."""
-    bodies = []
-    for name in ("target", "chaser"):
-        mass, *vectors = build_body(mechanism[name])
-        bodies.append(f"{{{mass!r}, {', '.join(map(_initialiser, vectors))}}}")
     return [
         f"enum {{ START_VALUES = {2 * BODY_NUMBERS} }};",
         f"#define VELOCITY_SHARE {SHARES[integrator]!r} /* of the velocity change that moves the body */",
         "/* Target and chaser: mass, inverse inertia, origin and attitude of the interface frame. */",
-        f"#define BODIES {{ \\\n    {bodies[0]}, \\\n    {bodies[1]}}}",
+        f"#define BODIES {body_constants(mechanism)}",
     ]
+
+
+def body_constants(mechanism: Mapping[str, Any]) -> str:
+    """Return the C initialiser of target and chaser in the numerical model with six axes."""
+    bodies = []
+    for name in ("target", "chaser"):
+        mass, *vectors = build_body(mechanism[name])
+        bodies.append(f"{{{mass!r}, {', '.join(map(_initialiser, vectors))}}}")
+    return f"{{ \\\n    {bodies[0]}, \\\n    {bodies[1]}}}"
 
 
 def _initialiser(values: Any) -> str:

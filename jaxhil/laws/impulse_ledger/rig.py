@@ -225,8 +225,7 @@ class ImpulseLedger(Compensator):
     def _learn(self, phi: Vector, depth: float, rate: float, reading: float, noise: float) -> None:
         """Update contact model and estimated delay with one `reading` [1/s] and its noise variance `noise`.
 
-        `phi` is the regressor. Reading, `depth` [s] and `rate` [1] of the hardware are divided by the approach
-        speed.
+        `phi` is the regressor. Reading, `depth` [s] and `rate` [1] are divided by the approach speed.
         """
         model, period, floor = self._model, self._period, self._floor
         model_error = MISFIT * reading

@@ -12,10 +12,15 @@ from tuning.bundle.controller_kind import ONE_AXIS, kind_of
 from tuning.bundle.fmu.archive import build_fmu
 from tuning.bundle.fmu.sources import read_source
 from tuning.bundle.fmu.variables import c_names, controller_variables, six_axis_names
+from tuning.bundle.rt_loop import body_constants
 from tuning.bundle.vector_replay import LAYOUTS
+from tuning.rig.numerical_model_six_axes import SHARES
 
 IDENTIFIER = "jaxhil_controller"
 INITIAL_INPUTS = ("position", "velocity", "position_desired", "velocity_desired")
+SIX_AXIS_INITIAL_INPUTS = [
+    name for vector in ("pose", "pose_desired", "twist_desired") for name in six_axis_names(vector)
+]
 _TESTED_FMU = """\
 #include <stdbool.h>
 #include <stdint.h>
@@ -57,18 +62,33 @@ def controller_fmu(document: Mapping[str, Any], fmi: int) -> bytes:
             GAINS_FILE: code[GAINS_FILE],
             "fmu_model.h": read_source("controller.h"),
             "fmu_model.c": read_source("controller_one_axis.c" if is_one_axis else "controller_six_axes.c"),
-            **{name: read_source(name) for name in ("controller_events.h", "numerical_model.h")},
+            "controller_events.h": read_source("controller_events.h"),
+            "numerical_model.h": read_source(
+                "numerical_model.h" if is_one_axis else "numerical_model_six_axes.h"
+            ),
         },
         constants={
             "FMU_GAIN_COUNT": len(gains),
             "FMU_FIRST_GAIN": names.index(gains[0]) if gains else 0,
             "FMU_FIRST_LIMIT": names.index(limits[0]),
             **_log_constants(document),
-            "FMU_INTEGRATOR": f"INTEGRATOR_{document['mechanism']['rig']['integrator'].upper()}",
+            "FMU_AXES": document.get("axes", 1),
+            **_model_constants(document),
         },
         fmi=fmi,
-        initial_inputs=INITIAL_INPUTS if is_one_axis else six_axis_names("pose"),
+        initial_inputs=INITIAL_INPUTS if is_one_axis else SIX_AXIS_INITIAL_INPUTS,
     )
+
+
+def _model_constants(document: Mapping[str, Any]) -> dict[str, str]:
+    """Return the C constants of the numerical model that the FMU can integrate."""
+    integrator = document["mechanism"]["rig"]["integrator"]
+    if kind_of(document) is ONE_AXIS:
+        return {"FMU_INTEGRATOR": f"INTEGRATOR_{integrator.upper()}"}
+    return {
+        "FMU_VELOCITY_SHARE": repr(SHARES[integrator]),
+        "FMU_BODIES": body_constants(document["mechanism"]),
+    }
 
 
 def _log_constants(document: Mapping[str, Any]) -> dict[str, str]:

@@ -17,7 +17,14 @@ from jaxhil.mechanism.structs import Contact, Mechanism
 from tuning.bundle.c99_tables import format_double
 from tuning.bundle.fmu.archive import build_fmu
 from tuning.bundle.fmu.sources import read_source
-from tuning.bundle.fmu.variables import MODEL_MASSES, SEED, TIME, Variable, six_axis_vector
+from tuning.bundle.fmu.variables import (
+    MODEL_MASSES,
+    SEED,
+    TIME,
+    Variable,
+    six_axis_vector,
+    target_angular_velocity,
+)
 from tuning.rig.plant import PlantConstants, compute_plant_constants
 
 IDENTIFIER = "jaxhil_rig"
@@ -144,6 +151,7 @@ def _six_axis_variables() -> list[Variable]:
         *six_axis_vector("pose", "pose", "output", "pose of C relative to T in the numerical model"),
         *six_axis_vector("twist", "twist", "output", "twist of C relative to T in the numerical model"),
         *six_axis_vector("wrench_contact", "wrench", "output", "real wrench without effects of the sensor"),
+        *target_angular_velocity("output"),
         SEED,
     ]
 

@@ -25,7 +25,8 @@ from jaxhil.sixdof.kinematics import RigidMotion
 from jaxhil.sixdof.loop import begin, build_rig_constants, complete_tick, integrate
 from jaxhil.sixdof.loop_state import Loop, RigConstants, RunState, Sensed
 from jaxhil.sixdof.numerical_model import model_motion
-from jaxhil.sixdof.relative import Wrench
+from jaxhil.sixdof.relative import Wrench, interface_frame
+from jaxhil.sixdof.rotations import rotate_back
 from jaxhil.sixdof.scenario import Scenario
 from jaxhil.sixdof.sensing import sense
 from jaxhil.sixdof.vectors import vector
@@ -51,7 +52,8 @@ extern const double rig_start[RIG_NUMBERS];
 void rig_move(const double *state, const double *wrench, const double *pose, double *moved);
 
 /* Read the sensors with this key of the noise. `sensed` is the state with the contact's new state.
- * The readings are those of wrench and pose, then pose and twist of the model, and the contact wrench. */
+ * The readings are those of wrench and pose, then pose and twist of the model, the contact wrench, and the
+ * target's angular velocity. */
 void rig_sense(const double *state, const uint32_t *key, double *sensed, double *readings);
 
 #endif
@@ -180,5 +182,7 @@ def _sense(loop: Loop, rig: RigConstants, state: RigState) -> tuple[Array, Array
         controller=run.controller._replace(lag=sensed.lag, bias_walk=sensed.bias_walk),
     )
     signals = sensed.signals
-    outputs = pack((signals.wrench, signals.pose_measured, run.near, run.twist, sensed.contact))
+    target = interface_frame(rig.bodies.target, run.states.target)
+    spin = rotate_back(target.attitude, target.angular_velocity)
+    outputs = pack((signals.wrench, signals.pose_measured, run.near, run.twist, sensed.contact, spin))
     return pack(RigState(after, sensed.reading)), outputs

@@ -47,6 +47,10 @@ VECTORS = {  # names and units of the components of a vector of six axes
 FLIGHT_LOG = Variable(
     "flight_log", "parameter", "string", "path of the flight log, which ends in .csv; empty for no log"
 )
+INTEGRATES_MODEL = Variable(
+    "integrates_model", "parameter", "boolean",
+    "whether the FMU itself integrates the numerical model; each run begins from the desired motion",
+)  # fmt: skip
 EVENTS = (
     Variable("next_contact", "input", "boolean", "true in the first step of each run of a series"),
     Variable("reset", "input", "boolean", "true in a step that begins with a reset after a trip"),
@@ -105,6 +109,15 @@ def six_axis_vector(name: str, quantity: str, causality: Any, description: str) 
     ]
 
 
+def target_angular_velocity(causality: Any) -> list[Variable]:
+    """Return the variables of the target's angular velocity, which the start of a run needs."""
+    description = "angular velocity of the target in the numerical model, in axes of T"
+    return [
+        Variable(f"target_angular_velocity.{part}", causality, "real", description, "rad/s")
+        for part in TWIST[3:]
+    ]
+
+
 def six_axis_names(name: str) -> list[str]:
     """Return the names of the variables of a vector with six axes, such as `wrench_command`."""
     return [f"{name}.{part}" for part in VECTORS[name.partition("_")[0]][0]]
@@ -132,10 +145,7 @@ def _one_axis_signals(document: Mapping[str, Any]) -> list[Variable]:
         signal("damping", "output", "N s/m", "identified damping; 0: none"),
         signal("model_position", "output", "m", "newest position of the numerical model"),
         signal("model_velocity", "output", "m/s", "newest velocity of the numerical model"),
-        Variable(
-            "integrates_model", "parameter", "boolean",
-            "whether the FMU itself integrates the numerical model; each run begins from the desired motion",
-        ),
+        INTEGRATES_MODEL,
         Variable(
             "equivalent_mass", "parameter", "real", "mass of the numerical model, if the FMU integrates it",
             "kg", mass, *MODEL_MASSES,
@@ -152,6 +162,7 @@ def _six_axis_signals() -> list[Variable]:
         *vector("pose_measured", "pose", "input", "measured pose of C relative to T on the hardware"),
         *vector("pose", "pose", "input", "newest pose of the numerical model, to be commanded"),
         *vector("twist", "twist", "input", "newest twist of the numerical model"),
+        *target_angular_velocity("input"),
         *vector("wrench_command", "wrench", "output", "compensated wrench about T's origin"),
         *vector("pose_command", "pose", "output", "pose command to the motion simulator"),
         *vector("wrench_bias", "wrench", "output", "bias of the force sensor from the last tare"),
@@ -160,6 +171,9 @@ def _six_axis_signals() -> list[Variable]:
             "loop_delay", "output", "real", "delay of the hardware in the last contact; 0: unknown", "s"
         ),
         Variable("unpaid_impulse", "output", "real", "share of the last contact's impulse that is owed"),
+        *vector("model_pose", "pose", "output", "newest pose of the numerical model"),
+        *vector("model_twist", "twist", "output", "newest twist of the numerical model"),
+        INTEGRATES_MODEL,
     ]
 
 

@@ -2,6 +2,7 @@
 #ifndef FMU_MODEL_H
 #define FMU_MODEL_H
 
+#include "fmu_variables.h"
 #include "jaxhil_controller.h"
 #include "numerical_model.h"
 
@@ -12,7 +13,7 @@ typedef struct {
     bool has_tick;    /* whether there was a tick since the initialisation */
     uint32_t contact; /* index of the contact in the flight log */
     numerical_model model; /* only if the FMU integrates the numerical model */
-    double position_desired, velocity_desired; /* of the last tick, on one axis */
+    double position_desired[FMU_AXES], velocity_desired[FMU_AXES]; /* of the last tick */
 } fmu_model;
 
 #endif

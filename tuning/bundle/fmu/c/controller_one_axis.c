@@ -24,8 +24,8 @@ static void tick(fmu_state *state, bool integrates, numerical_model *model) {
     jaxhil_controller *const controller = &state->model.controller;
     const double position = integrates ? model->position : values[V_POSITION_DESIRED];
     const double velocity = integrates ? model->velocity : values[V_VELOCITY_DESIRED];
-    state->model.position_desired = position;
-    state->model.velocity_desired = velocity;
+    state->model.position_desired[0] = position;
+    state->model.velocity_desired[0] = velocity;
     values[V_FORCE_COMMAND] =
         jaxhil_step(controller, values[V_FORCE_MEASURED], position, velocity, values[V_POSITION_MEASURED],
                     values[V_HAS_TICK_TIME] != 0.0 ? &values[V_TICK_TIME] : NULL);
@@ -66,7 +66,7 @@ void fmu_model_step(fmu_state *state) {
 
 size_t fmu_model_row(const fmu_state *state, double *row) {
     const double *const values = state->values;
-    const double readings[4] = {values[V_FORCE_MEASURED], state->model.position_desired,
-                                state->model.velocity_desired, values[V_POSITION_MEASURED]};
+    const double readings[4] = {values[V_FORCE_MEASURED], state->model.position_desired[0],
+                                state->model.velocity_desired[0], values[V_POSITION_MEASURED]};
     return fill_row(state, readings, &values[V_FORCE_BIAS], &values[V_FORCE_COMMAND], 1, row);
 }
