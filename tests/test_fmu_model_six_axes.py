@@ -39,7 +39,7 @@ def values_of(vectors, numbers):
 
 @pytest.mark.slow
 def test_six_axis_fmu_integrates_motion_of_both_bodies_with_a_turning_target(tmp_path):
-    made = document_of("probe-drogue", "phase_lead", ROTATED)
+    made = document_of("probe-drogue", "impulse_ledger", ROTATED)
     fmu = RunningFmu(extract(write_fmu(tmp_path / "controller.fmu", controller_fmu(made, 3))))
     controller = Controller6.from_dict(made)
     model, rng = SixAxisModelInLoop(controller, made["mechanism"]), np.random.default_rng(1)
