@@ -171,9 +171,9 @@ def test_rig_fmu_with_six_axes_compiles_without_warning_and_runs_under_sanitizer
     for standard in ("c++11", "c++20"):
         assert compile_sources(folder, "g++", f"-std={standard}", "-x", "c++", *PEDANTIC) == ""
     program = sanitised(folder, tmp_path / "calls", *SANITIZED)
-    ran = subprocess.run([program, "20000"], capture_output=True, text=True)
+    ran = subprocess.run([program, "100000"], capture_output=True, text=True)
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert int(ran.stdout.split()[0]) > 5000
+    assert int(ran.stdout.split()[0]) > 25000
 
 
 @pytest.mark.slow

@@ -88,7 +88,7 @@ def _describe_key(field: inspect.Field, path: str) -> KeyDescription:
     """Describe the key at a path. Raise ValueError if it has no description, or is a number without unit."""
     meaning = next(_find_descriptions(field.type), "")
     if not meaning:
-        raise ValueError(f"{path}: found a type annotation without description, expected one")
+        raise ValueError(f"{path}: found no description in the type annotation, expected one")
     default = None if field.default is NODEFAULT else field.default
     if field.default_factory is not NODEFAULT:
         default = field.default_factory()
