@@ -7,16 +7,18 @@ from typing import Any
 
 from jaxhil.rig.flight_recorder import FlightRecorder
 from tuning.bundle.controller_kind import ONE_AXIS, kind_of
-from tuning.bundle.fmu.sources import read_source
 from tuning.rig.numerical_model import NOISE_AND_BIAS_KEYS, NumericalModel
 from tuning.rig.numerical_model_six_axes import BODY_NUMBERS, SHARES, build_body
 
-# Files of the loop, and the source of its numerical model by number of axes.
+# Files of the loop, and the sources of its numerical model by number of axes.
 FILES = (
     *("rt_loop.h", "rt_loop.c", "rt_task.h", "rt_task.c", "rt_model.h"),
     *("rt_log.h", "rt_log.c", "rt_plant_udp.c"),
 )
-MODEL_FILE, MODEL_SOURCES = "rt_model.c", {1: "rt_model_one_axis.c", 6: "rt_model_six_axes.c"}
+MODEL_SOURCES = {
+    1: {"rt_model.c": "rt/rt_model_one_axis.c"},
+    6: {"rt_model.c": "rt/rt_model_six_axes.c", "numerical_model.h": "fmu/c/numerical_model_six_axes.h"},
+}
 # Displacement of the one-axis numerical model in a period, by integrator.
 MODEL_STEPS = {
     "semi_implicit_euler": "(PERIOD * (after))",
@@ -50,11 +52,9 @@ def rt_loop_files(document: Mapping[str, Any]) -> dict[str, str]:
         *(f"    {json.dumps(line)} \\" for line in recorder.mapping("*").splitlines(keepends=True)),
         '    ""',
     ]
-    folder = resources.files("tuning") / "bundle" / "rt"
-    sources = {**{name: name for name in FILES}, MODEL_FILE: MODEL_SOURCES[kind.axes]}
+    folder = resources.files("tuning") / "bundle"
+    sources = {**{name: f"rt/{name}" for name in FILES}, **MODEL_SOURCES[kind.axes]}
     texts = {name: (folder / source).read_text(encoding="utf-8") for name, source in sources.items()}
-    if kind is not ONE_AXIS:
-        texts["numerical_model.h"] = read_source("numerical_model_six_axes.h")
     return {name: text.replace("@constants@", "\n".join(lines)) for name, text in texts.items()}
 
 
