@@ -217,10 +217,10 @@ def start(table, case):
 
     begin = np.concatenate([rotation.ravel(), rotation.T @ w])
     y = solve_ivp(slope, (0, -before), begin, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
-    place = o1 + p - rotation @ o2 - before * velocity
+    position = o1 + p - rotation @ o2 - before * velocity
     return [
         (np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3)),
-        (place, velocity, y[:9].reshape(3, 3), y[9:]),
+        (position, velocity, y[:9].reshape(3, 3), y[9:]),
     ]
 
 

@@ -390,10 +390,7 @@ def _delayed_sample(ring, now, age, intervals):
 
 
 def _delayed_position(rig, state, now, age):
-    """Return the delayed position [m] for the position sensor; NaN if the loop does not measure the position.
-
-    The motion before the start of the run is assumed to be uniform.
-    """
+    """Return the delayed position [m], uniform before the run; NaN if the loop measures no position."""
     ring, intervals = state.sensed.rings.position, rig.delays.position.intervals
     if ring is None:
         return jnp.full_like(state.position, jnp.nan)

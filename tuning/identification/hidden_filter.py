@@ -185,13 +185,14 @@ def _fit_age(problem: ContactProblem, age: float, plane: float, lag: float) -> _
 def _find_minimum(misfit: Callable[[float], float], start: float, limits: tuple[float, float]) -> float:
     """Return the time constant [s] with the smallest misfit within limits, near a starting value."""
     best = start
-    while misfit(best) < np.inf:
+    while True:
         low, high = max(best / TRIAL_RATIO, limits[0]), min(best * TRIAL_RATIO, limits[1])
         better = min(low, high, key=misfit)
         if not misfit(better) < misfit(best):
             break
         best = better
-    if not low < best < high:
+    is_inside = low < best < high
+    if not is_inside or not misfit(low) + misfit(high) > 2.0 * misfit(best):  # no parabola has a minimum
         return best
     x, y = np.log([low, best, high]), [misfit(value) for value in (low, best, high)]
     a, b, _ = np.polyfit(x - x[1], y, 2)
