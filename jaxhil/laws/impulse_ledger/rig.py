@@ -149,7 +149,9 @@ class ImpulseLedger(Compensator):
             self.status = OUT_OF_CONTACT
             self._approach(force_measured, position_desired, velocity_desired, position)
             if not detector.total > 0.0:
-                detector.learn(force_measured)
+                # Inside the specified surface, the force of a soft contact would be learned as bias.
+                if reach == 0.0:
+                    detector.learn(force_measured)
                 return 0.0
         command = self._follow(force_measured - detector.bias, velocity_desired, position, velocity)
         if not detector.total > LEVEL:

@@ -135,7 +135,7 @@ class ImpulseLedger(Compensator):
         inside = side * reach > 0
         stays = inside | (side * deflection(position, clearance) > 0)
         flies = (side == 0) & ~(state.flight.total > rig.LEVEL)
-        state = self._approach(prepared, state, signals, position, flies)
+        state = self._approach(prepared, state, signals, position, reach, flies)
         # All lanes of a tile have contact at about the same time: on most ticks, no lane needs `_follow`.
         follow = partial(self._follow, prepared, state, signals, position, velocity)
         command = jnp.zeros_like(position)
@@ -156,7 +156,7 @@ class ImpulseLedger(Compensator):
             delay=select_lanes(over, contact.delay._replace(mean=mean), state.delay),
         )
 
-    def _approach(self, prepared, state, signals, position, flies):
+    def _approach(self, prepared, state, signals, position, reach, flies):
         """Test the force readings of the lanes `flies` for contact; in free flight, prepare for a contact."""
         gains, (period, clearance) = prepared
         flight, force, velocity = state.flight, signals.force_measured, signals.velocity_desired
@@ -175,9 +175,10 @@ class ImpulseLedger(Compensator):
         origin = position - rig.ONSET_PLACE * (period * velocity)
         lag = jnp.clip((signals.position_desired - position) / divisor, 0, rig.MAX_LAG)
         begin = partial(_begin_contact, gains, origin, lag, (position - origin) / divisor, state.delay)
-        learned = onset_detection.learn(flight, force, jnp.where(approaches, velocity, 0))
+        # Inside the specified surface, the force of a soft contact would be learned as bias.
+        flight = select_lanes(free & (reach == 0), onset_detection.learn(flight, force), flight)
         return state._replace(
-            flight=select_lanes(free, learned, flight),
+            flight=flight._replace(velocity=jnp.where(free, jnp.where(approaches, velocity, 0), flight.velocity)),
             contact=update_lanes(free & approaches, begin, state.contact),
         )
 

@@ -30,10 +30,10 @@ def update(flight: FreeFlight, deviation: Array, settled: Bool[Array, "*batch"])
     return jnp.where(settled & (total > 0), total, 0)
 
 
-def learn(old: FreeFlight, force: Array, velocity: Array) -> FreeFlight:
-    """Update the estimates with one force reading [N] of free flight, at the approach velocity [m/s]."""
+def learn(old: FreeFlight, force: Array) -> FreeFlight:
+    """Update the estimates of bias and noise with one force reading [N] of free flight."""
     step = force - old.before
     change = (0.5 * (step * step) - old.square) / jnp.maximum(old.count, 1)
     square = old.square + jnp.where(old.count > 0, change, 0)
     bias = old.bias + (force - old.bias) / jnp.minimum(old.count + 1, MAX_MEAN)
-    return FreeFlight(old.count + 1, square, force, bias, old.total, velocity)
+    return old._replace(count=old.count + 1, square=square, before=force, bias=bias)
