@@ -76,6 +76,20 @@ def test_impulse_ledger_uses_estimated_delay_in_second_contact():
     assert restitution(late, law, 1) == pytest.approx(1, abs=2e-3)
 
 
+@pytest.mark.parametrize("plane", [0.0, 2e-3])
+def test_impulse_ledger_counts_force_below_noise_in_soft_damped_contact(plane):
+    """The specified noise is 10 % of the peak force, so that the contact is detected late."""
+    mass, stiffness, ratio = 350.0, 1000.0, 0.05
+    damping = 2 * ratio * np.sqrt(stiffness * mass)
+    changes = [f"contact.stiffness=[{stiffness}]", f"contact.damping=[{damping}]"]
+    mechanism = load("suite-long", [*changes, f"rig.contact_plane={plane}"]).mechanism
+    peak = mechanism.approach.velocity * np.sqrt(stiffness * mass)
+    gains = literature_gains(mechanism, LAW) | {"force_noise": 0.1 * float(peak)}
+    # Closed form of a contact without tension, which ends where the force returns to zero.
+    ideal = np.exp(-ratio * (np.pi - 2 * np.arcsin(ratio)) / np.sqrt(1 - ratio**2))
+    assert restitution(mechanism, controller(mechanism, LAW, gains)) == pytest.approx(ideal, abs=0.002)
+
+
 def test_impulse_ledger_status_is_unexplained_for_damped_contact_with_delay():
     mechanism = load("suite-damped", ["contact.damping=[600.0]", UNCERTAIN]).mechanism
     gains = literature_gains(mechanism, LAW)

@@ -84,7 +84,7 @@ class ImpulseLedger(Compensator):
     __slots__ = (
         "_age", "_alignment", "_clearance", "_correction_limit", "_deepest", "_delay", "_delay_spread",
         "_detector", "_estimate", "_floor", "_gain", "_identification_delay", "_lag", "_mass", "_model",
-        "_origin", "_outside", "_peak", "_period", "_preload", "_reference", "_side", "_spreads",
+        "_origin", "_outside", "_peak", "_period", "_preload", "_reference", "_side", "_spreads", "_start",
         "_stiffness", "_variance", "_velocity", "status",
     )  # fmt: skip
     _estimate: tuple[float, float]  # mean and variance of the delay after this contact
@@ -136,21 +136,22 @@ class ImpulseLedger(Compensator):
         position, velocity = self._alignment.step(position_measured, velocity_desired, begins)
         position -= self._delay * velocity
         reach = deflection(position_desired, self._clearance)
+        depth = deflection(position, self._clearance)
         if begins and reach != 0.0:
             self._side = 1.0 if reach > 0.0 else -1.0
         if self._side != 0.0:
             # Return the measured force until model and hardware are out of contact.
             self.status = UNSURE
             inside = self._side * reach > 0.0
-            if not (inside or self._side * deflection(position, self._clearance) > 0.0):
+            if not (inside or self._side * depth > 0.0):
                 self._side = 0.0
             return force_measured if inside else 0.0
         if not detector.total > LEVEL:
             self.status = OUT_OF_CONTACT
-            self._approach(force_measured, position_desired, velocity_desired, position)
+            self._approach(force_measured, position_desired, velocity_desired, position, depth)
             if not detector.total > 0.0:
-                # Inside the specified surface, the force of a soft contact would be learned as bias.
-                if reach == 0.0:
+                # Behind the specified surface, the force of a soft contact would be learned as bias.
+                if depth == 0.0:
                     detector.learn(force_measured)
                 return 0.0
         command = self._follow(force_measured - detector.bias, velocity_desired, position, velocity)
@@ -166,27 +167,34 @@ class ImpulseLedger(Compensator):
             return 0.0
         return command
 
-    def _approach(self, force: float, position_desired: float, velocity: float, position: float) -> None:
+    def _approach(
+        self, force: float, position_desired: float, velocity: float, position: float, depth: float
+    ) -> None:
         """Test a force reading for contact; if it shows free flight, prepare for contact on the next tick."""
         side = 1.0 if velocity > 0.0 or self._clearance == inf else -1.0  # direction of the approach
         weight = self._mass * (side * velocity)
         approaches = weight > MIN_MOMENTUM
         # The bias is known only after a reading of free flight during an approach in this direction.
         settled = not self._age * self._period < SETTLING and approaches and self._velocity * velocity > 0.0
-        self._detector.update(force, side, self._floor * weight, settled)
-        if self._detector.total > 0.0:
+        detector = self._detector
+        detector.update(force, side, self._floor * weight, settled, side * depth > 0.0)
+        if not detector.early > 0.0:
+            self._start = position
+        if detector.total > 0.0:
             return
         self._velocity = velocity if approaches else 0.0
         if not approaches:
             return
-        self._origin = position - ONSET_PLACE * (self._period * velocity)
+        begun = detector.early > LEVEL
+        self._origin = (self._start if begun else position) - ONSET_PLACE * (self._period * velocity)
         self._lag = min(max((position_desired - position) / velocity, 0.0), MAX_LAG)
         self._deepest = 0.0
         self._peak = MIN_PEAK
         self._outside = 0.0  # number of ticks since the hardware left the surface
         self._estimate = 0.0, self._variance
         self._model.restart(self._stiffness, self._spreads, self._variance)
-        self._reference.begin((position - self._origin) / velocity, self._model.theta)
+        speed = 1.0 - self._period * detector.missed / weight if begun else 1.0
+        self._reference.begin((position - self._origin) / velocity, speed, self._model.theta)
 
     def _follow(self, force: float, velocity_desired: float, position: float, velocity: float) -> float:
         """Process one reading during a contact; return the force command [N].
@@ -253,7 +261,7 @@ class ImpulseLedger(Compensator):
             return UNSURE
         if self._lag * peak > LATE * pi:
             return TOO_SHORT
-        # Before the detection, an impulse of (DRIFT sigma)^2/(2 k) is lost in the noise. k, the stiffness
+        # Before the detection, an impulse of (DRIFT sigma)^2/(2 k) is below the noise. k, the stiffness
         # divided by the mass, is about peak^2.
         lost_impulse = 0.5 * (DRIFT * DRIFT) * noise / (peak * peak)
         if reference.spread(model.covariance, 0.0) + lost_impulse > UNCERTAIN:

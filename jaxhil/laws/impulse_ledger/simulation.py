@@ -115,7 +115,7 @@ class ImpulseLedger(Compensator):
             alignment=alignment.begin(ring, zeros),
             side=zeros,
             flight=onset_detection.FreeFlight(*[zeros] * len(onset_detection.FreeFlight._fields)),
-            contact=_begin_contact(full, zeros, zeros, zeros, delay),
+            contact=_begin_contact(full, zeros, zeros, zeros, zeros + 1, delay),
             delay=delay,
         )
 
@@ -131,11 +131,12 @@ class ImpulseLedger(Compensator):
         position, velocity, aligned = align(state.alignment, force_delay, period, signals, tick)
         position = position - state.delay.mean * velocity
         reach = deflection(signals.position_desired, clearance)
+        depth = deflection(position, clearance)
         side = jnp.where(signals.age == 0, jnp.sign(reach), state.side)
         inside = side * reach > 0
-        stays = inside | (side * deflection(position, clearance) > 0)
+        stays = inside | (side * depth > 0)
         flies = (side == 0) & ~(state.flight.total > rig.LEVEL)
-        state = self._approach(prepared, state, signals, position, reach, flies)
+        state = self._approach(prepared, state, signals, position, depth, flies)
         # All lanes of a tile have contact at about the same time: on most ticks, no lane needs `_follow`.
         follow = partial(self._follow, prepared, state, signals, position, velocity)
         command = jnp.zeros_like(position)
@@ -156,7 +157,7 @@ class ImpulseLedger(Compensator):
             delay=select_lanes(over, contact.delay._replace(mean=mean), state.delay),
         )
 
-    def _approach(self, prepared, state, signals, position, reach, flies):
+    def _approach(self, prepared, state, signals, position, depth, flies):
         """Test the force readings of the lanes `flies` for contact; in free flight, prepare for a contact."""
         gains, (period, clearance) = prepared
         flight, force, velocity = state.flight, signals.force_measured, signals.velocity_desired
@@ -168,17 +169,25 @@ class ImpulseLedger(Compensator):
         settled = settled & approaches & (flight.velocity * velocity > 0)
         sigma = safe_sqrt(onset_detection.variance(flight, gains["force_noise"]))
         sigma = sigma + gains["force_noise_floor"] * weight
-        deviation = jnp.sign(velocity) * (force - flight.bias) / jnp.where(approaches, sigma, 1)
-        total = jnp.where(flies, onset_detection.update(flight, deviation, settled), flight.total)
-        flight, free = flight._replace(total=total), flies & ~(total > 0)
+        inside = jnp.sign(velocity) * depth > 0
+        push, sigma = jnp.sign(velocity) * (force - flight.bias), jnp.where(approaches, sigma, 1)
+        flight = select_lanes(
+            flies, onset_detection.update(flight, push, sigma, settled, inside, position), flight
+        )
+        free, begun = flies & ~(flight.total > 0), flight.early > rig.LEVEL
         divisor = jnp.where(approaches, velocity, 1)
-        origin = position - rig.ONSET_PLACE * (period * velocity)
+        origin = jnp.where(begun, flight.start, position) - rig.ONSET_PLACE * (period * velocity)
+        missed = jnp.where(begun, period * flight.missed / jnp.where(approaches, weight, 1), 0)
         lag = jnp.clip((signals.position_desired - position) / divisor, 0, rig.MAX_LAG)
-        begin = partial(_begin_contact, gains, origin, lag, (position - origin) / divisor, state.delay)
-        # Inside the specified surface, the force of a soft contact would be learned as bias.
-        flight = select_lanes(free & (reach == 0), onset_detection.learn(flight, force), flight)
+        begin = partial(
+            _begin_contact, gains, origin, lag, (position - origin) / divisor, 1 - missed, state.delay
+        )
+        # Behind the specified surface, the force of a soft contact would be learned as bias.
+        flight = select_lanes(free & (depth == 0), onset_detection.learn(flight, force), flight)
         return state._replace(
-            flight=flight._replace(velocity=jnp.where(free, jnp.where(approaches, velocity, 0), flight.velocity)),
+            flight=flight._replace(
+                velocity=jnp.where(free, jnp.where(approaches, velocity, 0), flight.velocity)
+            ),
             contact=update_lanes(free & approaches, begin, state.contact),
         )
 
@@ -239,10 +248,10 @@ def _prior(gains, delay):
     return contact_model.prior(gains["prior_stiffness"], spreads, delay.variance)
 
 
-def _begin_contact(gains, origin, lag, depth, delay) -> LedgerContact:
-    """Return a contact before its first reading, at the scaled `depth` [s]."""
+def _begin_contact(gains, origin, lag, depth, speed, delay) -> LedgerContact:
+    """Return a contact before its first reading, at the scaled `depth` [s] and `speed` [1]."""
     zeros, prior = jnp.zeros_like(depth), _prior(gains, delay)
-    reference = reference_trajectory.begin(depth, prior[0])
+    reference = reference_trajectory.begin(depth, speed, prior[0])
     peak, estimate = zeros + rig.MIN_PEAK, contact_model.begin(*prior)
     return LedgerContact(origin, lag, zeros, peak, zeros, estimate, reference, delay._replace(mean=zeros))
 

@@ -5,17 +5,20 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxhil.laws.impulse_ledger.onset_detection.rig import DRIFT, MAX_MEAN, MIN_FLIGHT_READINGS
+from jaxhil.laws.impulse_ledger.onset_detection.rig import DRIFT, EARLY_DRIFT, MAX_MEAN, MIN_FLIGHT_READINGS
 
 
 class FreeFlight(NamedTuple):
-    """Statistics of the force readings in free flight, and the cumulative sum of the onset detection."""
+    """Statistics of the force readings in free flight, and the cumulative sums of the onset detection."""
 
     count: Float[Array, "*batch"]  # number of readings in free flight
     square: Float[Array, "*batch"]  # noise variance, from half the squared differences of readings [N^2]
     before: Float[Array, "*batch"]  # last reading [N]
     bias: Float[Array, "*batch"]  # mean of the readings [N]
     total: Float[Array, "*batch"]  # cumulative sum S [1]
+    early: Float[Array, "*batch"]  # cumulative sum S' [1]; 0 in front of the specified surface
+    missed: Float[Array, "*batch"]  # sum of the readings without bias since the last reading with S' = 0 [N]
+    start: Float[Array, "*batch"]  # position of the hardware at the last reading with S' = 0 [m]
     velocity: Float[Array, "*batch"]  # approach velocity at the last reading [m/s]; 0 without an approach
 
 
@@ -24,10 +27,20 @@ def variance(flight: FreeFlight, noise: Array) -> Float[Array, "*batch"]:
     return jnp.maximum(noise**2, jnp.where(flight.count > MIN_FLIGHT_READINGS, flight.square, 0))
 
 
-def update(flight: FreeFlight, deviation: Array, settled: Bool[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return the next cumulative sum; `deviation` is the reading minus the bias, divided by sigma."""
-    total = flight.total + deviation - DRIFT
-    return jnp.where(settled & (total > 0), total, 0)
+def update(
+    old: FreeFlight,
+    push: Array,
+    sigma: Array,
+    settled: Bool[Array, "*batch"],
+    inside: Bool[Array, "*batch"],
+    position: Array,
+) -> FreeFlight:
+    """Update the cumulative sums with one reading without bias, `push` [N]; `sigma` is its deviation [N]."""
+    total = jnp.where(settled, jnp.maximum(old.total + push / sigma - DRIFT, 0), 0)
+    early = jnp.where(settled & inside, jnp.maximum(old.early + push / sigma - EARLY_DRIFT, 0), 0)
+    rises = early > 0
+    missed, start = jnp.where(rises, old.missed + push, 0), jnp.where(rises, old.start, position)
+    return old._replace(total=total, early=early, missed=missed, start=start)
 
 
 def learn(old: FreeFlight, force: Array) -> FreeFlight:

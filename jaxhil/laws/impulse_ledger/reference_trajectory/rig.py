@@ -49,12 +49,12 @@ class ReferenceTrajectory:
     __slots__ = ("_depths", "_losses", "_speeds", "_theta", "deepest", "depth", "force", "released", "speed")
 
     def __init__(self) -> None:
-        self.begin(0.0, [0.0] * PARAMETERS)
+        self.begin(0.0, 1.0, [0.0] * PARAMETERS)
 
-    def begin(self, depth: float, theta: Vector) -> None:
-        """Start the trajectory with the approach speed, at `depth`: the depth / approach speed [s]."""
+    def begin(self, depth: float, speed: float, theta: Vector) -> None:
+        """Start the trajectory at `depth` [s] and `speed` [1], both divided by the approach speed."""
         self.depth = depth
-        self.speed = 1.0
+        self.speed = speed
         self.force = 0.0
         self.deepest = depth
         self.released = False

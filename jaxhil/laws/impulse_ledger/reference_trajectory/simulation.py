@@ -22,13 +22,13 @@ class ReferenceTrajectory(NamedTuple):
     speeds: Float[Array, "parameters *batch"]  # sensitivities s' of the speed
 
 
-def begin(depth: Array, like: Array) -> ReferenceTrajectory:
-    """Return the trajectory at the onset, at `depth`: the depth divided by the approach speed [s].
+def begin(depth: Array, speed: Array, like: Array) -> ReferenceTrajectory:
+    """Return the trajectory at `depth` [s] and `speed` [1], both divided by the approach speed.
 
     The sensitivities are 0 and have the shape of `like`.
     """
     zeros, sensitivities = jnp.zeros_like(depth), jnp.zeros_like(like)
-    return ReferenceTrajectory(depth, zeros + 1, zeros, depth, zeros > 0, sensitivities, sensitivities)
+    return ReferenceTrajectory(depth, speed, zeros, depth, zeros > 0, sensitivities, sensitivities)
 
 
 def correct(old: ReferenceTrajectory, changes: Array) -> ReferenceTrajectory:
