@@ -10,7 +10,15 @@ from law_contacts import run
 from rig_lock_step import controller
 
 from jaxhil.laws.compensators import literature_gains
-from jaxhil.laws.impulse_ledger.contact_model.rig import DELAY, PARAMETERS, ContactModel, features, slope
+from jaxhil.laws.impulse_ledger.contact_model.rig import (
+    DAMPING,
+    DELAY,
+    DEPTH_DAMPING,
+    PARAMETERS,
+    ContactModel,
+    features,
+    slope,
+)
 from jaxhil.mechanism.file import load
 from jaxhil.mechanism.uncertainty import draw
 from jaxhil.simulation.loop_construction import build_loop
@@ -56,6 +64,23 @@ def test_impulse_ledger_does_not_change_delay_if_delay_spread_is_zero():
     model.conclude(0.0)
     assert model.mean[DELAY] == model.theta[DELAY] == 0.0
     assert all(model.covariance[DELAY][j] == 0.0 for j in range(PARAMETERS))
+
+
+def test_impulse_ledger_corrects_damping_if_depth_damping_is_zero():
+    """With depth damping 0, the damping is the mean of the normal distribution under this condition."""
+    model, correlation = ContactModel(), -0.95
+    model.restart(10.0, SPREADS, 0.0)
+    model.mean[DAMPING], model.mean[DEPTH_DAMPING] = 0.4, -0.2
+    for row, column, share in (
+        (DAMPING, DAMPING, 1.0),
+        (DEPTH_DAMPING, DEPTH_DAMPING, 1.0),
+        (DAMPING, DEPTH_DAMPING, correlation),
+        (DEPTH_DAMPING, DAMPING, correlation),
+    ):
+        model.covariance[row][column] = share * 0.1**2
+    model.conclude(0.0)
+    assert model.theta[DEPTH_DAMPING] < 1e-3
+    assert model.theta[DAMPING] == pytest.approx(0.4 + correlation * 0.2, rel=0.03)
 
 
 def restitution(mechanism, law, contact: int = 0) -> float:

@@ -42,6 +42,7 @@ MIN_SLIDING_SPEED = 0.03  # speed / approach speed below which friction changes 
 # `SPREAD_INDICES`, times the parameter's entry of `FACTORS`.
 SPREAD_INDICES = (0, *[1] * (HINGES - 1), 2, 3, 4, 5, 6)
 FACTORS = (1.0, *[(deeper - depth) / WANDER for depth, deeper in pairwise(KNOTS)], *[1.0] * 5)
+ZERO_SIGMAS = 3.0  # a dissipative parameter below 0 by less than this is 0 [standard deviations]
 ZERO_PROBABILITY = 0.75  # prior probability that a dissipative parameter is zero [1]
 ODDS = ZERO_PROBABILITY / (2.0 * (1.0 - ZERO_PROBABILITY)) * sqrt(2.0 * pi)
 ELASTIC_ODDS = 19.0  # prior odds of a contact without dissipation [1]
@@ -161,6 +162,14 @@ class ContactModel:
         theta = list(self.mean)
         rows = [list(self.covariance[j]) for j in CONCLUDED]
         observe(theta, rows, len(DISSIPATIVE), DELAY, EXACT * delay, EXACT)
+        # Otherwise, errors of opposite sign in damping and depth damping would not cancel.
+        for row in range(len(DISSIPATIVE)):
+            index = DAMPING + row
+            if (
+                theta[index] < 0.0
+                and theta[index] * theta[index] < ZERO_SIGMAS * ZERO_SIGMAS * rows[row][index]
+            ):
+                observe(theta, rows, row, index, 0.0, EXACT)
         self._dissipate(theta, rows, DAMPING, True)
         for j in range(DAMPING, PRELOAD):
             theta[j] = theta[j] if theta[j] > 0.0 else 0.0

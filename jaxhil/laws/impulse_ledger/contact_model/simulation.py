@@ -94,6 +94,9 @@ def conclude(
     """Return theta, the estimated parameters for a known `delay` [s] and non-negative dissipation."""
     rows = [estimate.covariance[j] for j in rig.CONCLUDED]
     mean, rows = _observe(estimate.mean, rows, len(DISSIPATIVE), DELAY, rig.EXACT * delay, rig.EXACT)
+    for row, index in enumerate(DISSIPATIVE):
+        is_zero = (mean[index] < 0) & (mean[index] ** 2 < rig.ZERO_SIGMAS**2 * rows[row][index])
+        mean, rows = _observe(mean, rows, row, index, 0.0, jnp.where(is_zero, rig.EXACT, 0))
     theta, _ = _dissipate(mean, rows, DAMPING, prior_variances, True)
     signed = theta[DAMPING:PRELOAD]
     return jnp.concatenate([theta[:DAMPING], jnp.where(signed > 0, signed, 0), theta[PRELOAD:]])
