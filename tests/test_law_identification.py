@@ -51,7 +51,7 @@ def test_impulse_ledger_reports_unexplained_if_contact_seems_to_add_energy():
     """The force delay exceeds the specified value by 1 ms."""
     nominal = load("suite-noisy").mechanism
     errors, statuses = [], []
-    for index, mechanism in enumerate(contacts_of("hardening", 6, 10, ("rig.force_sensor.delay=0.009",))):
+    for index, mechanism in enumerate(contacts_of("hardening", 6, 16, ("rig.force_sensor.delay=0.009",))):
         law = controller(mechanism, LAW, literature_gains(nominal, LAW))
         velocity = run(mechanism, law, index).rows[:, ROW.index("velocity")]
         errors.append(abs(abs(velocity[-1]) / velocity[0] - 1))
