@@ -1,4 +1,4 @@
-"""Identification of rigs whose force sensor has a random walk of its bias that the prior states."""
+"""Identification of rigs whose force sensor has a random walk of its bias."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,7 @@ from scipy.signal import lfilter
 from tuning.identification.drifting_noise import (
     LONG_FILTER,
     estimate_drifting_noise,
+    estimate_force_noise,
     subtract_weighted_mean,
 )
 
@@ -51,9 +52,29 @@ def test_readings_without_noise_have_no_random_walk():
     assert (noise.mean, noise.std, noise.walk, noise.bias_step) == (0.2, 0.0, None, 0.0)
 
 
+def test_random_walk_that_is_not_stated_is_estimated_from_readings_at_rest():
+    for seed in range(5):
+        walk, error = estimate_force_noise(rest(seed), PERIOD, 0.0).walk
+        assert abs(walk - WALK) < 4 * error
+
+
+@pytest.mark.parametrize("noise", ["white", "30 Hz", "linear drift", "small walk"])
+def test_other_noise_is_not_taken_for_random_walk(noise):
+    for seed in range(5):
+        readings = rest(seed, walk=0.05 if noise == "small walk" else 0.0)
+        if noise == "30 Hz":
+            pole = np.exp(-2 * np.pi * 30 * PERIOD)
+            white = np.random.default_rng(seed + 5).normal(size=len(readings))
+            readings += np.asarray(lfilter([2 * np.sqrt(1 - pole**2)], [1, -pole], white))
+        elif noise == "linear drift":
+            readings += np.linspace(0.0, 2.0, len(readings))
+        assert estimate_force_noise(readings, PERIOD, 0.0).walk is None
+
+
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", ["bias_walk_stated", "bias_walk"])
 @pytest.mark.parametrize("seed", [8000, 8001])
-def test_identify_verdict_is_good_for_campaign_with_stated_random_walk(seed, tmp_path):
+def test_identify_verdict_is_good_for_campaign_with_random_walk(kind, seed, tmp_path):
     """The seed 8001 has a press run, in which the bias drifts by several newtons."""
-    outcome = evaluate_identification("bias_walk_stated", seed, tmp_path)
+    outcome = evaluate_identification(kind, seed, tmp_path)
     assert (outcome.verdict, outcome.check, outcome.wrong, outcome.trouble) == ("good", "good", False, "")

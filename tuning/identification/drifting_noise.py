@@ -18,6 +18,8 @@ from scipy.signal import lfilter
 
 from tuning.identification.noise import NoiseEstimate, detect_quantum, estimate_noise
 
+DRIFT_TIME = 1.0  # time in which a random walk exceeds the noise, if it is not stated [s]
+MIN_LIKELIHOOD_GAIN = 10.0  # smallest gain of the log-likelihood from a random walk that is not stated
 STATED_LOG_STD = 1.0  # standard deviation of the logarithm of the drift that the mechanism states
 FORGOTTEN_SHARE = 0.005  # weight of the readings that the whitening filter leaves out
 MAX_FILTER_LENGTH = 200  # largest number of coefficients of the whitening filter
@@ -27,8 +29,27 @@ LOG_GAIN_RANGE = -9.0, -0.01  # range of log(1 - p)
 
 
 def estimate_force_noise(readings: np.ndarray, period: float, stated: float) -> NoiseEstimate:
-    """Estimate the noise at rest, with a random walk of the bias if the mechanism states one."""
-    return estimate_drifting_noise(readings, period, stated) if stated else estimate_noise(readings)
+    """Estimate the noise at rest, with a random walk of the bias if the mechanism states one.
+
+    If the mechanism states none, the bias has a random walk if two conditions are met: within `DRIFT_TIME`,
+    the walk exceeds the noise, and it explains the readings better than a linear drift and an autoregression.
+    """
+    if stated:
+        return estimate_drifting_noise(readings, period, stated)
+    steady = estimate_noise(readings)
+    rate = float(np.std(readings)) / math.sqrt(period * len(readings))
+    drifting = estimate_drifting_noise(readings, period, rate)
+    if drifting.walk is None or drifting.walk[0] * math.sqrt(DRIFT_TIME) < drifting.std:
+        return steady
+    if len(readings) < 2 * MAX_FILTER_LENGTH:
+        return steady
+    line = steady.mean + steady.drift * np.linspace(-0.5, 0.5, len(readings))
+    with_walk, without = (
+        float(np.std(lfilter(noise.filter, [1.0], readings - bias)[MAX_FILTER_LENGTH:]))
+        for noise, bias in ((drifting, drifting.mean), (steady, line))
+    )
+    gain = len(readings) * math.log(without / with_walk)
+    return drifting if gain > MIN_LIKELIHOOD_GAIN else steady
 
 
 def estimate_drifting_noise(readings: np.ndarray, period: float, stated: float) -> NoiseEstimate:
