@@ -78,3 +78,4 @@ def test_identify_verdict_is_good_for_campaign_with_random_walk(kind, seed, tmp_
     """The seed 8001 has a press run, in which the bias drifts by several newtons."""
     outcome = evaluate_identification(kind, seed, tmp_path)
     assert (outcome.verdict, outcome.check, outcome.wrong, outcome.trouble) == ("good", "good", False, "")
+    assert "random walk of 0." in outcome.message

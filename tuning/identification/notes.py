@@ -54,6 +54,9 @@ def collect_notes(
         notes.append(contact.resampled)
     if force is not None and force.drift:
         notes.append(f"the force drifts at rest, by {force.drift:.3g} N from the first row to the last")
+    if force is not None and force.walk:
+        walk = f"the force's bias drifts, with a random walk of {force.walk[0]:.2g} N/sqrt(s)"
+        notes.append(f"{walk}; jaxhil monitor does not model this")
     if force is not None and not force.walk and force.pole > 0.5:
         notes.append(f"the force's noise is coloured (pole {force.pole:.2f}); tuning treats it as white")
     if contact is not None and (entries := contact.readings.entries) != tuple(range(len(entries))):
