@@ -71,6 +71,11 @@ def test_other_noise_is_not_taken_for_random_walk(noise):
         assert estimate_force_noise(readings, PERIOD, 0.0).walk is None
 
 
+def test_readings_that_begin_late_have_no_random_walk():
+    readings = np.where(np.arange(5000) < 100, 0.0, 0.2)
+    assert estimate_force_noise(readings, PERIOD, 0.0).walk is None
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bias_walk_stated", "bias_walk"])
 @pytest.mark.parametrize("seed", [8000, 8001])

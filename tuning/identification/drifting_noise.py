@@ -37,19 +37,20 @@ def estimate_force_noise(readings: np.ndarray, period: float, stated: float) -> 
     if stated:
         return estimate_drifting_noise(readings, period, stated)
     steady = estimate_noise(readings)
-    rate = float(np.std(readings)) / math.sqrt(period * len(readings))
-    drifting = estimate_drifting_noise(readings, period, rate)
-    if drifting.walk is None or drifting.walk[0] * math.sqrt(DRIFT_TIME) < drifting.std:
+    if steady.silent or steady.std == 0.0 or len(readings) < 2 * MAX_FILTER_LENGTH:
         return steady
-    if len(readings) < 2 * MAX_FILTER_LENGTH:
+    rate = float(np.std(readings)) / math.sqrt(period * len(readings))
+    drifting, (walk, _) = _fit_random_walk(readings, period, rate)
+    if walk * math.sqrt(DRIFT_TIME) < drifting.std:
         return steady
     line = steady.mean + steady.drift * np.linspace(-0.5, 0.5, len(readings))
     with_walk, without = (
         float(np.std(lfilter(noise.filter, [1.0], readings - bias)[MAX_FILTER_LENGTH:]))
         for noise, bias in ((drifting, drifting.mean), (steady, line))
     )
-    gain = len(readings) * math.log(without / with_walk)
-    return drifting if gain > MIN_LIKELIHOOD_GAIN else steady
+    # Both are 0 if the readings change only at the beginning.
+    is_better = without > with_walk * math.exp(MIN_LIKELIHOOD_GAIN / len(readings))
+    return drifting if is_better else steady
 
 
 def estimate_drifting_noise(readings: np.ndarray, period: float, stated: float) -> NoiseEstimate:
@@ -67,6 +68,23 @@ def estimate_drifting_noise(readings: np.ndarray, period: float, stated: float) 
     steady = estimate_noise(readings)
     if steady.silent or steady.std == 0.0:
         return steady
+    return _fit_random_walk(readings, period, stated)[0]
+
+
+def subtract_weighted_mean(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:
+    """Apply a whitening filter of this module along the last axis, as fast as a filter of first order."""
+    length, gain, pole = len(whitening), -whitening[1], whitening[2] / whitening[1]
+    total: Any = lfilter([gain], [1.0, -pole], values)
+    result = values.copy()
+    result[..., 1:] -= total[..., :-1]
+    result[..., length:] += pole ** (length - 1) * total[..., :-length]
+    return result
+
+
+def _fit_random_walk(
+    readings: np.ndarray, period: float, stated: float
+) -> tuple[NoiseEstimate, tuple[float, float]]:
+    """Return the noise of readings that are not constant, and its random walk with the standard error."""
     steps, number, root = np.diff(readings), len(readings), math.sqrt(period)
 
     def innovations(log_gain: float) -> float:
@@ -92,8 +110,8 @@ def estimate_drifting_noise(readings: np.ndarray, period: float, stated: float) 
     white = math.sqrt(max(pole * std**2 - quantum**2 / 12.0, 0.01 * pole * std**2))
     weights = gain * pole ** np.arange(number)
     length = min(math.ceil(math.log(FORGOTTEN_SHARE) / math.log(pole)) + 1, MAX_FILTER_LENGTH)
-    walk = gain * std / root
-    return NoiseEstimate(
+    walk = gain * std / root, gain * std / root * log_std
+    noise = NoiseEstimate(
         mean=float(weights @ readings / weights.sum()),
         std=white,
         mean_std=white * math.sqrt(gain),
@@ -102,16 +120,7 @@ def estimate_drifting_noise(readings: np.ndarray, period: float, stated: float) 
         silent=False,
         filter=(1.0, *(-weights[: length - 1]).tolist()),
         number=number,
-        walk=(walk, walk * log_std),
+        walk=walk,
         bias_step=gain * std,
     )
-
-
-def subtract_weighted_mean(values: np.ndarray, whitening: Sequence[float]) -> np.ndarray:
-    """Apply a whitening filter of this module along the last axis, as fast as a filter of first order."""
-    length, gain, pole = len(whitening), -whitening[1], whitening[2] / whitening[1]
-    total: Any = lfilter([gain], [1.0, -pole], values)
-    result = values.copy()
-    result[..., 1:] -= total[..., :-1]
-    result[..., length:] += pole ** (length - 1) * total[..., :-length]
-    return result
+    return noise, walk
